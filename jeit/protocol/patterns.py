@@ -1,0 +1,361 @@
+"""The named protocols of the literature.
+
+All count electrodes from 0, drive `+current` into the first electrode of a pair and take it out of the
+second, and measure the first minus the second.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from jeit.protocol._check import check_count, check_current, check_pairs, electrode_indices
+from jeit.protocol.matrices import from_matrices
+from jeit.protocol.protocol import Protocol
+
+Order = Literal["rotating", "fixed"]
+
+
+def adjacent(
+    num_electrodes: int,
+    *,
+    current: float = 1e-3,
+    driven_electrodes: bool = False,
+    reciprocal: Literal["all", "half"] = "all",
+    order: Order = "rotating",
+) -> Protocol:
+    """Neighbouring electrodes drive, neighbouring electrodes measure: L(L - 3) channels.
+
+    16 electrodes: 208 voltages, 104 with `reciprocal="half"`. Brown and Seagar 1987.
+
+    - `num_electrodes`: L, at least 4.
+    - `current`: amplitude in amperes.
+    - `driven_electrodes`: also measure where current flows (L² channels).
+    - `reciprocal`: "half" keeps the first of each two channels that reciprocity makes equal.
+    - `order`: "rotating" measures from the driven pair onwards, drive by drive; "fixed" always from electrode
+      0.
+
+    Raises `ValueError` for a bad count, current or option.
+    """
+    return skip(
+        num_electrodes,
+        0,
+        current=current,
+        driven_electrodes=driven_electrodes,
+        reciprocal=reciprocal,
+        order=order,
+    )
+
+
+def skip(
+    num_electrodes: int,
+    skipped: int,
+    *,
+    measurement_skipped: int | None = None,
+    current: float = 1e-3,
+    driven_electrodes: bool = False,
+    reciprocal: Literal["all", "half"] = "all",
+    order: Order = "rotating",
+) -> Protocol:
+    """Pairs that leave out `skipped` electrodes drive, pairs that leave out `measurement_skipped` measure.
+
+    Skip-0 is adjacent. `measurement_skipped` is `skipped` unless given. Options as in `adjacent`.
+
+    Raises `ValueError` for a skip that is negative or leads back to the same electrode, and as `adjacent`.
+    """
+    where = "adjacent" if skipped == 0 else "skip"
+    count = check_count(num_electrodes, where, 4)
+    measurement_skipped = skipped if measurement_skipped is None else measurement_skipped
+    for value, name in ((skipped, "skipped"), (measurement_skipped, "measurement_skipped")):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value <= count - 2:
+            raise ValueError(
+                f"skip: {name} must be an integer from 0 to {count - 2} for {count} electrodes; got "
+                f"{value!r}."
+            )
+    kind = "adjacent" if skipped == 0 else f"skip-{skipped}"
+    if measurement_skipped != skipped:
+        kind += f", skip-{measurement_skipped} measurement"
+    return _finish(
+        count,
+        _ring_pairs(count, skipped + 1),
+        _ring_pairs(count, measurement_skipped + 1),
+        name=f"{kind}, {count} electrodes",
+        where=where,
+        current=current,
+        driven_electrodes=driven_electrodes,
+        reciprocal=reciprocal,
+        order=order,
+    )
+
+
+def opposite(
+    num_electrodes: int,
+    *,
+    drives: Literal["distinct", "all"] = "distinct",
+    current: float = 1e-3,
+    driven_electrodes: bool = False,
+    order: Order = "rotating",
+) -> Protocol:
+    """Electrodes across the ring drive, neighbours measure: L(L - 4)/2 channels from the L/2 distinct drives.
+
+    16 electrodes: 96 voltages; 8 electrodes: 16. `drives="all"` also drives each pair the other way round,
+    which doubles the voltages (192 and 32) without a new one among them. Options as in `adjacent`.
+
+    Raises `ValueError` for an odd number of electrodes, and as `adjacent`.
+    """
+    count = check_count(num_electrodes, "opposite", 4)
+    if count % 2:
+        raise ValueError(
+            f"opposite: {count} electrodes have no opposite pairs. Use an even number, or `skip(..., "
+            f"{count // 2 - 1})`."
+        )
+    _check_choice(drives, ("distinct", "all"), "opposite", "drives")
+    pairs = _ring_pairs(count, count // 2)
+    return _finish(
+        count,
+        pairs[: count // 2] if drives == "distinct" else pairs,
+        _ring_pairs(count, 1),
+        name=f"opposite, {count} electrodes",
+        where="opposite",
+        current=current,
+        driven_electrodes=driven_electrodes,
+        reciprocal="all",
+        order=order,
+    )
+
+
+def all_against_one(
+    num_electrodes: int,
+    *,
+    common: int = 0,
+    measurement: Literal["common", "adjacent"] = "common",
+    current: float = 1e-3,
+    driven_electrodes: bool | None = None,
+    reciprocal: Literal["all", "half"] = "all",
+) -> Protocol:
+    """Every electrode in turn drives against the electrode `common`: L - 1 drives.
+
+    - `measurement`: "common" reads every electrode against `common` too ((L - 1)² channels; all of them on a
+      driven electrode); "adjacent" reads neighbouring pairs.
+    - `driven_electrodes`: measure where current flows; by default only where `measurement="common"` leaves no
+      choice.
+
+    Raises `ValueError` for `common` that is no electrode, for `measurement="common"` with
+    `driven_electrodes=False`, and as `adjacent`.
+    """
+    count = check_count(num_electrodes, "all_against_one", 3)
+    _check_choice(measurement, ("common", "adjacent"), "all_against_one", "measurement")
+    electrode_indices(common, count)
+    pairs = np.array([(k, common) for k in range(count) if k != common])
+    if driven_electrodes is None:
+        driven_electrodes = measurement == "common"
+    return _finish(
+        count,
+        pairs,
+        pairs if measurement == "common" else _ring_pairs(count, 1),
+        name=f"all against electrode {common}, {measurement} measurement, {count} electrodes",
+        where="all_against_one",
+        current=current,
+        driven_electrodes=driven_electrodes,
+        reciprocal=reciprocal,
+        order="fixed",
+    )
+
+
+def reference_electrode(
+    num_boundary: int,
+    *,
+    skipped: int = 0,
+    reference: int | None = None,
+    current: float = 1e-3,
+    driven_electrodes: bool = False,
+    order: Order = "rotating",
+) -> Protocol:
+    """Boundary electrodes drive in pairs and are each measured against one reference electrode.
+
+    The protocol has `num_boundary + 1` electrodes. 16 boundary electrodes and a centre one, adjacent drive:
+    16 · 14 = 224 voltages (Silvera Tawil et al. 2011, "centre measurement pattern").
+
+    - `num_boundary`: electrodes of the boundary, at least 4.
+    - `skipped`: electrodes left out between the two driven ones.
+    - `reference`: index of the reference electrode among the `num_boundary + 1`; by default the last.
+
+    Other options as in `adjacent`. Raises `ValueError` for a `reference` that does not exist, and as
+    `adjacent`.
+    """
+    count = check_count(num_boundary, "reference_electrode", 4)
+    reference = count if reference is None else reference
+    electrode_indices(reference, count + 1)
+    if not 0 <= skipped <= count - 2:
+        raise ValueError(f"reference_electrode: skipped must be from 0 to {count - 2}; got {skipped!r}.")
+    boundary = np.array([k for k in range(count + 1) if k != reference])
+    drive_kind = "adjacent" if skipped == 0 else f"skip-{skipped}"
+    return _finish(
+        count + 1,
+        boundary[_ring_pairs(count, skipped + 1)],
+        np.stack([boundary, np.full(count, reference)], axis=1),
+        name=f"{drive_kind} drive against reference electrode, {count} + 1 electrodes",
+        where="reference_electrode",
+        current=current,
+        driven_electrodes=driven_electrodes,
+        reciprocal="all",
+        order=order,
+    )
+
+
+def two_terminal(
+    num_electrodes: int,
+    pairs: Sequence[tuple[int, int]] | np.ndarray | None = None,
+    *,
+    current: float = 1e-3,
+) -> Protocol:
+    """Current and voltage on the same two electrodes, pair by pair.
+
+    All L(L - 1)/2 pairs, unless `pairs` (P, 2) says which.     Each voltage contains the contact impedance of
+    both electrodes.
+
+    Raises `ValueError` for a pair of an electrode with itself, or with one that does not exist.
+    """
+    count = check_count(num_electrodes, "two_terminal", 2)
+    check_current(current, "two_terminal")
+    if pairs is None:
+        pairs = np.array([(i, j) for i in range(count) for j in range(i + 1, count)])
+    chosen = check_pairs(pairs, count, "two_terminal")
+    patterns = pair_patterns(chosen, count)
+    channels = np.arange(len(chosen))
+    return Protocol(
+        drive=current * patterns,
+        measurement=patterns,
+        drive_index=channels,
+        measurement_index=channels,
+        name=f"two-terminal, {len(chosen)} pairs, {count} electrodes",
+    )
+
+
+def trigonometric(
+    num_electrodes: int,
+    *,
+    measurement: Literal["adjacent", "mean"] = "adjacent",
+    current: float = 1e-3,
+) -> Protocol:
+    """Sinusoidal currents in all electrodes at once: L - 1 drives, L(L - 1) channels.
+
+    Drives are cos(θ), sin(θ), cos(2θ), sin(2θ), ... with θ = 2πl/L and amplitude `current` in amperes: the
+    patterns that best tell a centred inclusion in a disk (Isaacson 1986; Gisser, Isaacson and Newell 1988).
+    16 electrodes: 240.
+
+    - `measurement`: "adjacent" reads each electrode against the next; "mean" against the mean of all others.
+
+    Raises `ValueError` for a bad count, current or option.
+    """
+    count = check_count(num_electrodes, "trigonometric", 3)
+    check_current(current, "trigonometric")
+    _check_choice(measurement, ("adjacent", "mean"), "trigonometric", "measurement")
+    angle = 2 * np.pi * np.arange(count) / count
+    waves = [wave(k * angle) for k in range(1, count // 2 + 1) for wave in (np.cos, np.sin)]
+    drive = np.array(waves[: count - 1])
+    drive -= drive.mean(axis=1, keepdims=True)  # the last rounding errors of Kirchhoff's law
+    if measurement == "adjacent":
+        rows = pair_patterns(_ring_pairs(count, 1), count)
+    else:
+        rows = np.eye(count) - (1 - np.eye(count)) / (count - 1)
+    return from_matrices(
+        current * drive, rows, name=f"trigonometric, {measurement} measurement, {count} electrodes"
+    )
+
+
+def bipolar(
+    num_electrodes: int,
+    drive_pairs: Sequence[tuple[int, int]] | np.ndarray,
+    measurement_pairs: Sequence[tuple[int, int]] | np.ndarray,
+    *,
+    current: float = 1e-3,
+    driven_electrodes: bool = False,
+    reciprocal: Literal["all", "half"] = "all",
+    name: str = "bipolar",
+) -> Protocol:
+    """Any drive pairs (S, 2) crossed with any measurement pairs (K, 2), drive by drive.
+
+    Options as in `adjacent`.     Raises `ValueError` for a pair of an electrode with itself, or with one that
+    does not exist.
+    """
+    count = check_count(num_electrodes, "bipolar", 2)
+    return _finish(
+        count,
+        check_pairs(drive_pairs, count, "bipolar: drive_pairs"),
+        check_pairs(measurement_pairs, count, "bipolar: measurement_pairs"),
+        name=name,
+        where="bipolar",
+        current=current,
+        driven_electrodes=driven_electrodes,
+        reciprocal=reciprocal,
+        order="fixed",
+    )
+
+
+def pair_patterns(pairs: np.ndarray, num_electrodes: int) -> np.ndarray:
+    """Pairs (P, 2) as patterns (P, L): +1 on the first electrode, -1 on the second."""
+    patterns = np.zeros((len(pairs), num_electrodes))
+    rows = np.arange(len(pairs))
+    patterns[rows, pairs[:, 0]] = 1.0
+    patterns[rows, pairs[:, 1]] = -1.0
+    return patterns
+
+
+def _ring_pairs(count: int, step: int) -> np.ndarray:
+    start = np.arange(count)
+    return np.stack([start, (start + step) % count], axis=1)
+
+
+def _check_choice(value, choices: tuple[str, ...], where: str, name: str) -> None:
+    if value not in choices:
+        raise ValueError(f"{where}: {name} must be one of {', '.join(map(repr, choices))}; got {value!r}.")
+
+
+def _finish(
+    count: int,
+    drive_pairs: np.ndarray,
+    measurement_pairs: np.ndarray,
+    *,
+    name: str,
+    where: str,
+    current: float,
+    driven_electrodes: bool,
+    reciprocal: str,
+    order: str,
+) -> Protocol:
+    """Cross drive pairs with measurement pairs, in the order and with the channels asked for."""
+    check_current(current, where)
+    _check_choice(reciprocal, ("all", "half"), where, "reciprocal")
+    _check_choice(order, ("rotating", "fixed"), where, "order")
+    num_rows = len(measurement_pairs)
+    drive_index = np.repeat(np.arange(len(drive_pairs)), num_rows)
+    measurement_index = np.tile(np.arange(num_rows), len(drive_pairs))
+    if order == "rotating":
+        # Drive i begins with measurement pair i: pairs are in ring order, one per electrode.
+        measurement_index = (measurement_index + drive_index) % num_rows
+    protocol = Protocol(
+        drive=current * pair_patterns(drive_pairs, count),
+        measurement=pair_patterns(measurement_pairs, count),
+        drive_index=drive_index,
+        measurement_index=measurement_index,
+        name=name,
+    )
+    keep = np.ones(protocol.num_measurements, dtype=bool)
+    if not driven_electrodes:
+        keep &= ~protocol.channels_on_driven_electrodes()
+    if reciprocal == "half":
+        pairs, _ = protocol.reciprocal_pairs()
+        keep[pairs[:, 1]] = False
+    if not keep.any():
+        raise ValueError(
+            f"{where}: every channel measures on a driven electrode, so none is left. Pass "
+            "driven_electrodes=True, or measure other pairs."
+        )
+    return Protocol(
+        drive=protocol.drive,
+        measurement=protocol.measurement,
+        drive_index=drive_index[keep],
+        measurement_index=measurement_index[keep],
+        name=name,
+    )

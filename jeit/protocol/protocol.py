@@ -1,0 +1,178 @@
+"""The protocol: which currents are driven, and which voltages are read, as matrices."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jeit.protocol._check import (
+    check_indices,
+    check_patterns,
+    electrode_indices,
+)
+from jeit.protocol.reciprocity import reciprocal_channel_pairs
+
+
+def _as_float(values) -> Array:
+    return jnp.asarray(values, dtype=jnp.result_type(float))
+
+
+def _as_index(values) -> Array:
+    if not isinstance(values, jax.Array) and np.asarray(values).dtype.kind not in "iub":
+        raise ValueError("Protocol: drive_index and measurement_index must be integers (0-based).")
+    return jnp.asarray(values, dtype=jnp.int32)
+
+
+class Protocol(eqx.Module):
+    """Drive and measurement patterns, and the channels made of them.
+
+    Channel `k` reads `measurement[measurement_index[k]] @ U`, where `U` (L,) are the electrode potentials in
+    volts while the currents `drive[drive_index[k]]` flow. Positive current enters the body.
+
+    Use the constructors (`adjacent`, `opposite`, `from_matrices`, ...) rather than this class, unless you
+    have all four arrays.
+
+    **Fields**
+
+    - `drive`: (S, L) amperes; each row sums to zero.
+    - `measurement`: (K, L) dimensionless weights, the distinct measurement patterns; each row sums to zero.
+    - `drive_index`: (M,) which row of `drive` is driven for each channel.
+    - `measurement_index`: (M,) which row of `measurement` is read for each channel.
+    - `name`: what to call it in reports.
+
+    **Raises** `ValueError` for patterns with NaN, with a zero row, with a row that does not sum to zero, of
+    differing numbers of electrodes, and for indices out of range.
+    """
+
+    drive: Float[Array, "S L"] = eqx.field(converter=_as_float)
+    measurement: Float[Array, "K L"] = eqx.field(converter=_as_float)
+    drive_index: Int[Array, " M"] = eqx.field(converter=_as_index)
+    measurement_index: Int[Array, " M"] = eqx.field(converter=_as_index)
+    name: str = eqx.field(static=True, default="custom")
+
+    def __check_init__(self):
+        check_patterns(self.drive, "drive")
+        check_patterns(self.measurement, "measurement")
+        if self.drive.shape[1] != self.measurement.shape[1]:
+            raise ValueError(
+                f"Protocol: drive patterns have {self.drive.shape[1]} electrodes (columns) but measurement "
+                f"patterns have {self.measurement.shape[1]}. Both need one column per electrode; transpose "
+                "the one that has one row per electrode."
+            )
+        check_indices(self.drive_index, self.drive.shape[0], "drive_index", "drive")
+        check_indices(self.measurement_index, self.measurement.shape[0], "measurement_index", "measurement")
+        if self.drive_index.shape != self.measurement_index.shape:
+            raise ValueError(
+                f"Protocol: drive_index has {self.drive_index.shape[0]} entries and measurement_index "
+                f"{self.measurement_index.shape[0]}. Both need one entry per channel."
+            )
+
+    @property
+    def num_electrodes(self) -> int:
+        """Number of electrodes L."""
+        return self.drive.shape[-1]
+
+    @property
+    def num_drives(self) -> int:
+        """Number of drive patterns S."""
+        return self.drive.shape[-2]
+
+    @property
+    def num_measurements(self) -> int:
+        """Number of channels M: voltages in one frame."""
+        return self.drive_index.shape[-1]
+
+    @property
+    def channel_drive(self) -> Float[Array, "M L"]:
+        """(M, L) the currents in amperes that flow while each channel is read."""
+        return self.drive[self.drive_index]
+
+    @property
+    def channel_measurement(self) -> Float[Array, "M L"]:
+        """(M, L) the measurement weights of each channel."""
+        return self.measurement[self.measurement_index]
+
+    def channels_touching(self, electrodes: int | Sequence[int]) -> Bool[np.ndarray, " M"]:
+        """(M,) True where a channel drives or measures any of `electrodes` (0-based indices).
+
+        Raises `ValueError` for an index that is not an electrode.
+        """
+        chosen = electrode_indices(electrodes, self.num_electrodes)
+        driven = np.any(np.asarray(self.drive)[:, chosen] != 0, axis=1)
+        measured = np.any(np.asarray(self.measurement)[:, chosen] != 0, axis=1)
+        return np.logical_or(
+            driven[np.asarray(self.drive_index)], measured[np.asarray(self.measurement_index)]
+        )
+
+    def mask_without(self, electrodes: int | Sequence[int]) -> Bool[np.ndarray, " M"]:
+        """(M,) True where a channel stays usable when `electrodes` (0-based) are missing or broken."""
+        return ~self.channels_touching(electrodes)
+
+    def channels_on_driven_electrodes(self) -> Bool[np.ndarray, " M"]:
+        """(M,) True where a channel measures on an electrode that carries current.
+
+        Such a channel sees the contact impedance's voltage drop as well as the body.
+        """
+        driven = np.asarray(self.drive) != 0
+        measured = np.asarray(self.measurement) != 0
+        shared = driven.astype(int) @ measured.T.astype(int) > 0
+        return shared[np.asarray(self.drive_index), np.asarray(self.measurement_index)]
+
+    def subset(self, keep) -> "Protocol":
+        """The protocol of the channels kept, with the drives and measurement patterns they use.
+
+        `keep` is a boolean mask (M,) or a sequence of channel indices. Voltages follow as `voltages[...,
+        keep]`. Raises `ValueError` for a mask of another length, or one that keeps nothing.
+        """
+        channels = np.asarray(keep)
+        if channels.dtype == bool:
+            if channels.shape != (self.num_measurements,):
+                raise ValueError(
+                    f"subset: the mask has shape {channels.shape}, the protocol {self.num_measurements} "
+                    "channels. Give one True or False per channel."
+                )
+            channels = np.flatnonzero(channels)
+        elif channels.size and (
+            channels.dtype.kind not in "iu" or channels.min() < 0 or channels.max() >= self.num_measurements
+        ):
+            raise ValueError(
+                f"subset: channels must be integers from 0 to {self.num_measurements - 1}, or a boolean mask."
+            )
+        if channels.size == 0:
+            raise ValueError("subset: no channel is left. Keep at least one.")
+        drives, drive_index = np.unique(np.asarray(self.drive_index)[channels], return_inverse=True)
+        rows, measurement_index = np.unique(np.asarray(self.measurement_index)[channels], return_inverse=True)
+        return Protocol(
+            drive=self.drive[drives],
+            measurement=self.measurement[rows],
+            drive_index=drive_index,
+            measurement_index=measurement_index,
+            name=f"{self.name}, {channels.size} of {self.num_measurements} channels",
+        )
+
+    def reciprocal_pairs(self) -> tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
+        """Pairs of channels that reciprocity ties together, and the ratio of their voltages.
+
+        Returns `pairs` (P, 2) and `ratio` (P,) such that `v[pairs[:, 1]] = ratio * v[pairs[:, 0]]` for any
+        body without magnetic bias: channels whose drive and measurement patterns are each other's, up to
+        scale. Empty when the patterns allow no pair (opposite drive with adjacent measurement, say). See
+        `jeit.protocol.reciprocity` for combinations of channels.
+        """
+        return reciprocal_channel_pairs(
+            np.asarray(self.drive),
+            np.asarray(self.measurement),
+            np.asarray(self.drive_index),
+            np.asarray(self.measurement_index),
+        )
+
+    def same_patterns(self, other: "Protocol") -> bool:
+        """True when both drive and read the same channels in the same order, whatever their names."""
+        return (
+            self.num_electrodes == other.num_electrodes
+            and self.num_measurements == other.num_measurements
+            and bool(np.allclose(self.channel_drive, other.channel_drive, rtol=1e-9, atol=0))
+            and bool(np.allclose(self.channel_measurement, other.channel_measurement, rtol=1e-9, atol=0))
+        )

@@ -1,0 +1,71 @@
+"""Reciprocity: driving at a and reading at b gives what driving at b and reading at a gives.
+
+The transfer impedance S (L, L) of any body of (symmetric) conductivity is symmetric: `m @ S @ d = d @ S @ m`.
+So two channels (d, m) and (d', m') with d' = a m and m' = b d have voltages v' = a b v. Geselowitz 1971, Lehr
+1972.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+def _direction_keys(patterns: np.ndarray) -> tuple[list[bytes], np.ndarray]:
+    """A hashable key per row, equal for proportional rows; and the scale with row = scale * unit row."""
+    # The first entry that is not tiny fixes scale and sign, so that proportional rows (also negative) meet.
+    size = np.max(np.abs(patterns), axis=1, keepdims=True)
+    first = np.argmax(np.abs(patterns) > 1e-9 * size, axis=1)
+    scale = patterns[np.arange(len(patterns)), first]
+    unit = np.round(patterns / scale[:, None], 9) + 0.0  # + 0.0 turns -0.0 into 0.0
+    return [row.tobytes() for row in unit], scale
+
+
+def reciprocal_channel_pairs(
+    drive: np.ndarray, measurement: np.ndarray, drive_index: np.ndarray, measurement_index: np.ndarray
+) -> tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
+    """Channel pairs (P, 2), first < second, and ratios (P,) with `v[second] = ratio * v[first]`.
+
+    Arguments are those of `Protocol`. A channel read twice pairs with the last of its mirror images only.
+    """
+    drive_key, drive_scale = _direction_keys(drive)
+    measurement_key, measurement_scale = _direction_keys(measurement)
+    channel = {
+        (drive_key[d], measurement_key[m]): k
+        for k, (d, m) in enumerate(zip(drive_index, measurement_index, strict=True))
+    }
+    gain = drive_scale[drive_index] * measurement_scale[measurement_index]
+    pairs, ratios = [], []
+    for first, (d, m) in enumerate(zip(drive_index, measurement_index, strict=True)):
+        second = channel.get((measurement_key[m], drive_key[d]))
+        if second is not None and first < second:
+            pairs.append((first, second))
+            ratios.append(gain[second] / gain[first])
+    return np.array(pairs, dtype=int).reshape(-1, 2), np.array(ratios, dtype=float)
+
+
+def reciprocity_combinations(
+    drive: np.ndarray,
+    measurement: np.ndarray,
+    drive_index: np.ndarray,
+    measurement_index: np.ndarray,
+    mask: np.ndarray,
+) -> tuple[Float[np.ndarray, "S S M"], np.ndarray]:
+    """Weights that turn channels into the transfer between drives, where measurements span the drives.
+
+    Returns `weights` (S, S, M) and `known` (S, S): `weights[i, j] @ v = drive[i] @ S @ drive[j]`, the voltage
+    that drive pattern i would read while drive j flows, when `known[i, j]`. The result is symmetric in i, j
+    for any body. Masked channels get no weight. A drive of skip-1 read by neighbours, for instance, is the
+    sum of two neighbours.
+    """
+    num_drives, num_channels = drive.shape[0], drive_index.shape[0]
+    weights = np.zeros((num_drives, num_drives, num_channels))
+    known = np.zeros((num_drives, num_drives), dtype=bool)
+    size = np.linalg.norm(drive, axis=1)
+    for flowing in range(num_drives):
+        channels = np.flatnonzero((drive_index == flowing) & mask)
+        if channels.size == 0:
+            continue
+        rows = measurement[measurement_index[channels]]
+        combination = drive @ np.linalg.pinv(rows, rcond=1e-10)
+        known[:, flowing] = np.linalg.norm(combination @ rows - drive, axis=1) <= 1e-8 * size
+        weights[:, flowing, channels] = combination
+    return weights, known
