@@ -1,1 +1,29 @@
-"""mesh"""
+"""Meshes: points, cells, boundary facets and tags; shapes to mesh; outlines; files."""
+
+from jeit.mesh.domain import Disk, Domain, Polygon, Rectangle
+from jeit.mesh.geometry import (
+    boundary_arc_length,
+    centroids,
+    facet_centroids,
+    facet_measures,
+    gradients,
+    measures,
+)
+from jeit.mesh.mesh import Mesh
+from jeit.mesh.shapes import disk, rectangle
+
+__all__ = [
+    "Disk",
+    "Domain",
+    "Mesh",
+    "Polygon",
+    "Rectangle",
+    "boundary_arc_length",
+    "centroids",
+    "disk",
+    "facet_centroids",
+    "facet_measures",
+    "gradients",
+    "measures",
+    "rectangle",
+]

@@ -1,11 +1,17 @@
 """`Mesh`: points, simplicial cells, boundary facets and named groups of facets."""
 
+from __future__ import annotations
 
+from collections.abc import Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
+
+from jeit.mesh import _checks, _topology
 
 
 class Mesh(eqx.Module):
@@ -40,3 +46,49 @@ class Mesh(eqx.Module):
     def num_cells(self) -> int:
         """Number of cells m."""
         return self.cells.shape[0]
+
+    @property
+    def num_facets(self) -> int:
+        """Number of boundary facets b."""
+        return self.facets.shape[0]
+
+    @staticmethod
+    def create(points: ArrayLike, cells: ArrayLike, *, tags: Mapping[str, ArrayLike] | None = None) -> Mesh:
+        """Check raw arrays, orient the cells, find the boundary, and make a `Mesh`.
+
+        **Arguments**: `points` (n, 2) or (n, 3) in metres; `cells` (m, d + 1) zero-based node indices in
+        either orientation (clockwise cells are turned round); `tags` maps a name to boundary facets, given
+        either as their nodes, (t, d) integers in any order, or as indices (t,) into the resulting `facets`.
+
+        In 2-D each loop of `facets` starts at its lowest-numbered node; the outer loop runs
+        counter-clockwise, holes clockwise. `points` may be traced by JAX: the checks on values are then
+        skipped and the cells are taken to be positively oriented already.
+
+        Raises `ValueError` if the arrays have the wrong shape or type, hold NaN or indices out of range,
+        or describe a mesh with degenerate, duplicated or overlapping cells, unused or coinciding nodes,
+        facets shared by three cells, or several separate parts; warns if the extent exceeds 10 m, which
+        almost always means millimetres.
+        """
+        traced = isinstance(points, jax.core.Tracer)
+        if isinstance(cells, jax.core.Tracer):
+            raise ValueError(
+                "cells: the boundary cannot be found from traced node indices. Create the mesh outside the "
+                "transformed function and pass it in, or replace its points with equinox.tree_at."
+            )
+        coordinates = None if traced else _checks.check_points(points)
+        num_points, dimension = np.shape(points) if traced else np.shape(coordinates)
+        indices = _checks.check_cells(cells, num_points, dimension)
+        if coordinates is not None:
+            _checks.check_coinciding(coordinates)
+            indices = _checks.orient(coordinates, indices)
+        facets = _topology.boundary_facets(indices)
+        _checks.check_connected(indices)
+        if dimension == 2:
+            facets = _topology.order_loops(facets, coordinates)
+        located = _checks.locate_tags(tags or {}, facets)
+        return Mesh(
+            points=jnp.asarray(points if traced else coordinates),
+            cells=jnp.asarray(indices.astype(np.int32)),
+            facets=jnp.asarray(facets.astype(np.int32)),
+            tags={name: jnp.asarray(index.astype(np.int32)) for name, index in located.items()},
+        )

@@ -1,0 +1,185 @@
+"""Checks on the raw arrays of a mesh: every fault is named, with what to do about it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from jeit.mesh import _topology
+
+# A cell flatter than this, relative to its longest edge, has gradients of no use in double precision.
+_FLAT = 1e-10
+# Nodes closer than this, relative to the extent, count as one node given twice.
+_COINCIDING = 1e-10
+# No tank or skin is larger; coordinates beyond it are nearly always millimetres.
+_LARGE = 10.0
+
+
+def check_points(points: ArrayLike) -> np.ndarray:
+    """Coordinates as float64 (n, d); raises `ValueError` on a wrong shape, type or NaN."""
+    try:
+        array = np.asarray(points, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"points: expected real numbers of shape (n, 2) or (n, 3); {error}.") from None
+    if array.ndim != 2 or array.shape[1] not in (2, 3):
+        hint = " Transpose the array." if array.ndim == 2 and array.shape[0] in (2, 3) else ""
+        raise ValueError(f"points: expected shape (n, 2) or (n, 3), got {array.shape}.{hint}")
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise ValueError(
+            f"points: {bad.size} node(s) hold NaN or infinity, first node {bad[0]}: {array[bad[0]].tolist()}. "
+            "Drop these nodes and the cells that use them."
+        )
+    if not len(array):
+        raise ValueError("points: the array is empty; a mesh needs at least one cell.")
+    warn_large(float(np.ptp(array, axis=0).max()), "points")
+    return array
+
+
+def warn_large(extent: float, name: str) -> None:
+    """Warn if a length in metres looks like millimetres."""
+    if extent > _LARGE:
+        warnings.warn(
+            f"{name}: the domain is {extent:g} m across. If the lengths are millimetres, multiply them by 1e-3: "
+            "jeit computes in metres.",
+            UserWarning,
+            stacklevel=4,
+        )
+
+
+def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray:
+    """Node indices as integers (m, d + 1); raises `ValueError` on bad, duplicated or unused ones."""
+    array = np.asarray(cells)
+    if array.ndim != 2 or array.shape[1] != dimension + 1 or not len(array):
+        kind = "triangles" if dimension == 2 else "tetrahedra"
+        raise ValueError(
+            f"cells: points in {dimension}-D need {kind} of shape (m, {dimension + 1}) with m > 0, got {array.shape}."
+        )
+    if not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(
+            f"cells: node indices must be integers, got {array.dtype}. Convert with .astype(int)."
+        )
+    array = array.astype(np.int64)
+    low, high = int(array.min()), int(array.max())
+    if low < 0 or high >= num_points:
+        hint = " They look one-based: subtract 1." if low >= 1 and high == num_points else ""
+        raise ValueError(
+            f"cells: node indices run from {low} to {high}, but the mesh has nodes 0 to {num_points - 1}.{hint}"
+        )
+    ordered = np.sort(array, axis=1)
+    repeated = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
+    if repeated.size:
+        raise ValueError(
+            f"cells: cell {repeated[0]} uses a node twice: {array[repeated[0]].tolist()}. Remove such cells."
+        )
+    order = np.lexsort(ordered.T[::-1])
+    twice = np.flatnonzero((ordered[order][1:] == ordered[order][:-1]).all(axis=1))
+    if twice.size:
+        pair = np.sort(order[twice[0] : twice[0] + 2]).tolist()
+        raise ValueError(
+            f"cells: {twice.size} cell(s) are duplicated, first cells {pair[0]} and {pair[1]} with nodes "
+            f"{ordered[order[twice[0]]].tolist()}. Keep one of each."
+        )
+    unused = np.setdiff1d(np.arange(num_points), array)
+    if unused.size:
+        raise ValueError(
+            f"points: {unused.size} node(s) belong to no cell, first node {unused[0]}. They would make the stiffness "
+            "matrix singular: drop them and renumber the cells."
+        )
+    return array
+
+
+def check_coinciding(points: np.ndarray) -> None:
+    """Raise `ValueError` if two nodes lie at the same place."""
+    if len(points) < 2:
+        return
+    distance, neighbour = cKDTree(points).query(points, k=2)
+    close = np.flatnonzero(distance[:, 1] <= _COINCIDING * np.ptp(points, axis=0).max())
+    if close.size:
+        first = int(close[0])
+        other = int(neighbour[first, 1] if neighbour[first, 1] != first else neighbour[first, 0])
+        raise ValueError(
+            f"points: {close.size} nodes coincide with another, first nodes {first} and {other} at "
+            f"{points[first].tolist()}. Merge them, or the mesh has an invisible crack there."
+        )
+
+
+def signed_measures(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Signed areas or volumes (m,) of the cells."""
+    edges = points[cells[:, 1:]] - points[cells[:, :1]]
+    return np.linalg.det(edges) / (2.0 if cells.shape[1] == 3 else 6.0)
+
+
+def orient(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Cells with positive measure; raises `ValueError` on cells without any."""
+    measure = signed_measures(points, cells)
+    dimension = points.shape[1]
+    corners = points[cells]
+    size = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    flat = np.flatnonzero(np.abs(measure) <= _FLAT * size**dimension)
+    if flat.size:
+        name = "area" if dimension == 2 else "volume"
+        raise ValueError(
+            f"cells: {flat.size} cell(s) have no {name}, first cell {flat[0]} with nodes {cells[flat[0]].tolist()}: "
+            "its nodes lie on one line or plane. Remove it or move a node."
+        )
+    swapped = cells.copy()
+    swapped[:, [-2, -1]] = cells[:, [-1, -2]]
+    return np.where((measure > 0)[:, None], cells, swapped)
+
+
+def check_connected(cells: np.ndarray) -> None:
+    """Raise `ValueError` if the cells do not hang together facet by facet."""
+    first, second, _ = _topology.pair_facets(cells)
+    width, count = cells.shape[1], len(cells)
+    graph = coo_array((np.ones(len(first)), (first // width, second // width)), shape=(count, count))
+    parts, label = connected_components(graph, directed=False)
+    if parts > 1:
+        sizes = np.bincount(label)
+        raise ValueError(
+            f"cells: the mesh falls into {parts} separate parts of {np.sort(sizes)[::-1][:5].tolist()} cells. No current "
+            "flows between them: keep one part, or merge the nodes along their common boundary."
+        )
+
+
+def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, np.ndarray]:
+    """Tags as indices (t,) into `facets`; raises `ValueError` on facets that are not there."""
+    located = {}
+    for name, value in tags.items():
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"tags: names must be non-empty strings, got {name!r}.")
+        array = np.asarray(value)
+        if array.size == 0:
+            raise ValueError(f"tags: {name!r} is empty. Leave it out, or name at least one boundary facet.")
+        if not np.issubdtype(array.dtype, np.integer):
+            raise ValueError(f"tags: {name!r} must hold integers, got {array.dtype}.")
+        if array.ndim == 2 and array.shape[1] == facets.shape[1]:
+            array = _match(name, array.astype(np.int64), facets)
+        elif array.ndim != 1:
+            raise ValueError(
+                f"tags: {name!r} must be facet indices (t,) or facet nodes (t, {facets.shape[1]}), got {array.shape}."
+            )
+        if array.min() < 0 or array.max() >= len(facets):
+            raise ValueError(
+                f"tags: {name!r} holds facet indices from {array.min()} to {array.max()}, but the mesh has boundary "
+                f"facets 0 to {len(facets) - 1}."
+            )
+        located[name] = np.unique(array)
+    return located
+
+
+def _match(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarray:
+    where = {tuple(row): index for index, row in enumerate(np.sort(facets, axis=1).tolist())}
+    found = [where.get(tuple(row), -1) for row in np.sort(nodes, axis=1).tolist()]
+    if -1 in found:
+        raise ValueError(
+            f"tags: {name!r} names the facet with nodes {nodes[found.index(-1)].tolist()}, which is not on the "
+            "boundary of the mesh. Tags group boundary facets only."
+        )
+    return np.array(found)
