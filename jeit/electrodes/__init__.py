@@ -1,1 +1,29 @@
-"""electrodes"""
+"""Electrodes (position, size, contact impedance), and layouts that say where to put them.
+
+| where | complete electrodes | point electrodes |
+|---|---|---|
+| edge of a sheet (2-D) | `BoundaryElectrodes` | `PointElectrodes` |
+| inside a sheet (2-D) | `SheetDiscs` | `PointElectrodes` |
+| faces of a 3-D body | `FaceDiscs`, `FacePatches` | `PointElectrodes` |
+| whole facets of a mesh, nodes of a mesh | `FacetElectrodes`, `plates`, `electrodes_from_nodes` | `NodeElectrodes` |
+| several of these at once | `CombinedElectrodes` | |
+"""
+
+from jeit.electrodes.boundary import BoundaryElectrodes as BoundaryElectrodes
+from jeit.electrodes.combined import CombinedElectrodes as CombinedElectrodes
+from jeit.electrodes.discs import FaceDiscs as FaceDiscs
+from jeit.electrodes.discs import SheetDiscs as SheetDiscs
+from jeit.electrodes.electrodes import AbstractElectrodes as AbstractElectrodes
+from jeit.electrodes.electrodes import Contact as Contact
+from jeit.electrodes.electrodes import is_concrete as is_concrete
+from jeit.electrodes.facets import FacetElectrodes as FacetElectrodes
+from jeit.electrodes.facets import electrodes_from_nodes as electrodes_from_nodes
+from jeit.electrodes.facets import plates as plates
+from jeit.electrodes.layouts import grid as grid
+from jeit.electrodes.layouts import perimeter as perimeter
+from jeit.electrodes.layouts import quasi_uniform as quasi_uniform
+from jeit.electrodes.layouts import ring as ring
+from jeit.electrodes.layouts import ring_and_centre as ring_and_centre
+from jeit.electrodes.patches import FacePatches as FacePatches
+from jeit.electrodes.point import NodeElectrodes as NodeElectrodes
+from jeit.electrodes.point import PointElectrodes as PointElectrodes

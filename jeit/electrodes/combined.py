@@ -1,0 +1,54 @@
+"""Electrodes of several kinds on one mesh, such as arcs round the edge of a sheet and a disc in its centre."""
+
+from typing import ClassVar
+
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from jeit.electrodes.electrodes import AbstractElectrodes, Contact
+from jeit.mesh import Mesh
+
+
+class CombinedElectrodes(AbstractElectrodes):
+    """Complete electrodes of several kinds, numbered one kind after the other.
+
+    **Fields**: `parts`, electrodes none of which is a point electrode.
+    """
+
+    parts: tuple[AbstractElectrodes, ...]
+    is_point: ClassVar[bool] = False
+
+    def __init__(self, *parts: AbstractElectrodes):
+        """Raises `ValueError` for no parts, or for point electrodes, which have no contact to combine."""
+        if not parts:
+            raise ValueError("CombinedElectrodes needs at least one set of electrodes.")
+        for part in parts:
+            if part.is_point:
+                raise ValueError(
+                    f"{type(part).__name__} cannot be combined with complete electrodes: give them a size and a "
+                    "contact impedance (SheetDiscs, FaceDiscs), or make all electrodes points."
+                )
+        self.parts = parts
+
+    @property
+    def num_electrodes(self) -> int:
+        """Number of electrodes L of all parts together."""
+        return sum(part.num_electrodes for part in self.parts)
+
+    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
+        """The facets and cells of all parts."""
+        return tuple(nodes for part in self.parts for nodes in part.contact_nodes(mesh))
+
+    def contact(self, mesh: Mesh) -> Contact:
+        """Contact integrals of all parts, side by side."""
+        contacts = [part.contact(mesh) for part in self.parts]
+        return Contact(
+            tuple(nodes for contact in contacts for nodes in contact.nodes),
+            tuple(mass for contact in contacts for mass in contact.mass),
+            jnp.concatenate([contact.load for contact in contacts], axis=1),
+        )
+
+    def check(self, mesh: Mesh) -> None:
+        """Check every part on its own."""
+        for part in self.parts:
+            part.check(mesh)

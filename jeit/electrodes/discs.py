@@ -1,0 +1,164 @@
+"""Round electrodes: discs inside a sheet, and discs on the faces of a 3-D body."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jeit.electrodes.electrodes import (
+    AbstractElectrodes,
+    Contact,
+    as_electrode_values,
+    as_positions,
+    check_dimension,
+    is_concrete,
+)
+from jeit.electrodes.window import EDGE, smooth_step, triangle_quadrature, window_contact
+from jeit.mesh import Mesh, facet_measures, measures
+
+
+class SheetDiscs(AbstractElectrodes):
+    """Complete electrodes that are discs inside a sheet (2-D mesh), free of its nodes.
+
+    The disc's indicator function is replaced by a smooth window whose edge is half a cell wide, so integrals are
+    differentiable in position and radius and converge to the sharp disc as the mesh is refined.
+
+    **Fields**: `position` (L, 2) metres; `radius` (L,) metres; `contact_impedance` (L,) ohm·m².
+    """
+
+    position: Float[Array, "L 2"]
+    radius: Float[Array, " L"]
+    contact_impedance: Float[Array, " L"]
+    is_point: ClassVar[bool] = False
+
+    def __init__(self, position, radius, contact_impedance):
+        """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
+        self.position = as_positions(position, (2,))
+        self.radius = as_electrode_values("radius", radius, self.num_electrodes, unit="metres")
+        self.contact_impedance = as_electrode_values(
+            "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²"
+        )
+
+    @property
+    def num_electrodes(self) -> int:
+        """Number of electrodes L."""
+        return self.position.shape[0]
+
+    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
+        """The cells of `mesh`."""
+        return (mesh.cells,)
+
+    def contact(self, mesh: Mesh) -> Contact:
+        """Contact integrals over the cells, by quadrature of the windows."""
+        area = measures(mesh)
+        barycentric, _ = triangle_quadrature()
+        points = jnp.einsum("pi,mid->mpd", barycentric, mesh.points[mesh.cells])
+        edge = EDGE * jnp.sqrt(area)[:, None, None]
+        window = disc_window(points, self.position, self.radius, edge)
+        return window_contact(mesh.cells, area, window, self.contact_impedance, mesh.num_points)
+
+    def check(self, mesh: Mesh) -> None:
+        """Raise `ValueError` for discs off the sheet, overlapping, or too small for the mesh."""
+        check_dimension("SheetDiscs", mesh, 2)
+        check_discs(self, mesh, measures(mesh))
+
+
+class FaceDiscs(AbstractElectrodes):
+    """Complete electrodes that are discs on flat or gently curved faces of a 3-D mesh, free of its nodes.
+
+    **Fields**: `position` (L, 3) metres, on the surface; `radius` (L,) metres; `contact_impedance` (L,) ohm·m².
+    """
+
+    position: Float[Array, "L 3"]
+    radius: Float[Array, " L"]
+    contact_impedance: Float[Array, " L"]
+    is_point: ClassVar[bool] = False
+
+    def __init__(self, position, radius, contact_impedance):
+        """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
+        self.position = as_positions(position, (3,))
+        self.radius = as_electrode_values("radius", radius, self.num_electrodes, unit="metres")
+        self.contact_impedance = as_electrode_values(
+            "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²"
+        )
+
+    @property
+    def num_electrodes(self) -> int:
+        """Number of electrodes L."""
+        return self.position.shape[0]
+
+    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
+        """The boundary triangles of `mesh`."""
+        return (mesh.facets,)
+
+    def contact(self, mesh: Mesh) -> Contact:
+        """Contact integrals over the boundary triangles, by quadrature of the windows."""
+        area = facet_measures(mesh)
+        barycentric, _ = triangle_quadrature()
+        points = jnp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
+        edge = EDGE * jnp.sqrt(area)[:, None, None]
+        window = disc_window(points, self.position, self.radius, edge)
+        window = window * same_face(mesh, self.position, 0.2 * self.radius)[:, None, :]
+        return window_contact(mesh.facets, area, window, self.contact_impedance, mesh.num_points)
+
+    def check(self, mesh: Mesh) -> None:
+        """Raise `ValueError` for discs off the surface, overlapping, or too small for the mesh."""
+        check_dimension("FaceDiscs", mesh, 3)
+        check_discs(self, mesh, facet_measures(mesh))
+
+
+def disc_window(points, position, radius, edge):
+    """Share (q, p, L) of each quadrature point (q, p, d) that a disc covers; `edge` (q, 1, 1) its half-width."""
+    squared = jnp.sum((points[:, :, None, :] - position) ** 2, axis=-1)
+    # r² - ρ² = (r - ρ)(r + ρ) spares the square root, whose derivative does not exist at the centre.
+    return smooth_step((radius**2 - squared) / (2 * radius * edge))
+
+
+def facet_normals(mesh: Mesh) -> Float[Array, "b 3"]:
+    """Outward unit normals of the boundary triangles of a 3-D mesh."""
+    corners = mesh.points[mesh.facets]
+    normal = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def same_face(mesh: Mesh, position: Float[Array, "L 3"], tolerance: Float[Array, " L"]) -> Float[Array, "b L"]:
+    """1 for boundary triangles whose plane passes within `tolerance` of an electrode's centre, 0 for others.
+
+    Keeps an electrode on a thin layer from reaching through to the other face. Not differentiated.
+    """
+    normal, corner = facet_normals(mesh), mesh.points[mesh.facets[:, 0]]
+    height = jnp.abs(normal @ position.T - jnp.sum(normal * corner, axis=1)[:, None])
+    return jax.lax.stop_gradient(height < tolerance).astype(position.dtype)
+
+
+def check_discs(electrodes: SheetDiscs | FaceDiscs, mesh: Mesh, area) -> None:
+    """Raise `ValueError` unless every disc lies on the mesh, apart from the others, and spans enough cells."""
+    position, radius = electrodes.position, electrodes.radius
+    if not is_concrete(position, radius, mesh.points, mesh.cells):
+        return
+    position, radius = np.asarray(position), np.asarray(radius)
+    contact = electrodes.contact(mesh)
+    covered = np.asarray(contact.load.sum(axis=0) * electrodes.contact_impedance)
+    for electrode in range(len(radius)):
+        share = covered[electrode] / (np.pi * radius[electrode] ** 2)
+        where = f"electrode {electrode + 1} at {position[electrode].tolist()} m with radius {radius[electrode]:.3g} m"
+        if share < 0.01:
+            raise ValueError(
+                f"position: {where} touches nothing; it lies off the mesh, which spans "
+                f"{np.asarray(mesh.points).min(axis=0).tolist()} to {np.asarray(mesh.points).max(axis=0).tolist()} m, "
+                "or is far smaller than a cell."
+            )
+        if share < 0.8:
+            raise ValueError(
+                f"position: only {100 * share:.0f} % of {where} lies on the mesh; move it inside, or refine the mesh "
+                "there if the disc is smaller than a cell."
+            )
+        if share > 1.2:
+            raise ValueError(f"radius: {where} is too small for the mesh there; refine the mesh around it.")
+    gap = np.linalg.norm(position[:, None] - position, axis=-1) - radius[:, None] - radius
+    np.fill_diagonal(gap, np.inf)
+    if gap.min() < 0:
+        first, second = np.unravel_index(gap.argmin(), gap.shape)
+        raise ValueError(f"Electrodes {first + 1} and {second + 1} overlap by {-gap.min():.3g} m; move them apart.")

@@ -1,0 +1,98 @@
+"""What every kind of electrode has in common, and the integrals the forward model asks of it."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jeit.mesh import Mesh
+
+
+class Contact(eqx.Module):
+    """The contact integrals of a set of L electrodes on a mesh, divided by contact impedance.
+
+    In the complete electrode model every electrode l adds the energy (1/z_l) ∫_l (u - U_l)²; with P1 basis
+    functions φ that needs three things:
+
+    - `mass`: Σ_l (1/z_l) ∫ φ_i φ_j over the q facets or cells of k nodes that electrodes may touch, (q, k, k) in
+      siemens, and their `nodes` (q, k); one pair of arrays for each kind of electrode;
+    - `load` (n, L): (1/z_l) ∫ φ_i, in siemens, whose column sums are |e_l| / z_l.
+
+    Point electrodes have no contact energy: `load` holds φ_i at the electrode, without unit, and `nodes` only names the
+    node that the forward model grounds, with zero mass.
+    """
+
+    nodes: tuple[Int[Array, "q k"], ...]
+    mass: tuple[Float[Array, "q k k"], ...]
+    load: Float[Array, "n L"]
+
+
+class AbstractElectrodes(eqx.Module):
+    """Base of all electrodes: something that turns itself and a mesh into contact integrals."""
+
+    is_point: eqx.AbstractClassVar[bool]
+
+    @property
+    @abc.abstractmethod
+    def num_electrodes(self) -> int:
+        """Number of electrodes L."""
+
+    @abc.abstractmethod
+    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
+        """Nodes of the facets or cells that may carry contact mass, as in `Contact.nodes`; the mesh alone decides."""
+
+    @abc.abstractmethod
+    def contact(self, mesh: Mesh) -> Contact:
+        """Contact integrals on `mesh`, differentiable in every field of the electrodes and in `mesh.points`."""
+
+    @abc.abstractmethod
+    def check(self, mesh: Mesh) -> None:
+        """Raise `ValueError` where these electrodes do not fit `mesh`. Does nothing on traced values."""
+
+
+def is_concrete(*arrays) -> bool:
+    """Whether all `arrays` have values that can be looked at, i.e. none is a JAX tracer."""
+    return not any(isinstance(array, jax.core.Tracer) for array in arrays)
+
+
+def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) -> Float[Array, " L"]:
+    """Broadcast a positive scalar or (L,) argument to (L,) floats; `ValueError` if it cannot be that."""
+    values = jnp.asarray(values, dtype=float)
+    if values.ndim > 1 or (values.ndim == 1 and values.shape[0] != num_electrodes):
+        raise ValueError(
+            f"{name} has shape {values.shape}; give one number for all electrodes or one for each of the "
+            f"{num_electrodes}, in {unit}."
+        )
+    if is_concrete(values):
+        bad = ~(np.isfinite(values) & (np.asarray(values) > 0))
+        if bad.any():
+            first = int(np.flatnonzero(np.atleast_1d(bad))[0])
+            raise ValueError(
+                f"{name} must be positive and finite, in {unit}; electrode {first + 1} has "
+                f"{float(np.atleast_1d(values)[first])}."
+            )
+    return jnp.broadcast_to(values, (num_electrodes,))
+
+
+def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
+    """Check and convert electrode positions (L, d) in metres, d one of `dimensions`."""
+    position = jnp.asarray(position, dtype=float)
+    if position.ndim != 2 or position.shape[1] not in dimensions or position.shape[0] == 0:
+        wanted = " or ".join(f"(L, {d})" for d in dimensions)
+        raise ValueError(f"position has shape {position.shape}; give one row per electrode, {wanted}, in metres.")
+    if is_concrete(position) and not np.isfinite(position).all():
+        rows = np.flatnonzero(~np.isfinite(position).all(axis=1)) + 1
+        raise ValueError(f"position has NaN or infinite coordinates at electrodes {rows.tolist()}.")
+    return position
+
+
+def check_dimension(electrodes: str, mesh: Mesh, dimension: int) -> None:
+    """Raise unless the mesh has the space dimension that this kind of electrode lives in."""
+    if mesh.dimension != dimension:
+        raise ValueError(
+            f"{electrodes} live on a {dimension}-D mesh, and this mesh is {mesh.dimension}-D; "
+            "see 'How to choose electrodes' in the documentation for the kinds that fit."
+        )

@@ -1,0 +1,110 @@
+"""Electrodes given as groups of boundary facets of a mesh, as imported models and plates have them."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jeit.electrodes.electrodes import AbstractElectrodes, Contact, as_electrode_values, is_concrete
+from jeit.mesh import Mesh, facet_measures
+
+
+class FacetElectrodes(AbstractElectrodes):
+    """Complete electrodes that cover whole boundary facets of a mesh; exact.
+
+    **Fields**: `covers` (b, L), 1 where electrode l covers boundary facet f and 0 elsewhere; `contact_impedance`
+    (L,) ohm·m² (ohm·m in 2-D). Build them from facet indices, from tags (`plates`), or from nodes
+    (`electrodes_from_nodes`).
+    """
+
+    covers: Float[Array, "b L"]
+    contact_impedance: Float[Array, " L"]
+    is_point: ClassVar[bool] = False
+
+    def __init__(self, mesh: Mesh, facets: Sequence, contact_impedance):
+        """`facets`: for each electrode the indices into `mesh.facets` that it covers. Raises `ValueError`."""
+        if not facets:
+            raise ValueError("facets is empty; give one list of facet indices for each electrode.")
+        num_facets = mesh.facets.shape[0]
+        covers = np.zeros((num_facets, len(facets)))
+        for electrode, indices in enumerate(facets):
+            indices = np.asarray(indices)
+            if indices.size == 0 or not np.issubdtype(indices.dtype, np.integer):
+                raise ValueError(f"facets: electrode {electrode + 1} has no facets; give integer facet indices.")
+            if indices.min() < 0 or indices.max() >= num_facets:
+                raise ValueError(
+                    f"facets: electrode {electrode + 1} names facet {int(indices.max())}, and the mesh has "
+                    f"{num_facets} boundary facets, counted from 0."
+                )
+            covers[indices, electrode] = 1
+        shared = np.flatnonzero(covers.sum(axis=1) > 1)
+        if shared.size:
+            first, second = np.flatnonzero(covers[shared[0]])[:2] + 1
+            raise ValueError(f"Electrodes {first} and {second} overlap: both cover boundary facet {shared[0]}.")
+        self.covers = jnp.asarray(covers)
+        self.contact_impedance = as_electrode_values(
+            "contact_impedance", contact_impedance, len(facets), unit="ohm·m² (ohm·m in 2-D)"
+        )
+
+    @property
+    def num_electrodes(self) -> int:
+        """Number of electrodes L."""
+        return self.covers.shape[1]
+
+    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
+        """The boundary facets of `mesh`."""
+        return (mesh.facets,)
+
+    def contact(self, mesh: Mesh) -> Contact:
+        """Contact integrals over whole facets: ∫φ_i = |f| / d, ∫φ_iφ_j = |f| (1 + δ_ij) / (d (d + 1))."""
+        d = mesh.dimension
+        measure = facet_measures(mesh)
+        admittance = self.covers / self.contact_impedance  # (b, L)
+        mass = (measure * admittance.sum(axis=1))[:, None, None] * (jnp.ones((d, d)) + jnp.eye(d)) / (d * (d + 1))
+        load = jnp.zeros((mesh.num_points, self.num_electrodes), measure.dtype)
+        load = load.at[mesh.facets].add((measure[:, None] * admittance / d)[:, None, :])
+        return Contact((mesh.facets,), (mass,), load)
+
+    def check(self, mesh: Mesh) -> None:
+        """Raise `ValueError` if made for a mesh with another number of boundary facets."""
+        if self.covers.shape[0] != mesh.facets.shape[0]:
+            raise ValueError(
+                f"These electrodes were made for a mesh of {self.covers.shape[0]} boundary facets, and this one has "
+                f"{mesh.facets.shape[0]}; build them again from this mesh."
+            )
+
+
+def plates(mesh: Mesh, tags: Sequence[str], contact_impedance) -> FacetElectrodes:
+    """Electrodes that cover whole named faces of a mesh, such as `plates(box(…), ["left", "right"], 0.01)`.
+
+    `tags`: names in `mesh.tags`, one for each electrode. `contact_impedance`: ohm·m² (2-D: ohm·m), one number or
+    (L,). Raises `ValueError` for a name the mesh does not have.
+    """
+    for tag in tags:
+        if tag not in mesh.tags:
+            known = ", ".join(sorted(mesh.tags)) or "none"
+            raise ValueError(f"The mesh has no facets tagged '{tag}'; its tags are: {known}.")
+    return FacetElectrodes(mesh, [np.asarray(mesh.tags[tag]) for tag in tags], contact_impedance)
+
+
+def electrodes_from_nodes(mesh: Mesh, nodes: Sequence, contact_impedance) -> FacetElectrodes:
+    """Complete electrodes that cover the boundary facets whose nodes all belong to them.
+
+    `nodes`: for each electrode its node indices, counted from 0. `contact_impedance` as in `FacetElectrodes`.
+    For electrodes of one node each use `NodeElectrodes`. Raises `ValueError` where no facet is covered.
+    """
+    if not is_concrete(mesh.facets):
+        raise ValueError("electrodes_from_nodes needs a mesh with values, not one that is being traced.")
+    boundary = np.asarray(mesh.facets)
+    facets = []
+    for electrode, members in enumerate(nodes):
+        covered = np.flatnonzero(np.isin(boundary, np.asarray(members)).all(axis=1))
+        if covered.size == 0:
+            raise ValueError(
+                f"nodes: the {len(members)} nodes of electrode {electrode + 1} span no boundary facet; an electrode of "
+                "a single node is a point electrode (NodeElectrodes)."
+            )
+        facets.append(covered)
+    return FacetElectrodes(mesh, facets, contact_impedance)

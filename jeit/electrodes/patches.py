@@ -1,0 +1,105 @@
+"""Rectangular electrodes on the surface of a 3-D body, such as the plates round a tank."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jeit.electrodes.discs import facet_normals
+from jeit.electrodes.electrodes import (
+    AbstractElectrodes,
+    Contact,
+    as_electrode_values,
+    as_positions,
+    check_dimension,
+    is_concrete,
+)
+from jeit.electrodes.window import EDGE, smooth_step, triangle_quadrature, window_contact
+from jeit.mesh import Mesh, facet_measures
+
+
+class FacePatches(AbstractElectrodes):
+    """Complete electrodes that are rectangles on the surface of a 3-D mesh, free of its nodes.
+
+    A patch lies in the tangent plane at its position: its width runs horizontally (perpendicular to z) and its
+    height up the surface; on a horizontal face width runs along x and height along y.
+
+    **Fields**: `position` (L, 3) metres, on the surface; `width`, `height` (L,) metres; `contact_impedance` (L,)
+    ohm·m².
+    """
+
+    position: Float[Array, "L 3"]
+    width: Float[Array, " L"]
+    height: Float[Array, " L"]
+    contact_impedance: Float[Array, " L"]
+    is_point: ClassVar[bool] = False
+
+    def __init__(self, position, width, height, contact_impedance):
+        """Sizes and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
+        self.position = as_positions(position, (3,))
+        self.width = as_electrode_values("width", width, self.num_electrodes, unit="metres")
+        self.height = as_electrode_values("height", height, self.num_electrodes, unit="metres")
+        self.contact_impedance = as_electrode_values(
+            "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²"
+        )
+
+    @property
+    def num_electrodes(self) -> int:
+        """Number of electrodes L."""
+        return self.position.shape[0]
+
+    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
+        """The boundary triangles of `mesh`."""
+        return (mesh.facets,)
+
+    def contact(self, mesh: Mesh) -> Contact:
+        """Contact integrals over the boundary triangles, by quadrature of the windows."""
+        area = facet_measures(mesh)
+        barycentric, _ = triangle_quadrature()
+        points = jnp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
+        normal, across, up = _frames(mesh, self.position)
+        offset = points[:, :, None, :] - self.position  # (b, p, L, 3)
+        edge = EDGE * jnp.sqrt(area)[:, None, None]
+        window = smooth_step((self.width / 2 - jnp.abs(jnp.sum(offset * across, axis=-1))) / edge)
+        window = window * smooth_step((self.height / 2 - jnp.abs(jnp.sum(offset * up, axis=-1))) / edge)
+        # The same side of the body: facing as the electrode does, and no deeper than the patch is large.
+        facing = facet_normals(mesh) @ normal.T > 0.5
+        depth = jnp.abs(jnp.sum(offset.mean(axis=1) * normal, axis=-1))
+        near = depth < jnp.maximum(self.width, self.height) / 2
+        window = window * jax.lax.stop_gradient(facing & near)[:, None, :]
+        return window_contact(mesh.facets, area, window, self.contact_impedance, mesh.num_points)
+
+    def check(self, mesh: Mesh) -> None:
+        """Raise `ValueError` for patches off the surface, overlapping, or too small for the mesh."""
+        check_dimension("FacePatches", mesh, 3)
+        if not is_concrete(self.position, self.width, self.height, mesh.points, mesh.facets):
+            return
+        contact = self.contact(mesh)
+        share = np.asarray(contact.load.sum(axis=0) * self.contact_impedance / (self.width * self.height))
+        # A patch bent round a wall is longer than its chord, by a tenth at 80° of arc.
+        wrong = np.flatnonzero((share < 0.8) | (share > 1.25))
+        if wrong.size:
+            raise ValueError(
+                f"position: {100 * share[wrong[0]]:.0f} % of electrode {wrong[0] + 1}'s area is found on the mesh's "
+                "surface; move it onto the surface, or refine the mesh there if the patch is smaller than a facet."
+            )
+        touched = np.asarray(contact.load) * np.asarray(self.contact_impedance)
+        overlap = (touched.T @ touched) / np.sqrt(np.outer(*(2 * [(touched**2).sum(axis=0)])))
+        np.fill_diagonal(overlap, 0)
+        if overlap.max() > 0.2:
+            first, second = np.unravel_index(overlap.argmax(), overlap.shape)
+            raise ValueError(f"Electrodes {first + 1} and {second + 1} overlap; move them apart.")
+
+
+def _frames(mesh: Mesh, position):
+    """Unit vectors (L, 3) at each electrode: normal of the nearest facet, across, and up. Not differentiated."""
+    centres = mesh.points[mesh.facets].mean(axis=1)
+    nearest = jnp.argmin(jnp.sum((position[:, None] - centres) ** 2, axis=-1), axis=1)
+    normal = facet_normals(mesh)[nearest]
+    horizontal = jnp.abs(normal[:, 2:]) > 0.9
+    upward = jnp.where(horizontal, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
+    across = jnp.cross(upward, normal)
+    across = across / jnp.linalg.norm(across, axis=1, keepdims=True)
+    return tuple(map(jax.lax.stop_gradient, (normal, across, jnp.cross(normal, across))))

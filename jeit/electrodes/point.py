@@ -1,0 +1,122 @@
+"""Point electrodes: the zero-size limit, without contact impedance."""
+
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jeit.electrodes.electrodes import AbstractElectrodes, Contact, as_positions, is_concrete
+from jeit.mesh import Mesh
+
+
+class PointElectrodes(AbstractElectrodes):
+    """Point electrodes at any position in or on the boundary of a mesh.
+
+    Current enters and voltage is read by P1 interpolation in the cell that holds the position. The potential of
+    a point source is singular, so voltages at driven electrodes depend on the mesh.
+
+    **Fields**: `position` (L, d) metres.
+    """
+
+    position: Float[Array, "L d"]
+    is_point: ClassVar[bool] = True
+
+    def __init__(self, position):
+        """Raises `ValueError` for anything but finite (L, 2) or (L, 3) positions."""
+        self.position = as_positions(position, (2, 3))
+
+    @property
+    def num_electrodes(self) -> int:
+        """Number of electrodes L."""
+        return self.position.shape[0]
+
+    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
+        """Node 0, where the potential is grounded: point electrodes have no contact mass."""
+        return (jnp.zeros((1, 1), mesh.cells.dtype),)
+
+    def contact(self, mesh: Mesh) -> Contact:
+        """`load` (n, L): values of the basis functions at the electrodes; no mass."""
+        cell, weights, _ = _locate(self.position, mesh)
+        load = jnp.zeros((mesh.num_points, self.num_electrodes), weights.dtype)
+        load = load.at[mesh.cells[cell], jnp.arange(self.num_electrodes)[:, None]].set(weights)
+        return _point_contact(self.contact_nodes(mesh), load)
+
+    def check(self, mesh: Mesh) -> None:
+        """Raise `ValueError` for electrodes outside the mesh, or two at one place."""
+        if self.position.shape[1] != mesh.dimension:
+            raise ValueError(f"position has {self.position.shape[1]} coordinates and the mesh is {mesh.dimension}-D.")
+        if not is_concrete(self.position, mesh.points, mesh.cells):
+            return
+        position, points = np.asarray(self.position), np.asarray(mesh.points)
+        _, _, outside = map(np.asarray, _locate(self.position, mesh))
+        # A point on a curved boundary lies slightly outside the polygon: allow a third of a cell.
+        far = np.flatnonzero(outside < -1 / 3)
+        if far.size:
+            raise ValueError(
+                f"position: electrode {far[0] + 1} at {position[far[0]].tolist()} m lies outside the mesh, which spans "
+                f"{points.min(axis=0).tolist()} to {points.max(axis=0).tolist()} m."
+            )
+        gap = np.linalg.norm(position[:, None] - position, axis=-1) + np.eye(len(position)) * 1e300
+        if gap.min() < 1e-9 * np.ptp(points, axis=0).max():
+            first, second = np.unravel_index(gap.argmin(), gap.shape)
+            raise ValueError(f"Electrodes {first + 1} and {second + 1} are at the same position.")
+
+
+class NodeElectrodes(AbstractElectrodes):
+    """Point electrodes at nodes of a mesh, as imported models have them; exact.
+
+    **Fields**: `nodes` (L,) indices into `mesh.points`.
+    """
+
+    nodes: Int[Array, " L"]
+    is_point: ClassVar[bool] = True
+
+    def __init__(self, nodes):
+        """Raises `ValueError` for anything but L distinct non-negative integers."""
+        array = np.asarray(nodes)
+        if array.ndim != 1 or array.size == 0 or not np.issubdtype(array.dtype, np.integer):
+            raise ValueError("nodes must be a list of node indices, one integer for each electrode.")
+        if array.min() < 0 or len(np.unique(array)) != len(array):
+            raise ValueError("nodes must be distinct, non-negative, zero-based node indices.")
+        self.nodes = jnp.asarray(array, jnp.int32)
+
+    @property
+    def num_electrodes(self) -> int:
+        """Number of electrodes L."""
+        return self.nodes.shape[0]
+
+    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
+        """Node 0, where the potential is grounded: point electrodes have no contact mass."""
+        return (jnp.zeros((1, 1), mesh.cells.dtype),)
+
+    def contact(self, mesh: Mesh) -> Contact:
+        """`load` (n, L): one at each electrode's node; no mass."""
+        load = jnp.zeros((mesh.num_points, self.num_electrodes), mesh.points.dtype)
+        return _point_contact(self.contact_nodes(mesh), load.at[self.nodes, jnp.arange(self.num_electrodes)].set(1))
+
+    def check(self, mesh: Mesh) -> None:
+        """Raise `ValueError` for a node the mesh does not have."""
+        if is_concrete(self.nodes) and int(self.nodes.max()) >= mesh.num_points:
+            raise ValueError(
+                f"nodes: index {int(self.nodes.max())} is out of range for a mesh of {mesh.num_points} nodes; indices "
+                "count from 0."
+            )
+
+
+def _point_contact(nodes, load) -> Contact:
+    return Contact(nodes, (jnp.zeros((1, 1, 1), load.dtype),), load)
+
+
+def _locate(position, mesh: Mesh):
+    """The cell of each position, its barycentric coordinates there, and how far inside (negative: outside) it is."""
+    corners = mesh.points[mesh.cells]  # (m, d + 1, d)
+    edges = corners[:, 1:] - corners[:, :1]
+    inverse = jnp.linalg.inv(jnp.swapaxes(edges, 1, 2))
+    local = jnp.einsum("mij,lmj->lmi", inverse, position[:, None] - corners[:, 0])
+    barycentric = jnp.concatenate([1 - local.sum(axis=-1, keepdims=True), local], axis=-1)
+    inside = jax.lax.stop_gradient(barycentric).min(axis=-1)
+    cell = jnp.argmax(inside, axis=1)
+    weights = jnp.take_along_axis(barycentric, cell[:, None, None], 1)[:, 0]
+    return cell, weights, inside.max(axis=1)

@@ -1,0 +1,76 @@
+"""P1 finite elements: conductivity per cell, element stiffness, and gradients of nodal fields."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Inexact
+
+from jeit.electrodes import is_concrete
+from jeit.mesh import Mesh, gradients, measures
+
+
+def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
+    """Conductivity per cell, (m,) or tensor (m, d, d), from a scalar, per-cell, per-node or tensor conductivity.
+
+    A conductivity given per node is linear in each cell; as P1 gradients are constant there, its mean over the
+    cell's nodes is exact.
+    """
+    if conductivity.ndim == 0:
+        return jnp.broadcast_to(conductivity, (mesh.num_cells,))
+    if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
+        return conductivity[mesh.cells].mean(axis=1)
+    return conductivity
+
+
+def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
+    """Convert `conductivity` to an array and raise `ValueError` if it has the wrong shape or is not positive.
+
+    Accepts a scalar, (m,) per cell, (n,) per node or (m, d, d) symmetric tensors; siemens per metre (in a 2-D
+    sheet, siemens). A complex admittivity needs a positive real part. Values of tracers are not looked at.
+    """
+    conductivity = jnp.asarray(conductivity)
+    if not jnp.issubdtype(conductivity.dtype, jnp.inexact):
+        conductivity = conductivity.astype(float)
+    m, n, d = mesh.num_cells, mesh.num_points, mesh.dimension
+    if conductivity.shape not in [(), (m,), (n,), (m, d, d)]:
+        raise ValueError(
+            f"conductivity has shape {conductivity.shape}; give a scalar, one value per cell ({m},), one per node "
+            f"({n},), or tensors ({m}, {d}, {d}). For a batch, use jax.vmap."
+        )
+    if is_concrete(conductivity):
+        values = np.asarray(conductivity)
+        if not np.isfinite(values).all():
+            raise ValueError("conductivity has NaN or infinite values.")
+        if values.ndim == 3:
+            if not np.allclose(values, np.swapaxes(values, 1, 2), rtol=1e-12, atol=0):
+                raise ValueError("conductivity tensors must be symmetric.")
+            least = np.linalg.eigvalsh(values.real).min()
+        else:
+            least = values.real.min()
+        if least <= 0:
+            raise ValueError(
+                f"conductivity must be positive everywhere; its least value is {least:.3g}. For an insulating "
+                "inclusion use a small positive value, such as a thousandth of the background."
+            )
+    return conductivity
+
+
+def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Array, "m p"]:
+    """Element stiffness ∫ ∇φ_i·σ∇φ_j for conductivity per cell: lower triangles (m, p), p = (d+1)(d+2)/2, siemens."""
+    gradient = gradients(mesh)  # (m, d + 1, d)
+    flux = gradient if conductivity.ndim == 1 else jnp.einsum("mij,mkj->mki", conductivity, gradient)
+    weight = measures(mesh) * (conductivity if conductivity.ndim == 1 else 1)
+    rows, columns = np.tril_indices(mesh.dimension + 1)
+    return weight[:, None] * jnp.sum(gradient[:, rows] * flux[:, columns], axis=-1)
+
+
+def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> tuple[Inexact[Array, "p m"], ...]:
+    """Gradients of nodal fields in every cell, times the root of the cell's measure: d arrays (p, m), one per axis.
+
+    With that weight the product of two of them is the integral ∫_e ∇u·∇w. One array per axis, patterns first,
+    keeps the long axis innermost.
+    """
+    weighted = gradients(mesh) * jnp.sqrt(measures(mesh))[:, None, None]
+    corners = [fields.T.at[:, mesh.cells[:, k]].get(mode="promise_in_bounds") for k in range(mesh.dimension + 1)]
+    return tuple(
+        sum(weighted[:, k, axis] * corner for k, corner in enumerate(corners)) for axis in range(mesh.dimension)
+    )

@@ -1,0 +1,150 @@
+"""`ForwardModel`: conductivity in, electrode voltages and their Jacobian out."""
+
+import equinox as eqx
+import jax
+import lineax as lx
+from jaxtyping import Array, Inexact
+
+from jeit.electrodes import AbstractElectrodes
+from jeit.forward.assembly import check_conductivity, field_gradients
+from jeit.forward.system import System
+from jeit.forward.transfer import electrode_fields, transfer_impedance
+from jeit.mesh import Mesh
+from jeit.protocol import Protocol
+
+
+class ForwardModel(eqx.Module):
+    """Electrode voltages of a body of given conductivity: ∇·(σ∇u) = 0 with the complete (or point) electrode model.
+
+    Every method takes a conductivity: a scalar, one value per cell (m,), one per node (n,), or symmetric tensors
+    (m, d, d), in siemens per metre (2-D: sheet conductivity in siemens); complex values are admittivities. All are
+    jit-compiled, differentiable in the conductivity and in every field of the model (`model.electrodes.position`,
+    `.contact_impedance`, `model.mesh.points`, …), and may be wrapped in `jax.vmap`.
+
+    **Fields**: `mesh`, `electrodes`, `protocol`, and `system`, the sparsity pattern and linear solver.
+    """
+
+    mesh: Mesh
+    electrodes: AbstractElectrodes
+    protocol: Protocol
+    system: System
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        electrodes: AbstractElectrodes,
+        protocol: Protocol,
+        *,
+        solver: str | lx.AbstractLinearSolver = "auto",
+    ):
+        """`solver`: "auto" (chosen by size; `model.system.solver` says which and why), "cholesky", "cg", or any
+        lineax solver. Raises `ValueError` if electrodes, mesh and protocol do not fit together.
+        """
+        _check(mesh, electrodes, protocol)
+        self.mesh = mesh
+        self.electrodes = electrodes
+        self.protocol = protocol
+        self.system = System.create(mesh, electrodes, solver)
+
+    def with_electrodes(self, electrodes: AbstractElectrodes) -> "ForwardModel":
+        """The same model with other electrodes of the same kind; their number may not change. Works under jit."""
+        if type(electrodes) is not type(self.electrodes):
+            raise ValueError(
+                f"with_electrodes needs {type(self.electrodes).__name__}, not {type(electrodes).__name__}; make a new "
+                "ForwardModel for another kind of electrode."
+            )
+        _check(self.mesh, electrodes, self.protocol)
+        return eqx.tree_at(lambda model: model.electrodes, self, electrodes)
+
+    def with_protocol(self, protocol: Protocol) -> "ForwardModel":
+        """The same model with another protocol for the same electrodes."""
+        _check(self.mesh, self.electrodes, protocol)
+        return eqx.tree_at(lambda model: model.protocol, self, protocol)
+
+    def voltages(self, conductivity) -> Inexact[Array, " M"]:
+        """Voltages (M,) of the protocol's channels, in volts."""
+        return _voltages(self, check_conductivity(self.mesh, conductivity))
+
+    def transfer_impedance(self, conductivity) -> Inexact[Array, "L L"]:
+        """Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero."""
+        return _transfer_impedance(self, check_conductivity(self.mesh, conductivity))
+
+    def potentials(self, conductivity) -> Inexact[Array, "S n"]:
+        """Potential at the nodes for every drive pattern, in volts; the mean over the electrodes is zero."""
+        return _potentials(self, check_conductivity(self.mesh, conductivity))
+
+    def jacobian(self, conductivity) -> Inexact[Array, "M m"]:
+        """∂(voltage)/∂(conductivity), volts per siemens per metre (2-D: per siemens).
+
+        With respect to the cells (M, m); with respect to the nodes (M, n) if `conductivity` is given per node.
+        """
+        return self.voltages_and_jacobian(conductivity)[1]
+
+    def voltages_and_jacobian(self, conductivity) -> tuple[Inexact[Array, " M"], Inexact[Array, "M m"]]:
+        """`voltages` and `jacobian` from one factorisation and one solve per electrode."""
+        conductivity = check_conductivity(self.mesh, conductivity)
+        if conductivity.ndim == 3:
+            raise ValueError(
+                "jacobian is with respect to scalar conductivities; for tensors use jax.jacfwd or jax.jacrev of "
+                "model.voltages."
+            )
+        return _voltages_and_jacobian(self, conductivity)
+
+
+def _check(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol) -> None:
+    if not isinstance(mesh, Mesh):
+        raise ValueError(f"mesh must be a Mesh, not {type(mesh).__name__}; see jeit.mesh.disk and jeit.mesh.read.")
+    if not isinstance(electrodes, AbstractElectrodes):
+        raise ValueError(
+            f"electrodes must be one of the kinds in jeit.electrodes, not {type(electrodes).__name__}; positions "
+            "become electrodes with PointElectrodes(position) or BoundaryElectrodes(position, width, "
+            "contact_impedance)."
+        )
+    if not isinstance(protocol, Protocol):
+        raise ValueError(f"protocol must be a jeit.protocol.Protocol, not {type(protocol).__name__}.")
+    if electrodes.num_electrodes != protocol.num_electrodes:
+        raise ValueError(
+            f"There are {electrodes.num_electrodes} electrodes, and protocol '{protocol.name}' is for "
+            f"{protocol.num_electrodes}; make both for the same number."
+        )
+    electrodes.check(mesh)
+
+
+def _select(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
+    """Voltages of the channels: entries of measurement · Z · driveᵀ."""
+    table = protocol.measurement @ impedance @ protocol.drive.T
+    return table.at[protocol.measurement_index, protocol.drive_index].get(mode="promise_in_bounds")
+
+
+@jax.jit
+def _transfer_impedance(model: ForwardModel, conductivity):
+    return transfer_impedance(model.mesh, conductivity, model.electrodes, model.system)
+
+
+@jax.jit
+def _voltages(model: ForwardModel, conductivity):
+    return _select(model.protocol, _transfer_impedance(model, conductivity))
+
+
+@jax.jit
+def _potentials(model: ForwardModel, conductivity):
+    fields, _ = electrode_fields(model.mesh, conductivity, model.electrodes, model.system)
+    return model.protocol.drive @ fields.T
+
+
+@jax.jit
+def _voltages_and_jacobian(model: ForwardModel, conductivity):
+    mesh, protocol = model.mesh, model.protocol
+    fields, impedance = electrode_fields(mesh, conductivity, model.electrodes, model.system)
+    jacobian = 0
+    for component in field_gradients(mesh, fields):  # ∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, axis by axis
+        drive = (-protocol.drive @ component).at[protocol.drive_index].get(mode="promise_in_bounds")
+        measure = (protocol.measurement @ component).at[protocol.measurement_index].get(mode="promise_in_bounds")
+        jacobian += drive * measure
+    if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
+        per_corner = jacobian / mesh.cells.shape[1]
+        jacobian = sum(
+            jax.ops.segment_sum(per_corner.T, mesh.cells[:, k], num_segments=mesh.num_points).T
+            for k in range(mesh.cells.shape[1])
+        )
+    return _select(protocol, impedance), jacobian
