@@ -6,7 +6,7 @@ So two channels (d, m) and (d', m') with d' = a m and m' = b d have voltages v' 
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Inexact, Int
 
 
 def _direction_keys(patterns: np.ndarray) -> tuple[list[bytes], np.ndarray]:
@@ -42,23 +42,28 @@ def reciprocal_channel_pairs(
     return np.array(pairs, dtype=int).reshape(-1, 2), np.array(ratios, dtype=float)
 
 
-def reciprocity_combinations(
+def transfer_between_drives(
     drive: np.ndarray,
     measurement: np.ndarray,
     drive_index: np.ndarray,
     measurement_index: np.ndarray,
+    voltages: np.ndarray,
     mask: np.ndarray,
-) -> tuple[Float[np.ndarray, "S S M"], np.ndarray]:
-    """Weights that turn channels into the transfer between drives, where measurements span the drives.
+) -> tuple[Inexact[np.ndarray, "F S S"], Bool[np.ndarray, "S S"], Float[np.ndarray, "S S"]]:
+    """What every drive pattern would read while every other drive flows: symmetric for any body.
 
-    Returns `weights` (S, S, M) and `known` (S, S): `weights[i, j] @ v = drive[i] @ S @ drive[j]`, the voltage
-    that drive pattern i would read while drive j flows, when `known[i, j]`. The result is symmetric in i, j
-    for any body. Masked channels get no weight. A drive of skip-1 read by neighbours, for instance, is the
-    sum of two neighbours.
+    `voltages` (F, M) volts and `mask` (M,) usable channels; the other arguments are those of `Protocol`.
+    Returns
+
+    - `transfer` (F, S, S) watts: `drive[i] @ S @ drive[j]` in entry (i, j), combined from the channels read
+      while j flows. A drive of skip-1 read by neighbours, for instance, is the sum of two neighbours.
+    - `known` (S, S): where the measurement patterns of drive j do span drive i.
+    - `gain` (S, S) amperes: one volt of independent noise in each channel is `gain` watts in `transfer`.
     """
-    num_drives, num_channels = drive.shape[0], drive_index.shape[0]
-    weights = np.zeros((num_drives, num_drives, num_channels))
+    num_drives = drive.shape[0]
+    transfer = np.zeros((voltages.shape[0], num_drives, num_drives), dtype=voltages.dtype)
     known = np.zeros((num_drives, num_drives), dtype=bool)
+    gain = np.zeros((num_drives, num_drives))
     size = np.linalg.norm(drive, axis=1)
     for flowing in range(num_drives):
         channels = np.flatnonzero((drive_index == flowing) & mask)
@@ -67,5 +72,6 @@ def reciprocity_combinations(
         rows = measurement[measurement_index[channels]]
         combination = drive @ np.linalg.pinv(rows, rcond=1e-10)
         known[:, flowing] = np.linalg.norm(combination @ rows - drive, axis=1) <= 1e-8 * size
-        weights[:, flowing, channels] = combination
-    return weights, known
+        transfer[:, :, flowing] = voltages[:, channels] @ combination.T
+        gain[:, flowing] = np.linalg.norm(combination, axis=1)
+    return transfer, known, gain
