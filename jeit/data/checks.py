@@ -1,0 +1,161 @@
+"""May this frame be imaged against this reference? The same set-up, and more signal than noise."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jeit.data.measurement import Measurement
+from jeit.data.quality import NoiseEstimate, estimate_noise, impossible_signs, reciprocity_error
+
+# A quarter of the signs wrong means that half of the voltages are noise (noise is wrong half the time).
+MOST_IMPOSSIBLE_SIGNS = 0.25
+# Reciprocity error r of a difference means noise over signal of r / sqrt(2 - r²): here a half.
+MOST_DIFFERENCE_RECIPROCITY_ERROR = 0.63
+
+
+@dataclass(frozen=True)
+class FrameQuality:
+    """What `assess` found about one frame and its difference from the reference.
+
+    - `difference`: ‖v - v_reference‖ / ‖v_reference‖ over usable channels.
+    - `difference_noise`: noise of the difference in volts, and relative to it; None when it cannot be told.
+    - `difference_reciprocity_error`: relative reciprocity error of the difference, or None.
+    - `impossible_signs`: the larger fraction, of frame and reference, of voltages of a sign that no passive
+      body gives; or None.
+    - `usable_channels`: channels usable in both.
+    - `reason`: why the frame cannot be imaged; empty when it can.
+    """
+
+    difference: float
+    difference_noise: NoiseEstimate | None
+    difference_reciprocity_error: float | None
+    impossible_signs: float | None
+    usable_channels: int
+    reason: str
+
+    @property
+    def imageable(self) -> bool:
+        """True when nothing speaks against imaging the frame."""
+        return not self.reason
+
+
+def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
+    """Raise `ValueError` unless both were measured with the same electrodes, patterns, currents and unit."""
+    ours, theirs = measurement.protocol, reference.protocol
+    if ours.num_electrodes != theirs.num_electrodes:
+        raise ValueError(
+            f"'{measurement.name}' has {ours.num_electrodes} electrodes and the reference '{reference.name}' "
+            f"{theirs.num_electrodes}: they are not of the same set-up. Give a reference from the same body."
+        )
+    if ours.num_measurements != theirs.num_measurements:
+        raise ValueError(
+            f"'{measurement.name}' has {ours.num_measurements} channels ({ours.name}) and the reference "
+            f"'{reference.name}' {theirs.num_measurements} ({theirs.name}). Both must use one protocol."
+        )
+    if not ours.same_patterns(theirs):
+        ratio = float(np.linalg.norm(ours.channel_drive) / np.linalg.norm(theirs.channel_drive))
+        scaled = ratio * np.asarray(theirs.channel_drive)
+        if np.allclose(ours.channel_drive, scaled, rtol=1e-6, atol=1e-12) and np.allclose(
+            ours.channel_measurement, theirs.channel_measurement, rtol=1e-6
+        ):
+            raise ValueError(
+                f"'{measurement.name}' was driven with {ratio:.4g} times the current of the reference "
+                f"'{reference.name}'. Their difference would show the current, not the body: use a reference "
+                "at the same current, or divide both by their currents first."
+            )
+        raise ValueError(
+            f"'{measurement.name}' ({ours.name}) and the reference '{reference.name}' ({theirs.name}) drive "
+            "or read different electrodes. Give a reference measured with the same protocol."
+        )
+    if np.iscomplexobj(measurement.voltages) != np.iscomplexobj(reference.voltages):
+        raise ValueError(
+            f"'{measurement.name}' and the reference '{reference.name}' are not both complex. Read both with "
+            "the same component (real, imaginary, magnitude or complex)."
+        )
+    common = np.asarray(measurement.mask).any(axis=0) & np.asarray(reference.mask).any(axis=0)
+    if not common.any():
+        raise ValueError(f"'{measurement.name}' and the reference '{reference.name}' have no usable channel in common.")
+    sizes = [np.median(np.abs(np.asarray(m.mean_frame().voltages)[0, common])) for m in (measurement, reference)]
+    ratio = sizes[0] / sizes[1] if sizes[1] > 0 else np.inf
+    if not 1 / 100 < ratio < 100:
+        raise ValueError(
+            f"The voltages of '{measurement.name}' are {ratio:.3g} times those of the reference "
+            f"'{reference.name}': the two are in different units (volts and millivolts?) or at different "
+            "gains. Give both in volts."
+        )
+
+
+def assess(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:
+    """Judge each frame of `measurement` for difference imaging against the mean of `reference`'s frames.
+
+    A frame cannot be imaged when
+
+    - it, or the reference, has an impossible sign in more than a quarter of its voltages
+      (`impossible_signs`): half of the voltages or more then lie below the instrument's noise or offset;
+    - the difference breaks reciprocity by more than 0.63, i.e. its noise is over half its signal;
+    - it does not differ from the reference at all;
+    - fewer channels than electrodes are usable.
+
+    On the measured sets in reach, usable frames stay below 0.18 and 0.21; a frame measured at too small a
+    current has 0.54 of its signs wrong.
+
+    Raises `ValueError` when the two are not of one set-up (`check_same_setup`).
+    """
+    check_same_setup(measurement, reference)
+    mean = reference.mean_frame()
+    reference_signs = impossible_signs(mean)
+    results = []
+    for index in range(measurement.num_frames):
+        frame = measurement.frame(index)
+        both = np.asarray(frame.mask & mean.mask)
+        change = Measurement(
+            np.where(both, np.asarray(frame.voltages - mean.voltages), np.nan), both, measurement.protocol
+        )
+        size = float(np.linalg.norm(np.asarray(change.filled())))
+        relative = size / float(np.linalg.norm(np.where(both, np.asarray(mean.filled()), 0)) or np.inf)
+        signs = [float(s[0]) for s in (impossible_signs(frame), reference_signs) if s is not None]
+        usable = int(both.sum())
+        error = reciprocity_error(change) if usable and size > 0 else None
+        wrong = max(signs) if signs else None
+        results.append(
+            FrameQuality(
+                difference=relative,
+                difference_noise=estimate_noise(change) if usable and size > 0 else None,
+                difference_reciprocity_error=error,
+                impossible_signs=wrong,
+                usable_channels=usable,
+                reason=_reason(measurement.protocol.num_electrodes, usable, relative, wrong, error),
+            )
+        )
+    return results
+
+
+def check_imageable(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:
+    """`assess(measurement, reference)`; raises `ValueError` with the reason for the first bad frame."""
+    qualities = assess(measurement, reference)
+    for index, quality in enumerate(qualities):
+        if not quality.imageable:
+            where = f", frame {index}" if measurement.num_frames > 1 else ""
+            raise ValueError(f"'{measurement.name}'{where} cannot be imaged: {quality.reason}")
+    return qualities
+
+
+def _reason(electrodes: int, usable: int, difference: float, signs: float | None, reciprocity: float | None) -> str:
+    if usable < electrodes:
+        return (
+            f"only {usable} channels are usable in both it and its reference, fewer than the {electrodes} electrodes."
+        )
+    if difference < 1e-12:
+        return "it equals its reference, so there is no difference to image. Is it the same file?"
+    if signs is not None and signs > MOST_IMPOSSIBLE_SIGNS:
+        return (
+            f"too noisy: {100 * signs:.0f} % of the voltages have a sign that no passive body gives, so that "
+            "more than half of them lie below the instrument's noise or offset. Measure with more current or "
+            "gain (or, if every sign is wrong, reverse the polarity)."
+        )
+    if reciprocity is not None and reciprocity > MOST_DIFFERENCE_RECIPROCITY_ERROR:
+        return (
+            f"too noisy: the difference from the reference breaks reciprocity by {100 * reciprocity:.0f} %, "
+            "so that its noise is more than half its signal. Average more frames, or use more current."
+        )
+    return ""

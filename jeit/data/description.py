@@ -1,0 +1,296 @@
+"""The small TOML file beside measured data that says what a table of numbers means.
+
+Sections (`tank6cm.toml` in this folder is an example; only `[protocol]` must be there):
+
+- `[geometry]`: `shape` = "disk" (`radius`), "rectangle" (`width`, `height`) or "polygon" (`vertices`);
+  `centre`. Metres.
+- `[electrodes]`: `kind` = "boundary" (`width`), "disc" (`radius`) or "point"; `contact_impedance`; and where
+  they are: `layout` = "ring" (disk: `number`, `start_angle_degrees`, `clockwise`), "perimeter" (`number`,
+  `start`) or `positions`.
+- `[protocol]`: `kind` = name of a constructor in `jeit.protocol` with its arguments, or "matrices" with
+  `drive` (S, L) in amperes and `measurement` (K, L). `current` in amperes, or `current_unit`;
+  `current_from_name`, a regular expression that finds it in the file's name.
+- `[data]`: `frames_in` = "columns" or "rows"; `delimiter`, `skip_rows`; `complex_pairs`, `component`; `gain`,
+  `polarity`, `unit`, `saturation`; `frame_names`; `keys`, the variables to read from a .mat or .npz file.
+- `[notes]`: `text`, a list of sentences to carry along.
+"""
+
+import re
+import tomllib
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jeit import protocol as protocols
+from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs, perimeter, ring
+from jeit.mesh import Disk, Domain, Polygon, Rectangle
+from jeit.protocol import Protocol
+
+CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
+VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
+BUNDLED = ("tank6cm",)
+
+_KEYS = {
+    "geometry": {"shape", "radius", "width", "height", "vertices", "centre"},
+    "electrodes": {
+        "kind",
+        "layout",
+        "number",
+        "start_angle_degrees",
+        "clockwise",
+        "start",
+        "positions",
+        "width",
+        "radius",
+        "contact_impedance",
+    },
+    "data": {
+        "frames_in",
+        "delimiter",
+        "skip_rows",
+        "complex_pairs",
+        "component",
+        "gain",
+        "polarity",
+        "unit",
+        "saturation",
+        "frame_names",
+        "keys",
+    },
+    "notes": {"text"},
+}
+_PROTOCOL_OPTIONS = {
+    "adjacent": {"driven_electrodes", "reciprocal", "order"},
+    "skip": {"skipped", "measurement_skipped", "driven_electrodes", "reciprocal", "order"},
+    "opposite": {"drives", "driven_electrodes", "order"},
+    "all_against_one": {"common", "measurement", "driven_electrodes", "reciprocal"},
+    "reference_electrode": {"skipped", "reference", "driven_electrodes", "order"},
+    "two_terminal": {"pairs"},
+    "trigonometric": {"measurement"},
+    "bipolar": {"drive_pairs", "measurement_pairs", "driven_electrodes", "reciprocal"},
+}
+
+
+@dataclass(frozen=True)
+class DataLayout:
+    """How numbers lie in a file (section `[data]`)."""
+
+    frames_in: str = "rows"
+    delimiter: str = ","
+    skip_rows: int = 0
+    complex_pairs: bool = False
+    component: str = "real"
+    scale: float = 1.0
+    saturation: float | None = None
+    frame_names: tuple[str, ...] = ()
+    keys: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Description:
+    """A description read and checked: see the module's docstring."""
+
+    origin: str
+    title: str
+    domain: Domain | None
+    electrodes: Any
+    layout: DataLayout
+    notes: tuple[str, ...]
+    protocol_section: dict[str, Any] = field(repr=False)
+
+    def protocol(self, path: Path) -> Protocol | None:
+        """The protocol of the file at `path` (whose name may hold the current), or None if not described."""
+        if not self.protocol_section:
+            return None
+        return _protocol(self.protocol_section, self.electrodes, path, self.origin)
+
+
+def load_description(which: str | Path) -> Description:
+    """Read a description: a path to a TOML file, or the name of a bundled one ("tank6cm").
+
+    Raises `ValueError` with the section and key at fault.
+    """
+    if str(which) in BUNDLED:
+        origin = f"{which}.toml"
+        text = resources.files("jeit.data").joinpath(origin).read_text("utf-8")
+    else:
+        path = Path(which)
+        if not path.is_file():
+            raise ValueError(
+                f"description {path}: there is no such file. Give a TOML file, or one of {', '.join(BUNDLED)}."
+            )
+        text, origin = path.read_text("utf-8"), path.name
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{origin} is not valid TOML: {error}.") from None
+    return parse_description(table, origin)
+
+
+def parse_description(table: dict[str, Any], origin: str) -> Description:
+    """Check a description given as nested dictionaries.
+
+    Raises `ValueError` with the section and key at fault.
+    """
+    known = {"title", "protocol", *_KEYS}
+    _refuse_unknown(table, known, origin, "the file")
+    sections = {name: table.get(name, {}) for name in (*_KEYS, "protocol")}
+    for name, section in sections.items():
+        if not isinstance(section, dict):
+            raise ValueError(f"{origin}: '{name}' must be a section, [{name}].")
+        if name in _KEYS:
+            _refuse_unknown(section, _KEYS[name], origin, f"[{name}]")
+    domain = _domain(sections["geometry"], origin) if sections["geometry"] else None
+    return Description(
+        origin=origin,
+        title=str(table.get("title", "")),
+        domain=domain,
+        electrodes=_electrodes(sections["electrodes"], domain, origin) if sections["electrodes"] else None,
+        layout=_layout(sections["data"], origin),
+        notes=tuple(str(note) for note in sections["notes"].get("text", ())),
+        protocol_section=sections["protocol"],
+    )
+
+
+def _refuse_unknown(section: dict, known: set[str], origin: str, where: str) -> None:
+    unknown = sorted(set(section) - known)
+    if unknown:
+        raise ValueError(f"{origin}: {where} has no '{unknown[0]}'. Known there: {', '.join(sorted(known))}.")
+
+
+def _need(section: dict, key: str, origin: str, where: str) -> Any:
+    if key not in section:
+        raise ValueError(f"{origin}: {where} needs '{key}'.")
+    return section[key]
+
+
+def _choice(value: Any, choices, origin: str, where: str) -> Any:
+    if value not in choices:
+        raise ValueError(f"{origin}: {where} must be one of {', '.join(map(str, choices))}; got {value!r}.")
+    return value
+
+
+def _domain(section: dict, origin: str) -> Domain:
+    where = "[geometry]"
+    shape = _choice(_need(section, "shape", origin, where), ("disk", "rectangle", "polygon"), origin, f"{where} shape")
+    centre = section.get("centre", (0.0, 0.0))
+    try:
+        if shape == "disk":
+            return Disk(_need(section, "radius", origin, where), centre)
+        if shape == "rectangle":
+            width, height = (_need(section, key, origin, where) for key in ("width", "height"))
+            return Rectangle(width, height, centre)
+        return Polygon(_need(section, "vertices", origin, where))
+    except ValueError as error:
+        raise _located(error, origin, where) from None
+
+
+def _electrodes(section: dict, domain: Domain | None, origin: str):
+    where = "[electrodes]"
+    kind = _choice(section.get("kind", "boundary"), ("boundary", "disc", "point"), origin, f"{where} kind")
+    try:
+        position = _positions(section, domain, origin)
+        if kind == "point":
+            return PointElectrodes(position)
+        size = _need(section, "width" if kind == "boundary" else "radius", origin, where)
+        contact_impedance = _need(section, "contact_impedance", origin, where)
+        build = BoundaryElectrodes if kind == "boundary" else SheetDiscs
+        return build(position, np.asarray(size, float), np.asarray(contact_impedance, float))
+    except (ValueError, TypeError) as error:
+        raise _located(error, origin, where) from None
+
+
+def _positions(section: dict, domain: Domain | None, origin: str) -> np.ndarray:
+    where = "[electrodes]"
+    if "positions" in section:
+        return np.asarray(section["positions"], dtype=float)
+    layout = _need(section, "layout", origin, f"{where} (or 'positions')")
+    _choice(layout, ("ring", "perimeter"), origin, f"{where} layout")
+    number = _need(section, "number", origin, where)
+    if domain is None:
+        raise ValueError(f"{origin}: {where} layout = {layout!r} needs [geometry] to lie on.")
+    if layout == "perimeter":
+        return perimeter(domain, number, start=section.get("start", 0.0))
+    if not isinstance(domain, Disk):
+        raise ValueError(f'{origin}: {where} layout = "ring" needs a disk; use "perimeter" for other shapes.')
+    return ring(
+        domain.radius,
+        number,
+        start_angle=np.radians(section.get("start_angle_degrees", 90.0)),
+        clockwise=section.get("clockwise", False),
+        centre=domain.centre,
+    )
+
+
+def _layout(section: dict, origin: str) -> DataLayout:
+    where = "[data]"
+    unit = _choice(section.get("unit", "V"), VOLTAGE_UNITS, origin, f"{where} unit")
+    gain = section.get("gain", 1.0)
+    if not isinstance(gain, (int, float)) or not np.isfinite(gain) or gain <= 0:
+        raise ValueError(f"{origin}: {where} gain must be a positive number; got {gain!r}. For signs, use polarity.")
+    polarity = _choice(section.get("polarity", "normal"), ("normal", "reversed"), origin, f"{where} polarity")
+    frames_in = _choice(section.get("frames_in", "rows"), ("rows", "columns"), origin, f"{where} frames_in")
+    components = ("real", "imaginary", "magnitude", "complex")
+    scale = VOLTAGE_UNITS[unit] / gain * (-1 if polarity == "reversed" else 1)
+    saturation = section.get("saturation")
+    return DataLayout(
+        frames_in=frames_in,
+        delimiter=section.get("delimiter", ","),
+        skip_rows=int(section.get("skip_rows", 0)),
+        complex_pairs=bool(section.get("complex_pairs", False)),
+        component=_choice(section.get("component", "real"), components, origin, f"{where} component"),
+        scale=scale,
+        # Given as the instrument reads it, compared after the gain is taken out.
+        saturation=None if saturation is None else float(saturation) * abs(scale),
+        frame_names=tuple(section.get("frame_names", ())),
+        keys=tuple(section.get("keys", ())),
+    )
+
+
+def _protocol(section: dict, electrodes, path: Path, origin: str) -> Protocol:
+    where = "[protocol]"
+    kind = _choice(_need(section, "kind", origin, where), (*_PROTOCOL_OPTIONS, "matrices"), origin, f"{where} kind")
+    common = {"kind", "number", "current", "current_from_name", "current_unit", "name"}
+    try:
+        if kind == "matrices":
+            known = {"kind", "name", "drive", "measurement", "select"}
+            _refuse_unknown(section, known, origin, f"{where} matrices")
+            select = section.get("select")
+            return protocols.from_matrices(
+                _need(section, "drive", origin, where),
+                _need(section, "measurement", origin, where),
+                None if select is None else np.asarray(select, bool),
+                name=section.get("name", "matrices"),
+            )
+        _refuse_unknown(section, common | _PROTOCOL_OPTIONS[kind], origin, f"{where} {kind}")
+        number = section.get("number", None if electrodes is None else electrodes.num_electrodes)
+        if number is None:
+            raise ValueError(f"{origin}: {where} needs 'number' (of electrodes), or an [electrodes] section.")
+        if kind == "reference_electrode" and "number" not in section:
+            number -= 1  # that constructor counts the boundary only
+        options = {key: value for key, value in section.items() if key in _PROTOCOL_OPTIONS[kind]}
+        return getattr(protocols, kind)(number, current=_current(section, path, origin), **options)
+    except (ValueError, TypeError) as error:
+        raise _located(error, origin, where) from None
+
+
+def _current(section: dict, path: Path, origin: str) -> float:
+    name = _choice(section.get("current_unit", "A"), CURRENT_UNITS, origin, "[protocol] current_unit")
+    unit = CURRENT_UNITS[name]
+    if "current_from_name" in section:
+        found = re.search(section["current_from_name"], path.name)
+        if found is None or not found.groups():
+            raise ValueError(
+                f"{origin}: [protocol] current_from_name = {section['current_from_name']!r} finds no current "
+                f"in the name {path.name!r}. Give 'current' instead."
+            )
+        return float(found.group(1)) * unit
+    return _need(section, "current", origin, "[protocol]") * unit
+
+
+def _located(error: Exception, origin: str, where: str) -> ValueError:
+    text = str(error)
+    return ValueError(text if text.startswith(origin) else f"{origin}: {where}: {text}")

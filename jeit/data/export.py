@@ -1,0 +1,86 @@
+"""Write a measurement as NPZ with a TOML description beside it, for other tools and for `read`."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from jeit.data.measurement import Measurement
+from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
+from jeit.mesh import Disk, Domain, Polygon, Rectangle
+
+
+def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]:
+    """Write `path` (.npz) and a description of the same name (.toml); return both paths.
+
+    The NPZ holds `voltages` (F, M) volts, `mask` (F, M), and the protocol's `drive` (S, L) amperes,
+    `measurement` (K, L), `drive_index` (M,), `measurement_index` (M,), `protocol_name`. The TOML holds
+    geometry, electrodes, frame names and notes. `read` gives the same measurement back.
+
+    Raises `ValueError` for another suffix, and for electrodes or domains that a description cannot say (3-D,
+    holes).
+    """
+    file = Path(path)
+    if file.suffix.lower() != ".npz":
+        raise ValueError(f"write_table: {file.name} must end in .npz.")
+    lines = [f"title = {_toml(measurement.name)}"]
+    if measurement.domain is not None:
+        lines += ["", "[geometry]", *_assignments(_geometry(measurement.domain))]
+    if measurement.electrodes is not None:
+        lines += ["", "[electrodes]", *_assignments(_electrodes(measurement.electrodes))]
+    component = "complex" if np.iscomplexobj(measurement.voltages) else "real"
+    layout: dict = {"frames_in": "rows", "component": component}
+    if measurement.frame_names:
+        layout["frame_names"] = list(measurement.frame_names)
+    lines += ["", "[data]", *_assignments(layout)]
+    lines += ["", "[notes]", *_assignments({"text": list(measurement.notes)})]
+    protocol = measurement.protocol
+    np.savez_compressed(
+        file,
+        voltages=np.asarray(measurement.voltages),
+        mask=np.asarray(measurement.mask),
+        drive=np.asarray(protocol.drive),
+        measurement=np.asarray(protocol.measurement),
+        drive_index=np.asarray(protocol.drive_index),
+        measurement_index=np.asarray(protocol.measurement_index),
+        protocol_name=np.asarray(protocol.name),
+    )
+    description = file.with_suffix(".toml")
+    description.write_text("\n".join(lines) + "\n", "utf-8")
+    return file, description
+
+
+def _geometry(domain: Domain) -> dict:
+    if isinstance(domain, Disk):
+        return {"shape": "disk", "radius": domain.radius, "centre": list(domain.centre)}
+    if isinstance(domain, Rectangle):
+        size = {"width": domain.width, "height": domain.height}
+        return {"shape": "rectangle", **size, "centre": list(domain.centre)}
+    if isinstance(domain, Polygon) and not domain.holes:
+        return {"shape": "polygon", "vertices": np.asarray(domain.vertices).tolist()}
+    raise ValueError(f"write_table: a description cannot say {domain!r}. Set domain to None, or save the mesh instead.")
+
+
+def _electrodes(electrodes) -> dict:
+    positions = {"positions": np.asarray(getattr(electrodes, "position", np.zeros((0, 0)))).tolist()}
+    if isinstance(electrodes, BoundaryElectrodes):
+        size = {"kind": "boundary", "width": np.asarray(electrodes.width).tolist()}
+    elif isinstance(electrodes, SheetDiscs):
+        size = {"kind": "disc", "radius": np.asarray(electrodes.radius).tolist()}
+    elif isinstance(electrodes, PointElectrodes) and electrodes.position.shape[1] == 2:
+        return {"kind": "point", **positions}
+    else:
+        raise ValueError(
+            f"write_table: a description cannot say {type(electrodes).__name__}; it knows 2-D boundary, disc "
+            "and point electrodes. Set electrodes to None, or save the model instead."
+        )
+    return {**size, **positions, "contact_impedance": np.asarray(electrodes.contact_impedance).tolist()}
+
+
+def _assignments(section: dict) -> list[str]:
+    return [f"{key} = {_toml(value)}" for key, value in section.items()]
+
+
+def _toml(value) -> str:
+    """Strings, numbers and nested lists: TOML as JSON writes it (floats by repr, so that they survive)."""
+    return json.dumps(value, ensure_ascii=False)

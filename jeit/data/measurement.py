@@ -1,0 +1,176 @@
+"""A measurement: frames of voltages, with all that is needed to make sense of them."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Inexact
+
+from jeit.electrodes import is_concrete
+from jeit.mesh import Domain
+from jeit.protocol import Protocol
+
+
+class Measurement(eqx.Module):
+    """Frames of measured (or simulated) voltages.
+
+    Build one with `screen`, which looks for bad channels, or with a reader (`jeit.data.read`).
+
+    **Fields**
+
+    - `voltages`: (F, M) volts, real or complex; NaN only where masked.
+    - `mask`: (F, M) True where a voltage is usable.
+    - `protocol`: what the M channels are.
+    - `electrodes`: where the electrodes are (an object of `jeit.electrodes`), or None when the file does not
+      say.
+    - `domain`: the outline of the body (`jeit.mesh.Disk` ...), or None when the file does not say.
+    - `name`, `source`: what and where it comes from; `frame_names`: one for each frame, or empty.
+    - `notes`: what was assumed, and what was masked and why; one sentence each.
+    """
+
+    voltages: Inexact[Array, "F M"]
+    mask: Bool[Array, "F M"]
+    protocol: Protocol
+    electrodes: Any
+    domain: Domain | None
+    name: str = eqx.field(static=True)
+    source: str = eqx.field(static=True)
+    frame_names: tuple[str, ...] = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        voltages,
+        mask,
+        protocol: Protocol,
+        *,
+        electrodes=None,
+        domain: Domain | None = None,
+        name: str = "measurement",
+        source: str = "",
+        frame_names: tuple[str, ...] = (),
+        notes: tuple[str, ...] = (),
+    ):
+        """`voltages` and `mask` (F, M), or (M,) for one frame. Raises `ValueError` where shapes disagree."""
+        self.voltages = jnp.atleast_2d(jnp.asarray(voltages))
+        self.mask = jnp.atleast_2d(jnp.asarray(mask))
+        self.protocol = protocol
+        self.electrodes = electrodes
+        self.domain = domain
+        self.name = name
+        self.source = source
+        self.frame_names = tuple(frame_names)
+        self.notes = tuple(notes)
+        if not jnp.issubdtype(self.voltages.dtype, jnp.inexact):
+            raise ValueError(f"voltages are {self.voltages.dtype}; give real or complex volts.")
+        if self.voltages.ndim != 2 or self.voltages.shape[1] != protocol.num_measurements:
+            raise ValueError(
+                f"voltages have shape {self.voltages.shape}, but the protocol '{protocol.name}' has "
+                f"{protocol.num_measurements} channels: give (frames, channels)."
+            )
+        if self.mask.shape != self.voltages.shape or self.mask.dtype != bool:
+            raise ValueError(
+                f"mask has shape {self.mask.shape} of {self.mask.dtype}; give one True (usable) or False for "
+                f"each of the voltages, shape {self.voltages.shape}."
+            )
+        if electrodes is not None and electrodes.num_electrodes != protocol.num_electrodes:
+            raise ValueError(
+                f"{electrodes.num_electrodes} electrodes were placed, but the protocol '{protocol.name}' "
+                f"uses {protocol.num_electrodes}. Both must count the same electrodes."
+            )
+        if self.frame_names and len(self.frame_names) != self.voltages.shape[0]:
+            raise ValueError(f"{len(self.frame_names)} frame names for {self.voltages.shape[0]} frames; give one each.")
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames F."""
+        return self.voltages.shape[0]
+
+    @property
+    def num_channels(self) -> int:
+        """Number of channels M in a frame."""
+        return self.voltages.shape[1]
+
+    def frame(self, which: int | str) -> "Measurement":
+        """One frame, by number from 0 (negative from the end) or by name, as a measurement of its own.
+
+        Raises `ValueError` for a frame that does not exist.
+        """
+        if isinstance(which, str):
+            if which not in self.frame_names:
+                known = ", ".join(self.frame_names) or "none: give a number"
+                raise ValueError(f"'{self.name}' has no frame named {which!r}. Named frames: {known}.")
+            which = self.frame_names.index(which)
+        if not -self.num_frames <= which < self.num_frames:
+            raise ValueError(f"'{self.name}' has frames 0 to {self.num_frames - 1}; there is no frame {which}.")
+        return self._frames(np.array([which % self.num_frames]))
+
+    def split_reference(self) -> tuple["Measurement", "Measurement"]:
+        """The frames to image, and the file's own reference frame (the one named "reference").
+
+        Raises `ValueError` when the file has no frame of that name, or no other.
+        """
+        if "reference" not in self.frame_names or self.num_frames < 2:
+            raise ValueError(
+                f"'{self.name}' holds no reference frame of its own. Measure the undisturbed body and give "
+                "that file as the reference."
+            )
+        index = self.frame_names.index("reference")
+        others = np.array([k for k in range(self.num_frames) if k != index])
+        return self._frames(others), self._frames(np.array([index]))
+
+    def mean_frame(self) -> "Measurement":
+        """The mean over frames of the usable voltages; a channel that no frame has stays masked."""
+        count = self.mask.sum(axis=0)
+        total = jnp.where(self.mask, self.voltages, 0).sum(axis=0)
+        mean = jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan)
+        return self._replace(mean[None], (count > 0)[None], frame_names=())
+
+    def filled(self, value: float = 0.0) -> Inexact[Array, "F M"]:
+        """(F, M) voltages with `value` in place of what is masked."""
+        return jnp.where(self.mask, self.voltages, value)
+
+    def masked(self, usable, reason: str) -> "Measurement":
+        """The same measurement with fewer usable channels.
+
+        `usable` is boolean, (M,) or (F, M); `reason` goes into the notes.
+        """
+        extra = jnp.asarray(usable)
+        if extra.dtype != bool or extra.shape not in ((self.num_channels,), self.mask.shape):
+            raise ValueError(
+                f"usable has shape {extra.shape} of {extra.dtype}; give booleans of shape "
+                f"({self.num_channels},) or {self.mask.shape}."
+            )
+        mask = self.mask & extra
+        note = reason
+        if is_concrete(mask):
+            note = f"{int(self.mask.sum() - mask.sum())} voltages masked: {reason}"
+        return self._replace(self.voltages, mask, notes=(*self.notes, note))
+
+    def without_electrodes(self, electrodes) -> "Measurement":
+        """Mask channels that drive or measure any of `electrodes` (0-based): missing or broken ones."""
+        numbers = ", ".join(str(k + 1) for k in np.atleast_1d(electrodes))
+        return self.masked(self.protocol.mask_without(electrodes), f"electrodes {numbers} left out.")
+
+    def without_driven_channels(self) -> "Measurement":
+        """Mask channels that measure on an electrode carrying current, and so see its contact impedance."""
+        usable = ~self.protocol.channels_on_driven_electrodes()
+        return self.masked(usable, "they measure on driven electrodes.")
+
+    def _frames(self, index: np.ndarray) -> "Measurement":
+        names = tuple(self.frame_names[k] for k in index) if self.frame_names else ()
+        return self._replace(self.voltages[index], self.mask[index], frame_names=names)
+
+    def _replace(self, voltages, mask, *, frame_names=None, notes=None) -> "Measurement":
+        return Measurement(
+            voltages,
+            mask,
+            self.protocol,
+            electrodes=self.electrodes,
+            domain=self.domain,
+            name=self.name,
+            source=self.source,
+            frame_names=self.frame_names if frame_names is None else frame_names,
+            notes=self.notes if notes is None else notes,
+        )

@@ -1,0 +1,81 @@
+"""One door for all files: `read` finds the format from the content, or takes it from you."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from jeit.data import _matlab, eidors, kit4, ktc2023, table
+from jeit.data.measurement import Measurement
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file format: how to know it, how to read it, and whether a description may go with it."""
+
+    summary: str
+    recognises: Callable[[Path], bool]
+    read: Callable[..., Measurement]
+    described: bool = False
+
+
+# The first that recognises a file reads it. To add a format, write a module like kit4.py and list it here.
+FORMATS: dict[str, Format] = {
+    "kit4": Format(kit4.DESCRIPTION, kit4.recognises, kit4.read),
+    "ktc2023": Format(ktc2023.DESCRIPTION, ktc2023.recognises, ktc2023.read),
+    "eidors": Format(eidors.DESCRIPTION, eidors.recognises, eidors.read, described=True),
+    "table": Format(table.DESCRIPTION, table.recognises, table.read, described=True),
+    "tank6cm": Format(
+        "6 cm tank (.csv, 208 rows of real and imaginary pairs): a table with the bundled description",
+        lambda path: False,
+        partial(table.read, description="tank6cm"),
+    ),
+}
+
+
+def read(path: str | Path, format: str | None = None, description: str | Path | None = None) -> Measurement:
+    """Read a measurement from a file.
+
+    - `path`: the data file.
+    - `format`: a name in `FORMATS` ("kit4", "ktc2023", "eidors", "table", "tank6cm"); found from the content
+      if not given.
+    - `description`: a TOML file (or the name of a bundled one) that says what the numbers mean, for formats
+      "table" and "eidors"; looked for beside the data if not given.
+
+    Raises `ValueError` when the file is not there, of no known format, or not what its format demands.
+    """
+    file = Path(path)
+    if file.is_dir():
+        raise ValueError(f"{file} is a folder. Give one data file in it.")
+    if not file.is_file():
+        raise ValueError(f"There is no file {file}. Check the path.")
+    if file.stat().st_size == 0:
+        raise ValueError(f"{file.name} is empty.")
+    name = _recognise(file, description) if format is None else format
+    if name not in FORMATS:
+        raise ValueError(f"There is no format {name!r}. Formats: {', '.join(FORMATS)}.")
+    chosen = FORMATS[name]
+    if chosen.described:
+        return chosen.read(file, description=description)
+    if description is not None:
+        raise ValueError(f"Format '{name}' describes itself; only table and eidors take a description.")
+    return chosen.read(file)
+
+
+def _recognise(file: Path, description: str | Path | None) -> str:
+    for name, candidate in FORMATS.items():
+        if candidate.recognises(file):
+            return name
+    if file.suffix.lower() == ".mat":
+        if description is not None or file.with_suffix(".toml").is_file():
+            return "eidors"
+        raise ValueError(
+            f"{file.name} is a .mat file of no known kind; it holds "
+            f"{', '.join(sorted(_matlab.variable_names(file)))}. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; "
+            f"{eidors.DESCRIPTION}."
+        )
+    raise ValueError(
+        f"{file.name}: files ending in '{file.suffix}' are of no known format. Known: "
+        + "; ".join(f"{name}: {candidate.summary}" for name, candidate in FORMATS.items())
+        + "."
+    )

@@ -1,0 +1,121 @@
+"""From raw voltages to a `Measurement`: what is unusable is masked, and said."""
+
+import numpy as np
+from jaxtyping import Bool
+
+from jeit.data.measurement import Measurement
+from jeit.mesh import Domain
+from jeit.protocol import Protocol
+
+
+def screen(
+    voltages,
+    protocol: Protocol,
+    *,
+    electrodes=None,
+    domain: Domain | None = None,
+    mask=None,
+    saturation: float | None = None,
+    name: str = "measurement",
+    source: str = "",
+    frame_names: tuple[str, ...] = (),
+    notes: tuple[str, ...] = (),
+) -> Measurement:
+    """A `Measurement` of raw voltages (M,) or (F, M) in volts: masks what cannot be used, and notes why.
+
+    Masked are: what `mask` (True = usable) excludes; NaN and infinity; saturated voltages (at or beyond
+    `saturation` volts, or, when that is not given, stuck at exactly the same extreme value); drives that read
+    nothing at all, because their current never flowed; and frames that are all zero.
+
+    Raises `ValueError` when the shape does not fit the protocol, or nothing usable is left.
+    """
+    values = _as_frames(voltages, protocol, name)
+    usable = np.ones(values.shape, dtype=bool)
+    found = list(notes)
+
+    def exclude(bad: np.ndarray, reason: str) -> None:
+        new = int((usable & bad).sum())
+        if new:
+            usable[bad] = False
+            found.append(f"{new} of {values.size} voltages masked: {reason}")
+
+    if mask is not None:
+        given = np.broadcast_to(np.asarray(mask), values.shape)
+        if given.dtype != bool:
+            raise ValueError(f"mask is {given.dtype}; give booleans, True where a voltage is usable.")
+        exclude(~given, "excluded by the mask given.")
+    finite = np.isfinite(values)
+    values = np.where(finite, values, np.nan)
+    exclude(~finite, "NaN or infinite (an electrode missing or not connected).")
+    dead = ~np.any(np.where(usable, values, 0) != 0, axis=1)
+    if dead.all():
+        raise ValueError(
+            f"{name}: every usable voltage is zero or missing; there is nothing measured in it. Was the "
+            "instrument on, and is this the right variable or column?"
+        )
+    exclude(np.broadcast_to(dead[:, None], values.shape), f"{int(dead.sum())} frames are all zero.")
+    exclude(_saturated(values, usable, saturation), "saturated (stuck at an end of the instrument's range).")
+    exclude(_without_current(values, usable, protocol), "their drive's current did not flow.")
+    if not usable.any():
+        raise ValueError(f"{name}: no usable voltage is left. {' '.join(found)}")
+    return Measurement(
+        values,
+        usable,
+        protocol,
+        electrodes=electrodes,
+        domain=domain,
+        name=name,
+        source=source,
+        frame_names=frame_names,
+        notes=tuple(found),
+    )
+
+
+def _as_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:
+    values = np.asarray(voltages)
+    if values.dtype.kind not in "fiuc":
+        raise ValueError(f"{name}: voltages are {values.dtype}; they must be numbers, in volts.")
+    values = np.atleast_2d(values.astype(complex if values.dtype.kind == "c" else float))
+    channels = protocol.num_measurements
+    if values.ndim != 2 or values.shape[0] == 0 or values.shape[1] != channels:
+        hint = " It looks transposed: give one row per frame." if values.shape[0] == channels else ""
+        raise ValueError(
+            f"{name}: the data have shape {values.shape}, but the protocol '{protocol.name}' has {channels} "
+            f"channels, so (frames, {channels}) is needed.{hint} Otherwise choose the protocol that the data "
+            "were measured with."
+        )
+    return values
+
+
+def _saturated(values: np.ndarray, usable: np.ndarray, limit: float | None) -> Bool[np.ndarray, "F M"]:
+    if limit is not None:
+        if not np.isfinite(limit) or limit <= 0:
+            raise ValueError(f"saturation must be a positive voltage in volts; got {limit!r}.")
+        with np.errstate(invalid="ignore"):
+            return np.abs(values) >= limit * (1 - 1e-9)
+    result = np.zeros(values.shape, dtype=bool)
+    parts = [np.real(values), np.imag(values)] if np.iscomplexobj(values) else [values]
+    for part in parts:
+        for frame, (row, good) in enumerate(zip(part, usable, strict=True)):
+            if good.sum() < 8:
+                continue
+            level, inverse, count = np.unique(row[good], return_inverse=True, return_counts=True)
+            for end in (0, len(level) - 1):
+                # Exactly equal extremes also come from a coarse converter or a simulated symmetric body, but
+                # then values in between repeat as often; a rail repeats alone.
+                others = np.delete(count, [0, len(level) - 1]) if len(level) > 2 else np.zeros(1)
+                if level[end] != 0 and count[end] >= 4 and count[end] >= 4 * others.max(initial=0):
+                    result[frame, np.flatnonzero(good)[inverse == end]] = True
+    return result
+
+
+def _without_current(values: np.ndarray, usable: np.ndarray, protocol: Protocol) -> Bool[np.ndarray, "F M"]:
+    """Channels of drives whose voltages are a thousand times smaller than those of the usual drive."""
+    drive_index = np.asarray(protocol.drive_index)
+    size = np.where(usable, np.abs(values), 0)
+    largest = np.zeros((values.shape[0], protocol.num_drives))
+    np.maximum.at(largest.T, drive_index, size.T)
+    if protocol.num_drives < 3:
+        return np.zeros(values.shape, dtype=bool)
+    usual = np.median(largest, axis=1, keepdims=True)
+    return (largest < 1e-3 * usual)[:, drive_index]

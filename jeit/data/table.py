@@ -1,0 +1,154 @@
+"""Reader of plain tables: CSV, text, NPY and NPZ with a TOML description."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jeit.data.description import DataLayout, Description, load_description
+from jeit.data.measurement import Measurement
+from jeit.data.screening import screen
+from jeit.protocol import Protocol
+
+DESCRIPTION = "table (.csv, .txt, .npy, .npz) with a TOML description beside it"
+SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
+
+
+def recognises(path: Path) -> bool:
+    """True for a table's suffix."""
+    return path.suffix.lower() in SUFFIXES
+
+
+def find_description(path: Path) -> str | Path | None:
+    """The description that belongs to a file: same name with .toml, else `description.toml` in its folder.
+
+    A table of 208 × 4 numbers whose name holds current and frequency as the 6 cm tank's files do
+    (`…_55uA_1000Hz.csv`) is described by the bundled "tank6cm". None when nothing is found.
+    """
+    for candidate in (path.with_suffix(".toml"), path.parent / "description.toml"):
+        if candidate.is_file():
+            return candidate
+    if path.suffix.lower() == ".csv" and re.search(r"_[0-9.]+uA_[0-9.]+Hz$", path.stem):
+        return "tank6cm"
+    return None
+
+
+def read(path: Path, description: str | Path | None = None) -> Measurement:
+    """Read a table with the `description` given (path or bundled name), or the one found beside it.
+
+    Raises `ValueError` when there is no description, or when file and description disagree.
+    """
+    which = find_description(path) if description is None else description
+    if which is None:
+        raise ValueError(
+            f"{path.name} is a table of numbers, and nothing says what they mean. Put a description beside "
+            f"it, {path.with_suffix('.toml').name} (geometry, electrodes, protocol), or name one with "
+            "--description."
+        )
+    described = load_description(which)
+    if path.suffix.lower() in (".npz", ".npy"):
+        table, mask, protocol = _from_numpy(path, described)
+    else:
+        table, mask, protocol = _from_text(path, described.layout), None, None
+    return measurement_from(path, described, frames_from(table, described.layout, path.name), protocol, mask)
+
+
+def measurement_from(
+    path: Path, described: Description, frames: np.ndarray, protocol: Protocol | None, mask: np.ndarray | None
+) -> Measurement:
+    """Screen frames (F, M) in file units under a description. `protocol` is the file's own, if it has one."""
+    protocol = protocol or described.protocol(path)
+    if protocol is None:
+        raise ValueError(
+            f'{described.origin}: no protocol: add a [protocol] section with kind = "adjacent" or another.'
+        )
+    names = described.layout.frame_names
+    if names and len(names) != len(np.atleast_2d(frames)):
+        raise ValueError(
+            f"{described.origin}: [data] names {len(names)} frames, but {path.name} holds {len(np.atleast_2d(frames))}."
+        )
+    return screen(
+        frames * described.layout.scale,
+        protocol,
+        electrodes=described.electrodes,
+        domain=described.domain,
+        mask=mask,
+        saturation=described.layout.saturation,
+        name=path.stem,
+        source=str(path),
+        frame_names=names,
+        notes=described.notes,
+    )
+
+
+def frames_from(table: np.ndarray, layout: DataLayout, name: str) -> np.ndarray:
+    """Frames (F, M), in file units, of a table laid out as described."""
+    frames = table.T if table.ndim == 2 and layout.frames_in == "columns" else np.atleast_2d(table)
+    if layout.complex_pairs:
+        if len(frames) % 2:
+            raise ValueError(
+                f"{name}: complex_pairs needs real and imaginary {layout.frames_in} in turn, an even number; "
+                f"there are {len(frames)}."
+            )
+        frames = frames[0::2] + 1j * frames[1::2]
+    if not np.iscomplexobj(frames):
+        return frames
+    if layout.component == "imaginary":
+        return np.imag(frames)
+    if layout.component == "magnitude":
+        # With the sign of the real part: a magnitude alone has lost the direction of the voltage.
+        return np.abs(frames) * np.where(np.real(frames) < 0, -1.0, 1.0)
+    return frames if layout.component == "complex" else np.real(frames)
+
+
+def _from_text(path: Path, layout: DataLayout) -> np.ndarray:
+    delimiter = None if layout.delimiter.strip() == "" and layout.delimiter != "\t" else layout.delimiter
+    try:
+        lines = path.read_text("utf-8").splitlines()
+    except UnicodeDecodeError:
+        raise ValueError(f"{path.name} is not a text file. If it is a spreadsheet, export it as CSV.") from None
+    rows = []
+    for number, line in enumerate(lines[layout.skip_rows :], start=layout.skip_rows + 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            rows.append([float(cell) for cell in line.split(delimiter)])
+        except ValueError:
+            raise ValueError(
+                f"{path.name}, line {number}: {line.strip()[:40]!r} is not numbers separated by "
+                f"{delimiter or 'spaces'!r}. Set [data] delimiter and skip_rows in the description (missing "
+                "values are written nan)."
+            ) from None
+        if len(rows[-1]) != len(rows[0]):
+            raise ValueError(
+                f"{path.name}, line {number} has {len(rows[-1])} numbers, the first {len(rows[0])}. Is the "
+                "file cut off?"
+            )
+    if not rows:
+        raise ValueError(f"{path.name} holds no numbers.")
+    return np.array(rows)
+
+
+def _from_numpy(path: Path, described: Description) -> tuple[np.ndarray, np.ndarray | None, Protocol | None]:
+    try:
+        content = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(f"{path.name} is not a readable NumPy file of plain arrays ({error}).") from None
+    if isinstance(content, np.ndarray):
+        return content, None, None
+    with content:
+        arrays = {name: content[name] for name in content.files}
+    keys = described.layout.keys or ("voltages",)
+    missing = [key for key in keys if key not in arrays]
+    if missing:
+        raise ValueError(
+            f"{path.name}: there is no array '{missing[0]}'; the file has {', '.join(sorted(arrays))}. Name "
+            "the voltages with [data] keys in the description."
+        )
+    table = arrays[keys[0]] if len(keys) == 1 else np.stack([arrays[key].ravel() for key in keys])
+    parts = ("drive", "measurement", "drive_index", "measurement_index")
+    protocol = None
+    if all(part in arrays for part in parts) and not described.protocol_section:
+        name = str(arrays.get("protocol_name", "custom"))
+        protocol = Protocol(**{part: arrays[part] for part in parts}, name=name)
+    return table, arrays.get("mask"), protocol
