@@ -25,9 +25,9 @@ def recognises(path: Path) -> bool:
 def read(path: Path) -> Measurement:
     """Read one file of the archive: one frame of 79 drives × 16 cyclic differences = 1,264 channels.
 
-    Channels go drive by drive. The 16 differences of a drive sum to zero, so 15 are independent; all are kept,
-    with those that touch driven electrodes (`Measurement.without_driven_channels` masks the latter). The tank is 0.14 m in radius,
-    electrode 1 at 12 o'clock, then clockwise.
+    Channels go drive by drive. The 16 differences of a drive sum to zero, so 15 are independent; all are kept, with
+    those that touch driven electrodes (`Measurement.without_driven_channels` masks these). The tank is 0.14 m in
+    radius, electrode 1 at 12 o'clock, then clockwise.
 
     Raises `ValueError` for a file of another shape.
     """

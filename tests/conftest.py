@@ -1,0 +1,37 @@
+"""Shared by all tests: where measured data lie, and a cache that keeps compiled code between runs."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Most of a test's time is compilation; the same shapes come back run after run.
+jax.config.update("jax_compilation_cache_dir", str(ROOT / ".jax_cache"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _shared(variable: str, folder: str) -> Path | None:
+    named = os.environ.get(variable)
+    candidates = [Path(named)] if named else [ROOT.parent / "shared" / folder]
+    return next((path for path in candidates if path.is_dir()), None)
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """The folder of measured data (kit4, ktc2023, tank6cm); skips the test where there is none."""
+    folder = _shared("JEIT_DATA", "data")
+    if folder is None:
+        pytest.skip("no measured data: set JEIT_DATA to the folder that holds kit4, ktc2023 and tank6cm")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def reference_folder() -> Path:
+    """The folder of another toolkit's numbers; skips the test where there is none."""
+    folder = _shared("JEIT_REFERENCE", "reference")
+    if folder is None:
+        pytest.skip("no reference numbers: set JEIT_REFERENCE to the folder that holds circ2d_cem_576.mat")
+    return folder
