@@ -9,8 +9,10 @@ from jeit.mesh.geometry import (
     gradients,
     measures,
 )
+from jeit.mesh.interior import interior_facets
 from jeit.mesh.mesh import Mesh
-from jeit.mesh.shapes import disk, rectangle
+from jeit.mesh.refine import Refine
+from jeit.mesh.shapes import disk, polygon, rectangle
 
 __all__ = [
     "Disk",
@@ -18,12 +20,15 @@ __all__ = [
     "Mesh",
     "Polygon",
     "Rectangle",
+    "Refine",
     "boundary_arc_length",
     "centroids",
     "disk",
     "facet_centroids",
     "facet_measures",
     "gradients",
+    "interior_facets",
     "measures",
+    "polygon",
     "rectangle",
 ]

@@ -7,7 +7,13 @@ angle falls below about 40°.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
+
+
+# Height of a row per mean edge along it: between a square's 1 and an equilateral triangle's 0.87.
+_ROW = 0.93
 
 
 def zip_chains(outer: np.ndarray, inner: np.ndarray, *, closed: bool) -> np.ndarray:
@@ -65,10 +71,43 @@ def ring_disk(num_rings: int, num_boundary: int) -> tuple[np.ndarray, np.ndarray
     angle = np.concatenate([2 * np.pi * np.arange(count) / count for count in counts])
     points = np.concatenate([radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1), np.zeros((1, 2))])
     rings = [np.arange(offsets[k], offsets[k + 1]) for k in range(num_rings)]
-    cells = [zip_chains(a, b, closed=True) for a, b in zip(rings[:-1], rings[1:], strict=True)]
+    cells = [zip_chains(a, b, closed=True) for a, b in pairwise(rings)]
     last = rings[-1]
     cells.append(np.stack([last, np.roll(last, -1), np.full(len(last), offsets[-1])], axis=1))
     return points, np.concatenate(cells)
+
+
+def choose_rows(
+    width: float, height: float, num_points: int, cell_size: float | None
+) -> tuple[int, int]:
+    """Columns and rows for `row_rectangle` with nearly `num_points` nodes, or of cells of `cell_size`.
+
+    Raises `ValueError` if so few nodes can only make flat cells.
+    """
+    if cell_size is not None:
+        cell_size = min(cell_size, width, height)
+        return max(1, round(width / cell_size - 0.5)), max(1, round(height / (_ROW * cell_size)))
+    edge = np.sqrt(width * height / (_ROW * num_points))
+    guess = height / (_ROW * edge)
+    best = None
+    for num_rows in range(max(1, int(0.6 * guess)), int(1.5 * guess) + 3):
+        odd = (num_rows + 1) // 2
+        for num_columns in {int(c) for c in np.rint((num_points - odd) / (num_rows + 1) - 1 + np.arange(-1, 2))}:
+            if num_columns < 1:
+                continue
+            total = (num_rows + 1) * (num_columns + 1) + odd
+            miss = abs(total / num_points - 1.0)
+            stretch = abs(np.log(height / num_rows / (_ROW * width / (num_columns + 0.5))))
+            cost = (stretch > 0.6, miss > 0.03, miss if miss > 0.03 else 0.0, stretch)
+            if best is None or cost < best[0]:
+                best = (cost, num_columns, num_rows)
+    if best is None or best[0][0]:
+        least = 2 * max(width / height, height / width) + 3
+        raise ValueError(
+            f"num_points: {num_points} nodes in a rectangle of {width:g} by {height:g} m make flat cells. Ask for at "
+            f"least about {least:.0f}."
+        )
+    return best[1], best[2]
 
 
 def row_rectangle(
@@ -83,5 +122,5 @@ def row_rectangle(
         points.append(np.stack([x, np.full_like(x, height * row / num_rows)], axis=1))
         rows.append(np.arange(offset, offset + columns + 1))
         offset += columns + 1
-    cells = [zip_chains(a, b, closed=False) for a, b in zip(rows[:-1], rows[1:], strict=True)]
+    cells = [zip_chains(a, b, closed=False) for a, b in pairwise(rows)]
     return np.concatenate(points), np.concatenate(cells)

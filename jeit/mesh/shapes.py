@@ -1,17 +1,17 @@
-"""Meshes of plane outlines: disk, rectangle."""
+"""Meshes of plane outlines: `disk`, `rectangle`, `polygon`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from jeit.mesh import _structured
-from jeit.mesh.domain import Disk, Rectangle
+from jeit.mesh import _curve, _structured, _unstructured
+from jeit.mesh._curve import Curve
+from jeit.mesh.domain import Disk, Polygon, Rectangle
 from jeit.mesh.mesh import Mesh
-
-_DEFAULT_NUM_POINTS = 1200
+from jeit.mesh.refine import Refine, Refinement
 
 
 def disk(
@@ -20,17 +20,61 @@ def disk(
     num_points: int | None = None,
     cell_size: float | None = None,
     centre: Sequence[float] = (0.0, 0.0),
-    refine: Any = None,
+    refine: Refinement = None,
+    num_boundary: int | None = None,
+    boundary_points: ArrayLike | None = None,
+    interior_points: ArrayLike | None = None,
 ) -> Mesh:
-    """A disk of `radius` metres."""
+    """Mesh of a disk of `radius` metres; its boundary nodes lie on the circle.
+
+    Without refinement the mesh is made of concentric rings, and node 0 lies at angle 0. Otherwise it is
+    unstructured, and node 0 is the first boundary node counter-clockwise from angle 0.
+
+    **Arguments**: `num_points`, number of nodes, met within about 5 % (1,200 if nothing is said), or
+    `cell_size`, edge length in metres; `centre` (x, y) in metres; `refine`, see `Refine`: one, several, or a function
+    that takes points (p, 2) and returns the edge length wanted there (p,) in metres (with `num_points`, up to a common
+    factor); `num_boundary`, number of nodes on the circle, cells growing from there inwards;
+    `boundary_points`, angles in radians at which there must be nodes; `interior_points` (k, 2), places in metres
+    at which there must be nodes.
+
+    The mesh is the polygon inscribed in the circle: with N boundary nodes its area falls short by the fraction
+    (2 π² / 3) / N². Every angle is at least 25°. Raises `ValueError` on bad or contradicting arguments.
+    """
     domain = Disk(radius, centre)
-    if cell_size is not None:
-        num_rings = max(1, round(radius / (0.98 * cell_size)))
-        num_boundary = 6 * num_rings
-    else:
-        num_rings, num_boundary = _structured.choose_rings(num_points or _DEFAULT_NUM_POINTS)
-    points, cells = _structured.ring_disk(num_rings, num_boundary)
-    return Mesh.create(np.asarray(domain.centre) + domain.radius * points, cells)
+    middle = np.asarray(domain.centre)
+    target = _unstructured.Target.create(num_points, cell_size)
+    if num_boundary is not None:
+        num_boundary = _unstructured.check_count("num_boundary", num_boundary, 3)
+        if callable(refine):
+            raise ValueError("num_boundary: cannot be combined with a size function; let the function give the size.")
+        along = Refine(cell_size=domain.perimeter / num_boundary)
+        others = () if refine is None else (refine,) if isinstance(refine, Refine) else tuple(refine)
+        refine = (along, *others)
+    if refine is None and boundary_points is None and interior_points is None:
+        if target.cell_size is None:
+            rings = _structured.choose_rings(target.num_points)
+        else:
+            # Six nodes a ring make edges along it π/3 of those across: their mean is the size asked.
+            num_rings = max(1, round(1.02 * domain.radius / target.cell_size))
+            rings = (num_rings, 6 * num_rings)
+        _unstructured.check_total(rings[0] * rings[1] // 2, "cell_size")
+        points, cells = _structured.ring_disk(*rings)
+        return Mesh.create(middle + domain.radius * points, cells)
+    stops = np.zeros(1)
+    if boundary_points is not None:
+        angles = _unstructured.check_positions("boundary_points", boundary_points)
+        stops = domain.radius * np.mod(angles, 2 * np.pi)
+    curve = _curve.circle(domain.radius, middle)
+    points, cells = _unstructured.mesh([curve], [stops], interior_points, refine, target, domain.area)
+    mesh = Mesh.create(points, cells)
+    if num_boundary is not None and mesh.num_facets < 0.9 * num_boundary or (
+        num_boundary is not None and mesh.num_facets > 1.1 * num_boundary + 2 and boundary_points is None
+    ):
+        raise ValueError(
+            f"num_boundary: cells of the size asked give {mesh.num_facets} nodes on the circle, not {num_boundary}. Ask for "
+            "fewer nodes inside (num_points), larger cells, or more nodes on the circle."
+        )
+    return mesh
 
 
 def rectangle(
@@ -40,25 +84,66 @@ def rectangle(
     num_points: int | None = None,
     cell_size: float | None = None,
     centre: Sequence[float] = (0.0, 0.0),
-    refine: Any = None,
+    refine: Refinement = None,
+    boundary_points: ArrayLike | None = None,
+    interior_points: ArrayLike | None = None,
 ) -> Mesh:
-    """A rectangle of `width` by `height` metres, tags 'left', 'right', 'bottom', 'top'."""
+    """Mesh of a rectangle of `width` (along x) by `height` (along y) metres.
+
+    Without refinement the mesh is made of rows of nearly equilateral cells. Node 0 is the lower left corner. The sides
+    are tagged 'left', 'right', 'bottom', 'top'. `boundary_points` are arc lengths in metres, counter-clockwise from
+    the lower left corner; the other arguments are those of `disk`, and so are the errors.
+    """
     domain = Rectangle(width, height, centre)
-    if cell_size is None:
-        cell_size = float(np.sqrt(width * height / (num_points or _DEFAULT_NUM_POINTS)))
-    num_columns = max(1, round(width / cell_size - 0.5))
-    num_rows = max(1, round(height / (0.93 * cell_size)))
-    points, cells = _structured.row_rectangle(domain.width, domain.height, num_columns, num_rows)
-    left, _, bottom, _ = domain.extent
-    mesh = Mesh.create(points + [left, bottom], cells)
-    middle = np.asarray(mesh.points)[np.asarray(mesh.facets)].mean(axis=1)
-    extent = domain.extent
-    tags = {}
-    for name, axis, value in (
-        ("left", 0, extent[0]),
-        ("right", 0, extent[1]),
-        ("bottom", 1, extent[2]),
-        ("top", 1, extent[3]),
-    ):
-        tags[name] = np.flatnonzero(np.abs(middle[:, axis] - value) < 1e-9 * max(width, height))
-    return Mesh.create(mesh.points, mesh.cells, tags=tags)
+    left, right, bottom, top = domain.extent
+    target = _unstructured.Target.create(num_points, cell_size)
+    if refine is None and boundary_points is None and interior_points is None:
+        rows = _structured.choose_rows(domain.width, domain.height, target.num_points, target.cell_size)
+        _unstructured.check_total(rows[0] * rows[1], "cell_size")
+        points, cells = _structured.row_rectangle(domain.width, domain.height, *rows)
+        points = points + np.array([left, bottom])
+    else:
+        curve = _curve.closed_line(np.asarray(domain.vertices))
+        stops = _arc_lengths(curve, boundary_points)
+        points, cells = _unstructured.mesh([curve], [stops], interior_points, refine, target, domain.area)
+    mesh = Mesh.create(points, cells)
+    facets = np.asarray(mesh.facets)
+    ends = np.asarray(mesh.points)[facets]
+    tolerance = 1e-9 * max(domain.width, domain.height)
+    sides = {"left": (0, left), "right": (0, right), "bottom": (1, bottom), "top": (1, top)}
+    tags = {
+        name: facets[(np.abs(ends[:, :, axis] - value) < tolerance).all(axis=1)]
+        for name, (axis, value) in sides.items()
+    }
+    return Mesh.create(points, cells, tags=tags)
+
+
+def polygon(
+    vertices: ArrayLike,
+    *,
+    holes: Sequence[ArrayLike] = (),
+    num_points: int | None = None,
+    cell_size: float | None = None,
+    refine: Refinement = None,
+    boundary_points: ArrayLike | None = None,
+    interior_points: ArrayLike | None = None,
+) -> Mesh:
+    """Mesh of the inside of a simple polygon with `vertices` (k, 2) in metres, outside its `holes`.
+
+    The vertices are nodes, the first of them node 0. Every angle is at least 25°, except the polygon's own sharper
+    corners, each of which is cut off as one cell with two equal sides. `boundary_points` are arc lengths in metres along the outer
+    outline, counter-clockwise from the first vertex; the other arguments are those of `disk`. Raises `ValueError` on
+    an outline that is not simple, and on bad or contradicting arguments.
+    """
+    domain = Polygon(vertices, holes)
+    target = _unstructured.Target.create(num_points, cell_size)
+    curves = [_curve.closed_line(np.asarray(loop)) for loop in (domain.vertices, *domain.holes)]
+    stops = [_arc_lengths(curves[0], boundary_points)] + [np.zeros(0)] * (len(curves) - 1)
+    points, cells = _unstructured.mesh(curves, stops, interior_points, refine, target, float(domain.area))
+    return Mesh.create(points, cells)
+
+
+def _arc_lengths(curve: Curve, positions: ArrayLike | None) -> np.ndarray:
+    if positions is None:
+        return np.zeros(0)
+    return np.mod(_unstructured.check_positions("boundary_points", positions), curve.length)
