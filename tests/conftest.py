@@ -15,7 +15,7 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 def _shared(variable: str, folder: str) -> Path | None:
     named = os.environ.get(variable)
-    candidates = [Path(named)] if named else [ROOT.parent / "shared" / folder]
+    candidates = [*([Path(named)] if named else []), ROOT.parent / "shared" / folder]
     return next((path for path in candidates if path.is_dir()), None)
 
 

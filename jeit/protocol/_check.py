@@ -85,9 +85,7 @@ def check_amplitude(value: float, where: str) -> None:
 def check_count(number, where: str, least: int) -> int:
     """The number of electrodes, as an int of at least `least`."""
     if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < least:
-        raise ValueError(
-            f"{where}: the number of electrodes must be an integer of at least {least}; got {number!r}."
-        )
+        raise ValueError(f"{where}: the number of electrodes must be an integer of at least {least}; got {number!r}.")
     return int(number)
 
 
@@ -96,12 +94,7 @@ def electrode_indices(electrodes, num_electrodes: int) -> np.ndarray:
     values = np.atleast_1d(np.asarray(electrodes))
     if values.size == 0:
         return np.zeros(0, dtype=int)
-    if (
-        values.ndim != 1
-        or values.dtype.kind not in "iu"
-        or values.min() < 0
-        or values.max() >= num_electrodes
-    ):
+    if values.ndim != 1 or values.dtype.kind not in "iu" or values.min() < 0 or values.max() >= num_electrodes:
         raise ValueError(
             f"electrodes {electrodes!r}: give integers from 0 to {num_electrodes - 1} "
             f"(0-based; there are {num_electrodes} electrodes)."
@@ -114,14 +107,12 @@ def check_pairs(pairs, num_electrodes: int, what: str) -> np.ndarray:
     values = np.asarray(pairs)
     if values.ndim != 2 or values.shape[1] != 2 or values.shape[0] == 0 or values.dtype.kind not in "iu":
         raise ValueError(
-            f"{what}: give pairs of electrodes as integers of shape (P, 2); got shape {values.shape} of "
-            f"{values.dtype}."
+            f"{what}: give pairs of electrodes as integers of shape (P, 2); got shape {values.shape} of {values.dtype}."
         )
     electrode_indices(values.ravel(), num_electrodes)
     same = np.flatnonzero(values[:, 0] == values[:, 1])
     if same.size:
         raise ValueError(
-            f"{what}: pair {same[0]} is electrode {values[same[0], 0]} with itself. Use two different "
-            "electrodes."
+            f"{what}: pair {same[0]} is electrode {values[same[0], 0]} with itself. Use two different electrodes."
         )
     return values

@@ -6,9 +6,7 @@ from jeit.protocol._check import check_amplitude, is_traced
 from jeit.protocol.protocol import Protocol
 
 
-def from_matrices(
-    drive, measurement, select=None, *, name: str = "custom", large_currents: bool = False
-) -> Protocol:
+def from_matrices(drive, measurement, select=None, *, name: str = "custom", large_currents: bool = False) -> Protocol:
     """Every drive pattern crossed with every measurement pattern, drive by drive.
 
     - `drive`: (S, L) currents in amperes, one row per drive.
@@ -59,9 +57,7 @@ def from_channels(
             f"{len(rows)} channels."
         )
     if not np.all(np.isfinite(rows)):
-        raise ValueError(
-            "from_channels: the measurement patterns contain NaN or infinity. Mask channels instead."
-        )
+        raise ValueError("from_channels: the measurement patterns contain NaN or infinity. Mask channels instead.")
     _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
     # In order of first appearance, so that a file's own numbering of its patterns survives.
     appearance = np.argsort(first)

@@ -69,8 +69,7 @@ def skip(
     for value, name in ((skipped, "skipped"), (measurement_skipped, "measurement_skipped")):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value <= count - 2:
             raise ValueError(
-                f"skip: {name} must be an integer from 0 to {count - 2} for {count} electrodes; got "
-                f"{value!r}."
+                f"skip: {name} must be an integer from 0 to {count - 2} for {count} electrodes; got {value!r}."
             )
     kind = "adjacent" if skipped == 0 else f"skip-{skipped}"
     if measurement_skipped != skipped:
@@ -259,9 +258,7 @@ def trigonometric(
         rows = pair_patterns(_ring_pairs(count, 1), count)
     else:
         rows = np.eye(count) - (1 - np.eye(count)) / (count - 1)
-    return from_matrices(
-        current * drive, rows, name=f"trigonometric, {measurement} measurement, {count} electrodes"
-    )
+    return from_matrices(current * drive, rows, name=f"trigonometric, {measurement} measurement, {count} electrodes")
 
 
 def bipolar(
@@ -334,8 +331,9 @@ def _finish(
     if order == "rotating":
         # Drive i begins with measurement pair i: pairs are in ring order, one per electrode.
         measurement_index = (measurement_index + drive_index) % num_rows
+    # Channels are chosen at unit current, so that the current itself may be traced.
     protocol = Protocol(
-        drive=current * pair_patterns(drive_pairs, count),
+        drive=pair_patterns(drive_pairs, count),
         measurement=pair_patterns(measurement_pairs, count),
         drive_index=drive_index,
         measurement_index=measurement_index,
@@ -353,7 +351,7 @@ def _finish(
             "driven_electrodes=True, or measure other pairs."
         )
     return Protocol(
-        drive=protocol.drive,
+        drive=current * protocol.drive,
         measurement=protocol.measurement,
         drive_index=drive_index[keep],
         measurement_index=measurement_index[keep],

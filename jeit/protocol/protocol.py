@@ -103,9 +103,7 @@ class Protocol(eqx.Module):
         chosen = electrode_indices(electrodes, self.num_electrodes)
         driven = np.any(np.asarray(self.drive)[:, chosen] != 0, axis=1)
         measured = np.any(np.asarray(self.measurement)[:, chosen] != 0, axis=1)
-        return np.logical_or(
-            driven[np.asarray(self.drive_index)], measured[np.asarray(self.measurement_index)]
-        )
+        return np.logical_or(driven[np.asarray(self.drive_index)], measured[np.asarray(self.measurement_index)])
 
     def mask_without(self, electrodes: int | Sequence[int]) -> Bool[np.ndarray, " M"]:
         """(M,) True where a channel stays usable when `electrodes` (0-based) are missing or broken."""
