@@ -96,27 +96,29 @@ def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
 
 
 def generate(
-    curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size
+    curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, front: Front | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 2) and cells (m, 3) inside `curves`, the first of which encloses the others.
 
     `stops` are arc lengths on each curve and `fixed` points (f, 2) inside where nodes must be; `size` gives the
-    wanted edge length at points (p, 2). Node 0 is the first node of the first curve. Raises
-    `ValueError` if no mesh with the promised angle is found.
+    wanted edge length at points (p, 2). A `front` already filled for this size saves the first two
+    steps. Node 0 is the first node of the first curve. Raises `ValueError` if no mesh with the promised angle is
+    found.
     """
     for guard in (1.0, 0.5, 0.25):
-        front = outline_nodes(curves, stops, fixed, size, guard)
-        fill(front, size)
+        if front is None:
+            front = outline_nodes(curves, stops, fixed, size, guard)
+            fill(front, size)
         smooth(front, size)
         _repair.polish(front)
-        if not _repair.repair(front):
-            continue
+        done = _repair.repair(front)
         _repair.polish(front, passes=1)
         points = front.points()
         cells = triangulate(front, points)
         angle = smallest_angles(points[cells])
-        if angle[_repair.improvable(front, cells)].min() >= _repair.PROMISED_ANGLE:
+        if done and angle[_repair.improvable(front, cells)].min(initial=90.0) >= _repair.PROMISED_ANGLE:
             return order_nodes(points, cells)
+        front = None
     raise ValueError(
         "refine: no mesh with angles of at least 25° was found for this outline and these cell sizes. Ask for smaller "
         "cells near narrow places and nodes that lie close together, or for slower growth."

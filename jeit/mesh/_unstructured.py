@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -20,6 +21,8 @@ DEFAULT_NUM_POINTS = 1200
 _MOST_POINTS = 1_000_000
 # Nodes that must be there, closer than this relative to the outline's length, are refused.
 _CLOSEST = 1e-6
+# How well the number of nodes is met before smoothing and repair, which may add or drop a few.
+_MISS = 0.02
 
 
 @dataclass(frozen=True)
@@ -81,28 +84,24 @@ def mesh(
     stops = [_merge(curve, own) for curve, own in zip(curves, stops, strict=True)]
     fixed = _check_interior(interior_points, curves)
     field = SizeField(curves, refine, *_room(curves, stops, fixed))
+    front = None
     if target.cell_size is not None:
-        cap = target.cell_size
-        size = partial(_capped, field, cap) if field.is_own else partial(_at, field, cap)
+        size = partial(_capped if field.is_own else _sized, field, target.cell_size)
         check_total(_estimate(curves, size, area), "cell_size")
     elif field.is_own and not target.asked:
-        size = partial(_scaled, field, 1.0)
+        size = partial(_sized, field, 1.0)
         check_total(_estimate(curves, size, area), "refine")
     else:
-        size = _fit(curves, stops, fixed, field, target.num_points, area)
-    return _generate.generate(curves, stops, fixed, size)
+        size, front = _fit(curves, stops, fixed, field, target.num_points, area)
+    return _generate.generate(curves, stops, fixed, size, front)
 
 
-def _at(field: SizeField, background: float, points: np.ndarray) -> np.ndarray:
-    return field.at(points, background)
-
-
-def _scaled(field: SizeField, scale: float, points: np.ndarray) -> np.ndarray:
-    return field.scaled(points, scale)
+def _sized(field: SizeField, background: float, points: np.ndarray) -> np.ndarray:
+    return field.at(points)(background)
 
 
 def _capped(field: SizeField, cap: float, points: np.ndarray) -> np.ndarray:
-    return np.minimum(field.scaled(points, 1.0), cap)
+    return np.minimum(field.at(points)(1.0), cap)
 
 
 def _merge(curve: Curve, own: np.ndarray) -> np.ndarray:
@@ -171,17 +170,20 @@ def _room(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tu
     return held, spacing
 
 
-def _estimate(curves: list[Curve], size: Size, area: float) -> float:
-    """About how many nodes a mesh of this size has, from samples of the size along a grid and the outline."""
-    outline = np.concatenate([curve.at(np.linspace(0, curve.length, 400)) for curve in curves])
-    low, high = outline.min(axis=0), outline.max(axis=0)
-    axes = [np.linspace(low[k], high[k], 60) for k in (0, 1)]
+def _sample(curves: list[Curve]) -> np.ndarray:
+    """Points of a regular grid that lie inside."""
+    outline = curves[0].at(np.linspace(0, curves[0].length, 400))
+    axes = [np.linspace(outline[:, k].min(), outline[:, k].max(), 60) for k in (0, 1)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    grid = grid[_curve.inside(curves, grid)]
-    inner = area * float(np.mean(1.0 / size(grid) ** 2)) if len(grid) else 0.0
-    return inner + sum(
-        curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400))))) for curve in curves
-    )
+    return grid[_curve.inside(curves, grid)]
+
+
+def _estimate(curves: list[Curve], size: Size, area: float) -> float:
+    """About how many nodes a mesh of this size has, from samples inside and along the outline."""
+    total = area * float(np.mean(1.0 / size(_sample(curves)) ** 2))
+    for curve in curves:
+        total += curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400)))))
+    return total
 
 
 def _fit(
@@ -191,56 +193,50 @@ def _fit(
     field: SizeField,
     num_points: int,
     area: float,
-) -> Size:
-    """The size function that makes `num_points` nodes, by its background size (or its scale).
+) -> tuple[Size, Front]:
+    """The size function that makes `num_points` nodes, by its background size or factor, and a filled outline.
 
-    The number of nodes is about ∫ c/h² over the domain; a first mesh gives the constant c and the
-    sample points, the next ones correct the rest.
+    The number of nodes is about ∫ c/h² over the domain: a coarser mesh gives the constant c and the sample
+    points, the next ones correct the rest.
     """
-    make = _scaled if field.is_own else _at
-    value = float(np.sqrt(1.1 * area / num_points))
+    first = num_points / 4 if num_points > 4000 else num_points
+    value = float(np.sqrt(1.1 * area / first))
     if field.is_own:
-        inside = _sample(curves)
-        value = float(np.sqrt(1.1 * area * np.mean(1.0 / field.scaled(inside, 1.0) ** 2) / num_points))
-    best = (np.inf, value)
+        value *= float(np.sqrt(np.mean(1.0 / field.at(_sample(curves))(1.0) ** 2)))
+    best: tuple[float, Size, Front] | None = None
     for _ in range(6):
-        front, points, cells = _trial(curves, stops, fixed, partial(make, field, value))
+        size = partial(_sized, field, value)
+        front = _generate.outline_nodes(curves, stops, fixed, size, 1.0)
+        _generate.fill(front, size)
+        points = front.points()
         miss = len(points) / num_points - 1.0
-        if abs(miss) < best[0]:
-            best = (abs(miss), value)
-        if abs(miss) < 0.015:
+        if best is None or abs(miss) < best[0]:
+            best = (abs(miss), size, front)
+        if abs(miss) < _MISS:
             break
-        weight, middle = doubled_areas(points, cells), points[cells].mean(axis=1)
-
-        def total(trial: float, middle: np.ndarray = middle, weight: np.ndarray = weight) -> float:
-            return float(np.sum(weight / make(field, trial, middle) ** 2))
-
-        wanted = total(value) * num_points / len(points)
-        if total(1e3 * value) > 1.1 * wanted:
-            least = round(len(points) * total(1e3 * value) / total(value))
-            raise ValueError(
-                f"num_points: the outline and refinement alone need about {least} nodes, more than the {num_points} asked. Ask "
-                "for more nodes, less refinement (larger cell_size, smaller factor) or faster growth."
-            )
-        low, high = np.log(value / 1e3), np.log(value * 1e3)
-        for _ in range(50):
-            mid = 0.5 * (low + high)
-            low, high = (mid, high) if total(np.exp(mid)) > wanted else (low, mid)
-        value = float(np.exp(0.5 * (low + high)))
-    return partial(make, field, best[1])
+        cells = triangulate(front, points)
+        value = _corrected(field.at(points[cells].mean(axis=1)), doubled_areas(points, cells), value, miss, num_points)
+    assert best is not None
+    return best[1], best[2]
 
 
-def _sample(curves: list[Curve]) -> np.ndarray:
-    outline = curves[0].at(np.linspace(0, curves[0].length, 400))
-    axes = [np.linspace(outline[:, k].min(), outline[:, k].max(), 60) for k in (0, 1)]
-    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    return grid[_curve.inside(curves, grid)]
+def _corrected(
+    size: Callable[[float], np.ndarray], weight: np.ndarray, value: float, miss: float, num_points: int
+) -> float:
+    """The background size at which ∫ 1/h² is what it was at `value`, less the relative surplus of nodes `miss`."""
 
+    def total(trial: float) -> float:
+        return float(np.sum(weight / size(trial) ** 2))
 
-def _trial(
-    curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size
-) -> tuple[Front, np.ndarray, np.ndarray]:
-    front = _generate.outline_nodes(curves, stops, fixed, size, 1.0)
-    _generate.fill(front, size)
-    points = front.points()
-    return front, points, triangulate(front, points)
+    wanted = total(value) / (1.0 + miss)
+    if total(1e3 * value) > 1.1 * wanted:
+        least = round(num_points * total(1e3 * value) / wanted)
+        raise ValueError(
+            f"num_points: the outline and refinement alone need about {least} nodes, more than the {num_points} asked. "
+            "Ask for more nodes, less refinement (larger cell_size, smaller factor) or faster growth."
+        )
+    low, high = np.log(value / 1e3), np.log(value * 1e3)
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if total(float(np.exp(middle))) > wanted else (low, middle)
+    return float(np.exp(0.5 * (low + high)))

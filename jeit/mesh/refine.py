@@ -92,24 +92,31 @@ class SizeField:
                     )
                 self._terms.append((_distance_from(curves, term.points), term))
         self._held = _close_nodes(held, spacing)
+        self._least_room = float(spacing.min()) if len(spacing) else np.inf
 
     @property
     def is_own(self) -> bool:
         """Whether the user gave the sizes as a function."""
         return self._own is not None
 
-    def at(self, points: np.ndarray, background: float) -> np.ndarray:
-        """Edge length (p,) at points (p, 2) where cells of `background` metres are wanted away from refinement."""
-        size = np.full(len(points), background)
-        for apart, term in self._terms:
-            smallest = background / term.factor if term.cell_size is None and term.factor else term.cell_size
-            size = np.minimum(size, smallest + term.growth * np.maximum(apart(points) - term.distance, 0.0))
-        return np.minimum(size, self._held(points))
+    def at(self, points: np.ndarray) -> Callable[[float], np.ndarray]:
+        """Edge length (p,) at points (p, 2) as a function of the background: of the cell size in metres wanted away
+        from refinement, or, where the user gave a function, of the factor it is multiplied by."""
+        held = self._held(points) if self._own is not None else None
+        if self._own is not None:
+            own = self._own(points)
+            return lambda factor: np.minimum(factor * own, held)
+        apart = [np.maximum(distance(points) - term.distance, 0.0) for distance, term in self._terms]
 
-    def scaled(self, points: np.ndarray, scale: float) -> np.ndarray:
-        """Edge length (p,) for a user's own function times `scale`."""
-        assert self._own is not None
-        return np.minimum(scale * self._own(points), self._held(points))
+        def size(background: float) -> np.ndarray:
+            result = np.full(len(points), background)
+            for beyond, (_, term) in zip(apart, self._terms, strict=True):
+                smallest = background / term.factor if term.cell_size is None and term.factor else term.cell_size
+                result = np.minimum(result, smallest + term.growth * beyond)
+            # Nodes with room enough for the background cells need no thought.
+            return result if background <= self._least_room else np.minimum(result, self._held(points))
+
+        return size
 
 
 def _distance_from(curves: list[Curve], points: np.ndarray | None) -> Callable[[np.ndarray], np.ndarray]:
@@ -124,7 +131,7 @@ def _close_nodes(held: np.ndarray, spacing: np.ndarray) -> Size:
     if not len(held):
         return lambda points: np.full(len(points), np.inf)
     tree = cKDTree(held)
-    count = min(16, len(held))
+    count = min(8, len(held))
     if count > 1:
         # Let every node know of tighter ones farther off, so that the nearest few decide.
         for _ in range(4):
