@@ -114,22 +114,35 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
 def _project(position, mesh: Mesh):
     """Arc length of the boundary point nearest to each position, with its facet; and the distance to it.
 
-    Returns ((facet (L,), arc length (L,)), distance (L,)).
+    Returns ((facet (L,), arc length (L,)), distance (L,)). The foot point p(t) on an edge is where the offset is
+    perpendicular to the tangent interpolated between the edge's corners, τ(t) = (1-t)τ_0 + tτ_1, each the bisector of
+    the two edges that meet there. On the edge itself that is the ordinary projection; and unlike that one it has a
+    continuous derivative where an electrode slides over a corner.
     """
-    tail, head = mesh.points[mesh.facets[:, 0]], mesh.points[mesh.facets[:, 1]]
-    along = head - tail
-    offset = position[:, None, :] - tail  # (L, b, 2)
-    fraction = jnp.sum(offset * along, axis=-1) / jnp.sum(along**2, axis=-1)
-    clipped = jnp.clip(fraction, 0, 1)
-    squared = jnp.sum((offset - clipped[..., None] * along) ** 2, axis=-1)
-    facet = jnp.argmin(jax.lax.stop_gradient(squared), axis=1)
-    chosen = facet[:, None]
-    # Not clipped: at a corner either edge's tangent is a one-sided derivative, where clipping would give zero.
-    fraction = jnp.take_along_axis(fraction, chosen, 1)[:, 0]
-    distance = jnp.sqrt(jnp.take_along_axis(jax.lax.stop_gradient(squared), chosen, 1)[:, 0])
+    tail, head = mesh.facets[:, 0], mesh.facets[:, 1]
+    along = mesh.points[head] - mesh.points[tail]
     length = jnp.sqrt(jnp.sum(along**2, axis=-1))
-    _, arc_start, _ = _loops(mesh, length)
-    return (facet, arc_start[facet] + fraction * length[facet]), distance
+    unit = along / length[:, None]
+    bisector = jnp.zeros_like(mesh.points).at[tail].add(unit).at[head].add(unit)
+    offset = position[:, None, :] - mesh.points[tail]  # (L, b, 2)
+    clipped = jnp.clip(jnp.sum(offset * along, axis=-1) / length**2, 0, 1)
+    squared = jax.lax.stop_gradient(jnp.sum((offset - clipped[..., None] * along) ** 2, axis=-1))
+    facet = jnp.argmin(squared, axis=1)
+    offset = jnp.take_along_axis(offset, facet[:, None, None], 1)[:, 0]
+    along, length = along[facet], length[facet]
+    first, second = _normalised(bisector[tail[facet]]), _normalised(bisector[head[facet]])
+    # (offset - t along)·τ(t) = 0 is constant + linear t + quadratic t² = 0; the root that is regular as quadratic → 0.
+    constant = jnp.sum(offset * first, axis=-1)
+    linear = jnp.sum(offset * (second - first) - along * first, axis=-1)
+    quadratic = -jnp.sum(along * (second - first), axis=-1)
+    fraction = 2 * constant / (jnp.sqrt(jnp.maximum(linear**2 - 4 * quadratic * constant, 0)) - linear)
+    distance = jnp.sqrt(jnp.min(squared, axis=1))
+    _, arc_start, _ = _loops(mesh, facet_measures(mesh))
+    return (facet, arc_start[facet] + fraction * length), distance
+
+
+def _normalised(vectors):
+    return vectors / jnp.sqrt(jnp.sum(vectors**2, axis=-1, keepdims=True))
 
 
 def _loops(mesh: Mesh, length):

@@ -2,10 +2,12 @@
 
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+import numpy as np
+from jaxtyping import Array, Float, Int
 
-from jeit.electrodes.electrodes import AbstractElectrodes, Contact
+from jeit.electrodes.electrodes import AbstractElectrodes, Contact, as_electrode_values
 from jeit.mesh import Mesh
 
 
@@ -35,6 +37,11 @@ class CombinedElectrodes(AbstractElectrodes):
         """Number of electrodes L of all parts together."""
         return sum(part.num_electrodes for part in self.parts)
 
+    @property
+    def contact_impedance(self) -> Float[Array, " L"]:
+        """Contact impedances (L,) of all parts, ohm·m² (ohm·m for arcs)."""
+        return jnp.concatenate([part.contact_impedance for part in self.parts])
+
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The facets and cells of all parts."""
         return tuple(nodes for part in self.parts for nodes in part.contact_nodes(mesh))
@@ -52,3 +59,15 @@ class CombinedElectrodes(AbstractElectrodes):
         """Check every part on its own."""
         for part in self.parts:
             part.check(mesh)
+
+
+def with_contact_impedance(electrodes: AbstractElectrodes, contact_impedance) -> AbstractElectrodes:
+    """The same electrodes with other contact impedances: one number or (L,). Raises `ValueError` for points."""
+    if electrodes.is_point:
+        raise ValueError(f"{type(electrodes).__name__} have no contact impedance.")
+    values = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
+    if isinstance(electrodes, CombinedElectrodes):
+        ends = np.cumsum([part.num_electrodes for part in electrodes.parts])[:-1]
+        pieces = jnp.split(values, ends)
+        return CombinedElectrodes(*map(with_contact_impedance, electrodes.parts, pieces))
+    return eqx.tree_at(lambda each: each.contact_impedance, electrodes, values)
