@@ -1,6 +1,11 @@
-"""Meshes: points, cells, boundary facets and tags; shapes to mesh; outlines; files."""
+"""The mesh room: outlines, meshes of them, their geometry, their quality, and files.
+
+Outlines without a mesh: `Disk`, `Rectangle`, `Polygon`. Plane meshes: `disk`, `rectangle`, `polygon`, made finer
+where a `Refine` asks. Solids: `layer`, `box`, `cylinder`. From elsewhere: `Mesh.create`, `read`, `from_gmsh`.
+"""
 
 from jeit.mesh.domain import Disk, Domain, Polygon, Rectangle
+from jeit.mesh.files import read, write
 from jeit.mesh.geometry import (
     boundary_arc_length,
     centroids,
@@ -9,26 +14,37 @@ from jeit.mesh.geometry import (
     gradients,
     measures,
 )
+from jeit.mesh.gmsh import from_gmsh
 from jeit.mesh.interior import interior_facets
 from jeit.mesh.mesh import Mesh
+from jeit.mesh.quality import Quality, quality
 from jeit.mesh.refine import Refine
 from jeit.mesh.shapes import disk, polygon, rectangle
+from jeit.mesh.solids import box, cylinder, layer
 
 __all__ = [
     "Disk",
     "Domain",
     "Mesh",
     "Polygon",
+    "Quality",
     "Rectangle",
     "Refine",
     "boundary_arc_length",
+    "box",
     "centroids",
+    "cylinder",
     "disk",
     "facet_centroids",
     "facet_measures",
+    "from_gmsh",
     "gradients",
     "interior_facets",
+    "layer",
     "measures",
     "polygon",
+    "quality",
+    "read",
     "rectangle",
+    "write",
 ]
