@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -131,13 +132,13 @@ def _from_text(path: Path, layout: DataLayout) -> np.ndarray:
 
 def _from_numpy(path: Path, described: Description) -> tuple[np.ndarray, np.ndarray | None, Protocol | None]:
     try:
-        content = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
+        with path.open("rb") as file:
+            content = np.load(file, allow_pickle=False)
+            if isinstance(content, np.ndarray):
+                return content, None, None
+            arrays = {name: content[name] for name in content.files}
+    except (ValueError, EOFError, OSError, BadZipFile) as error:
         raise ValueError(f"{path.name} is not a readable NumPy file of plain arrays ({error}).") from None
-    if isinstance(content, np.ndarray):
-        return content, None, None
-    with content:
-        arrays = {name: content[name] for name in content.files}
     keys = described.layout.keys or ("voltages",)
     missing = [key for key in keys if key not in arrays]
     if missing:

@@ -11,7 +11,8 @@ import numpy as np
 
 from jeit.protocol._check import check_count, check_current, check_pairs, electrode_indices
 from jeit.protocol.matrices import from_matrices
-from jeit.protocol.protocol import Protocol
+from jeit.protocol.protocol import Protocol, shares_electrode
+from jeit.protocol.reciprocity import reciprocal_channel_pairs
 
 Order = Literal["rotating", "fixed"]
 
@@ -331,19 +332,13 @@ def _finish(
     if order == "rotating":
         # Drive i begins with measurement pair i: pairs are in ring order, one per electrode.
         measurement_index = (measurement_index + drive_index) % num_rows
-    # Channels are chosen at unit current, so that the current itself may be traced.
-    protocol = Protocol(
-        drive=pair_patterns(drive_pairs, count),
-        measurement=pair_patterns(measurement_pairs, count),
-        drive_index=drive_index,
-        measurement_index=measurement_index,
-        name=name,
-    )
-    keep = np.ones(protocol.num_measurements, dtype=bool)
+    # Channels are chosen with NumPy at unit current, so that the current itself may be traced.
+    drive, measurement = pair_patterns(drive_pairs, count), pair_patterns(measurement_pairs, count)
+    keep = np.ones(len(drive_index), dtype=bool)
     if not driven_electrodes:
-        keep &= ~protocol.channels_on_driven_electrodes()
+        keep &= ~shares_electrode(drive, measurement)[drive_index, measurement_index]
     if reciprocal == "half":
-        pairs, _ = protocol.reciprocal_pairs()
+        pairs, _ = reciprocal_channel_pairs(drive, measurement, drive_index, measurement_index)
         keep[pairs[:, 1]] = False
     if not keep.any():
         raise ValueError(
@@ -351,8 +346,8 @@ def _finish(
             "driven_electrodes=True, or measure other pairs."
         )
     return Protocol(
-        drive=current * protocol.drive,
-        measurement=protocol.measurement,
+        drive=current * drive,
+        measurement=measurement,
         drive_index=drive_index[keep],
         measurement_index=measurement_index[keep],
         name=name,

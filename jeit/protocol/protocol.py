@@ -114,9 +114,7 @@ class Protocol(eqx.Module):
 
         Such a channel sees the contact impedance's voltage drop as well as the body.
         """
-        driven = np.asarray(self.drive) != 0
-        measured = np.asarray(self.measurement) != 0
-        shared = driven.astype(int) @ measured.T.astype(int) > 0
+        shared = shares_electrode(np.asarray(self.drive), np.asarray(self.measurement))
         return shared[np.asarray(self.drive_index), np.asarray(self.measurement_index)]
 
     def subset(self, keep) -> "Protocol":
@@ -174,3 +172,8 @@ class Protocol(eqx.Module):
             and bool(np.allclose(self.channel_drive, other.channel_drive, rtol=1e-9, atol=0))
             and bool(np.allclose(self.channel_measurement, other.channel_measurement, rtol=1e-9, atol=0))
         )
+
+
+def shares_electrode(drive: Float[np.ndarray, "S L"], measurement: Float[np.ndarray, "K L"]) -> Bool[np.ndarray, "S K"]:
+    """(S, K) True where a measurement pattern reads an electrode that the drive pattern drives."""
+    return (drive != 0).astype(int) @ (measurement != 0).T.astype(int) > 0

@@ -104,7 +104,7 @@ def test_from_channels_stores_equal_rows_once_in_order():
     assert again.measurement_index[0] == 0
 
 
-@given(st.integers(4, 24), st.integers(0, 22), st.booleans())
+@given(st.integers(5, 24), st.integers(0, 22), st.booleans())
 @settings(max_examples=25, deadline=None)
 def test_skip_any(count, skipped, driven):
     skipped = skipped % (count - 1)

@@ -1,0 +1,194 @@
+"""Bad files and descriptions: each is refused with one line that says what is wrong and what to do."""
+
+import numpy as np
+import pytest
+import scipy.io
+
+from jeit import data, protocol
+
+GOOD = """
+[geometry]
+shape = "disk"
+radius = 0.1
+[electrodes]
+layout = "ring"
+number = 8
+width = 0.005
+contact_impedance = 0.01
+[protocol]
+kind = "adjacent"
+current = 1e-3
+[data]
+delimiter = ","
+"""
+FRAME = ",".join(str(k + 1.0) for k in range(40))
+
+
+def table(text=FRAME, description=GOOD, name="a.csv"):
+    def write(folder):
+        (folder / name).write_text(text, "utf-8")
+        if description is not None:
+            (folder / "a.toml").write_text(description, "utf-8")
+        return folder / name
+
+    return write
+
+
+def changed(old, new):
+    assert old in GOOD
+    return table(description=GOOD.replace(old, new))
+
+
+def matlab(**content):
+    def write(folder):
+        scipy.io.savemat(folder / "a.mat", content)
+        return folder / "a.mat"
+
+    return write
+
+
+def raw(name, content):
+    def write(folder):
+        (folder / name).write_bytes(content)
+        return folder / name
+
+    return write
+
+
+def numpy_file(**content):
+    def write(folder):
+        np.savez(folder / "a.npz", **content)
+        (folder / "a.toml").write_text(GOOD, "utf-8")
+        return folder / "a.npz"
+
+    return write
+
+
+KIT4 = {"Uel": np.ones((16, 79)), "CurrentPattern": np.ones((16, 79)), "MeasPattern": np.eye(16)}
+PATTERN = {"stim": [[1e-3], [-1e-3]], "meas": [[1.0, -1]], "meas_stim": [[1]], "vh": [[1.0]]}
+
+BAD_FILES = {
+    "no such file": (lambda folder: folder / "absent.csv", "no file"),
+    "a folder": (lambda folder: folder, "a folder"),
+    "empty": (raw("a.csv", b""), "is empty"),
+    "unknown suffix": (raw("a.docx", b"1,2"), "no known format"),
+    "no description": (table(description=None), "nothing says what they mean"),
+    "not TOML": (table(description="[geometry"), "not valid TOML"),
+    "unknown section": (table(description=GOOD + "[tank]\n"), "no 'tank'"),
+    "unknown key": (changed("radius =", "diameter ="), "no 'diameter'"),
+    "no shape": (changed('shape = "disk"', ""), "needs 'shape'"),
+    "unknown shape": (changed('"disk"', '"sphere"'), "must be one of disk"),
+    "negative radius": (changed("radius = 0.1", "radius = -0.1"), "radius"),
+    "ring without geometry": (
+        table(description=GOOD.replace('[geometry]\nshape = "disk"\nradius = 0.1', "")),
+        r"needs \[geometry\]",
+    ),
+    "unknown layout": (changed('"ring"', '"spiral"'), "ring, perimeter"),
+    "no width": (changed("width = 0.005", ""), "needs 'width'"),
+    "negative width": (changed("width = 0.005", "width = -1"), "width must be positive"),
+    "unknown protocol": (changed('"adjacent"', '"nextdoor"'), "adjacent, skip, opposite"),
+    "option of another protocol": (changed("current = 1e-3", 'current = 1e-3\ndrives = "all"'), "no 'drives'"),
+    "no current": (changed("current = 1e-3", ""), "needs 'current'"),
+    "milliamperes": (changed("current = 1e-3", "current = 5"), "5 mA"),
+    "unknown current unit": (changed("current = 1e-3", 'current = 1\ncurrent_unit = "kA"'), "current_unit"),
+    "no protocol": (
+        table(description=GOOD.replace('[protocol]\nkind = "adjacent"\ncurrent = 1e-3', "")),
+        r"add a \[protocol\]",
+    ),
+    "zero gain": (changed('delimiter = ","', "gain = 0"), "gain"),
+    "unknown unit": (changed('delimiter = ","', 'unit = "dB"'), "unit must be one of V"),
+    "unknown component": (changed('delimiter = ","', 'component = "phase"'), "component"),
+    "unknown polarity": (changed('delimiter = ","', 'polarity = "-"'), "polarity"),
+    "frame names do not fit": (changed('delimiter = ","', 'frame_names = ["a", "b"]'), "names 2 frames"),
+    "header not skipped": (table("first,second\n" + FRAME), "line 1"),
+    "ragged": (table(FRAME + "\n1,2,3"), "line 2 has 3 numbers"),
+    "only comments": (table("# nothing\n"), "no numbers"),
+    "binary": (lambda folder: table()(folder) and raw("a.csv", b"\xff\xfe\x00PK")(folder), "not a text file"),
+    "odd complex columns": (changed('delimiter = ","', "complex_pairs = true"), "even number"),
+    "wrong number of channels": (table("1,2,3,4"), "40 channels"),
+    "transposed": (table("\n".join(FRAME.split(","))), "transposed"),
+    "all zero": (table(",".join(["0"] * 40)), "every usable voltage is zero"),
+    "all missing": (table(",".join(["nan"] * 40)), "every usable voltage is zero or missing"),
+    "no voltages in npz": (numpy_file(u=np.ones(40)), "no array 'voltages'"),
+    "pickled npz": (numpy_file(voltages=np.array([{}] * 40, dtype=object)), "allow_pickle"),
+    "damaged npz": (lambda folder: table()(folder) and raw("a.npz", b"PK\x03\x04xx")(folder), "not a readable NumPy"),
+    "damaged mat": (raw("a.mat", b"MATLAB 5.0" + b"\0" * 200), "not a readable .mat"),
+    "mat of another kind": (matlab(x=1.0), "no known kind; it holds x"),
+    "kit4 of another shape": (matlab(**{**KIT4, "Uel": np.ones((16, 78))}), "Uel"),
+    "kit4 patterns unbalanced": (matlab(**KIT4), "sums to"),
+    "kit4 text": (matlab(**{**KIT4, "Uel": "none"}), "not numbers"),
+    "ktc of another shape": (matlab(Uel=np.ones(5), Inj=np.eye(4), Mpat=np.eye(4)), "5 voltages"),
+    "eidors without voltages": (matlab(**{**PATTERN, "vh": []}), "not numbers"),
+    "eidors unnamed voltages": (matlab(stim=1.0, meas=1.0, meas_stim=1.0), "none of v_h"),
+    "eidors lengths differ": (matlab(**PATTERN, vi=[[1.0, 2]]), "differ in length"),
+    "eidors drive beyond the last": (matlab(**{**PATTERN, "meas_stim": [[2]]}), "1 drive patterns"),
+    "eidors fractional drive": (matlab(**{**PATTERN, "meas_stim": [[1.5]]}), "whole numbers"),
+    "eidors other length": (matlab(**{**PATTERN, "vh": [[1.0], [2.0]]}), "1 channels"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_files_are_refused_with_a_lesson(name, tmp_path):
+    write, lesson = BAD_FILES[name]
+    with pytest.raises(ValueError, match=lesson) as error:
+        data.read(write(tmp_path))
+    assert "\n" not in str(error.value)
+
+
+def test_the_file_that_the_bad_ones_were_made_from_is_good(tmp_path):
+    assert data.read(table()(tmp_path)).num_channels == 40
+
+
+@pytest.mark.parametrize(
+    ("options", "lesson"),
+    [
+        ({"format": "xlsx"}, "kit4, ktc2023, eidors, table, tank6cm"),
+        ({"format": "kit4"}, "not a readable .mat"),
+        ({"format": "tank6cm", "description": "other.toml"}, "describes itself"),
+        ({"description": "absent.toml"}, "no such file"),
+    ],
+)
+def test_bad_options(options, lesson, tmp_path):
+    with pytest.raises(ValueError, match=lesson):
+        data.read(table()(tmp_path), **options)
+
+
+ADJACENT = protocol.adjacent(8)
+ONES = np.linspace(1, 2, 40)
+BAD_CALLS = {
+    "text": (lambda: data.screen(["a"] * 40, ADJACENT), "must be numbers"),
+    "channels": (lambda: data.screen(ONES[:39], ADJACENT), "40 channels"),
+    "mask of numbers": (lambda: data.screen(ONES, ADJACENT, mask=np.ones(40)), "booleans"),
+    "nothing left": (lambda: data.screen(ONES, ADJACENT, mask=np.zeros(40, bool)), "zero or missing"),
+    "limit": (lambda: data.screen(ONES, ADJACENT, saturation=-1.0), "positive voltage"),
+    "everything saturated": (lambda: data.screen(ONES, ADJACENT, saturation=0.5), "no usable voltage"),
+    "names": (lambda: data.screen(ONES, ADJACENT, frame_names=("a", "b")), "give one each"),
+    "integers": (lambda: data.Measurement(np.ones(40, int), np.ones(40, bool), ADJACENT), "real or complex"),
+    "mask shape": (lambda: data.Measurement(ONES, np.ones(39, bool), ADJACENT), "mask has shape"),
+    "frame": (lambda: data.screen(ONES, ADJACENT).frame(1), "no frame 1"),
+    "frame name": (lambda: data.screen(ONES, ADJACENT).frame("press"), "no frame named 'press'"),
+    "reference": (lambda: data.screen(ONES, ADJACENT).split_reference(), "no reference frame"),
+    "usable": (lambda: data.screen(ONES, ADJACENT).masked(np.ones(40), "x"), "booleans"),
+    "electrode": (lambda: data.screen(ONES, ADJACENT).without_electrodes(8), "0 to 7"),
+    "written as text": (lambda: data.write_table(data.screen(ONES, ADJACENT), "a.csv"), "must end in .npz"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_CALLS)
+def test_bad_calls_are_refused_with_a_lesson(name):
+    call, lesson = BAD_CALLS[name]
+    with pytest.raises(ValueError, match=lesson):
+        call()
+
+
+def test_electrodes_and_protocol_must_agree(setup):
+    with pytest.raises(ValueError, match="16 electrodes were placed"):
+        data.screen(ONES, ADJACENT, **setup(16))
+
+
+def test_what_cannot_be_described_is_not_written(tmp_path):
+    from jeit.electrodes import NodeElectrodes
+
+    measurement = data.screen(ONES, ADJACENT, electrodes=NodeElectrodes(np.arange(8)))
+    with pytest.raises(ValueError, match="NodeElectrodes"):
+        data.write_table(measurement, tmp_path / "a.npz")

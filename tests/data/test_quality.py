@@ -1,0 +1,170 @@
+"""Screening and judging: what is masked, what noise is found, which frames are refused."""
+
+import jax
+import numpy as np
+import pytest
+
+from jeit import data, protocol
+
+
+def test_missing_saturated_and_dead_channels_are_masked_and_noted(tank, setup):
+    chosen = protocol.adjacent(16)
+    voltages = tank(chosen) * (1 + 1e-3 * np.random.default_rng(0).normal(size=208))
+    voltages[[3, 50]] = np.nan, np.inf
+    stuck = np.arange(60, 68)
+    voltages[stuck] = 2 * np.abs(voltages[np.isfinite(voltages)]).max()
+    dead = np.asarray(chosen.drive_index) == 12
+    voltages[dead] *= 1e-6
+    measurement = data.screen(voltages, chosen, **setup(16))
+    mask = np.asarray(measurement.mask)[0]
+    np.testing.assert_array_equal(np.flatnonzero(~mask), np.sort([3, 50, *stuck, *np.flatnonzero(dead)]))
+    for expected in ("2 of 208 voltages masked: NaN", "8 of 208 voltages masked: saturated", "current did not flow"):
+        assert any(expected in note for note in measurement.notes)
+    # Masked channels have no say in the sums.
+    assert data.reciprocity_error(measurement) < 5e-3
+    np.testing.assert_array_equal(measurement.filled()[0, ~mask], 0)
+
+
+def test_a_given_limit_masks_what_reaches_it(tank):
+    chosen = protocol.adjacent(16)
+    voltages = tank(chosen)
+    limit = 0.3 * np.abs(voltages).max()
+    measurement = data.screen(np.clip(voltages, -limit, limit), chosen, saturation=limit)
+    np.testing.assert_array_equal(np.asarray(measurement.mask)[0], np.abs(voltages) < limit)
+
+
+def test_symmetric_simulated_data_are_not_taken_for_saturated(tank):
+    # On a homogeneous disk 32 of 208 voltages share the largest magnitude, but so does every other level.
+    voltages = np.round(tank(protocol.adjacent(16)), 12)
+    assert np.asarray(data.screen(voltages, protocol.adjacent(16)).mask).all()
+
+
+def test_an_all_zero_frame_among_others_is_masked(tank):
+    chosen = protocol.adjacent(8)
+    measurement = data.screen(np.stack([tank(chosen), np.zeros(40)]), chosen)
+    assert np.asarray(measurement.mask).all(axis=1).tolist() == [True, False]
+
+
+@pytest.mark.parametrize("chosen", [protocol.adjacent(16), protocol.skip(16, 2, measurement_skipped=0)])
+def test_noise_is_found_from_reciprocity(tank, chosen):
+    if chosen.name.startswith("skip"):  # spanned by neighbours only with the driven electrodes
+        chosen = protocol.skip(16, 2, measurement_skipped=0, driven_electrodes=True)
+    clean, deviation = tank(chosen), 1e-5
+    noisy = clean + deviation * np.random.default_rng(3).normal(size=clean.shape)
+    estimate = data.estimate_noise(data.screen(noisy, chosen))
+    assert estimate is not None
+    assert estimate.method == "reciprocity"
+    # The median of about 100 values scatters by 10 %.
+    assert estimate.standard_deviation == pytest.approx(deviation, rel=0.3)
+    assert estimate.relative == pytest.approx(deviation / np.sqrt(np.mean(clean**2)), rel=0.3)
+    assert data.reciprocity_error(data.screen(clean, chosen)) < 1e-12
+
+
+def test_noise_is_found_from_repeated_frames(tank):
+    chosen = protocol.opposite(16)
+    noisy = tank(chosen) + 1e-5 * np.random.default_rng(4).normal(size=(20, 96))
+    estimate = data.estimate_noise(data.screen(noisy, chosen))
+    assert estimate is not None
+    assert estimate.method == "repeated frames"
+    assert estimate.standard_deviation == pytest.approx(1e-5, rel=0.1)
+    assert data.estimate_noise(data.screen(noisy[:2], chosen)) is None
+
+
+def test_channel_reciprocity_error_finds_the_channel(tank):
+    chosen = protocol.adjacent(16)
+    voltages = tank(chosen)
+    voltages[17] *= 1.5
+    error = data.channel_reciprocity_error(data.screen(voltages, chosen))[0]
+    assert np.argmax(np.abs(error)) in (17, *(p for pair in chosen.reciprocal_pairs()[0] if 17 in pair for p in pair))
+    assert np.sum(np.abs(error) > 1e-10) == 2
+    assert np.isnan(data.channel_reciprocity_error(data.screen(tank(protocol.opposite(8)), protocol.opposite(8)))).all()
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        protocol.adjacent(16, driven_electrodes=True),
+        protocol.opposite(16),
+        protocol.skip(15, 3, measurement_skipped=1),
+        protocol.all_against_one(12),
+        protocol.two_terminal(7),
+    ],
+)
+@pytest.mark.parametrize("clockwise", [True, False])
+def test_expected_signs(tank, chosen, clockwise):
+    count = chosen.num_electrodes
+    order = np.roll(np.arange(count)[:: 1 if clockwise else -1], 3)
+    signs = data.expected_signs(chosen, order)
+    assert np.count_nonzero(signs) > 0.3 * len(signs)
+    known = signs != 0
+    np.testing.assert_array_equal(signs[known], np.sign(tank(chosen))[known])
+
+
+def test_signs_of_noise_are_wrong_half_the_time(tank, setup):
+    chosen = protocol.adjacent(16)
+    assert data.impossible_signs(data.screen(tank(chosen), chosen, **setup(16))) == 0
+    noise = np.random.default_rng(5).normal(size=208)
+    fraction = data.impossible_signs(data.screen(noise, chosen, **setup(16)))
+    assert fraction is not None
+    assert fraction[0] == pytest.approx(0.5, abs=0.15)  # four standard deviations of a binomial
+    assert data.impossible_signs(data.screen(noise, chosen)) is None
+
+
+def test_noise_in_the_difference_is_refused(tank, setup):
+    chosen = protocol.adjacent(16)
+    clean, other = tank(chosen), tank(chosen, change=0.02)
+    size = np.sqrt(np.mean((other - clean) ** 2))
+    rng = np.random.default_rng(6)
+    reference = data.screen(clean, chosen, **setup(16))
+    little = data.screen(other + 0.1 * size * rng.normal(size=208), chosen, **setup(16))
+    (quality,) = data.check_imageable(little, reference)
+    # Independent noise of relative size 0.1 breaks reciprocity by about √2 times as much.
+    assert quality.difference_reciprocity_error == pytest.approx(0.14, rel=0.2)
+    much = data.screen(other + 1.0 * size * rng.normal(size=208), chosen, **setup(16))
+    with pytest.raises(ValueError, match="breaks reciprocity"):
+        data.check_imageable(much, reference)
+    assert [q.imageable for q in data.assess(much, reference)] == [False]
+
+
+def test_too_few_channels_are_refused(tank, setup):
+    chosen = protocol.adjacent(16)
+    reference = data.screen(tank(chosen), chosen, **setup(16))
+    with pytest.raises(ValueError, match="only 9 channels"):
+        data.check_imageable(data.screen(1.1 * tank(chosen), chosen, mask=np.arange(208) < 9), reference)
+
+
+def test_reversed_polarity_is_named(tank, setup):
+    chosen = protocol.adjacent(16)
+    reference = data.screen(-tank(chosen), chosen, **setup(16))
+    with pytest.raises(ValueError, match="reverse the polarity"):
+        data.check_imageable(data.screen(-1.1 * tank(chosen), chosen, **setup(16)), reference)
+
+
+def test_different_units_are_named(tank):
+    chosen = protocol.adjacent(16)
+    with pytest.raises(ValueError, match="millivolts"):
+        data.check_imageable(data.screen(1e3 * tank(chosen), chosen), data.screen(tank(chosen), chosen))
+
+
+def test_frames_masks_and_mean(tank, setup):
+    chosen = protocol.adjacent(8)
+    voltages = np.stack([tank(chosen), 3 * tank(chosen)])
+    voltages[0, 5] = np.nan
+    measurement = data.screen(voltages, chosen, frame_names=("reference", "press"), **setup(8))
+    assert measurement.frame("press").num_frames == 1
+    np.testing.assert_array_equal(measurement.frame(-1).voltages, measurement.frame("press").voltages)
+    mean = measurement.mean_frame()
+    assert float(mean.voltages[0, 4]) == pytest.approx(2 * tank(chosen)[4])
+    assert float(mean.voltages[0, 5]) == pytest.approx(3 * tank(chosen)[5])
+    fewer = measurement.without_electrodes(2)
+    assert fewer.notes[-1].endswith("electrodes 3 left out.")
+    np.testing.assert_array_equal(fewer.mask[1], chosen.mask_without(2))
+    driven = data.screen(tank(protocol.two_terminal(5)), protocol.two_terminal(5)).without_driven_channels()
+    assert not np.asarray(driven.mask).any()
+
+
+def test_a_measurement_is_a_pytree(tank, setup):
+    chosen = protocol.adjacent(8)
+    measurement = data.screen(tank(chosen), chosen, **setup(8))
+    doubled = jax.jit(lambda m: 2 * m.filled())(measurement)
+    np.testing.assert_allclose(doubled, 2 * measurement.voltages)
