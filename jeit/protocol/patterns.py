@@ -4,10 +4,11 @@ All count electrodes from 0, drive `+current` into the first electrode of a pair
 second, and measure the first minus the second.
 """
 
-from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jeit.protocol._check import check_count, check_current, check_pairs, electrode_indices
 from jeit.protocol.matrices import from_matrices
@@ -15,12 +16,14 @@ from jeit.protocol.protocol import Protocol, shares_electrode
 from jeit.protocol.reciprocity import reciprocal_channel_pairs
 
 Order = Literal["rotating", "fixed"]
+# Amperes; an array, possibly traced, when something is differentiated with respect to it.
+Current = float | Float[Array, ""]
 
 
 def adjacent(
     num_electrodes: int,
     *,
-    current: float = 1e-3,
+    current: Current = 1e-3,
     driven_electrodes: bool = False,
     reciprocal: Literal["all", "half"] = "all",
     order: Order = "rotating",
@@ -53,7 +56,7 @@ def skip(
     skipped: int,
     *,
     measurement_skipped: int | None = None,
-    current: float = 1e-3,
+    current: Current = 1e-3,
     driven_electrodes: bool = False,
     reciprocal: Literal["all", "half"] = "all",
     order: Order = "rotating",
@@ -92,7 +95,7 @@ def opposite(
     num_electrodes: int,
     *,
     drives: Literal["distinct", "all"] = "distinct",
-    current: float = 1e-3,
+    current: Current = 1e-3,
     driven_electrodes: bool = False,
     order: Order = "rotating",
 ) -> Protocol:
@@ -129,7 +132,7 @@ def all_against_one(
     *,
     common: int = 0,
     measurement: Literal["common", "adjacent"] = "common",
-    current: float = 1e-3,
+    current: Current = 1e-3,
     driven_electrodes: bool | None = None,
     reciprocal: Literal["all", "half"] = "all",
 ) -> Protocol:
@@ -167,7 +170,7 @@ def reference_electrode(
     *,
     skipped: int = 0,
     reference: int | None = None,
-    current: float = 1e-3,
+    current: Current = 1e-3,
     driven_electrodes: bool = False,
     order: Order = "rotating",
 ) -> Protocol:
@@ -205,9 +208,9 @@ def reference_electrode(
 
 def two_terminal(
     num_electrodes: int,
-    pairs: Sequence[tuple[int, int]] | np.ndarray | None = None,
+    pairs: ArrayLike | None = None,
     *,
-    current: float = 1e-3,
+    current: Current = 1e-3,
 ) -> Protocol:
     """Current and voltage on the same two electrodes, pair by pair.
 
@@ -236,7 +239,7 @@ def trigonometric(
     num_electrodes: int,
     *,
     measurement: Literal["adjacent", "mean"] = "adjacent",
-    current: float = 1e-3,
+    current: Current = 1e-3,
 ) -> Protocol:
     """Sinusoidal currents in all electrodes at once: L - 1 drives, L(L - 1) channels.
 
@@ -264,10 +267,10 @@ def trigonometric(
 
 def bipolar(
     num_electrodes: int,
-    drive_pairs: Sequence[tuple[int, int]] | np.ndarray,
-    measurement_pairs: Sequence[tuple[int, int]] | np.ndarray,
+    drive_pairs: ArrayLike,
+    measurement_pairs: ArrayLike,
     *,
-    current: float = 1e-3,
+    current: Current = 1e-3,
     driven_electrodes: bool = False,
     reciprocal: Literal["all", "half"] = "all",
     name: str = "bipolar",
@@ -317,7 +320,7 @@ def _finish(
     *,
     name: str,
     where: str,
-    current: float,
+    current: Current,
     driven_electrodes: bool,
     reciprocal: str,
     order: str,
