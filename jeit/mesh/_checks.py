@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jeit.mesh import _topology
 
@@ -17,6 +17,8 @@ from jeit.mesh import _topology
 _FLAT = 1e-10
 # Nodes closer than this, relative to the extent, count as one node given twice.
 _COINCIDING = 1e-10
+# Three node numbers of a facet are packed into one 64-bit integer.
+_MOST_POINTS = 2_000_000
 # No tank or skin is larger; coordinates beyond it are nearly always millimetres.
 _LARGE = 10.0
 
@@ -62,10 +64,10 @@ def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray
             f"cells: points in {dimension}-D need {kind} of shape (m, {dimension + 1}) with m > 0, got {array.shape}."
         )
     if not np.issubdtype(array.dtype, np.integer):
-        raise ValueError(
-            f"cells: node indices must be integers, got {array.dtype}. Convert with .astype(int)."
-        )
+        raise ValueError(f"cells: node indices must be integers, got {array.dtype}. Convert with .astype(int).")
     array = array.astype(np.int64)
+    if num_points > _MOST_POINTS:
+        raise ValueError(f"points: {num_points} nodes are more than the {_MOST_POINTS} that jeit can index.")
     low, high = int(array.min()), int(array.max())
     if low < 0 or high >= num_points:
         hint = " They look one-based: subtract 1." if low >= 1 and high == num_points else ""
@@ -99,7 +101,7 @@ def check_coinciding(points: np.ndarray) -> None:
     """Raise `ValueError` if two nodes lie at the same place."""
     if len(points) < 2:
         return
-    distance, neighbour = cKDTree(points).query(points, k=2)
+    distance, neighbour = map(np.asarray, KDTree(points).query(points, k=2))
     close = np.flatnonzero(distance[:, 1] <= _COINCIDING * np.ptp(points, axis=0).max())
     if close.size:
         first = int(close[0])
@@ -143,8 +145,8 @@ def check_connected(cells: np.ndarray) -> None:
     if parts > 1:
         sizes = np.bincount(label)
         raise ValueError(
-            f"cells: the mesh falls into {parts} separate parts of {np.sort(sizes)[::-1][:5].tolist()} cells. No current "
-            "flows between them: keep one part, or merge the nodes along their common boundary."
+            f"cells: the mesh falls into {parts} separate parts of {np.sort(sizes)[::-1][:5].tolist()} cells. "
+            "No current flows between them: keep one part, or merge the nodes along their common boundary."
         )
 
 
@@ -175,11 +177,15 @@ def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, 
 
 
 def _match(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarray:
-    where = {tuple(row): index for index, row in enumerate(np.sort(facets, axis=1).tolist())}
-    found = [where.get(tuple(row), -1) for row in np.sort(nodes, axis=1).tolist()]
-    if -1 in found:
+    count = int(max(facets.max(), nodes.max())) + 1
+    keys = _topology.facet_keys(facets, count)
+    order = np.argsort(keys)
+    wanted = _topology.facet_keys(nodes, count)
+    place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+    missing = np.flatnonzero((keys[order][place] != wanted) | (nodes.min(axis=1) < 0))
+    if missing.size:
         raise ValueError(
-            f"tags: {name!r} names the facet with nodes {nodes[found.index(-1)].tolist()}, which is not on the "
-            "boundary of the mesh. Tags group boundary facets only."
+            f"tags: {name!r} names the facet with nodes {nodes[missing[0]].tolist()}, which is not on the boundary "
+            "of the mesh. Tags group boundary facets only."
         )
-    return np.array(found)
+    return order[place]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import Delaunay, cKDTree
+from scipy.spatial import Delaunay, KDTree
 
 from jeit.mesh import _curve
 from jeit.mesh._curve import Curve
@@ -117,7 +117,7 @@ def smallest_angles(corners: np.ndarray) -> np.ndarray:
 def select_apart(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -> np.ndarray:
     """Indices of points taken greedily by falling `priority`, none within `radius` of one taken before."""
     order = np.argsort(-priority, kind="stable")
-    near = cKDTree(points[order]).query_ball_point(points[order], radius[order], return_sorted=False)
+    near = KDTree(points[order]).query_ball_point(points[order], radius[order], return_sorted=False)
     taken = np.zeros(len(points), bool)
     blocked = np.zeros(len(points), bool)
     for index, others in enumerate(near):
@@ -133,7 +133,7 @@ def clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: n
         return np.zeros(0, bool)
     segments = front.segments()
     start, end = nodes[segments[:, 0]], nodes[segments[:, 1]]
-    tree = cKDTree(0.5 * (start + end))
+    tree = KDTree(0.5 * (start + end))
     _, nearest = tree.query(points, k=min(3, len(segments)))
     apart = np.full(len(points), np.inf)
     for column in nearest.reshape(len(points), -1).T:

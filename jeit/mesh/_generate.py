@@ -34,9 +34,7 @@ _SMOOTHING_STEPS = 14
 _SHARP = np.radians(75.0)
 
 
-def outline_nodes(
-    curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, guard: float
-) -> Front:
+def outline_nodes(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, guard: float) -> Front:
     """Nodes on the outline, with the sharp corners cut off at `guard` times the cell size there."""
     all_stops, guards = [], []
     for curve, own in zip(curves, stops, strict=True):

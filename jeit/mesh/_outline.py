@@ -20,9 +20,7 @@ def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray
         raise ValueError(f"{name}: expected at least three vertices, shape (k, 2), got {loop.shape}.")
     if not np.isfinite(loop).all():
         bad = int(np.flatnonzero(~np.isfinite(loop).all(axis=1))[0])
-        raise ValueError(
-            f"{name}: vertex {bad} is {loop[bad].tolist()}. Every coordinate must be a finite number."
-        )
+        raise ValueError(f"{name}: vertex {bad} is {loop[bad].tolist()}. Every coordinate must be a finite number.")
     extent = np.ptp(loop, axis=0).max()
     length = np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1)
     if length.min() <= 1e-9 * extent:
@@ -71,9 +69,7 @@ def distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarr
 
 
 def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (
-        c[..., 0] - a[..., 0]
-    )
+    return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
 
 
 def _meeting(first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:

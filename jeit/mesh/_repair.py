@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jeit.mesh import _curve
 from jeit.mesh._delaunay import (
@@ -30,7 +30,7 @@ def improvable(front: Front, cells: np.ndarray) -> np.ndarray:
     """True for cells not cut off by a sharp corner of the outline, whose shape is given."""
     sharp = np.zeros(cells.max() + 1, bool)
     sharp[: front.num_outline] = front.guarded()
-    return ~sharp[cells].any(axis=1)
+    return np.logical_not(sharp[cells].any(axis=1))
 
 
 def missing_segments(front: Front, cells: np.ndarray, num_points: int) -> np.ndarray:
@@ -117,14 +117,14 @@ def _diametral(front: Front, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def _divisible(front: Front) -> np.ndarray:
     """True for outline segments that do not end in a sharp corner."""
-    return ~front.guarded()[front.segments()].any(axis=1)
+    return np.logical_not(front.guarded()[front.segments()].any(axis=1))
 
 
 def _recover(front: Front, points: np.ndarray, missing: np.ndarray, *, remove: bool) -> None:
     """Make missing segments appear: remove the free nodes close to them, or else halve them."""
     middle, half = _diametral(front, points)
     if remove and len(front.free):
-        near = cKDTree(front.free).query_ball_point(middle[missing], half[missing])
+        near = KDTree(front.free).query_ball_point(middle[missing], half[missing])
         doomed = np.unique(np.concatenate([np.asarray(n, dtype=int) for n in near]))
         if doomed.size:
             front.free = np.delete(front.free, doomed, axis=0)
@@ -140,7 +140,7 @@ def _refine(front: Front, points: np.ndarray, bad: np.ndarray, angle: np.ndarray
     middle, half = _diametral(front, points)
     divisible = _divisible(front)
     # A segment is encroached upon if the new node falls into the circle over it.
-    near = cKDTree(centre).query_ball_point(middle, half * (1 - 1e-9))
+    near = KDTree(centre).query_ball_point(middle, half * (1 - 1e-9))
     encroached = np.array([len(n) > 0 for n in near])
     spoilt = np.zeros(len(centre), bool)
     for index in np.flatnonzero(encroached):
@@ -148,7 +148,7 @@ def _refine(front: Front, points: np.ndarray, bad: np.ndarray, angle: np.ndarray
     outside = ~_curve.inside(front.curves, centre)
     lost = np.flatnonzero(outside & ~spoilt)
     if lost.size:
-        encroached[cKDTree(middle).query(centre[lost])[1]] = True
+        encroached[KDTree(middle).query(centre[lost])[1]] = True
     accepted = centre[~spoilt & ~outside]
     if len(accepted):
         accepted = accepted[clear_of_outline(front, points, accepted, np.zeros(len(accepted)))]

@@ -11,7 +11,6 @@ from itertools import pairwise
 
 import numpy as np
 
-
 # Height of a row per mean edge along it: between a square's 1 and an equilateral triangle's 0.87.
 _ROW = 0.93
 
@@ -30,15 +29,9 @@ def zip_chains(outer: np.ndarray, inner: np.ndarray, *, closed: bool) -> np.ndar
     facing_inner = np.searchsorted(inner_middle, outer_middle, side="left")
     facing_outer = np.searchsorted(outer_middle, inner_middle, side="right")
     step_outer, step_inner = np.arange(num_outer), np.arange(num_inner)
-    low = np.stack(
-        [outer[step_outer], outer[(step_outer + 1) % len(outer)], inner[facing_inner % len(inner)]], axis=1
-    )
-    high = np.stack(
-        [inner[(step_inner + 1) % len(inner)], inner[step_inner], outer[facing_outer % len(outer)]], axis=1
-    )
-    return np.concatenate([low, high])[
-        np.argsort(np.concatenate([outer_middle, inner_middle]), kind="stable")
-    ]
+    low = np.stack([outer[step_outer], outer[(step_outer + 1) % len(outer)], inner[facing_inner % len(inner)]], axis=1)
+    high = np.stack([inner[(step_inner + 1) % len(inner)], inner[step_inner], outer[facing_outer % len(outer)]], axis=1)
+    return np.concatenate([low, high])[np.argsort(np.concatenate([outer_middle, inner_middle]), kind="stable")]
 
 
 def ring_counts(num_rings: int, num_boundary: int) -> np.ndarray:
@@ -77,9 +70,7 @@ def ring_disk(num_rings: int, num_boundary: int) -> tuple[np.ndarray, np.ndarray
     return points, np.concatenate(cells)
 
 
-def choose_rows(
-    width: float, height: float, num_points: int, cell_size: float | None
-) -> tuple[int, int]:
+def choose_rows(width: float, height: float, num_points: int, cell_size: float | None) -> tuple[int, int]:
     """Columns and rows for `row_rectangle` with nearly `num_points` nodes, or of cells of `cell_size`.
 
     Raises `ValueError` if so few nodes can only make flat cells.
@@ -110,9 +101,7 @@ def choose_rows(
     return best[1], best[2]
 
 
-def row_rectangle(
-    width: float, height: float, num_columns: int, num_rows: int
-) -> tuple[np.ndarray, np.ndarray]:
+def row_rectangle(width: float, height: float, num_columns: int, num_rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Rectangle of rows with alternately `num_columns` and one more cells: points (n, 2), node 0 at the lower
     left corner of [0, width] × [0, height], and cells (m, 3)."""
     points, rows, offset = [], [], 0

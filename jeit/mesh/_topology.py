@@ -17,15 +17,11 @@ def cell_facets(cells: np.ndarray) -> np.ndarray:
     return cells[:, LOCAL_FACETS[dimension]].reshape(-1, dimension)
 
 
-def _keys(facets: np.ndarray) -> np.ndarray:
+def facet_keys(facets: np.ndarray, num_points: int) -> np.ndarray:
     """One integer per facet that does not depend on the order of its nodes."""
-    ordered = np.sort(facets, axis=1).astype(np.int64)
-    base = np.int64(ordered.max() + 1)
-    if facets.shape[1] == 3 and base > 2_000_000:
-        raise ValueError("cells: meshes of more than two million nodes are not supported in 3-D.")
-    key = ordered[:, 0]
-    for column in range(1, facets.shape[1]):
-        key = key * base + ordered[:, column]
+    key = np.zeros(len(facets), dtype=np.int64)
+    for column in np.sort(facets.astype(np.int64), axis=1).T:
+        key = key * num_points + column
     return key
 
 
@@ -44,7 +40,7 @@ def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     the two cells of a facet lie on the same side of it.
     """
     facets = cell_facets(cells)
-    key = _keys(facets)
+    key = facet_keys(facets, int(cells.max()) + 1)
     order = np.argsort(key, kind="stable")
     ordered = key[order]
     same = ordered[1:] == ordered[:-1]

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from numbers import Integral
+from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jeit.mesh import _curve, _generate, _outline
 from jeit.mesh._curve import Curve, Size
@@ -38,7 +38,7 @@ class Target:
         """Check the two arguments of a shape; raises `ValueError` if both are given or one is out of range."""
         if num_points is not None and cell_size is not None:
             raise ValueError("num_points, cell_size: give one of the two, not both.")
-        if cell_size is not None and not (np.isscalar(cell_size) and np.isfinite(cell_size) and cell_size > 0):
+        if cell_size is not None and not (isinstance(cell_size, Real) and 0 < cell_size < np.inf):
             raise ValueError(f"cell_size: expected a positive length in metres, got {cell_size!r}.")
         number = DEFAULT_NUM_POINTS if num_points is None else check_count("num_points", num_points, 4)
         check_total(number, "num_points")
@@ -56,8 +56,8 @@ def check_total(number: float, name: str) -> None:
     """Raise `ValueError` if the mesh would not fit a machine."""
     if number > _MOST_POINTS:
         raise ValueError(
-            f"{name}: this would make about {number:.2g} nodes; the limit is {_MOST_POINTS:.0e}. Lengths are in metres: "
-            "check the units, or ask for larger cells."
+            f"{name}: this would make about {number:.2g} nodes; the limit is {_MOST_POINTS:.0e}. Lengths are in "
+            "metres: check the units, or ask for larger cells."
         )
 
 
@@ -141,7 +141,7 @@ def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> n
             f"interior_points: point {bad[0]} at {fixed[bad[0]].tolist()} does not lie inside the outline. Use "
             "boundary_points for nodes on it."
         )
-    if len(fixed) > 1 and cKDTree(fixed).query(fixed, k=2)[0][:, 1].min() < _CLOSEST * curves[0].length:
+    if len(fixed) > 1 and KDTree(fixed).query(fixed, k=2)[0][:, 1].min() < _CLOSEST * curves[0].length:
         raise ValueError("interior_points: two points coincide or nearly so. Keep one of them.")
     return fixed
 
@@ -153,7 +153,7 @@ def _room(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tu
     if len(held) < 2:
         apart = np.array([curves[0].distance(point[None])[0] for point in fixed])
         return (held, apart) if len(fixed) else (np.zeros((0, 2)), np.zeros(0))
-    spacing = cKDTree(held).query(held, k=2)[0][:, 1]
+    spacing = KDTree(held).query(held, k=2)[0][:, 1]
     offset = 0
     for chain in chains:
         count = len(chain)

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def _traced(*values: Any) -> bool:
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
 def _length(name: str, value: Any) -> Any:
@@ -90,9 +91,7 @@ class Disk(eqx.Module):
         """A mesh of the disk; see `jeit.mesh.disk`."""
         from jeit.mesh.shapes import disk
 
-        return disk(
-            self.radius, centre=self.centre, num_points=num_points, cell_size=cell_size, refine=refine
-        )
+        return disk(self.radius, centre=self.centre, num_points=num_points, cell_size=cell_size, refine=refine)
 
 
 class Rectangle(eqx.Module):
@@ -210,9 +209,7 @@ class Polygon(eqx.Module):
         """A mesh of the polygon; see `jeit.mesh.polygon`."""
         from jeit.mesh.shapes import polygon
 
-        return polygon(
-            self.vertices, holes=self.holes, num_points=num_points, cell_size=cell_size, refine=refine
-        )
+        return polygon(self.vertices, holes=self.holes, num_points=num_points, cell_size=cell_size, refine=refine)
 
 
 Domain = Disk | Rectangle | Polygon

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
@@ -69,14 +69,13 @@ class Mesh(eqx.Module):
         facets shared by three cells, or several separate parts; warns if the extent exceeds 10 m, which
         almost always means millimetres.
         """
-        traced = isinstance(points, jax.core.Tracer)
-        if isinstance(cells, jax.core.Tracer):
+        if isinstance(cells, Tracer):
             raise ValueError(
                 "cells: the boundary cannot be found from traced node indices. Create the mesh outside the "
                 "transformed function and pass it in, or replace its points with equinox.tree_at."
             )
-        coordinates = None if traced else _checks.check_points(points)
-        num_points, dimension = np.shape(points) if traced else np.shape(coordinates)
+        coordinates = None if isinstance(points, Tracer) else _checks.check_points(points)
+        num_points, dimension = np.shape(points if coordinates is None else coordinates)
         indices = _checks.check_cells(cells, num_points, dimension)
         if coordinates is not None:
             _checks.check_coinciding(coordinates)
@@ -87,7 +86,7 @@ class Mesh(eqx.Module):
             facets = _topology.order_loops(facets, coordinates)
         located = _checks.locate_tags(tags or {}, facets)
         return Mesh(
-            points=jnp.asarray(points if traced else coordinates),
+            points=jnp.asarray(points if coordinates is None else coordinates),
             cells=jnp.asarray(indices.astype(np.int32)),
             facets=jnp.asarray(facets.astype(np.int32)),
             tags={name: jnp.asarray(index.astype(np.int32)) for name, index in located.items()},

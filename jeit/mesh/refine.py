@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jeit.mesh import _curve
 from jeit.mesh._curve import Curve, Size
@@ -71,6 +71,13 @@ class Refine(eqx.Module):
         self.growth = float(growth)
         self.distance = float(distance)
 
+    def smallest(self, background: float) -> float:
+        """Edge length in metres at the points themselves, for a background cell size in metres."""
+        if self.cell_size is not None:
+            return self.cell_size
+        assert self.factor is not None
+        return background / self.factor
+
 
 Refinement = Refine | Sequence[Refine] | Callable[[np.ndarray], np.ndarray] | None
 
@@ -102,17 +109,15 @@ class SizeField:
     def at(self, points: np.ndarray) -> Callable[[float], np.ndarray]:
         """Edge length (p,) at points (p, 2) as a function of the background: of the cell size in metres wanted away
         from refinement, or, where the user gave a function, of the factor it is multiplied by."""
-        held = self._held(points) if self._own is not None else None
         if self._own is not None:
-            own = self._own(points)
+            own, held = self._own(points), self._held(points)
             return lambda factor: np.minimum(factor * own, held)
         apart = [np.maximum(distance(points) - term.distance, 0.0) for distance, term in self._terms]
 
         def size(background: float) -> np.ndarray:
             result = np.full(len(points), background)
             for beyond, (_, term) in zip(apart, self._terms, strict=True):
-                smallest = background / term.factor if term.cell_size is None and term.factor else term.cell_size
-                result = np.minimum(result, smallest + term.growth * beyond)
+                result = np.minimum(result, term.smallest(background) + term.growth * beyond)
             # Nodes with room enough for the background cells need no thought.
             return result if background <= self._least_room else np.minimum(result, self._held(points))
 
@@ -122,7 +127,7 @@ class SizeField:
 def _distance_from(curves: list[Curve], points: np.ndarray | None) -> Callable[[np.ndarray], np.ndarray]:
     if points is None:
         return lambda where: np.min([curve.distance(where) for curve in curves], axis=0)
-    tree = cKDTree(points)
+    tree = KDTree(points)
     return lambda where: tree.query(where)[0]
 
 
@@ -130,7 +135,7 @@ def _close_nodes(held: np.ndarray, spacing: np.ndarray) -> Size:
     """Cells no larger than the room that nodes which must be there have, growing away from them."""
     if not len(held):
         return lambda points: np.full(len(points), np.inf)
-    tree = cKDTree(held)
+    tree = KDTree(held)
     count = min(8, len(held))
     if count > 1:
         # Let every node know of tighter ones farther off, so that the nearest few decide.
@@ -168,7 +173,8 @@ def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resoluti
     if not (np.isfinite(values).all() and (values > 0).all()):
         bad = inside[int(np.flatnonzero(~(np.isfinite(values) & (values > 0)))[0])]
         raise ValueError(
-            f"refine: the size function must be positive and finite inside the domain; at {flat[bad].tolist()} it is not."
+            f"refine: the size function must be positive and finite inside the domain; "
+            f"at {flat[bad].tolist()} it is not."
         )
     number = np.arange(len(flat)).reshape(shape)
     links = [
@@ -182,13 +188,14 @@ def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resoluti
     weight = np.concatenate([np.full(a.size, _OWN_GROWTH * length) for a, _, length in links] + [values])
     graph = coo_array((weight, (start, end)), shape=(len(flat) + 1,) * 2).tocsr()
     field = dijkstra(graph, directed=False, indices=len(flat))[:-1].reshape(shape)
-    interpolate = RegularGridInterpolator(axes, field, bounds_error=False, fill_value=None)
+    interpolate = RegularGridInterpolator(axes, field)
+    first, last = grid[0, 0], grid[-1, -1]
 
     def size(points: np.ndarray) -> np.ndarray:
         # Trial nodes may lie outside the domain, where the user's function need not make sense.
         with np.errstate(all="ignore"):
             own = np.asarray(function(points), dtype=float)
         own = np.where(np.isfinite(own) & (own > 0), own, np.inf)
-        return np.minimum(own, np.maximum(interpolate(points), values.min()))
+        return np.minimum(own, interpolate(np.clip(points, first, last)))
 
     return size

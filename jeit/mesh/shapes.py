@@ -67,12 +67,10 @@ def disk(
     curve = _curve.circle(domain.radius, middle)
     points, cells = _unstructured.mesh([curve], [stops], interior_points, refine, target, domain.area)
     mesh = Mesh.create(points, cells)
-    if num_boundary is not None and mesh.num_facets < 0.9 * num_boundary or (
-        num_boundary is not None and mesh.num_facets > 1.1 * num_boundary + 2 and boundary_points is None
-    ):
+    if num_boundary is not None and abs(mesh.num_facets - num_boundary) > 0.1 * num_boundary + np.size(stops):
         raise ValueError(
-            f"num_boundary: cells of the size asked give {mesh.num_facets} nodes on the circle, not {num_boundary}. Ask for "
-            "fewer nodes inside (num_points), larger cells, or more nodes on the circle."
+            f"num_boundary: cells of the size asked give {mesh.num_facets} nodes on the circle, not {num_boundary}. "
+            "Ask for fewer nodes inside (num_points), larger cells, or more nodes on the circle."
         )
     return mesh
 
@@ -131,8 +129,8 @@ def polygon(
     """Mesh of the inside of a simple polygon with `vertices` (k, 2) in metres, outside its `holes`.
 
     The vertices are nodes, the first of them node 0. Every angle is at least 25°, except the polygon's own sharper
-    corners, each of which is cut off as one cell with two equal sides. `boundary_points` are arc lengths in metres along the outer
-    outline, counter-clockwise from the first vertex; the other arguments are those of `disk`. Raises `ValueError` on
+    corners, each of which is cut off as one cell with two equal sides. `boundary_points` are arc lengths in metres
+    along the outer outline, counter-clockwise from the first vertex; the other arguments are those of `disk`. Raises `ValueError` on
     an outline that is not simple, and on bad or contradicting arguments.
     """
     domain = Polygon(vertices, holes)

@@ -1,0 +1,168 @@
+"""Meshes from and to files, through meshio (vtu, msh, xdmf, inp, …)."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Mapping
+from numbers import Real
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jeit.mesh import _topology
+from jeit.mesh.mesh import Mesh
+
+_CELLS = {2: "triangle", 3: "tetra"}
+_FACETS = {2: "line", 3: "triangle"}
+
+
+def read(path: str | Path, *, scale: float = 1.0) -> Mesh:
+    """Read a mesh of triangles (2-D) or tetrahedra (3-D) from any file meshio knows.
+
+    `scale` is the length of the file's unit in metres: 1e-3 for millimetres. Groups of boundary facets (Gmsh's physical
+    groups, or meshio's cell sets) become tags; groups that hold no boundary facet are left out, and so are
+    nodes that no cell uses. A flat mesh in the plane z = constant becomes 2-D.
+
+    Raises `FileNotFoundError` if there is no such file and `ValueError` if it is not a mesh file, holds other
+    cells than linear triangles or tetrahedra, or a mesh that `Mesh.create` refuses.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
+    if not isinstance(scale, Real) or not 0 < scale < np.inf:
+        raise ValueError(f"scale: expected the file's unit in metres, such as 1e-3 for millimetres, got {scale!r}.")
+    return _from_meshio(_quietly(path, lambda: meshio.read(path)), float(scale), str(path))
+
+
+def write(
+    mesh: Mesh,
+    path: str | Path,
+    *,
+    cell_data: Mapping[str, ArrayLike] | None = None,
+    point_data: Mapping[str, ArrayLike] | None = None,
+) -> None:
+    """Write a mesh, with values per cell (m, …) and per node (n, …), in the format its file name ends with.
+
+    `.msh` files (Gmsh 2.2) keep the tags, as physical groups, but no values per cell; other formats keep both
+    kinds of values, but no tags. Plane meshes are written at z = 0. Raises `ValueError` on an unknown
+    format and on data of the wrong length or complex.
+    """
+    path = Path(path)
+    points = np.asarray(mesh.points, dtype=float)
+    if mesh.dimension == 2:
+        points = np.column_stack([points, np.zeros(len(points))])
+    cells = {name: _data("cell_data", name, value, mesh.num_cells) for name, value in (cell_data or {}).items()}
+    nodes: dict[str, ArrayLike] = {
+        name: _data("point_data", name, value, mesh.num_points) for name, value in (point_data or {}).items()
+    }
+    blocks: list[Any] = [(_CELLS[mesh.dimension], np.asarray(mesh.cells))]
+    data: dict[str, Any] = {name: [value] for name, value in cells.items()}
+    field_data = {}
+    options: dict[str, Any] = {}
+    if path.suffix.lower() == ".msh":
+        if cells:
+            # meshio 5.3 writes values per cell into these files but cannot read them back.
+            raise ValueError(
+                "cell_data: .msh files keep the mesh, its tags and point_data; write values per cell to a .vtu file."
+            )
+        options = {"file_format": "gmsh22"}
+        physical = [np.full(mesh.num_cells, 1)]
+        field_data["domain"] = np.array([1, mesh.dimension])
+        for number, (tag, index) in enumerate(sorted(mesh.tags.items()), start=2):
+            facets = np.asarray(mesh.facets)[np.asarray(index)]
+            blocks.append((_FACETS[mesh.dimension], facets))
+            physical.append(np.full(len(facets), number))
+            field_data[tag] = np.array([number, mesh.dimension - 1])
+        data["gmsh:physical"] = physical
+        data["gmsh:geometrical"] = physical
+    try:
+        content = meshio.Mesh(points, blocks, point_data=dict(nodes), cell_data=data, field_data=field_data)
+        _quietly(path, lambda: content.write(path, **options))
+    except OSError as error:
+        raise ValueError(f"path: {path} cannot be written: {error.strerror}. Is there such a folder?") from None
+
+
+def _data(argument: str, name: str, value: ArrayLike, length: int) -> np.ndarray:
+    array = np.asarray(value)
+    if array.ndim < 1 or len(array) != length:
+        what = "cell" if argument == "cell_data" else "node"
+        raise ValueError(f"{argument}: {name!r} needs one value per {what}, {length} in all, got shape {array.shape}.")
+    if np.iscomplexobj(array):
+        raise ValueError(f"{argument}: {name!r} is complex, which mesh files cannot hold. Write its parts separately.")
+    return array
+
+
+def _quietly(path: Path, action: Any) -> Any:
+    """Run a meshio call: it prints, and leaves the interpreter, where it should raise."""
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            return action()
+    except OSError:
+        raise
+    except (Exception, SystemExit) as error:
+        reason = " ".join(said.getvalue().split()) or str(error) or type(error).__name__
+        raise ValueError(
+            f"path: {path} does not work as a mesh file: {reason.rstrip('.')}. The ending of the name "
+            "tells the format: .vtu, .vtk, .msh, .inp and others that meshio knows."
+        ) from None
+
+
+def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
+    kinds = {block.type for block in content.cells}
+    dimension = 3 if "tetra" in kinds else 2
+    if _CELLS[dimension] not in kinds:
+        raise ValueError(
+            f"path: {source} holds cells of type {sorted(kinds)}, but jeit needs linear triangles or tetrahedra. "
+            "Save it with elements of order 1 and without quadrilaterals or hexahedra."
+        )
+    if mixed := kinds & ({"quad"} if dimension == 2 else {"hexahedron", "wedge", "pyramid"}):
+        raise ValueError(f"path: {source} mixes in cells of type {sorted(mixed)}. Split them into simplices first.")
+    points = np.asarray(content.points, dtype=float) * scale
+    cells = np.concatenate([block.data for block in content.cells if block.type == _CELLS[dimension]])
+    used, inverse = np.unique(cells, return_inverse=True)
+    cells = inverse.reshape(cells.shape)
+    points = points[used]
+    if dimension == 2 and points.shape[1] == 3:
+        if np.ptp(points[:, 2]) > 1e-9 * np.ptp(points, axis=0).max():
+            raise ValueError(
+                f"path: {source} is a surface in space: its nodes differ in z. A 2-D mesh must lie in a "
+                "plane z = constant; a solid needs tetrahedra."
+            )
+        points = points[:, :2]
+    number = np.full(len(content.points), -1)
+    number[used] = np.arange(len(used))
+    boundary = _topology.facet_keys(_topology.boundary_facets(cells), len(used))
+    tags = {}
+    for name, facets in _groups(content, _FACETS[dimension]).items():
+        nodes = number[facets]
+        nodes = nodes[(nodes >= 0).all(axis=1)]
+        nodes = nodes[np.isin(_topology.facet_keys(nodes, len(used)), boundary)]
+        if len(nodes):
+            tags[name] = nodes
+    return Mesh.create(points, cells, tags=tags)
+
+
+def _groups(content: meshio.Mesh, kind: str) -> dict[str, np.ndarray]:
+    """Facets (t, d) of each named group in the file."""
+    found: dict[str, list[np.ndarray]] = {}
+    order = 2 if kind == "triangle" else 1
+    names = {int(value[0]): name for name, value in content.field_data.items() if int(value[1]) == order}
+    physical = content.cell_data.get("gmsh:physical", [])
+    for block, numbers in zip(content.cells, physical, strict=False):
+        if block.type != kind:
+            continue
+        for value in np.unique(numbers):
+            if value > 0:
+                name = names.get(int(value), f"physical_{value}")
+                found.setdefault(name, []).append(block.data[np.asarray(numbers) == value])
+    if not found:
+        for name, members in content.cell_sets.items():
+            for block, chosen in zip(content.cells, members, strict=False):
+                if block.type == kind and np.size(chosen) and not name.startswith("gmsh:"):
+                    found.setdefault(name, []).append(block.data[np.asarray(chosen)])
+    return {name: np.concatenate(facets) for name, facets in found.items()}

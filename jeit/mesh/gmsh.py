@@ -1,0 +1,108 @@
+"""Meshes made by Gmsh (optional: `pip install "jeit[mesh]"`), for geometries beyond jeit's own shapes."""
+
+from __future__ import annotations
+
+import importlib
+import tempfile
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from jeit.mesh.domain import Disk, Domain, Polygon, Rectangle
+from jeit.mesh.files import read
+from jeit.mesh.mesh import Mesh
+
+
+def from_gmsh(
+    source: str | Path | Domain | None = None,
+    *,
+    cell_size: float | None = None,
+    dimension: int | None = None,
+    scale: float = 1.0,
+) -> Mesh:
+    """Mesh a geometry with Gmsh.
+
+    **Arguments**: `source`, a geometry file (.geo, .step, .brep, …), a `Disk`, `Rectangle` or `Polygon`, or None
+    for the model that is current in the `gmsh` module; `cell_size` in the geometry's own unit (metres for a domain), the
+    largest edge; `dimension` 2 or 3 (by default the geometry's own); `scale`, the geometry's unit in metres.
+    Physical groups of the boundary become tags.
+
+    Raises `ImportError` if the gmsh package or a system library it needs is missing, and `ValueError`
+    if Gmsh refuses the geometry.
+    """
+    gmsh = _import()
+    if cell_size is not None and not (np.isfinite(cell_size) and cell_size > 0):
+        raise ValueError(f"cell_size: expected a positive length, got {cell_size!r}.")
+    if dimension not in (None, 2, 3):
+        raise ValueError(f"dimension: expected 2 or 3, got {dimension!r}.")
+    if isinstance(source, (str, Path)) and not Path(source).is_file():
+        raise FileNotFoundError(f"source: there is no file {source}. Check the name and the working directory.")
+    if source is None and not gmsh.isInitialized():
+        raise ValueError(
+            "source: Gmsh has no current model. Build one with the gmsh module, or give a file or outline."
+        )
+    own = not gmsh.isInitialized()
+    if own:
+        gmsh.initialize(interruptible=False)
+    quiet = gmsh.option.getNumber("General.Terminal")
+    gmsh.option.setNumber("General.Terminal", 0)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "mesh.msh"
+            _write(gmsh, source, cell_size, dimension, path)
+            return read(path, scale=scale)
+    finally:
+        gmsh.option.setNumber("General.Terminal", quiet)
+        if own:
+            gmsh.finalize()
+
+
+def _import() -> ModuleType:
+    try:
+        return importlib.import_module("gmsh")
+    except (ImportError, OSError) as error:
+        raise ImportError(
+            'from_gmsh needs the gmsh package: pip install "jeit[mesh]" (on Linux also the system libraries it names, '
+            f"such as libGLU). It could not be loaded: {error}. Discs, rectangles, polygons, layers, boxes and cylinders need "
+            "no Gmsh: see jeit.mesh."
+        ) from error
+
+
+def _write(
+    gmsh: ModuleType, source: str | Path | Domain | None, cell_size: float | None, dimension: int | None, path: Path
+) -> None:
+    try:
+        if isinstance(source, (str, Path)):
+            gmsh.open(str(source))
+        elif source is not None:
+            gmsh.model.add("jeit")
+            _draw(gmsh, source)
+        if cell_size is not None:
+            gmsh.option.setNumber("Mesh.MeshSizeMax", cell_size)
+        gmsh.model.mesh.generate(dimension or max(gmsh.model.getDimension(), 2))
+        # Without this, cells outside any physical group are left out as soon as there is one group.
+        gmsh.option.setNumber("Mesh.SaveAll", 1)
+        gmsh.option.setNumber("Mesh.MshFileVersion", 2.2)
+        gmsh.write(str(path))
+    except Exception as error:
+        raise ValueError(f"source: Gmsh could not mesh the geometry: {error}.") from error
+
+
+def _draw(gmsh: ModuleType, domain: Domain) -> None:
+    shape = gmsh.model.occ
+    if isinstance(domain, Disk):
+        shape.addDisk(*domain.centre, 0.0, domain.radius, domain.radius)
+    elif isinstance(domain, Rectangle):
+        left, _, bottom, _ = domain.extent
+        shape.addRectangle(left, bottom, 0.0, domain.width, domain.height)
+    elif isinstance(domain, Polygon):
+        loops = []
+        for vertices in (domain.vertices, *domain.holes):
+            corners = [shape.addPoint(float(x), float(y), 0.0) for x, y in np.asarray(vertices)]
+            sides = [shape.addLine(a, b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]
+            loops.append(shape.addCurveLoop(sides))
+        shape.addPlaneSurface(loops)
+    else:
+        raise ValueError(f"source: expected a file, an outline or None, got {type(domain).__name__}")
+    shape.synchronize()

@@ -1,0 +1,136 @@
+"""Solid meshes of tetrahedra, made by stacking a plane mesh: `layer`, `box`, `cylinder`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jeit.mesh import _unstructured
+from jeit.mesh.domain import _length
+from jeit.mesh.mesh import Mesh
+from jeit.mesh.refine import Refinement
+from jeit.mesh.shapes import disk, rectangle
+
+# In a solid 'bottom' and 'top' are the faces across z, so the sides of a rectangle across y get new names.
+_RENAMED = {"bottom": "front", "top": "back"}
+
+
+def layer(mesh: Mesh, thickness: float, num_layers: int = 1) -> Mesh:
+    """A plate: a plane mesh times [0, thickness], its prisms cut into three tetrahedra each.
+
+    Node k · n + i is node i of the plane mesh at height z = k · thickness / num_layers. Tags: 'bottom' (z = 0),
+    'top' (z = thickness), 'side', and those of the plane mesh as parts of the side; its 'bottom' and 'top'
+    (across y) are then called 'front' and 'back'.
+
+    Every prism is cut along the diagonals that rise from its lower-numbered to its higher-numbered node, so that
+    neighbours agree. Raises `ValueError` on a solid mesh, a thickness that is not positive, or no layers.
+    """
+    if mesh.dimension != 2:
+        raise ValueError("mesh: a layer is made from a plane (2-D) mesh, this one is 3-D.")
+    thickness = _length("thickness", thickness)
+    num_layers = _unstructured.check_count("num_layers", num_layers, 1)
+    plane, cells, facets = np.asarray(mesh.points), np.asarray(mesh.cells), np.asarray(mesh.facets)
+    count = len(plane)
+    _unstructured.check_total(count * (num_layers + 1), "num_layers")
+    heights = np.repeat(np.linspace(0.0, thickness, num_layers + 1), count)
+    points = np.column_stack([np.tile(plane, (num_layers + 1, 1)), heights])
+
+    a, b, c = np.sort(cells.astype(np.int64), axis=1).T
+    up = count
+    prism = np.stack(
+        [
+            np.stack([a, b, c, c + up], axis=1),
+            np.stack([a, b, b + up, c + up], axis=1),
+            np.stack([a, a + up, b + up, c + up], axis=1),
+        ],
+        axis=1,
+    ).reshape(-1, 4)
+    solid = np.concatenate([prism + k * count for k in range(num_layers)])
+
+    def side(edges: np.ndarray) -> np.ndarray:
+        low, high = np.sort(edges.astype(np.int64), axis=1).T
+        lower = np.stack([low, high, high + up], axis=1)
+        upper = np.stack([low, low + up, high + up], axis=1)
+        return np.concatenate([face + k * count for k in range(num_layers) for face in (lower, upper)])
+
+    tags: dict[str, ArrayLike] = {"bottom": cells, "top": cells + num_layers * count, "side": side(facets)}
+    for name, index in mesh.tags.items():
+        new = _RENAMED.get(name, name)
+        if new in tags:
+            raise ValueError(f"mesh: its tag {name!r} would be called {new!r} in the layer, which is taken. Rename it.")
+        tags[new] = side(facets[np.asarray(index)])
+    return Mesh.create(points, solid, tags=tags)
+
+
+def box(
+    width: float,
+    depth: float,
+    height: float,
+    *,
+    num_points: int | None = None,
+    cell_size: float | None = None,
+    num_layers: int | None = None,
+    refine: Refinement = None,
+) -> Mesh:
+    """Mesh of a box of `width` (x) by `depth` (y) by `height` (z) metres, centred at x = y = 0, from z = 0 up.
+
+    Give `num_points`, the number of nodes (4,000 if nothing is said; met within about 10 %), or `cell_size` in metres;
+    `num_layers` along z follows from them unless told. `refine` as in `jeit.mesh.disk`, seen from above. Tags: 'left',
+    'right' (across x), 'front', 'back' (across y), 'bottom', 'top' (across z), and 'side'. Raises `ValueError`
+    on bad or contradicting arguments.
+    """
+    width, depth = _length("width", width), _length("depth", depth)
+    height = _length("height", height)
+    base_points, layers = _stack(width * depth, height, num_points, cell_size, num_layers)
+    base = rectangle(width, depth, num_points=base_points, cell_size=cell_size, refine=refine)
+    return layer(base, height, layers)
+
+
+def cylinder(
+    radius: float,
+    height: float,
+    *,
+    num_points: int | None = None,
+    cell_size: float | None = None,
+    num_layers: int | None = None,
+    refine: Refinement = None,
+    num_boundary: int | None = None,
+    boundary_points: ArrayLike | None = None,
+) -> Mesh:
+    """Mesh of an upright cylinder of `radius` and `height` metres around the z axis, from z = 0 up.
+
+    Give `num_points`, the number of nodes (4,000 if nothing is said; met within about 10 %), or `cell_size` in metres;
+    `num_layers` along z follows from them unless told. `refine`, `num_boundary` and `boundary_points` (angles) as in
+    `jeit.mesh.disk`, seen from above. Tags: 'bottom', 'top', 'side'. Raises `ValueError` on bad or
+    contradicting arguments.
+    """
+    radius, height = _length("radius", radius), _length("height", height)
+    base_points, layers = _stack(np.pi * radius**2, height, num_points, cell_size, num_layers)
+    base = disk(
+        radius,
+        num_points=base_points,
+        cell_size=cell_size,
+        refine=refine,
+        num_boundary=num_boundary,
+        boundary_points=boundary_points,
+    )
+    return layer(base, height, layers)
+
+
+def _stack(
+    area: float, height: float, num_points: int | None, cell_size: float | None, num_layers: int | None
+) -> tuple[int | None, int]:
+    """Nodes of the base (None if a cell size is given) and number of layers."""
+    target = _unstructured.Target.create(num_points, cell_size)
+    if num_layers is not None:
+        num_layers = _unstructured.check_count("num_layers", num_layers, 1)
+    if target.cell_size is not None:
+        return None, num_layers or max(1, round(height / target.cell_size))
+    number = target.num_points if target.asked else 4000
+    # Of n nodes with spacing h in the plane and along z: n = (1.1 A / h² ) (H / h + 1).
+    if num_layers is None:
+        spacing = np.cbrt(1.1 * area * height / number)
+        for _ in range(20):
+            spacing = np.sqrt(1.1 * area * (height / spacing + 1) / number)
+        num_layers = max(1, round(height / spacing))
+    return max(4, round(number / (num_layers + 1))), num_layers
