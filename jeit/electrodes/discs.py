@@ -136,7 +136,7 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], tolerance: Float[Array,
 def check_discs(electrodes: SheetDiscs | FaceDiscs, mesh: Mesh, area) -> None:
     """Raise `ValueError` unless every disc lies on the mesh, apart from the others, and spans enough cells."""
     position, radius = electrodes.position, electrodes.radius
-    if not is_concrete(position, radius, mesh.points, mesh.cells):
+    if not is_concrete(position, radius, electrodes.contact_impedance, mesh.points, mesh.cells):
         return
     position, radius = np.asarray(position), np.asarray(radius)
     contact = electrodes.contact(mesh)

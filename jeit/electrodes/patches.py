@@ -74,7 +74,7 @@ class FacePatches(AbstractElectrodes):
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for patches off the surface, overlapping, or too small for the mesh."""
         check_dimension("FacePatches", mesh, 3)
-        if not is_concrete(self.position, self.width, self.height, mesh.points, mesh.facets):
+        if not is_concrete(self.position, self.width, self.height, self.contact_impedance, mesh.points, mesh.facets):
             return
         contact = self.contact(mesh)
         share = np.asarray(contact.load.sum(axis=0) * self.contact_impedance / (self.width * self.height))

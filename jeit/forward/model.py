@@ -107,7 +107,8 @@ def _check(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol) -> No
             f"There are {electrodes.num_electrodes} electrodes, and protocol '{protocol.name}' is for "
             f"{protocol.num_electrodes}; make both for the same number."
         )
-    electrodes.check(mesh)
+    with jax.ensure_compile_time_eval():  # a model may be made inside jit, of values that are known
+        electrodes.check(mesh)
 
 
 def _select(protocol: Protocol, impedance) -> Inexact[Array, " M"]:

@@ -1,1 +1,5 @@
-"""image"""
+"""Images: rasters of what lives on a mesh, and the inclusions found in them."""
+
+from jeit.image.inclusions import Inclusion as Inclusion
+from jeit.image.inclusions import find_inclusions as find_inclusions
+from jeit.image.raster import Raster as Raster

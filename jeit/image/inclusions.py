@@ -1,0 +1,103 @@
+"""Inclusions: where an image departs from its background, as regions with sign, centroid and area."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from jeit.mesh import Mesh, centroids, interior_facets, measures
+
+
+class Inclusion(eqx.Module):
+    """One region of raised or lowered conductivity.
+
+    **Fields**: `sign`, +1 conductive or -1 resistive; `centroid` in metres, weighted by the change; `area` in m² (3-D:
+    volume in m³); `peak`, the strongest change in it, in the image's unit.
+    """
+
+    sign: int
+    centroid: tuple[float, ...]
+    area: float
+    peak: float
+
+    @property
+    def kind(self) -> str:
+        """'conductive' or 'resistive'."""
+        return "conductive" if self.sign > 0 else "resistive"
+
+
+def find_inclusions(
+    mesh: Mesh,
+    image: Float[Array, " m"],
+    *,
+    level: float = 0.5,
+    least_peak: float = 0.3,
+    least_prominence: float = 0.2,
+    least_area: float = 0.004,
+) -> list[Inclusion]:
+    """Peaks of an image, each with the region round it where the change exceeds `level` times that peak.
+
+    `image` (m,): change of conductivity in every cell. A peak counts if it is at least `least_peak` times the
+    strongest change of either sign, stands at least `least_prominence` times its own height above the saddle to a
+    higher one, and its region covers at least `least_area` of the mesh; the rest are artefacts. Strongest first.
+    Raises `ValueError` for an image of another size or with NaN.
+    """
+    image = np.asarray(image)
+    if image.shape != (mesh.num_cells,):
+        raise ValueError(f"image has shape {image.shape}; give one value for each of the {mesh.num_cells} cells.")
+    if not np.isfinite(image).all():
+        raise ValueError("image has NaN or infinite values; reconstruct it from unmasked channels first.")
+    strongest = np.abs(image).max()
+    if strongest == 0:
+        return []
+    measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
+    neighbours = _neighbours(mesh)
+    found = []
+    for sign in (1, -1):
+        change = sign * image
+        basin = _basins(change, neighbours, floor=level * least_peak * strongest, least_prominence=least_prominence)
+        for label in np.unique(basin[basin >= 0]):
+            peak = change[label]
+            region = (basin == label) & (change >= level * peak)
+            if peak < least_peak * strongest or measure[region].sum() < least_area * measure.sum():
+                continue
+            weight = (measure * change)[region]
+            centroid = tuple(float(value) for value in weight @ centre[region] / weight.sum())
+            found.append(Inclusion(sign, centroid, float(measure[region].sum()), float(sign * peak)))
+    return sorted(found, key=lambda inclusion: -abs(inclusion.peak))
+
+
+def _neighbours(mesh: Mesh) -> list[list[int]]:
+    pairs, _ = interior_facets(mesh)
+    neighbours: list[list[int]] = [[] for _ in range(mesh.num_cells)]
+    for first, second in pairs.tolist():
+        neighbours[first].append(second)
+        neighbours[second].append(first)
+    return neighbours
+
+
+def _basins(change: np.ndarray, neighbours: list[list[int]], *, floor: float, least_prominence: float) -> np.ndarray:
+    """The peak (a cell's index) that every cell above `floor` belongs to, -1 below: a watershed from the top down.
+
+    Where two basins meet, the lower one is swallowed unless its peak stands out from the meeting point.
+    """
+    peak = np.full(len(change), -1)
+    swallowed: dict[int, int] = {}
+
+    def root(label: int) -> int:
+        while label in swallowed:
+            label = swallowed[label]
+        return label
+
+    for cell in np.argsort(-change):
+        if change[cell] <= floor:
+            break
+        labels = {root(peak[other]) for other in neighbours[cell] if peak[other] >= 0}
+        if not labels:
+            peak[cell] = cell
+            continue
+        highest = max(labels, key=lambda label: change[label])
+        peak[cell] = highest
+        for label in labels - {highest}:
+            if change[label] - change[cell] < least_prominence * change[label]:
+                swallowed[label] = highest
+    return np.array([root(label) if label >= 0 else -1 for label in peak.tolist()])

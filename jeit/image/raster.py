@@ -1,0 +1,95 @@
+"""Rasters: an image on the cells of a mesh, sampled on a grid of pixels."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Inexact, Int
+from scipy.spatial import cKDTree
+
+from jeit.mesh import Mesh
+
+
+class Raster(eqx.Module):
+    """Which cell every pixel lies in: made once for a mesh, used for every image on it.
+
+    **Fields**: `cell` (rows, columns), index of the cell that holds the pixel's centre, or -1 outside the mesh; row 0
+    at the top (largest y), column 0 at the left; `extent` (x_min, x_max, y_min, y_max) in metres, the outer edges of
+    the outermost pixels.
+    """
+
+    cell: Int[Array, "rows columns"]
+    extent: tuple[float, float, float, float] = eqx.field(static=True)
+
+    @classmethod
+    def create(
+        cls,
+        mesh: Mesh,
+        *,
+        shape: tuple[int, int] = (256, 256),
+        extent: tuple[float, float, float, float] | None = None,
+        height: float | None = None,
+    ) -> "Raster":
+        """`shape`: (rows, columns). `extent`: metres; the smallest square round the mesh unless given. `height`: z of
+        the slice through a 3-D mesh, metres (half way up unless given). Raises `ValueError` for an empty extent.
+        """
+        points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
+        low, high = points.min(axis=0), points.max(axis=0)
+        if extent is None:
+            centre, half = (low + high)[:2] / 2, (high - low)[:2].max() / 2
+            extent = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
+        x_min, x_max, y_min, y_max = (float(value) for value in extent)
+        if not (x_max > x_min and y_max > y_min) or min(shape) < 1:
+            raise ValueError(f"extent {extent} must be (x_min, x_max, y_min, y_max) in metres, and shape positive.")
+        rows, columns = shape
+        x = x_min + (np.arange(columns) + 0.5) * (x_max - x_min) / columns
+        y = y_max - (np.arange(rows) + 0.5) * (y_max - y_min) / rows
+        grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        if mesh.dimension == 3:
+            z = (low[2] + high[2]) / 2 if height is None else float(height)
+            grid = np.column_stack([grid, np.full(len(grid), z)])
+        cell = locate(points, cells, grid).reshape(shape)
+        return cls(jnp.asarray(cell, jnp.int32), (x_min, x_max, y_min, y_max))
+
+    @property
+    def pixel_area(self) -> float:
+        """Area of a pixel, m²."""
+        x_min, x_max, y_min, y_max = self.extent
+        return (x_max - x_min) * (y_max - y_min) / self.cell.size
+
+    def pixel_centres(self) -> np.ndarray:
+        """Centres of the pixels, (rows, columns, 2) metres."""
+        rows, columns = self.cell.shape
+        x_min, x_max, y_min, y_max = self.extent
+        x = x_min + (np.arange(columns) + 0.5) * (x_max - x_min) / columns
+        y = y_max - (np.arange(rows) + 0.5) * (y_max - y_min) / rows
+        return np.stack(np.meshgrid(x, y), axis=-1)
+
+    def sample(self, image: Inexact[Array, "*frames m"]) -> Float[Array, "*frames rows columns"]:
+        """Values of one image (m,) or many (F, m) at the pixels, NaN outside the mesh."""
+        image = jnp.asarray(image)
+        return jnp.where(self.cell >= 0, image[..., jnp.maximum(self.cell, 0)], jnp.nan)
+
+
+def locate(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Index of the cell that holds each position (q, d), -1 where none does.
+
+    Tries the cells with the nearest centroids first and widens the search for what is left.
+    """
+    corners = points[cells]
+    inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
+    tree = cKDTree(corners.mean(axis=1))
+    reach = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=-1).max()
+    found = np.full(len(positions), -1)
+    left = np.flatnonzero(tree.query(positions)[0] <= reach)
+    tried, number = 0, 8
+    while left.size and tried < len(cells):
+        number = min(number, len(cells))
+        distance, candidate = tree.query(positions[left], k=np.arange(tried + 1, number + 1))
+        local = np.einsum("qkij,qkj->qki", inverse[candidate], positions[left][:, None] - corners[candidate, 0])
+        inside = np.minimum(local.min(axis=-1), 1 - local.sum(axis=-1)) > -1e-9
+        hit = inside.any(axis=1)
+        found[left[hit]] = candidate[hit, inside[hit].argmax(axis=1)]
+        # A cell cannot hold what is farther from its centroid than its farthest corner.
+        left = left[~hit & (distance[:, -1] <= reach)]
+        tried, number = number, 4 * number
+    return found

@@ -1,0 +1,91 @@
+"""Calibration: the background conductivity and contact impedance that explain a frame of the empty tank."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from jeit.electrodes import with_contact_impedance
+from jeit.forward import ForwardModel
+
+
+class Calibration(eqx.Module):
+    """A forward model fitted to a reference frame.
+
+    **Fields**: `model`, with its electrodes' contact impedance fitted; `conductivity`, the uniform background
+    (S/m; 2-D: S); `voltages` (M,), what the model predicts; `misfit`, ‖predicted - measured‖ / ‖measured‖ over the
+    channels used; `iterations`; `status`, "converged" or the reason why not.
+    """
+
+    model: ForwardModel
+    conductivity: Float[Array, ""]
+    voltages: Float[Array, " M"]
+    misfit: Float[Array, ""]
+    iterations: int = eqx.field(static=True)
+    status: str = eqx.field(static=True)
+
+
+def calibrate(
+    model: ForwardModel,
+    voltages: Float[Array, " M"],
+    *,
+    mask: Bool[Array, " M"] | None = None,
+    contact: str = "common",
+    max_steps: int = 100,
+) -> Calibration:
+    """Fit background conductivity and contact impedance to a reference frame, by Levenberg-Marquardt.
+
+    `voltages` (M,) volts of the empty tank. `mask`: True for the channels to use. `contact`: "common", one impedance
+    for all electrodes; "each", one per electrode; "fixed", the model's own. The parameters are logarithms, so both
+    stay positive; the start is the model's impedance with the conductivity that scales the prediction best (voltages
+    are proportional to 1/σ at fixed z·σ). Raises `ValueError` for a frame of another shape or without signal.
+    """
+    measured = jnp.asarray(voltages, float)
+    shape = (model.protocol.num_measurements,)
+    used = jnp.ones(shape, bool) if mask is None else jnp.asarray(mask, bool)
+    if measured.shape != shape or used.shape != shape:
+        raise ValueError(
+            f"voltages has shape {measured.shape} and mask {used.shape}; protocol '{model.protocol.name}' has {shape}."
+        )
+    if contact not in ("common", "each", "fixed"):
+        raise ValueError(f"contact must be 'common', 'each' or 'fixed', not '{contact}'.")
+    measured = jnp.where(used, measured, 0)
+    size = jnp.linalg.norm(measured)
+    if not np.isfinite(size) or size == 0:
+        raise ValueError("voltages: the reference frame has no finite, non-zero values to calibrate on.")
+    return _fit(model, measured, used, contact, max_steps)
+
+
+def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> Calibration:
+    num_electrodes = model.electrodes.num_electrodes
+    if model.electrodes.is_point:
+        contact = "fixed"
+    start = model.electrodes.contact_impedance if contact != "fixed" else jnp.ones(num_electrodes)
+    size = jnp.linalg.norm(measured)
+
+    def unpack(parameters):
+        # Voltages at fixed z·σ are proportional to 1/σ, so these two are nearly independent of each other.
+        conductivity = jnp.exp(parameters["conductivity"])
+        if contact == "fixed":
+            return model, conductivity
+        impedance = start * jnp.exp(parameters["contact"] - parameters["conductivity"])
+        return model.with_electrodes(with_contact_impedance(model.electrodes, impedance)), conductivity
+
+    def residual(parameters, _):
+        fitted, conductivity = unpack(parameters)
+        return jnp.where(used, fitted.voltages(conductivity) - measured, 0) / size
+
+    # Start at the model's own contact impedance for a conductivity of one, scaled to fit.
+    shape = {"fixed": (0,), "common": (), "each": (num_electrodes,)}[contact]
+    unit = jnp.where(used, model.voltages(1.0), 0)
+    conductivity = jnp.log(jnp.abs(unit @ unit / (unit @ measured)))
+    initial = {"conductivity": conductivity, "contact": jnp.zeros(shape) + conductivity}
+    solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-11)
+    solution = optx.least_squares(residual, solver, initial, max_steps=max_steps, throw=False)
+    fitted, conductivity = unpack(solution.value)
+    voltages = fitted.voltages(conductivity)
+    misfit = jnp.linalg.norm(jnp.where(used, voltages - measured, 0)) / size
+    converged = solution.result == optx.RESULTS.successful
+    status = "converged" if converged else f"not converged in {max_steps} steps"
+    return Calibration(fitted, conductivity, voltages, misfit, int(solution.stats["num_steps"]), status)
