@@ -1,0 +1,103 @@
+"""The figures that are asked for, beside those measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from benchmarks.contest import Figures
+from benchmarks.match import Match
+from benchmarks.report import duration
+
+JACOBIAN = "voltages and Jacobian"
+
+
+@dataclass
+class Check:
+    """One figure: what is asked, what was measured, and `met`, `missed` or `not measured`."""
+
+    asked: str
+    measured: str
+    verdict: str
+
+
+def checks(matches: list[Match], import_seconds: float, demo_seconds: float | None) -> list[Check]:
+    """All checks that can be made with what was measured."""
+    found = [*_against_pyeit(matches), *_against_scipy(matches), *_images(matches), *_batches(matches)]
+    found.append(_limit("`import jeit` < 2 s", import_seconds, 2.0))
+    asked = "first picture of `jeit demo` within 15 s of a cold start"
+    found.append(Check(asked, "–", "not measured") if demo_seconds is None else _limit(asked, demo_seconds, 15.0))
+    return found
+
+
+def _figures(match: Match, task: str, name: str) -> Figures | None:
+    figures = match.figures.get(task, {}).get(name)
+    return figures if figures is not None and figures.seconds and not figures.remark else None
+
+
+def _verdict(met: bool) -> str:
+    return "met" if met else "missed"
+
+
+def _limit(asked: str, seconds: float, limit: float) -> Check:
+    return Check(asked, duration(seconds), _verdict(seconds < limit))
+
+
+def _at_least(asked: str, match: Match, task: str, opponent: str, times: float) -> Check | None:
+    mine, other = _figures(match, task, "jeit"), _figures(match, task, opponent)
+    if mine is None or other is None:
+        return None
+    ratio = other.median / mine.median
+    return Check(asked, f"{ratio:.1f}×", _verdict(ratio >= times))
+
+
+def _against_pyeit(matches: list[Match]):
+    for match in matches:
+        if match.model != "point" or match.num_electrodes != 16:
+            continue
+        times = 100 if match.num_points < 2000 else 50
+        asked = f"{JACOBIAN}, 16 electrodes, {match.num_points} nodes: ≥ {times}× pyEIT"
+        check = _at_least(asked, match, JACOBIAN, "pyeit", times)
+        yield check or Check(asked, "pyEIT cannot", "not measured")
+
+
+def _against_scipy(matches: list[Match]):
+    for match in matches:
+        if match.model != "complete" or match.num_electrodes != 16:
+            continue
+        times = 6.0 if match.num_points < 2000 else 5.0 if match.num_points < 10_000 else 2.5
+        asked = f"{JACOBIAN}, 16 electrodes, {match.num_points} nodes: ≥ {times:g}× SciPy"
+        check = _at_least(asked, match, JACOBIAN, "scipy plain", times)
+        if check is not None:
+            tuned = _at_least("", match, JACOBIAN, "scipy tuned", times)
+            if tuned is not None:
+                check.measured += f" ({tuned.measured} tuned SciPy)"
+            yield check
+
+
+def _images(matches: list[Match]):
+    for match in matches:
+        if match.model != "complete" or match.num_electrodes != 16 or match.num_points > 2000:
+            continue
+        for task, limit, text in (
+            ("linear image", 50e-6, "a linear image < 50 µs"),
+            ("1000 linear images", 10e-3, "1,000 linear images < 10 ms"),
+        ):
+            mine = _figures(match, task, "jeit")
+            if mine is not None:
+                asked = f"{text} ({match.num_cells} cells, {match.num_channels} channels)"
+                yield _limit(asked, mine.median, limit)
+
+
+def _batches(matches: list[Match]):
+    for match in matches:
+        for batch, alone in (("64 conductivities", "voltages"), ("64 Jacobians", JACOBIAN)):
+            many, one = _figures(match, batch, "jeit"), _figures(match, alone, "jeit")
+            if match.num_electrodes != 16 or many is None or one is None:
+                continue
+            each = many.median / 64
+            # 5 % is what the medians of two such series differ by on a quiet machine.
+            yield Check(
+                f"{batch}, {match.num_points} nodes: per item no more than one alone ({alone})",
+                f"{duration(each)} against {duration(one.median)}",
+                _verdict(each <= 1.05 * one.median),
+            )

@@ -1,0 +1,99 @@
+"""One contestant in a process of its own: takes commands on standard input, answers on standard output, in JSON lines.
+
+Run as `python -m benchmarks.worker CONTESTANT PROBLEM.npz`. Contestants live in processes so that pyEIT can have its
+own environment, so that memory is each one's own, and so that turns can be interleaved whoever's turn it is.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import json
+import os
+import sys
+import time
+import traceback
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.problem import load
+
+CONTESTANTS = {
+    "jeit": ("benchmarks.jeit_contestant", "JeitContestant", ()),
+    "scipy plain": ("benchmarks.scipy_contestant", "ScipyContestant", ("plain",)),
+    "scipy tuned": ("benchmarks.scipy_contestant", "ScipyContestant", ("tuned",)),
+    "pyeit": ("benchmarks.pyeit_contestant", "PyeitContestant", ()),
+}
+
+
+def peak_memory() -> float | None:
+    """Peak resident memory of this process in MB since `reset_peak_memory` (Linux), else None."""
+    try:
+        status = Path("/proc/self/status").read_text()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM")), None)
+
+
+def reset_peak_memory() -> None:
+    """Start counting peak memory anew, where the system can."""
+    gc.collect()
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:
+        return
+
+
+def answer(contestant, command: dict) -> dict:
+    """Carry out one command: `describe`, `first`, `time`, `memory` or `save`."""
+    match command["do"]:
+        case "describe":
+            return {"tasks": list(contestant.tasks), "description": contestant.description, "peak": peak_memory()}
+        case "first":
+            start = time.perf_counter()
+            contestant.tasks[command["task"]](0)
+            return {"seconds": time.perf_counter() - start}
+        case "time":
+            run, seconds = contestant.tasks[command["task"]], []
+            if command["warm"]:
+                run(command["round"])
+            for call in range(command["calls"]):
+                start = time.perf_counter()
+                run(command["round"] + call)
+                seconds.append(time.perf_counter() - start)
+            return {"seconds": seconds}
+        case "memory":
+            reset_peak_memory()
+            contestant.tasks[command["task"]](0)
+            return {"peak": peak_memory()}
+        case "save":
+            results = contestant.tasks[command["task"]](0)
+            if hasattr(contestant, "in_si"):
+                results = contestant.in_si(results)
+            arrays = results if isinstance(results, tuple) else (results,)
+            np.savez(command["path"], *[np.asarray(array) for array in arrays])
+            return {}
+    raise ValueError(f"Unknown command {command!r}.")
+
+
+def main() -> None:
+    """Serve until standard input closes."""
+    name, path = sys.argv[1:]
+    # Whatever a library prints must not mix with the answers.
+    channel = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    try:
+        module, kind, arguments = CONTESTANTS[name]
+        contestant = getattr(importlib.import_module(module), kind)(load(Path(path)), *arguments)
+        print(json.dumps({"ready": True}), file=channel, flush=True)
+        for line in sys.stdin:
+            print(json.dumps(answer(contestant, json.loads(line))), file=channel, flush=True)
+    except Exception as error:
+        traceback.print_exc()
+        print(json.dumps({"error": f"{type(error).__name__}: {error}"}), file=channel, flush=True)
+        raise SystemExit(1) from error
+
+
+if __name__ == "__main__":
+    main()
