@@ -136,11 +136,9 @@ def orient(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     return np.where((measure > 0)[:, None], cells, swapped)
 
 
-def check_connected(cells: np.ndarray) -> None:
-    """Raise `ValueError` if the cells do not hang together facet by facet."""
-    first, second, _ = _topology.pair_facets(cells)
-    width, count = cells.shape[1], len(cells)
-    graph = coo_array((np.ones(len(first)), (first // width, second // width)), shape=(count, count))
+def check_connected(first: np.ndarray, second: np.ndarray, count: int) -> None:
+    """Raise `ValueError` if `count` cells, of which `first` and `second` share facets, do not hang together."""
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
     parts, label = connected_components(graph, directed=False)
     if parts > 1:
         sizes = np.bincount(label)

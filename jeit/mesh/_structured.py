@@ -45,7 +45,7 @@ def choose_rings(num_points: int) -> tuple[int, int]:
     guess = np.sqrt(num_points / 3.0)
     best = None
     for num_rings in range(max(1, int(guess) - 1), int(guess) + 3):
-        for num_boundary in range(max(5, int(5.6 * num_rings)), int(6.6 * num_rings) + 2):
+        for num_boundary in range(max(5, int(4.9 * num_rings)), int(7.3 * num_rings) + 2):
             total = 1 + int(ring_counts(num_rings, num_boundary).sum())
             # Six nodes per ring make the most regular triangles: part from it only to meet the number.
             miss = abs(total / num_points - 1.0)
@@ -76,10 +76,13 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
     Raises `ValueError` if so few nodes can only make flat cells.
     """
     if cell_size is not None:
-        cell_size = min(cell_size, width, height)
+        # Cells with base b and height 0.93 b have the area of equilateral ones with edge 1.036 b.
+        cell_size = min(cell_size, width, height) / 1.036
         return max(1, round(width / cell_size - 0.5)), max(1, round(height / (_ROW * cell_size)))
     edge = np.sqrt(width * height / (_ROW * num_points))
     guess = height / (_ROW * edge)
+    # Few nodes leave little choice: rather miss the number than make long cells.
+    enough = 0.03 if num_points > 200 else 0.1
     best = None
     for num_rows in range(max(1, int(0.6 * guess)), int(1.5 * guess) + 3):
         odd = (num_rows + 1) // 2
@@ -89,7 +92,7 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
             total = (num_rows + 1) * (num_columns + 1) + odd
             miss = abs(total / num_points - 1.0)
             stretch = abs(np.log(height / num_rows / (_ROW * width / (num_columns + 0.5))))
-            cost = (stretch > 0.6, miss > 0.03, miss if miss > 0.03 else 0.0, stretch)
+            cost = (stretch > 0.6, max(0.0, miss - enough), stretch)
             if best is None or cost < best[0]:
                 best = (cost, num_columns, num_rows)
     if best is None or best[0][0]:

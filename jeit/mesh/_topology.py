@@ -68,12 +68,6 @@ def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return first, second, np.flatnonzero(~paired)
 
 
-def boundary_facets(cells: np.ndarray) -> np.ndarray:
-    """Facets that belong to one cell only, (b, d), oriented outward."""
-    _, _, single = pair_facets(cells)
-    return cell_facets(cells)[single]
-
-
 def order_loops(facets: np.ndarray, points: np.ndarray | None) -> np.ndarray:
     """Boundary edges of a 2-D mesh sorted head to tail, loop after loop, the outer loop first.
 

@@ -136,7 +136,9 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
         points = points[:, :2]
     number = np.full(len(content.points), -1)
     number[used] = np.arange(len(used))
-    boundary = _topology.facet_keys(_topology.boundary_facets(cells), len(used))
+    # The cells may still be turned either way: a boundary facet is one that occurs once.
+    keys, occurrences = np.unique(_topology.facet_keys(_topology.cell_facets(cells), len(used)), return_counts=True)
+    boundary = keys[occurrences == 1]
     tags = {}
     for name, facets in _groups(content, _FACETS[dimension]).items():
         nodes = number[facets]

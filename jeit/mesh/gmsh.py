@@ -24,8 +24,8 @@ def from_gmsh(
     """Mesh a geometry with Gmsh.
 
     **Arguments**: `source`, a geometry file (.geo, .step, .brep, …), a `Disk`, `Rectangle` or `Polygon`, or None
-    for the model that is current in the `gmsh` module; `cell_size` in the geometry's own unit (metres for a domain), the
-    largest edge; `dimension` 2 or 3 (by default the geometry's own); `scale`, the geometry's unit in metres.
+    for the model that is current in the `gmsh` module; `cell_size` in the geometry's own unit (metres for a domain),
+    the largest edge; `dimension` 2 or 3 (by default the geometry's own); `scale`, the geometry's unit in metres.
     Physical groups of the boundary become tags.
 
     Raises `ImportError` if the gmsh package or a system library it needs is missing, and `ValueError`
@@ -64,8 +64,8 @@ def _import() -> ModuleType:
     except (ImportError, OSError) as error:
         raise ImportError(
             'from_gmsh needs the gmsh package: pip install "jeit[mesh]" (on Linux also the system libraries it names, '
-            f"such as libGLU). It could not be loaded: {error}. Discs, rectangles, polygons, layers, boxes and cylinders need "
-            "no Gmsh: see jeit.mesh."
+            f"such as libGLU). It could not be loaded: {error}. Discs, rectangles, polygons, layers, boxes and "
+            "cylinders need no Gmsh: see jeit.mesh."
         ) from error
 
 

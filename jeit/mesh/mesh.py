@@ -80,8 +80,9 @@ class Mesh(eqx.Module):
         if coordinates is not None:
             _checks.check_coinciding(coordinates)
             indices = _checks.orient(coordinates, indices)
-        facets = _topology.boundary_facets(indices)
-        _checks.check_connected(indices)
+        first, second, single = _topology.pair_facets(indices)
+        _checks.check_connected(first // (dimension + 1), second // (dimension + 1), len(indices))
+        facets = _topology.cell_facets(indices)[single]
         if dimension == 2:
             facets = _topology.order_loops(facets, coordinates)
         located = _checks.locate_tags(tags or {}, facets)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -54,8 +55,8 @@ def disk(
         if target.cell_size is None:
             rings = _structured.choose_rings(target.num_points)
         else:
-            # Six nodes a ring make edges along it π/3 of those across: their mean is the size asked.
-            num_rings = max(1, round(1.02 * domain.radius / target.cell_size))
+            # Six nodes a ring: cells with legs t and π/3 t have the area of equilateral ones with edge 1.1 t.
+            num_rings = max(1, round(1.1 * domain.radius / target.cell_size))
             rings = (num_rings, 6 * num_rings)
         _unstructured.check_total(rings[0] * rings[1] // 2, "cell_size")
         points, cells = _structured.ring_disk(*rings)
@@ -105,15 +106,14 @@ def rectangle(
         stops = _arc_lengths(curve, boundary_points)
         points, cells = _unstructured.mesh([curve], [stops], interior_points, refine, target, domain.area)
     mesh = Mesh.create(points, cells)
-    facets = np.asarray(mesh.facets)
-    ends = np.asarray(mesh.points)[facets]
+    ends = np.asarray(mesh.points)[np.asarray(mesh.facets)]
     tolerance = 1e-9 * max(domain.width, domain.height)
     sides = {"left": (0, left), "right": (0, right), "bottom": (1, bottom), "top": (1, top)}
     tags = {
-        name: facets[(np.abs(ends[:, :, axis] - value) < tolerance).all(axis=1)]
+        name: jnp.asarray(np.flatnonzero((np.abs(ends[:, :, axis] - value) < tolerance).all(axis=1)), jnp.int32)
         for name, (axis, value) in sides.items()
     }
-    return Mesh.create(points, cells, tags=tags)
+    return Mesh(mesh.points, mesh.cells, mesh.facets, tags)
 
 
 def polygon(
@@ -130,8 +130,9 @@ def polygon(
 
     The vertices are nodes, the first of them node 0. Every angle is at least 25°, except the polygon's own sharper
     corners, each of which is cut off as one cell with two equal sides. `boundary_points` are arc lengths in metres
-    along the outer outline, counter-clockwise from the first vertex; the other arguments are those of `disk`. Raises `ValueError` on
-    an outline that is not simple, and on bad or contradicting arguments.
+    along the outer outline, counter-clockwise from the first vertex; the other arguments are those of `disk`.
+
+    Raises `ValueError` on an outline that is not simple, and on bad or contradicting arguments.
     """
     domain = Polygon(vertices, holes)
     target = _unstructured.Target.create(num_points, cell_size)

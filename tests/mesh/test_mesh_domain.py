@@ -1,0 +1,65 @@
+"""Outlines: area, extent, what they contain, and their boundary by arc length."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.mesh import Disk, Polygon, Rectangle, quality
+
+L_SHAPE = [[0, 0], [0.2, 0], [0.2, 0.1], [0.1, 0.1], [0.1, 0.2], [0, 0.2]]
+HOLE = [[0.02, 0.02], [0.06, 0.02], [0.06, 0.06], [0.02, 0.06]]
+DOMAINS = [Disk(0.1, (0.3, -0.2)), Rectangle(0.3, 0.2, (0.1, 0.05)), Polygon(L_SHAPE), Polygon(L_SHAPE, [HOLE])]
+NAMES = ["disk", "rectangle", "polygon", "polygon with a hole"]
+
+
+@pytest.mark.parametrize("domain", DOMAINS, ids=NAMES)
+def test_area_by_counting_points(domain):
+    left, right, low, high = domain.extent
+    x, y = np.meshgrid(np.linspace(left, right, 801), np.linspace(low, high, 801))
+    fraction = np.mean(np.asarray(domain.contains(np.stack([x, y], axis=-1))))
+    # A grid of 800² counts an area to about its perimeter over 800.
+    assert fraction * (right - left) * (high - low) == pytest.approx(float(domain.area), rel=5e-3)
+
+
+@pytest.mark.parametrize("domain", DOMAINS, ids=NAMES)
+def test_boundary_runs_counter_clockwise_at_unit_speed_and_wraps(domain):
+    perimeter = float(domain.perimeter)
+    arc = jnp.linspace(0, perimeter, 4001)
+    points = np.asarray(domain.boundary(arc))
+    assert np.linalg.norm(np.diff(points, axis=0), axis=1).sum() == pytest.approx(perimeter, rel=1e-5)
+    x, y = points[:-1].T
+    enclosed = 0.5 * np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
+    holes = 0.0016 if isinstance(domain, Polygon) and domain.holes else 0.0
+    assert enclosed == pytest.approx(float(domain.area) + holes, rel=1e-4)
+    np.testing.assert_allclose(domain.boundary(arc[7] + perimeter), points[7], atol=1e-12)
+    np.testing.assert_allclose(domain.boundary(arc[7] - perimeter), points[7], atol=1e-12)
+
+
+def test_where_the_boundary_starts():
+    np.testing.assert_allclose(Disk(0.1, (1.0, 2.0)).boundary(0.0), [1.1, 2.0])
+    np.testing.assert_allclose(Disk(0.1).boundary(0.1 * np.pi / 2), [0.0, 0.1], atol=1e-15)
+    np.testing.assert_allclose(
+        Rectangle(0.2, 0.1).boundary(jnp.array([0.0, 0.2, 0.25])), [[-0.1, -0.05], [0.1, -0.05], [0.1, 0.0]], atol=1e-15
+    )
+    clockwise = Polygon([[0, 0], [0, 1], [1, 1], [1, 0]])
+    np.testing.assert_allclose(clockwise.boundary(jnp.array([0.0, 0.5])), [[0, 0], [0.5, 0]])
+
+
+@pytest.mark.parametrize("domain", DOMAINS, ids=NAMES)
+def test_boundary_derivative_is_the_unit_tangent(domain):
+    tangent = jax.jacfwd(domain.boundary)(0.123 * float(domain.perimeter))
+    assert float(jnp.linalg.norm(tangent)) == pytest.approx(1.0, rel=1e-12)
+
+
+def test_the_radius_can_be_differentiated():
+    slope = jax.grad(lambda radius: Disk(radius).boundary(0.0)[0])(0.1)
+    assert float(slope) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("domain", DOMAINS, ids=NAMES)
+def test_domains_mesh_themselves(domain):
+    mesh = domain.mesh(num_points=300)
+    assert mesh.num_points == pytest.approx(300, rel=0.06)
+    assert quality(mesh).smallest_angle.min() >= 25
+    assert np.asarray(domain.contains(np.asarray(mesh.points)[np.asarray(mesh.cells)].mean(axis=1))).all()
