@@ -22,7 +22,7 @@ from benchmarks.report import markdown, table, write_between_markers
 
 def parse() -> argparse.Namespace:
     """Options of the command."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="The speed benchmark; see benchmarks/README.md.")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="See benchmarks/README.md.")
     parser.add_argument("--nodes", type=int, nargs="+", default=[1150, 5000, 20000], help="sizes of the meshes")
     parser.add_argument("--electrodes", type=int, nargs="+", default=[16, 32])
     parser.add_argument("--rounds", type=int, default=15, help="turns each contestant has at each task")
