@@ -117,8 +117,6 @@ def _foresee(match: Match, task: str, settings: Settings, before: list[Match]) -
     """pyEIT inverts the dense matrix for its Jacobian: n³ operations, three copies of n². Spare the hopeless."""
     if match.model != "point" or task != "voltages and Jacobian" or settings.pyeit_python is None:
         return {}
-    if 4 * 8 * match.num_points**2 > MEMORY_SHARE * available_memory():
-        return {"pyeit": Figures(remark="no memory for a dense inverse")}
     for earlier in reversed(before):
         known = earlier.figures.get(task, {}).get("pyeit")
         if earlier.num_electrodes == match.num_electrodes and known is not None and known.seconds:
@@ -126,6 +124,8 @@ def _foresee(match: Match, task: str, settings: Settings, before: list[Match]) -
             expected = known.median * (match.num_points / earlier.num_points) ** 2
             if expected > settings.limit:
                 return {"pyeit": Figures(remark=f"> {expected:.0f} s expected, not run")}
+    if 4 * 8 * match.num_points**2 > MEMORY_SHARE * available_memory():
+        return {"pyeit": Figures(remark="no memory for a dense inverse")}
     return {}
 
 

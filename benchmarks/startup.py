@@ -27,7 +27,7 @@ def demo_seconds(limit: float = 120.0) -> float | None:
         environment = dict(os.environ, XDG_CACHE_HOME=folder + "/cache", MPLCONFIGDIR=folder + "/matplotlib")
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
         start = time.perf_counter()
-        command = [sys.executable, "-m", "jeit.cli", "demo", "--output", folder + "/out"]
+        command = [sys.executable, "-c", "from jeit.cli import main; main()", "demo", "--output", folder + "/out"]
         process = subprocess.Popen(
             command, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
