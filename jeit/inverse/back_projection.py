@@ -1,6 +1,5 @@
 """Back-projection: the change seen by each channel, smeared over the cells that channel looks at."""
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
@@ -23,8 +22,8 @@ def back_projection(
     (Barber and Brown, J. Phys. E 17 (1984) 723-733). The result is scaled so that a uniform change of conductivity
     is imaged as itself.
 
-    `filtered`: image B (JB + λ²·mean diagonal·I)⁻¹ v, so that the image, seen through the Jacobian, gives back the
-    data: sharper, and noisier; `hyperparameter` is that λ. `mask`: True for the channels to use. Raises `ValueError`
+    `filtered`: back-project filtered data F v instead, where F minimises ‖JBFv - v‖² + λ²‖JB‖²‖Fv‖², so that the
+    image, seen through the Jacobian J, gives back the data: sharper, and noisier; `hyperparameter` is λ. `mask`: True for the channels to use. Raises `ValueError`
     for protocols whose channels have more than two electrodes, where no band is defined.
     """
     protocol = model.protocol
@@ -52,13 +51,11 @@ def back_projection(
     scale = np.broadcast_to(np.asarray(conductivity, float), (model.mesh.num_cells,))
     smear = -(scale / reached)[:, None] * band / np.where(used & (voltages != 0), voltages, np.inf)
     if not filtered:
-        return LinearReconstruction(model.mesh, jnp.asarray(smear), jnp.asarray(jnp.nan), "none", "back-projection")
-    seen = jacobian @ smear
+        return LinearReconstruction.create(model, smear, np.nan, "none", "back-projection")
     kept = np.flatnonzero(used)
-    inner = seen[np.ix_(kept, kept)]
-    damping = hyperparameter**2 * np.abs(np.diag(inner)).mean()
+    seen = jacobian[kept] @ smear[:, kept]
+    damping = (hyperparameter * np.linalg.norm(seen, 2)) ** 2
     matrix = np.zeros_like(smear)
-    matrix[:, kept] = np.linalg.solve((inner + damping * np.eye(len(kept))).T, smear[:, kept].T).T
-    return LinearReconstruction(
-        model.mesh, jnp.asarray(matrix), jnp.asarray(hyperparameter), "given", "filtered back-projection"
-    )
+    filter_matrix = np.linalg.solve(seen.T @ seen + damping * np.eye(len(kept)), seen.T)
+    matrix[:, kept] = smear[:, kept] @ filter_matrix
+    return LinearReconstruction.create(model, matrix, hyperparameter, "given", "filtered back-projection")

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jeit.forward import ForwardModel
 from jeit.inverse.hyperparameter import Spectrum, choose
@@ -15,30 +15,87 @@ from jeit.mesh import Mesh
 class LinearReconstruction(eqx.Module):
     """A linear image reconstruction: change of conductivity = matrix · change of voltages.
 
-    **Fields**: `mesh`; `matrix` (m, M), siemens per metre (2-D: siemens) per volt, zero in the columns of masked
-    channels; `hyperparameter` λ, and `rule`, how it was chosen; `method`, the name of the reconstruction.
+    Two channels that reciprocity ties together (v_b = r v_a) have proportional columns in the matrix, so they are
+    added first and multiplied once: half the arithmetic, the same image.
+
+    **Fields**: `mesh`; `first`, `second` (K,) the channels added to make each combined channel, and `ratio` (K,) the
+    weight of the second; `weights` (K, m), siemens per metre (2-D: siemens) per volt of combined channel;
+    `hyperparameter` λ, and `rule`, how it was chosen; `method`, the name of the reconstruction.
     """
 
     mesh: Mesh
-    matrix: Float[Array, "m M"]
+    first: Int[Array, " K"]
+    second: Int[Array, " K"]
+    ratio: Float[Array, " K"]
+    weights: Float[Array, "K m"]
     hyperparameter: Float[Array, ""]
+    num_measurements: int = eqx.field(static=True)
     rule: str = eqx.field(static=True)
     method: str = eqx.field(static=True)
 
+    @classmethod
+    def create(cls, model: ForwardModel, matrix, hyperparameter, rule: str, method: str):
+        """From a full reconstruction matrix (m, M)."""
+        matrix = np.asarray(matrix)
+        first, second, ratio = _combine(model, matrix)
+        return cls(
+            model.mesh,
+            jnp.asarray(first),
+            jnp.asarray(second),
+            jnp.asarray(ratio),
+            jnp.asarray(np.ascontiguousarray(matrix.T[first])),
+            jnp.asarray(hyperparameter, float),
+            matrix.shape[1],
+            rule,
+            method,
+        )
+
+    @property
+    def matrix(self) -> Float[Array, "m M"]:
+        """The full reconstruction matrix (m, M), zero in the columns of masked channels."""
+        full = jnp.zeros((self.num_measurements, self.weights.shape[1]))
+        full = full.at[self.second].add(self.ratio[:, None] * self.weights)
+        return full.at[self.first].add(self.weights).T
+
     def image(self, difference: Float[Array, "*frames M"]) -> Float[Array, "*frames m"]:
-        """Change of conductivity in every cell, for one difference of frames (M,) in volts or many (F, M)."""
-        difference = jnp.asarray(difference)
-        if difference.ndim not in (1, 2) or difference.shape[-1] != self.matrix.shape[1]:
+        """Change of conductivity in every cell, for one difference of frames (M,) in volts or many (F, M).
+
+        Raises `ValueError` for another number of channels.
+        """
+        shape = np.shape(difference)
+        if len(shape) not in (1, 2) or shape[-1] != self.num_measurements:
             raise ValueError(
-                f"difference has shape {difference.shape}; this reconstruction takes ({self.matrix.shape[1]},) volts, "
-                f"or (frames, {self.matrix.shape[1]})."
+                f"difference has shape {shape}; this reconstruction takes ({self.num_measurements},) volts, or "
+                f"(frames, {self.num_measurements})."
             )
-        return _apply(self.matrix, difference)
+        return _apply(self.first, self.second, self.ratio, self.weights, difference)
 
 
 @jax.jit
-def _apply(matrix, difference):
-    return difference @ matrix.T
+def _apply(first, second, ratio, weights, difference):
+    # Bare arrays across the jit boundary: flattening a Module costs as much as the product itself.
+    get = jnp.asarray(difference).at
+    combined = get[..., first].get(mode="promise_in_bounds") + ratio * get[..., second].get(mode="promise_in_bounds")
+    return combined @ weights
+
+
+def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Channels to add before the product: pairs tied by reciprocity whose columns are proportional, others alone."""
+    size = np.linalg.norm(matrix, axis=0)
+    alone = size > 0
+    pairs, _ = model.protocol.reciprocal_pairs()
+    pairs = np.asarray(pairs).reshape(-1, 2)
+    first, second = pairs[(size[pairs] > 0).all(axis=1)].T
+    ratio = np.einsum("ij,ij->j", matrix[:, first], matrix[:, second]) / size[first] ** 2
+    tied = np.abs(matrix[:, second] - ratio * matrix[:, first]).max(axis=0) < 1e-9 * np.abs(matrix).max()
+    first, second, ratio = first[tied], second[tied], ratio[tied]
+    alone[first] = alone[second] = False
+    single = np.flatnonzero(alone)
+    return (
+        np.concatenate([first, single]),
+        np.concatenate([second, single]),
+        np.concatenate([ratio, np.zeros(len(single))]),
+    )
 
 
 def one_step(
@@ -79,4 +136,4 @@ def one_step(
     chosen, rule = choose(spectrum, hyperparameter, data)
     narrow = spectrum.reconstruction(chosen) * root_weight
     matrix = jnp.zeros((model.mesh.num_cells, num_channels)).at[:, np.flatnonzero(used)].set(narrow)
-    return LinearReconstruction(model.mesh, matrix, chosen, rule, f"one-step, {type(prior).__name__} prior")
+    return LinearReconstruction.create(model, matrix, chosen, rule, f"one-step, {type(prior).__name__} prior")

@@ -1,0 +1,182 @@
+"""Contact integrals: exact where they claim to be, convergent elsewhere, differentiable everywhere."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.electrodes import (
+    BoundaryElectrodes,
+    CombinedElectrodes,
+    FaceDiscs,
+    FacePatches,
+    FacetElectrodes,
+    NodeElectrodes,
+    PointElectrodes,
+    SheetDiscs,
+    electrodes_from_nodes,
+    plates,
+    ring,
+    with_contact_impedance,
+)
+from jeit.mesh import Mesh, box, cylinder, disk, facet_measures, rectangle
+
+ROUNDING = 1e-12
+
+
+def strip():
+    """A 4 × 1 strip of unit squares, each cut in two: every integral can be done by hand."""
+    x, y = np.meshgrid(np.arange(5.0), np.arange(2.0))
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    lower = np.arange(4)
+    cells = np.concatenate(
+        [np.stack([lower, lower + 1, lower + 6], axis=1), np.stack([lower, lower + 6, lower + 5], axis=1)]
+    )
+    return Mesh.create(points, cells)
+
+
+def mass_matrix(contact, num_points):
+    matrix = np.zeros((num_points, num_points))
+    for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
+        np.add.at(matrix, (np.asarray(nodes)[:, :, None], np.asarray(nodes)[:, None, :]), np.asarray(mass))
+    return matrix
+
+
+def test_arc_over_part_of_an_edge_by_hand():
+    # Covers x from 1.25 to 1.75 of the edge from (1, 0) to (2, 0), at z = 2 ohm·m.
+    contact = BoundaryElectrodes([[1.5, 0.0]], 0.5, 2.0).contact(strip())
+    load = np.zeros(10)
+    load[[1, 2]] = 0.25 / 2
+    np.testing.assert_allclose(np.asarray(contact.load)[:, 0], load, atol=ROUNDING)
+    matrix = mass_matrix(contact, 10)
+    square, mixed = (0.75**3 - 0.25**3) / 3 / 2, ((0.75**2 - 0.25**2) / 2 - (0.75**3 - 0.25**3) / 3) / 2
+    np.testing.assert_allclose(matrix[np.ix_([1, 2], [1, 2])], [[square, mixed], [mixed, square]], atol=ROUNDING)
+    assert np.count_nonzero(np.abs(matrix) > ROUNDING) == 4
+
+
+def test_arc_round_a_corner_and_across_the_start_of_the_boundary():
+    mesh = strip()
+    for corner in ([0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [0.0, 1.0]):
+        contact = BoundaryElectrodes([corner], 0.6, 1.0).contact(mesh)
+        touched = np.flatnonzero(np.abs(np.asarray(contact.load)[:, 0]) > ROUNDING)
+        assert len(touched) == 3
+        assert float(contact.load.sum()) == pytest.approx(0.6, rel=ROUNDING)
+
+
+def test_arc_on_whole_edges_equals_facet_electrode():
+    mesh = disk(0.1, num_points=200)
+    facets = np.asarray(mesh.facets)
+    middle = np.asarray(mesh.points)[facets[3:5]].reshape(-1, 2)[1]
+    lengths = np.asarray(facet_measures(mesh))[3:5]
+    arc = BoundaryElectrodes([middle], lengths.sum(), 0.3).contact(mesh)
+    exact = FacetElectrodes(mesh, [[3, 4]], 0.3).contact(mesh)
+    # On a circle of equal edges the shared node is the middle of the two.
+    np.testing.assert_allclose(arc.load, exact.load, atol=1e-9 * float(exact.load.max()))
+    np.testing.assert_allclose(
+        mass_matrix(arc, mesh.num_points), mass_matrix(exact, mesh.num_points), atol=1e-9 * float(exact.load.max())
+    )
+
+
+@pytest.mark.parametrize(
+    ("electrodes", "mesh", "area"),
+    [
+        (lambda m: BoundaryElectrodes(ring(0.1, 8), 0.02, 3.0), lambda: disk(0.1, num_points=300), 0.02),
+        (lambda m: SheetDiscs(0.06 * ring(1.0, 5), 0.01, 3.0), lambda: disk(0.1, num_points=2000), np.pi * 1e-4),
+        (
+            lambda m: FacePatches(ring(0.1, 4, height=float(m.points[:, 2].mean())), 0.03, 0.03, 3.0),
+            lambda: cylinder(0.1, 0.1, num_points=4000),
+            9e-4,
+        ),
+    ],
+)
+def test_mass_and_load_add_up_to_area_over_impedance(electrodes, mesh, area):
+    mesh = mesh()
+    electrodes = electrodes(mesh)
+    contact = electrodes.contact(mesh)
+    per_electrode = np.asarray(contact.load.sum(axis=0))
+    # Arcs are exact; windows smear the edge over half a cell, patches bend round the wall.
+    tolerance = ROUNDING if isinstance(electrodes, BoundaryElectrodes) else 0.03
+    np.testing.assert_allclose(per_electrode, area / 3.0, rtol=tolerance)
+    total = sum(float(mass.sum()) for mass in contact.mass)
+    assert total == pytest.approx(per_electrode.sum(), rel=1e-12)
+
+
+def test_window_area_converges_to_the_disc():
+    errors = []
+    for cell_size in (0.008, 0.004, 0.002):
+        mesh = rectangle(0.1, 0.1, cell_size=cell_size)
+        middle = np.asarray(mesh.points).mean(axis=0) + np.array([0.0013, 0.0007])
+        electrodes = SheetDiscs([middle], 0.02, 1.0)
+        load = electrodes.contact(mesh).load[:, 0]
+        first_moment = np.asarray(load @ mesh.points / load.sum())
+        errors.append(abs(float(load.sum()) / (np.pi * 0.02**2) - 1) + np.linalg.norm(first_moment - middle) / 0.02)
+    assert errors[2] < 1e-3
+    assert errors[2] < errors[0] / 8
+
+
+def test_face_disc_on_a_thin_layer_stays_on_its_face():
+    mesh = box(0.05, 0.05, 0.002, cell_size=0.0025)
+    points = np.asarray(mesh.points)
+    top = points[:, 2].max()
+    middle = [*points[:, :2].mean(axis=0), top]
+    load = np.asarray(FaceDiscs([middle], 0.008, 1.0).contact(mesh).load)[:, 0]
+    assert load[points[:, 2] < top].sum() == 0
+    assert load.sum() == pytest.approx(np.pi * 0.008**2, rel=0.02)
+
+
+def test_point_electrode_interpolates():
+    mesh = disk(0.1, num_points=200)
+    position = np.array([[0.013, 0.021], [-0.05, 0.04]])
+    load = np.asarray(PointElectrodes(position).contact(mesh).load)
+    np.testing.assert_allclose(load.sum(axis=0), 1, rtol=ROUNDING)
+    np.testing.assert_allclose(load.T @ np.asarray(mesh.points), position, atol=ROUNDING)
+
+
+def test_point_electrode_at_a_node_equals_node_electrode():
+    mesh = disk(0.1, num_points=200)
+    nodes = np.array([0, 17, 60])
+    at_points = PointElectrodes(mesh.points[nodes]).contact(mesh).load
+    np.testing.assert_allclose(at_points, NodeElectrodes(nodes).contact(mesh).load, atol=1e-9)
+
+
+def test_electrodes_from_nodes_cover_facets_between_their_nodes():
+    mesh = disk(0.1, num_points=200)
+    facets = np.asarray(mesh.facets)
+    electrodes = electrodes_from_nodes(mesh, [facets[2:4].ravel(), facets[10]], [0.1, 0.2])
+    covers = np.asarray(electrodes.covers)
+    assert np.flatnonzero(covers[:, 0]).tolist() == [2, 3]
+    assert np.flatnonzero(covers[:, 1]).tolist() == [10]
+
+
+def test_plates_cover_tagged_faces():
+    mesh = box(0.3, 0.2, 0.1, num_points=200)
+    contact = plates(mesh, ["left", "top"], 0.5).contact(mesh)
+    np.testing.assert_allclose(contact.load.sum(axis=0) * 0.5, [0.2 * 0.1, 0.3 * 0.2], rtol=ROUNDING)
+
+
+def test_combined_electrodes_keep_their_order_and_impedances():
+    mesh = disk(0.1, num_points=600)
+    arcs, disc = BoundaryElectrodes(ring(0.1, 3), 0.02, 1e-3), SheetDiscs([[0.0, 0.0]], 0.02, 1e-4)
+    both = CombinedElectrodes(arcs, disc)
+    load = both.contact(mesh).load
+    np.testing.assert_allclose(load[:, :3], arcs.contact(mesh).load, atol=ROUNDING)
+    np.testing.assert_allclose(load[:, 3:], disc.contact(mesh).load, atol=ROUNDING)
+    changed = with_contact_impedance(both, [1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_allclose(changed.contact_impedance, [1, 2, 3, 4])
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.004, 0.011])
+def test_position_gradient_where_an_electrode_slides_over_corners(offset):
+    """Of a disk's polygon: the middle of an electrode often is a node (offset zero)."""
+    mesh = disk(0.1, num_points=300)
+    position = ring(0.1, 4, start_angle=offset / 0.1)
+    weight = jax.random.normal(jax.random.key(0), (mesh.num_points, 4))
+
+    def total(position):
+        return jnp.sum(BoundaryElectrodes(position, 0.03, 1.0).contact(mesh).load * weight)
+
+    direction = jnp.asarray(np.random.default_rng(1).normal(size=position.shape))
+    derivative = jax.jvp(total, (jnp.asarray(position),), (direction,))[1]
+    step = 1e-8
+    difference = (total(position + step * direction) - total(position - step * direction)) / (2 * step)
+    assert difference == pytest.approx(float(derivative), rel=1e-5)

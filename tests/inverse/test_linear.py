@@ -1,0 +1,116 @@
+"""Linear images: the matrix against its definition, the rules, and what they find on simulated inclusions."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes, ring
+from jeit.forward import ForwardModel
+from jeit.image import find_inclusions
+from jeit.inverse import RULES, Gaussian, Laplace, Noser, Tikhonov, back_projection, one_step
+from jeit.mesh import centroids, disk
+from jeit.protocol import adjacent
+
+PRIORS = {"tikhonov": Tikhonov(), "laplace": Laplace(), "noser": Noser(), "gaussian": Gaussian(0.02)}
+
+
+@pytest.fixture(scope="module")
+def model():
+    electrodes = BoundaryElectrodes(ring(0.1, 16), 0.02, 1e-3)
+    return ForwardModel(disk(0.1, num_points=300), electrodes, adjacent(16, current=1e-3))
+
+
+@pytest.fixture(scope="module")
+def difference(model):
+    """An inclusion at (0.05, 0.02) m of doubled conductivity, seen by a finer mesh; plus one part in 1e4 of noise."""
+    fine = ForwardModel(disk(0.1, num_points=900), model.electrodes, model.protocol)
+    inside = jnp.linalg.norm(centroids(fine.mesh) - jnp.array([0.05, 0.02]), axis=1) < 0.02
+    change = fine.voltages(jnp.where(inside, 2.0, 1.0)) - fine.voltages(1.0)
+    noise = np.random.default_rng(3).normal(size=change.shape) * 1e-2 * float(jnp.abs(change).max())
+    return change + noise
+
+
+@pytest.mark.parametrize("name", ["tikhonov", "laplace", "noser"])
+def test_matrix_solves_the_normal_equations(model, name):
+    """(JᵀWJ + λ²Q) R = JᵀW, the definition, with unequal noise and a mask."""
+    mask = np.ones(208, bool)
+    mask[[3, 50]] = False
+    noise = np.random.default_rng(0).uniform(0.5, 2, 208)
+    reconstruction = one_step(model, 1.0, prior=PRIORS[name], hyperparameter=0.03, noise=noise, mask=mask)
+    weight = np.where(mask, noise**-2, 0)
+    jacobian = np.asarray(model.jacobian(1.0))
+    whitened = np.sqrt(weight)[:, None] * jacobian
+    precision = PRIORS[name].precision(model.mesh, whitened).toarray()
+    normal = whitened.T @ whitened + 0.03**2 * precision
+    matrix = np.asarray(reconstruction.matrix)
+    right = jacobian.T * weight
+    assert np.linalg.norm(normal @ matrix - right) < 1e-9 * np.linalg.norm(right)
+    assert np.abs(matrix[:, ~mask]).max() == 0
+
+
+def test_gaussian_matrix_is_the_data_space_form_of_its_covariance(model):
+    jacobian = np.asarray(model.jacobian(1.0))
+    centre = np.asarray(centroids(model.mesh))
+    covariance = np.exp(-((centre[:, None] - centre) ** 2).sum(axis=-1) / (2 * 0.02**2))
+    expected = covariance @ jacobian.T @ np.linalg.inv(jacobian @ covariance @ jacobian.T + 0.3**2 * np.eye(208))
+    matrix = np.asarray(one_step(model, 1.0, prior=PRIORS["gaussian"], hyperparameter=0.3).matrix)
+    assert np.linalg.norm(matrix - expected) < 1e-9 * np.linalg.norm(expected)
+
+
+def test_image_equals_the_full_matrix_for_one_frame_and_many(model, difference):
+    reconstruction = one_step(model, 1.0, hyperparameter=0.03)
+    assert reconstruction.weights.shape[0] == 104  # reciprocity halves 208 adjacent channels
+    frames = np.stack([difference, 2 * np.roll(difference, 5)])
+    images = reconstruction.image(frames)
+    expected = frames @ np.asarray(reconstruction.matrix).T
+    np.testing.assert_allclose(images, expected, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(reconstruction.image(frames[0]), expected[0], atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS.keys())
+def test_every_prior_finds_the_inclusion(model, difference, prior):
+    image = one_step(model, 1.0, prior=prior, difference=difference).image(difference)
+    strongest = find_inclusions(model.mesh, image)[0]
+    assert strongest.sign == 1
+    # Tikhonov alone pulls images towards the edge, where a change of conductivity costs least.
+    tolerance = 0.02 if isinstance(prior, Tikhonov) else 0.012
+    assert np.linalg.norm(np.array(strongest.centroid) - [0.05, 0.02]) < tolerance
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_back_projection_finds_the_inclusion(model, difference, filtered):
+    image = back_projection(model, 1.0, filtered=filtered, hyperparameter=0.01).image(difference)
+    strongest = find_inclusions(model.mesh, image)[0]
+    assert strongest.sign == 1
+    assert np.linalg.norm(np.array(strongest.centroid) - [0.05, 0.02]) < 0.03
+
+
+def test_back_projection_images_a_uniform_change_as_itself(model):
+    change = model.voltages(1.01) - model.voltages(1.0)
+    image = np.asarray(back_projection(model, 1.0).image(change))
+    reached = image != 0
+    assert reached.mean() > 0.9
+    # z stays put while σ changes, so the voltages do not scale exactly.
+    np.testing.assert_allclose(image[reached], 0.01, rtol=0.1)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_rules_choose_a_hyperparameter_that_follows_the_noise(model, difference, rule):
+    """Data in units of noise: with ten times the noise, rules that see data must not choose a smaller λ."""
+    chosen = []
+    for level in (1e-2, 1e-1):
+        scale = level * float(jnp.abs(difference).max())
+        noise = scale * np.random.default_rng(4).normal(size=208)
+        quiet = one_step(model, 1.0, hyperparameter=rule, difference=difference + noise, noise=scale)
+        chosen.append(float(quiet.hyperparameter) * scale)
+        assert quiet.rule == rule
+    if rule != "noise-figure":
+        assert chosen[1] > chosen[0]
+
+
+def test_discrepancy_leaves_the_noise_in_the_residual(model, difference):
+    scale = 0.05 * float(jnp.abs(difference).max())
+    noisy = difference + scale * np.random.default_rng(5).normal(size=208)
+    reconstruction = one_step(model, 1.0, hyperparameter="discrepancy", difference=noisy, noise=scale)
+    residual = noisy - model.jacobian(1.0) @ reconstruction.image(noisy)
+    assert float(jnp.sum(residual**2)) / scale**2 == pytest.approx(208, rel=0.1)
