@@ -1,10 +1,83 @@
-"""jeit: differentiable electrical impedance tomography in JAX."""
+"""jeit: differentiable electrical impedance tomography in JAX.
 
+The names used most, and where the rest is:
+
+- `read`, `Measurement`: measured files (`jeit.data`);
+- `image_difference`, `ImagingSettings`: from two frames to a picture, in one call (`jeit.imaging`, `jeit.report`);
+- `Disk`, `Rectangle`, `Polygon`, `Mesh`: outlines and their meshes (`jeit.mesh`);
+- `BoundaryElectrodes`, `ring`: electrodes and where to put them (`jeit.electrodes`);
+- `adjacent`: what is driven and measured (`jeit.protocol`);
+- `ForwardModel`: conductivity to voltages and Jacobian (`jeit.forward`);
+- `calibrate`, `one_step`: linear imaging (`jeit.inverse`);
+- `Raster`, `find_inclusions`: what an image shows (`jeit.image`);
+- `plot_image`: pictures (`jeit.plot`).
+
+Importing jeit turns on JAX's 64-bit mode, unless JAX_ENABLE_X64 is set. Rooms are imported when first used.
+"""
+
+import importlib
 import os
+from typing import TYPE_CHECKING
 
 import jax
+
+if TYPE_CHECKING:
+    from jeit.data import Measurement as Measurement
+    from jeit.data import read as read
+    from jeit.electrodes import BoundaryElectrodes as BoundaryElectrodes
+    from jeit.electrodes import ring as ring
+    from jeit.forward import ForwardModel as ForwardModel
+    from jeit.image import Raster as Raster
+    from jeit.image import find_inclusions as find_inclusions
+    from jeit.imaging import ImagingSettings as ImagingSettings
+    from jeit.imaging import image_difference as image_difference
+    from jeit.inverse import calibrate as calibrate
+    from jeit.inverse import one_step as one_step
+    from jeit.mesh import Disk as Disk
+    from jeit.mesh import Mesh as Mesh
+    from jeit.mesh import Polygon as Polygon
+    from jeit.mesh import Rectangle as Rectangle
+    from jeit.plot import plot_image as plot_image
+    from jeit.protocol import adjacent as adjacent
 
 # A light touch changes voltages by 1e-4: single precision is not enough. A user who has set
 # JAX_ENABLE_X64 has decided already.
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
+
+_ROOMS = ("data", "electrodes", "forward", "image", "imaging", "inverse", "mesh", "plot", "protocol", "report")
+_HOMES = {
+    "BoundaryElectrodes": "electrodes",
+    "Disk": "mesh",
+    "ForwardModel": "forward",
+    "ImagingSettings": "imaging",
+    "Measurement": "data",
+    "Mesh": "mesh",
+    "Polygon": "mesh",
+    "Raster": "image",
+    "Rectangle": "mesh",
+    "adjacent": "protocol",
+    "calibrate": "inverse",
+    "find_inclusions": "image",
+    "image_difference": "imaging",
+    "one_step": "inverse",
+    "plot_image": "plot",
+    "read": "data",
+    "ring": "electrodes",
+}
+
+
+def __getattr__(name: str):
+    if name in _ROOMS:
+        return importlib.import_module(f"jeit.{name}")
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"jeit.{_HOMES[name]}"), name)
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("jeit")
+    raise AttributeError(f"module 'jeit' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_ROOMS, *_HOMES])

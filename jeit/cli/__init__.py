@@ -1,0 +1,6 @@
+"""The `jeit` command: one file for each of its commands, and `app`, which ties them together.
+
+The commands import what they need when they run, so that `jeit --help` answers at once.
+"""
+
+from jeit.cli.app import main as main

@@ -1,0 +1,116 @@
+"""The command line's frame: its commands, its errors, its compilation cache."""
+
+import io
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jeit.cli.demo import demo
+from jeit.cli.info import info
+from jeit.cli.reconstruct import reconstruct
+
+app = typer.Typer(
+    name="jeit",
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help="Electrical impedance tomography: from a measured tank or skin to an image.",
+)
+app.command()(demo)
+app.command()(reconstruct)
+app.command()(info)
+
+
+@app.callback(invoke_without_command=True)
+def _top(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Say which version this is.")] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as installed
+
+        typer.echo(f"jeit {installed('jeit')}")
+    elif context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command with `arguments` (those of the process unless given); returns its exit status.
+
+    0: done. 1: something is wrong with the data or the values given. 2: the command was not called as it should be.
+    Whatever is wrong is said in one line on standard error; JEIT_DEBUG=1 shows the traceback instead.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal that knows no Greek must not end the run
+    command = typer.main.get_command(app)
+    try:
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            _keep_compiled_code()
+            status = command.main(args=None if arguments is None else list(arguments), standalone_mode=False)
+    except KeyboardInterrupt:
+        return _fail("stopped.", 130)
+    except Exception as error:
+        if os.environ.get("JEIT_DEBUG"):
+            raise
+        return _explain(error)
+    return status if isinstance(status, int) else 0
+
+
+def _explain(error: Exception) -> int:
+    """One line on standard error, and the exit status."""
+    if hasattr(error, "format_message"):  # how the command was called: click's and typer's own errors
+        context = getattr(error, "ctx", None)
+        path = context.command_path if context is not None else "jeit"
+        return _fail(f"{error.format_message()} See '{path} --help'.", 2)  # pyright: ignore[reportAttributeAccessIssue]
+    if type(error).__name__ == "Abort":
+        return _fail("stopped.", 130)
+    if isinstance(error, ValueError):
+        return _fail(str(error), 1)
+    if isinstance(error, OSError):
+        return _fail(f"{error.filename or 'file'}: {error.strerror or error}.", 1)
+    if isinstance(error, MemoryError):
+        return _fail("there is not enough memory; ask for fewer --num-points.", 1)
+    return _fail(
+        f"this should not have happened: {type(error).__name__}: {error} "
+        "Run again with JEIT_DEBUG=1 for the traceback, and report it.",
+        1,
+    )
+
+
+def _fail(message: str, status: int) -> int:
+    print(f"jeit: {' '.join(message.split())}", file=sys.stderr)
+    return status
+
+
+def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    print(f"jeit: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+def _keep_compiled_code() -> None:
+    """Let JAX keep compiled code between runs, in the user's cache folder or in JAX_COMPILATION_CACHE_DIR."""
+    import jax
+
+    if jax.config.jax_compilation_cache_dir is not None:  # pyright: ignore[reportAttributeAccessIssue]
+        return
+    folder = _cache_folder() / "jeit" / "jax"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return  # no home to write to: every run compiles afresh
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def _cache_folder() -> Path:
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    variable = "LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"
+    return Path(os.environ.get(variable) or Path.home() / ".cache")

@@ -1,0 +1,68 @@
+"""What the commands print: steps as they go, and tables of results."""
+
+import time
+
+from rich.console import Console
+from rich.table import Table
+
+
+class Steps:
+    """Progress on standard output: the step under way with a spinner, steps done with the seconds they took.
+
+    Call it with the name of each step as it begins. Prints nothing when `quiet`.
+    """
+
+    def __init__(self, console: Console, *, quiet: bool):
+        self.console = console
+        self.quiet = quiet
+        self._status = None
+        self._step = ""
+        self._start = 0.0
+
+    def __call__(self, step: str) -> None:
+        self._finish()
+        self._step, self._start = step, time.perf_counter()
+        if not self.quiet:
+            self._status = self.console.status(f"{step} …")
+            self._status.start()
+
+    def __enter__(self) -> "Steps":
+        return self
+
+    def __exit__(self, kind, error, traceback) -> None:
+        if kind is None:
+            self._finish()
+        elif self._status is not None:
+            self._status.stop()
+
+    def _finish(self) -> None:
+        if self._status is None:
+            return
+        self._status.stop()
+        self._status = None
+        self.console.print(f"  {self._step:<24}{time.perf_counter() - self._start:6.1f} s", highlight=False)
+
+
+def pairs(title: str, rows: list[tuple[str, str]]) -> Table:
+    """A table of names and values."""
+    table = Table(title=title, title_justify="left", title_style="bold", show_header=False, box=None, padding=(0, 2))
+    table.add_column(style="dim")
+    table.add_column(overflow="fold")
+    for name, value in rows:
+        table.add_row(name, value)
+    return table
+
+
+def scaled(value: float | None, unit: str) -> str:
+    """A value with three digits and an SI prefix: 0.00132 S is "1.32 mS"."""
+    if value is None:
+        return "not known"
+    for exponent, prefix in ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n")):
+        if abs(value) >= 10.0**exponent:
+            return f"{value / 10.0**exponent:.3g} {prefix}{unit}"
+    return f"{value:.3g} {unit}"
+
+
+def percent(value: float | None) -> str:
+    """A ratio in per cent."""
+    return "not known" if value is None else f"{100 * value:.2g} %"

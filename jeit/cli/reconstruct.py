@@ -1,0 +1,132 @@
+"""`jeit reconstruct`: a measured file in; a picture, arrays and a report out."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from jeit.imaging import ImagedDifference
+
+Format = Annotated[
+    str | None,
+    typer.Option(help="kit4, ktc2023, eidors, table or tank6cm; found from the content unless given."),
+]
+Description = Annotated[
+    str | None,
+    typer.Option(help="TOML file that says what the numbers mean; looked for beside the data unless given."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+
+
+def reconstruct(
+    data: Annotated[Path, typer.Argument(help="Measured file to image.", show_default=False)],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for image.png, image.npz, report.json.", show_default=False)
+    ],
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="Measured file of the undisturbed body; may be left out if DATA has a frame 'reference'."),
+    ] = None,
+    format: Format = None,
+    description: Description = None,
+    method: Annotated[
+        str | None, typer.Option(help="one-step (default), back-projection or filtered-back-projection.")
+    ] = None,
+    prior: Annotated[
+        str | None, typer.Option(help="tikhonov, laplace, noser (default) or gaussian; for one-step.")
+    ] = None,
+    hyperparameter: Annotated[
+        str | None,
+        typer.Option(
+            help="A number, or the rule that chooses it: noise-figure (default), l-curve, gcv, discrepancy.",
+            metavar="VALUE|RULE",
+        ),
+    ] = None,
+    contact: Annotated[
+        str | None,
+        typer.Option(help="Contact impedance in the calibration: each, common or fixed; found from the protocol."),
+    ] = None,
+    num_points: Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000).")] = None,
+    frame: Annotated[
+        str | None, typer.Option(help="Frame of DATA to image, by number from 0 or by name; the first unless given.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Image what changed between REFERENCE and DATA; writes image.png, image.npz and report.json."""
+    from rich.console import Console
+
+    from jeit.cli.console import Steps
+    from jeit.data import read
+    from jeit.imaging import ImagingSettings, image_difference
+    from jeit.report import write
+
+    given = {
+        "method": method,
+        "prior": prior,
+        "hyperparameter": None if hyperparameter is None else _number_or_name(hyperparameter),
+        "contact": contact,
+        "num_points": num_points,
+    }
+    settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})
+    make_folder(output)
+    console = Console(highlight=False)
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        measurement = read(data, format, description)
+        base = None if reference is None else read(reference, format, description)
+        chosen = None if frame is None else _number_or_name(frame, int)
+        result = image_difference(measurement, base, settings, frame=chosen, progress=step)
+        step("write")
+        write(result, output)
+    if not quiet:
+        show(console, result)
+        console.print(f"[dim]Written:[/dim] {output / 'image.png'}, image.npz, report.json", soft_wrap=True)
+
+
+def show(console, result: "ImagedDifference") -> None:
+    """Print what was found."""
+    from rich.table import Table
+
+    from jeit.cli.console import pairs, percent, scaled
+
+    calibration, reconstruction = result.calibration, result.reconstruction
+    unit = "S" if result.mesh.dimension == 2 else "S/m"
+    noise = result.quality.difference_noise
+    hyperparameter = float(reconstruction.hyperparameter)
+    chosen = "none" if reconstruction.rule == "none" else f"{hyperparameter:.3g} ({reconstruction.rule})"
+    rows = [
+        ("background", f"{scaled(float(calibration.conductivity), unit)}, misfit {percent(float(calibration.misfit))}"),
+        ("difference", f"{percent(result.quality.difference)} of the reference"),
+        ("noise in it", "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"),
+        ("method", f"{reconstruction.method}, hyperparameter {chosen}"),
+        ("mesh", f"{result.mesh.num_points:,} nodes, {result.mesh.num_cells:,} cells"),
+    ]
+    if calibration.status != "converged":
+        rows.insert(1, ("calibration", calibration.status))
+    console.print()
+    console.print(pairs(result.measurement.name, rows))
+    console.print()
+    table = Table("inclusion", "x / mm", "y / mm", "area / mm²", f"peak / {unit}", box=None, padding=(0, 2))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for inclusion in result.inclusions:
+        x, y = inclusion.centroid[:2]
+        numbers = (f"{1e3 * x:.1f}", f"{1e3 * y:.1f}", f"{1e6 * inclusion.area:.0f}", f"{inclusion.peak:.3g}")
+        table.add_row(inclusion.kind, *numbers)
+    console.print(table if result.inclusions else "  no inclusion found")
+    console.print()
+
+
+def make_folder(output: Path) -> None:
+    """Make the folder for the results before any work is done for them. Raises `ValueError` if it cannot be one."""
+    if output.exists() and not output.is_dir():
+        raise ValueError(f"--output {output} is a file; give a folder for the results.")
+    output.mkdir(parents=True, exist_ok=True)
+
+
+def _number_or_name(text: str, number: type = float):
+    try:
+        return number(text)
+    except ValueError:
+        return text

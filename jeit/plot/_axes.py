@@ -1,0 +1,80 @@
+"""Axes for plane pictures: no ticks but a scale bar, colour bars, units with the prefix that suits."""
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.ticker import MaxNLocator
+
+INK = "#26292e"
+SOFT = "#8b9098"
+# Red is more conductive, blue more resistive; white is no change.
+DIVERGING = "RdBu_r"
+SEQUENTIAL = "viridis"
+_PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+
+
+def axes_or_new(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes:
+    """`ax`, or the axes of a new pyplot figure of `size` inches."""
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot
+
+    return pyplot.subplots(figsize=size, layout="constrained")[1]
+
+
+def bare(ax: Axes, extent: tuple[float, float, float, float], *, margin: float = 0.12) -> None:
+    """Equal scales, no frame and no ticks, and room round the `extent` (metres) for electrode numbers."""
+    x_min, x_max, y_min, y_max = extent
+    room = margin * max(x_max - x_min, y_max - y_min)
+    ax.set_aspect("equal")
+    ax.set_xlim(x_min - room, x_max + room)
+    ax.set_ylim(y_min - 1.5 * room, y_max + room)
+    ax.set_axis_off()
+
+
+def extent_of(points: np.ndarray) -> tuple[float, float, float, float]:
+    """(x_min, x_max, y_min, y_max) of points (n, 2 or 3)."""
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    return (low[0], high[0], low[1], high[1])
+
+
+def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
+    """A bar of a round length, about a quarter of the picture, below its lower left corner."""
+    x_min, x_max, y_min, y_max = extent
+    size = max(x_max - x_min, y_max - y_min)
+    length = _round_down(0.27 * (x_max - x_min))
+    x, y = x_min - 0.06 * size, y_min - 0.125 * size
+    ax.plot([x, x + length], [y, y], color=INK, linewidth=2.5, solid_capstyle="butt")
+    millimetres = 1e3 * length
+    ax.text(x + length / 2, y - 0.012 * size, f"{millimetres:g} mm", ha="center", va="top", color=INK, fontsize=9)
+
+
+def draw_colour_bar(ax: Axes, drawn: ScalarMappable, label: str, *, signed: bool = False) -> None:
+    """A slim colour bar at the right, its ticks signed if the quantity is a difference."""
+    figure = ax.figure
+    bar = figure.colorbar(
+        drawn, ax=ax, shrink=0.72, aspect=28, pad=0.02, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10])
+    )
+    if signed:
+        bar.ax.yaxis.set_major_formatter(
+            lambda value, _: "0" if abs(value) < 1e-12 else f"{value:+g}".replace("-", "−")
+        )
+    bar.set_label(label, color=INK)
+    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    bar.ax.tick_params(length=2, color=SOFT, labelcolor=INK)
+
+
+def prefixed(largest: float, unit: str) -> tuple[float, str]:
+    """Factor to multiply values of up to `largest` with, and the unit with its SI prefix: (1e3, "mS")."""
+    if not unit or unit == "%" or not (math.isfinite(largest) and largest > 0):
+        return 1.0, unit
+    exponent = 3 * math.floor(math.log10(largest) / 3 + 1e-9)
+    exponent = min(max(exponent, -12), 9)
+    return 10.0**-exponent, _PREFIXES[exponent] + unit
+
+
+def _round_down(length: float) -> float:
+    decade = 10 ** math.floor(math.log10(length))
+    return max(step * decade for step in (1, 2, 5) if step * decade <= length * (1 + 1e-9))
