@@ -1,1 +1,29 @@
-"""Numerics with no physics in it."""
+"""Numerics with no physics in it: sparse symmetric positive definite systems, solved in pure JAX.
+
+A direct solver (nested dissection, multifrontal Cholesky in batches of dense fronts) and conjugate gradients, both for
+`SparseSymmetric` operators and behind `lineax.linear_solve`; and the functions beneath it, for when every microsecond
+counts. See `analyse`, `factorise` and `solve`.
+"""
+
+from .choose import choose_solver
+from .conjugate_gradient import ConjugateGradient
+from .multifrontal import Factor, factorise, half_solve, quadratic_form, solve
+from .operator import SparseSymmetric
+from .pattern import SparsityPattern
+from .plan import FactorisationPlan, analyse
+from .sparse_cholesky import SparseCholesky
+
+__all__ = [
+    "ConjugateGradient",
+    "Factor",
+    "FactorisationPlan",
+    "SparseCholesky",
+    "SparseSymmetric",
+    "SparsityPattern",
+    "analyse",
+    "choose_solver",
+    "factorise",
+    "half_solve",
+    "quadratic_form",
+    "solve",
+]

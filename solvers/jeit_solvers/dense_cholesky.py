@@ -1,0 +1,100 @@
+"""Batched inverse Cholesky factors of small dense matrices, in elementwise operations and matrix products only.
+
+Why not LAPACK through `jax.lax.linalg`: its small-matrix routines are several times slower than a matrix product of
+the same size; a triangular solve may start BLAS threads that fight with XLA's own; and in jaxlib 0.10 two batched
+LAPACK calls that run side by side in one program can wait for each other for ever when the thread pool is as small
+as two. Matrix products have none of these troubles, and the same code serves complex symmetric matrices.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Inexact
+
+_BLOCK = 8
+_LARGEST_UNROLLED = 24
+
+
+def inverse_cholesky(matrices: Inexact[Array, "*batch s s"]) -> Inexact[Array, "*batch s s"]:
+    """W = L^-1 for the lower triangular L with A = L L^T, so that W A W^T = 1.
+
+    Real matrices must be positive definite. Complex ones must be symmetric (not Hermitian) with a positive definite
+    real part, which makes the elimination stable without pivoting (Higham, Math. Comp. 67, 1998). What cannot be
+    factorised comes back as NaN.
+    """
+    size = matrices.shape[-1]
+    if size <= _BLOCK:
+        return _by_columns(matrices)
+    if size <= _LARGEST_UNROLLED:
+        return _by_halves(matrices)
+    return _by_block_rows(matrices)
+
+
+def _transposed(matrices: Inexact[Array, "*batch a b"]) -> Inexact[Array, "*batch b a"]:
+    return jnp.swapaxes(matrices, -1, -2)
+
+
+def _by_columns(matrices):
+    """Unrolled elimination. The barriers keep XLA from fusing it all into one kernel that computes things again and
+    again."""
+    size, dtype = matrices.shape[-1], matrices.dtype
+    columns, scales = [], []
+    for j in range(size):
+        column = matrices[..., :, j]
+        for previous in columns:
+            column = column - previous * previous[..., j : j + 1]
+        column = jax.lax.optimization_barrier(column)
+        scale = _inverse_square_root(column[..., j : j + 1])
+        scales.append(scale)
+        columns.append(jax.lax.optimization_barrier(column * scale))
+    rows = []
+    for i in range(size):
+        row = jnp.broadcast_to(jnp.asarray(np.eye(size)[i], dtype), matrices.shape[:-1])
+        for column, previous in zip(columns, rows, strict=False):
+            row = row - column[..., i : i + 1] * previous
+        rows.append(jax.lax.optimization_barrier(row * scales[i]))
+    return jnp.stack(rows, axis=-2)
+
+
+def _inverse_square_root(pivot):
+    if not jnp.issubdtype(pivot.dtype, jnp.complexfloating):
+        return jax.lax.rsqrt(pivot)
+    # A positive definite real part keeps the real part of every pivot positive; others are refused.
+    return jnp.where(pivot.real > 0, jax.lax.rsqrt(pivot), jnp.nan)
+
+
+def _by_halves(matrices):
+    size = matrices.shape[-1]
+    if size <= _BLOCK:
+        return _by_columns(matrices)
+    half = _BLOCK * -(-size // (2 * _BLOCK))
+    first = _by_halves(matrices[..., :half, :half])
+    lower = matrices[..., half:, :half] @ _transposed(first)
+    second = _by_halves(matrices[..., half:, half:] - lower @ _transposed(lower))
+    corner = -(second @ (lower @ first))
+    top = jnp.concatenate([first, jnp.zeros((*first.shape[:-1], size - half), matrices.dtype)], axis=-1)
+    return jnp.concatenate([top, jnp.concatenate([corner, second], axis=-1)], axis=-2)
+
+
+def _by_block_rows(matrices):
+    """A loop over blocks of rows, W one block at a time: with G = A_k W^T, the new diagonal block is
+    A_kk - G G^T = (W_kk^T W_kk)^-1 and the new rows are W_kk (E_k - G W). One compiled body, whatever the size."""
+    size, dtype = matrices.shape[-1], matrices.dtype
+    block = _BLOCK if size <= 64 else 32 if size <= 256 else 64
+    padding = -size % block
+    if padding:
+        matrices = jnp.pad(matrices, [(0, 0)] * (matrices.ndim - 2) + [(0, padding)] * 2)
+        matrices = matrices + jnp.asarray(np.diag(np.arange(size + padding) >= size), dtype)
+    identity = jnp.eye(size + padding, dtype=dtype)
+
+    def next_rows(inverse, number):
+        start = number * block
+        rows = jax.lax.dynamic_slice_in_dim(matrices, start, block, axis=-2)
+        lower = rows @ _transposed(inverse)
+        pivot = jax.lax.dynamic_slice_in_dim(rows, start, block, axis=-1) - lower @ _transposed(lower)
+        remainder = jax.lax.dynamic_slice_in_dim(identity, start, block, axis=-2) - lower @ inverse
+        factor = _by_columns(pivot) if block == _BLOCK else _by_block_rows(pivot)
+        return jax.lax.dynamic_update_slice_in_dim(inverse, factor @ remainder, start, axis=-2), None
+
+    inverse, _ = jax.lax.scan(next_rows, jnp.zeros_like(matrices), jnp.arange((size + padding) // block))
+    return inverse[..., :size, :size]

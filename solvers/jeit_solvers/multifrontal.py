@@ -1,0 +1,142 @@
+"""The numeric half of the direct solver, in pure JAX: factorise, solve, and products with the inverse."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Inexact
+
+from .dense_cholesky import inverse_cholesky
+from .plan import FactorisationPlan
+
+
+class Factor(eqx.Module):
+    """A factorised matrix A = L L^T: for every stage of its plan one array (batch, pivots + border, pivots).
+
+    The pivot rows hold the inverses of L's diagonal blocks, the border rows minus L's blocks below them times these
+    inverses, so that solving is nothing but matrix products. For a complex symmetric A, transposes are not conjugated.
+    """
+
+    blocks: tuple[Inexact[Array, "batch rows pivots"], ...]
+
+    @property
+    def positive_definite(self) -> Bool[Array, ""]:
+        """Whether the matrix was positive definite (complex: every pivot had a positive real part)."""
+        diagonals = [jnp.diagonal(block, axis1=-2, axis2=-1) for block in self.blocks]
+        return jnp.all(jnp.stack([jnp.all(jnp.isfinite(diagonal), axis=(-2, -1)) for diagonal in diagonals]), axis=0)
+
+    def require_positive_definite(self) -> None:
+        """Raise a ValueError if the matrix was not positive definite; does nothing while JAX traces."""
+        verdict = self.positive_definite
+        if not isinstance(verdict, Tracer) and not verdict.all():
+            raise ValueError(
+                "factorise: the matrix is not positive definite, so it has no Cholesky factor. In a finite-element "
+                "system the usual reasons are: a conductivity that is zero, negative or NaN somewhere; no boundary "
+                "condition or electrode that fixes the reference, which leaves the matrix singular; or a part of the "
+                "mesh that is not connected to the rest."
+            )
+
+
+def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor:
+    """Factorise the matrix with the given values (nnz,), in the order of the pattern that `plan` was made for.
+
+    Real values must make a positive definite matrix. Complex ones make a complex *symmetric* matrix, whose real part
+    must be positive definite (an admittivity). If they do not, the factor is NaN and `positive_definite` is false.
+    """
+    if values.shape != (plan.num_entries,):
+        raise ValueError(
+            f"factorise: `values` must have shape {(plan.num_entries,)}, the entries of the plan's pattern; "
+            f"got {values.shape}. Use jax.vmap for a batch of matrices."
+        )
+    indices, dtype = plan.indices, values.dtype
+    extended = jnp.concatenate([values, jnp.ones(1, dtype)])
+    blocks, left = [], []
+    for stage in plan.stages:
+        pivots, border = stage.pivots, stage.border
+        panel = stage.entries.apply(indices, extended)
+        corner = jnp.zeros(stage.batch * border * border, dtype)
+        for link in stage.links:
+            schur = left[link.source].reshape(-1)
+            panel = panel + link.panel.apply(indices, schur)
+            corner = corner + link.corner.apply(indices, schur)
+        panel = panel.reshape(stage.batch, pivots + border, pivots)
+        inverse = inverse_cholesky(panel[:, :pivots])
+        lower = panel[:, pivots:] @ _transposed(inverse)
+        blocks.append(jnp.concatenate([inverse, -(lower @ inverse)], axis=1))
+        left.append(corner.reshape(stage.batch, border, border) - lower @ _transposed(lower))
+    return Factor(tuple(blocks))
+
+
+def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
+    """x with A x = b, for one right-hand side (n,) or several (n, k) at once."""
+    vectors = _columns(plan, right_hand_sides, "solve")
+    return _backward(plan, factor, _forward(plan, factor, vectors)).reshape(right_hand_sides.shape)
+
+
+def half_solve(
+    plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n k"]
+) -> Inexact[Array, "rows k"]:
+    """Y = L^-1 P b, rows in the order of elimination and with rows of zeros for padding: Y^T Y = b^T A^-1 b.
+
+    Half the work of `solve`, if products with the inverse are all that is wanted.
+    """
+    reduced = _forward(plan, factor, _columns(plan, right_hand_sides, "half_solve"))
+    return jnp.concatenate([rows.reshape(-1, rows.shape[-1]) for rows in reduced])
+
+
+def quadratic_form(
+    plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n k"]
+) -> Inexact[Array, "k k"]:
+    """b^T A^-1 b, symmetric (complex: not conjugated), by the forward half of a solve."""
+    half = half_solve(plan, factor, right_hand_sides)
+    return half.T @ half
+
+
+def _transposed(matrices: Inexact[Array, "batch a b"]) -> Inexact[Array, "batch b a"]:
+    return jnp.swapaxes(matrices, -1, -2)
+
+
+def _columns(plan: FactorisationPlan, right_hand_sides: Inexact[Array, "n *k"], where: str) -> Inexact[Array, "n k"]:
+    if right_hand_sides.ndim not in (1, 2) or right_hand_sides.shape[0] != plan.size:
+        raise ValueError(
+            f"{where}: right-hand sides must have shape (n,) or (n, k) with n = {plan.size}; "
+            f"got {right_hand_sides.shape}."
+        )
+    return right_hand_sides.reshape(plan.size, -1)
+
+
+def _forward(
+    plan: FactorisationPlan, factor: Factor, vectors: Inexact[Array, "n k"]
+) -> list[Inexact[Array, "batch pivots k"]]:
+    """L^-1 times the vectors, stage by stage. A front's pivot rows gather what its children have subtracted."""
+    indices, count = plan.indices, vectors.shape[1]
+    reduced, updates = [], []
+    for stage, block in zip(plan.stages, factor.blocks, strict=True):
+        rows = vectors.at[stage.right_hand_side.read(indices)].get(mode="fill", fill_value=0)
+        passed_on = jnp.zeros((), vectors.dtype)
+        for link in stage.links:
+            received = link.rows.apply(indices, updates[link.source].reshape(-1, count))
+            received = received.reshape(stage.batch, -1, count)
+            rows = rows + received[:, : stage.pivots]
+            passed_on = passed_on + received[:, stage.pivots :]
+        product = block @ rows
+        reduced.append(product[:, : stage.pivots])
+        updates.append(product[:, stage.pivots :] + passed_on)
+    return reduced
+
+
+def _backward(
+    plan: FactorisationPlan, factor: Factor, reduced: list[Inexact[Array, "batch pivots k"]]
+) -> Inexact[Array, "n k"]:
+    """L^-T times the vectors, from the root down. A front finds its border's solution in its parent."""
+    indices, count = plan.indices, reduced[0].shape[-1]
+    fronts: dict[int, Inexact[Array, "rows k"]] = {}
+    solved = []
+    for number in reversed(range(len(plan.stages))):
+        stage, block, local = plan.stages[number], factor.blocks[number], reduced[number]
+        if stage.border:
+            above = fronts[stage.parent].at[stage.above.read(indices)].get(mode="fill", fill_value=0)
+            local = jnp.concatenate([local, above], axis=1)
+        pivots = _transposed(block) @ local
+        solved.append(pivots.reshape(-1, count))
+        fronts[number] = jnp.concatenate([pivots, local[:, stage.pivots :]], axis=1).reshape(-1, count)
+    return jnp.concatenate(solved[::-1])[plan.solution.read(indices)]
