@@ -80,11 +80,20 @@ def _write(
             _draw(gmsh, source)
         if cell_size is not None:
             gmsh.option.setNumber("Mesh.MeshSizeMax", cell_size)
-        gmsh.model.mesh.generate(dimension or max(gmsh.model.getDimension(), 2))
-        # Without this, cells outside any physical group are left out as soon as there is one group.
-        gmsh.option.setNumber("Mesh.SaveAll", 1)
+        dimension = dimension or max(gmsh.model.getDimension(), 2)
+        gmsh.model.mesh.generate(dimension)
+        # As soon as there is one physical group, Gmsh leaves out all cells that are in none.
+        grouped = {
+            entity
+            for group in gmsh.model.getPhysicalGroups(dimension)
+            for entity in gmsh.model.getEntitiesForPhysicalGroup(*group)
+        }
+        rest = [entity for _, entity in gmsh.model.getEntities(dimension) if entity not in grouped]
+        added = [(dimension, gmsh.model.addPhysicalGroup(dimension, rest))] if rest else []
         gmsh.option.setNumber("Mesh.MshFileVersion", 2.2)
         gmsh.write(str(path))
+        if added:
+            gmsh.model.removePhysicalGroups(added)
     except Exception as error:
         raise ValueError(f"source: Gmsh could not mesh the geometry: {error}.") from error
 

@@ -109,7 +109,12 @@ def test_gmsh_meshes_outlines_and_files(tmp_path):
         area = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 2
         assert area == pytest.approx(float(domain.area), rel=5e-3)
     path = tmp_path / "tank.geo"
-    path.write_text('SetFactory("OpenCASCADE"); Cylinder(1) = {0, 0, 0, 0, 0, 50, 100}; Physical Surface("lid") = {2};')
+    lines = [
+        'SetFactory("OpenCASCADE");',
+        "Cylinder(1) = {0, 0, 0, 0, 0, 50, 100};",
+        'Physical Surface("lid") = {2};',
+    ]
+    path.write_text("\n".join(lines))
     tank = from_gmsh(path, cell_size=25, scale=1e-3)
     assert tank.dimension == 3
     assert set(tank.tags) == {"lid"}
