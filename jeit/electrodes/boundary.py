@@ -73,14 +73,13 @@ class BoundaryElectrodes(AbstractElectrodes):
         check_dimension("BoundaryElectrodes", mesh, 2)
         if not is_concrete(self.position, self.width, mesh.points, mesh.facets):
             return
-        _, distance = map(np.asarray, _project(self.position, mesh))
+        distance, start, end = map(np.asarray, _measures_for_check(self, mesh))
         far = np.flatnonzero(distance > np.maximum(0.5 * self.width, 2e-3 * np.ptp(mesh.points, axis=0).max()))
         if far.size:
             raise ValueError(
                 f"position: electrode {far[0] + 1} lies {distance[far[0]]:.3g} m from the boundary of the mesh; "
                 "they must lie on it (are both in metres?). For electrodes inside a sheet use SheetDiscs."
             )
-        start, end = map(np.asarray, _covered(self, mesh))
         covered = np.clip(end - start, 0, None).sum(axis=-1)  # (b, L)
         short = np.flatnonzero(covered.sum(axis=0) < (1 - 1e-9) * np.asarray(self.width))
         if short.size:
@@ -88,13 +87,19 @@ class BoundaryElectrodes(AbstractElectrodes):
                 f"width: electrode {short[0] + 1} is {float(self.width[short[0]]):.3g} m wide, more than the boundary "
                 "it lies on; widths are in metres."
             )
-        pairs = overlapping_pairs(np.asarray(start), np.asarray(end))
+        pairs = overlapping_pairs(start, end)
         if pairs:
             first, second = pairs[0]
             raise ValueError(
                 f"Electrodes {first + 1} and {second + 1} overlap; move them apart or make them narrower "
                 "(positions and widths are in metres along the boundary)."
             )
+
+
+@jax.jit
+def _measures_for_check(electrodes: BoundaryElectrodes, mesh: Mesh):
+    """Distance to the boundary and covered intervals, compiled as a whole: op by op it would take seconds."""
+    return _project(electrodes.position, mesh)[1], *_covered(electrodes, mesh)
 
 
 def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int]]:

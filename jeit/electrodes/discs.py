@@ -13,6 +13,7 @@ from jeit.electrodes.electrodes import (
     as_electrode_values,
     as_positions,
     check_dimension,
+    compiled_contact,
     is_concrete,
 )
 from jeit.electrodes.window import EDGE, smooth_step, triangle_quadrature, window_contact
@@ -139,7 +140,7 @@ def check_discs(electrodes: SheetDiscs | FaceDiscs, mesh: Mesh, area) -> None:
     if not is_concrete(position, radius, electrodes.contact_impedance, mesh.points, mesh.cells):
         return
     position, radius = np.asarray(position), np.asarray(radius)
-    contact = electrodes.contact(mesh)
+    contact = compiled_contact(electrodes, mesh)
     covered = np.asarray(contact.load.sum(axis=0) * electrodes.contact_impedance)
     for electrode in range(len(radius)):
         share = covered[electrode] / (np.pi * radius[electrode] ** 2)

@@ -53,6 +53,12 @@ class AbstractElectrodes(eqx.Module):
         """Raise `ValueError` where these electrodes do not fit `mesh`. Does nothing on traced values."""
 
 
+@jax.jit
+def compiled_contact(electrodes: AbstractElectrodes, mesh: Mesh) -> Contact:
+    """`electrodes.contact(mesh)` compiled as a whole, for checks: op by op its first call would take seconds."""
+    return electrodes.contact(mesh)
+
+
 def is_concrete(*arrays) -> bool:
     """Whether all `arrays` have values that can be looked at, i.e. none is a JAX tracer."""
     return not any(isinstance(array, jax.core.Tracer) for array in arrays)

@@ -14,6 +14,7 @@ from jeit.electrodes.electrodes import (
     as_electrode_values,
     as_positions,
     check_dimension,
+    compiled_contact,
     is_concrete,
 )
 from jeit.electrodes.window import EDGE, smooth_step, triangle_quadrature, window_contact
@@ -76,7 +77,7 @@ class FacePatches(AbstractElectrodes):
         check_dimension("FacePatches", mesh, 3)
         if not is_concrete(self.position, self.width, self.height, self.contact_impedance, mesh.points, mesh.facets):
             return
-        contact = self.contact(mesh)
+        contact = compiled_contact(self, mesh)
         share = np.asarray(contact.load.sum(axis=0) * self.contact_impedance / (self.width * self.height))
         # A patch bent round a wall is longer than its chord, by a tenth at 80° of arc.
         wrong = np.flatnonzero((share < 0.8) | (share > 1.25))

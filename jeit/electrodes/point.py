@@ -50,7 +50,7 @@ class PointElectrodes(AbstractElectrodes):
         if not is_concrete(self.position, mesh.points, mesh.cells):
             return
         position, points = np.asarray(self.position), np.asarray(mesh.points)
-        _, _, outside = map(np.asarray, _locate(self.position, mesh))
+        outside = np.asarray(jax.jit(_locate)(self.position, mesh)[2])
         # A point on a curved boundary lies slightly outside the polygon: allow a third of a cell.
         far = np.flatnonzero(outside < -1 / 3)
         if far.size:

@@ -54,13 +54,18 @@ def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
     return conductivity
 
 
-def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Array, "m p"]:
-    """Element stiffness ∫ ∇φ_i·σ∇φ_j for conductivity per cell: lower triangles (m, p), p = (d+1)(d+2)/2, siemens."""
+def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Array, "p m"]:
+    """Element stiffness ∫ ∇φ_i·σ∇φ_j for conductivity per cell: lower triangles (p, m), p = (d+1)(d+2)/2, siemens."""
     gradient = gradients(mesh)  # (m, d + 1, d)
     flux = gradient if conductivity.ndim == 1 else jnp.einsum("mij,mkj->mki", conductivity, gradient)
     weight = measures(mesh) * (conductivity if conductivity.ndim == 1 else 1)
     rows, columns = np.tril_indices(mesh.dimension + 1)
-    return weight[:, None] * jnp.sum(gradient[:, rows] * flux[:, columns], axis=-1)
+    return jnp.stack(
+        [
+            weight * sum(gradient[:, row, axis] * flux[:, column, axis] for axis in range(mesh.dimension))
+            for row, column in zip(rows, columns, strict=True)
+        ]
+    )
 
 
 def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> tuple[Inexact[Array, "p m"], ...]:

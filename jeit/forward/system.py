@@ -6,17 +6,19 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jaxtyping import Array, Inexact
-from jeit_solvers import (
-    SparseCholesky,
-    SparseSymmetric,
-    SparsityPattern,
-    choose_solver,
-    quadratic_form,
-)
 
 from jeit.electrodes import AbstractElectrodes, Contact
 from jeit.forward.assembly import stiffness
 from jeit.mesh import Mesh
+from jeit_solvers import (
+    ConjugateGradient,
+    SparseCholesky,
+    SparseSymmetric,
+    SparsityPattern,
+    analyse,
+    choose_solver,
+    quadratic_form,
+)
 
 
 class System(eqx.Module):
@@ -35,7 +37,15 @@ class System(eqx.Module):
         groups = [np.asarray(nodes) for nodes in (mesh.cells, *electrodes.contact_nodes(mesh))]
         pattern = SparsityPattern.from_elements(groups, size=mesh.num_points)
         if isinstance(solver, str):
-            solver = choose_solver(pattern, coordinates=np.asarray(mesh.points), method=solver)
+            coordinates = np.asarray(mesh.points)
+            if solver == "auto":
+                solver = choose_solver(pattern, coordinates)
+            elif solver == "cholesky":
+                solver = SparseCholesky(analyse(pattern, coordinates))
+            elif solver == "cg":
+                solver = ConjugateGradient()
+            else:
+                raise ValueError(f"solver must be 'auto', 'cholesky', 'cg' or a lineax solver, not '{solver}'.")
         return cls(pattern, solver)
 
     def operator(self, mesh: Mesh, conductivity, electrodes: AbstractElectrodes, contact: Contact) -> SparseSymmetric:
@@ -47,7 +57,7 @@ class System(eqx.Module):
         packed = stiffness(mesh, conductivity)
         mass = contact.mass
         if electrodes.is_point:
-            level = jax.lax.stop_gradient(jnp.abs(packed[:, -1]).mean())
+            level = jax.lax.stop_gradient(jnp.abs(packed[-1]).mean())
             mass = (jnp.full((1, 1, 1), level, packed.dtype),)
         return SparseSymmetric(self.pattern.assemble(packed, *mass), self.pattern)
 
@@ -56,7 +66,7 @@ class System(eqx.Module):
         state = self.solver.init(operator, {})
 
         def column(vector):
-            return lx.linear_solve(operator, vector, self.solver, state=state).value
+            return lx.linear_solve(operator, vector, self.solver, state=state, throw=False).value
 
         return jax.vmap(column, in_axes=1, out_axes=1)(load.astype(operator.values.dtype))
 
