@@ -16,7 +16,7 @@ from pathlib import Path
 from benchmarks import machine, pyeit_environment, startup
 from benchmarks.checks import checks
 from benchmarks.contest import CORES, ROOT
-from benchmarks.match import Match, Settings, play
+from benchmarks.match import TASKS, Match, Settings, play
 from benchmarks.report import markdown, table, write_between_markers
 
 
@@ -41,9 +41,15 @@ def main() -> int:
     machine.use_cores(CORES)
     heading = machine.heading()
     if options.quick:
-        options.nodes, options.electrodes, options.rounds, options.budget = [400], [16], 2, 2.0
+        options.nodes, options.electrodes, options.rounds, options.budget = [200], [16], 2, 2.0
     python = None if options.without_pyeit else pyeit_environment.python(create=not options.quick)
-    settings = Settings(options.rounds, options.budget, options.time_limit, None if python is None else str(python))
+    settings = Settings(
+        rounds=options.rounds,
+        budget=options.budget,
+        limit=options.time_limit,
+        pyeit_python=None if python is None else str(python),
+        tasks=TASKS[:-1] if options.quick else TASKS,
+    )
     start = time.perf_counter()
     matches: list[Match] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -52,6 +58,8 @@ def main() -> int:
                 for model in ("complete", "point"):
                     say(f"{num_points} nodes, {num_electrodes} electrodes, {model} electrode model …")
                     matches.append(play(num_points, num_electrodes, model, settings, matches, Path(folder)))
+                    # A run that is stopped has said what it knew.
+                    say(table(matches[-1:]))
     say("cold starts …")
     import_seconds = startup.import_seconds(2 if options.quick else 5)
     demo_seconds = None if options.quick else startup.demo_seconds()

@@ -29,6 +29,7 @@ class Settings:
     budget: float
     limit: float
     pyeit_python: str | None
+    tasks: tuple[str, ...] = TASKS
 
 
 @dataclass
@@ -94,7 +95,7 @@ def play(
             problems.save(problem, path)
         others = [enter(name, python) for name, python in opponents.items()]
         contestants = [jeit, *[other for other in others if other is not None]]
-        for task in TASKS:
+        for task in settings.tasks:
             if (model == "point" and task not in TASKS[:2]) or not _fits(match, task):
                 continue
             foreseen = _foresee(match, task, settings, before)

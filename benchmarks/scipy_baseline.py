@@ -285,7 +285,7 @@ def _superlu(options):
     return lambda matrix: scipy.sparse.linalg.splu(matrix, **options).solve
 
 
-def _time_each(functions, repeats: int = 7) -> dict[str, float]:
+def _time_each(functions, repeats: int = 15) -> dict[str, float]:
     """Least time in seconds of each function, the repeats interleaved."""
     least = dict.fromkeys(functions, np.inf)
     for _ in range(repeats):
