@@ -30,6 +30,7 @@ from jeit.inverse import (
     back_projection,
     calibrate,
     one_step,
+    relative_noise,
 )
 from jeit.mesh import Domain, Mesh, Refine
 
@@ -60,13 +61,13 @@ class ImagingSettings:
     """
 
     method: str = "one-step"
-    prior: str | AbstractPrior = "noser"
+    prior: str | AbstractPrior = "gaussian"
     hyperparameter: float | str = "noise-figure"
     contact: str | None = None
     num_points: int = 2000
     raster_shape: tuple[int, int] = (256, 256)
     level: float = 0.6
-    least_peak: float = 0.25
+    least_peak: float = 0.3
 
     def __post_init__(self):
         if self.method not in METHODS:
@@ -159,7 +160,7 @@ def image_difference(
             )
     with clock("image"):
         noise = quality.difference_noise
-        reconstruction = _reconstruction(calibration, settings, domain, difference, both, noise)
+        reconstruction = _reconstruction(calibration, settings, domain, base, difference, both, noise)
         change = jax.block_until_ready(reconstruction.image(difference))
     with clock("raster and inclusions"):
         grid = Raster.create(mesh, shape=settings.raster_shape)
@@ -254,7 +255,9 @@ def _setup(measurement: Measurement, reference: Measurement) -> tuple[Domain, Ab
     return domain, electrodes
 
 
-def _reconstruction(calibration: Calibration, settings: ImagingSettings, domain: Domain, difference, mask, noise):
+def _reconstruction(
+    calibration: Calibration, settings: ImagingSettings, domain: Domain, base: Measurement, difference, mask, noise
+) -> LinearReconstruction:
     model, conductivity = calibration.model, calibration.conductivity
     if settings.method != "one-step":
         filtered = settings.method.startswith("filtered")
@@ -264,20 +267,20 @@ def _reconstruction(calibration: Calibration, settings: ImagingSettings, domain:
     if isinstance(prior, str):
         x_min, x_max, y_min, y_max = domain.extent
         prior = PRIORS[prior](max(x_max - x_min, y_max - y_min))
-    scale = 1.0
+    deviation = relative_noise(base.voltages[0], mask)
     if settings.hyperparameter == "discrepancy":
         if noise is None:
             raise ValueError(
                 "hyperparameter: 'discrepancy' needs to know the noise, and no two channels of "
                 f"'{model.protocol.name}' are tied by reciprocity to tell it from; choose another rule, or a number."
             )
-        scale = noise.standard_deviation
+        deviation = deviation * noise.standard_deviation / jnp.sqrt(jnp.mean(deviation[mask] ** 2))
     return one_step(
         model,
         conductivity,
         prior=prior,
         hyperparameter=settings.hyperparameter,
         difference=difference,
-        noise=scale,
+        noise=deviation,
         mask=mask,
     )

@@ -53,7 +53,7 @@ class BoundaryElectrodes(AbstractElectrodes):
 
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the boundary edges of `mesh`, exact for P1 basis functions."""
-        start, end = _covered(self, mesh)
+        start, end = _covered(self.position, self.width, mesh)
         length = facet_measures(mesh)[:, None, None]
         # Basis functions on an edge: φ_1 = t / length, φ_0 = 1 - φ_1; these are their integrals over [start, end].
         one = end - start
@@ -73,7 +73,7 @@ class BoundaryElectrodes(AbstractElectrodes):
         check_dimension("BoundaryElectrodes", mesh, 2)
         if not is_concrete(self.position, self.width, mesh.points, mesh.facets):
             return
-        distance, start, end = map(np.asarray, _measures_for_check(self, mesh))
+        distance, start, end = map(np.asarray, _measures_for_check(self.position, self.width, mesh))
         far = np.flatnonzero(distance > np.maximum(0.5 * self.width, 2e-3 * np.ptp(mesh.points, axis=0).max()))
         if far.size:
             raise ValueError(
@@ -97,9 +97,9 @@ class BoundaryElectrodes(AbstractElectrodes):
 
 
 @jax.jit
-def _measures_for_check(electrodes: BoundaryElectrodes, mesh: Mesh):
+def _measures_for_check(position, width, mesh: Mesh):
     """Distance to the boundary and covered intervals, compiled as a whole: op by op it would take seconds."""
-    return _project(electrodes.position, mesh)[1], *_covered(electrodes, mesh)
+    return _project(position, mesh)[1], *_covered(position, width, mesh)
 
 
 def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int]]:
@@ -161,17 +161,17 @@ def _loops(mesh: Mesh, length):
     return loop, travelled - before[loop], perimeters[loop]
 
 
-def _covered(electrodes: BoundaryElectrodes, mesh: Mesh):
+def _covered(position, width, mesh: Mesh):
     """Interval of each edge that each electrode covers: start and end (b, L, 3), zero ≤ start ≤ end ≤ length.
 
     The last axis goes round the loop: an electrode may lie across the point where arc length begins.
     """
     length = facet_measures(mesh)
-    (facet, centre), _ = _project(electrodes.position, mesh)
+    (facet, centre), _ = _project(position, mesh)
     loop, arc_start, perimeter = _loops(mesh, length)
     turns = jnp.array([-1.0, 0.0, 1.0]) * perimeter[facet][:, None]
     middle = (centre[:, None] + turns)[None] - arc_start[:, None, None]  # (b, L, 3)
-    half = 0.5 * electrodes.width[:, None]
+    half = 0.5 * width[:, None]
     limit = length[:, None, None]
     start, end = jnp.clip(middle - half, 0, limit), jnp.clip(middle + half, 0, limit)
     same = (loop[:, None] == loop[facet])[..., None]

@@ -31,7 +31,7 @@ def find_inclusions(
     *,
     level: float = 0.5,
     least_peak: float = 0.3,
-    least_prominence: float = 0.2,
+    least_prominence: float = 0.1,
     least_area: float = 0.004,
 ) -> list[Inclusion]:
     """Peaks of an image, each with the region round it where the change exceeds `level` times that peak.

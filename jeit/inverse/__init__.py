@@ -6,6 +6,7 @@ from jeit.inverse.calibrate import calibrate as calibrate
 from jeit.inverse.hyperparameter import RULES as RULES
 from jeit.inverse.linear import LinearReconstruction as LinearReconstruction
 from jeit.inverse.linear import one_step as one_step
+from jeit.inverse.noise import relative_noise as relative_noise
 from jeit.inverse.priors import AbstractPrior as AbstractPrior
 from jeit.inverse.priors import Gaussian as Gaussian
 from jeit.inverse.priors import Laplace as Laplace

@@ -23,8 +23,9 @@ def back_projection(
     is imaged as itself.
 
     `filtered`: back-project filtered data F v instead, where F minimises ‖JBFv - v‖² + λ²‖JB‖²‖Fv‖², so that the
-    image, seen through the Jacobian J, gives back the data: sharper, and noisier; `hyperparameter` is λ. `mask`: True for the channels to use. Raises `ValueError`
-    for protocols whose channels have more than two electrodes, where no band is defined.
+    image, seen through the Jacobian J, gives back the data: sharper, and noisier; `hyperparameter` is λ. `mask`: True
+    for the channels to use. Raises `ValueError` for protocols whose channels have more than two electrodes, where no
+    band is defined.
     """
     protocol = model.protocol
     used = np.ones(protocol.num_measurements, bool) if mask is None else np.asarray(mask, bool)

@@ -61,31 +61,36 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     num_electrodes = model.electrodes.num_electrodes
     if model.electrodes.is_point:
         contact = "fixed"
-    start = model.electrodes.contact_impedance if contact != "fixed" else jnp.ones(num_electrodes)
     size = jnp.linalg.norm(measured)
-
-    def unpack(parameters):
-        # Voltages at fixed z·σ are proportional to 1/σ, so these two are nearly independent of each other.
-        conductivity = jnp.exp(parameters["conductivity"])
-        if contact == "fixed":
-            return model, conductivity
-        impedance = start * jnp.exp(parameters["contact"] - parameters["conductivity"])
-        return model.with_electrodes(with_contact_impedance(model.electrodes, impedance)), conductivity
-
-    def residual(parameters, _):
-        fitted, conductivity = unpack(parameters)
-        return jnp.where(used, fitted.voltages(conductivity) - measured, 0) / size
-
     # Start at the model's own contact impedance for a conductivity of one, scaled to fit.
     shape = {"fixed": (0,), "common": (), "each": (num_electrodes,)}[contact]
     unit = jnp.where(used, model.voltages(1.0), 0)
     conductivity = jnp.log(jnp.abs(unit @ unit / (unit @ measured)))
     initial = {"conductivity": conductivity, "contact": jnp.zeros(shape) + conductivity}
-    solver = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-11)
-    solution = optx.least_squares(residual, solver, initial, max_steps=max_steps, throw=False)
-    fitted, conductivity = unpack(solution.value)
+    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
+    arguments = (model, measured, used, size)
+    solution = optx.least_squares(_residual, solver, initial, arguments, max_steps=max_steps, throw=False)
+    fitted, conductivity = _fitted(model, solution.value)
     voltages = fitted.voltages(conductivity)
     misfit = jnp.linalg.norm(jnp.where(used, voltages - measured, 0)) / size
     converged = solution.result == optx.RESULTS.successful
     status = "converged" if converged else f"not converged in {max_steps} steps"
     return Calibration(fitted, conductivity, voltages, misfit, int(solution.stats["num_steps"]), status)
+
+
+def _fitted(model: ForwardModel, parameters) -> tuple[ForwardModel, Float[Array, ""]]:
+    """The model and conductivity that the parameters (logarithms of σ and of z·σ over the model's z) stand for."""
+    conductivity = jnp.exp(parameters["conductivity"])
+    if parameters["contact"].shape == (0,):
+        return model, conductivity
+    # Voltages at fixed z·σ are proportional to 1/σ, so these two are nearly independent of each other.
+    factor = jnp.exp(parameters["contact"] - parameters["conductivity"])
+    impedance = model.electrodes.contact_impedance * factor
+    return model.with_electrodes(with_contact_impedance(model.electrodes, impedance)), conductivity
+
+
+def _residual(parameters, arguments):
+    """A function of its arguments alone, so that it is compiled once for all models of one shape."""
+    model, measured, used, size = arguments
+    fitted, conductivity = _fitted(model, parameters)
+    return jnp.where(used, fitted.voltages(conductivity) - measured, 0) / size

@@ -114,7 +114,7 @@ def l_curve(spectrum: Spectrum, data) -> float:
     return float(grid[np.argmax(np.where(np.isfinite(bend), bend, -np.inf))])
 
 
-def noise_figure(spectrum: Spectrum, data=None, *, target: float = 0.5) -> float:
+def noise_figure(spectrum: Spectrum, data=None, *, target: float = 1.25) -> float:
     """λ at which the signal-to-noise ratio of the image is 1 / `target` times that of the data; looks at no data.
 
     Signals are drawn from the prior and the noise is white: the ratio of the data is trΛ / r, that of the image
