@@ -38,12 +38,15 @@ class LinearReconstruction(eqx.Module):
         """From a full reconstruction matrix (m, M)."""
         matrix = np.asarray(matrix)
         first, second, ratio = _combine(model, matrix)
+        # Of two tied columns the mean, not either: their rounding errors are large where λ is small, and opposite.
+        tied = matrix.T[first] + ratio[:, None] * matrix.T[second]
+        weights = tied / (1 + ratio**2)[:, None]
         return cls(
             model.mesh,
             jnp.asarray(first),
             jnp.asarray(second),
             jnp.asarray(ratio),
-            jnp.asarray(np.ascontiguousarray(matrix.T[first])),
+            jnp.asarray(weights),
             jnp.asarray(hyperparameter, float),
             matrix.shape[1],
             rule,
