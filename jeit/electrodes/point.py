@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.electrodes.electrodes import AbstractElectrodes, Contact, as_positions, is_concrete
-from jeit.mesh import Mesh
+from jeit.mesh import Mesh, gradients
 
 
 class PointElectrodes(AbstractElectrodes):
@@ -112,9 +112,8 @@ def _point_contact(nodes, load) -> Contact:
 def _locate(position, mesh: Mesh):
     """The cell of each position, its barycentric coordinates there, and how far inside (negative: outside) it is."""
     corners = mesh.points[mesh.cells]  # (m, d + 1, d)
-    edges = corners[:, 1:] - corners[:, :1]
-    inverse = jnp.linalg.inv(jnp.swapaxes(edges, 1, 2))
-    local = jnp.einsum("mij,lmj->lmi", inverse, position[:, None] - corners[:, 0])
+    # Basis functions are linear: their value at a position follows from their gradients.
+    local = jnp.einsum("mij,lmj->lmi", gradients(mesh)[:, 1:], position[:, None] - corners[:, 0])
     barycentric = jnp.concatenate([1 - local.sum(axis=-1, keepdims=True), local], axis=-1)
     inside = jax.lax.stop_gradient(barycentric).min(axis=-1)
     cell = jnp.argmax(inside, axis=1)
