@@ -42,7 +42,7 @@ PRIORS: dict[str, Callable[[float], AbstractPrior]] = {
     "tikhonov": lambda size: Tikhonov(),
     "laplace": lambda size: Laplace(),
     "noser": lambda size: Noser(),
-    "gaussian": lambda size: Gaussian(0.075 * size),
+    "gaussian": lambda size: Gaussian(0.085 * size),
 }
 
 
@@ -66,7 +66,7 @@ class ImagingSettings:
     contact: str | None = None
     num_points: int = 2000
     raster_shape: tuple[int, int] = (256, 256)
-    level: float = 0.6
+    level: float = 0.65
     least_peak: float = 0.3
 
     def __post_init__(self):
