@@ -11,6 +11,11 @@ from scipy.sparse import csr_array
 from .dissection import nested_dissection
 from .pattern import SparsityPattern
 
+# Fronts this small still use matrix products well, and are small enough to be eliminated without looking inside.
+_LEAF_SIZE = 24
+# The launch of one stage's operations takes as long as about this many floating-point operations.
+_OPERATIONS_WORTH_A_STAGE = 1e6
+
 
 class EliminationTree:
     """Fronts, numbered from 0, of a sparsity pattern, and the borders that elimination gives them.
@@ -21,14 +26,14 @@ class EliminationTree:
     - For each stage: `borders`, sorted keys front * n + row; `batch`, `pivots`, `border`: its padded shape.
     """
 
-    def __init__(self, pattern: SparsityPattern, coordinates: np.ndarray | None, leaf_size: int, merge: int):
-        """Dissect down to about `leaf_size` rows, and merge `merge` levels of small separators into one front."""
+    def __init__(self, pattern: SparsityPattern, coordinates: np.ndarray | None):
+        """Dissect the pattern's graph, and find out what elimination in that order touches."""
         size = pattern.size
         rows, columns = np.asarray(pattern.rows, dtype=np.int64), np.asarray(pattern.columns, dtype=np.int64)
         self.size = size
-        depth = max(0, int(np.ceil(np.log2(size / leaf_size))))
+        depth = max(0, int(np.ceil(np.log2(size / _LEAF_SIZE))))
         owner = nested_dissection(_graph(rows, columns, size), depth, coordinates)
-        self._merge_levels(owner, depth, merge)
+        self._make_fronts(owner, depth)
         order = np.argsort(self.front, kind="stable")
         self.place = np.empty(size, dtype=np.int64)
         self.place[order] = rank_within(self.front[order])
@@ -41,18 +46,13 @@ class EliminationTree:
         self.pivots = [max(1, int(self.pivot_count[self.stage == stage].max())) for stage in stages]
         self.border = [int(rank_within(keys // size).max(initial=-1)) + 1 for keys in self.borders]
 
-    def _merge_levels(self, owner: np.ndarray, depth: int, merge: int) -> None:
-        """Fronts out of tree nodes: small separators, near the leaves, are eliminated together with those below them.
-        That halves the number of stages and most of the copying between them, for few more operations."""
+    def _make_fronts(self, owner: np.ndarray, depth: int) -> None:
+        """Fronts out of tree nodes: small separators are eliminated together with those below them."""
         nodes = np.arange(2 ** (depth + 1) - 1)
         level = np.floor(np.log2(nodes + 1)).astype(int)
-        # From the leaves up: the leaves alone, then merged levels, and at the top, where separators are large, one
-        # level to a stage.
-        heights = [1] * min(depth + 1, 1)
-        while sum(heights) < depth + 1:
-            left = depth + 1 - sum(heights)
-            heights.append(merge if left > 2 else 1)
-            heights[-1] = min(heights[-1], left)
+        largest = np.zeros(depth + 1, dtype=int)
+        np.maximum.at(largest, level, np.bincount(owner, minlength=nodes.size))
+        heights = _merged_levels(largest)
         first_level = depth + 1 - np.cumsum(heights)
         stage_of_level = np.searchsorted(-first_level, -np.arange(depth + 1), side="left")
         top = nodes.copy()
@@ -91,7 +91,7 @@ class EliminationTree:
     def num_operations(self) -> float:
         """Floating-point operations of one factorisation, padding included."""
         pivots, border = np.asarray(self.pivots, dtype=float), np.asarray(self.border, dtype=float)
-        return float((self.batch * (4 / 3 * pivots**3 + 4 * pivots**2 * border + 2 * pivots * border**2)).sum())
+        return float((self.batch * (4 / 3 * pivots**3 + 2 * pivots**2 * border + 2 * pivots * border**2)).sum())
 
     @property
     def num_factor_entries(self) -> int:
@@ -102,6 +102,32 @@ class EliminationTree:
     def num_front_entries(self) -> int:
         """Numbers in all fronts, about as many as the plan has indices."""
         return int(sum(c * (s + b) ** 2 for c, s, b in zip(self.batch, self.pivots, self.border, strict=True)))
+
+
+def _merged_levels(largest: np.ndarray) -> list[int]:
+    """How many levels of the tree each stage takes, from the leaves up, for levels with separators up to `largest`.
+
+    Eliminating a separator together with the two below it makes a stage less, and wastes operations on the zeros
+    between these two. It is done where the waste is smaller than what a stage costs in itself.
+    """
+
+    def operations(batch: int, pivots: int, border: int) -> float:
+        return batch * (4 / 3 * pivots**3 + 2 * pivots**2 * border + 2 * pivots * border**2)
+
+    heights, level = [1], len(largest) - 2
+    while level >= 0:
+        height, pivots = 1, int(largest[level])
+        while level > 0:
+            # Half a front's surroundings were cut by the separators next above: borders are a few of these long.
+            batch, above = 2 ** (level - 1), int(largest[level - 1])
+            border = 3 * above
+            apart = operations(2 * batch, pivots, border) + operations(batch, above, border)
+            if operations(batch, 2 * pivots + above, border) - apart > _OPERATIONS_WORTH_A_STAGE:
+                break
+            height, pivots, level = height + 1, 2 * pivots + above, level - 1
+        heights.append(height)
+        level -= 1
+    return heights
 
 
 def rank_within(groups: np.ndarray) -> np.ndarray:

@@ -10,18 +10,19 @@ from .plan import FactorisationPlan
 
 
 class Factor(eqx.Module):
-    """A factorised matrix A = L L^T: for every stage of its plan one array (batch, pivots + border, pivots).
+    """A factorised matrix A = L L^T: two arrays for every stage of its plan.
 
-    The pivot rows hold the inverses of L's diagonal blocks, the border rows minus L's blocks below them times these
-    inverses, so that solving is nothing but matrix products. For a complex symmetric A, transposes are not conjugated.
+    `inverses` (batch, pivots, pivots) of L's diagonal blocks, and `lowers` (batch, border, pivots), the blocks below
+    them: solving is nothing but matrix products. For a complex symmetric A, transposes are not conjugated.
     """
 
-    blocks: tuple[Inexact[Array, "batch rows pivots"], ...]
+    inverses: tuple[Inexact[Array, "batch pivots pivots"], ...]
+    lowers: tuple[Inexact[Array, "batch border pivots"], ...]
 
     @property
     def positive_definite(self) -> Bool[Array, ""]:
         """Whether the matrix was positive definite (complex: every pivot had a positive real part)."""
-        diagonals = [jnp.diagonal(block, axis1=-2, axis2=-1) for block in self.blocks]
+        diagonals = [jnp.diagonal(inverse, axis1=-2, axis2=-1) for inverse in self.inverses]
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(diagonal), axis=(-2, -1)) for diagonal in diagonals]), axis=0)
 
     def require_positive_definite(self) -> None:
@@ -30,8 +31,8 @@ class Factor(eqx.Module):
         if not isinstance(verdict, Tracer) and not verdict.all():
             raise ValueError(
                 "factorise: the matrix is not positive definite, so it has no Cholesky factor. In a finite-element "
-                "system the usual reasons are: a conductivity that is zero, negative or NaN somewhere; no boundary "
-                "condition or electrode that fixes the reference, which leaves the matrix singular; or a part of the "
+                "system the usual reasons are: a coefficient that is zero, negative or NaN somewhere; no boundary "
+                "condition that fixes the solution's constant part, which leaves the matrix singular; or a part of the "
                 "mesh that is not connected to the rest."
             )
 
@@ -49,7 +50,7 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
         )
     indices, dtype = plan.indices, values.dtype
     extended = jnp.concatenate([values, jnp.ones(1, dtype)])
-    blocks, left = [], []
+    inverses, lowers, left = [], [], []
     for stage in plan.stages:
         pivots, border = stage.pivots, stage.border
         panel = stage.entries.apply(indices, extended)
@@ -61,9 +62,10 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
         panel = panel.reshape(stage.batch, pivots + border, pivots)
         inverse = inverse_cholesky(panel[:, :pivots])
         lower = panel[:, pivots:] @ _transposed(inverse)
-        blocks.append(jnp.concatenate([inverse, -(lower @ inverse)], axis=1))
+        inverses.append(inverse)
+        lowers.append(lower)
         left.append(corner.reshape(stage.batch, border, border) - lower @ _transposed(lower))
-    return Factor(tuple(blocks))
+    return Factor(tuple(inverses), tuple(lowers))
 
 
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
@@ -110,7 +112,7 @@ def _forward(
     """L^-1 times the vectors, stage by stage. A front's pivot rows gather what its children have subtracted."""
     indices, count = plan.indices, vectors.shape[1]
     reduced, updates = [], []
-    for stage, block in zip(plan.stages, factor.blocks, strict=True):
+    for stage, inverse, lower in zip(plan.stages, factor.inverses, factor.lowers, strict=True):
         rows = vectors.at[stage.right_hand_side.read(indices)].get(mode="fill", fill_value=0)
         passed_on = jnp.zeros((), vectors.dtype)
         for link in stage.links:
@@ -118,9 +120,8 @@ def _forward(
             received = received.reshape(stage.batch, -1, count)
             rows = rows + received[:, : stage.pivots]
             passed_on = passed_on + received[:, stage.pivots :]
-        product = block @ rows
-        reduced.append(product[:, : stage.pivots])
-        updates.append(product[:, stage.pivots :] + passed_on)
+        reduced.append(inverse @ rows)
+        updates.append(passed_on - lower @ reduced[-1])
     return reduced
 
 
@@ -132,11 +133,12 @@ def _backward(
     fronts: dict[int, Inexact[Array, "rows k"]] = {}
     solved = []
     for number in reversed(range(len(plan.stages))):
-        stage, block, local = plan.stages[number], factor.blocks[number], reduced[number]
+        stage, local = plan.stages[number], reduced[number]
+        above = jnp.zeros((stage.batch, 0, count), local.dtype)
         if stage.border:
             above = fronts[stage.parent].at[stage.above.read(indices)].get(mode="fill", fill_value=0)
-            local = jnp.concatenate([local, above], axis=1)
-        pivots = _transposed(block) @ local
+            local = local - _transposed(factor.lowers[number]) @ above
+        pivots = _transposed(factor.inverses[number]) @ local
         solved.append(pivots.reshape(-1, count))
-        fronts[number] = jnp.concatenate([pivots, local[:, stage.pivots :]], axis=1).reshape(-1, count)
+        fronts[number] = jnp.concatenate([pivots, above], axis=1).reshape(-1, count)
     return jnp.concatenate(solved[::-1])[plan.solution.read(indices)]

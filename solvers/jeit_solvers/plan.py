@@ -69,7 +69,7 @@ class FactorisationPlan(eqx.Module):
     def num_operations(self) -> int:
         """Floating-point operations of one factorisation, padding included."""
         return sum(
-            stage.batch * (4 * s**3 // 3 + 4 * s * s * stage.border + 2 * s * stage.border**2)
+            stage.batch * (4 * s**3 // 3 + 2 * s * s * stage.border + 2 * s * stage.border**2)
             for stage in self.stages
             for s in [stage.pivots]
         )
@@ -84,9 +84,7 @@ def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationP
     return plan_of_tree(pattern, elimination_tree(pattern, coordinates))
 
 
-def elimination_tree(
-    pattern: SparsityPattern, coordinates: Any = None, leaf_size: int = 16, merge: int = 2
-) -> EliminationTree:
+def elimination_tree(pattern: SparsityPattern, coordinates: Any = None) -> EliminationTree:
     """The tree that `analyse` makes a plan of; cheap, and enough to tell what the plan would cost."""
     if coordinates is not None:
         coordinates = np.asarray(coordinates, dtype=float)
@@ -97,7 +95,7 @@ def elimination_tree(
             )
         if not np.isfinite(coordinates).all():
             raise ValueError("analyse: `coordinates` hold NaN or infinity.")
-    return EliminationTree(pattern, coordinates, leaf_size, merge)
+    return EliminationTree(pattern, coordinates)
 
 
 def plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> FactorisationPlan:

@@ -1,0 +1,37 @@
+"""The dense inverse Cholesky factor, on every route it takes by size and batch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit_solvers.dense_cholesky import inverse_cholesky
+
+
+# Row by row; unrolled; unrolled halves; block rows with padding; block rows in block rows, with padding.
+@pytest.mark.parametrize(("batch", "size"), [(1, 1), (3, 7), (20, 13), (2, 29), (1, 70)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex128])
+def test_inverse_factor(batch, size, dtype):
+    rng = np.random.default_rng(size)
+    square = rng.standard_normal((batch, size, size))
+    matrices = square @ square.transpose(0, 2, 1) + size * np.eye(size)
+    if dtype == np.complex128:
+        matrices = matrices + 0.5j * (square + square.transpose(0, 2, 1))
+    matrices = matrices.astype(dtype)
+    inverse = np.asarray(jax.jit(inverse_cholesky)(jnp.asarray(matrices)))
+    assert inverse.dtype == dtype
+    np.testing.assert_array_equal(inverse, np.tril(inverse))
+    # The condition numbers are below 10, so a few units of roundoff for each row.
+    tolerance = 10 * size * np.finfo(dtype).eps
+    unity = inverse @ matrices @ inverse.transpose(0, 2, 1)
+    np.testing.assert_allclose(unity, np.broadcast_to(np.eye(size), unity.shape), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize(("batch", "size"), [(20, 12), (2, 13)])
+@pytest.mark.parametrize("dtype", [np.float64, np.complex128])
+def test_indefinite_matrices_give_nan_and_leave_the_others_alone(batch, size, dtype):
+    matrices = np.broadcast_to(np.eye(size, dtype=dtype), (batch, size, size)).copy()
+    matrices[1, -1, -1] = -1
+    inverse = jax.jit(inverse_cholesky)(jnp.asarray(matrices))
+    assert not np.isfinite(inverse[1]).all()
+    np.testing.assert_array_equal(inverse[0], np.eye(size))

@@ -1,0 +1,155 @@
+"""The direct solver against SciPy and dense algebra, for every problem and number type."""
+
+import jax
+import jax.numpy as jnp
+import lineax
+import numpy as np
+import pytest
+import sparse_problems
+from scipy.sparse.linalg import splu
+
+from jeit_solvers import (
+    ConjugateGradient,
+    SparseCholesky,
+    SparseSymmetric,
+    analyse,
+    choose_solver,
+    factorise,
+    half_solve,
+    quadratic_form,
+    solve,
+)
+
+# Residuals relative to |A| |x|; a backward stable solver reaches a small multiple of the unit roundoff.
+TOLERANCE = {"float32": 3e-6, "float64": 5e-15, "complex128": 5e-15}
+
+
+def as_type(values, dtype):
+    if dtype == "complex128":
+        # Any symmetric imaginary part will do; this one is not a multiple of the real part.
+        rng = np.random.default_rng(5)
+        return values + 0.5j * values * jnp.asarray(rng.uniform(-1, 1, values.shape))
+    return values.astype(dtype)
+
+
+ALL_TYPES = ("disk", "disconnected")
+SOLVED = [
+    (case, dtype)
+    for case in sparse_problems.PROBLEMS
+    for dtype in TOLERANCE
+    if dtype == "float64" or case.__name__ in ALL_TYPES
+]
+
+
+@jax.jit
+def everything(plan, values, vectors):
+    factor = factorise(plan, values)
+    form, half = quadratic_form(plan, factor, vectors), half_solve(plan, factor, vectors)
+    return factor.positive_definite, solve(plan, factor, vectors), form, half
+
+
+@pytest.mark.parametrize(("case", "dtype"), SOLVED, ids=lambda value: getattr(value, "__name__", value))
+def test_solves_every_problem_to_roundoff(case, dtype):
+    pattern, values, coordinates = case()
+    values = as_type(values, dtype)
+    plan = analyse(pattern, coordinates)
+    vectors = jax.random.normal(jax.random.key(0), (pattern.size, 5)).astype(dtype)
+    positive_definite, solution, form, half = everything(plan, values, vectors)
+    assert positive_definite
+    assert solution.dtype == values.dtype
+    dense = np.asarray(pattern.to_dense(values))
+    residual = np.linalg.norm(dense @ solution - vectors) / np.linalg.norm(dense) / np.linalg.norm(solution)
+    assert residual < TOLERANCE[dtype]
+    # Forward errors may be larger, by the condition numbers, which are below 1e3.
+    loose = 1e3 * TOLERANCE[dtype]
+    np.testing.assert_allclose(form, vectors.T @ solution, rtol=0, atol=loose * abs(form).max())
+    np.testing.assert_allclose(half.T @ half, form, rtol=0, atol=loose * abs(form).max())
+
+
+def test_agrees_with_superlu_on_a_large_disk():
+    points, cells = sparse_problems.disk_cells(1500)
+    pattern, values, _ = sparse_problems.from_cells(points, cells)
+    vectors = np.random.default_rng(0).standard_normal((pattern.size, 3))
+    expected = splu(pattern.to_scipy(values).tocsc()).solve(vectors)
+    plan = analyse(pattern, points)
+    solution = jax.jit(lambda p, v, b: solve(p, factorise(p, v), b))(plan, values, jnp.asarray(vectors))
+    np.testing.assert_allclose(solution, expected, rtol=0, atol=1e-12 * abs(expected).max())
+
+
+def test_one_vector_is_a_column_and_jit_equals_eager():
+    pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
+    plan = analyse(pattern, coordinates)
+    vectors = jax.random.normal(jax.random.key(0), (pattern.size, 5))
+    _, solution, _, _ = everything(plan, values, vectors)
+    eager = solve(plan, factorise(plan, values), vectors[:, 0])
+    np.testing.assert_allclose(eager, solution[:, 0], rtol=0, atol=1e-13 * abs(eager).max())
+
+
+def test_one_executable_serves_all_values():
+    pattern, values, coordinates = sparse_problems.disk()
+    plan = analyse(pattern, coordinates)
+    jitted = jax.jit(factorise)
+    jitted(plan, values)
+    jitted(analyse(pattern, coordinates), 2 * values)  # another plan, equal in structure
+    assert jitted._cache_size() == 1
+
+
+def test_batches_of_matrices_equal_a_loop():
+    pattern, values, coordinates = sparse_problems.disk()
+    plan = analyse(pattern, coordinates)
+    scales = jnp.asarray(np.random.default_rng(0).uniform(0.5, 2.0, (4, pattern.num_entries)))
+    batch = values * (1 + 0.1 * scales)
+    vectors = jax.random.normal(jax.random.key(1), (pattern.size, 2))
+    both = jax.jit(lambda p, v, b: solve(p, factorise(p, v), b))
+    together = jax.vmap(both, in_axes=(None, 0, None))(plan, batch, vectors)
+    for values_, solution in zip(batch, together, strict=True):
+        np.testing.assert_allclose(solution, both(plan, values_, vectors), rtol=0, atol=1e-12 * abs(solution).max())
+
+
+@pytest.mark.parametrize("change", ["negative_pivot", "singular", "nan"])
+@pytest.mark.parametrize("dtype", ["float64", "complex128"])
+def test_matrices_that_are_not_positive_definite_are_refused(change, dtype):
+    pattern, values, points = sparse_problems.disk()
+    index, value = {"negative_pivot": (7, -5.0), "singular": (7, 0.0), "nan": (3, np.nan)}[change]
+    values = as_type(values, dtype).at[index].set(value)
+    plan = analyse(pattern, points)
+    factor = jax.jit(factorise)(plan, values)
+    assert not factor.positive_definite
+    with pytest.raises(ValueError, match=r"not positive definite.*boundary condition"):
+        factor.require_positive_definite()
+    operator, vector = SparseSymmetric(values, pattern), jnp.ones(pattern.size, dtype)
+    solution = lineax.linear_solve(operator, vector, SparseCholesky(plan), throw=False)
+    assert solution.result == lineax.RESULTS.singular
+
+
+def test_lineax_throws_on_an_indefinite_matrix():
+    pattern, values, coordinates = sparse_problems.chain()
+    solver = SparseCholesky(analyse(pattern, coordinates))
+    with pytest.raises(Exception, match="positive definiteness"):
+        lineax.linear_solve(SparseSymmetric(-values, pattern), jnp.ones(pattern.size), solver)
+
+
+def test_batch_tells_which_matrix_failed():
+    pattern, values, coordinates = sparse_problems.disk()
+    plan = analyse(pattern, coordinates)
+    batch = jnp.stack([values, values.at[0].set(-1.0), 2 * values])
+    factors = jax.jit(jax.vmap(factorise, in_axes=(None, 0)))(plan, batch)
+    verdict = jax.vmap(lambda factor: factor.positive_definite)(factors)
+    assert verdict.tolist() == [True, False, True]
+
+
+def test_choice_follows_the_limits_and_says_why():
+    pattern, values, coordinates = sparse_problems.box()
+    vector = jnp.ones(pattern.size)
+    direct = choose_solver(pattern, coordinates)
+    assert isinstance(direct, SparseCholesky)
+    assert direct.reason.startswith("direct: ")
+    little_memory = choose_solver(pattern, coordinates, memory_limit=1e3)
+    assert isinstance(little_memory, ConjugateGradient)
+    assert "MB allowed" in little_memory.reason
+    little_time = choose_solver(pattern, coordinates, operations_limit=1e3)
+    assert isinstance(little_time, ConjugateGradient)
+    assert "operations allowed" in little_time.reason
+    operator = SparseSymmetric(values, pattern)
+    expected = lineax.linear_solve(operator, vector, direct).value
+    np.testing.assert_allclose(lineax.linear_solve(operator, vector, little_time).value, expected, rtol=1e-7)
