@@ -34,7 +34,7 @@ def reconstruct(
         str | None, typer.Option(help="one-step (default), back-projection or filtered-back-projection.")
     ] = None,
     prior: Annotated[
-        str | None, typer.Option(help="tikhonov, laplace, noser (default) or gaussian; for one-step.")
+        str | None, typer.Option(help="tikhonov, laplace, noser or gaussian (default); for one-step.")
     ] = None,
     hyperparameter: Annotated[
         str | None,

@@ -14,7 +14,7 @@ from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.electrodes import BoundaryElectrodes, ring
 from jeit.forward import ForwardModel
-from jeit.mesh import Disk, Refine, centroids
+from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
 
 
@@ -38,9 +38,8 @@ class RoundSkin(eqx.Module):
 
     def model(self) -> ForwardModel:
         """The forward model that simulates the skin."""
-        domain = Disk(self.radius)
         electrodes = self.electrodes()
-        mesh = domain.mesh(num_points=self.num_points, refine=Refine(np.asarray(electrodes.position), factor=3.0))
+        mesh = Disk(self.radius).mesh(num_points=self.num_points)
         return ForwardModel(mesh, electrodes, adjacent(self.num_electrodes, current=self.current))
 
     def electrodes(self) -> BoundaryElectrodes:

@@ -1,0 +1,341 @@
+"""Bad input, over the whole library and on the command line: each refused with an error that says what to do."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import scipy.io
+
+from jeit import electrodes as el
+from jeit import protocol as pr
+from jeit.data import read
+from jeit.data.simulated import RoundSkin, simulate_press
+from jeit.forward import ForwardModel
+from jeit.image import Raster, find_inclusions
+from jeit.imaging import ImagingSettings, image_difference
+from jeit.inverse import Gaussian, back_projection, calibrate, one_step
+from jeit.mesh import Disk, Mesh, Polygon, Rectangle, Refine, box, disk
+from jeit.plot import plot_image, plot_raster, plot_voltages
+
+SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+CELLS = np.array([[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return disk(0.1, num_points=150)
+
+
+@pytest.fixture(scope="module")
+def model(mesh):
+    return ForwardModel(mesh, arcs(), pr.adjacent(8))
+
+
+def arcs(number=8, radius=0.1, width=0.01, contact_impedance=0.01):
+    return el.BoundaryElectrodes(el.ring(radius, number), width, contact_impedance)
+
+
+GEOMETRY = {
+    "negative radius": (lambda: disk(-0.1), "radius: expected a positive length"),
+    "radius is text": (lambda: Disk("10 cm"), "expected one length in metres"),  # pyright: ignore[reportArgumentType]
+    "flat rectangle": (lambda: Rectangle(0.1, 0.0), "height: expected a positive length"),
+    "centre of three": (lambda: Disk(0.1, (0, 0, 0)), "two finite coordinates"),
+    "too few vertices": (lambda: Polygon(SQUARE[:2]), "vertices: "),
+    "outline crosses itself": (lambda: Polygon(SQUARE[[0, 2, 1, 3]]), "cross"),
+    "hole outside": (lambda: Polygon(SQUARE, [SQUARE + 3]), "strictly inside the outline"),
+    "points transposed": (lambda: Mesh.create(SQUARE.T, CELLS), "Transpose"),
+    "NaN node": (lambda: Mesh.create(np.where(SQUARE == 0, np.nan, SQUARE), CELLS), "NaN"),
+    "cell of unknown node": (lambda: Mesh.create(SQUARE, CELLS + 1), "They look one-based"),
+    "duplicated cell": (lambda: Mesh.create(SQUARE, CELLS[[0, 1, 0]]), "are duplicated"),
+    "flat cell": (
+        lambda: Mesh.create(SQUARE * [1, 0] + [[0, 0], [1, 0], [3, 0], [0.5, 0]], CELLS),
+        "flat|degenerate|area",
+    ),
+    "node twice": (lambda: Mesh.create(SQUARE[[0, 1, 2, 2]], CELLS), "coincide with another"),
+    "unused node": (lambda: Mesh.create(SQUARE, CELLS[:1]), "belong to no cell"),
+    "unknown tag": (lambda: Mesh.create(SQUARE, CELLS, tags={"side": [9]}), "'side' holds facet indices"),
+    "no cell size": (lambda: disk(0.1, num_points=2), "num_points"),
+    "both sizes": (lambda: disk(0.1, num_points=100, cell_size=0.01), "cell_size"),
+    "cells without end": (lambda: disk(0.1, cell_size=1e-6), "cell_size"),
+    "refine by nothing": (lambda: Refine([[0, 0]]), "exactly one of cell_size"),
+    "refine too steep": (lambda: Refine([[0, 0]], factor=2, growth=3), "growth"),
+    "box without height": (lambda: box(0.1, 0.1, -0.1), "height: expected a positive length"),
+    "raster without extent": (lambda: Raster.create(disk(0.1, num_points=60), extent=(0, 0, 0, 1)), "extent"),
+}
+
+ELECTRODES = {
+    "off the boundary": (lambda mesh: arcs(radius=0.05).check(mesh), "from the boundary of the mesh"),
+    "in millimetres": (lambda mesh: arcs(radius=100.0).check(mesh), "metres"),
+    "overlapping": (lambda mesh: arcs(width=0.09).check(mesh), "overlap"),
+    "wider than the edge": (lambda mesh: arcs(number=1 + 1, width=2.0).check(mesh), "wide"),
+    "zero width": (lambda mesh: arcs(width=0.0), "width must be positive"),
+    "negative contact impedance": (lambda mesh: arcs(contact_impedance=-1), "contact_impedance must be positive"),
+    "NaN position": (lambda mesh: el.PointElectrodes([[np.nan, 0.0]]), "NaN"),
+    "widths of another number": (lambda mesh: arcs(width=np.full(3, 0.01)), "one for each of the"),
+    "positions in one row": (lambda mesh: el.PointElectrodes([0.1, 0.0]), "one row per electrode"),
+    "disc off the sheet": (lambda mesh: el.SheetDiscs([[0.5, 0]], 0.01, 0.01).check(mesh), "off the mesh"),
+    "discs overlap": (lambda mesh: el.SheetDiscs([[0, 0], [0.01, 0]], 0.03, 0.01).check(mesh), "overlap by"),
+    "point outside": (lambda mesh: el.PointElectrodes([[0.2, 0], [0, 0]]).check(mesh), "outside the mesh"),
+    "ring of one": (lambda mesh: el.ring(0.1, 1), "2"),
+    "faces on a plane mesh": (lambda mesh: el.FaceDiscs([[0, 0, 0]], 0.01, 0.01).check(mesh), "3-D mesh"),
+    "number against protocol": (lambda mesh: ForwardModel(mesh, arcs(), pr.adjacent(16)), "8 electrodes"),
+    "positions as electrodes": (
+        lambda mesh: ForwardModel(mesh, el.ring(0.1, 8), pr.adjacent(8)),  # pyright: ignore[reportArgumentType]
+        "become electrodes",
+    ),
+    "protocol by name": (lambda mesh: ForwardModel(mesh, arcs(), "adjacent"), "jeit.protocol"),  # pyright: ignore[reportArgumentType]
+}
+
+PATTERNS = {
+    "three electrodes": (lambda: pr.adjacent(3), "at least 4"),
+    "half an electrode": (lambda: pr.adjacent(8.5), "integer"),  # pyright: ignore[reportArgumentType]
+    "five amperes": (lambda: pr.adjacent(8, current=5.0), "if you meant 5 mA"),
+    "no current": (lambda: pr.adjacent(8, current=0.0), "positive"),
+    "opposite of odd": (lambda: pr.opposite(7), "no opposite pairs"),
+    "skip too many": (lambda: pr.skip(8, 9), "skip"),
+    "common electrode missing": (lambda: pr.all_against_one(8, common=8), "0 to 7"),
+    "pair with itself": (lambda: pr.two_terminal(8, [[1, 1]]), "with itself"),
+    "current is lost": (lambda: pr.from_matrices([[1e-3, 0]], [[1, -1]]), "sums to"),
+    "pattern of zeros": (lambda: pr.from_matrices([[0, 0]], [[1, -1]]), "all zero"),
+    "patterns of other sizes": (lambda: pr.from_matrices([[1e-3, -1e-3]], [[1, -1, 0]]), "electrodes"),
+    "NaN in a pattern": (lambda: pr.from_matrices([[np.nan, 0]], [[1, -1]]), "NaN"),
+    "nothing left to measure": (lambda: pr.adjacent(8).subset(np.zeros(40, bool)), "no channel is left"),
+}
+
+COMPUTING = {
+    "negative conductivity": (lambda m: m.voltages(-1.0), "must be positive"),
+    "conductivity of another mesh": (lambda m: m.voltages(np.ones(7)), "one value per cell"),
+    "conductivity NaN": (lambda m: m.voltages(np.nan), "NaN"),
+    "unknown solver": (lambda m: ForwardModel(m.mesh, m.electrodes, m.protocol, solver="magic"), "magic"),
+    "reference of another length": (lambda m: calibrate(m, np.ones(3)), "shape"),
+    "reference of zeros": (lambda m: calibrate(m, np.zeros(40)), "no finite, non-zero"),
+    "unknown contact": (lambda m: calibrate(m, np.ones(40), contact="good"), "'common', 'each' or 'fixed'"),
+    "mask of nothing": (lambda m: one_step(m, 1.0, mask=np.zeros(40, bool)), "at least one True"),
+    "unknown rule": (lambda m: one_step(m, 1.0, hyperparameter="luck"), "no rule 'luck'"),
+    "rule without data": (lambda m: one_step(m, 1.0, hyperparameter="gcv"), "give difference"),
+    "negative hyperparameter": (lambda m: one_step(m, 1.0, hyperparameter=-1.0), "must be positive"),
+    "noise of zero": (lambda m: one_step(m, 1.0, noise=0.0), "noise must be positive"),
+    "prior of no length": (lambda m: Gaussian(0.0), "length must be positive"),
+    "back-projection of waves": (
+        lambda m: back_projection(m.with_protocol(pr.trigonometric(8, measurement="mean")), 1.0),
+        "two electrodes each",
+    ),
+    "image of another mesh": (lambda m: find_inclusions(m.mesh, np.ones(3)), "one value for each"),
+    "image of NaN": (lambda m: find_inclusions(m.mesh, np.full(m.mesh.num_cells, np.nan)), "NaN"),
+    "picture of another mesh": (lambda m: plot_image(m.mesh, np.ones(3)), "one for each of the"),
+    "picture of NaN": (lambda m: plot_image(m.mesh, np.full(m.mesh.num_cells, np.nan)), "finite"),
+    "raster of nothing": (lambda m: plot_raster(np.full((3, 3), np.nan), (0, 1, 0, 1)), "at least one finite"),
+    "voltages of two lengths": (lambda m: plot_voltages(np.ones(3), np.ones(4)), "one frame"),
+    "press beyond the edge": (lambda m: simulate_press(RoundSkin(), None, (20.0, 0.0)), "beyond the skin"),  # pyright: ignore[reportArgumentType]
+    "press of no size": (lambda m: simulate_press(RoundSkin(), None, (0, 0), radius=0), "positive size"),  # pyright: ignore[reportArgumentType]
+    "unknown method": (lambda m: ImagingSettings(method="two-step"), "one-step, back-projection"),
+    "mesh of three nodes": (lambda m: ImagingSettings(num_points=3), "50 to 100,000"),
+}
+
+
+def refused(call, lesson):
+    with pytest.raises(ValueError, match=lesson) as caught:
+        call()
+    message = str(caught.value)
+    assert len(message) > 25
+    assert message.endswith((".", ")", "?", "'")), message
+
+
+@pytest.mark.parametrize("name", GEOMETRY)
+def test_geometry(name):
+    refused(*GEOMETRY[name])
+
+
+@pytest.mark.parametrize("name", ELECTRODES)
+def test_electrodes(name, mesh):
+    call, lesson = ELECTRODES[name]
+    refused(lambda: call(mesh), lesson)
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_patterns(name):
+    refused(*PATTERNS[name])
+
+
+@pytest.mark.parametrize("name", COMPUTING)
+def test_computing(name, model):
+    call, lesson = COMPUTING[name]
+    refused(lambda: call(model), lesson)
+
+
+def test_messages_of_one_table_differ():
+    """Each fault has its own message: the same words for two faults teach nothing."""
+    messages = []
+    for call, _ in (*GEOMETRY.values(), *PATTERNS.values()):
+        with pytest.raises(ValueError, match=" ") as caught:
+            call()
+        messages.append(str(caught.value))
+    assert len(set(messages)) == len(messages)
+
+
+# On the command line: DATA, REFERENCE and options out of a good tank with one thing spoilt.
+
+
+def good(tank, *options):
+    return ["reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv", *options]
+
+
+def spoilt(tank, old, new):
+    """The good tank with other words in the description of both files."""
+    assert old in tank.description
+    description = tank.description.replace(old, new)
+    tank.write("rest", tank.rest, description)
+    tank.write("touched", tank.touched, description)
+    return good(tank)
+
+
+def with_data(tank, values, **options):
+    return ["reconstruct", tank.write("other", values, **options), "--reference", tank.folder / "rest.csv"]
+
+
+def raw(tank, name, content):
+    (tank.folder / name).write_bytes(content)
+    return ["reconstruct", tank.folder / name, "--reference", tank.folder / "rest.csv"]
+
+
+def matlab(tank, **content):
+    scipy.io.savemat(tank.folder / "a.mat", content)
+    return ["reconstruct", tank.folder / "a.mat", "--reference", tank.folder / "rest.csv"]
+
+
+COMMANDS = {
+    "no such data": (lambda t: ["reconstruct", "absent.mat"], "There is no file absent.mat"),
+    "no such reference": (lambda t: [*good(t)[:2], "--reference", "absent.csv"], "no file absent.csv"),
+    "data is a folder": (lambda t: ["reconstruct", t.folder], "is a folder"),
+    "empty file": (lambda t: raw(t, "a.csv", b""), "is empty"),
+    "a spreadsheet": (lambda t: raw(t, "a.xlsx", b"PK\x03\x04"), "no known format"),
+    "not text": (lambda t: spoilt(t, "V", "V") and raw(t, "rest.csv", b"\xff\xfe\x00"), "not a text file"),
+    "damaged mat": (lambda t: raw(t, "a.mat", b"MATLAB 5.0" + b"\0" * 200), "not a readable .mat"),
+    "mat of another kind": (lambda t: matlab(t, x=1.0), "no known kind; it holds x"),
+    "unknown format": (lambda t: good(t, "--format", "xls"), "no format 'xls'"),
+    "another format": (lambda t: good(t, "--format", "kit4"), "not a readable .mat"),
+    "no such description": (lambda t: good(t, "--description", "absent.toml"), "there is no such file"),
+    "no description": (lambda t: with_data(t, t.touched, description=None), "nothing says what they mean"),
+    "description is no TOML": (lambda t: spoilt(t, "[geometry]", "[geometry"), "not valid TOML"),
+    "unknown key": (lambda t: spoilt(t, "radius", "diameter"), "no 'diameter'"),
+    "negative radius": (lambda t: spoilt(t, "radius = 0.1", "radius = -0.1"), "positive length"),
+    "no geometry": (
+        lambda t: spoilt(
+            t, t.description.split("[protocol]")[0], f"[electrodes]\nkind = 'point'\npositions = {POINTS}\n"
+        ),
+        r"[geometry]",
+    ),
+    "five amperes": (lambda t: spoilt(t, "current = 1e-3", "current = 5"), "if you meant 5 mA"),
+    "unknown protocol": (lambda t: spoilt(t, '"adjacent"', '"nextdoor"'), "adjacent, skip, opposite"),
+    "another protocol": (lambda t: spoilt(t, '"adjacent"', '"opposite"'), "channels"),
+    "electrodes overlap": (lambda t: spoilt(t, "width = 0.005", "width = 0.09"), "overlap"),
+    "electrodes off the edge": (
+        lambda t: spoilt(t, 'layout = "ring"\nnumber = 8\nclockwise = true', "positions = " + POINTS),
+        "from the boundary",
+    ),
+    "unknown unit": (lambda t: spoilt(t, 'unit = "V"', 'unit = "dB"'), "unit must be one of V"),
+    "header not skipped": (lambda t: with_data(t, "a,b\n1,2"), "line 1"),
+    "ragged rows": (lambda t: with_data(t, "1,2,3\n1,2"), "line 2 has 2 numbers"),
+    "too few channels": (lambda t: with_data(t, t.touched[:-1]), "40 channels"),
+    "transposed": (lambda t: with_data(t, t.touched[:, None]), "transposed"),
+    "all zero": (lambda t: with_data(t, 0 * t.touched), "every usable voltage is zero"),
+    "all missing": (lambda t: with_data(t, np.nan * t.touched), "zero or missing"),
+    "too few left": (lambda t: with_data(t, np.where(np.arange(40) < 5, t.touched, np.nan)), "5 channels are usable"),
+    "same file twice": (lambda t: [*good(t)[:2], "--reference", t.folder / "touched.csv"], "same file"),
+    "no reference": (lambda t: good(t)[:2], "no reference frame of its own"),
+    "millivolts against volts": (lambda t: with_data(t, 1e3 * t.touched), "different units"),
+    "another current": (
+        lambda t: with_data(t, t.touched, description=t.description.replace("1e-3", "2e-3")),
+        "2 times the current",
+    ),
+    "another body": (lambda t: with_data(t, "1," * 207 + "2", description=SIXTEEN), "16 electrodes and the reference"),
+    "nothing but noise": (lambda t: with_data(t, np.random.default_rng(0).normal(size=40)), "too noisy"),
+    "complex": (
+        lambda t: with_both(t, 'unit = "V"', 'complex_pairs = true\ncomponent = "complex"'),
+        "choose the part to image",
+    ),
+    "unknown prior": (lambda t: good(t, "--prior", "flat"), "tikhonov, laplace, noser, gaussian"),
+    "unknown method": (lambda t: good(t, "--method", "guess"), "one-step, back-projection"),
+    "unknown rule": (lambda t: good(t, "--hyperparameter", "luck"), "gcv, l-curve"),
+    "negative hyperparameter": (lambda t: good(t, "--hyperparameter", "-1"), "positive number or a rule"),
+    "hyperparameter NaN": (lambda t: good(t, "--hyperparameter", "nan"), "positive number or a rule"),
+    "rule for back-projection": (
+        lambda t: good(t, "--method", "filtered-back-projection", "--hyperparameter", "gcv"),
+        "takes a number",
+    ),
+    "unknown contact": (lambda t: good(t, "--contact", "firm"), "each, common, fixed"),
+    "mesh of three nodes": (lambda t: good(t, "--num-points", "3"), "50 to 100,000"),
+    "mesh of a word": (lambda t: good(t, "--num-points", "many"), "Invalid value for '--num-points'"),
+    "no such frame": (lambda t: good(t, "--frame", "7"), "no frame 7"),
+    "no such named frame": (lambda t: good(t, "--frame", "press"), "no frame named 'press'"),
+    "unknown option": (lambda t: good(t, "--colour", "red"), "No such option: --colour"),
+    "no data named": (lambda t: ["reconstruct"], "Missing argument"),
+    "unknown command": (lambda t: ["image"], "No such command 'image'"),
+    "press beyond the edge": (lambda t: ["demo", "--x", "20"], "in metres from its centre"),
+    "noise below zero": (lambda t: ["demo", "--noise", "-1"], "zero or positive"),
+    "info on nothing": (lambda t: ["info", "absent.csv"], "There is no file"),
+    "info on a folder": (lambda t: ["info", t.folder], "is a folder"),
+}
+POINTS = "[" + ", ".join(f"[{x}, {y}]" for x, y in el.ring(0.05, 8).tolist()) + "]"
+SIXTEEN = """
+[geometry]
+shape = "disk"
+radius = 0.1
+[electrodes]
+layout = "ring"
+number = 16
+width = 0.005
+contact_impedance = 0.01
+[protocol]
+kind = "adjacent"
+current = 1e-3
+"""
+
+
+def with_both(tank, old, new):
+    description = tank.description.replace(old, new)
+    for name, values in (("rest", tank.rest), ("touched", tank.touched)):
+        tank.write(name, np.stack([values, 0.1 * values]), description)
+    return good(tank)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_command_line(name, tank, run):
+    arguments, lesson = COMMANDS[name]
+    arguments = list(arguments(tank))
+    if arguments[0] in ("reconstruct", "demo"):
+        arguments += ["--output", tank.folder / "out"]
+    status, _, error = run(*arguments)
+    assert status in (1, 2)
+    assert lesson in error
+    assert error.startswith("jeit: ")
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    assert "should not have happened" not in error
+
+
+def test_output_that_is_a_file(tank, run):
+    status, _, error = run(*good(tank, "--output", tank.folder / "rest.csv"))
+    assert status == 1
+    assert "is a file; give a folder" in error
+
+
+def test_no_output(tank, run):
+    status, _, error = run(*good(tank))
+    assert status == 2
+    assert "--output" in error
+
+
+def test_a_frame_too_noisy_says_so_in_python_too(tank):
+    noise = tank.write("noise", np.random.default_rng(1).normal(size=40))
+    with pytest.raises(ValueError, match="too noisy"):
+        image_difference(read(noise), read(tank.folder / "rest.csv"))
+
+
+def test_a_real_process_leaves_one_line_and_a_status(tmp_path):
+    command = [sys.executable, "-m", "jeit", "reconstruct", "absent.mat", "--output", "out"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=os.environ, check=False)
+    assert done.returncode == 1
+    assert done.stderr == "jeit: There is no file absent.mat. Check the path.\n"

@@ -1,0 +1,80 @@
+"""The demo, and what a first contact with jeit meets: help, version, import."""
+
+import json
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import jeit
+
+
+@pytest.mark.slow
+def test_demo_finds_the_press(run, tmp_path):
+    status, output, error = run("demo", "--x", "0.01", "--y", "-0.02", "--output", tmp_path)
+    assert (status, error) == (0, "")
+    assert "error" in output
+    found = json.loads((tmp_path / "report.json").read_text("utf-8"))["inclusions"]
+    assert len(found) == 1
+    assert found[0]["kind"] == "conductive"
+    # 3 % of the diameter; Chen et al. report up to 11 mm on the real skin.
+    assert np.hypot(found[0]["centroid"][0] - 0.01, found[0]["centroid"][1] + 0.02) < 0.003
+    assert (tmp_path / "image.png").stat().st_size > 10_000
+
+
+def test_the_same_seed_gives_the_same_press():
+    import jax
+
+    from jeit.data.simulated import RoundSkin, simulate_press
+
+    skin = RoundSkin(num_points=300)
+    frames = [simulate_press(skin, jax.random.key(seed), (0.01, 0.0))[0].voltages for seed in (3, 3, 4)]
+    np.testing.assert_array_equal(frames[0], frames[1])
+    assert not np.array_equal(frames[0], frames[2])
+    # The noise asked for, relative to the root mean square: 208 draws give it to about 5 %.
+    spread = np.std(frames[0] - frames[2]) / np.sqrt(2) / np.sqrt(np.mean(frames[0] ** 2))
+    assert spread == pytest.approx(1e-4, rel=0.2)
+
+
+def test_help_and_version(run):
+    status, output, _ = run("--help")
+    assert status == 0
+    for command in ("demo", "reconstruct", "info"):
+        assert command in output
+    status, output, _ = run("--version")
+    assert (status, output) == (0, f"jeit {jeit.__version__}\n")
+    assert run()[0] == 0
+
+
+def test_help_tells_the_defaults(run):
+    _, output, _ = run("reconstruct", "--help")
+    told = " ".join(output.replace("│", " ").split())
+    settings = jeit.ImagingSettings()
+    for value in (settings.method, settings.prior, settings.hyperparameter):
+        assert f"{value} (default)" in told
+    assert f"(default {settings.num_points})" in told
+
+
+def test_contents_page():
+    for name in dir(jeit):
+        assert getattr(jeit, name) is not None
+    assert jeit.Disk is jeit.mesh.Disk
+    with pytest.raises(AttributeError, match="no attribute 'disc'"):
+        _ = jeit.disc
+
+
+def test_import_is_quick_and_leaves_heavy_things_alone():
+    code = (
+        "import sys, jeit; print([m for m in ('matplotlib', 'optimistix', 'meshio', 'scipy.io') if m in sys.modules])"
+    )
+    seconds = []
+    for _ in range(3):  # the least of three: the machine may be busy
+        start = time.perf_counter()
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        seconds.append(time.perf_counter() - start)
+        if seconds[-1] < 2:
+            break
+    assert done.stdout == "[]\n"
+    assert min(seconds) < 2

@@ -1,0 +1,23 @@
+"""Every example runs, and its figure holds."""
+
+import importlib.util
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[2] / "examples"
+MOST = {"press_on_a_skin": 3e-3, "design_gradient": 1e-5}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [file.stem for file in sorted(FOLDER.glob("*.py"))])
+def test_example(name, tmp_path, monkeypatch):
+    matplotlib.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    specification = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    assert module.main() < MOST[name]

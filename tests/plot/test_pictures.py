@@ -1,0 +1,186 @@
+"""Pictures, judged by what was drawn: colours, limits, labels, places."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.figure import Figure
+
+from jeit.electrodes import (
+    BoundaryElectrodes,
+    CombinedElectrodes,
+    FaceDiscs,
+    PointElectrodes,
+    SheetDiscs,
+    plates,
+    ring,
+)
+from jeit.forward import ForwardModel
+from jeit.image import Inclusion
+from jeit.mesh import Polygon, centroids, disk, layer, rectangle
+from jeit.plot import draw_electrodes, plot_image, plot_mesh, plot_raster, plot_sensitivity, plot_voltages
+from jeit.protocol import adjacent
+
+RADIUS = 0.05
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return disk(RADIUS, num_points=300)
+
+
+@pytest.fixture(scope="module")
+def electrodes():
+    return BoundaryElectrodes(ring(RADIUS, 8, clockwise=True), 0.012, 0.1)
+
+
+@pytest.fixture
+def ax():
+    return Figure(layout="constrained").subplots()
+
+
+def texts(ax):
+    return {text.get_text(): np.array(text.get_position()) for text in ax.texts}
+
+
+def colour_bar_label(ax):
+    return ax.figure.axes[-1].get_ylabel()
+
+
+def test_differences_are_centred_at_zero(mesh, electrodes, ax):
+    values = jnp.where(centroids(mesh)[:, 0] > 0, 2e-3, -1e-3)
+    assert plot_image(mesh, values, electrodes, ax=ax) is ax
+    (cells,) = [c for c in ax.collections if c.get_array() is not None]
+    assert cells.get_clim() == pytest.approx((-2, 2))
+    np.testing.assert_allclose(cells.get_array(), 1e3 * values)
+    assert colour_bar_label(ax) == "Change of conductivity (mS)"
+    red, _, blue, _ = cells.to_rgba(2.0)
+    assert red > blue  # conductive is red
+    assert np.allclose(cells.to_rgba(0.0)[:3], 1, atol=0.05)  # nothing is white
+
+
+def test_conductivity_is_sequential_and_spans_its_range(mesh, ax):
+    values = np.linspace(1.0, 3.0, mesh.num_points)
+    plot_image(mesh, values, difference=False, unit="S/m", ax=ax)
+    drawn = [c for c in ax.collections if c.get_array() is not None]
+    assert drawn[0].get_clim() == pytest.approx((1, 3))
+    assert colour_bar_label(ax) == "Conductivity (S/m)"
+
+
+def test_electrodes_stand_at_their_place_and_width(mesh, electrodes, ax):
+    draw_electrodes(mesh, electrodes, ax=ax)
+    (arcs,) = [c for c in ax.collections if isinstance(c, LineCollection)]
+    for arc, position in zip(arcs.get_segments(), np.asarray(electrodes.position), strict=True):
+        # On a polygon inscribed in the circle: within the sagitta of an edge.
+        length = np.linalg.norm(np.diff(arc, axis=0), axis=1).sum()
+        assert length == pytest.approx(0.012, rel=1e-6)
+        assert np.linalg.norm(arc.mean(axis=0) - position) < 0.03 * RADIUS
+    numbers = texts(ax)
+    assert set(numbers) == {str(k) for k in range(1, 9)}
+    for k, position in enumerate(np.asarray(electrodes.position), start=1):
+        assert np.linalg.norm(numbers[str(k)]) > RADIUS
+        assert np.dot(numbers[str(k)], position) > 0.99 * np.linalg.norm(numbers[str(k)]) * RADIUS
+
+
+def test_an_electrode_over_the_start_of_the_outline_is_one_piece(mesh, ax):
+    across = BoundaryElectrodes(jnp.array([[RADIUS, 0.0], [-RADIUS, 0.0]]), 0.02, 0.1)
+    draw_electrodes(mesh, across, ax=ax)
+    (arcs,) = [c for c in ax.collections if isinstance(c, LineCollection)]
+    arc = arcs.get_segments()[0]
+    assert np.linalg.norm(np.diff(arc, axis=0), axis=1).max() < 0.02
+    assert arc[:, 1].min() == pytest.approx(-arc[:, 1].max(), rel=1e-6)
+
+
+def test_other_electrodes(ax):
+    sheet = rectangle(0.2, 0.1, num_points=200)
+    combined = CombinedElectrodes(
+        BoundaryElectrodes(jnp.array([[-0.1, 0.0]]), 0.02, 0.1), SheetDiscs([[0.0, 0.0]], 0.01, 0.1)
+    )
+    draw_electrodes(sheet, combined, ax=ax)
+    assert set(texts(ax)) == {"1", "2"}
+    assert any(isinstance(c, PatchCollection) for c in ax.collections)
+    draw_electrodes(sheet, plates(sheet, ["left", "right"], 0.1), ax=ax, first=3)
+    assert set(texts(ax)) == {"1", "2", "3", "4"}
+    draw_electrodes(sheet, PointElectrodes([[0.05, 0.0], [-0.05, 0.0]]), ax=ax, numbers=False)
+    assert len(texts(ax)) == 4
+
+
+def test_electrodes_of_an_outline_with_a_hole(ax):
+    square = np.array([[0, 0], [0.1, 0], [0.1, 0.1], [0, 0.1]])
+    mesh = Polygon(square, [0.03 + 0.4 * square]).mesh(num_points=200)
+    draw_electrodes(mesh, BoundaryElectrodes([[0.1, 0.05], [0.03, 0.05]], 0.01, 0.1), ax=ax)
+    (arcs,) = [c for c in ax.collections if isinstance(c, LineCollection)]
+    for arc, x in zip(arcs.get_segments(), (0.1, 0.03), strict=True):
+        np.testing.assert_allclose(arc[:, 0], x, atol=1e-12)
+
+
+def test_scale_bar_is_as_long_as_it_says(mesh, ax):
+    plot_image(mesh, np.ones(mesh.num_cells), ax=ax)
+    (bar,) = ax.lines
+    assert np.ptp(bar.get_xdata()) == pytest.approx(0.02)
+    assert "20 mm" in texts(ax)
+
+
+def test_inclusions_are_marked(mesh, ax):
+    plot_image(mesh, np.ones(mesh.num_cells), inclusions=[Inclusion(1, (0.01, -0.02), np.pi * 1e-4, 1.0)], ax=ax)
+    (circle,) = ax.patches
+    assert circle.get_center() == (0.01, -0.02)
+    assert circle.get_radius() == pytest.approx(0.01)
+
+
+def test_raster_lies_as_its_extent_says(ax):
+    raster = np.full((4, 8), np.nan)
+    raster[0, 0] = -5.0
+    plot_raster(raster, (0.0, 0.08, 0.0, 0.04), ax=ax)
+    (drawn,) = ax.images
+    assert list(drawn.get_extent()) == [0.0, 0.08, 0.0, 0.04]
+    assert drawn.get_clim() == pytest.approx((-5, 5))
+    assert drawn.origin == "upper"
+
+
+def test_slice_of_a_solid(ax):
+    solid = layer(rectangle(0.1, 0.1, num_points=60), 0.02, 2)
+    lower = jnp.where(centroids(solid)[:, 2] < 0.01, 1.0, 3.0)
+    electrodes = FaceDiscs([[0.03, 0.03, 0.02], [-0.03, -0.03, 0.02]], 0.01, 0.1)
+    plot_image(solid, lower, electrodes, height=0.005, ax=ax)
+    np.testing.assert_allclose(np.asarray(ax.images[0].get_array()), 1.0)
+    assert colour_bar_label(ax) == "Change of conductivity (S/m)"
+    with pytest.raises(ValueError, match="no mesh at z = 1"):
+        plot_image(solid, lower, height=1.0)
+
+
+def test_sensitivity_is_least_in_the_middle(mesh, electrodes, ax):
+    plot_sensitivity(ForwardModel(mesh, electrodes, adjacent(8)), 1e-3, ax=ax)
+    (cells,) = [c for c in ax.collections if c.get_array() is not None]
+    middle = np.argmin(np.linalg.norm(np.asarray(centroids(mesh)), axis=1))
+    assert cells.get_array()[middle] < -20  # decibels under the edge: adjacent drives hardly see the middle
+    assert cells.get_array().max() == 0
+
+
+def test_voltages_and_their_difference(ax):
+    protocol = adjacent(8)
+    measured = np.linspace(1e-3, 2e-3, 40)
+    plot_voltages(measured, 1.02 * measured, protocol, ax=ax)
+    upper, lower = ax.child_axes
+    assert upper.get_title(loc="left") == "Relative misfit 2 %"
+    assert upper.get_ylabel() == "Voltage (mV)"
+    np.testing.assert_allclose(upper.lines[0].get_ydata(), 1e3 * measured)
+    assert lower.lines[-1].get_ydata().max() == pytest.approx(2 * 2e-3 / np.sqrt(np.mean(measured**2)), rel=1e-9)
+
+
+def test_masked_channels_are_left_out(ax):
+    measured = np.array([1.0, np.nan, 2.0])
+    plot_voltages(measured, np.ones(3), mask=[True, False, True], ax=ax)
+    np.testing.assert_array_equal(ax.child_axes[0].lines[0].get_xdata(), [0, 2])
+
+
+def test_a_figure_is_made_where_no_axes_are_given(mesh, electrodes):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    ax = plot_mesh(mesh, electrodes)
+    assert "nodes" in ax.get_title()
+    ax.figure.canvas.draw()
+    pyplot.close(ax.figure)
