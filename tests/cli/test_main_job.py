@@ -116,7 +116,7 @@ def test_every_prior_finds_the_rod(prior, data_folder, run, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("rule", ["gcv", "l-curve", "discrepancy"])
 def test_rules_are_taken_and_reported(rule, data_folder, run, tmp_path):
-    """Where the model misses a quarter of the voltages, as here, these rules smooth too little: no word on the image."""
+    """Where the model misses a quarter of the voltages, as here, these rules smooth too little."""
     (file,) = (data_folder / "tank6cm" / "electrode01_metal").glob("*.csv")
     _, report = reconstruct(run, tmp_path, file, "--hyperparameter", rule, "--num-points", 500)
     assert report["hyperparameter"]["chosen_by"] == rule
