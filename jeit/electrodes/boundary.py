@@ -54,13 +54,14 @@ class BoundaryElectrodes(AbstractElectrodes):
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the boundary edges of `mesh`, exact for P1 basis functions."""
         start, end = _covered(self.position, self.width, mesh)
-        length = facet_measures(mesh)[:, None, None]
+        length = facet_measures(mesh)[:, None]
         # Basis functions on an edge: φ_1 = t / length, φ_0 = 1 - φ_1; these are their integrals over [start, end].
         one = end - start
         first = (end**2 - start**2) / (2 * length)
         second = (end**3 - start**3) / (3 * length**2)
-        phi = jnp.stack([one - first, first]).sum(axis=-1)  # (2, b, L)
-        phi_phi = jnp.stack([one - 2 * first + second, first - second, second]).sum(axis=-1)
+        one, first, second = one.sum(axis=0), first.sum(axis=0), second.sum(axis=0)  # over the turns, (b, L)
+        phi = jnp.stack([one - first, first])
+        phi_phi = jnp.stack([one - 2 * first + second, first - second, second])
         admittance = 1 / self.contact_impedance
         entries = phi_phi @ admittance  # (3, b)
         mass = jnp.stack([entries[:2], entries[1:]]).transpose(2, 0, 1)
@@ -80,7 +81,7 @@ class BoundaryElectrodes(AbstractElectrodes):
                 f"position: electrode {far[0] + 1} lies {distance[far[0]]:.3g} m from the boundary of the mesh; "
                 "they must lie on it (are both in metres?). For electrodes inside a sheet use SheetDiscs."
             )
-        covered = np.clip(end - start, 0, None).sum(axis=-1)  # (b, L)
+        covered = np.clip(end - start, 0, None).sum(axis=0)  # (b, L)
         short = np.flatnonzero(covered.sum(axis=0) < (1 - 1e-9) * np.asarray(self.width))
         if short.size:
             raise ValueError(
@@ -103,8 +104,8 @@ def _measures_for_check(position, width, mesh: Mesh):
 
 
 def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of electrodes that cover a common piece of an edge, given intervals (b, L, 3) along each edge."""
-    start, end = start.transpose(1, 0, 2), end.transpose(1, 0, 2)
+    """Pairs of electrodes that cover a common piece of an edge, given intervals (3, b, L) along each edge."""
+    start, end = start.transpose(2, 1, 0), end.transpose(2, 1, 0)
     pairs = []
     for first in range(start.shape[0]):
         for second in range(first + 1, start.shape[0]):
@@ -153,26 +154,26 @@ def _normalised(vectors):
 def _loops(mesh: Mesh, length):
     """For every boundary edge: its loop, the arc length from the loop's beginning, and the loop's perimeter."""
     tail, head = mesh.facets[:, 0], mesh.facets[:, 1]
-    begins = jnp.concatenate([jnp.zeros(1, bool), tail[1:] != head[:-1]])
-    loop = jnp.cumsum(begins)
-    travelled = jnp.cumsum(length) - length
-    perimeters = jax.ops.segment_sum(length, loop, num_segments=length.shape[0], indices_are_sorted=True)
-    before = jnp.cumsum(perimeters) - perimeters
-    return loop, travelled - before[loop], perimeters[loop]
+    begins = jnp.concatenate([jnp.ones(1), (tail[1:] != head[:-1]).astype(length.dtype)])
+    order = jnp.arange(length.shape[0])
+    # Sums as matrix products: XLA turns a cumulative sum into dozens of small operations.
+    earlier = (order < order[:, None]).astype(length.dtype)
+    loop = earlier @ begins + begins
+    same = (loop[:, None] == loop).astype(length.dtype)
+    return loop, (earlier * same) @ length, same @ length
 
 
 def _covered(position, width, mesh: Mesh):
-    """Interval of each edge that each electrode covers: start and end (b, L, 3), zero ≤ start ≤ end ≤ length.
+    """Interval of each edge that each electrode covers: start and end (3, b, L), zero ≤ start ≤ end ≤ length.
 
-    The last axis goes round the loop: an electrode may lie across the point where arc length begins.
+    The first axis goes round the loop: an electrode may lie across the point where arc length begins.
     """
     length = facet_measures(mesh)
     (facet, centre), _ = _project(position, mesh)
     loop, arc_start, perimeter = _loops(mesh, length)
-    turns = jnp.array([-1.0, 0.0, 1.0]) * perimeter[facet][:, None]
-    middle = (centre[:, None] + turns)[None] - arc_start[:, None, None]  # (b, L, 3)
-    half = 0.5 * width[:, None]
-    limit = length[:, None, None]
+    turns = jnp.array([-1.0, 0.0, 1.0])[:, None] * perimeter[facet]
+    middle = (centre + turns)[:, None, :] - arc_start[:, None]
+    half, limit = 0.5 * width, length[:, None]
     start, end = jnp.clip(middle - half, 0, limit), jnp.clip(middle + half, 0, limit)
-    same = (loop[:, None] == loop[facet])[..., None]
+    same = loop[:, None] == loop[facet]
     return jnp.where(same, start, 0), jnp.where(same, end, 0)
