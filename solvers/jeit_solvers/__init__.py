@@ -5,6 +5,7 @@ A direct solver (nested dissection, multifrontal Cholesky in batches of dense fr
 counts. See `analyse`, `factorise` and `solve`.
 """
 
+from .batching import in_turn
 from .choose import choose_solver
 from .conjugate_gradient import ConjugateGradient
 from .multifrontal import Factor, factorise, half_solve, quadratic_form, solve
@@ -24,6 +25,7 @@ __all__ = [
     "choose_solver",
     "factorise",
     "half_solve",
+    "in_turn",
     "quadratic_form",
     "solve",
 ]

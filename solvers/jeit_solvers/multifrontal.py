@@ -1,12 +1,17 @@
 """The numeric half of the direct solver, in pure JAX: factorise, solve, and products with the inverse."""
 
+from functools import partial
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Inexact
+from jaxtyping import Array, Bool, Inexact, Int
 
+from .batching import differentiable_batches, in_turn, one_by_one
 from .dense_cholesky import inverse_cholesky
-from .plan import FactorisationPlan
+from .index_store import Layout
+from .plan import FactorisationPlan, Stage
 
 
 class Factor(eqx.Module):
@@ -48,10 +53,15 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
             f"factorise: `values` must have shape {(plan.num_entries,)}, the entries of the plan's pattern; "
             f"got {values.shape}. Use jax.vmap for a batch of matrices."
         )
-    indices, dtype = plan.indices, values.dtype
+    numeric = in_turn(partial(_factorise, plan.stages))
+    return numeric(plan.indices, values)
+
+
+def _factorise(stages: tuple[Stage, ...], indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Factor:
+    dtype = values.dtype
     extended = jnp.concatenate([values, jnp.ones(1, dtype)])
     inverses, lowers, left = [], [], []
-    for stage in plan.stages:
+    for stage in stages:
         pivots, border = stage.pivots, stage.border
         panel = stage.entries.apply(indices, extended)
         corner = jnp.zeros(stage.batch * border * border, dtype)
@@ -71,7 +81,25 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
     """x with A x = b, for one right-hand side (n,) or several (n, k) at once."""
     vectors = _columns(plan, right_hand_sides, "solve")
-    return _backward(plan, factor, _forward(plan, factor, vectors)).reshape(right_hand_sides.shape)
+    numeric = differentiable_batches(partial(_solve, plan.layout), _batch_of_solves)
+    return numeric(plan.indices, factor, vectors).reshape(right_hand_sides.shape)
+
+
+def _solve(
+    layout: Layout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
+) -> Inexact[Array, "n k"]:
+    stages, solution = layout.content
+    reduced = _forward(stages, indices, factor, vectors)
+    return _backward(stages, indices, factor, reduced)[solution.read(indices)]
+
+
+def _batch_of_solves(batchable, plain, axis_size, batched, indices, factor, vectors):
+    """More right-hand sides for one factor are more columns; more factors are solved with one by one."""
+    if any(jax.tree.leaves(batched[:2])):
+        return one_by_one(batchable, plain, axis_size, batched, indices, factor, vectors)
+    size, count = vectors.shape[1:]
+    columns = jnp.moveaxis(vectors, 0, 1).reshape(size, axis_size * count)
+    return jnp.moveaxis(batchable(indices, factor, columns).reshape(size, axis_size, count), 1, 0)
 
 
 def half_solve(
@@ -81,7 +109,7 @@ def half_solve(
 
     Half the work of `solve`, if products with the inverse are all that is wanted.
     """
-    reduced = _forward(plan, factor, _columns(plan, right_hand_sides, "half_solve"))
+    reduced = _forward(plan.stages, plan.indices, factor, _columns(plan, right_hand_sides, "half_solve"))
     return jnp.concatenate([rows.reshape(-1, rows.shape[-1]) for rows in reduced])
 
 
@@ -107,12 +135,12 @@ def _columns(plan: FactorisationPlan, right_hand_sides: Inexact[Array, "n *k"], 
 
 
 def _forward(
-    plan: FactorisationPlan, factor: Factor, vectors: Inexact[Array, "n k"]
+    stages: tuple[Stage, ...], indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> list[Inexact[Array, "batch pivots k"]]:
     """L^-1 times the vectors, stage by stage. A front's pivot rows gather what its children have subtracted."""
-    indices, count = plan.indices, vectors.shape[1]
+    count = vectors.shape[1]
     reduced, updates = [], []
-    for stage, inverse, lower in zip(plan.stages, factor.inverses, factor.lowers, strict=True):
+    for stage, inverse, lower in zip(stages, factor.inverses, factor.lowers, strict=True):
         rows = vectors.at[stage.right_hand_side.read(indices)].get(mode="fill", fill_value=0)
         passed_on = jnp.zeros((), vectors.dtype)
         for link in stage.links:
@@ -126,14 +154,18 @@ def _forward(
 
 
 def _backward(
-    plan: FactorisationPlan, factor: Factor, reduced: list[Inexact[Array, "batch pivots k"]]
-) -> Inexact[Array, "n k"]:
-    """L^-T times the vectors, from the root down. A front finds its border's solution in its parent."""
-    indices, count = plan.indices, reduced[0].shape[-1]
+    stages: tuple[Stage, ...],
+    indices: Int[Array, " total"],
+    factor: Factor,
+    reduced: list[Inexact[Array, "batch pivots k"]],
+) -> Inexact[Array, "rows k"]:
+    """L^-T times the vectors, from the root down: the pivots of all stages. A front finds its border's solution in its
+    parent."""
+    count = reduced[0].shape[-1]
     fronts: dict[int, Inexact[Array, "rows k"]] = {}
     solved = []
-    for number in reversed(range(len(plan.stages))):
-        stage, local = plan.stages[number], reduced[number]
+    for number in reversed(range(len(stages))):
+        stage, local = stages[number], reduced[number]
         above = jnp.zeros((stage.batch, 0, count), local.dtype)
         if stage.border:
             above = fronts[stage.parent].at[stage.above.read(indices)].get(mode="fill", fill_value=0)
@@ -141,4 +173,4 @@ def _backward(
         pivots = _transposed(factor.inverses[number]) @ local
         solved.append(pivots.reshape(-1, count))
         fronts[number] = jnp.concatenate([pivots, above], axis=1).reshape(-1, count)
-    return jnp.concatenate(solved[::-1])[plan.solution.read(indices)]
+    return jnp.concatenate(solved[::-1])

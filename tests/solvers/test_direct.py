@@ -153,3 +153,25 @@ def test_choice_follows_the_limits_and_says_why():
     operator = SparseSymmetric(values, pattern)
     expected = lineax.linear_solve(operator, vector, direct).value
     np.testing.assert_allclose(lineax.linear_solve(operator, vector, little_time).value, expected, rtol=1e-7)
+
+
+def test_nested_batches_and_gradients_of_batches():
+    pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
+    plan = analyse(pattern, coordinates)
+    batch = values * jnp.linspace(1.0, 2.0, 6).reshape(2, 3, 1)
+    vectors = jax.random.normal(jax.random.key(2), (4, pattern.size))
+
+    def energy(values, vector):
+        return vector @ solve(plan, factorise(plan, values), vector)
+
+    def dense_energy(values, vector):
+        return vector @ jnp.linalg.solve(pattern.to_dense(values), vector)
+
+    def everywhere(function):
+        over_vectors = jax.vmap(function, in_axes=(None, 0))
+        return jax.jit(jax.vmap(jax.vmap(over_vectors, in_axes=(0, None)), in_axes=(0, None)))(batch, vectors)
+
+    np.testing.assert_allclose(everywhere(energy), everywhere(dense_energy), rtol=1e-11)
+    np.testing.assert_allclose(
+        everywhere(jax.grad(energy)), everywhere(jax.grad(dense_energy)), rtol=0, atol=1e-9 * abs(vectors).max() ** 2
+    )
