@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jeit.data import Measurement
+from jeit.electrodes import contact_impedance
 from jeit.imaging import ImagedDifference
 from jeit.mesh import Disk, Domain, Polygon, Rectangle
 
@@ -90,7 +91,7 @@ def report(result: ImagedDifference) -> dict[str, Any]:
             "conductivity": background,
             "conductivity_unit": unit,
             "contact": settings.contact,
-            "contact_impedance": getattr(electrodes, "contact_impedance", None),
+            "contact_impedance": None if electrodes.is_point else contact_impedance(electrodes),
             "contact_impedance_unit": "ohm·m" if result.mesh.dimension == 2 else "ohm·m²",
             "relative_misfit": float(calibration.misfit),
             "iterations": calibration.iterations,

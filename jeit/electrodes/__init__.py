@@ -11,6 +11,7 @@
 
 from jeit.electrodes.boundary import BoundaryElectrodes as BoundaryElectrodes
 from jeit.electrodes.combined import CombinedElectrodes as CombinedElectrodes
+from jeit.electrodes.combined import contact_impedance as contact_impedance
 from jeit.electrodes.combined import with_contact_impedance as with_contact_impedance
 from jeit.electrodes.discs import FaceDiscs as FaceDiscs
 from jeit.electrodes.discs import SheetDiscs as SheetDiscs

@@ -1,7 +1,5 @@
 """Electrodes on the edge of a sheet: arcs of the boundary of a 2-D mesh, integrated exactly."""
 
-from typing import ClassVar
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +30,6 @@ class BoundaryElectrodes(AbstractElectrodes):
     position: Float[Array, "L 2"]
     width: Float[Array, " L"]
     contact_impedance: Float[Array, " L"]
-    is_point: ClassVar[bool] = False
 
     def __init__(self, position, width, contact_impedance):
         """`width` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
@@ -41,6 +38,11 @@ class BoundaryElectrodes(AbstractElectrodes):
         self.contact_impedance = as_electrode_values(
             "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m"
         )
+
+    @property
+    def is_point(self) -> bool:
+        """No."""
+        return False
 
     @property
     def num_electrodes(self) -> int:

@@ -1,7 +1,5 @@
 """Electrodes of several kinds on one mesh, such as arcs round the edge of a sheet and a disc in its centre."""
 
-from typing import ClassVar
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +16,6 @@ class CombinedElectrodes(AbstractElectrodes):
     """
 
     parts: tuple[AbstractElectrodes, ...]
-    is_point: ClassVar[bool] = False
 
     def __init__(self, *parts: AbstractElectrodes):
         """Raises `ValueError` for no parts, or for point electrodes, which have no contact to combine."""
@@ -33,14 +30,14 @@ class CombinedElectrodes(AbstractElectrodes):
         self.parts = parts
 
     @property
+    def is_point(self) -> bool:
+        """No."""
+        return False
+
+    @property
     def num_electrodes(self) -> int:
         """Number of electrodes L of all parts together."""
         return sum(part.num_electrodes for part in self.parts)
-
-    @property
-    def contact_impedance(self) -> Float[Array, " L"]:
-        """Contact impedances (L,) of all parts, ohm·m² (ohm·m for arcs)."""
-        return jnp.concatenate([part.contact_impedance for part in self.parts])
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The facets and cells of all parts."""
@@ -61,13 +58,25 @@ class CombinedElectrodes(AbstractElectrodes):
             part.check(mesh)
 
 
+def contact_impedance(electrodes: AbstractElectrodes) -> Float[Array, " L"]:
+    """Contact impedances (L,) of complete electrodes, ohm·m² (ohm·m for arcs). Raises `ValueError` for points."""
+    if isinstance(electrodes, CombinedElectrodes):
+        return jnp.concatenate([contact_impedance(part) for part in electrodes.parts])
+    _refuse_points(electrodes)
+    return vars(electrodes)["contact_impedance"]
+
+
 def with_contact_impedance(electrodes: AbstractElectrodes, contact_impedance) -> AbstractElectrodes:
     """The same electrodes with other contact impedances: one number or (L,). Raises `ValueError` for points."""
-    if electrodes.is_point:
-        raise ValueError(f"{type(electrodes).__name__} have no contact impedance.")
+    _refuse_points(electrodes)
     values = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
     if isinstance(electrodes, CombinedElectrodes):
         ends = np.cumsum([part.num_electrodes for part in electrodes.parts])[:-1]
         pieces = jnp.split(values, ends)
         return CombinedElectrodes(*map(with_contact_impedance, electrodes.parts, pieces))
     return eqx.tree_at(lambda each: each.contact_impedance, electrodes, values)
+
+
+def _refuse_points(electrodes: AbstractElectrodes) -> None:
+    if electrodes.is_point:
+        raise ValueError(f"{type(electrodes).__name__} have no contact impedance.")

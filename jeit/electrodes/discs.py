@@ -1,7 +1,5 @@
 """Round electrodes: discs inside a sheet, and discs on the faces of a 3-D body."""
 
-from typing import ClassVar
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +30,6 @@ class SheetDiscs(AbstractElectrodes):
     position: Float[Array, "L 2"]
     radius: Float[Array, " L"]
     contact_impedance: Float[Array, " L"]
-    is_point: ClassVar[bool] = False
 
     def __init__(self, position, radius, contact_impedance):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
@@ -41,6 +38,11 @@ class SheetDiscs(AbstractElectrodes):
         self.contact_impedance = as_electrode_values(
             "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²"
         )
+
+    @property
+    def is_point(self) -> bool:
+        """No."""
+        return False
 
     @property
     def num_electrodes(self) -> int:
@@ -75,7 +77,6 @@ class FaceDiscs(AbstractElectrodes):
     position: Float[Array, "L 3"]
     radius: Float[Array, " L"]
     contact_impedance: Float[Array, " L"]
-    is_point: ClassVar[bool] = False
 
     def __init__(self, position, radius, contact_impedance):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
@@ -84,6 +85,11 @@ class FaceDiscs(AbstractElectrodes):
         self.contact_impedance = as_electrode_values(
             "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²"
         )
+
+    @property
+    def is_point(self) -> bool:
+        """No."""
+        return False
 
     @property
     def num_electrodes(self) -> int:

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jeit.mesh import Mesh
@@ -33,7 +34,10 @@ class Contact(eqx.Module):
 class AbstractElectrodes(eqx.Module):
     """Base of all electrodes: something that turns itself and a mesh into contact integrals."""
 
-    is_point: eqx.AbstractClassVar[bool]
+    @property
+    @abc.abstractmethod
+    def is_point(self) -> bool:
+        """Whether these are point electrodes, which have no contact."""
 
     @property
     @abc.abstractmethod
@@ -61,7 +65,7 @@ def compiled_contact(electrodes: AbstractElectrodes, mesh: Mesh) -> Contact:
 
 def is_concrete(*arrays) -> bool:
     """Whether all `arrays` have values that can be looked at, i.e. none is a JAX tracer."""
-    return not any(isinstance(array, jax.core.Tracer) for array in arrays)
+    return not any(isinstance(array, Tracer) for array in arrays)
 
 
 def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) -> Float[Array, " L"]:

@@ -1,7 +1,6 @@
 """Electrodes given as groups of boundary facets of a mesh, as imported models and plates have them."""
 
 from collections.abc import Sequence
-from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +20,6 @@ class FacetElectrodes(AbstractElectrodes):
 
     covers: Float[Array, "b L"]
     contact_impedance: Float[Array, " L"]
-    is_point: ClassVar[bool] = False
 
     def __init__(self, mesh: Mesh, facets: Sequence, contact_impedance):
         """`facets`: for each electrode the indices into `mesh.facets` that it covers. Raises `ValueError`."""
@@ -47,6 +45,11 @@ class FacetElectrodes(AbstractElectrodes):
         self.contact_impedance = as_electrode_values(
             "contact_impedance", contact_impedance, len(facets), unit="ohm·m² (ohm·m in 2-D)"
         )
+
+    @property
+    def is_point(self) -> bool:
+        """No."""
+        return False
 
     @property
     def num_electrodes(self) -> int:

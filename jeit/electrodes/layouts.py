@@ -1,7 +1,7 @@
 """Layouts: positions for electrodes of any kind, as arrays (L, d) in metres."""
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jeit.mesh import Domain
 
@@ -74,7 +74,7 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
     samples = samples[np.asarray(domain.contains(samples))]
     if margin > 0:
         edge = domain.boundary(np.linspace(0, domain.perimeter, int(4 * domain.perimeter / spacing), endpoint=False))
-        samples = samples[cKDTree(edge).query(samples)[0] >= margin]
+        samples = samples[KDTree(edge).query(samples)[0] >= margin]
     if len(samples) < num_electrodes:
         raise ValueError(f"margin: {margin} m leaves no room for {num_electrodes} electrodes inside the outline.")
     position = samples[[np.argmin(np.sum((samples - samples.mean(axis=0)) ** 2, axis=1))]]
@@ -83,7 +83,7 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
         distance = np.minimum(distance, np.sum((samples - position[-1]) ** 2, axis=1))
         position = np.vstack([position, samples[distance.argmax()]])
     for _ in range(iterations):
-        owner = cKDTree(position).query(samples)[1]
+        owner = KDTree(position).query(samples)[1]
         count = np.bincount(owner, minlength=num_electrodes)
         total = np.stack([np.bincount(owner, samples[:, k], num_electrodes) for k in range(2)], axis=1)
         moved = np.where(count[:, None] > 0, total / np.maximum(count, 1)[:, None], position)

@@ -1,7 +1,5 @@
 """Rectangular electrodes on the surface of a 3-D body, such as the plates round a tank."""
 
-from typing import ClassVar
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +33,6 @@ class FacePatches(AbstractElectrodes):
     width: Float[Array, " L"]
     height: Float[Array, " L"]
     contact_impedance: Float[Array, " L"]
-    is_point: ClassVar[bool] = False
 
     def __init__(self, position, width, height, contact_impedance):
         """Sizes and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
@@ -45,6 +42,11 @@ class FacePatches(AbstractElectrodes):
         self.contact_impedance = as_electrode_values(
             "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²"
         )
+
+    @property
+    def is_point(self) -> bool:
+        """No."""
+        return False
 
     @property
     def num_electrodes(self) -> int:

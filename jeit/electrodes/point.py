@@ -1,7 +1,5 @@
 """Point electrodes: the zero-size limit, without contact impedance."""
 
-from typing import ClassVar
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,11 +19,15 @@ class PointElectrodes(AbstractElectrodes):
     """
 
     position: Float[Array, "L d"]
-    is_point: ClassVar[bool] = True
 
     def __init__(self, position):
         """Raises `ValueError` for anything but finite (L, 2) or (L, 3) positions."""
         self.position = as_positions(position, (2, 3))
+
+    @property
+    def is_point(self) -> bool:
+        """Yes."""
+        return True
 
     @property
     def num_electrodes(self) -> int:
@@ -71,7 +73,6 @@ class NodeElectrodes(AbstractElectrodes):
     """
 
     nodes: Int[Array, " L"]
-    is_point: ClassVar[bool] = True
 
     def __init__(self, nodes):
         """Raises `ValueError` for anything but L distinct non-negative integers."""
@@ -81,6 +82,11 @@ class NodeElectrodes(AbstractElectrodes):
         if array.min() < 0 or len(np.unique(array)) != len(array):
             raise ValueError("nodes must be distinct, non-negative, zero-based node indices.")
         self.nodes = jnp.asarray(array, jnp.int32)
+
+    @property
+    def is_point(self) -> bool:
+        """Yes."""
+        return True
 
     @property
     def num_electrodes(self) -> int:

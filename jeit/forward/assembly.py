@@ -1,5 +1,7 @@
 """P1 finite elements: conductivity per cell, element stiffness, and gradients of nodal fields."""
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
@@ -43,9 +45,9 @@ def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
         if values.ndim == 3:
             if not np.allclose(values, np.swapaxes(values, 1, 2), rtol=1e-12, atol=0):
                 raise ValueError("conductivity tensors must be symmetric.")
-            least = np.linalg.eigvalsh(values.real).min()
+            least = np.linalg.eigvalsh(np.real(values)).min()
         else:
-            least = values.real.min()
+            least = np.real(values).min()
         if least <= 0:
             raise ValueError(
                 f"conductivity must be positive everywhere; its least value is {least:.3g}. For an insulating "
@@ -77,5 +79,6 @@ def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> tuple[Inexact[
     weighted = gradients(mesh) * jnp.sqrt(measures(mesh))[:, None, None]
     corners = [fields.T.at[:, mesh.cells[:, k]].get(mode="promise_in_bounds") for k in range(mesh.dimension + 1)]
     return tuple(
-        sum(weighted[:, k, axis] * corner for k, corner in enumerate(corners)) for axis in range(mesh.dimension)
+        functools.reduce(jnp.add, [weighted[:, k, axis] * corner for k, corner in enumerate(corners)])
+        for axis in range(mesh.dimension)
     )

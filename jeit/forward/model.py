@@ -138,14 +138,14 @@ def _potentials(model: ForwardModel, conductivity):
 def _voltages_and_jacobian(model: ForwardModel, conductivity):
     mesh, protocol = model.mesh, model.protocol
     fields, impedance = electrode_fields(mesh, conductivity, model.electrodes, model.system)
-    jacobian = 0
+    jacobian = jnp.zeros(())
     # One product for all patterns: it also keeps XLA from computing the gradients anew for every channel.
     patterns = jnp.concatenate([-protocol.drive, protocol.measurement])
     for component in field_gradients(mesh, fields):  # ∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, axis by axis
         rows = (patterns @ component).at
         drive = rows[protocol.drive_index].get(mode="promise_in_bounds")
         measure = rows[protocol.num_drives + protocol.measurement_index].get(mode="promise_in_bounds")
-        jacobian += drive * measure
+        jacobian = jacobian + drive * measure
     if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
         per_corner = jacobian / mesh.cells.shape[1]
         jacobian = sum(

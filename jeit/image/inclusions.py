@@ -41,19 +41,19 @@ def find_inclusions(
     higher one, and its region covers at least `least_area` of the mesh; the rest are artefacts. Strongest first.
     Raises `ValueError` for an image of another size or with NaN.
     """
-    image = np.asarray(image)
-    if image.shape != (mesh.num_cells,):
-        raise ValueError(f"image has shape {image.shape}; give one value for each of the {mesh.num_cells} cells.")
-    if not np.isfinite(image).all():
+    values = np.asarray(image)
+    if values.shape != (mesh.num_cells,):
+        raise ValueError(f"image has shape {values.shape}; give one value for each of the {mesh.num_cells} cells.")
+    if not np.isfinite(values).all():
         raise ValueError("image has NaN or infinite values; reconstruct it from unmasked channels first.")
-    strongest = np.abs(image).max()
+    strongest = np.abs(values).max()
     if strongest == 0:
         return []
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
     neighbours = _neighbours(mesh)
     found = []
     for sign in (1, -1):
-        change = sign * image
+        change = sign * values
         basin = _basins(change, neighbours, floor=level * least_peak * strongest, least_prominence=least_prominence)
         for label in np.unique(basin[basin >= 0]):
             peak = change[label]
@@ -88,10 +88,10 @@ def _basins(change: np.ndarray, neighbours: list[list[int]], *, floor: float, le
             label = swallowed[label]
         return label
 
-    for cell in np.argsort(-change):
+    for cell in np.argsort(-change).tolist():
         if change[cell] <= floor:
             break
-        labels = {root(peak[other]) for other in neighbours[cell] if peak[other] >= 0}
+        labels = {root(int(peak[other])) for other in neighbours[cell] if peak[other] >= 0}
         if not labels:
             peak[cell] = cell
             continue

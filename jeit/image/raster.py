@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from jeit.mesh import Mesh
 
@@ -77,14 +77,15 @@ def locate(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> np.n
     """
     corners = points[cells]
     inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
-    tree = cKDTree(corners.mean(axis=1))
+    tree = KDTree(corners.mean(axis=1))
     reach = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=-1).max()
     found = np.full(len(positions), -1)
     left = np.flatnonzero(tree.query(positions)[0] <= reach)
     tried, number = 0, 8
     while left.size and tried < len(cells):
         number = min(number, len(cells))
-        distance, candidate = tree.query(positions[left], k=np.arange(tried + 1, number + 1))
+        nearest = tree.query(positions[left], k=number)
+        distance, candidate = np.asarray(nearest[0])[:, tried:], np.asarray(nearest[1])[:, tried:]
         local = np.einsum("qkij,qkj->qki", inverse[candidate], positions[left][:, None] - corners[candidate, 0])
         inside = np.minimum(local.min(axis=-1), 1 - local.sum(axis=-1)) > -1e-9
         hit = inside.any(axis=1)

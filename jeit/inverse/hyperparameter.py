@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 
@@ -35,9 +36,8 @@ class Spectrum(eqx.Module):
     @classmethod
     def create(cls, jacobian: Float[Array, "M m"], product: Float[Array, "m M"], null_space: Float[Array, "m p"]):
         """From the whitened Jacobian, its product with the prior covariance, and the prior's null space."""
-        return cls(
-            *_decompose(jacobian, product, null_space), product, null_space, jacobian @ null_space, jacobian @ product
-        )
+        basis, eigenvalues = _decompose(jacobian, product, null_space)
+        return cls(basis, eigenvalues, product, null_space, jacobian @ null_space, jacobian @ product)
 
     def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
         """R_λ (m, M) for whitened data."""
@@ -145,7 +145,7 @@ def choose(spectrum: Spectrum, hyperparameter: float | str, data) -> tuple[Float
         if hyperparameter not in RULES:
             raise ValueError(f"hyperparameter: no rule '{hyperparameter}'; give a number or one of {', '.join(RULES)}.")
         return jnp.asarray(RULES[hyperparameter](spectrum, data)), hyperparameter
-    if not isinstance(hyperparameter, jax.core.Tracer) and not (np.isfinite(hyperparameter) and hyperparameter > 0):
+    if not isinstance(hyperparameter, Tracer) and not (np.isfinite(hyperparameter) and hyperparameter > 0):
         raise ValueError(f"hyperparameter must be positive and finite; it is {hyperparameter}.")
     return jnp.asarray(hyperparameter, float), "given"
 

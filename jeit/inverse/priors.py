@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jeit.mesh import Mesh, centroids, interior_facets
@@ -26,7 +27,7 @@ class AbstractPrior(eqx.Module):
         """Γ Jᵀ, one column per measurement."""
 
     @abc.abstractmethod
-    def precision(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> scipy.sparse.spmatrix:
+    def precision(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> scipy.sparse.sparray:
         """Q (m, m), sparse."""
 
     def null_space(self, mesh: Mesh) -> Float[Array, "m p"]:
@@ -41,9 +42,9 @@ class Tikhonov(AbstractPrior):
         """Jᵀ."""
         return jacobian.T
 
-    def precision(self, mesh, jacobian):
+    def precision(self, mesh, jacobian) -> scipy.sparse.sparray:
         """The identity."""
-        return scipy.sparse.identity(mesh.num_cells, format="csr")
+        return scipy.sparse.csr_array(scipy.sparse.eye_array(mesh.num_cells))
 
 
 class Noser(AbstractPrior):
@@ -61,7 +62,7 @@ class Noser(AbstractPrior):
 
     def precision(self, mesh, jacobian):
         """The diagonal matrix Q."""
-        return scipy.sparse.diags(np.sum(np.asarray(jacobian) ** 2, axis=0) ** self.exponent).tocsr()
+        return scipy.sparse.diags_array(np.sum(np.asarray(jacobian) ** 2, axis=0) ** self.exponent).tocsr()
 
 
 class Laplace(AbstractPrior):
@@ -83,9 +84,9 @@ class Laplace(AbstractPrior):
         """The Laplacian matrix Q."""
         pairs, _ = interior_facets(mesh)
         size = mesh.num_cells
-        links = scipy.sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(size, size))
+        links = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(size, size))
         adjacency = (links + links.T).tocsr()
-        return 2 * (scipy.sparse.diags(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
+        return 2 * (scipy.sparse.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
 
     def null_space(self, mesh):
         """The constant image."""
@@ -101,7 +102,7 @@ class Gaussian(AbstractPrior):
     length: float
 
     def __check_init__(self):
-        if not isinstance(self.length, jax.core.Tracer) and not self.length > 0:
+        if not isinstance(self.length, Tracer) and not self.length > 0:
             raise ValueError(f"length must be positive, in metres; it is {self.length}.")
 
     def covariance_product(self, mesh, jacobian):

@@ -1,7 +1,7 @@
 """Interior facets: which cells are neighbours, and through what."""
 
-import jax
 import numpy as np
+from jax.core import Tracer
 
 from jeit.mesh._topology import cell_facets, pair_facets
 from jeit.mesh.mesh import Mesh
@@ -12,7 +12,7 @@ def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
     Raises `ValueError` for a mesh that is being traced.
     """
-    if isinstance(mesh.cells, jax.core.Tracer):
+    if isinstance(mesh.cells, Tracer):
         raise ValueError("interior_facets needs a mesh with values; call it outside jit and vmap.")
     cells = np.asarray(mesh.cells)
     first, second, _ = pair_facets(cells)
