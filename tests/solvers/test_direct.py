@@ -32,7 +32,7 @@ def as_type(values, dtype):
     return values.astype(dtype)
 
 
-ALL_TYPES = ("disk", "disconnected")
+ALL_TYPES = ("disk",)
 SOLVED = [
     (case, dtype)
     for case in sparse_problems.PROBLEMS
