@@ -3,12 +3,15 @@
 import os
 from pathlib import Path
 
+# Most of a test's time is compilation: compile quickly, run a little slower. Before JAX starts, which reads it once.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+
 import jax
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Most of a test's time is compilation; the same shapes come back run after run.
+# The same shapes come back run after run.
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 

@@ -65,9 +65,18 @@ class System(eqx.Module):
     def solve(self, operator: SparseSymmetric, load: Inexact[Array, "n L"]) -> Inexact[Array, "n L"]:
         """A⁻¹ load, one column per electrode. Differentiable by the implicit rule, whichever solver."""
         load = load.astype(operator.values.dtype)
-        if isinstance(self.solver, SparseCholesky):
-            return _solve_directly(operator, load, self.solver)
-        state = self.solver.init(operator, {})
+        constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B alone, not through the factor
+        state = self.solver.init(constant, {})
+        if isinstance(self.solver, SparseCholesky):  # all columns at once, where lineax takes them one by one
+            plan = self.solver.plan
+
+            def solve_columns(_, columns):
+                return solve(plan, state, columns)
+
+            def multiply(columns):
+                return operator.pattern.multiply(operator.values, columns)
+
+            return jax.lax.custom_linear_solve(multiply, load, solve_columns, symmetric=True)
 
         def column(vector):
             return lx.linear_solve(operator, vector, self.solver, state=state, throw=False).value
@@ -80,21 +89,3 @@ class System(eqx.Module):
         if isinstance(self.solver, SparseCholesky):
             return quadratic_form(self.solver.plan, self.solver.init(operator, {}), load)
         return load.T @ self.solve(operator, load)
-
-
-@eqx.filter_custom_jvp
-def _solve_directly(operator: SparseSymmetric, load, solver: SparseCholesky):
-    """All columns at once, where lineax would take them one by one."""
-    return solve(solver.plan, solver.init(operator, {}), load)
-
-
-@_solve_directly.def_jvp
-def _solve_directly_jvp(primals, tangents):
-    operator, load, solver = primals
-    factor = solver.init(operator, {})
-    solution = solve(solver.plan, factor, load)
-    values, right = tangents[0].values, tangents[1]
-    source = jnp.zeros_like(load) if right is None else right
-    if values is not None:  # A dX = dB - dA X
-        source -= operator.pattern.multiply(values, solution)
-    return solution, solve(solver.plan, factor, source)

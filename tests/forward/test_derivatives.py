@@ -86,7 +86,13 @@ def _patch():
 MODELS = {f.__name__.strip("_"): f for f in (_boundary, _inside, _combined, _point, _node, _facet, _face, _patch)}
 
 
-@pytest.fixture(params=MODELS, scope="module")
+# Every kind of electrode is tried; the quick suite has one of each way of finding contact integrals.
+QUICK = ("boundary", "inside", "point")
+
+
+@pytest.fixture(
+    params=[name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in MODELS], scope="module"
+)
 def model(request):
     return MODELS[request.param]()
 
@@ -153,7 +159,7 @@ def test_reciprocity(model, conductivity):
 
 def test_fields_are_the_solution(model, conductivity):
     """K u, tested with every node's basis function, is the current that enters there (zero off the electrodes)."""
-    fields, impedance = electrode_fields(model.mesh, conductivity, model.electrodes, model.system)
+    fields, impedance = jax.jit(electrode_fields)(model.mesh, conductivity, model.electrodes, model.system)
     potentials = model.potentials(conductivity)
     assert potentials.shape == (model.protocol.num_drives, model.mesh.num_points)
     assert _relative(potentials, model.protocol.drive @ fields.T) < 1e-12
@@ -235,6 +241,7 @@ class TestShapesAndTypes:
         for k in range(2):
             assert _relative(batch[k], voltages(shifts[k])) < 1e-12
 
+    @pytest.mark.slow
     def test_jit_equals_eager(self, model, conductivity):
         with jax.disable_jit():
             eager = model.voltages(conductivity)
