@@ -13,7 +13,7 @@ from jeit.electrodes.electrodes import (
     check_dimension,
     is_concrete,
 )
-from jeit.mesh import Mesh, facet_measures
+from jeit.mesh import Mesh, boundary_loops, facet_measures
 
 
 class BoundaryElectrodes(AbstractElectrodes):
@@ -61,7 +61,8 @@ class BoundaryElectrodes(AbstractElectrodes):
         one = end - start
         first = (end**2 - start**2) / (2 * length)
         second = (end**3 - start**3) / (3 * length**2)
-        one, first, second = one.sum(axis=0), first.sum(axis=0), second.sum(axis=0)  # over the turns, (b, L)
+        # Over the turns, (b, L), written out: XLA makes a slow matrix product of a sum over so short an axis.
+        one, first, second = (integral[0] + integral[1] + integral[2] for integral in (one, first, second))
         phi = jnp.stack([one - first, first])
         phi_phi = jnp.stack([one - 2 * first + second, first - second, second])
         admittance = 1 / self.contact_impedance
@@ -102,7 +103,7 @@ class BoundaryElectrodes(AbstractElectrodes):
 @jax.jit
 def _measures_for_check(position, width, mesh: Mesh):
     """Distance to the boundary and covered intervals, compiled as a whole: op by op it would take seconds."""
-    return _project(position, mesh)[1], *_covered(position, width, mesh)
+    return _project(position, mesh)[2], *_covered(position, width, mesh)
 
 
 def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int]]:
@@ -120,49 +121,42 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
 
 
 def _project(position, mesh: Mesh):
-    """Arc length of the boundary point nearest to each position, with its facet; and the distance to it.
+    """Nearest boundary facet (L,) of each position, how far along it the foot point lies (L,), and its distance (L,).
 
-    Returns ((facet (L,), arc length (L,)), distance (L,)). The foot point p(t) on an edge is where the offset is
-    perpendicular to the tangent interpolated between the edge's corners, τ(t) = (1-t)τ_0 + tτ_1, each the bisector of
-    the two edges that meet there. On the edge itself that is the ordinary projection; and unlike that one it has a
-    continuous derivative where an electrode slides over a corner.
+    The foot point p(t) on an edge is where the offset is perpendicular to the tangent interpolated between the edge's
+    corners, τ(t) = (1-t)τ_0 + tτ_1, each the bisector of the two edges that meet there. On the edge itself that is the
+    ordinary projection; and unlike that one it has a continuous derivative where an electrode slides over a corner.
     """
-    tail, head = mesh.facets[:, 0], mesh.facets[:, 1]
-    along = mesh.points[head] - mesh.points[tail]
-    length = jnp.sqrt(jnp.sum(along**2, axis=-1))
-    unit = along / length[:, None]
-    bisector = jnp.zeros_like(mesh.points).at[tail].add(unit).at[head].add(unit)
-    offset = position[:, None, :] - mesh.points[tail]  # (L, b, 2)
-    clipped = jnp.clip(jnp.sum(offset * along, axis=-1) / length**2, 0, 1)
-    squared = jax.lax.stop_gradient(jnp.sum((offset - clipped[..., None] * along) ** 2, axis=-1))
+    corners = mesh.points[mesh.facets]
+    along = corners[:, 1] - corners[:, 0]
+    offset = position[:, None, :] - corners[:, 0]  # (L, b, 2)
+    clipped = jnp.clip(_dot(offset, along) / _dot(along, along), 0, 1)
+    beside = offset - clipped[..., None] * along
+    squared = jax.lax.stop_gradient(_dot(beside, beside))
     facet = jnp.argmin(squared, axis=1)
-    offset = jnp.take_along_axis(offset, facet[:, None, None], 1)[:, 0]
-    along, length = along[facet], length[facet]
-    first, second = _normalised(bisector[tail[facet]]), _normalised(bisector[head[facet]])
+    tail, head = mesh.facets[facet].T
+    before = jnp.argmax(mesh.facets[:, 1] == tail[:, None], axis=1)
+    after = jnp.argmax(mesh.facets[:, 0] == head[:, None], axis=1)
+    along = along[facet]
+    length = jnp.sqrt(_dot(along, along))
+    before, middle, after = (_normalised(corners[:, 1] - corners[:, 0])[index] for index in (before, facet, after))
+    first, second = _normalised(before + middle), _normalised(middle + after)
+    offset = position - corners[facet, 0]
     # (offset - t along)·τ(t) = 0 is constant + linear t + quadratic t² = 0; the root that is regular as quadratic → 0.
-    constant = jnp.sum(offset * first, axis=-1)
-    linear = jnp.sum(offset * (second - first) - along * first, axis=-1)
-    quadratic = -jnp.sum(along * (second - first), axis=-1)
+    constant = _dot(offset, first)
+    linear = _dot(offset, second - first) - _dot(along, first)
+    quadratic = -_dot(along, second - first)
     fraction = 2 * constant / (jnp.sqrt(jnp.maximum(linear**2 - 4 * quadratic * constant, 0)) - linear)
-    distance = jnp.sqrt(jnp.min(squared, axis=1))
-    _, arc_start, _ = _loops(mesh, facet_measures(mesh))
-    return (facet, arc_start[facet] + fraction * length), distance
+    return facet, fraction * length, jnp.sqrt(jnp.min(squared, axis=1))
+
+
+def _dot(first, second):
+    """Products of vectors in the plane, written out: XLA makes a slow matrix product of a sum over so short an axis."""
+    return first[..., 0] * second[..., 0] + first[..., 1] * second[..., 1]
 
 
 def _normalised(vectors):
-    return vectors / jnp.sqrt(jnp.sum(vectors**2, axis=-1, keepdims=True))
-
-
-def _loops(mesh: Mesh, length):
-    """For every boundary edge: its loop, the arc length from the loop's beginning, and the loop's perimeter."""
-    tail, head = mesh.facets[:, 0], mesh.facets[:, 1]
-    begins = jnp.concatenate([jnp.ones(1), (tail[1:] != head[:-1]).astype(length.dtype)])
-    order = jnp.arange(length.shape[0])
-    # Sums as matrix products: XLA turns a cumulative sum into dozens of small operations.
-    earlier = (order < order[:, None]).astype(length.dtype)
-    loop = earlier @ begins + begins
-    same = (loop[:, None] == loop).astype(length.dtype)
-    return loop, (earlier * same) @ length, same @ length
+    return vectors / jnp.sqrt(_dot(vectors, vectors))[..., None]
 
 
 def _covered(position, width, mesh: Mesh):
@@ -171,11 +165,13 @@ def _covered(position, width, mesh: Mesh):
     The first axis goes round the loop: an electrode may lie across the point where arc length begins.
     """
     length = facet_measures(mesh)
-    (facet, centre), _ = _project(position, mesh)
-    loop, arc_start, perimeter = _loops(mesh, length)
-    turns = jnp.array([-1.0, 0.0, 1.0])[:, None] * perimeter[facet]
+    loop, arc_start = boundary_loops(mesh)
+    facet, along, _ = _project(position, mesh)
+    same = loop[:, None] == loop[facet]  # (b, L)
+    perimeter = jnp.sum(jnp.where(same, length[:, None], 0), axis=0)
+    centre = arc_start[facet] + along
+    turns = jnp.array([-1.0, 0.0, 1.0])[:, None] * perimeter
     middle = (centre + turns)[:, None, :] - arc_start[:, None]
     half, limit = 0.5 * width, length[:, None]
     start, end = jnp.clip(middle - half, 0, limit), jnp.clip(middle + half, 0, limit)
-    same = loop[:, None] == loop[facet]
     return jnp.where(same, start, 0), jnp.where(same, end, 0)

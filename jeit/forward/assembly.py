@@ -70,15 +70,16 @@ def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Arra
     )
 
 
-def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> tuple[Inexact[Array, "p m"], ...]:
-    """Gradients of nodal fields in every cell, times the root of the cell's measure: d arrays (p, m), one per axis.
+def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array, "d m p"]:
+    """Gradients of nodal fields in every cell, times the root of the cell's measure: (d, m, p), one layer per axis.
 
-    With that weight the product of two of them is the integral ∫_e ∇u·∇w. One array per axis, patterns first,
-    keeps the long axis innermost.
+    With that weight the product of two of them is the integral ∫_e ∇u·∇w.
     """
     weighted = gradients(mesh) * jnp.sqrt(measures(mesh))[:, None, None]
-    corners = [fields.T.at[:, mesh.cells[:, k]].get(mode="promise_in_bounds") for k in range(mesh.dimension + 1)]
-    return tuple(
-        functools.reduce(jnp.add, [weighted[:, k, axis] * corner for k, corner in enumerate(corners)])
-        for axis in range(mesh.dimension)
+    corners = [fields.at[mesh.cells[:, k]].get(mode="promise_in_bounds") for k in range(mesh.dimension + 1)]
+    return jnp.stack(
+        [
+            functools.reduce(jnp.add, [weighted[:, k, axis, None] * corner for k, corner in enumerate(corners)])
+            for axis in range(mesh.dimension)
+        ]
     )

@@ -12,6 +12,7 @@ from jeit.forward.system import System
 from jeit.forward.transfer import electrode_fields, transfer_impedance
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
+from jeit_solvers import in_turn
 
 
 class ForwardModel(eqx.Module):
@@ -135,17 +136,20 @@ def _potentials(model: ForwardModel, conductivity):
 
 
 @jax.jit
+@in_turn
 def _voltages_and_jacobian(model: ForwardModel, conductivity):
     mesh, protocol = model.mesh, model.protocol
     fields, impedance = electrode_fields(mesh, conductivity, model.electrodes, model.system)
-    jacobian = jnp.zeros(())
-    # One product for all patterns: it also keeps XLA from computing the gradients anew for every channel.
+    # One product for all patterns and axes: it also keeps XLA from computing the gradients anew for every channel.
     patterns = jnp.concatenate([-protocol.drive, protocol.measurement])
-    for component in field_gradients(mesh, fields):  # ∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, axis by axis
-        rows = (patterns @ component).at
-        drive = rows[protocol.drive_index].get(mode="promise_in_bounds")
-        measure = rows[protocol.num_drives + protocol.measurement_index].get(mode="promise_in_bounds")
-        jacobian = jacobian + drive * measure
+    gradient = field_gradients(mesh, fields)
+    rows = patterns @ gradient.reshape(-1, gradient.shape[-1]).T
+    # ∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, axis by axis.
+    jacobian = jnp.zeros(())
+    for component in jnp.split(rows, mesh.dimension, axis=1):
+        drive = component.at[protocol.drive_index].get(mode="promise_in_bounds")
+        measure = component.at[protocol.num_drives + protocol.measurement_index].get(mode="promise_in_bounds")
+        jacobian += drive * measure
     if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
         per_corner = jacobian / mesh.cells.shape[1]
         jacobian = sum(

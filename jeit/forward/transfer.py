@@ -19,6 +19,7 @@ from jeit.electrodes import AbstractElectrodes, Contact
 from jeit.forward.assembly import cell_conductivity, field_gradients
 from jeit.forward.system import System
 from jeit.mesh import Mesh
+from jeit_solvers import symmetric_inverse
 
 
 @eqx.filter_custom_jvp
@@ -73,7 +74,7 @@ def _impedance(electrodes: AbstractElectrodes, product: Inexact[Array, "L L"]) -
     schur = jnp.diag(others.sum(axis=0)) - others
     # The constant vector is the null space; weight it like the rest, invert, and take it out again.
     level = jnp.trace(schur) / size**2
-    return centred(jnp.linalg.inv(schur + level))
+    return centred(symmetric_inverse(schur + level))
 
 
 def centred(matrix: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:
@@ -89,10 +90,9 @@ def _stationary_form(mesh, conductivity, electrodes, fields, impedance):
     contact = electrodes.contact(mesh)
     gradient = field_gradients(mesh, fields)
     if conductivity.ndim == 1:
-        energy = sum((component * conductivity) @ component.T for component in gradient)
+        energy = sum((component.T * conductivity) @ component for component in gradient)
     else:
-        stacked = jnp.stack(gradient)
-        energy = jnp.einsum("ipm,mij,jqm->pq", stacked, conductivity, stacked)
+        energy = jnp.einsum("imp,mij,jmq->pq", gradient, conductivity, gradient)
     if electrodes.is_point:
         source = contact.load.T @ fields
         return centred(source + source.T - energy)

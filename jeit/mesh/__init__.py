@@ -7,7 +7,7 @@ where a `Refine` asks. Solids: `layer`, `box`, `cylinder`. From elsewhere: `Mesh
 from jeit.mesh.domain import Disk, Domain, Polygon, Rectangle
 from jeit.mesh.files import read, write
 from jeit.mesh.geometry import (
-    boundary_arc_length,
+    boundary_loops,
     centroids,
     facet_centroids,
     facet_measures,
@@ -30,7 +30,7 @@ __all__ = [
     "Quality",
     "Rectangle",
     "Refine",
-    "boundary_arc_length",
+    "boundary_loops",
     "box",
     "centroids",
     "cylinder",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jeit.mesh.mesh import Mesh
 
@@ -36,7 +38,9 @@ def gradients(mesh: Mesh) -> Float[Array, "m k d"]:
         determinant = jnp.sum(a * normal, axis=-1)[:, None]
         others = jnp.stack([normal, jnp.cross(c, a), jnp.cross(a, b)], axis=1)
     others = others / determinant[:, :, None]
-    return jnp.concatenate([-jnp.sum(others, axis=1, keepdims=True), others], axis=1)
+    # Written out, for XLA makes a slow matrix product of a sum over so short an axis.
+    first = -functools.reduce(jnp.add, [others[:, k] for k in range(mesh.dimension)])
+    return jnp.concatenate([first[:, None], others], axis=1)
 
 
 def centroids(mesh: Mesh) -> Float[Array, "m d"]:
@@ -49,7 +53,7 @@ def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
     corners = mesh.points[mesh.facets]
     edges = corners[:, 1:] - corners[:, :1]
     if mesh.dimension == 2:
-        return jnp.sqrt(jnp.sum(edges[:, 0] ** 2, axis=-1))
+        return jnp.sqrt(edges[:, 0, 0] ** 2 + edges[:, 0, 1] ** 2)
     return 0.5 * jnp.sqrt(jnp.sum(jnp.cross(edges[:, 0], edges[:, 1]) ** 2, axis=-1))
 
 
@@ -58,16 +62,20 @@ def facet_centroids(mesh: Mesh) -> Float[Array, "b d"]:
     return jnp.mean(mesh.points[mesh.facets], axis=1)
 
 
-def boundary_arc_length(mesh: Mesh) -> Float[Array, " b"]:
-    """Arc length in metres at which each boundary facet of a 2-D mesh starts, (b,).
+def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
+    """For each boundary facet of a 2-D mesh: the number of its loop, and the arc length in metres where it starts.
 
-    Counted along `mesh.facets`, counter-clockwise from the first node of the outer loop; facets of holes
-    follow and go on counting. The perimeter is the sum of `facet_measures`.
+    Both (b,). Arc length counts along `mesh.facets` from the first node of each loop, counter-clockwise on the outer
+    one; the perimeter of a loop is the sum of its `facet_measures`. Raises `ValueError` in 3-D.
     """
     if mesh.dimension != 2:
         raise ValueError("mesh: arc length is defined on the boundary of 2-D meshes only, this one is 3-D.")
-    length = facet_measures(mesh)
-    return jnp.cumsum(length) - length
+    first = jnp.concatenate([jnp.ones(1, bool), mesh.facets[1:, 0] != mesh.facets[:-1, 1]])
+    # Sums over all pairs of facets: XLA turns a cumulative sum into dozens of small operations.
+    order = jnp.arange(mesh.num_facets)
+    loop = jnp.sum((order <= order[:, None]) & first, axis=1)
+    earlier = (order < order[:, None]) & (loop == loop[:, None])
+    return loop, jnp.sum(jnp.where(earlier, facet_measures(mesh), 0), axis=1)
 
 
 def _cross(a: Float[Array, "m 2"], b: Float[Array, "m 2"]) -> Float[Array, " m"]:

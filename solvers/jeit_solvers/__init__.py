@@ -8,6 +8,7 @@ counts. See `analyse`, `factorise` and `solve`.
 from .batching import in_turn
 from .choose import choose_solver
 from .conjugate_gradient import ConjugateGradient
+from .dense_cholesky import symmetric_inverse
 from .multifrontal import Factor, factorise, half_solve, quadratic_form, solve
 from .operator import SparseSymmetric
 from .pattern import SparsityPattern
@@ -28,4 +29,5 @@ __all__ = [
     "in_turn",
     "quadratic_form",
     "solve",
+    "symmetric_inverse",
 ]

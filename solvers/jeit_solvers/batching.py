@@ -5,10 +5,12 @@ twice as long per matrix as one that stays in the cache. Accelerators do get the
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
 
 
 def in_turn(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -41,11 +43,25 @@ def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..
     def differentiable(*arguments):
         return batchable(*arguments)
 
-    @differentiable.defjvp
+    @partial(differentiable.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
-        return jax.jvp(function, primals, tangents)
+        leaves, structure = jax.tree.flatten(primals)
+        directions = jax.tree.leaves(tangents, is_leaf=_is_zero)
+        moving = [number for number, direction in enumerate(directions) if not _is_zero(direction)]
+
+        def of_what_moves(*values):
+            merged = list(leaves)
+            for number, value in zip(moving, values, strict=True):
+                merged[number] = value
+            return function(*jax.tree.unflatten(structure, merged))
+
+        return jax.jvp(of_what_moves, [leaves[i] for i in moving], [directions[i] for i in moving])
 
     return differentiable
+
+
+def _is_zero(tangent: Any) -> bool:
+    return isinstance(tangent, SymbolicZero)
 
 
 def one_by_one(

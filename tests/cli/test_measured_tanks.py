@@ -1,5 +1,6 @@
 """What is found in the small tank and in the challenge's tank, at jeit's default settings."""
 
+import csv
 import re
 
 import numpy as np
@@ -44,6 +45,36 @@ def test_tank6cm_weak_current_is_refused(data_folder, run, tmp_path):
     assert status == 1
     assert "too noisy" in error
     assert error.count("\n") == 1
+
+
+KIT4_RADIUS = 0.14
+
+
+@pytest.mark.slow
+def test_kit4_every_inclusion_with_its_sign(data_folder):
+    """All 34 inclusions of the 17 files at one setting; each is matched with the nearest found one of its sign."""
+    folder = data_folder / "kit4"
+    truth: dict[str, list[tuple[int, np.ndarray]]] = {}
+    with open(folder / "truth_centroids.csv", newline="") as file:
+        for row in csv.DictReader(file):
+            place = KIT4_RADIUS * np.array([float(row["x_over_R"]), float(row["y_over_R"])])
+            truth.setdefault(row["case"], []).append((1 if row["kind"] == "conductive" else -1, place))
+    assert sum(map(len, truth.values())) == 34
+    reference = read(folder / "datamat_1_0.mat")
+    errors = []
+    for case, inclusions in truth.items():
+        found = list(image_difference(read(folder / f"datamat_{case}.mat"), reference).inclusions)
+        assert len(found) == len(inclusions), f"{case}: {len(found)} inclusions found, {len(inclusions)} are there"
+        for sign, place in inclusions:
+            distances = {i: np.hypot(*(one.centroid - place)) for i, one in enumerate(found) if one.sign == sign}
+            assert distances, f"{case}: an inclusion of sign {sign} is missing"
+            nearest = min(distances, key=distances.__getitem__)
+            errors.append(distances[nearest] / KIT4_RADIUS)
+            del found[nearest]
+    assert max(errors) <= 0.10
+    # 0.037 with every mesh and setting tried. Half of it is one shift of 0.018 R common to all inclusions, within the
+    # ±0.03 R of the published centroids.
+    assert np.median(errors) <= 0.04
 
 
 # Correlation of the difference image with the truth (water 0, resistive -1, conductive +1), all pixels of the tank.

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.mesh import Mesh, boundary_arc_length, disk, facet_measures, measures, polygon, rectangle
+from jeit.mesh import Mesh, boundary_loops, disk, facet_measures, measures, polygon, rectangle
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 TWO_TRIANGLES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -69,13 +69,16 @@ def test_boundary_starts_where_the_outline_does():
     assert np.asarray(polygon(SQUARE[[2, 3, 0, 1]], num_points=100).points)[0] == pytest.approx([1.0, 1.0])
 
 
-def test_arc_length_starts_every_facet():
-    mesh = disk(0.1, num_points=300)
-    arc = np.asarray(boundary_arc_length(mesh))
-    length = np.asarray(facet_measures(mesh))
-    np.testing.assert_allclose(arc, np.concatenate([[0.0], np.cumsum(length)[:-1]]), rtol=1e-13)
+def test_arc_length_counts_along_each_loop():
+    mesh = polygon(SQUARE, holes=[HOLE], num_points=300)
+    loop, arc = map(np.asarray, boundary_loops(mesh))
+    assert loop[0] == loop.min()
+    assert np.unique(loop).size == 2
+    for number in np.unique(loop):
+        length = np.asarray(facet_measures(mesh))[loop == number]
+        np.testing.assert_allclose(arc[loop == number], np.concatenate([[0.0], np.cumsum(length)[:-1]]), rtol=1e-13)
     with pytest.raises(ValueError, match="2-D"):
-        boundary_arc_length(Mesh.create(np.eye(4, 3), [[0, 1, 2, 3]]))
+        boundary_loops(Mesh.create(np.eye(4, 3), [[0, 1, 2, 3]]))
 
 
 def test_a_mesh_is_a_pytree_that_jit_and_vmap_take():
