@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Inexact
@@ -122,10 +123,8 @@ class Measurement(eqx.Module):
 
     def mean_frame(self) -> "Measurement":
         """The mean over frames of the usable voltages; a channel that no frame has stays masked."""
-        count = self.mask.sum(axis=0)
-        total = jnp.where(self.mask, self.voltages, 0).sum(axis=0)
-        mean = jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan)
-        return self._replace(mean[None], (count > 0)[None], frame_names=())
+        mean, usable = _mean(self.voltages, self.mask)
+        return self._replace(mean[None], usable[None], frame_names=())
 
     def filled(self, value: float = 0.0) -> Inexact[Array, "F M"]:
         """(F, M) voltages with `value` in place of what is masked."""
@@ -160,7 +159,7 @@ class Measurement(eqx.Module):
 
     def _frames(self, index: np.ndarray) -> "Measurement":
         names = tuple(self.frame_names[k] for k in index) if self.frame_names else ()
-        return self._replace(self.voltages[index], self.mask[index], frame_names=names)
+        return self._replace(*_rows(self.voltages, self.mask, index), frame_names=names)
 
     def _replace(self, voltages, mask, *, frame_names=None, notes=None) -> "Measurement":
         return Measurement(
@@ -174,3 +173,15 @@ class Measurement(eqx.Module):
             frame_names=self.frame_names if frame_names is None else frame_names,
             notes=self.notes if notes is None else notes,
         )
+
+
+@jax.jit
+def _rows(voltages, mask, index):
+    return voltages[index], mask[index]
+
+
+@jax.jit
+def _mean(voltages, mask):
+    count = mask.sum(axis=0)
+    total = jnp.where(mask, voltages, 0).sum(axis=0)
+    return jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan), count > 0

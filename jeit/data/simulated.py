@@ -48,6 +48,7 @@ class RoundSkin(eqx.Module):
         return BoundaryElectrodes(position, self.electrode_width, self.contact_impedance)
 
 
+@jax.jit
 def pressed_conductivity(
     points: Float[Array, "m 2"], background: float, position, radius: float, strength: float
 ) -> Float[Array, " m"]:

@@ -77,7 +77,8 @@ class BoundaryElectrodes(AbstractElectrodes):
         check_dimension("BoundaryElectrodes", mesh, 2)
         if not is_concrete(self.position, self.width, mesh.points, mesh.facets):
             return
-        distance, start, end = map(np.asarray, _measures_for_check(self.position, self.width, mesh))
+        distance = np.asarray(_project(self.position, mesh)[2])
+        start, end = map(np.asarray, _covered(self.position, self.width, mesh))
         far = np.flatnonzero(distance > np.maximum(0.5 * self.width, 2e-3 * np.ptp(mesh.points, axis=0).max()))
         if far.size:
             raise ValueError(
@@ -100,12 +101,6 @@ class BoundaryElectrodes(AbstractElectrodes):
             )
 
 
-@jax.jit
-def _measures_for_check(position, width, mesh: Mesh):
-    """Distance to the boundary and covered intervals, compiled as a whole: op by op it would take seconds."""
-    return _project(position, mesh)[2], *_covered(position, width, mesh)
-
-
 def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int]]:
     """Pairs of electrodes that cover a common piece of an edge, given intervals (3, b, L) along each edge."""
     start, end = start.transpose(2, 1, 0), end.transpose(2, 1, 0)
@@ -120,6 +115,7 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
     return pairs
 
 
+@jax.jit
 def _project(position, mesh: Mesh):
     """Nearest boundary facet (L,) of each position, how far along it the foot point lies (L,), and its distance (L,).
 
@@ -159,6 +155,7 @@ def _normalised(vectors):
     return vectors / jnp.sqrt(_dot(vectors, vectors))[..., None]
 
 
+@jax.jit
 def _covered(position, width, mesh: Mesh):
     """Interval of each edge that each electrode covers: start and end (3, b, L), zero ≤ start ≤ end ≤ length.
 

@@ -11,13 +11,11 @@ from jeit.mesh import Mesh, gradients, measures
 
 
 def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
-    """Conductivity per cell, (m,) or tensor (m, d, d), from a scalar, per-cell, per-node or tensor conductivity.
+    """Conductivity per cell, (m,) or tensor (m, d, d), from a per-cell, per-node or tensor conductivity.
 
     A conductivity given per node is linear in each cell; as P1 gradients are constant there, its mean over the
     cell's nodes is exact.
     """
-    if conductivity.ndim == 0:
-        return jnp.broadcast_to(conductivity, (mesh.num_cells,))
     if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
         return conductivity[mesh.cells].mean(axis=1)
     return conductivity
@@ -26,12 +24,14 @@ def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
 def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
     """Convert `conductivity` to an array and raise `ValueError` if it has the wrong shape or is not positive.
 
-    Accepts a scalar, (m,) per cell, (n,) per node or (m, d, d) symmetric tensors; siemens per metre (in a 2-D
-    sheet, siemens). A complex admittivity needs a positive real part. Values of tracers are not looked at.
+    Accepts a scalar, which comes back as (m,), (m,) per cell, (n,) per node or (m, d, d) symmetric tensors; siemens per
+    metre (in a 2-D sheet, siemens). A complex admittivity needs a positive real part. Values of tracers are not looked
+    at.
     """
     conductivity = jnp.asarray(conductivity)
-    if not jnp.issubdtype(conductivity.dtype, jnp.inexact):
-        conductivity = conductivity.astype(float)
+    inexact = jnp.issubdtype(conductivity.dtype, jnp.inexact)
+    # One type and shape for all that mean the same, or JAX compiles again: Python's numbers are "weakly" typed.
+    conductivity = jnp.asarray(conductivity, conductivity.dtype if inexact else float)
     m, n, d = mesh.num_cells, mesh.num_points, mesh.dimension
     if conductivity.shape not in [(), (m,), (n,), (m, d, d)]:
         raise ValueError(
@@ -53,7 +53,7 @@ def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
                 f"conductivity must be positive everywhere; its least value is {least:.3g}. For an insulating "
                 "inclusion use a small positive value, such as a thousandth of the background."
             )
-    return conductivity
+    return jnp.broadcast_to(conductivity, (m,)) if conductivity.ndim == 0 else conductivity
 
 
 def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Array, "p m"]:

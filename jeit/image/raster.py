@@ -1,6 +1,7 @@
 """Rasters: an image on the cells of a mesh, sampled on a grid of pixels."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Int
@@ -66,8 +67,12 @@ class Raster(eqx.Module):
 
     def sample(self, image: Inexact[Array, "*frames m"]) -> Float[Array, "*frames rows columns"]:
         """Values of one image (m,) or many (F, m) at the pixels, NaN outside the mesh."""
-        image = jnp.asarray(image)
-        return jnp.where(self.cell >= 0, image[..., jnp.maximum(self.cell, 0)], jnp.nan)
+        return _sample(self.cell, jnp.asarray(image))
+
+
+@jax.jit
+def _sample(cell, image):
+    return jnp.where(cell >= 0, image[..., jnp.maximum(cell, 0)], jnp.nan)
 
 
 def locate(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> np.ndarray:

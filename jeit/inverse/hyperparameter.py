@@ -10,6 +10,7 @@ residual is v - JR_λv = λ²P_λv = QU diag(λ²/(Λ + λ²)) UᵀQᵀv, whatev
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -74,12 +75,12 @@ def _reconstruction(spectrum: Spectrum, hyperparameter):
 def generalised_cross_validation(spectrum: Spectrum, data) -> float:
     """λ that predicts each channel best from the others: least M‖r‖²/(tr(I - H))². Golub, Heath and Wahba 1979."""
     components = spectrum.basis.T @ _needed(data, "gcv")
+    return _least(_gcv_score, spectrum, components)
 
-    def score(hyperparameter):
-        left = spectrum.filter(hyperparameter)
-        return jnp.sum((left * components) ** 2) / jnp.sum(left) ** 2
 
-    return _least(score, spectrum)
+def _gcv_score(hyperparameter, spectrum: Spectrum, components):
+    left = spectrum.filter(hyperparameter)
+    return jnp.sum((left * components) ** 2) / jnp.sum(left) ** 2
 
 
 def discrepancy(spectrum: Spectrum, data) -> float:
@@ -121,13 +122,14 @@ def noise_figure(spectrum: Spectrum, data=None, *, target: float = 1.25) -> floa
     tr(RJΓJᵀRᵀ) / tr(RRᵀ). Adler and Guardo 1996, with the prior in place of their one central object.
     """
     gain = jnp.sum((spectrum.product @ spectrum.basis) ** 2, axis=0)  # diagonal of UᵀQᵀ JΓΓJᵀ QU
+    return _least(_noise_figure_score, spectrum, (gain, target))
 
-    def figure(hyperparameter):
-        passed = gain / (spectrum.eigenvalues + hyperparameter**2) ** 2
-        image = jnp.sum(passed * spectrum.eigenvalues) / jnp.sum(passed)
-        return jnp.sqrt(spectrum.eigenvalues.mean() / image)
 
-    return _least(lambda value: jnp.abs(jnp.log(figure(value) / target)), spectrum)
+def _noise_figure_score(hyperparameter, spectrum: Spectrum, arguments):
+    gain, target = arguments
+    passed = gain / (spectrum.eigenvalues + hyperparameter**2) ** 2
+    image = jnp.sum(passed * spectrum.eigenvalues) / jnp.sum(passed)
+    return jnp.abs(jnp.log(jnp.sqrt(spectrum.eigenvalues.mean() / image) / target))
 
 
 RULES: dict[str, Callable[[Spectrum, Float[Array, " M"] | None], float]] = {
@@ -156,12 +158,19 @@ def _needed(data, rule: str):
     return data
 
 
+@partial(jax.jit, static_argnames="size")
 def _grid(spectrum: Spectrum, size: int = 200):
     """Candidate λ, logarithmic over the range where any component is neither kept nor dropped."""
     largest = jnp.sqrt(spectrum.eigenvalues.max())
     return largest * jnp.logspace(-6, 1, size)
 
 
-def _least(score, spectrum: Spectrum) -> float:
+def _least(score, spectrum: Spectrum, arguments) -> float:
+    """The candidate λ of the least score(λ, spectrum, arguments)."""
+    return float(_least_of_grid(score, spectrum, arguments))
+
+
+@partial(jax.jit, static_argnums=0)
+def _least_of_grid(score, spectrum: Spectrum, arguments):
     grid = _grid(spectrum)
-    return float(grid[jnp.argmin(jax.vmap(score)(grid))])
+    return grid[jnp.argmin(jax.vmap(lambda value: score(value, spectrum, arguments))(grid))]

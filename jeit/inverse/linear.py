@@ -101,6 +101,11 @@ def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.nd
     )
 
 
+@jax.jit
+def _whitened(jacobian, channels, root_weight):
+    return root_weight[:, None] * jacobian[channels]
+
+
 def one_step(
     model: ForwardModel,
     conductivity,
@@ -130,13 +135,14 @@ def one_step(
     deviation = np.broadcast_to(np.asarray(noise, float), (num_channels,))
     if not (np.isfinite(deviation[used]) & (deviation[used] > 0)).all():
         raise ValueError("noise must be positive and finite for every channel in use.")
-    root_weight = jnp.asarray(1 / deviation[used])
-    whitened = root_weight[:, None] * jacobian[used]
-    data = None if difference is None else root_weight * jnp.asarray(difference)[used]
+    channels = np.flatnonzero(used)
+    root_weight = 1 / deviation[used]
+    whitened = _whitened(jacobian, channels, root_weight)
+    data = None if difference is None else jnp.asarray(root_weight * np.asarray(difference)[used])
     product = prior.covariance_product(model.mesh, whitened)
     null_space = prior.null_space(model.mesh)
     spectrum = Spectrum.create(whitened, product, null_space)
     chosen, rule = choose(spectrum, hyperparameter, data)
-    narrow = spectrum.reconstruction(chosen) * root_weight
-    matrix = jnp.zeros((model.mesh.num_cells, num_channels)).at[:, np.flatnonzero(used)].set(narrow)
+    matrix = np.zeros((model.mesh.num_cells, num_channels))
+    matrix[:, channels] = np.asarray(spectrum.reconstruction(chosen)) * root_weight
     return LinearReconstruction.create(model, matrix, chosen, rule, f"one-step, {type(prior).__name__} prior")

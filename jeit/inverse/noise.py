@@ -1,9 +1,11 @@
 """How much each channel is to be trusted."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 
+@jax.jit
 def relative_noise(
     voltages: Float[Array, " M"], mask: Bool[Array, " M"] | None = None, *, relative: float = 0.01, floor: float = 0.3
 ) -> Float[Array, " M"]:

@@ -107,14 +107,17 @@ class Gaussian(AbstractPrior):
 
     def covariance_product(self, mesh, jacobian):
         """Γ Jᵀ, a block of rows at a time: Γ is dense and is not kept."""
-        centres = centroids(mesh)
-
-        def row(centre):
-            covariance = jnp.exp(-jnp.sum((centres - centre) ** 2, axis=1) / (2 * self.length**2))
-            return jacobian @ covariance
-
-        return jax.lax.map(row, centres, batch_size=256)
+        return _gaussian_product(centroids(mesh), jacobian, self.length)
 
     def precision(self, mesh, jacobian):
         """Not to be had: the inverse of a Gaussian covariance is dense and ill-conditioned. Raises `ValueError`."""
         raise ValueError("The Gaussian prior has no usable precision matrix; use its covariance_product.")
+
+
+@jax.jit
+def _gaussian_product(centres, jacobian, length):
+    def row(centre):
+        covariance = jnp.exp(-jnp.sum((centres - centre) ** 2, axis=1) / (2 * length**2))
+        return jacobian @ covariance
+
+    return jax.lax.map(row, centres, batch_size=256)

@@ -1,15 +1,20 @@
-"""Measures and P1 gradients of cells and facets: pure JAX, differentiable in the points."""
+"""Measures and P1 gradients of cells and facets: pure JAX, differentiable in the points.
+
+Compiled one by one, for outside of compiled code, op by op, their first calls would take a second.
+"""
 
 from __future__ import annotations
 
 import functools
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jeit.mesh.mesh import Mesh
 
 
+@jax.jit
 def measures(mesh: Mesh) -> Float[Array, " m"]:
     """Area in m² (2-D) or volume in m³ (3-D) of every cell, (m,), positive for a valid mesh."""
     corners = mesh.points[mesh.cells]
@@ -19,6 +24,7 @@ def measures(mesh: Mesh) -> Float[Array, " m"]:
     return jnp.sum(jnp.cross(edges[:, 0], edges[:, 1]) * edges[:, 2], axis=-1) / 6.0
 
 
+@jax.jit
 def gradients(mesh: Mesh) -> Float[Array, "m k d"]:
     """Gradients in 1/m of the d + 1 linear basis functions on every cell, (m, d + 1, d).
 
@@ -43,11 +49,13 @@ def gradients(mesh: Mesh) -> Float[Array, "m k d"]:
     return jnp.concatenate([first[:, None], others], axis=1)
 
 
+@jax.jit
 def centroids(mesh: Mesh) -> Float[Array, "m d"]:
     """Centre of gravity in metres of every cell, (m, d)."""
     return jnp.mean(mesh.points[mesh.cells], axis=1)
 
 
+@jax.jit
 def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
     """Length in m (2-D) or area in m² (3-D) of every boundary facet, (b,)."""
     corners = mesh.points[mesh.facets]
@@ -57,6 +65,7 @@ def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
     return 0.5 * jnp.sqrt(jnp.sum(jnp.cross(edges[:, 0], edges[:, 1]) ** 2, axis=-1))
 
 
+@jax.jit
 def facet_centroids(mesh: Mesh) -> Float[Array, "b d"]:
     """Centre in metres of every boundary facet, (b, d)."""
     return jnp.mean(mesh.points[mesh.facets], axis=1)

@@ -169,8 +169,13 @@ class Protocol(eqx.Module):
         return (
             self.num_electrodes == other.num_electrodes
             and self.num_measurements == other.num_measurements
-            and bool(np.allclose(self.channel_drive, other.channel_drive, rtol=1e-9, atol=0))
-            and bool(np.allclose(self.channel_measurement, other.channel_measurement, rtol=1e-9, atol=0))
+            and all(
+                np.allclose(np.asarray(mine)[self_index], np.asarray(theirs)[other_index], rtol=1e-9, atol=0)
+                for mine, self_index, theirs, other_index in (
+                    (self.drive, self.drive_index, other.drive, other.drive_index),
+                    (self.measurement, self.measurement_index, other.measurement, other.measurement_index),
+                )
+            )
         )
 
 

@@ -53,11 +53,14 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
             f"factorise: `values` must have shape {(plan.num_entries,)}, the entries of the plan's pattern; "
             f"got {values.shape}. Use jax.vmap for a batch of matrices."
         )
-    numeric = in_turn(partial(_factorise, plan.stages))
+    numeric = in_turn(partial(_factorise, plan.layout))
     return numeric(plan.indices, values)
 
 
-def _factorise(stages: tuple[Stage, ...], indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Factor:
+# Compiled functions of their own, so that a second program with the same plan need not trace them again.
+@partial(jax.jit, static_argnums=0)
+def _factorise(layout: Layout, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Factor:
+    stages, _ = layout.content
     dtype = values.dtype
     extended = jnp.concatenate([values, jnp.ones(1, dtype)])
     inverses, lowers, left = [], [], []
@@ -85,11 +88,12 @@ def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Arr
     return numeric(plan.indices, factor, vectors).reshape(right_hand_sides.shape)
 
 
+@partial(jax.jit, static_argnums=0)
 def _solve(
     layout: Layout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> Inexact[Array, "n k"]:
     stages, solution = layout.content
-    reduced = _forward(stages, indices, factor, vectors)
+    reduced = _forward(layout, indices, factor, vectors)
     return _backward(stages, indices, factor, reduced)[solution.read(indices)]
 
 
@@ -109,7 +113,7 @@ def half_solve(
 
     Half the work of `solve`, if products with the inverse are all that is wanted.
     """
-    reduced = _forward(plan.stages, plan.indices, factor, _columns(plan, right_hand_sides, "half_solve"))
+    reduced = _forward(plan.layout, plan.indices, factor, _columns(plan, right_hand_sides, "half_solve"))
     return jnp.concatenate([rows.reshape(-1, rows.shape[-1]) for rows in reduced])
 
 
@@ -134,10 +138,12 @@ def _columns(plan: FactorisationPlan, right_hand_sides: Inexact[Array, "n *k"], 
     return right_hand_sides.reshape(plan.size, -1)
 
 
+@partial(jax.jit, static_argnums=0)
 def _forward(
-    stages: tuple[Stage, ...], indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
+    layout: Layout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> list[Inexact[Array, "batch pivots k"]]:
     """L^-1 times the vectors, stage by stage. A front's pivot rows gather what its children have subtracted."""
+    stages, _ = layout.content
     count = vectors.shape[1]
     reduced, updates = [], []
     for stage, inverse, lower in zip(stages, factor.inverses, factor.lowers, strict=True):
