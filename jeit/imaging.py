@@ -81,7 +81,7 @@ class ImagingSettings:
                     f"{', '.join(RULES)}."
                 )
             if self.method == "filtered-back-projection" and self.hyperparameter != type(self).hyperparameter:
-                raise ValueError("hyperparameter: filtered back-projection takes a number such as 1e-3, not a rule.")
+                raise ValueError("hyperparameter: filtered back-projection takes a number such as 0.05, not a rule.")
         elif not (np.isfinite(self.hyperparameter) and self.hyperparameter > 0):
             raise ValueError(f"hyperparameter must be a positive number or a rule; it is {self.hyperparameter}.")
         if self.contact is not None and self.contact not in CONTACTS:

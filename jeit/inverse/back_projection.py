@@ -12,7 +12,7 @@ def back_projection(
     conductivity,
     *,
     filtered: bool = False,
-    hyperparameter: float = 1e-3,
+    hyperparameter: float = 0.05,
     mask: Bool[Array, " M"] | None = None,
 ) -> LinearReconstruction:
     """Back-projection of voltage differences along the bands between equipotential lines of every drive.

@@ -127,8 +127,7 @@ def one_step(
     space. Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179.
     """
     prior = Noser() if prior is None else prior
-    jacobian = model.jacobian(conductivity)
-    num_channels = jacobian.shape[0]
+    num_channels = model.protocol.num_measurements
     used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
     if used.shape != (num_channels,) or not used.any():
         raise ValueError(f"mask must be ({num_channels},) booleans with at least one True: one for each channel.")
@@ -137,7 +136,7 @@ def one_step(
         raise ValueError("noise must be positive and finite for every channel in use.")
     channels = np.flatnonzero(used)
     root_weight = 1 / deviation[used]
-    whitened = _whitened(jacobian, channels, root_weight)
+    whitened = _whitened(model.jacobian(conductivity), channels, root_weight)
     data = None if difference is None else jnp.asarray(root_weight * np.asarray(difference)[used])
     product = prior.covariance_product(model.mesh, whitened)
     null_space = prior.null_space(model.mesh)
