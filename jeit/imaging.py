@@ -72,8 +72,9 @@ class ImagingSettings:
     def __post_init__(self):
         if self.method not in METHODS:
             raise ValueError(f"method: there is no '{self.method}'; give one of {', '.join(METHODS)}.")
-        if isinstance(self.prior, str) and self.prior not in PRIORS:
-            raise ValueError(f"prior: there is no '{self.prior}'; give one of {', '.join(PRIORS)}.")
+        known = self.prior in PRIORS if isinstance(self.prior, str) else isinstance(self.prior, AbstractPrior)
+        if not known:
+            raise ValueError(f"prior: there is no {self.prior!r}; give one of {', '.join(PRIORS)}, or a prior.")
         if isinstance(self.hyperparameter, str):
             if self.hyperparameter not in RULES:
                 raise ValueError(
@@ -82,7 +83,9 @@ class ImagingSettings:
                 )
             if self.method == "filtered-back-projection" and self.hyperparameter != type(self).hyperparameter:
                 raise ValueError("hyperparameter: filtered back-projection takes a number such as 0.05, not a rule.")
-        elif not (np.isfinite(self.hyperparameter) and self.hyperparameter > 0):
+        elif isinstance(self.hyperparameter, bool) or not (
+            np.isfinite(self.hyperparameter) and self.hyperparameter > 0
+        ):
             raise ValueError(f"hyperparameter must be a positive number or a rule; it is {self.hyperparameter}.")
         if self.contact is not None and self.contact not in CONTACTS:
             raise ValueError(f"contact: there is no '{self.contact}'; give one of {', '.join(CONTACTS)}.")
@@ -116,6 +119,11 @@ class ImagedDifference:
     extent: tuple[float, float, float, float]
     inclusions: tuple[Inclusion, ...]
     timings: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def lowest(self) -> float:
+        """Least change relative to the background; below -1 the linear image claims a negative conductivity."""
+        return float(jnp.min(self.change) / self.calibration.conductivity)
 
     @property
     def mesh(self) -> Mesh:
@@ -152,6 +160,9 @@ def image_difference(
     with clock("calibrate"):
         contact = settings.contact or default_contact(one)
         calibration = calibrate(model, base.voltages[0], mask=base.mask[0], contact=contact)
+        if settings.contact is None and contact == "each" and calibration.status != "converged":
+            contact = "common"  # the data do not tell so many impedances apart
+            calibration = calibrate(model, base.voltages[0], mask=base.mask[0], contact=contact)
         calibration = jax.block_until_ready(calibration)
         if not np.isfinite(calibration.misfit):
             raise ValueError(
@@ -162,6 +173,13 @@ def image_difference(
         noise = quality.difference_noise
         reconstruction = _reconstruction(calibration, settings, domain, base, difference, both, noise)
         change = jax.block_until_ready(reconstruction.image(difference))
+        largest = float(jnp.abs(change).max())
+        if not largest > 1e-9 * float(calibration.conductivity):
+            raise ValueError(
+                f"'{one.name}': the image is empty, no change reaches a billionth of the background. The "
+                f"hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give a smaller "
+                "one, or a rule."
+            )
     with clock("raster and inclusions"):
         grid = Raster.create(mesh, shape=settings.raster_shape)
         raster = jax.block_until_ready(grid.sample(change))

@@ -56,10 +56,12 @@ def draw(result: ImagedDifference, *, truth: tuple[float, float] | None = None):
         ax=figure.subplots(),
     )
     if truth is not None:
-        ax.plot(
-            *truth, marker="x", markersize=10, markeredgewidth=2, color="#157f3b", linestyle="none", label="pressed"
-        )
-        ax.legend(loc="lower right", frameon=False)
+        ring = {"marker": "o", "markersize": 15, "markerfacecolor": "none", "markeredgewidth": 2, "linestyle": "none"}
+        ax.plot(*truth, color="#157f3b", label="pressed here", **ring)
+    if result.inclusions:
+        ax.plot([], [], color="black", linewidth=1, linestyle=(0, (4, 3)), label="found: sign and area")
+    if ax.get_legend_handles_labels()[1]:
+        ax.legend(loc="upper left", bbox_to_anchor=(0, 0), frameon=False, borderaxespad=0)
     return figure
 
 
@@ -114,6 +116,7 @@ def report(result: ImagedDifference) -> dict[str, Any]:
         "reconstruction": {
             "quantity": f"change of conductivity against the reference, {unit}",
             "method": settings.method,
+            "least_change_relative_to_background": result.lowest,
             "prior": _prior(settings.prior) if settings.method == "one-step" else None,
         },
         "hyperparameter": {

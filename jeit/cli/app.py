@@ -78,7 +78,8 @@ def _explain(error: Exception) -> int:
     if isinstance(error, ValueError):
         return _fail(str(error), 1)
     if isinstance(error, OSError):
-        return _fail(f"{error.filename or 'file'}: {error.strerror or error}.", 1)
+        where = f"{error.filename}: " if error.filename else ""
+        return _fail(f"{where}{error.strerror or error}.", 1)
     if isinstance(error, MemoryError):
         return _fail("there is not enough memory; ask for fewer --num-points.", 1)
     return _fail(

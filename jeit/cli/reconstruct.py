@@ -1,5 +1,6 @@
 """`jeit reconstruct`: a measured file in; a picture, arrays and a report out."""
 
+import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -68,6 +69,10 @@ def reconstruct(
         "contact": contact,
         "num_points": num_points,
     }
+    if method not in (None, "one-step") and prior is not None:
+        raise ValueError(f"--prior belongs to one-step images; --method {method} has none.")
+    if method == "back-projection" and hyperparameter is not None:
+        raise ValueError("--hyperparameter: plain back-projection has none; leave it out.")
     settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})
     make_folder(output)
     console = Console(highlight=False)
@@ -104,6 +109,9 @@ def show(console, result: "ImagedDifference") -> None:
     ]
     if calibration.status != "converged":
         rows.insert(1, ("calibration", calibration.status))
+    if result.lowest < -1:
+        fall = f"falls to {percent(result.lowest)} of the background: of changes so large only place and sign are right"
+        rows.append(("linear image", fall))
     console.print()
     console.print(pairs(result.measurement.name, rows))
     console.print()
@@ -122,7 +130,16 @@ def make_folder(output: Path) -> None:
     """Make the folder for the results before any work is done for them. Raises `ValueError` if it cannot be one."""
     if output.exists() and not output.is_dir():
         raise ValueError(f"--output {output} is a file; give a folder for the results.")
-    output.mkdir(parents=True, exist_ok=True)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=output):
+            pass
+        taken = [name for name in ("image.png", "image.npz", "report.json") if (output / name).is_dir()]
+    except OSError as error:
+        reason = error.strerror or error
+        raise ValueError(f"--output {output} cannot be written to ({reason}); give another folder.") from None
+    if taken:
+        raise ValueError(f"--output {output}: there is a folder named {taken[0]} in it; give another.")
 
 
 def _number_or_name(text: str, number: type = float):

@@ -42,7 +42,9 @@ def _guard(path: Path, reader):
         raise ValueError(
             f"{path.name} was saved in MATLAB's version 7.3 (HDF5). Save it again with `save(name, '-v7')`."
         ) from None
-    except OSError:
-        raise
+    except OSError as error:
+        if error.errno is not None:
+            raise
+        raise ValueError(f"{path.name} is not a readable .mat file ({error}). Is it complete?") from None
     except Exception as error:  # scipy raises many kinds on damaged files
         raise ValueError(f"{path.name} is not a readable .mat file ({error}). Is it complete?") from None

@@ -115,7 +115,8 @@ class Measurement(eqx.Module):
         if "reference" not in self.frame_names or self.num_frames < 2:
             raise ValueError(
                 f"'{self.name}' holds no reference frame of its own. Measure the undisturbed body and give "
-                "that file as the reference."
+                'that file as the reference; or, if one of its frames is that, name it "reference" in the '
+                "description: [data] frame_names."
             )
         index = self.frame_names.index("reference")
         others = np.array([k for k in range(self.num_frames) if k != index])

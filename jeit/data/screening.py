@@ -50,7 +50,7 @@ def screen(
     dead = ~np.any(np.where(usable, values, 0) != 0, axis=1)
     if dead.all():
         raise ValueError(
-            f"{name}: every usable voltage is zero or missing; there is nothing measured in it. Was the "
+            f"{name}: every usable voltage is zero, NaN or missing; there is nothing measured in it. Was the "
             "instrument on, and is this the right variable or column?"
         )
     exclude(np.broadcast_to(dead[:, None], values.shape), f"{int(dead.sum())} frames are all zero.")

@@ -86,7 +86,8 @@ class BoundaryElectrodes(AbstractElectrodes):
                 "they must lie on it (are both in metres?). For electrodes inside a sheet use SheetDiscs."
             )
         covered = np.clip(end - start, 0, None).sum(axis=0)  # (b, L)
-        short = np.flatnonzero(covered.sum(axis=0) < (1 - 1e-9) * np.asarray(self.width))
+        rounding = max(1e-9, 1e3 * np.finfo(covered.dtype).eps)
+        short = np.flatnonzero(covered.sum(axis=0) < (1 - rounding) * np.asarray(self.width))
         if short.size:
             raise ValueError(
                 f"width: electrode {short[0] + 1} is {float(self.width[short[0]]):.3g} m wide, more than the boundary "
@@ -110,7 +111,7 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
             common = np.minimum(end[first][:, :, None], end[second][:, None, :]) - np.maximum(
                 start[first][:, :, None], start[second][:, None, :]
             )
-            if common.max() > 1e-9 * end.max():
+            if common.max() > max(1e-9, 1e3 * np.finfo(end.dtype).eps) * end.max():
                 pairs.append((first, second))
     return pairs
 

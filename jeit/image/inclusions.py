@@ -44,6 +44,10 @@ def find_inclusions(
     values = np.asarray(image)
     if values.shape != (mesh.num_cells,):
         raise ValueError(f"image has shape {values.shape}; give one value for each of the {mesh.num_cells} cells.")
+    if np.iscomplexobj(values):
+        raise ValueError("image is complex; look for inclusions in its real or imaginary part.")
+    if not (0 < level < 1 and 0 <= least_peak <= 1):
+        raise ValueError(f"level must lie between 0 and 1 and least_peak too; they are {level} and {least_peak}.")
     if not np.isfinite(values).all():
         raise ValueError("image has NaN or infinite values; reconstruct it from unmasked channels first.")
     strongest = np.abs(values).max()

@@ -41,6 +41,8 @@ def calibrate(
     stay positive; the start is the model's impedance with the conductivity that scales the prediction best (voltages
     are proportional to 1/σ at fixed z·σ). Raises `ValueError` for a frame of another shape or without signal.
     """
+    if jnp.iscomplexobj(voltages):
+        raise ValueError("voltages are complex; calibrate on their real part or magnitude.")
     measured = jnp.asarray(voltages, float)
     shape = (model.protocol.num_measurements,)
     used = jnp.ones(shape, bool) if mask is None else jnp.asarray(mask, bool)
@@ -65,6 +67,11 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     # Start at the model's own contact impedance for a conductivity of one, scaled to fit.
     shape = {"fixed": (0,), "common": (), "each": (num_electrodes,)}[contact]
     unit = jnp.where(used, model.voltages(1.0), 0)
+    if not unit @ measured > 0:
+        raise ValueError(
+            "voltages: they have the opposite sign of the model's. Is the polarity of drive or measurement turned "
+            "round, or the order of the channels another than the protocol's?"
+        )
     conductivity = jnp.log(jnp.abs(unit @ unit / (unit @ measured)))
     initial = {"conductivity": conductivity, "contact": jnp.zeros(shape) + conductivity}
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)

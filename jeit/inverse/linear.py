@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit.forward import ForwardModel
@@ -71,6 +72,8 @@ class LinearReconstruction(eqx.Module):
                 f"difference has shape {shape}; this reconstruction takes ({self.num_measurements},) volts, or "
                 f"(frames, {self.num_measurements})."
             )
+        if not isinstance(difference, Tracer) and not np.isfinite(difference).all():
+            raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
         return _apply(self.first, self.second, self.ratio, self.weights, difference)
 
 
@@ -127,6 +130,10 @@ def one_step(
     space. Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179.
     """
     prior = Noser() if prior is None else prior
+    if not isinstance(prior, AbstractPrior):
+        raise ValueError(f"prior must be one of those in jeit.inverse, such as Noser(), not {prior!r}.")
+    if jnp.iscomplexobj(conductivity):
+        raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
     num_channels = model.protocol.num_measurements
     used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
     if used.shape != (num_channels,) or not used.any():

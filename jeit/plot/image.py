@@ -132,7 +132,8 @@ def _colours(shown: np.ndarray, difference: bool, unit: str, quantity, limit: fl
         low = factor * float(shown.min())
         if low >= high:  # a constant image
             low, high = low - 0.05 * abs(low) - 1e-12, high + 0.05 * abs(high) + 1e-12
-    what = quantity or ("Change of conductivity" if difference else "Conductivity")
+    sheet = "sheet conductivity" if unit == "S" else "conductivity"
+    what = quantity or (f"Change of {sheet}" if difference else sheet.capitalize())
     colours = {"cmap": colour_map or (DIVERGING if difference else SEQUENTIAL), "vmin": low, "vmax": high}
     return factor, f"{what} ({with_prefix})" if with_prefix else what, colours
 

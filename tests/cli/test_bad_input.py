@@ -128,6 +128,15 @@ COMPUTING = {
     "picture of NaN": (lambda m: plot_image(m.mesh, np.full(m.mesh.num_cells, np.nan)), "finite"),
     "raster of nothing": (lambda m: plot_raster(np.full((3, 3), np.nan), (0, 1, 0, 1)), "at least one finite"),
     "voltages of two lengths": (lambda m: plot_voltages(np.ones(3), np.ones(4)), "one frame"),
+    "image of complex values": (lambda m: find_inclusions(m.mesh, 1j * np.ones(m.mesh.num_cells)), "complex"),
+    "level of two": (lambda m: find_inclusions(m.mesh, np.ones(m.mesh.num_cells), level=2.0), "between 0 and 1"),
+    "linear image of a complex body": (lambda m: one_step(m, 1.0 + 0.1j), "complex"),
+    "prior by name": (lambda m: one_step(m, 1.0, prior="noser"), "such as Noser"),  # pyright: ignore[reportArgumentType]
+    "frame with NaN": (lambda m: back_projection(m, 1.0).image(np.full(40, np.nan)), "zeros in masked channels"),
+    "complex reference": (lambda m: calibrate(m, (1 + 0.1j) * m.voltages(1.0)), "real part or magnitude"),
+    "reference turned round": (lambda m: calibrate(m, -m.voltages(1.0)), "opposite sign"),
+    "prior of a number": (lambda m: ImagingSettings(prior=3), "tikhonov, laplace"),  # pyright: ignore[reportArgumentType]
+    "hyperparameter of truth": (lambda m: ImagingSettings(hyperparameter=True), "positive number"),
     "press beyond the edge": (lambda m: simulate_press(RoundSkin(), None, (20.0, 0.0)), "beyond the skin"),  # pyright: ignore[reportArgumentType]
     "press of no size": (lambda m: simulate_press(RoundSkin(), None, (0, 0), radius=0), "positive size"),  # pyright: ignore[reportArgumentType]
     "unknown method": (lambda m: ImagingSettings(method="two-step"), "one-step, back-projection"),
@@ -241,7 +250,7 @@ COMMANDS = {
     "too few channels": (lambda t: with_data(t, t.touched[:-1]), "40 channels"),
     "transposed": (lambda t: with_data(t, t.touched[:, None]), "transposed"),
     "all zero": (lambda t: with_data(t, 0 * t.touched), "every usable voltage is zero"),
-    "all missing": (lambda t: with_data(t, np.nan * t.touched), "zero or missing"),
+    "all missing": (lambda t: with_data(t, np.nan * t.touched), "zero, NaN or missing"),
     "too few left": (lambda t: with_data(t, np.where(np.arange(40) < 5, t.touched, np.nan)), "5 channels are usable"),
     "same file twice": (lambda t: [*good(t)[:2], "--reference", t.folder / "touched.csv"], "same file"),
     "no reference": (lambda t: good(t)[:2], "no reference frame of its own"),
@@ -265,6 +274,15 @@ COMMANDS = {
         lambda t: good(t, "--method", "filtered-back-projection", "--hyperparameter", "gcv"),
         "takes a number",
     ),
+    "prior for back-projection": (
+        lambda t: good(t, "--method", "back-projection", "--prior", "noser"),
+        "belongs to one-step",
+    ),
+    "hyperparameter for back-projection": (
+        lambda t: good(t, "--method", "back-projection", "--hyperparameter", "5"),
+        "back-projection has none",
+    ),
+    "hyperparameter without end": (lambda t: good(t, "--hyperparameter", "1e300"), "the image is empty"),
     "unknown contact": (lambda t: good(t, "--contact", "firm"), "each, common, fixed"),
     "mesh of three nodes": (lambda t: good(t, "--num-points", "3"), "50 to 100,000"),
     "mesh of a word": (lambda t: good(t, "--num-points", "many"), "Invalid value for '--num-points'"),
@@ -320,6 +338,16 @@ def test_output_that_is_a_file(tank, run):
     status, _, error = run(*good(tank, "--output", tank.folder / "rest.csv"))
     assert status == 1
     assert "is a file; give a folder" in error
+
+
+def test_output_that_cannot_be_written(tank, run, tmp_path):
+    status, _, error = run(*good(tank, "--output", tank.folder / "rest.csv" / "deeper"))
+    assert status == 1
+    assert "cannot be written" in error
+    (tmp_path / "image.png").mkdir()
+    status, _, error = run(*good(tank, "--output", tmp_path))
+    assert status == 1
+    assert "folder named image.png" in error
 
 
 def test_no_output(tank, run):

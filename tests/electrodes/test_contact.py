@@ -20,7 +20,9 @@ from jeit.electrodes import (
     ring,
     with_contact_impedance,
 )
+from jeit.forward import ForwardModel
 from jeit.mesh import Mesh, box, cylinder, disk, facet_measures, rectangle
+from jeit.protocol import adjacent
 
 ROUNDING = 1e-12
 
@@ -181,3 +183,16 @@ def test_position_gradient_where_an_electrode_slides_over_corners(offset):
     step = 1e-8
     difference = (total(position + step * direction) - total(position - step * direction)) / (2 * step)
     assert difference == pytest.approx(float(derivative), rel=1e-5)
+
+
+def test_single_precision_is_enough_to_make_a_model():
+    """Rounding in the covered length must not be taken for an electrode wider than the boundary."""
+    with jax.enable_x64(False):
+        mesh = disk(0.05, num_points=400)
+        electrodes = BoundaryElectrodes(ring(0.05, 16), width=0.008, contact_impedance=0.1)
+        single = ForwardModel(mesh, electrodes, adjacent(16, current=1e-3)).voltages(1e-3)
+        assert single.dtype == np.float32
+    mesh = disk(0.05, num_points=400)
+    electrodes = BoundaryElectrodes(ring(0.05, 16), width=0.008, contact_impedance=0.1)
+    double = ForwardModel(mesh, electrodes, adjacent(16, current=1e-3)).voltages(1e-3)
+    np.testing.assert_allclose(single, double, rtol=2e-3)

@@ -53,7 +53,7 @@ def test_differences_are_centred_at_zero(mesh, electrodes, ax):
     (cells,) = [c for c in ax.collections if c.get_array() is not None]
     assert cells.get_clim() == pytest.approx((-2, 2))
     np.testing.assert_allclose(cells.get_array(), 1e3 * values)
-    assert colour_bar_label(ax) == "Change of conductivity (mS)"
+    assert colour_bar_label(ax) == "Change of sheet conductivity (mS)"
     red, _, blue, _ = cells.to_rgba(2.0)
     assert red > blue  # conductive is red
     assert np.allclose(cells.to_rgba(0.0)[:3], 1, atol=0.05)  # nothing is white
