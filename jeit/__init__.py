@@ -8,7 +8,7 @@ The names used most, and where the rest is:
 - `BoundaryElectrodes`, `ring`: electrodes and where to put them (`jeit.electrodes`);
 - `adjacent`: what is driven and measured (`jeit.protocol`);
 - `ForwardModel`: conductivity to voltages and Jacobian (`jeit.forward`);
-- `calibrate`, `one_step`: linear imaging (`jeit.inverse`);
+- `calibrate`, `one_step`, `reconstruct`: linear and nonlinear imaging (`jeit.inverse`);
 - `Raster`, `find_inclusions`: what an image shows (`jeit.image`);
 - `plot_image`: pictures (`jeit.plot`).
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from jeit.imaging import image_difference as image_difference
     from jeit.inverse import calibrate as calibrate
     from jeit.inverse import one_step as one_step
+    from jeit.inverse import reconstruct as reconstruct
     from jeit.mesh import Disk as Disk
     from jeit.mesh import Mesh as Mesh
     from jeit.mesh import Polygon as Polygon
@@ -63,6 +64,7 @@ _HOMES = {
     "one_step": "inverse",
     "plot_image": "plot",
     "read": "data",
+    "reconstruct": "inverse",
     "ring": "electrodes",
 }
 
@@ -79,5 +81,8 @@ def __getattr__(name: str):
     raise AttributeError(f"module 'jeit' has no attribute '{name}'")
 
 
+__all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_ROOMS, *_HOMES])
+    return sorted([*_ROOMS, *_HOMES, "__version__"])

@@ -3,3 +3,4 @@
 from jeit.image.inclusions import Inclusion as Inclusion
 from jeit.image.inclusions import find_inclusions as find_inclusions
 from jeit.image.raster import Raster as Raster
+from jeit.image.score import challenge_score as challenge_score

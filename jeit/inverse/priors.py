@@ -11,12 +11,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 import scipy.sparse
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jeit.inverse.bases import AbstractBasis, DenseBasis, DiagonalBasis, pivoted_cholesky
 from jeit.mesh import Mesh, centroids, interior_facets
 from jeit_solvers import SparsityPattern, analyse, factorise, solve
+
+# Precision given to the constant image where it would have none, relative to a step between neighbouring cells.
+_FREEDOM = 1e-6
 
 
 class AbstractPrior(eqx.Module):
@@ -29,6 +34,10 @@ class AbstractPrior(eqx.Module):
     @abc.abstractmethod
     def precision(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> scipy.sparse.sparray:
         """Q (m, m), sparse."""
+
+    @abc.abstractmethod
+    def basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
+        """S with Γ = S Sᵀ, for nonlinear reconstructions; where Q has a null space, a wide prior stands for none."""
 
     def null_space(self, mesh: Mesh) -> Float[Array, "m p"]:
         """Basis of the images that cost nothing; none unless a prior says otherwise."""
@@ -45,6 +54,10 @@ class Tikhonov(AbstractPrior):
     def precision(self, mesh, jacobian) -> scipy.sparse.sparray:
         """The identity."""
         return scipy.sparse.csr_array(scipy.sparse.eye_array(mesh.num_cells))
+
+    def basis(self, mesh, jacobian):
+        """Every cell on its own."""
+        return DiagonalBasis(jnp.ones(mesh.num_cells))
 
 
 class Noser(AbstractPrior):
@@ -63,6 +76,10 @@ class Noser(AbstractPrior):
     def precision(self, mesh, jacobian):
         """The diagonal matrix Q."""
         return scipy.sparse.diags_array(np.sum(np.asarray(jacobian) ** 2, axis=0) ** self.exponent).tocsr()
+
+    def basis(self, mesh, jacobian):
+        """Every cell on its own."""
+        return DiagonalBasis(jnp.sum(jacobian**2, axis=0) ** (-self.exponent / 2))
 
 
 class Laplace(AbstractPrior):
@@ -88,6 +105,13 @@ class Laplace(AbstractPrior):
         adjacency = (links + links.T).tocsr()
         return 2 * (scipy.sparse.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
 
+    def basis(self, mesh, jacobian):
+        """All of Q's inverse, dense, the constant image nearly free."""
+        precision = self.precision(mesh, jacobian).toarray()
+        precision[np.diag_indices_from(precision)] += _FREEDOM
+        lower = scipy.linalg.cholesky(precision, lower=True)
+        return DenseBasis(jnp.asarray(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T))
+
     def null_space(self, mesh):
         """The constant image."""
         return jnp.ones((mesh.num_cells, 1))
@@ -108,6 +132,15 @@ class Gaussian(AbstractPrior):
     def covariance_product(self, mesh, jacobian):
         """Γ Jᵀ, a block of rows at a time: Γ is dense and is not kept."""
         return _gaussian_product(centroids(mesh), jacobian, self.length)
+
+    def basis(self, mesh, jacobian):
+        """The shapes that hold all but a thousandth of the variance: fewer than cells where `length` spans many."""
+        centres = np.asarray(centroids(mesh))
+
+        def column(cell):
+            return np.exp(-np.sum((centres - centres[cell]) ** 2, axis=1) / (2 * self.length**2))
+
+        return DenseBasis(jnp.asarray(pivoted_cholesky(np.ones(len(centres)), column, tolerance=1e-3, max_rank=2000)))
 
     def precision(self, mesh, jacobian):
         """Not to be had: the inverse of a Gaussian covariance is dense and ill-conditioned. Raises `ValueError`."""

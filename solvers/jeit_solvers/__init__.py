@@ -13,12 +13,14 @@ from .multifrontal import Factor, factorise, half_solve, quadratic_form, solve
 from .operator import SparseSymmetric
 from .pattern import SparsityPattern
 from .plan import FactorisationPlan, analyse
+from .ridge import RidgeSolver, ridge_step
 from .sparse_cholesky import SparseCholesky
 
 __all__ = [
     "ConjugateGradient",
     "Factor",
     "FactorisationPlan",
+    "RidgeSolver",
     "SparseCholesky",
     "SparseSymmetric",
     "SparsityPattern",
@@ -28,6 +30,7 @@ __all__ = [
     "half_solve",
     "in_turn",
     "quadratic_form",
+    "ridge_step",
     "solve",
     "symmetric_inverse",
 ]

@@ -1,0 +1,96 @@
+"""Links: the scale on which conductivity is estimated, x for σ = link(x), cell by cell."""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+
+class AbstractLink(eqx.Module):
+    """Base of all links between the estimated quantity x and conductivity σ, increasing and smooth."""
+
+    @abc.abstractmethod
+    def conductivity(self, estimate: Float[Array, " m"]) -> Float[Array, " m"]:
+        """σ(x), S/m (2-D: S)."""
+
+    @abc.abstractmethod
+    def slope(self, estimate: Float[Array, " m"]) -> Float[Array, " m"]:
+        """dσ/dx at x."""
+
+    @abc.abstractmethod
+    def estimate(self, conductivity: Float[Array, " m"]) -> Float[Array, " m"]:
+        """x(σ), the inverse of `conductivity`. Raises `ValueError` for conductivities that no x gives."""
+
+
+class Linear(AbstractLink):
+    """σ = x. Nothing keeps conductivity positive; a step that leads below zero is refused and shortened."""
+
+    def conductivity(self, estimate):
+        """x."""
+        return estimate
+
+    def slope(self, estimate):
+        """1."""
+        return jnp.ones_like(estimate)
+
+    def estimate(self, conductivity):
+        """σ."""
+        return conductivity
+
+
+class Log(AbstractLink):
+    """σ = exp(x): always positive, and a ratio of conductivities counts alike on either side of one."""
+
+    def conductivity(self, estimate):
+        """exp(x)."""
+        return jnp.exp(estimate)
+
+    def slope(self, estimate):
+        """exp(x)."""
+        return jnp.exp(estimate)
+
+    def estimate(self, conductivity):
+        """log(σ)."""
+        _check_inside(conductivity, 0, np.inf)
+        return jnp.log(conductivity)
+
+
+class Bounded(AbstractLink):
+    """σ = lower + (upper - lower) / (1 + exp(-x)): strictly between `lower` and `upper`, S/m (2-D: S)."""
+
+    lower: float
+    upper: float
+
+    def __check_init__(self):
+        if not isinstance(self.lower, Tracer) and not 0 <= self.lower < self.upper < np.inf:
+            raise ValueError(f"Bounded: give 0 ≤ lower < upper, finite; they are {self.lower} and {self.upper}.")
+
+    def conductivity(self, estimate):
+        """The logistic function between the bounds."""
+        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(estimate)
+
+    def slope(self, estimate):
+        """Its derivative, largest half way between the bounds."""
+        share = jax.nn.sigmoid(estimate)
+        return (self.upper - self.lower) * share * (1 - share)
+
+    def estimate(self, conductivity):
+        """The logit of σ's place between the bounds."""
+        _check_inside(conductivity, self.lower, self.upper)
+        share = (conductivity - self.lower) / (self.upper - self.lower)
+        return jnp.log(share) - jnp.log1p(-share)
+
+
+def _check_inside(conductivity, lower, upper) -> None:
+    if isinstance(conductivity, Tracer):
+        return
+    values = np.asarray(conductivity)
+    if not ((values > lower) & (values < upper)).all():
+        raise ValueError(
+            f"conductivity must lie between {lower:g} and {upper:g}; it goes from {values.min():.3g} to "
+            f"{values.max():.3g}."
+        )

@@ -1,0 +1,159 @@
+"""Nonlinear reconstructions of bodies simulated on another, finer mesh; every solver with every prior and link."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes, ring
+from jeit.forward import ForwardModel
+from jeit.inverse import Bounded, Gaussian, Laplace, Linear, Log, Noser, Tikhonov, reconstruct
+from jeit.mesh import Disk, Refine, centroids, measures
+from jeit.protocol import adjacent
+
+RADIUS = 0.1
+CENTRE, INCLUSION = np.array([0.03, 0.02]), 0.025
+ELECTRODES = BoundaryElectrodes(ring(RADIUS, 16), 0.012, 1e-3)
+
+
+def model_of(num_points):
+    mesh = Disk(RADIUS).mesh(num_points=num_points, refine=Refine(np.asarray(ELECTRODES.position), factor=2.0))
+    return ForwardModel(mesh, ELECTRODES, adjacent(16, current=1e-3))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return model_of(600)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """Voltages of a disk with an inclusion of thrice its conductivity, and their noise of 0.1 %."""
+    fine = model_of(4000)
+    inside = np.linalg.norm(centroids(fine.mesh) - CENTRE, axis=1) < INCLUSION
+    voltages = fine.voltages(jnp.where(inside, 3.0, 1.0))
+    noise = 1e-3 * jnp.abs(voltages)
+    return voltages + noise * jax.random.normal(jax.random.key(0), voltages.shape), noise
+
+
+def contrast_and_centroid(model, conductivity):
+    """Mean conductivity where the inclusion is, and centroid of what stands out by half."""
+    position, weight = np.asarray(centroids(model.mesh)), np.asarray(measures(model.mesh))
+    values = np.asarray(conductivity)
+    inside = np.linalg.norm(position - CENTRE, axis=1) < 0.8 * INCLUSION
+    raised = weight * np.maximum(values - (1 + values.max()) / 2, 0)
+    return weight[inside] @ values[inside] / weight[inside].sum(), raised @ position / raised.sum()
+
+
+@pytest.mark.parametrize("solver", ["gauss-newton", "levenberg-marquardt"])
+@pytest.mark.parametrize("rule", ["discrepancy", "gcv"])
+@pytest.mark.parametrize("prior", [Gaussian(0.02), Laplace()], ids=["gaussian", "laplace"])
+def test_contrast_and_place_of_an_inclusion(solver, rule, prior, model, frame):
+    voltages, noise = frame
+    result = reconstruct(model, voltages, 1.0, prior=prior, noise=noise, hyperparameter=rule, solver=solver)
+    contrast, centroid = contrast_and_centroid(model, result.conductivity)
+    assert result.status == "converged"
+    assert result.iterations <= 8
+    assert result.misfit < 1.6
+    assert contrast == pytest.approx(3, rel=0.15)
+    assert np.linalg.norm(centroid - CENTRE) < 0.03 * RADIUS
+    assert (np.diff(result.costs) < 0).all()
+
+
+@pytest.mark.parametrize("link", [Linear(), Log(), Bounded(0.5, 4.0)], ids=["linear", "log", "bounded"])
+@pytest.mark.parametrize("prior", [Noser(), Tikhonov()], ids=["noser", "tikhonov"])
+def test_every_link(link, prior, model, frame):
+    voltages, noise = frame
+    result = reconstruct(model, voltages, 1.0, prior=prior, link=link, noise=noise, max_steps=60)
+    _, centroid = contrast_and_centroid(model, result.conductivity)
+    assert result.status == "converged"
+    assert (np.asarray(result.conductivity) > 0).all()
+    assert np.linalg.norm(centroid - CENTRE) < 0.15 * RADIUS
+    if isinstance(link, Bounded):
+        assert 0.5 < result.conductivity.min() < result.conductivity.max() < 4
+
+
+def test_derivative_of_the_misfit(model, frame):
+    """Taylor's second order, and products with the Jacobian against autodiff."""
+    voltages, noise = frame
+    inversion = reconstruct(model, voltages, 1.0, prior=Gaussian(0.03), noise=noise, max_steps=1).inversion
+    point = 0.01 * jax.random.normal(jax.random.key(1), (inversion.basis.num_coefficients,))
+    direction = jax.random.normal(jax.random.key(2), point.shape)
+    misfit, jacobian = inversion.linearise(point)
+    np.testing.assert_allclose(misfit, inversion.misfit(point), rtol=1e-9, atol=1e-9)
+    _, tangent = jax.jvp(inversion.misfit, (point,), (direction,))
+    np.testing.assert_allclose(jacobian @ direction, tangent, rtol=1e-8, atol=1e-8 * np.abs(tangent).max())
+    steps = 1e-2 * 0.5 ** np.arange(4)
+    errors = [np.linalg.norm(inversion.misfit(point + h * direction) - misfit - h * tangent) for h in steps]
+    assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2, abs=0.1)
+
+
+def test_solvers_of_optimistix_find_the_same(model, frame):
+    voltages, noise = frame
+    options = {"prior": Gaussian(0.05), "noise": noise, "hyperparameter": 100.0}
+    ours = reconstruct(model, voltages, 1.0, **options)
+    theirs = reconstruct(model, voltages, 1.0, solver=optx.LevenbergMarquardt(1e-8, 1e-8), **options)
+    assert theirs.status == "converged"
+    np.testing.assert_allclose(theirs.conductivity, ours.conductivity, rtol=1e-3)
+
+
+def test_a_warm_start_needs_fewer_steps(model, frame):
+    voltages, noise = frame
+    options = {"prior": Gaussian(0.02), "noise": noise, "hyperparameter": "discrepancy"}
+    cold = reconstruct(model, voltages, 1.0, **options)
+    warm = reconstruct(model, voltages, 1.0, start=cold, **options)
+    assert warm.iterations < cold.iterations
+    np.testing.assert_allclose(warm.conductivity, cold.conductivity, rtol=1e-2)
+
+
+def test_masked_channels_are_not_looked_at(model, frame):
+    voltages, noise = frame
+    mask = np.ones(208, bool)
+    mask[3::20] = False
+    spoilt = jnp.where(mask, voltages, jnp.nan)
+    result = reconstruct(model, spoilt, 1.0, prior=Gaussian(0.02), noise=noise, mask=mask, hyperparameter="gcv")
+    _, centroid = contrast_and_centroid(model, result.conductivity)
+    assert result.status == "converged"
+    assert np.linalg.norm(centroid - CENTRE) < 0.03 * RADIUS
+
+
+def test_too_few_steps_are_said_so(model, frame):
+    voltages, noise = frame
+    result = reconstruct(model, voltages, 1.0, prior=Gaussian(0.02), noise=noise, max_steps=2)
+    assert result.status == "not converged"
+    assert "2 steps" in result.reason
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"voltages": jnp.zeros(208)}, "current source"),
+        ({"voltages": jnp.full(208, jnp.nan)}, "NaN"),
+        ({"voltages": jnp.ones(96)}, "208 channels"),
+        ({"mask": np.zeros(208, bool)}, "every channel"),
+        ({"mask": np.ones(208)}, "booleans"),
+        ({"noise": 0.0}, "noise"),
+        ({"background": -1.0}, "between 0"),
+        ({"background": 5.0, "link": Bounded(0.5, 4.0)}, "between 0.5 and 4"),
+        ({"solver": "newton"}, "gauss-newton"),
+        ({"hyperparameter": "magic"}, "magic"),
+        ({"hyperparameter": -1.0}, "positive"),
+    ],
+)
+def test_bad_input(change, message, model, frame):
+    arguments = {"voltages": frame[0], "background": 1.0, "noise": frame[1], **change}
+    with pytest.raises(ValueError, match=message):
+        reconstruct(model, **arguments)
+
+
+def test_bounds_in_the_wrong_order():
+    with pytest.raises(ValueError, match="lower < upper"):
+        Bounded(2.0, 1.0)
+
+
+def test_a_body_at_odds_with_the_model_is_not_called_converged_with_nan(model, frame):
+    result = reconstruct(model, -frame[0], 1.0, prior=Gaussian(0.02), noise=frame[1], hyperparameter=1e-3)
+    assert np.isfinite(np.asarray(result.conductivity)).all() or result.status == "failed"
+    assert eqx.is_array(result.misfit)
