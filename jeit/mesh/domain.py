@@ -6,7 +6,7 @@ Readers, layouts, rasters and mesh builders share them. Arc length runs counter-
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,9 +18,8 @@ from numpy.typing import ArrayLike
 
 from jeit.mesh import _outline
 from jeit.mesh._checks import warn_large
-
-if TYPE_CHECKING:
-    from jeit.mesh.mesh import Mesh
+from jeit.mesh._meshing import mesh_disk, mesh_polygon, mesh_rectangle
+from jeit.mesh.mesh import Mesh
 
 
 def _traced(*values: Any) -> bool:
@@ -89,9 +88,7 @@ class Disk(eqx.Module):
 
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Any = None) -> Mesh:
         """A mesh of the disk; see `jeit.mesh.disk`."""
-        from jeit.mesh.shapes import disk
-
-        return disk(self.radius, centre=self.centre, num_points=num_points, cell_size=cell_size, refine=refine)
+        return mesh_disk(self, num_points=num_points, cell_size=cell_size, refine=refine)
 
 
 class Rectangle(eqx.Module):
@@ -141,16 +138,7 @@ class Rectangle(eqx.Module):
 
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Any = None) -> Mesh:
         """A mesh of the rectangle; see `jeit.mesh.rectangle`."""
-        from jeit.mesh.shapes import rectangle
-
-        return rectangle(
-            self.width,
-            self.height,
-            centre=self.centre,
-            num_points=num_points,
-            cell_size=cell_size,
-            refine=refine,
-        )
+        return mesh_rectangle(self, num_points=num_points, cell_size=cell_size, refine=refine)
 
 
 class Polygon(eqx.Module):
@@ -207,9 +195,7 @@ class Polygon(eqx.Module):
 
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Any = None) -> Mesh:
         """A mesh of the polygon; see `jeit.mesh.polygon`."""
-        from jeit.mesh.shapes import polygon
-
-        return polygon(self.vertices, holes=self.holes, num_points=num_points, cell_size=cell_size, refine=refine)
+        return mesh_polygon(self, num_points=num_points, cell_size=cell_size, refine=refine)
 
 
 Domain = Disk | Rectangle | Polygon
