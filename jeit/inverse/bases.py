@@ -1,7 +1,7 @@
 """Bases: images as combinations of shapes, x = x₀ + S c, that a prior makes independent and of unit variance.
 
 With covariance Γ = S Sᵀ the prior energy (x - x₀)ᵀ Γ⁻¹ (x - x₀) is ‖c‖². A diagonal S keeps every cell on its own; a
-narrow one (Karhunen-Loève) keeps what the prior holds possible and leaves out the rest.
+narrow one (a covariance of low rank) keeps what the prior holds possible and leaves out the rest.
 """
 
 import abc

@@ -52,7 +52,8 @@ class Reconstruction(eqx.Module):
 
     **Fields**: `conductivity` (m,), S/m (2-D: S); `voltages` (M,), what the model predicts for it; `misfit`, root mean
     square of predicted - measured over the channels used, in standard deviations (1: as good as the noise lets it be);
-    `costs`, the objective at every accepted iterate, the start first; `iterations`; `status`, "converged" or what
+    `costs`, the objective at every accepted iterate, the start first (with a solver of optimistix's own, at the end
+    only); `iterations`; `status`, "converged" or what
     happened instead, and `reason`, in a sentence; `hyperparameter` λ and `rule`, how it was chosen; `inversion` and
     `coefficients`, the problem solved and its solution, for warm starts and uncertainty.
     """
@@ -93,12 +94,23 @@ def reconstruct(
     rule in `jeit.inverse.RULES`, used on the problem linearised at the background. `mask`: True for the channels to
     use. `solver`: a name in `METHODS`, or any least-squares solver of optimistix. Raises `ValueError` for arguments
     that do not fit; a solver that fails says so in the result's `status`.
+
+    Tarantola, Inverse Problem Theory (SIAM 2005), ch. 3; Nocedal and Wright, Numerical Optimization (2006), ch. 10.
     """
     measured, used = _check_frame(model, voltages, mask)
     link = Log() if link is None else link
     prior = Noser() if prior is None else prior
+    if not isinstance(prior, AbstractPrior) or not isinstance(link, AbstractLink):
+        raise ValueError(f"prior and link must be of those in jeit.inverse, such as Noser() and Log(), not {prior!r}.")
+    if jnp.iscomplexobj(background) or jnp.shape(background) not in ((), (model.mesh.num_cells,)):
+        raise ValueError(
+            f"background must be one real conductivity, or one for each of the {model.mesh.num_cells} cells; it is "
+            f"{jnp.asarray(background).dtype} of shape {jnp.shape(background)}."
+        )
     background = jnp.broadcast_to(jnp.asarray(background, float), (model.mesh.num_cells,))
     reference = link.estimate(background)
+    if noise is not None and jnp.shape(noise) not in ((), measured.shape):
+        raise ValueError(f"noise has shape {jnp.shape(noise)}; give one number, or one for each channel.")
     deviation = relative_noise(measured, used) if noise is None else np.broadcast_to(np.asarray(noise), measured.shape)
     if not (np.isfinite(deviation)[used] & (np.asarray(deviation)[used] > 0)).all():
         raise ValueError("noise must be positive and finite for every channel in use.")
@@ -115,12 +127,19 @@ def reconstruct(
     inversion = Inversion(model, link, reference, basis.scaled(1 / chosen), measured, weight)
     coefficients = jnp.zeros(basis.num_coefficients)
     if start is not None:
+        if start.coefficients.shape != coefficients.shape:
+            raise ValueError(
+                f"start has {start.coefficients.size} coefficients and this problem {coefficients.size}; give a "
+                "reconstruction of the same model and prior."
+            )
         coefficients = start.coefficients * (chosen / start.hyperparameter)
     return _solve(inversion, coefficients, _solver(solver, max_steps), max_steps, chosen, rule)
 
 
 def _check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
     """Voltages as an array with zeros for what is left out, and which channels are used; raises `ValueError`."""
+    if jnp.iscomplexobj(voltages):
+        raise ValueError("voltages are complex; reconstruct from their real part or magnitude.")
     shape = (model.protocol.num_measurements,)
     measured = jnp.asarray(voltages, float)
     used = np.ones(shape, bool) if mask is None else np.asarray(mask)

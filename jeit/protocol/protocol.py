@@ -169,14 +169,21 @@ class Protocol(eqx.Module):
         return (
             self.num_electrodes == other.num_electrodes
             and self.num_measurements == other.num_measurements
-            and all(
-                np.allclose(np.asarray(mine)[self_index], np.asarray(theirs)[other_index], rtol=1e-9, atol=0)
-                for mine, self_index, theirs, other_index in (
-                    (self.drive, self.drive_index, other.drive, other.drive_index),
-                    (self.measurement, self.measurement_index, other.measurement, other.measurement_index),
+            and bool(np.allclose(_rows(self.drive, self.drive_index), _rows(other.drive, other.drive_index), 1e-9, 0))
+            and bool(
+                np.allclose(
+                    _rows(self.measurement, self.measurement_index),
+                    _rows(other.measurement, other.measurement_index),
+                    rtol=1e-9,
+                    atol=0,
                 )
             )
         )
+
+
+def _rows(patterns, index) -> np.ndarray:
+    """The pattern of each channel, in NumPy: JAX would compile the gather."""
+    return np.asarray(patterns)[np.asarray(index)]
 
 
 def shares_electrode(drive: Float[np.ndarray, "S L"], measurement: Float[np.ndarray, "K L"]) -> Bool[np.ndarray, "S K"]:
