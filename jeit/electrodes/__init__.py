@@ -21,6 +21,7 @@ from jeit.electrodes.electrodes import is_concrete as is_concrete
 from jeit.electrodes.facets import FacetElectrodes as FacetElectrodes
 from jeit.electrodes.facets import electrodes_from_nodes as electrodes_from_nodes
 from jeit.electrodes.facets import plates as plates
+from jeit.electrodes.integrated import IntegratedElectrodes as IntegratedElectrodes
 from jeit.electrodes.layouts import grid as grid
 from jeit.electrodes.layouts import perimeter as perimeter
 from jeit.electrodes.layouts import quasi_uniform as quasi_uniform

@@ -1,9 +1,17 @@
-"""Inverse problems: calibration, priors, linear images, and the rules that choose a hyperparameter."""
+"""Inverse problems: calibration, priors, linear and nonlinear images, and the rules that choose a hyperparameter."""
 
 from jeit.inverse.back_projection import back_projection as back_projection
+from jeit.inverse.bases import Regions as Regions
+from jeit.inverse.bases import pixels as pixels
 from jeit.inverse.calibrate import Calibration as Calibration
 from jeit.inverse.calibrate import calibrate as calibrate
+from jeit.inverse.choice import Choice as Choice
+from jeit.inverse.comparison import choose_hyperparameter as choose_hyperparameter
+from jeit.inverse.comparison import compare_rules as compare_rules
+from jeit.inverse.greit import greit as greit
 from jeit.inverse.hyperparameter import RULES as RULES
+from jeit.inverse.imager import Imager as Imager
+from jeit.inverse.inversion import Inversion as Inversion
 from jeit.inverse.linear import LinearReconstruction as LinearReconstruction
 from jeit.inverse.linear import one_step as one_step
 from jeit.inverse.links import AbstractLink as AbstractLink
@@ -11,11 +19,20 @@ from jeit.inverse.links import Bounded as Bounded
 from jeit.inverse.links import Linear as Linear
 from jeit.inverse.links import Log as Log
 from jeit.inverse.noise import relative_noise as relative_noise
+from jeit.inverse.posterior import Posterior as Posterior
+from jeit.inverse.posterior import posterior as posterior
 from jeit.inverse.priors import AbstractPrior as AbstractPrior
 from jeit.inverse.priors import Gaussian as Gaussian
 from jeit.inverse.priors import Laplace as Laplace
 from jeit.inverse.priors import Noser as Noser
 from jeit.inverse.priors import Tikhonov as Tikhonov
-from jeit.inverse.reconstruct import Inversion as Inversion
 from jeit.inverse.reconstruct import Reconstruction as Reconstruction
 from jeit.inverse.reconstruct import reconstruct as reconstruct
+from jeit.inverse.stream import FrameImage as FrameImage
+from jeit.inverse.stream import stream as stream
+from jeit.inverse.total_variation import TotalVariation as TotalVariation
+from jeit.inverse.unknowns import AbstractUnknown as AbstractUnknown
+from jeit.inverse.unknowns import Background as Background
+from jeit.inverse.unknowns import ContactImpedance as ContactImpedance
+from jeit.inverse.unknowns import ElectrodePosition as ElectrodePosition
+from jeit.inverse.unknowns import Scale as Scale

@@ -8,8 +8,12 @@ import abc
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
+
+from jeit.mesh import Mesh, centroids, measures
 
 
 class AbstractBasis(eqx.Module):
@@ -31,6 +35,14 @@ class AbstractBasis(eqx.Module):
     @abc.abstractmethod
     def scaled(self, factor) -> "AbstractBasis":
         """S times a number."""
+
+    def single(self) -> "AbstractBasis":
+        """For products in single precision, where they cost most of the time; the same basis where they do not."""
+        return self
+
+    @abc.abstractmethod
+    def pooled(self, regions: "Regions") -> "AbstractBasis":
+        """S with the rows of every region replaced by their mean, and by zero where the image is held fixed."""
 
 
 class DiagonalBasis(AbstractBasis):
@@ -55,9 +67,16 @@ class DiagonalBasis(AbstractBasis):
         """Deviations times a number."""
         return DiagonalBasis(self.deviation * factor)
 
+    def pooled(self, regions):
+        """One coefficient for each region, with the mean variance of its cells."""
+        return RegionBasis(regions, jnp.sqrt(regions.mean(self.deviation**2)))
+
 
 class DenseBasis(AbstractBasis):
-    """Shapes in the columns of a matrix: S = `shapes` (m, n)."""
+    """Shapes in the columns of a matrix: S = `shapes` (m, n).
+
+    Products are taken in the shapes' own precision: single, where a millionth does not matter and time does.
+    """
 
     shapes: Float[Array, "m n"]
 
@@ -68,15 +87,103 @@ class DenseBasis(AbstractBasis):
 
     def expand(self, coefficients):
         """The shapes, weighted and added."""
-        return self.shapes @ coefficients
+        return (self.shapes @ coefficients.astype(self.shapes.dtype)).astype(coefficients.dtype)
 
     def restrict(self, rows):
         """Rows times the matrix."""
-        return rows @ self.shapes
+        return (rows.astype(self.shapes.dtype) @ self.shapes).astype(rows.dtype)
 
     def scaled(self, factor):
         """The matrix times a number."""
         return DenseBasis(self.shapes * factor)
+
+    def single(self):
+        """Shapes in single precision."""
+        return DenseBasis(self.shapes.astype(jnp.float32))
+
+    def pooled(self, regions):
+        """Shapes that are constant in every region."""
+        return DenseBasis(regions.spread(regions.mean(self.shapes)))
+
+
+class Regions(eqx.Module):
+    """Cells that share one value: pixels of a grid, the layers of a skin; and cells whose value is known.
+
+    **Fields**: `label` (m,), the region of every cell from 0, or -1 where the image is held at the background;
+    `measure` (m,), the cells' area (3-D: volume); `number` of regions.
+    """
+
+    label: Int[Array, " m"]
+    measure: Float[Array, " m"]
+    number: int = eqx.field(static=True)
+
+    @classmethod
+    def create(cls, mesh: Mesh, label) -> "Regions":
+        """Raises `ValueError` for labels that are not one integer for each cell, from -1 with none left out."""
+        label = np.asarray(label)
+        number = int(label.max(initial=-1)) + 1
+        if label.shape != (mesh.num_cells,) or label.dtype.kind not in "iu" or number == 0 or label.min() < -1:
+            raise ValueError(
+                f"regions must be integers, one for each of the {mesh.num_cells} cells: from 0, or -1 for cells held "
+                f"at the background; got {label.dtype} of shape {label.shape}."
+            )
+        empty = np.setdiff1d(np.arange(number), label)
+        if empty.size:
+            raise ValueError(f"regions: no cell has the label {empty[0]}; use all from 0 to {number - 1}.")
+        return cls(jnp.asarray(label), measures(mesh), number)
+
+    def total(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
+        """Sums of cells' values over every region."""
+        return jax.ops.segment_sum(values, jnp.where(self.label < 0, self.number, self.label), self.number + 1)[:-1]
+
+    def mean(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
+        """Means over every region, weighted by area."""
+        weight = self.measure / self.spread(self.total(self.measure))
+        return self.total(values * jnp.expand_dims(jnp.where(self.label < 0, 0, weight), range(1, values.ndim)))
+
+    def spread(self, values: Float[Array, "p *k"]) -> Float[Array, "m *k"]:
+        """Regions' values at the cells, zero where the image is held fixed."""
+        fixed = jnp.expand_dims(self.label < 0, range(1, values.ndim))
+        return jnp.where(fixed, 0, values[jnp.maximum(self.label, 0)])
+
+
+def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
+    """Labels for `Regions`: the pixels of a grid (rows, columns) over the mesh that hold the centre of any cell."""
+    if len(shape) != 2 or min(shape) < 1:
+        raise ValueError(f"shape must be (rows, columns), both positive; it is {shape}.")
+    centre = np.asarray(centroids(mesh))[:, :2]
+    low, high = centre.min(axis=0), centre.max(axis=0)
+    place = np.minimum((centre - low) / (high - low) * [shape[1], shape[0]], np.array([shape[1], shape[0]]) - 1)
+    number = place.astype(int) @ [1, shape[1]]
+    return np.unique(number, return_inverse=True)[1]
+
+
+class RegionBasis(AbstractBasis):
+    """One value for each region: S c is `deviation` (p,) times c, at all cells of the region."""
+
+    regions: Regions
+    deviation: Float[Array, " p"]
+
+    @property
+    def num_coefficients(self) -> int:
+        """One for each region."""
+        return self.regions.number
+
+    def expand(self, coefficients):
+        """Each region's value at its cells."""
+        return self.regions.spread(self.deviation * coefficients)
+
+    def restrict(self, rows):
+        """Columns added up over every region."""
+        return self.regions.total(rows.T).T * self.deviation
+
+    def scaled(self, factor):
+        """Deviations times a number."""
+        return RegionBasis(self.regions, self.deviation * factor)
+
+    def pooled(self, regions):
+        """Not done twice. Raises `ValueError`."""
+        raise ValueError("This basis has regions already.")
 
 
 def pivoted_cholesky(

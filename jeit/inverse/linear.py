@@ -8,8 +8,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit.forward import ForwardModel
-from jeit.inverse.hyperparameter import Spectrum, choose
-from jeit.inverse.priors import AbstractPrior, Noser
+from jeit.inverse.choice import Choice
+from jeit.inverse.hyperparameter import Rule, choose
+from jeit.inverse.linearisation import Linearisation
+from jeit.inverse.priors import AbstractPrior
 from jeit.mesh import Mesh
 
 
@@ -21,7 +23,8 @@ class LinearReconstruction(eqx.Module):
 
     **Fields**: `mesh`; `first`, `second` (K,) the channels added to make each combined channel, and `ratio` (K,) the
     weight of the second; `weights` (K, m), siemens per metre (2-D: siemens) per volt of combined channel;
-    `hyperparameter` λ, and `rule`, how it was chosen; `method`, the name of the reconstruction.
+    `hyperparameter` λ, and `rule`, how it was chosen; `method`, the name of the reconstruction; `choice`, all that was
+    looked at in choosing λ and whether to trust it (`choice.note`), where λ came from `jeit.inverse.RULES` or a number.
     """
 
     mesh: Mesh
@@ -33,9 +36,10 @@ class LinearReconstruction(eqx.Module):
     num_measurements: int = eqx.field(static=True)
     rule: str = eqx.field(static=True)
     method: str = eqx.field(static=True)
+    choice: Choice | None = None
 
     @classmethod
-    def create(cls, model: ForwardModel, matrix, hyperparameter, rule: str, method: str):
+    def create(cls, model: ForwardModel, matrix, hyperparameter, rule: str, method: str, choice: Choice | None = None):
         """From a full reconstruction matrix (m, M)."""
         matrix = np.asarray(matrix)
         first, second, ratio = _combine(model, matrix)
@@ -52,6 +56,7 @@ class LinearReconstruction(eqx.Module):
             matrix.shape[1],
             rule,
             method,
+            choice,
         )
 
     @property
@@ -106,17 +111,12 @@ def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.nd
     )
 
 
-@jax.jit
-def _whitened(jacobian, channels, root_weight):
-    return root_weight[:, None] * jacobian[channels]
-
-
 def one_step(
     model: ForwardModel,
     conductivity,
     *,
     prior: AbstractPrior | None = None,
-    hyperparameter: float | str = "noise-figure",
+    hyperparameter: float | str | Rule | Choice = "noise-figure",
     difference: Float[Array, " M"] | None = None,
     noise: Float[Array, " M"] | float = 1.0,
     mask: Bool[Array, " M"] | None = None,
@@ -124,33 +124,17 @@ def one_step(
     """Reconstruction matrix of the linearised problem, R = (JᵀWJ + λ²Q)⁻¹JᵀW, at a background conductivity.
 
     `prior`: `Noser()` unless given. `hyperparameter`: λ itself, or the rule that chooses it, one of
-    `jeit.inverse.RULES`; rules that look at data need `difference`, the change of voltages (M,) to be imaged.
+    `jeit.inverse.RULES`, or a `Choice`; rules that look at data need `difference`, the change of voltages (M,) to be
+    imaged.
     `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
     other). `mask`: True for the channels to use. Raises `ValueError` for arguments that do not fit.
 
     Computed in data space: R = ΓJᵀ(JΓJᵀ + λ²W⁻¹)⁻¹ with Γ = Q⁻¹; see `jeit.inverse.priors` for a Q with a null
     space. Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179.
     """
-    prior = Noser() if prior is None else prior
-    if not isinstance(prior, AbstractPrior):
-        raise ValueError(f"prior must be one of those in jeit.inverse, such as Noser(), not {prior!r}.")
-    if jnp.iscomplexobj(conductivity):
-        raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
-    num_channels = model.protocol.num_measurements
-    used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
-    if used.shape != (num_channels,) or not used.any():
-        raise ValueError(f"mask must be ({num_channels},) booleans with at least one True: one for each channel.")
-    deviation = np.broadcast_to(np.asarray(noise, float), (num_channels,))
-    if not (np.isfinite(deviation[used]) & (deviation[used] > 0)).all():
-        raise ValueError("noise must be positive and finite for every channel in use.")
-    channels = np.flatnonzero(used)
-    root_weight = 1 / deviation[used]
-    whitened = _whitened(model.jacobian(conductivity), channels, root_weight)
-    data = None if difference is None else jnp.asarray(root_weight * np.asarray(difference)[used])
-    product = prior.covariance_product(model.mesh, whitened)
-    null_space = prior.null_space(model.mesh)
-    spectrum = Spectrum.create(whitened, product, null_space)
-    chosen, rule = choose(spectrum, hyperparameter, data)
-    matrix = np.zeros((model.mesh.num_cells, num_channels))
-    matrix[:, channels] = np.asarray(spectrum.reconstruction(chosen)) * root_weight
-    return LinearReconstruction.create(model, matrix, chosen, rule, f"one-step, {type(prior).__name__} prior")
+    linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
+    data = None if difference is None else linear.whiten(difference)
+    choice = choose(linear.spectrum, hyperparameter, data, model.mesh)
+    matrix = linear.matrix(choice.hyperparameter)
+    method = f"one-step, {type(linear.prior).__name__} prior"
+    return LinearReconstruction.create(model, matrix, choice.hyperparameter, choice.rule, method, choice)

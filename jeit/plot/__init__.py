@@ -4,10 +4,13 @@ Every function takes `ax`, makes a figure of its own where none is given, and re
 in metres in the arguments and in millimetres in the pictures.
 """
 
+from jeit.plot.choice import plot_choice as plot_choice
 from jeit.plot.electrodes import draw_electrodes as draw_electrodes
+from jeit.plot.figures_of_merit import plot_figures_of_merit as plot_figures_of_merit
 from jeit.plot.image import plot_image as plot_image
 from jeit.plot.image import plot_raster as plot_raster
 from jeit.plot.inclusions import draw_inclusions as draw_inclusions
+from jeit.plot.labels import draw_labels as draw_labels
 from jeit.plot.mesh import plot_mesh as plot_mesh
 from jeit.plot.sensitivity import plot_sensitivity as plot_sensitivity
 from jeit.plot.voltages import plot_voltages as plot_voltages

@@ -39,6 +39,7 @@ def plot_image(
     colour_map: str | None = None,
     title: str | None = None,
     height: float | None = None,
+    colour_bar: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw `values` on the mesh: per cell (m,), flat; or per node (n,), shaded.
@@ -47,7 +48,8 @@ def plot_image(
     sequential one. `electrodes` are drawn at their place and width, and numbered. `unit`: of the values, "S" on 2-D
     meshes and "S/m" on 3-D ones unless given; the colour bar finds the prefix. `quantity`: what the colour bar says.
     `inclusions`: marked. `limit`: value at the end of the colour bar, in `unit`. `height`: z in metres of the
-    slice through a 3-D mesh, half way up unless given. Raises `ValueError` for values of another shape.
+    slice through a 3-D mesh, half way up unless given. `colour_bar`: whether to draw one. Raises `ValueError` for
+    values of another shape.
     """
     image = np.asarray(values)
     if image.shape not in ((mesh.num_cells,), (mesh.num_points,)):
@@ -81,7 +83,8 @@ def plot_image(
         style = {"shading": "flat", "edgecolors": "face", "linewidth": 0.5} if per_cell else {"shading": "gouraud"}
         drawn = ax.tripcolor(triangles, factor * image, **style, **colours)
     _dress(ax, mesh, electrodes, inclusions, extent, title)
-    draw_colour_bar(ax, drawn, label, signed=difference)
+    if colour_bar:
+        draw_colour_bar(ax, drawn, label, signed=difference)
     return ax
 
 

@@ -9,18 +9,20 @@ from .batching import in_turn
 from .choose import choose_solver
 from .conjugate_gradient import ConjugateGradient
 from .dense_cholesky import symmetric_inverse
+from .descent import Descent
 from .multifrontal import Factor, factorise, half_solve, quadratic_form, solve
 from .operator import SparseSymmetric
 from .pattern import SparsityPattern
 from .plan import FactorisationPlan, analyse
-from .ridge import RidgeSolver, ridge_step
+from .ridge import Model, ridge_model, ridge_step, solve_definite
 from .sparse_cholesky import SparseCholesky
 
 __all__ = [
     "ConjugateGradient",
+    "Descent",
     "Factor",
     "FactorisationPlan",
-    "RidgeSolver",
+    "Model",
     "SparseCholesky",
     "SparseSymmetric",
     "SparsityPattern",
@@ -30,7 +32,9 @@ __all__ = [
     "half_solve",
     "in_turn",
     "quadratic_form",
+    "ridge_model",
     "ridge_step",
     "solve",
+    "solve_definite",
     "symmetric_inverse",
 ]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Inexact
 
 _BLOCK = 8
-_LARGEST_IN_HALVES = 64
+_LARGEST_IN_HALVES = 128
 _LARGE_BATCH = 16
 
 

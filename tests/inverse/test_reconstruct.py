@@ -81,11 +81,11 @@ def test_derivative_of_the_misfit(model, frame):
     point = 0.01 * jax.random.normal(jax.random.key(1), (inversion.basis.num_coefficients,))
     direction = jax.random.normal(jax.random.key(2), point.shape)
     misfit, jacobian = inversion.linearise(point)
-    np.testing.assert_allclose(misfit, inversion.misfit(point), rtol=1e-9, atol=1e-9)
-    _, tangent = jax.jvp(inversion.misfit, (point,), (direction,))
+    np.testing.assert_allclose(misfit, inversion.residual(point), rtol=1e-9, atol=1e-9)
+    _, tangent = jax.jvp(inversion.residual, (point,), (direction,))
     np.testing.assert_allclose(jacobian @ direction, tangent, rtol=1e-8, atol=1e-8 * np.abs(tangent).max())
     steps = 1e-2 * 0.5 ** np.arange(4)
-    errors = [np.linalg.norm(inversion.misfit(point + h * direction) - misfit - h * tangent) for h in steps]
+    errors = [np.linalg.norm(inversion.residual(point + h * direction) - misfit - h * tangent) for h in steps]
     assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2, abs=0.1)
 
 

@@ -1,0 +1,151 @@
+"""Figures of merit of an image of one small round target: amplitude, position, resolution, shape, ringing.
+
+Adler et al., "GREIT: a unified approach to 2D linear EIT reconstruction of lung images", Physiol. Meas. 30 (2009)
+S35-S55.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+# The target is what is brighter than this share of the brightest pixel.
+_LEVEL = 0.25
+
+
+class FiguresOfMerit(eqx.Module):
+    """The GREIT figures of merit of images x, each of one target; every field has one value per target.
+
+    The quarter-amplitude set Q holds the pixels with x ≥ max(x) / 4, where x is positive for a change of the target's
+    sign. C is the disc round the centre of gravity of Q with the area of Q.
+
+    **Fields**
+
+    - `amplitude_response`: AR = ∫x / (area of the target · its change), dimensionless. 1 if the image holds as much
+      change as there was; best the same everywhere.
+    - `position_error`: PE = r_t - r_q, metres, the distance from the centre of the body of the target less that of the
+      centre of gravity of Q. **Positive when the target is imaged nearer to the centre than it is.** Best zero. A
+      displacement round the centre does not show.
+    - `resolution`: RES = √(area of Q / area of the body), dimensionless: the radius of Q over `body_radius`. Best
+      small, and the same everywhere.
+    - `shape_deformation`: SD = (area of Q outside C) / (area of Q), dimensionless, 0 for a round image.
+    - `ringing`: RNG = -(∫x over the pixels outside C where x < 0) / (∫x over C), dimensionless and not negative: the
+      change of the wrong sign round the target, relative to the target. Best zero.
+    - `distance`: r_t, metres.
+    - `body_radius`: metres, of the disc with the body's area; lengths divided by it compare between bodies.
+
+    All but the first and the last two are NaN for an image without a pixel of the target's sign, where Q is empty; and
+    ringing is infinite where C holds no net change of that sign.
+    """
+
+    amplitude_response: Float[Array, "*targets"]
+    position_error: Float[Array, "*targets"]
+    resolution: Float[Array, "*targets"]
+    shape_deformation: Float[Array, "*targets"]
+    ringing: Float[Array, "*targets"]
+    distance: Float[Array, "*targets"]
+    body_radius: Float[Array, "*targets"]
+
+
+def figures_of_merit(
+    raster: Float[Array, "*targets rows columns"],
+    extent: tuple[float, float, float, float],
+    position: Float[Array, "*targets 2"],
+    *,
+    area: Float[Array, "*targets"] | float,
+    change: Float[Array, "*targets"] | float = 1.0,
+) -> FiguresOfMerit:
+    """The GREIT figures of merit of one image (rows, columns), or of many (T, rows, columns), one target in each.
+
+    `raster`: change of conductivity on pixels, NaN outside the body, as `Raster.sample` gives it, row 0 at the top;
+    `extent` of the raster, (x_min, x_max, y_min, y_max) in metres. `position` (2,) or (T, 2): centre of each target,
+    metres. `area` of the target, m², and `change`, its change of conductivity, siemens (negative for a resistive
+    target): one number, or (T,). The centre of the body is the centre of gravity of its pixels, whatever its outline.
+
+    Works under jit and vmap. Raises `ValueError` for arguments whose shapes or values do not fit.
+    """
+    if jnp.iscomplexobj(raster) or jnp.iscomplexobj(change):
+        raise ValueError("raster and change must be real; judge the real and the imaginary part of an image apart.")
+    raster, position, area, change = (jnp.asarray(values, float) for values in (raster, position, area, change))
+    _check(raster, extent, position, area, change)
+    return _figures_of_merit(raster, jnp.asarray(extent, float), position, area, change)
+
+
+@jax.jit
+def _figures_of_merit(raster, extent, position, area, change):
+    if raster.ndim == 2:
+        return _of_one(raster, extent, position, area, change)
+    area, change = jnp.broadcast_to(area, len(raster)), jnp.broadcast_to(change, len(raster))
+    return jax.vmap(_of_one, in_axes=(0, None, 0, 0, 0))(raster, extent, position, area, change)
+
+
+def _of_one(raster, extent, position, area, change):
+    rows, columns = raster.shape
+    x_min, x_max, y_min, y_max = extent
+    x = x_min + (jnp.arange(columns) + 0.5) * (x_max - x_min) / columns
+    y = (y_max - (jnp.arange(rows) + 0.5) * (y_max - y_min) / rows)[:, None]
+    pixel = (x_max - x_min) * (y_max - y_min) / raster.size
+    body = jnp.isfinite(raster)
+    value = jnp.where(body, raster, 0) / change  # positive is the target's sign
+    highest = value.max()
+    seen = body & (value >= _LEVEL * highest) & (highest > 0)
+    centre, size = _gravity(body, x, y), jnp.sum(body)
+    middle, size_seen = _gravity(seen, x, y), jnp.sum(seen)
+    circle = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 <= size_seen * pixel / jnp.pi
+    distance = jnp.hypot(*(position - centre))
+    right = jnp.sum(jnp.where(circle, value, 0))
+    wrong = -jnp.sum(jnp.where(circle, 0, jnp.minimum(value, 0)))
+    return FiguresOfMerit(
+        amplitude_response=jnp.sum(value) * pixel / area,
+        position_error=distance - jnp.hypot(*(middle - centre)),
+        resolution=jnp.sqrt(jnp.where(size_seen > 0, size_seen, jnp.nan) / size),
+        shape_deformation=jnp.sum(seen & ~circle) / size_seen,
+        ringing=jnp.where(size_seen > 0, jnp.where(right > 0, wrong / right, jnp.inf), jnp.nan),
+        distance=distance,
+        body_radius=jnp.sqrt(size * pixel / jnp.pi),
+    )
+
+
+def _gravity(inside, x, y):
+    """Centre of gravity of a set of pixels; NaN for none."""
+    size = jnp.sum(inside)
+    return jnp.stack([jnp.sum(jnp.where(inside, x, 0)), jnp.sum(jnp.where(inside, y, 0))]) / size
+
+
+def _check(raster, extent, position, area, change) -> None:
+    if raster.ndim not in (2, 3):
+        raise ValueError(
+            f"raster has shape {raster.shape}; give one image (rows, columns) or many (targets, rows, columns)."
+        )
+    targets = raster.shape[:-2]
+    if position.shape != (*targets, 2):
+        raise ValueError(
+            f"position has shape {position.shape}; give (x, y) in metres of the target of each image, {(*targets, 2)}."
+        )
+    for name, values in (("area", area), ("change", change)):
+        if values.shape not in ((), targets):
+            raise ValueError(f"{name} has shape {values.shape}; give one number, or one for each of the images.")
+    x_min, x_max, y_min, y_max = extent
+    if isinstance(raster, Tracer) or any(isinstance(value, Tracer) for value in (position, area, change, *extent)):
+        return
+    if not (x_max > x_min and y_max > y_min):
+        raise ValueError(f"extent {tuple(extent)} must be (x_min, x_max, y_min, y_max) in metres; see Raster.extent.")
+    if not (np.isfinite(area) & (np.asarray(area) > 0)).all():
+        raise ValueError("area of the targets must be positive, in square metres.")
+    if not (np.isfinite(change) & (np.asarray(change) != 0)).all():
+        raise ValueError("change of the targets must be finite and not zero, in siemens; negative where it falls.")
+    body = np.isfinite(raster)
+    if not body.any(axis=(-2, -1)).all():
+        raise ValueError("raster: an image has no finite pixel; give a change of conductivity wherever the body is.")
+    if body.ndim == 3 and (body != body[0]).any():
+        raise ValueError(
+            "raster: the images are NaN at different pixels; NaN stands for outside the body, which is the same for "
+            "all. Was a reconstruction given NaN voltages?"
+        )
+    place = np.asarray(position)
+    if not ((place >= [x_min, y_min]) & (place <= [x_max, y_max])).all():
+        raise ValueError(
+            f"position: a target lies outside the raster, whose extent is {tuple(extent)}; are both in metres?"
+        )

@@ -1,0 +1,72 @@
+"""What choosing a hyperparameter leaves behind: the λ chosen, how, and the curve that was looked at."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+
+class Choice(eqx.Module):
+    """A hyperparameter λ and how it came about: chosen by a rule on a grid of candidates, or given.
+
+    **Fields**: `hyperparameter` λ; `candidates` (K,), the λ looked at, ascending; `criterion` (K,), what the rule looks
+    at, at every candidate (see the rules in `jeit.inverse.hyperparameter`); `residual` (K,), ‖w (v - Jx)‖ in
+    standard deviations, and `penalty` (K,), √(xᵀQx), of the image x at every candidate: the coordinates of the L-curve;
+    `rule`, its name, or "given"; `target`, the value that the criterion is to have, None where the rule takes
+    its least or greatest; `edge`, "smallest" or "largest" where λ is that candidate, so that the rule's own would lie
+    beyond it, else empty.
+
+    A given number is its own only candidate, and its curves are empty, (0,); so are residual and penalty without data.
+    """
+
+    hyperparameter: Float[Array, ""]
+    candidates: Float[Array, " K"]
+    criterion: Float[Array, " _"]
+    residual: Float[Array, " _"]
+    penalty: Float[Array, " _"]
+    rule: str = eqx.field(static=True)
+    target: float | None = eqx.field(static=True, default=None)
+    edge: str = eqx.field(static=True, default="")
+
+    @classmethod
+    def given(cls, hyperparameter) -> "Choice":
+        """Of a number that was given."""
+        value = jnp.asarray(hyperparameter, float)
+        nothing = jnp.zeros(0)
+        return cls(value, value[None], nothing, nothing, nothing, "given")
+
+    @classmethod
+    def among(
+        cls, rule: str, candidates, index: int, criterion, curves, *, target: float | None = None, between=None
+    ) -> "Choice":
+        """Of candidate number `index`; or of `between`, a λ found between that candidate and the next.
+
+        `curves`: residual and penalty at every candidate, or empty ones.
+        """
+        edge = {0: "smallest", len(candidates) - 1: "largest"}.get(int(index), "") if between is None else ""
+        value = candidates[index] if between is None else between
+        residual, penalty = (jnp.asarray(curve, float) for curve in curves)
+        return cls(
+            jnp.asarray(value), jnp.asarray(candidates), jnp.asarray(criterion), residual, penalty, rule, target, edge
+        )
+
+    @property
+    def note(self) -> str:
+        """What speaks against the choice, in a sentence; empty when nothing does."""
+        if not self.edge:
+            return ""
+        return (
+            f"The rule '{self.rule}' ran to the {self.edge} hyperparameter of its grid without finding what it looks "
+            "for: the choice is not to be trusted."
+        )
+
+    def read(self, curve: ArrayLike, hyperparameter=None) -> float:
+        """Value of one of its curves (K,) at any λ, the one chosen unless given; interpolated between candidates.
+
+        Raises `ValueError` for a curve that it does not have.
+        """
+        if np.size(curve) == 0:
+            raise ValueError(f"curve: this choice ('{self.rule}') has none; let a rule choose, and give it data.")
+        value = self.hyperparameter if hyperparameter is None else hyperparameter
+        return float(np.interp(np.log(value), np.log(np.asarray(self.candidates)), np.asarray(curve)))

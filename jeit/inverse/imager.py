@@ -1,0 +1,198 @@
+"""`Imager`: frame after frame to images, linear or by Gauss-Newton from the last image, in a bounded time.
+
+All that does not depend on the frame is worked out once: which channels are independent, the prior's basis, the
+hyperparameter, the electrodes' integrals, the linear image's matrix. The prior's shapes are kept in single precision,
+which alters an image by a millionth. Array shapes never change, so nothing is compiled again: a channel that is masked
+keeps its place, and gets a variance so large that it does not count.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from jeit.electrodes import IntegratedElectrodes
+from jeit.forward import ForwardModel
+from jeit.inverse.channels import IndependentChannels, Weighing
+from jeit.inverse.inversion import Inversion
+from jeit.inverse.links import AbstractLink, Log
+from jeit.inverse.priors import AbstractPrior, Gaussian
+from jeit.inverse.reconstruct import check_background, check_frame, check_noise, pose
+from jeit.inverse.total_variation import TotalVariation
+from jeit_solvers import Descent
+
+METHODS = ("linear", "gauss-newton", "levenberg-marquardt")
+# Standard deviation of a masked channel over the largest noise.
+_BLIND = 1e5
+
+
+class Estimate(eqx.Module):
+    """What an `Imager` makes of one frame by iteration.
+
+    **Fields**: `conductivity` (m,), S/m (2-D: S); `coefficients`, where the next frame may start; `misfit`, root mean
+    square in standard deviations of the channels used; `iterations`; `converged`, whether one more step would have
+    changed the objective by less than the tolerance.
+    """
+
+    conductivity: Float[Array, " m"]
+    coefficients: Float[Array, " n"]
+    misfit: Float[Array, ""]
+    iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+class LinearMap(eqx.Module):
+    """The linear image: σ = `level` (m,) + `matrix` (m, r) · `estimator` (r, M) · voltages (M,), S/m (2-D: S)."""
+
+    matrix: Float[Array, "m r"]
+    estimator: Float[Array, "r M"]
+    level: Float[Array, " m"]
+
+
+class Imager(eqx.Module):
+    """Images frames of one sensor. Made by `Imager.create`; `stream` feeds it, and looks after bad frames.
+
+    **Fields**: `channels`, which of them are independent; `inversion`, the problem, whose data are exchanged for every
+    frame's; `noise` (M,), volts; `mask` (M,), the channels used at all; `expected` (M,) volts, an undisturbed frame;
+    `offset` (M,) volts, added to frames: what the model's voltages have and the sensor's have not; `touching` (L, M),
+    channels that drive or read each electrode; `method`; `steps`, the most iterations a frame is given; `rtol`, the
+    relative change of the objective that ends them sooner.
+    """
+
+    channels: IndependentChannels
+    inversion: Inversion
+    noise: Float[Array, " M"]
+    mask: Bool[Array, " M"]
+    expected: Float[Array, " M"]
+    offset: Float[Array, " M"]
+    touching: Bool[Array, "L M"]
+    method: str = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    rtol: float = eqx.field(static=True)
+
+    @classmethod
+    def create(
+        cls,
+        model: ForwardModel,
+        background,
+        *,
+        reference: Float[Array, " M"] | None = None,
+        method: str = "gauss-newton",
+        prior: AbstractPrior | TotalVariation | None = None,
+        link: AbstractLink | None = None,
+        hyperparameter: float | str | None = None,
+        noise: Float[Array, " M"] | float | None = None,
+        mask: Bool[Array, " M"] | None = None,
+        steps: int = 4,
+        rtol: float = 1e-3,
+    ) -> "Imager":
+        """`background`: conductivity of the undisturbed body, S/m (2-D: S). `reference` (M,): a measured frame of it,
+        volts; frames are then imaged by their difference to it, which frees images from what the model gets wrong.
+        `prior`: `Gaussian` of a twelfth of the body's width unless given. The rest as in `reconstruct`. Raises
+        `ValueError` for arguments that do not fit.
+        """
+        if method not in METHODS:
+            raise ValueError(f"method: there is no '{method}'; give one of {', '.join(METHODS)}.")
+        if steps < 1 or not rtol >= 0:
+            raise ValueError(f"steps must be at least 1 and rtol not negative; they are {steps} and {rtol}.")
+        if method == "linear" and isinstance(prior, TotalVariation):
+            raise ValueError("prior: total variation is not linear; take method 'gauss-newton', or another prior.")
+        background = check_background(model, background)
+        predicted = model.voltages(background)
+        frame, used = check_frame(model, predicted if reference is None else reference, mask)
+        deviation = check_noise(noise, frame, used)
+        width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
+        channels = IndependentChannels.create(model.protocol)
+        weighing = channels.weigh(_blinded(deviation, used))
+        small = model.with_protocol(model.protocol.subset(np.asarray(channels.index)))
+        inversion, _ = pose(
+            eqx.tree_at(lambda m: m.electrodes, small, IntegratedElectrodes(model.electrodes, model.mesh)),
+            weighing.combine(predicted),
+            Log() if link is None else link,
+            background,
+            Gaussian(0.085 * width) if prior is None else prior,
+            hyperparameter,
+        )
+        return cls(
+            channels=channels,
+            inversion=eqx.tree_at(lambda i: i.basis, inversion, inversion.basis.single()),
+            noise=deviation,
+            mask=jnp.asarray(used),
+            expected=jnp.where(used, frame, predicted),
+            offset=jnp.where(used, predicted - frame, 0),
+            touching=jnp.asarray([model.protocol.channels_touching(k) for k in range(model.protocol.num_electrodes)]),
+            method=method,
+            steps=int(steps),
+            rtol=float(rtol),
+        )
+
+    @property
+    def start(self) -> Float[Array, " n"]:
+        """Coefficients of the background: where the first frame starts."""
+        return jnp.zeros(self.inversion.num_coefficients)
+
+    def weighing(self, usable: Bool[Array, " M"]) -> Weighing:
+        """How to combine frames of which only the `usable` channels count."""
+        return self.channels.weigh(_blinded(self.noise, self.mask & usable))
+
+    def linear_map(self, weighing: Weighing) -> LinearMap:
+        """The linear image for frames combined in this way: one Gauss-Newton step from the background."""
+        return _linear_map(self.inversion, weighing, self.offset)
+
+    def estimate(self, frame: Float[Array, " M"], weighing: Weighing, start: Float[Array, " n"]) -> Estimate:
+        """The image of a frame (M,) in volts, by at most `steps` iterations from coefficients `start`.
+
+        Channels that do not count must hold some finite voltage, best that of the last frame.
+        """
+        return _estimate(self, frame, weighing, start)
+
+
+def _blinded(noise, used) -> Float[Array, " M"]:
+    return jnp.where(used, noise, _BLIND * jnp.max(jnp.where(used, noise, 0)))
+
+
+@jax.jit
+def _linear_map(inversion: Inversion, weighing: Weighing, offset) -> LinearMap:
+    start = jnp.zeros(inversion.num_coefficients)
+    posed = eqx.tree_at(lambda i: i.data, inversion, weighing.combine(offset))
+    residual, jacobian = posed.linearise(start)
+    lower = jnp.linalg.cholesky(jacobian @ jacobian.T + posed.data.covariance)
+    gain = jax.scipy.linalg.cho_solve((lower, True), jacobian)
+    matrix = jax.vmap(inversion.basis.expand)(gain).T * inversion.link.slope(inversion.reference)[:, None]
+    level = inversion.link.conductivity(inversion.reference) - matrix @ residual
+    return LinearMap(matrix * weighing.weight, weighing.estimator, level)
+
+
+def _residual(coefficients, inversion: Inversion):
+    return inversion.residual(coefficients), coefficients
+
+
+def _expand(coefficients, inversion: Inversion):
+    return inversion.quadratic_model(coefficients)
+
+
+@jax.jit
+def _estimate(imager: Imager, frame, weighing: Weighing, start) -> Estimate:
+    data = weighing.combine(frame + imager.offset)
+    inversion = eqx.tree_at(lambda i: i.data, imager.inversion, data)
+    damping = 1.0 if imager.method == "levenberg-marquardt" else 0.0
+    solver = Descent(rtol=imager.rtol, damping=damping, history=imager.steps)
+    solution = optx.least_squares(
+        _residual, solver, start, inversion, options={"expand": _expand}, max_steps=imager.steps, throw=False
+    )
+    # The last step leads to a point not looked at yet. It takes voltages, but no Jacobian, to see if it is better.
+    state = solution.state
+    cost = inversion.cost(state.trial)
+    better = cost < state.cost
+    coefficients = jnp.where(better, state.trial, solution.value)
+    penalty = inversion.penalty.cost(coefficients)
+    squares = 2 * (jnp.where(better, cost, state.cost) - penalty) + data.rest
+    return Estimate(
+        conductivity=inversion.conductivity(coefficients),
+        coefficients=coefficients,
+        misfit=jnp.sqrt(squares / jnp.sum(weighing.noise <= jnp.max(imager.noise))),
+        iterations=state.num_accepted - 1 + better,
+        converged=state.converged,
+    )

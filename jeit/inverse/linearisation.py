@@ -1,0 +1,84 @@
+"""The linearised problem of difference imaging: checked, whitened and decomposed, ready for any hyperparameter."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from jeit.forward import ForwardModel
+from jeit.inverse.priors import AbstractPrior, Noser
+from jeit.inverse.spectrum import Spectrum
+
+
+class Linearisation(eqx.Module):
+    """v = J x at a background conductivity, divided by the noise, for the channels in use.
+
+    **Fields**: `spectrum` of the problem; `prior`; `channels` (K,) in use; `root_weight` (K,), 1 / their standard
+    deviation; `num_channels` M of the protocol.
+    """
+
+    spectrum: Spectrum
+    prior: AbstractPrior
+    channels: Int[np.ndarray, " K"]
+    root_weight: Float[np.ndarray, " K"]
+    num_channels: int = eqx.field(static=True)
+
+    @classmethod
+    def create(
+        cls,
+        model: ForwardModel,
+        conductivity,
+        *,
+        prior: AbstractPrior | None = None,
+        noise: Float[Array, " M"] | float = 1.0,
+        mask: Bool[Array, " M"] | None = None,
+    ) -> "Linearisation":
+        """At `conductivity`; arguments as in `one_step`. Raises `ValueError` for those that do not fit."""
+        prior = Noser() if prior is None else prior
+        if not isinstance(prior, AbstractPrior):
+            raise ValueError(f"prior must be one of those in jeit.inverse, such as Noser(), not {prior!r}.")
+        if jnp.iscomplexobj(conductivity):
+            raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
+        num_channels = model.protocol.num_measurements
+        used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
+        if used.shape != (num_channels,) or not used.any():
+            raise ValueError(f"mask must be ({num_channels},) booleans with at least one True: one for each channel.")
+        if np.shape(noise) not in ((), (num_channels,)):
+            raise ValueError(f"noise has shape {np.shape(noise)}; give one number, or one for each channel.")
+        deviation = np.broadcast_to(np.asarray(noise, float), (num_channels,))
+        if not (np.isfinite(deviation[used]) & (deviation[used] > 0)).all():
+            raise ValueError("noise must be positive and finite for every channel in use.")
+        channels = np.flatnonzero(used)
+        root_weight = 1 / deviation[used]
+        whitened = _whitened(model.jacobian(conductivity), channels, root_weight)
+        product = prior.covariance_product(model.mesh, whitened)
+        spectrum = Spectrum.create(whitened, product, prior.null_space(model.mesh))
+        return cls(spectrum, prior, channels, root_weight, num_channels)
+
+    def whiten(self, difference: ArrayLike) -> Float[Array, " K"]:
+        """A change of voltages (M,) in standard deviations, channels in use only.
+
+        Raises `ValueError` for another number of channels, and for NaN in channels in use.
+        """
+        if np.shape(difference) != (self.num_channels,) or np.iscomplexobj(difference):
+            raise ValueError(
+                f"difference has shape {np.shape(difference)}; give {self.num_channels} real voltages, one frame."
+            )
+        data = self.root_weight * np.asarray(difference)[self.channels]
+        if not np.isfinite(data).all():
+            raise ValueError("difference has NaN or infinite voltages in channels in use; mask them.")
+        return jnp.asarray(data)
+
+    def matrix(self, hyperparameter) -> Float[np.ndarray, "m M"]:
+        """The reconstruction matrix: change of conductivity per volt, zero for channels not in use."""
+        whitened = np.asarray(self.spectrum.reconstruction(hyperparameter))
+        matrix = np.zeros((whitened.shape[0], self.num_channels))
+        matrix[:, self.channels] = whitened * self.root_weight
+        return matrix
+
+
+@jax.jit
+def _whitened(jacobian, channels, root_weight):
+    return root_weight[:, None] * jacobian[channels]

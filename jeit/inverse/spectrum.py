@@ -1,0 +1,110 @@
+"""The linear problem in the space of the data, decomposed once, from which images for any hyperparameter are cheap.
+
+With whitened Jacobian J (M, m), prior covariance Γ and null space N, the reconstruction is
+
+    R_λ = ΓJᵀP_λ + N(BᵀK⁻¹B)⁻¹BᵀK⁻¹,   K = JΓJᵀ + λ²I,   B = JN,   P_λ = Q(QᵀKQ)⁻¹Qᵀ,
+
+Q being an orthonormal basis of the complement of B (all of the data where N is empty). With QᵀJΓJᵀQ = UΛUᵀ the
+residual is v - JR_λv = λ²P_λv = QU diag(λ²/(Λ + λ²)) UᵀQᵀv, whatever λ, and
+
+    R_λ = (I - NB⁺J) ΓJᵀQU diag(1/(Λ + λ²)) UᵀQᵀ + NB⁺.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+
+class Spectrum(eqx.Module):
+    """Eigendecomposition of the data-space system, from which the reconstruction for any λ is cheap.
+
+    **Fields**: `basis` (M, r) = QU; `eigenvalues` Λ (r,); `jacobian` J (M, m); `product` ΓJᵀ (m, M); `null_space` N
+    (m, p); `seen` B = JN (M, p); `outer` JΓJᵀ (M, M).
+    """
+
+    basis: Float[Array, "M r"]
+    eigenvalues: Float[Array, " r"]
+    jacobian: Float[Array, "M m"]
+    product: Float[Array, "m M"]
+    null_space: Float[Array, "m p"]
+    seen: Float[Array, "M p"]
+    outer: Float[Array, "M M"]
+
+    @classmethod
+    def create(cls, jacobian: Float[Array, "M m"], product: Float[Array, "m M"], null_space: Float[Array, "m p"]):
+        """From the whitened Jacobian, its product with the prior covariance, and the prior's null space."""
+        basis, eigenvalues = _decompose(jacobian, product, null_space)
+        return cls(basis, eigenvalues, jacobian, product, null_space, jacobian @ null_space, jacobian @ product)
+
+    def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
+        """R_λ (m, M) for whitened data."""
+        return _reconstruction(self, hyperparameter)
+
+    def image(self, data: ArrayLike, hyperparameter) -> Float[Array, " m"]:
+        """R_λ v (m,) for whitened data v, without R_λ."""
+        return _image(self, data, hyperparameter)
+
+    def filter(self, hyperparameter) -> Float[Array, " r"]:
+        """λ²/(Λ + λ²): the share of each data component that stays in the residual."""
+        return hyperparameter**2 / (self.eigenvalues + hyperparameter**2)
+
+    def modes(self) -> Float[Array, "m r"]:
+        """(I - NB⁺J) ΓJᵀQU: what each data component adds to the image, but for the factor 1/(Λ + λ²)."""
+        return _modes(self)
+
+    def candidates(self, size: int = 200) -> Float[np.ndarray, " K"]:
+        """Candidate λ (K,), logarithmic over the range where any component is neither kept nor dropped."""
+        largest = np.sqrt(np.asarray(self.eigenvalues).max())
+        return largest * np.logspace(-6, 1, size)
+
+    def curves(self, data: ArrayLike | None, candidates: Float[np.ndarray, " K"]) -> tuple[np.ndarray, np.ndarray]:
+        """Residual ‖v - JR_λv‖ and penalty √(xᵀQx), each (K,), of every candidate λ; empty ones without data."""
+        if data is None:
+            return np.zeros(0), np.zeros(0)
+        eigenvalues = np.asarray(self.eigenvalues)
+        components = np.asarray(self.basis).T @ np.asarray(data)
+        damped = (components / (eigenvalues + candidates[:, None] ** 2)) ** 2
+        return candidates**2 * np.sqrt(damped.sum(axis=1)), np.sqrt(damped @ eigenvalues)
+
+
+@jax.jit
+def _decompose(jacobian, product, null_space):
+    outer = jacobian @ product
+    full, _ = jnp.linalg.qr(jacobian @ null_space, mode="complete")
+    complement = full[:, null_space.shape[1] :]
+    projected = complement.T @ outer @ complement
+    eigenvalues, vectors = jnp.linalg.eigh((projected + projected.T) / 2)
+    return complement @ vectors, jnp.maximum(eigenvalues, 0)
+
+
+@jax.jit
+def _reconstruction(spectrum: Spectrum, hyperparameter):
+    basis = spectrum.basis
+    inverse = (basis / (spectrum.eigenvalues + hyperparameter**2)) @ basis.T
+    matrix = spectrum.product @ inverse
+    if spectrum.null_space.shape[1] == 0:
+        return matrix
+    # What the penalised part leaves of the data, seen by the null space: its least-squares coefficients.
+    coefficients = jnp.linalg.pinv(spectrum.seen)
+    rest = jnp.eye(basis.shape[0]) - spectrum.outer @ inverse
+    return matrix + spectrum.null_space @ (coefficients @ rest)
+
+
+@jax.jit
+def _image(spectrum: Spectrum, data, hyperparameter):
+    inner = spectrum.basis @ ((spectrum.basis.T @ data) / (spectrum.eigenvalues + hyperparameter**2))
+    image = spectrum.product @ inner
+    if spectrum.null_space.shape[1] == 0:
+        return image
+    return image + spectrum.null_space @ (jnp.linalg.pinv(spectrum.seen) @ (data - spectrum.outer @ inner))
+
+
+@jax.jit
+def _modes(spectrum: Spectrum):
+    modes = spectrum.product @ spectrum.basis
+    if spectrum.null_space.shape[1] == 0:
+        return modes
+    return modes - spectrum.null_space @ (jnp.linalg.pinv(spectrum.seen) @ (spectrum.outer @ spectrum.basis))

@@ -1,0 +1,124 @@
+"""Unknowns: what else is not known exactly, and may be estimated along with the conductivity.
+
+Each has a prior of zero mean and the given standard deviation, and changes the forward model or the image; what it does
+to the voltages is found by automatic differentiation.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jeit.electrodes import BoundaryElectrodes, SheetDiscs, contact_impedance, with_contact_impedance
+from jeit.forward import ForwardModel
+from jeit.mesh import Mesh
+
+
+class AbstractUnknown(eqx.Module):
+    """Base of all unknowns: `size` values with prior standard deviation `deviation`."""
+
+    deviation: eqx.AbstractVar[Float[Array, " k"]]
+
+    @property
+    def size(self) -> int:
+        """Number of values k."""
+        return self.deviation.shape[0]
+
+    @abc.abstractmethod
+    def apply(
+        self, model: ForwardModel, estimate: Float[Array, " m"], values: Float[Array, " k"]
+    ) -> tuple[ForwardModel, Float[Array, " m"]]:
+        """The model and the image (on the link's scale) with these values in place of zeros."""
+
+
+class ContactImpedance(AbstractUnknown):
+    """The logarithm of every electrode's contact impedance over the model's."""
+
+    deviation: Float[Array, " L"]
+
+    def __init__(self, model: ForwardModel, deviation: float = 0.5):
+        """`deviation`: of the logarithm. Raises `ValueError` for point electrodes, which have no contact."""
+        if model.electrodes.is_point:
+            raise ValueError("ContactImpedance: point electrodes have no contact impedance to estimate.")
+        self.deviation = _deviation("ContactImpedance", deviation, model.electrodes.num_electrodes)
+
+    def apply(self, model, estimate, values):
+        """z exp(values)."""
+        impedance = contact_impedance(model.electrodes) * jnp.exp(values)
+        return model.with_electrodes(with_contact_impedance(model.electrodes, impedance)), estimate
+
+
+class ElectrodePosition(AbstractUnknown):
+    """How far electrodes are from where the model has them, metres: along the boundary, or anywhere in a sheet.
+
+    One value for each electrode on the boundary, counter-clockwise; for discs in a sheet two, x of all and then y.
+    """
+
+    deviation: Float[Array, " k"]
+    direction: Float[Array, "L a 2"]
+
+    def __init__(self, model: ForwardModel, deviation: float):
+        """`deviation`: metres. Raises `ValueError` for electrodes of other kinds."""
+        electrodes = model.electrodes
+        if isinstance(electrodes, BoundaryElectrodes):
+            direction = _tangents(model.mesh, np.asarray(electrodes.position))[:, None]
+        elif isinstance(electrodes, SheetDiscs):
+            direction = np.broadcast_to(np.eye(2), (electrodes.num_electrodes, 2, 2))
+        else:
+            raise ValueError(
+                f"ElectrodePosition is for BoundaryElectrodes and SheetDiscs; these are {type(electrodes).__name__}."
+            )
+        self.direction = jnp.asarray(direction)
+        self.deviation = _deviation("ElectrodePosition", deviation, direction.shape[0] * direction.shape[1])
+
+    def apply(self, model, estimate, values):
+        """Positions moved."""
+        shift = jnp.einsum("al,lad->ld", values.reshape(self.direction.shape[1], -1), self.direction)
+        electrodes: Any = model.electrodes
+        moved = eqx.tree_at(lambda e: e.position, electrodes, electrodes.position + shift)
+        return model.with_electrodes(moved), estimate
+
+
+class Background(AbstractUnknown):
+    """One value added to the image everywhere, on the link's scale (Log: the logarithm of a factor)."""
+
+    deviation: Float[Array, " 1"]
+
+    def __init__(self, deviation: float = 0.5):
+        self.deviation = _deviation("Background", deviation, 1)
+
+    def apply(self, model, estimate, values):
+        """The image plus a constant."""
+        return model, estimate + values[0]
+
+
+class Scale(AbstractUnknown):
+    """The logarithm of a factor on all voltages: a current or a gain that is not known."""
+
+    deviation: Float[Array, " 1"]
+
+    def __init__(self, deviation: float = 0.1):
+        self.deviation = _deviation("Scale", deviation, 1)
+
+    def apply(self, model, estimate, values):
+        """Currents times exp(value)."""
+        drive = model.protocol.drive * jnp.exp(values[0])
+        return eqx.tree_at(lambda m: m.protocol.drive, model, drive), estimate
+
+
+def _deviation(name: str, deviation, size: int) -> Float[Array, " k"]:
+    values = np.asarray(deviation, float)
+    if values.shape not in ((), (size,)) or not (np.isfinite(values) & (values > 0)).all():
+        raise ValueError(f"{name}: deviation must be positive, one number or {size}; it is {deviation}.")
+    return jnp.broadcast_to(jnp.asarray(values), (size,))
+
+
+def _tangents(mesh: Mesh, position: np.ndarray) -> np.ndarray:
+    """Direction of the boundary, counter-clockwise, (L, 2), where the electrodes lie."""
+    start, end = np.asarray(mesh.points)[np.asarray(mesh.facets)].swapaxes(0, 1)
+    nearest = np.argmin(np.linalg.norm(position[:, None] - (start + end) / 2, axis=-1), axis=1)
+    along = (end - start)[nearest]
+    return along / np.linalg.norm(along, axis=1, keepdims=True)

@@ -1,0 +1,119 @@
+"""Reconstruction between bounds, by jaxopt."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes, ring
+from jeit.forward import ForwardModel
+from jeit.inverse import Bounded, Gaussian, Laplace, Linear, Log, Noser, TotalVariation, reconstruct
+from jeit.mesh import Disk, centroids
+from jeit.protocol import adjacent
+
+
+def disk(num_points):
+    electrodes = BoundaryElectrodes(ring(0.1, 16), 0.012, 1e-3)
+    return ForwardModel(Disk(0.1).mesh(num_points=num_points), electrodes, adjacent(16))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return disk(300)
+
+
+@pytest.fixture(scope="module")
+def frame(model):
+    inside = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.03, 0.02], axis=1) < 0.03
+    voltages = model.voltages(jnp.where(inside, 3.0, 1.0))
+    return voltages, 1e-2 * jnp.abs(voltages)
+
+
+@pytest.mark.parametrize(
+    ("solver", "prior"),
+    [
+        ("projected-gradient", Noser()),
+        pytest.param("l-bfgs-b", Noser(), marks=pytest.mark.slow),
+        pytest.param("l-bfgs-b", Laplace(), marks=pytest.mark.slow),
+        pytest.param("projected-gradient", Laplace(), marks=pytest.mark.slow),
+        pytest.param("l-bfgs-b", TotalVariation(), marks=pytest.mark.slow),
+        pytest.param("projected-gradient", TotalVariation(), marks=pytest.mark.slow),
+    ],
+)
+def test_bounds_hold_and_are_reached(solver, prior, model, frame):
+    options = {} if isinstance(prior, TotalVariation) else {"hyperparameter": 1.0}
+    result = reconstruct(
+        model, frame[0], 1.0, prior=prior, noise=frame[1], bounds=(0.95, 1.6), solver=solver, **options
+    )
+    values = np.asarray(result.conductivity)
+    assert values.min() >= 0.95 * (1 - 1e-12)
+    assert values.max() <= 1.6 * (1 + 1e-12)
+    assert values.max() == pytest.approx(1.6, rel=1e-6)
+    assert result.costs[-1] < result.costs[0]
+
+
+@pytest.mark.parametrize("solver", ["l-bfgs-b", "projected-gradient"])
+def test_bounds_that_are_not_reached_change_nothing(solver, model, frame):
+    options = {"prior": Laplace(), "noise": frame[1], "hyperparameter": 3.0}
+    free = reconstruct(model, frame[0], 1.0, **options)
+    result = reconstruct(model, frame[0], 1.0, solver=solver, bounds=(1e-3, 1e3), max_steps=2000, **options)
+    assert result.status == "converged"
+    assert float(result.costs[-1]) < 1.01 * float(free.costs[-1])
+    np.testing.assert_allclose(result.conductivity, free.conductivity, rtol=0.05)
+
+
+def test_bounds_alone_choose_a_bounded_solver_and_too_few_steps_are_said_so(model, frame):
+    options = {"prior": Noser(), "noise": frame[1], "hyperparameter": 1.0, "bounds": (0.9, 2.0)}
+    result = reconstruct(model, frame[0], 1.0, max_steps=2, **options)
+    assert float(result.conductivity.max()) <= 2.0 * (1 + 1e-12)
+    assert result.status == "not converged"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"bounds": (2.0, 1.0)}, "lower < upper"),
+        ({"bounds": (1.5, 2.0)}, "background must lie"),
+        ({"bounds": (0.5, 2.0), "link": Bounded(0.1, 4.0)}, "bounded already"),
+        ({"bounds": (0.5, 2.0), "solver": "levenberg-marquardt"}, "knows none"),
+        ({"bounds": (0.5, 2.0), "prior": Gaussian(0.02)}, "no usable precision"),
+        ({"bounds": (0.5, 2.0), "regions": True}, "every cell"),
+    ],
+)
+def test_bad_input(change, message, model, frame):
+    if "regions" in change:
+        change = {**change, "regions": np.zeros(model.mesh.num_cells, int)}
+    arguments = {"prior": Noser(), "noise": frame[1], **change}
+    with pytest.raises(ValueError, match=message):
+        reconstruct(model, frame[0], 1.0, **arguments)
+
+
+@pytest.mark.parametrize("link", [Linear(), Log()], ids=["linear", "log"])
+def test_lower_bound_of_zero(link, model, frame):
+    """Zero is outside what the logarithm can take, and no bound at all there."""
+    result = reconstruct(
+        model, frame[0], 1.0, prior=Noser(), noise=frame[1], bounds=(0.0, 1.5), link=link, hyperparameter=1.0,
+        solver="projected-gradient", max_steps=200,
+    )  # fmt: skip
+    assert (np.asarray(result.conductivity) > 0).all()
+
+
+def test_gradient_of_the_cost(model, frame):
+    """What the bounded solvers descend along, by finite differences."""
+    result = reconstruct(
+        model,
+        frame[0],
+        1.0,
+        prior=Noser(),
+        noise=frame[1],
+        hyperparameter=1.0,
+        bounds=(0.5, 4.0),
+        max_steps=3,
+        solver="projected-gradient",
+    )
+    direction = jax.random.normal(jax.random.key(0), result.coefficients.shape)
+    cost = result.inversion.cost
+    _, slope = jax.jvp(cost, (result.coefficients,), (direction,))
+    step = 1e-5
+    ahead, behind = (cost(result.coefficients + sign * step * direction) for sign in (1, -1))
+    assert float(slope) == pytest.approx(float(ahead - behind) / (2 * step), rel=1e-5)

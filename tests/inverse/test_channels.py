@@ -1,0 +1,59 @@
+"""Independent channels: what they rebuild, how many they are, and that least squares on them lose nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.inverse.channels import IndependentChannels
+from jeit.protocol import adjacent, opposite, reference_electrode, two_terminal
+
+PROTOCOLS = {
+    "adjacent": (adjacent(16), 104),
+    "with driven electrodes": (adjacent(8, driven_electrodes=True), 28),
+    "opposite": (opposite(8), None),
+    "against a centre": (reference_electrode(17, reference=16), None),
+    "two-terminal": (two_terminal(8), 28),
+}
+
+
+def voltages_of_a_body(protocol, key=0):
+    """Of a random symmetric transfer impedance whose rows sum to zero: all that any body can be."""
+    root = jax.random.normal(jax.random.key(key), (protocol.num_electrodes, protocol.num_electrodes))
+    root = root - root.mean(axis=0)
+    impedance = root.T @ root
+    impedance = impedance - impedance.mean(axis=0) - impedance.mean(axis=1)[:, None] + impedance.mean()
+    return jnp.einsum("ki,ij,kj->k", protocol.channel_measurement, impedance, protocol.channel_drive)
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_all_channels_from_the_independent_ones(name):
+    protocol, number = PROTOCOLS[name]
+    channels = IndependentChannels.create(protocol)
+    voltages = voltages_of_a_body(protocol)
+    np.testing.assert_allclose(channels.combination @ voltages[channels.index], voltages, rtol=1e-9, atol=1e-12)
+    rank = np.linalg.matrix_rank(np.stack([voltages_of_a_body(protocol, k) for k in range(200)]), rtol=1e-9)
+    assert len(channels.index) == rank
+    assert number is None or rank == number
+
+
+@pytest.mark.parametrize("name", PROTOCOLS)
+def test_least_squares_on_them_is_that_on_all(name):
+    """½‖(Tu - y)/noise‖² = ½(u - ŷ)ᵀG(u - ŷ) + rest/2 at any u."""
+    protocol, _ = PROTOCOLS[name]
+    channels = IndependentChannels.create(protocol)
+    noise = 0.1 + jax.random.uniform(jax.random.key(2), (protocol.num_measurements,))
+    measured = voltages_of_a_body(protocol) + noise * jax.random.normal(jax.random.key(3), noise.shape)
+    data = channels.weigh(noise).combine(measured)
+    trial = voltages_of_a_body(protocol, 5)
+    away = data.weight * (trial[channels.index] - data.voltages)
+    expected = jnp.sum(((trial - measured) / noise) ** 2)
+    np.testing.assert_allclose(away @ data.precision @ away + data.rest, expected, rtol=1e-9)
+    np.testing.assert_allclose(jnp.sum(data.whiten(away) ** 2) + data.rest, expected, rtol=1e-9)
+    np.testing.assert_allclose(data.covariance @ data.precision, np.eye(len(away)), atol=1e-7)
+
+
+def test_reciprocal_channels_are_uncorrelated():
+    channels = IndependentChannels.create(adjacent(16))
+    precision = channels.weigh(jnp.ones(208)).precision
+    np.testing.assert_allclose(precision, np.eye(104), atol=1e-12)

@@ -1,0 +1,82 @@
+"""One table: every solver on every problem, with the most iterations each may take."""
+
+import functools
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes, SheetDiscs, perimeter, ring, ring_and_centre
+from jeit.forward import ForwardModel
+from jeit.inverse import Laplace, reconstruct
+from jeit.mesh import Disk, Rectangle, centroids
+from jeit.protocol import adjacent, opposite, reference_electrode
+
+
+def disk(num_points):
+    electrodes = BoundaryElectrodes(ring(0.1, 16), 0.012, 1e-3)
+    return ForwardModel(Disk(0.1).mesh(num_points=num_points), electrodes, adjacent(16))
+
+
+def sheet(num_points):
+    outline = Rectangle(0.3, 0.2)
+    electrodes = BoundaryElectrodes(perimeter(outline, 12), 0.012, 1e-3)
+    return ForwardModel(outline.mesh(num_points=num_points), electrodes, opposite(12))
+
+
+def centred(num_points):
+    electrodes = SheetDiscs(ring_and_centre(0.08, 9), 0.008, 1e-3)
+    return ForwardModel(Disk(0.1).mesh(num_points=num_points), electrodes, reference_electrode(9, reference=8))
+
+
+# Body, where the inclusion is and how large (metres), and its conductivity in a body of one.
+PROBLEMS = {
+    "conductive in a disk": (disk, (0.03, 0.02), 0.025, 3.0),
+    "resistive in a disk": (disk, (-0.04, 0.0), 0.03, 0.3),
+    "resistive in a sheet": (sheet, (0.05, 0.02), 0.035, 0.4),
+    "conductive among discs": (centred, (0.02, 0.04), 0.025, 2.5),
+}
+# Solver, and the most iterations it may take on any of the problems: recorded, with a fifth to spare.
+SOLVERS = {
+    "gauss-newton": ("gauss-newton", 8),
+    "levenberg-marquardt": ("levenberg-marquardt", 12),
+    "optimistix LM": (optx.LevenbergMarquardt(1e-6, 1e-6), 40),
+    "optimistix Dogleg": (optx.Dogleg(1e-6, 1e-6), 40),
+    "l-bfgs-b": ("l-bfgs-b", 700),
+    "projected-gradient": ("projected-gradient", 1000),
+}
+
+
+@functools.cache
+def pose(name):
+    """Model, voltages of a finer one, options, and the best reconstruction there is."""
+    make, centre, radius, conductivity = PROBLEMS[name]
+    fine, model = make(2000), make(300)
+    inside = np.linalg.norm(np.asarray(centroids(fine.mesh)) - centre, axis=1) < radius
+    voltages = fine.voltages(jnp.where(inside, conductivity, 1.0))
+    noise = 1e-2 * jnp.abs(voltages) + 1e-3 * jnp.abs(voltages).max()
+    options = {"prior": Laplace(), "noise": noise, "hyperparameter": 3.0}
+    best = reconstruct(model, voltages, 1.0, rtol=1e-12, **options)
+    return model, voltages, options, best
+
+
+def cases():
+    """All pairs; the quick suite takes every solver once, and Gauss-Newton on everything."""
+    for problem, solver in itertools.product(PROBLEMS, SOLVERS):
+        quick = solver == "gauss-newton" or problem == "conductive in a disk"
+        yield pytest.param(problem, solver, marks=() if quick else pytest.mark.slow)
+
+
+@pytest.mark.parametrize(("problem", "name"), list(cases()))
+def test_every_solver_on_every_problem(problem, name):
+    model, voltages, options, best = pose(problem)
+    solver, limit = SOLVERS[name]
+    result = reconstruct(model, voltages, 1.0, solver=solver, max_steps=1000, **options)
+    assert result.status == "converged", result.reason
+    assert result.iterations <= limit
+    assert float(result.costs[-1]) <= 1.005 * float(best.costs[-1])
+    assert float(result.costs[-1]) < float(result.costs[0])
+    largest = np.abs(np.log(best.conductivity)).max()
+    assert np.abs(np.log(result.conductivity / best.conductivity)).max() < 0.1 * largest

@@ -1,0 +1,192 @@
+"""Streams: what comes out frame by frame, and what happens to frames that are no good."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes, ring
+from jeit.forward import ForwardModel
+from jeit.inverse import Gaussian, Imager, TotalVariation, reconstruct, stream
+from jeit.mesh import Disk, centroids
+from jeit.protocol import adjacent
+
+RADIUS = 0.1
+PLACES = [(0.05 * np.cos(angle), 0.05 * np.sin(angle)) for angle in np.linspace(0, 0.5, 6)]
+
+
+@pytest.fixture(scope="module")
+def model():
+    electrodes = BoundaryElectrodes(ring(RADIUS, 16), 0.012, 1e-3)
+    return ForwardModel(Disk(RADIUS).mesh(num_points=300), electrodes, adjacent(16))
+
+
+def near(model, place):
+    return np.linalg.norm(np.asarray(centroids(model.mesh)) - place, axis=1) < 0.03
+
+
+@pytest.fixture(scope="module")
+def frames(model):
+    """A press that moves: half the conductivity within 30 mm, with noise of 0.1 %."""
+    key = jax.random.key(0)
+    rest = model.voltages(1.0)
+    clean = jnp.stack([model.voltages(jnp.where(near(model, place), 0.5, 1.0)) for place in PLACES])
+    return np.asarray(clean + 1e-3 * jnp.abs(rest) * jax.random.normal(key, clean.shape))
+
+
+@pytest.fixture(scope="module")
+def options(model):
+    noise = 2e-3 * jnp.abs(model.voltages(1.0))
+    return {"prior": Gaussian(0.02), "noise": noise, "hyperparameter": 3.0}
+
+
+@pytest.fixture(scope="module")
+def imager(model, options):
+    return Imager.create(model, 1.0, steps=4, **options)
+
+
+@pytest.fixture(scope="module")
+def linear(model, options):
+    return Imager.create(model, 1.0, method="linear", **options)
+
+
+def darkest(model, conductivity):
+    return np.asarray(centroids(model.mesh))[np.argmin(conductivity)]
+
+
+def test_images_follow_the_press(model, frames, imager, linear):
+    for one in (imager, linear):
+        images = list(stream(one, iter(frames)))
+        assert [image.number for image in images] == list(range(len(PLACES)))
+        assert {image.status for image in images} == {"imaged"}
+        for image, place in zip(images, PLACES, strict=True):
+            assert np.linalg.norm(darkest(model, image.conductivity) - place) < 0.03
+            assert image.conductivity.min() < 0.7
+            assert 0 < image.latency < 5
+
+
+def test_iterations_end_where_reconstruct_does(model, frames, imager, options):
+    image = list(stream(imager, frames))[-1]
+    best = reconstruct(model, frames[-1], 1.0, rtol=1e-10, **options)
+    error = np.linalg.norm(image.conductivity - best.conductivity) / np.linalg.norm(best.conductivity - 1)
+    assert error < 0.02
+    assert image.misfit == pytest.approx(float(best.misfit), rel=0.02)
+    assert 1 <= image.iterations <= 4
+
+
+def test_the_linear_image_is_the_first_step_of_gauss_newton(model, frames, linear, options):
+    image = next(iter(stream(linear, frames)))
+    first = Imager.create(model, 1.0, steps=1, **options)
+    step = first.estimate(jnp.asarray(frames[0]), first.weighing(first.mask), first.start)
+    change = image.conductivity - 1
+    np.testing.assert_allclose(change, np.log(step.conductivity), atol=1e-4 * np.abs(change).max())
+
+
+def test_a_reference_takes_the_model_error_out(model, frames, options):
+    gain = 1 + 0.05 * np.cos(np.arange(208))
+    imager = Imager.create(model, 1.0, reference=gain * np.asarray(model.voltages(1.0)), **options)
+    image = next(iter(stream(imager, frames * gain)))
+    assert np.linalg.norm(darkest(model, image.conductivity) - PLACES[0]) < 0.03
+
+
+def test_total_variation_streams_too(model, frames, options):
+    imager = Imager.create(model, 1.0, prior=TotalVariation(), noise=options["noise"], hyperparameter=30.0, steps=6)
+    image = list(stream(imager, frames[:2]))[-1]
+    assert image.imaged
+    assert np.linalg.norm(darkest(model, image.conductivity) - PLACES[1]) < 0.03
+
+
+def spoil(frames, fault):
+    """Frames with one of them spoilt; the third."""
+    spoilt = [frame.copy() for frame in frames]
+    spoilt[2] = fault(spoilt[2])
+    return spoilt
+
+
+def dead_electrode(frame, electrode=4):
+    frame[np.asarray(adjacent(16).channels_touching(electrode))] = 0
+    return frame
+
+
+def with_nan(frame):
+    frame[[3, 60, 61]] = np.nan
+    return frame
+
+
+def half_gone(frame):
+    frame[:110] = np.inf
+    return frame
+
+
+REFUSED = {
+    "all zero": (np.zeros_like, "current source"),
+    "all NaN": (lambda frame: frame * np.nan, "Only 0 of 208"),
+    "half gone": (half_gone, "can be used"),
+    "another protocol": (lambda frame: frame[:96], "208 real voltages"),
+    "another sensor": (lambda frame: 3 * frame, "another sensor"),
+    "shuffled": (lambda frame: np.roll(frame, 5), "another sensor"),
+    "complex": (lambda frame: frame + 1j, "real voltages"),
+    "text": (lambda frame: "no frame at all", "real voltages"),
+    "nothing": (lambda frame: None, "real voltages"),
+}
+
+
+@pytest.mark.parametrize("method", ["gauss-newton", "linear"])
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_bad_frame_is_refused_and_the_stream_goes_on(name, method, frames, imager, linear):
+    fault, message = REFUSED[name]
+    one = imager if method == "gauss-newton" else linear
+    images = list(stream(one, spoil(frames, fault)))
+    assert images[2].status == "refused"
+    assert message in images[2].reason
+    assert images[2].conductivity is None
+    assert not images[2].imaged
+    clean = list(stream(one, frames))
+    np.testing.assert_allclose(images[-1].conductivity, clean[-1].conductivity, rtol=0.02)
+
+
+@pytest.mark.parametrize("method", ["gauss-newton", "linear"])
+@pytest.mark.parametrize(
+    ("fault", "left", "message"), [(with_nan, 205, "3 channels"), (dead_electrode, 156, "Electrode 5")]
+)
+def test_channels_without_a_reading_are_left_out(fault, left, message, method, model, frames, imager, linear):
+    one = imager if method == "gauss-newton" else linear
+    images = list(stream(one, spoil(frames, fault)))
+    assert images[2].status == "partial"
+    assert message in images[2].reason
+    assert images[2].usable.sum() == left
+    assert np.linalg.norm(darkest(model, images[2].conductivity) - PLACES[2]) < 0.04
+    assert images[3].status == "imaged"
+
+
+def test_a_masked_channel_is_not_looked_at(frames, imager):
+    """Whatever it reads: the same image to rounding."""
+    first, second = frames[0].copy(), frames[0].copy()
+    first[7], second[7] = np.nan, -np.inf
+    images = [next(iter(stream(imager, [frame]))).conductivity for frame in (first, second)]
+    np.testing.assert_array_equal(*images)
+
+
+def test_a_frame_that_needs_more_steps_is_said_so(model, frames, options):
+    imager = Imager.create(model, 1.0, steps=1, rtol=1e-9, **options)
+    image = next(iter(stream(imager, frames)))
+    assert image.status == "not converged"
+    assert image.imaged
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"method": "magic"}, "gauss-newton"),
+        ({"steps": 0}, "steps"),
+        ({"rtol": -1.0}, "rtol"),
+        ({"method": "linear", "prior": TotalVariation()}, "not linear"),
+        ({"reference": np.ones(96)}, "208 channels"),
+        ({"reference": np.zeros(208)}, "current source"),
+        ({"mask": np.zeros(208, bool)}, "every channel"),
+        ({"noise": 0.0}, "noise"),
+    ],
+)
+def test_bad_input(change, message, model, options):
+    with pytest.raises(ValueError, match=message):
+        Imager.create(model, 1.0, **{**options, **change})

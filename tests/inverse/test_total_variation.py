@@ -1,0 +1,128 @@
+"""Total variation: its quadratic model, and that it finds a block's edge where smooth priors blur it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes, perimeter
+from jeit.forward import ForwardModel
+from jeit.inverse import Gaussian, Laplace, Noser, Tikhonov, TotalVariation, posterior, reconstruct
+from jeit.inverse.channels import IndependentChannels
+from jeit.mesh import Rectangle, box, centroids, measures
+from jeit.protocol import adjacent
+
+OUTLINE = Rectangle(0.2, 0.16)
+BLOCK = np.array([0.05, 0.04])  # half its size, centred
+
+
+def model_of(num_points):
+    electrodes = BoundaryElectrodes(perimeter(OUTLINE, 16), 0.015, 1e-3)
+    return ForwardModel(OUTLINE.mesh(num_points=num_points), electrodes, adjacent(16))
+
+
+@pytest.fixture(scope="module")
+def model():
+    return model_of(700)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """Voltages of a block of half the conductivity, and their noise of 0.1 %."""
+    fine = model_of(4000)
+    inside = (np.abs(np.asarray(centroids(fine.mesh))) < BLOCK).all(axis=1)
+    voltages = fine.voltages(jnp.where(inside, 0.5, 1.0))
+    noise = 1e-3 * jnp.abs(voltages)
+    return voltages + noise * jax.random.normal(jax.random.key(0), voltages.shape), noise
+
+
+def edge_width(mesh, conductivity):
+    """Metres over which log σ falls from a tenth to nine tenths of its depth, along the block's long middle line."""
+    centre, values = np.asarray(centroids(mesh)), np.log(np.asarray(conductivity))
+    band = np.abs(centre[:, 1]) < 0.03
+    bins = np.arange(0.005, 0.1, 0.005)
+    profile = np.array([values[band & (np.abs(np.abs(centre[:, 0]) - b) < 0.004)].mean() for b in bins])
+    share = (profile - profile[-3:].mean()) / (profile[:3].mean() - profile[-3:].mean())
+    return np.interp(-0.1, -share, bins) - np.interp(-0.9, -share, bins)
+
+
+def test_an_edge_is_sharper_than_with_any_smooth_prior(model, frame):
+    voltages, noise = frame
+    sharp = reconstruct(model, voltages, 1.0, prior=TotalVariation(), noise=noise, hyperparameter=100.0, max_steps=60)
+    assert sharp.status == "converged"
+    assert (np.diff(sharp.costs) < 0).all()
+    width = edge_width(model.mesh, sharp.conductivity)
+    for prior in (Gaussian(0.017), Laplace(), Noser(), Tikhonov()):
+        smooth = reconstruct(model, voltages, 1.0, prior=prior, noise=noise, hyperparameter="discrepancy")
+        assert smooth.status == "converged"
+        assert width < 0.8 * edge_width(model.mesh, smooth.conductivity), type(prior).__name__
+    inside = (np.abs(np.asarray(centroids(model.mesh))) < 0.8 * BLOCK).all(axis=1)
+    area = np.asarray(measures(model.mesh))[inside]
+    assert area @ np.asarray(sharp.conductivity)[inside] / area.sum() == pytest.approx(0.5, rel=0.1)
+
+
+def test_both_solvers_find_the_same(model, frame):
+    options = {"prior": TotalVariation(), "noise": frame[1], "hyperparameter": 100.0, "max_steps": 200, "rtol": 1e-7}
+    first = reconstruct(model, frame[0], 1.0, **options)
+    second = reconstruct(model, frame[0], 1.0, solver="levenberg-marquardt", **options)
+    assert first.status == second.status == "converged"
+    assert float(second.costs[-1]) == pytest.approx(float(first.costs[-1]), rel=1e-4)
+    np.testing.assert_allclose(second.conductivity, first.conductivity, rtol=0.02)
+
+
+def small_penalty(mesh):
+    reference = 0.3 * jnp.cos(30 * centroids(mesh)[:, 0])
+    return TotalVariation(0.05).penalty(mesh, reference, 20.0)
+
+
+@pytest.mark.parametrize("mesh", [OUTLINE.mesh(num_points=150), box(0.1, 0.1, 0.05, cell_size=0.03)], ids=["2d", "3d"])
+def test_the_quadratic_model_touches_the_energy_from_above(mesh):
+    """Slope along any step is the energy's; for a linear misfit the true cost never exceeds the model's."""
+    penalty = small_penalty(mesh)
+    m = mesh.num_cells
+    data = IndependentChannels.create(adjacent(6, driven_electrodes=True)).weigh(jnp.ones(36)).combine(jnp.ones(36))
+    jacobian = jax.random.normal(jax.random.key(0), (len(data.voltages), m))
+    point = 0.1 * jax.random.normal(jax.random.key(1), (m,))
+    start = jnp.ones(len(jacobian))
+
+    def total(c):
+        residual = start + jacobian @ (c - point)
+        return 0.5 * residual @ data.precision @ residual + penalty.cost(c)
+
+    cost, step = penalty.model(start, jacobian, point, data)
+    direction, slope, curvature = step(jnp.zeros(()))
+    assert float(cost) == pytest.approx(float(total(point)), rel=1e-12)
+    _, expected = jax.jvp(total, (point,), (direction,))
+    assert float(slope) == pytest.approx(float(expected), rel=1e-9)
+    assert float(slope) == pytest.approx(-float(curvature), rel=1e-7)  # the step ends at the model's minimum
+    for scale in (0.1, 0.5, 1.0, 1.5):
+        above = float(cost + scale * slope + scale**2 * curvature / 2)
+        assert float(total(point + scale * direction)) <= above * (1 + 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"hyperparameter": "gcv"}, "takes a number"),
+        ({"hyperparameter": -1.0}, "positive"),
+        ({"solver": optx.LevenbergMarquardt(1e-6, 1e-6)}, "not a sum of squares"),
+        ({"regions": "all"}, "finds its own"),
+    ],
+)
+def test_bad_input(change, message, model, frame):
+    if "regions" in change:
+        change = {"regions": np.zeros(model.mesh.num_cells, int)}
+    with pytest.raises(ValueError, match=message):
+        reconstruct(model, frame[0], 1.0, prior=TotalVariation(), noise=frame[1], **change)
+
+
+def test_smoothing_must_be_positive():
+    with pytest.raises(ValueError, match="smoothing"):
+        TotalVariation(0.0)
+
+
+def test_there_is_no_gaussian_posterior(model, frame):
+    result = reconstruct(model, frame[0], 1.0, prior=TotalVariation(), noise=frame[1], max_steps=1)
+    with pytest.raises(ValueError, match="smooth priors"):
+        posterior(result)

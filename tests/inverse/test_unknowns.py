@@ -1,0 +1,155 @@
+"""Joint estimation: electrode positions, contact impedances, background and scale, with the conductivity."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs, grid, ring
+from jeit.forward import ForwardModel
+from jeit.inverse import (
+    Background,
+    ContactImpedance,
+    ElectrodePosition,
+    Gaussian,
+    Scale,
+    TotalVariation,
+    posterior,
+    reconstruct,
+)
+from jeit.mesh import Disk, Rectangle, centroids
+from jeit.protocol import adjacent
+
+RADIUS, NUMBER = 0.05, 16
+ANGLE = 2 * np.pi * np.arange(NUMBER) / NUMBER
+CENTRE = np.array([0.015, 0.01])
+
+
+def model_of(num_points, shift=0.0, contact=1e-3, driven=False):
+    """A disk 100 mm across; `shift` of the electrodes along its edge, metres."""
+    angle = ANGLE + np.asarray(shift) / RADIUS
+    position = RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    electrodes = BoundaryElectrodes(position, 0.006, contact)
+    protocol = adjacent(NUMBER, driven_electrodes=driven)
+    return ForwardModel(Disk(RADIUS).mesh(num_points=num_points), electrodes, protocol)
+
+
+def inclusion(mesh):
+    return np.linalg.norm(np.asarray(centroids(mesh)) - CENTRE, axis=1) < 0.012
+
+
+def noisy(voltages, relative=1e-3):
+    noise = relative * jnp.abs(voltages)
+    return voltages + noise * jax.random.normal(jax.random.key(0), voltages.shape), noise
+
+
+@pytest.fixture(scope="module")
+def model():
+    return model_of(900)
+
+
+def test_positions_repair_an_image(model):
+    """Every electrode 2 mm off. A disk cannot tell of three motions: those of its conformal maps onto itself.
+
+    (1, cos and sin of the angle; Boyle, Adler and Lionheart, IEEE Trans. Med. Imaging 31 (2012) 2185-2193.)
+    """
+    shift = 2e-3 * np.sign(np.cos(2 * ANGLE + 0.2))
+    truth = model_of(4000, shift)
+    voltages, noise = noisy(truth.voltages(jnp.where(inclusion(truth.mesh), 3.0, 1.0)))
+    options = {"prior": TotalVariation(), "noise": noise, "hyperparameter": 100.0, "max_steps": 60}
+    wrong = reconstruct(model, voltages, 1.0, **options)
+    right = reconstruct(model, voltages, 1.0, unknowns=[ElectrodePosition(model, 2e-3)], **options)
+    assert right.status == "converged"
+    error = np.asarray(right.unknowns["ElectrodePosition"]) - shift
+    motions = np.stack([np.ones(NUMBER), np.cos(ANGLE), np.sin(ANGLE)], axis=1)
+    left = error - motions @ np.linalg.lstsq(motions, error)[0]
+    assert np.abs(left).max() < 0.3e-3
+    place = inclusion(model.mesh)
+    alike = [np.corrcoef(place, np.log(one.conductivity))[0, 1] for one in (wrong, right)]
+    assert alike[0] < 0.8
+    assert alike[1] > 0.92
+    moved = np.asarray(right.model.electrodes.position - model.electrodes.position)
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.abs(right.unknowns["ElectrodePosition"]), rtol=1e-9)
+
+
+def test_contact_impedances(model):
+    factor = np.exp(0.4 * np.cos(3 * ANGLE))
+    truth = model_of(2500, contact=1e-3 * factor, driven=True)
+    voltages, noise = noisy(truth.voltages(jnp.where(inclusion(truth.mesh), 0.5, 1.0)))
+    model = model_of(900, driven=True)
+    result = reconstruct(
+        model, voltages, 1.0, prior=Gaussian(0.015), noise=4 * noise, hyperparameter=3.0,
+        unknowns=[ContactImpedance(model)],
+    )  # fmt: skip
+    assert result.status == "converged"
+    found = np.exp(np.asarray(result.unknowns["ContactImpedance"]))
+    assert np.corrcoef(found, factor)[0, 1] > 0.98
+    # A common factor is what a coarse mesh is off by at the electrodes' ends.
+    ratio = found / factor
+    assert np.abs(ratio / ratio.mean() - 1).max() < 0.12
+    deviation = posterior(result).unknowns()["ContactImpedance"]
+    assert (np.asarray(deviation) < 0.2).all()
+
+
+def test_background_and_scale(model):
+    """Each by itself: only the contact impedance tells a scale from a background. The image takes a share of it."""
+    truth = model_of(900, driven=True)
+    known = model_of(900, driven=True)
+    voltages, noise = noisy(truth.voltages(1.3), 1e-4)
+    options = {"prior": Gaussian(0.02), "noise": noise, "hyperparameter": 10.0}
+    background = reconstruct(known, voltages, 1.0, unknowns=[Background(1.0)], **options)
+    assert float(background.unknowns["Background"][0]) == pytest.approx(np.log(1.3), abs=0.02)
+    np.testing.assert_allclose(background.conductivity, 1.3, rtol=5e-3)
+    doubled = reconstruct(known, 2 * voltages, 1.3, unknowns=[Scale(1.0)], **options)
+    assert float(doubled.unknowns["Scale"][0]) == pytest.approx(np.log(2), abs=0.02)
+    np.testing.assert_allclose(doubled.conductivity, 1.3, rtol=5e-3)
+    np.testing.assert_allclose(doubled.model.protocol.drive, 2 * known.protocol.drive, rtol=0.02)
+
+
+def test_derivative_with_all_unknowns(model):
+    """Products with the Jacobian against autodiff, and Taylor's second order."""
+    model = model_of(600, driven=True)
+    voltages, noise = noisy(model.voltages(1.1))
+    unknowns = [ContactImpedance(model), ElectrodePosition(model, 1e-4), Background(), Scale()]
+    inversion = reconstruct(
+        model, voltages, 1.0, prior=Gaussian(0.02), noise=noise, hyperparameter=1.0, unknowns=unknowns, max_steps=1
+    ).inversion
+    point = 0.01 * jax.random.normal(jax.random.key(1), (inversion.num_coefficients,))
+    direction = jax.random.normal(jax.random.key(2), point.shape)
+    residual, jacobian = inversion.linearise(point)
+    _, tangent = jax.jvp(inversion.residual, (point,), (direction,))
+    np.testing.assert_allclose(jacobian @ direction, tangent, rtol=1e-8, atol=1e-8 * np.abs(tangent).max())
+    steps = 1e-2 * 0.5 ** np.arange(4)
+    errors = [np.linalg.norm(inversion.residual(point + h * direction) - residual - h * tangent) for h in steps]
+    assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2, abs=0.1)
+
+
+def test_discs_in_a_sheet_move_both_ways():
+    electrodes = SheetDiscs(grid(0.08, 0.08, 3, 3), 0.004, 1e-3)
+    sheet = ForwardModel(Rectangle(0.12, 0.12).mesh(num_points=700), electrodes, adjacent(9))
+    unknown = ElectrodePosition(sheet, 1e-3)
+    assert unknown.size == 18
+    moved, _ = unknown.apply(sheet, jnp.zeros(1), jnp.arange(18.0) * 1e-5)
+    change = np.asarray(moved.electrodes.position - electrodes.position)
+    np.testing.assert_allclose(change[:, 0], np.arange(9) * 1e-5, atol=1e-15)
+    np.testing.assert_allclose(change[:, 1], np.arange(9, 18) * 1e-5, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda model: ElectrodePosition(model, 0.0), "positive"),
+        (lambda model: ElectrodePosition(model, np.ones(3)), "16"),
+        (lambda model: Background(-1.0), "positive"),
+        (lambda model: Scale(np.nan), "positive"),
+        (lambda model: ContactImpedance(point_model(model)), "point electrodes"),
+        (lambda model: ElectrodePosition(point_model(model), 1e-3), "BoundaryElectrodes"),
+    ],
+)
+def test_bad_input(make, message, model):
+    with pytest.raises(ValueError, match=message):
+        make(model)
+
+
+def point_model(model):
+    return ForwardModel(model.mesh, PointElectrodes(ring(RADIUS, NUMBER)), model.protocol)
