@@ -1,23 +1,19 @@
 """From two frames to a picture: check, mesh, calibrate, image, and say what is in it.
 
 This is what `jeit reconstruct` runs, as one function. Its steps are the public functions of `jeit.data`,
-`jeit.inverse` and `jeit.image`; take them from there for anything out of the ordinary.
+`jeit.preparation`, `jeit.inverse` and `jeit.image`; take them from there for anything out of the ordinary.
 """
 
-import time
 from collections.abc import Callable
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
-from jeit.data import FrameQuality, Measurement, check_imageable
-from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes, PointElectrodes, SheetDiscs
-from jeit.forward import ForwardModel
-from jeit.image import Inclusion, Raster, find_inclusions
+from jeit.data import FrameQuality, Measurement
+from jeit.image import Inclusion, Raster, find_inclusions, segment
 from jeit.inverse import (
     RULES,
     AbstractPrior,
@@ -26,15 +22,23 @@ from jeit.inverse import (
     Laplace,
     LinearReconstruction,
     Noser,
+    Reconstruction,
     Tikhonov,
+    TotalVariation,
     back_projection,
-    calibrate,
     one_step,
-    relative_noise,
+    reconstruct,
 )
-from jeit.mesh import Domain, Mesh, Refine
+from jeit.inverse.hyperparameter import Rule, discrepancy
+from jeit.mesh import Domain, Mesh
+from jeit.preparation import Clock, PreparedDifference, prepare_difference
+from jeit.preparation import default_contact as default_contact
+from jeit.preparation import imaging_mesh as imaging_mesh
+from jeit.preparation import select_frames as select_frames
 
-METHODS = ("one-step", "back-projection", "filtered-back-projection")
+LINEAR_METHODS = ("one-step", "back-projection", "filtered-back-projection")
+ITERATIVE_METHODS = ("gauss-newton", "levenberg-marquardt", "total-variation")
+METHODS = (*LINEAR_METHODS, *ITERATIVE_METHODS)
 CONTACTS = ("each", "common", "fixed")
 
 # Priors by name, made for a body of a given size: the longer side of its outline in metres.
@@ -50,14 +54,16 @@ PRIORS: dict[str, Callable[[float], AbstractPrior]] = {
 class ImagingSettings:
     """How to image. The defaults here are jeit's defaults, for Python and command line alike.
 
-    - `method`: one of `METHODS`.
-    - `prior`: a name in `PRIORS`, or a prior; used by one-step imaging.
-    - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; not used by plain back-projection.
+    - `method`: one of `METHODS`: linear ones, and iterative ones that solve for conductivity itself.
+    - `prior`: a name in `PRIORS`, or a prior; used by one-step, Gauss-Newton and Levenberg-Marquardt imaging.
+    - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; not used by plain back-projection; a number
+      for total variation, where the default's place is taken by `jeit.inverse.reconstruct.EDGE_PRICE`.
     - `contact`: how the contact impedance is calibrated ("each", "common", "fixed"); None decides by the protocol: each
       electrode's own where voltages are read on driven electrodes, else fixed, for then nothing shows it.
     - `num_points`: nodes of the mesh, about.
     - `raster_shape`: (rows, columns) of the raster.
     - `level`, `least_peak`: see `jeit.image.find_inclusions`.
+    - `segment`: whether to cut the image up into background, resistive and conductive, see `jeit.image.segment`.
     """
 
     method: str = "one-step"
@@ -68,6 +74,7 @@ class ImagingSettings:
     raster_shape: tuple[int, int] = (256, 256)
     level: float = 0.65
     least_peak: float = 0.3
+    segment: bool = False
 
     def __post_init__(self):
         if self.method not in METHODS:
@@ -83,6 +90,8 @@ class ImagingSettings:
                 )
             if self.method == "filtered-back-projection" and self.hyperparameter != type(self).hyperparameter:
                 raise ValueError("hyperparameter: filtered back-projection takes a number such as 0.05, not a rule.")
+            if self.method == "total-variation" and self.hyperparameter != type(self).hyperparameter:
+                raise ValueError("hyperparameter: total variation takes a number such as 300, not a rule.")
         elif isinstance(self.hyperparameter, bool) or not (
             np.isfinite(self.hyperparameter) and self.hyperparameter > 0
         ):
@@ -101,10 +110,13 @@ class ImagedDifference:
     - `quality`: what was found about the data before imaging.
     - `settings`: how it was imaged, with what was decided on the way filled in.
     - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
-    - `reconstruction`: the reconstruction matrix, with the hyperparameter used and the rule that chose it.
+    - `reconstruction`: the reconstruction matrix, or what the iteration found; with the hyperparameter used and the
+      rule that chose it.
     - `change`: change of conductivity in every cell (m,), S/m (2-D: S); against `calibration.conductivity`.
     - `raster`: `change` on a grid, NaN outside the mesh; `extent` (x_min, x_max, y_min, y_max) in metres.
-    - `inclusions`: regions of changed conductivity, strongest first.
+    - `inclusions`: regions of changed conductivity, strongest first; iterative images are looked at on the scale of the
+      logarithm, which weighs both signs alike.
+    - `labels`: 0 background, 1 resistive, 2 conductive for every pixel of the raster, if asked for.
     - `timings`: seconds of each step.
     """
 
@@ -113,11 +125,12 @@ class ImagedDifference:
     quality: FrameQuality
     settings: ImagingSettings
     calibration: Calibration
-    reconstruction: LinearReconstruction
+    reconstruction: LinearReconstruction | Reconstruction
     change: Float[Array, " m"]
     raster: Float[Array, "rows columns"]
     extent: tuple[float, float, float, float]
     inclusions: tuple[Inclusion, ...]
+    labels: UInt8[np.ndarray, "rows columns"] | None = None
     timings: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -129,6 +142,18 @@ class ImagedDifference:
     def mesh(self) -> Mesh:
         """The mesh imaged on."""
         return self.calibration.model.mesh
+
+    @property
+    def iterative(self) -> bool:
+        """Whether the image solves for conductivity itself."""
+        return isinstance(self.reconstruction, Reconstruction)
+
+    @property
+    def departure(self) -> Float[Array, " m"]:
+        """What stands out, per cell: the change of conductivity, or of its logarithm in iterative images."""
+        if not self.iterative:
+            return self.change
+        return jnp.log1p(self.change / self.calibration.conductivity)
 
 
 def image_difference(
@@ -147,158 +172,119 @@ def image_difference(
     imaged (see `jeit.data.check_imageable`), that do not say where the electrodes are, or that are complex.
     """
     settings = ImagingSettings() if settings is None else settings
-    clock = _Clock(progress)
-    with clock("check"):
-        one, base = select_frames(measurement, reference, frame)
-        (quality,) = check_imageable(one, base)
-        domain, electrodes = _setup(one, base)
-        both = np.asarray(one.mask[0] & base.mask[0])
-        difference = jnp.where(both, one.voltages[0] - base.voltages[0], 0)
-    with clock("mesh"):
-        mesh = imaging_mesh(domain, electrodes, settings.num_points)
-        model = ForwardModel(mesh, electrodes, one.protocol)
-    with clock("calibrate"):
-        contact = settings.contact or default_contact(one)
-        calibration = calibrate(model, base.voltages[0], mask=base.mask[0], contact=contact)
-        if settings.contact is None and contact == "each" and calibration.status != "converged":
-            contact = "common"  # the data do not tell so many impedances apart
-            calibration = calibrate(model, base.voltages[0], mask=base.mask[0], contact=contact)
-        calibration = jax.block_until_ready(calibration)
-        if not np.isfinite(calibration.misfit):
-            raise ValueError(
-                f"'{base.name}': calibration on it failed ({calibration.status}); is this a frame of the empty body, "
-                "and are geometry and protocol right?"
-            )
+    clock = Clock(progress)
+    prepared = prepare_difference(
+        measurement,
+        reference,
+        frame=frame,
+        contact=settings.contact,
+        num_points=settings.num_points,
+        clock=clock,
+    )
+    calibration, mesh = prepared.calibration, prepared.mesh
     with clock("image"):
-        noise = quality.difference_noise
-        reconstruction = _reconstruction(calibration, settings, domain, base, difference, both, noise)
-        change = jax.block_until_ready(reconstruction.image(difference))
+        if settings.method in LINEAR_METHODS:
+            reconstruction = _reconstruction(prepared, settings)
+            change = reconstruction.image(prepared.difference)
+        else:
+            reconstruction = _iterated(prepared, settings)
+            change = reconstruction.conductivity - calibration.conductivity
         largest = float(jnp.abs(change).max())
         if not largest > 1e-9 * float(calibration.conductivity):
             raise ValueError(
-                f"'{one.name}': the image is empty, no change reaches a billionth of the background. The "
-                f"hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give a smaller "
-                "one, or a rule."
+                f"'{prepared.measurement.name}': the image is empty, no change reaches a billionth of the background. "
+                f"The hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give a "
+                "smaller one, or a rule."
             )
     with clock("raster and inclusions"):
         grid = Raster.create(mesh, shape=settings.raster_shape)
-        raster = jax.block_until_ready(grid.sample(change))
-        inclusions = find_inclusions(mesh, change, level=settings.level, least_peak=settings.least_peak)
-    return ImagedDifference(
-        measurement=one,
-        reference=base,
-        quality=quality,
-        settings=ImagingSettings(**{**vars(settings), "contact": contact}),
-        calibration=calibration,
-        reconstruction=reconstruction,
-        change=change,
-        raster=raster,
-        extent=grid.extent,
-        inclusions=tuple(inclusions),
-        timings=clock.seconds,
-    )
-
-
-def select_frames(
-    measurement: Measurement, reference: Measurement | None = None, frame: int | str | None = None
-) -> tuple[Measurement, Measurement]:
-    """The frame to image and the reference to image it against, one frame each.
-
-    A frame named "reference" in `measurement` is never imaged unless asked for, and is what the others are compared
-    with when no `reference` is given. Raises `ValueError` when there is no reference, or no such frame.
-    """
-    if reference is None:
-        objects, reference = measurement.split_reference()
-    elif "reference" in measurement.frame_names and measurement.num_frames > 1:
-        objects, _ = measurement.split_reference()
-    else:
-        objects = measurement
-    if "reference" in reference.frame_names and reference.num_frames > 1:
-        _, reference = reference.split_reference()
-    one = objects.frame(0) if frame is None else measurement.frame(frame)
-    return one, reference.mean_frame()
-
-
-def imaging_mesh(domain: Domain, electrodes: AbstractElectrodes, num_points: int) -> Mesh:
-    """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep."""
-    if isinstance(electrodes, SheetDiscs):
-        radius = np.asarray(electrodes.radius)
-        refine = Refine(np.asarray(electrodes.position), cell_size=0.7 * radius.min(), distance=float(radius.max()))
-    elif isinstance(electrodes, (BoundaryElectrodes, PointElectrodes)):
-        refine = Refine(np.asarray(electrodes.position), factor=2.0)
-    else:
-        refine = None
-    return domain.mesh(num_points=num_points, refine=refine)
-
-
-def default_contact(measurement: Measurement) -> str:
-    """How to calibrate contact impedance: "each" if driven electrodes are read, else "fixed".
-
-    Only the voltage of an electrode that carries current drops across its contact; without such channels the fit would
-    bend contact impedances to explain something else.
-    """
-    return "each" if measurement.protocol.channels_on_driven_electrodes().any() else "fixed"
-
-
-class _Clock:
-    """Tells `progress` of each step and keeps the seconds that it took."""
-
-    def __init__(self, progress: Callable[[str], None] | None):
-        self.progress = progress
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, step: str):
-        if self.progress is not None:
-            self.progress(step)
-        start = time.perf_counter()
-        yield
-        self.seconds[step] = time.perf_counter() - start
-
-
-def _setup(measurement: Measurement, reference: Measurement) -> tuple[Domain, AbstractElectrodes]:
-    domain = measurement.domain if measurement.domain is not None else reference.domain
-    electrodes = measurement.electrodes if measurement.electrodes is not None else reference.electrodes
-    if domain is None or electrodes is None:
-        missing = "[geometry]" if domain is None else "[electrodes]"
-        raise ValueError(
-            f"'{measurement.name}' does not say what it was measured on: give a description with {missing} "
-            "(a TOML file beside the data, or --description)."
+        found = ImagedDifference(
+            measurement=prepared.measurement,
+            reference=prepared.reference,
+            quality=prepared.quality,
+            settings=replace(settings, contact=prepared.contact),
+            calibration=calibration,
+            reconstruction=reconstruction,
+            change=change,
+            raster=grid.sample(change),
+            extent=grid.extent,
+            inclusions=(),
+            timings=clock.seconds,
         )
-    if jnp.iscomplexobj(measurement.voltages):
+        departure = found.departure
+        inclusions = find_inclusions(mesh, departure, level=settings.level, least_peak=settings.least_peak)
+        if found.iterative:
+            inclusions = [_with_change(one, calibration.conductivity) for one in inclusions]
+        labels = segment(np.asarray(grid.sample(departure))) if settings.segment else None
+    return replace(found, inclusions=tuple(inclusions), labels=labels)
+
+
+def _with_change(inclusion: Inclusion, background) -> Inclusion:
+    """An inclusion found in the logarithm of conductivity over `background`, its peak turned into a change."""
+    peak = float(background * np.expm1(inclusion.peak))
+    return Inclusion(inclusion.sign, inclusion.centroid, inclusion.area, peak)
+
+
+def prior_for(prior: str | AbstractPrior, domain: Domain) -> AbstractPrior:
+    """The prior itself, or the one of that name in `PRIORS`, made for the size of the body."""
+    if not isinstance(prior, str):
+        return prior
+    x_min, x_max, y_min, y_max = domain.extent
+    return PRIORS[prior](max(x_max - x_min, y_max - y_min))
+
+
+def rule_for(name: str, prepared: PreparedDifference) -> Rule:
+    """The rule of that name, told of the noise in the data if it needs to know. Raises `ValueError` if none does."""
+    if name != "discrepancy":
+        return RULES[name]
+    if prepared.noise is None:
         raise ValueError(
-            f"'{measurement.name}' is complex; choose the part to image with [data] component in its description: "
-            "real, imaginary or magnitude."
+            "hyperparameter: 'discrepancy' needs to know the noise, and no two channels of "
+            f"'{prepared.model.protocol.name}' are tied by reciprocity to tell it from; choose another rule, or a "
+            "number."
         )
-    return domain, electrodes
+    return partial(discrepancy, noise=prepared.noise)
 
 
-def _reconstruction(
-    calibration: Calibration, settings: ImagingSettings, domain: Domain, base: Measurement, difference, mask, noise
-) -> LinearReconstruction:
-    model, conductivity = calibration.model, calibration.conductivity
+def _reconstruction(prepared: PreparedDifference, settings: ImagingSettings) -> LinearReconstruction:
+    model, conductivity = prepared.model, prepared.calibration.conductivity
+    hyperparameter = settings.hyperparameter
     if settings.method != "one-step":
         filtered = settings.method.startswith("filtered")
-        given = {} if isinstance(settings.hyperparameter, str) else {"hyperparameter": settings.hyperparameter}
-        return back_projection(model, conductivity, filtered=filtered, mask=mask, **given)
-    prior = settings.prior
-    if isinstance(prior, str):
-        x_min, x_max, y_min, y_max = domain.extent
-        prior = PRIORS[prior](max(x_max - x_min, y_max - y_min))
-    deviation = relative_noise(base.voltages[0], mask)
-    if settings.hyperparameter == "discrepancy":
-        if noise is None:
-            raise ValueError(
-                "hyperparameter: 'discrepancy' needs to know the noise, and no two channels of "
-                f"'{model.protocol.name}' are tied by reciprocity to tell it from; choose another rule, or a number."
-            )
-        deviation = deviation * noise.standard_deviation / jnp.sqrt(jnp.mean(deviation[mask] ** 2))
+        given = {} if isinstance(hyperparameter, str) else {"hyperparameter": hyperparameter}
+        return back_projection(model, conductivity, filtered=filtered, mask=prepared.mask, **given)
     return one_step(
         model,
         conductivity,
-        prior=prior,
-        hyperparameter=settings.hyperparameter,
-        difference=difference,
-        noise=deviation,
-        mask=mask,
+        prior=prior_for(settings.prior, prepared.domain),
+        hyperparameter=rule_for(hyperparameter, prepared) if isinstance(hyperparameter, str) else hyperparameter,
+        difference=prepared.difference,
+        noise=prepared.deviation,
+        mask=prepared.mask,
     )
+
+
+def _iterated(prepared: PreparedDifference, settings: ImagingSettings) -> Reconstruction:
+    """The conductivity whose voltages differ from the model's own as the frame differs from its reference.
+
+    So what the model gets wrong alike with and without objects is left out. Raises `ValueError` if the solver fails.
+    """
+    model, background = prepared.model, prepared.calibration.conductivity
+    total_variation = settings.method == "total-variation"
+    hyperparameter = settings.hyperparameter
+    if isinstance(hyperparameter, str):
+        hyperparameter = None if total_variation else rule_for(hyperparameter, prepared)
+    found = reconstruct(
+        model,
+        model.voltages(background) + prepared.difference,
+        background,
+        prior=TotalVariation() if total_variation else prior_for(settings.prior, prepared.domain),
+        hyperparameter=hyperparameter,
+        noise=prepared.deviation,
+        mask=prepared.mask,
+        solver="gauss-newton" if total_variation else settings.method,
+        max_steps=100,
+    )
+    if found.status == "failed":
+        raise ValueError(f"'{prepared.measurement.name}': the reconstruction failed. {found.reason}")
+    return found

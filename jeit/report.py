@@ -11,6 +11,7 @@ import numpy as np
 from jeit.data import Measurement
 from jeit.electrodes import contact_impedance
 from jeit.imaging import ImagedDifference
+from jeit.inverse import LinearReconstruction
 from jeit.mesh import Disk, Domain, Polygon, Rectangle
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix", "matplotlib")
@@ -21,21 +22,24 @@ def write(result: ImagedDifference, folder: str | Path, *, truth: tuple[float, f
 
     The NPZ holds `raster` (rows, columns), the change of conductivity (S; 3-D: S/m), NaN outside the body, row 0 at the
     top, column 0 at the left; `extent` (x_min, x_max, y_min, y_max) in metres; `conductivity` (m,), the same change per
-    cell; `background`, the conductivity it is a change of; `points` (n, d) and `cells` (m, d + 1). `truth`: a known
-    position (x, y) in metres, marked in the picture.
+    cell; `background`, the conductivity it is a change of; `points` (n, d) and `cells` (m, d + 1); and `labels` (rows,
+    columns), if the image was segmented: 0 background, 1 resistive, 2 conductive. `truth`: a known position (x, y) in
+    metres, marked in the picture.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     draw(result, truth=truth).savefig(folder / "image.png", dpi=150)
-    np.savez_compressed(
-        folder / "image.npz",
-        raster=np.asarray(result.raster),
-        extent=np.asarray(result.extent),
-        conductivity=np.asarray(result.change),
-        background=np.asarray(result.calibration.conductivity),
-        points=np.asarray(result.mesh.points),
-        cells=np.asarray(result.mesh.cells),
-    )
+    arrays: dict[str, Any] = {
+        "raster": np.asarray(result.raster),
+        "extent": np.asarray(result.extent),
+        "conductivity": np.asarray(result.change),
+        "background": np.asarray(result.calibration.conductivity),
+        "points": np.asarray(result.mesh.points),
+        "cells": np.asarray(result.mesh.cells),
+    }
+    if result.labels is not None:
+        arrays["labels"] = result.labels
+    np.savez_compressed(folder / "image.npz", **arrays)
     text = json.dumps(report(result), indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "report.json").write_text(text + "\n", "utf-8")
 
@@ -44,21 +48,26 @@ def draw(result: ImagedDifference, *, truth: tuple[float, float] | None = None):
     """The picture of a result, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
-    from jeit.plot import plot_image
+    from jeit.plot import draw_labels, plot_image
 
     figure = Figure(figsize=(6.4, 5.6), layout="constrained")
+    # Iterative images reach from a hundredth to a hundred times the background: on the logarithm's scale both show.
     ax = plot_image(
         result.mesh,
-        result.change,
+        result.departure / (math.log(10) if result.iterative else 1),
         result.calibration.model.electrodes,
-        inclusions=result.inclusions,
+        inclusions=result.inclusions if result.labels is None else (),
         title=result.measurement.name,
+        quantity="log₁₀ of conductivity over background" if result.iterative else None,
+        unit="" if result.iterative else None,
         ax=figure.subplots(),
     )
     if truth is not None:
         ring = {"marker": "o", "markersize": 15, "markerfacecolor": "none", "markeredgewidth": 2, "linestyle": "none"}
         ax.plot(*truth, color="#157f3b", label="pressed here", **ring)
-    if result.inclusions:
+    if result.labels is not None:
+        draw_labels(result.labels, result.extent, ax=ax)
+    elif result.inclusions:
         ax.plot([], [], color="black", linewidth=1, linestyle=(0, (4, 3)), label="found: sign and area")
     if ax.get_legend_handles_labels()[1]:
         ax.legend(loc="upper left", bbox_to_anchor=(0, 0), frameon=False, borderaxespad=0)
@@ -117,11 +126,13 @@ def report(result: ImagedDifference) -> dict[str, Any]:
             "quantity": f"change of conductivity against the reference, {unit}",
             "method": settings.method,
             "least_change_relative_to_background": result.lowest,
-            "prior": _prior(settings.prior) if settings.method == "one-step" else None,
+            "prior": _prior(settings),
+            **_iteration(result),
         },
         "hyperparameter": {
             "value": float(reconstruction.hyperparameter),
             "chosen_by": reconstruction.rule,
+            "note": (reconstruction.choice.note or None) if reconstruction.choice is not None else None,
         },
         "inclusions": [
             {
@@ -141,7 +152,7 @@ def report(result: ImagedDifference) -> dict[str, Any]:
         "timings": {**result.timings, "unit": "s"},
         "versions": {name: _version(name) for name in _PACKAGES},
     }
-    return _plain(content)
+    return plain(content)
 
 
 def describe_measurement(measurement: Measurement) -> dict[str, Any]:
@@ -178,11 +189,30 @@ def describe_electrodes(electrodes) -> dict[str, Any]:
         for name in ("position", "width", "height", "radius")
         if hasattr(electrodes, name)
     }
-    return _plain({"kind": type(electrodes).__name__, "number": electrodes.num_electrodes, **known, "unit": "m"})
+    return plain({"kind": type(electrodes).__name__, "number": electrodes.num_electrodes, **known, "unit": "m"})
 
 
-def _prior(prior) -> str:
-    return prior if isinstance(prior, str) else type(prior).__name__
+def _prior(settings) -> str | None:
+    if settings.method == "total-variation":
+        return "total variation"
+    if settings.method.endswith("back-projection"):
+        return None
+    return settings.prior if isinstance(settings.prior, str) else type(settings.prior).__name__
+
+
+def _iteration(result: ImagedDifference) -> dict[str, Any]:
+    """How the iteration went; nothing for linear images."""
+    found = result.reconstruction
+    if isinstance(found, LinearReconstruction):
+        return {}
+    return {
+        "status": found.status,
+        "reason": found.reason,
+        "iterations": found.iterations,
+        "misfit": float(found.misfit),
+        "misfit_unit": "standard deviations",
+        "objective_per_iteration": np.asarray(found.costs),
+    }
 
 
 def _version(package: str) -> str | None:
@@ -192,14 +222,14 @@ def _version(package: str) -> str | None:
         return None
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Arrays as lists, and None for numbers that JSON does not know (NaN, infinity)."""
     if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
+        return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
+        return [plain(entry) for entry in value]
     if hasattr(value, "tolist"):
-        return _plain(np.asarray(value).tolist())
+        return plain(np.asarray(value).tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

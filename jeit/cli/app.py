@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from jeit.cli.choose import choose
 from jeit.cli.demo import demo
 from jeit.cli.info import info
 from jeit.cli.reconstruct import reconstruct
@@ -23,6 +24,7 @@ app = typer.Typer(
 )
 app.command()(demo)
 app.command()(reconstruct)
+app.command()(choose)
 app.command()(info)
 
 

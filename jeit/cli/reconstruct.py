@@ -32,15 +32,23 @@ def reconstruct(
     format: Format = None,
     description: Description = None,
     method: Annotated[
-        str | None, typer.Option(help="one-step (default), back-projection or filtered-back-projection.")
+        str | None,
+        typer.Option(
+            help="one-step (default), back-projection, filtered-back-projection; gauss-newton, levenberg-marquardt, "
+            "total-variation (default with --segment)."
+        ),
     ] = None,
     prior: Annotated[
-        str | None, typer.Option(help="tikhonov, laplace, noser or gaussian (default); for one-step.")
+        str | None,
+        typer.Option(
+            help="tikhonov, laplace, noser or gaussian (default); not for back-projection and total-variation."
+        ),
     ] = None,
     hyperparameter: Annotated[
         str | None,
         typer.Option(
-            help="A number, or the rule that chooses it: noise-figure (default), l-curve, gcv, discrepancy.",
+            help="A number, or the rule that chooses it: noise-figure (default), l-curve, gcv, discrepancy, "
+            "best-resolution; see jeit choose.",
             metavar="VALUE|RULE",
         ),
     ] = None,
@@ -48,6 +56,9 @@ def reconstruct(
         str | None,
         typer.Option(help="Contact impedance in the calibration: each, common or fixed; found from the protocol."),
     ] = None,
+    segment: Annotated[
+        bool, typer.Option("--segment", help="Add labels to image.npz: 0 background, 1 resistive, 2 conductive.")
+    ] = False,
     num_points: Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000).")] = None,
     frame: Annotated[
         str | None, typer.Option(help="Frame of DATA to image, by number from 0 or by name; the first unless given.")
@@ -62,15 +73,18 @@ def reconstruct(
     from jeit.imaging import ImagingSettings, image_difference
     from jeit.report import write
 
+    if segment and method is None:
+        method = "total-variation"
     given = {
+        "segment": segment,
         "method": method,
         "prior": prior,
-        "hyperparameter": None if hyperparameter is None else _number_or_name(hyperparameter),
+        "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
         "contact": contact,
         "num_points": num_points,
     }
-    if method not in (None, "one-step") and prior is not None:
-        raise ValueError(f"--prior belongs to one-step images; --method {method} has none.")
+    if method in ("back-projection", "filtered-back-projection", "total-variation") and prior is not None:
+        raise ValueError(f"--prior: --method {method} has its own; leave it out, or choose another method.")
     if method == "back-projection" and hyperparameter is not None:
         raise ValueError("--hyperparameter: plain back-projection has none; leave it out.")
     settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})
@@ -80,7 +94,7 @@ def reconstruct(
         step("read")
         measurement = read(data, format, description)
         base = None if reference is None else read(reference, format, description)
-        chosen = None if frame is None else _number_or_name(frame, int)
+        chosen = None if frame is None else number_or_name(frame, int)
         result = image_difference(measurement, base, settings, frame=chosen, progress=step)
         step("write")
         write(result, output)
@@ -94,6 +108,7 @@ def show(console, result: "ImagedDifference") -> None:
     from rich.table import Table
 
     from jeit.cli.console import pairs, percent, scaled
+    from jeit.inverse import Reconstruction
 
     calibration, reconstruction = result.calibration, result.reconstruction
     unit = "S" if result.mesh.dimension == 2 else "S/m"
@@ -104,12 +119,19 @@ def show(console, result: "ImagedDifference") -> None:
         ("background", f"{scaled(float(calibration.conductivity), unit)}, misfit {percent(float(calibration.misfit))}"),
         ("difference", f"{percent(result.quality.difference)} of the reference"),
         ("noise in it", "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"),
-        ("method", f"{reconstruction.method}, hyperparameter {chosen}"),
+        ("method", f"{result.settings.method}, hyperparameter {chosen}"),
         ("mesh", f"{result.mesh.num_points:,} nodes, {result.mesh.num_cells:,} cells"),
     ]
     if calibration.status != "converged":
         rows.insert(1, ("calibration", calibration.status))
-    if result.lowest < -1:
+    if reconstruction.choice is not None and reconstruction.choice.note:
+        rows.append(("hyperparameter", reconstruction.choice.note))
+    if isinstance(reconstruction, Reconstruction):
+        misfit = f"misfit {float(reconstruction.misfit):.2g} standard deviations"
+        rows.append(("iteration", f"{reconstruction.status}, {reconstruction.iterations} steps, {misfit}"))
+        if reconstruction.status != "converged":
+            rows.append(("", reconstruction.reason))
+    elif result.lowest < -1:
         fall = f"falls to {percent(result.lowest)} of the background: of changes so large only place and sign are right"
         rows.append(("linear image", fall))
     console.print()
@@ -126,15 +148,15 @@ def show(console, result: "ImagedDifference") -> None:
     console.print()
 
 
-def make_folder(output: Path) -> None:
-    """Make the folder for the results before any work is done for them. Raises `ValueError` if it cannot be one."""
+def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json")) -> None:
+    """Make the folder for results of these names before any work is done. Raises `ValueError` if it cannot be one."""
     if output.exists() and not output.is_dir():
         raise ValueError(f"--output {output} is a file; give a folder for the results.")
     try:
         output.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=output):
             pass
-        taken = [name for name in ("image.png", "image.npz", "report.json") if (output / name).is_dir()]
+        taken = [name for name in names if (output / name).is_dir()]
     except OSError as error:
         reason = error.strerror or error
         raise ValueError(f"--output {output} cannot be written to ({reason}); give another folder.") from None
@@ -142,7 +164,8 @@ def make_folder(output: Path) -> None:
         raise ValueError(f"--output {output}: there is a folder named {taken[0]} in it; give another.")
 
 
-def _number_or_name(text: str, number: type = float):
+def number_or_name(text: str, number: type = float):
+    """The number that `text` spells, or else the text."""
     try:
         return number(text)
     except ValueError:

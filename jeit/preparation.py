@@ -1,0 +1,176 @@
+"""What comes before any image of measured data: two frames checked, a mesh, and a model calibrated on the reference."""
+
+import time
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jeit.data import FrameQuality, Measurement, check_imageable
+from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes, PointElectrodes, SheetDiscs
+from jeit.forward import ForwardModel
+from jeit.inverse import Calibration, calibrate, relative_noise
+from jeit.mesh import Domain, Mesh, Refine
+
+
+class Clock:
+    """Tells `progress` of each step and keeps the seconds that it took, in `seconds`."""
+
+    def __init__(self, progress: Callable[[str], None] | None):
+        self.progress = progress
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, step: str):
+        if self.progress is not None:
+            self.progress(step)
+        start = time.perf_counter()
+        yield
+        self.seconds[step] = time.perf_counter() - start
+
+
+@dataclass(frozen=True)
+class PreparedDifference:
+    """A difference of two frames, ready to be imaged.
+
+    - `measurement`, `reference`: the two frames compared, one frame each.
+    - `quality`: what was found about the data.
+    - `domain`: the outline of the body.
+    - `contact`: how the contact impedance was calibrated: "each", "common" or "fixed".
+    - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
+    - `difference`: (M,) volts, zero in masked channels; `mask` (M,), True for channels usable in both frames.
+    """
+
+    measurement: Measurement
+    reference: Measurement
+    quality: FrameQuality
+    domain: Domain
+    contact: str
+    calibration: Calibration
+    difference: Float[Array, " M"]
+    mask: Bool[Array, " M"]
+
+    @property
+    def model(self) -> ForwardModel:
+        """The calibrated forward model."""
+        return self.calibration.model
+
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh to image on."""
+        return self.calibration.model.mesh
+
+    @property
+    def deviation(self) -> Float[Array, " M"]:
+        """How far channels are trusted relative to each other: `relative_noise` of the reference, volts."""
+        return relative_noise(self.reference.voltages[0], self.mask)
+
+    @property
+    def noise(self) -> float | None:
+        """Standard deviation of the noise found in the difference, in units of `deviation`; None if not known."""
+        found = self.quality.difference_noise
+        if found is None:
+            return None
+        return found.standard_deviation / float(jnp.sqrt(jnp.mean(self.deviation[self.mask] ** 2)))
+
+
+def prepare_difference(
+    measurement: Measurement,
+    reference: Measurement | None = None,
+    *,
+    frame: int | str | None = None,
+    contact: str | None = None,
+    num_points: int = 2000,
+    clock: Clock | None = None,
+) -> PreparedDifference:
+    """Check a frame against its reference, make a mesh, and calibrate a model of the body on the reference.
+
+    Arguments as in `jeit.imaging.image_difference` and its settings; `clock` takes the time of each step. Raises
+    `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`), that do not say where the electrodes
+    are, that are complex, or on which the calibration fails.
+    """
+    clock = Clock(None) if clock is None else clock
+    with clock("check"):
+        one, base = select_frames(measurement, reference, frame)
+        (quality,) = check_imageable(one, base)
+        domain, electrodes = _setup(one, base)
+        both = one.mask[0] & base.mask[0]
+        difference = jnp.where(both, one.voltages[0] - base.voltages[0], 0)
+    with clock("mesh"):
+        mesh = imaging_mesh(domain, electrodes, num_points)
+        model = ForwardModel(mesh, electrodes, one.protocol)
+    with clock("calibrate"):
+        chosen = contact or default_contact(one)
+        calibration = calibrate(model, base.voltages[0], mask=base.mask[0], contact=chosen)
+        if contact is None and chosen == "each" and calibration.status != "converged":
+            chosen = "common"  # the data do not tell so many impedances apart
+            calibration = calibrate(model, base.voltages[0], mask=base.mask[0], contact=chosen)
+        calibration = jax.block_until_ready(calibration)
+        if not np.isfinite(calibration.misfit):
+            raise ValueError(
+                f"'{base.name}': calibration on it failed ({calibration.status}); is this a frame of the empty body, "
+                "and are geometry and protocol right?"
+            )
+    return PreparedDifference(one, base, quality, domain, chosen, calibration, difference, both)
+
+
+def select_frames(
+    measurement: Measurement, reference: Measurement | None = None, frame: int | str | None = None
+) -> tuple[Measurement, Measurement]:
+    """The frame to image and the reference to image it against, one frame each.
+
+    A frame named "reference" in `measurement` is never imaged unless asked for, and is what the others are compared
+    with when no `reference` is given. Raises `ValueError` when there is no reference, or no such frame.
+    """
+    if reference is None:
+        objects, reference = measurement.split_reference()
+    elif "reference" in measurement.frame_names and measurement.num_frames > 1:
+        objects, _ = measurement.split_reference()
+    else:
+        objects = measurement
+    if "reference" in reference.frame_names and reference.num_frames > 1:
+        _, reference = reference.split_reference()
+    one = objects.frame(0) if frame is None else measurement.frame(frame)
+    return one, reference.mean_frame()
+
+
+def imaging_mesh(domain: Domain, electrodes: AbstractElectrodes, num_points: int) -> Mesh:
+    """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep."""
+    if isinstance(electrodes, SheetDiscs):
+        radius = np.asarray(electrodes.radius)
+        refine = Refine(np.asarray(electrodes.position), cell_size=0.7 * radius.min(), distance=float(radius.max()))
+    elif isinstance(electrodes, (BoundaryElectrodes, PointElectrodes)):
+        refine = Refine(np.asarray(electrodes.position), factor=2.0)
+    else:
+        refine = None
+    return domain.mesh(num_points=num_points, refine=refine)
+
+
+def default_contact(measurement: Measurement) -> str:
+    """How to calibrate contact impedance: "each" if driven electrodes are read, else "fixed".
+
+    Only the voltage of an electrode that carries current drops across its contact; without such channels the fit would
+    bend contact impedances to explain something else.
+    """
+    return "each" if measurement.protocol.channels_on_driven_electrodes().any() else "fixed"
+
+
+def _setup(measurement: Measurement, reference: Measurement) -> tuple[Domain, AbstractElectrodes]:
+    domain = measurement.domain if measurement.domain is not None else reference.domain
+    electrodes = measurement.electrodes if measurement.electrodes is not None else reference.electrodes
+    if domain is None or electrodes is None:
+        missing = "[geometry]" if domain is None else "[electrodes]"
+        raise ValueError(
+            f"'{measurement.name}' does not say what it was measured on: give a description with {missing} "
+            "(a TOML file beside the data, or --description)."
+        )
+    if jnp.iscomplexobj(measurement.voltages):
+        raise ValueError(
+            f"'{measurement.name}' is complex; choose the part to image with [data] component in its description: "
+            "real, imaginary or magnitude."
+        )
+    return domain, electrodes

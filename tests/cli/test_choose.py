@@ -1,0 +1,133 @@
+"""`jeit choose`: a table, a picture and a report of what every rule chooses."""
+
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from jeit.choosing import compare_on_data, report
+from jeit.cli.choose import show
+from jeit.data import read
+from jeit.imaging import ImagingSettings
+from jeit.inverse import RULES
+
+SMALL = ("--num-points", 300, "--contact", "fixed")
+
+
+def choose(run, folder, *options):
+    status, output, error = run("choose", *options, "--output", folder)
+    assert (status, error) == (0, "")
+    return output, json.loads((folder / "choice.json").read_text("utf-8"), parse_constant=pytest.fail)
+
+
+def test_every_rule_in_table_picture_and_report(tank, run, tmp_path):
+    files = (tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv")
+    folder = tmp_path / "out"
+    output, written = choose(run, folder, *files, *SMALL, "--prior", "noser")
+    assert sorted(file.name for file in folder.iterdir()) == ["choice.json", "choice.png"]
+    assert (folder / "choice.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    rows = {line.split()[0]: line for line in output.splitlines() if line.split()}
+    assert [entry["rule"] for entry in written["rules"]] == list(RULES)
+    assert written["prior"] == "noser"
+    for entry in written["rules"]:
+        row = rows[entry["rule"]]
+        assert f"{entry['hyperparameter']:.3g}" in row
+        assert f"{entry['noise_figure']:.3g}" in row
+        assert row.split()[-1] == str(len(entry["inclusions"]))
+        assert 0 < entry["relative_residual"] < 1
+        lengths = {len(entry[curve]) for curve in ("candidates", "criterion", "residual", "penalty")}
+        assert len(lengths) == 1
+    # Data without noise: what reciprocity tells of it is nil, and no residual is as small.
+    (edge,) = [entry for entry in written["rules"] if entry["rule"] == "discrepancy"]
+    assert edge["edge_of_grid"] == "smallest"
+    assert edge["note"] in output
+    assert rows["discrepancy"].split()[1] == "*"
+    # The same λ as `jeit reconstruct` uses.
+    status, _, error = run("reconstruct", *files, *SMALL, "--prior", "noser", "--output", folder)
+    assert (status, error) == (0, "")
+    imaged = json.loads((folder / "report.json").read_text("utf-8"))
+    (figure,) = [entry for entry in written["rules"] if entry["rule"] == "noise-figure"]
+    assert imaged["hyperparameter"]["value"] == pytest.approx(figure["hyperparameter"])
+    assert imaged["hyperparameter"]["note"] is None
+
+
+def test_one_rule_and_quiet(tank, run, tmp_path):
+    options = ("--rule", "l-curve", "--rule", "gcv", "--quiet", *SMALL)
+    output, written = choose(
+        run, tmp_path / "out", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv", *options
+    )
+    assert output == ""
+    assert [entry["rule"] for entry in written["rules"]] == ["l-curve", "gcv"]
+
+
+def test_reconstruct_says_when_its_rule_ran_to_the_edge(tank, run, tmp_path):
+    files = (tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv")
+    status, output, error = run(
+        "reconstruct", *files, *SMALL, "--hyperparameter", "discrepancy", "--output", tmp_path / "out"
+    )
+    assert (status, error) == (0, "")
+    imaged = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
+    assert "ran to the smallest" in imaged["hyperparameter"]["note"]
+    assert "not to be" in " ".join(output.split())
+
+
+def test_a_rule_that_cannot_choose_is_refused_and_the_others_are_not(tank, capsys):
+    """Of every two reciprocal channels only one: nothing tells of the noise."""
+    pairs, _ = read(tank.folder / "rest.csv").protocol.reciprocal_pairs()
+    usable = np.ones(40, bool)
+    usable[np.asarray(pairs)[:, 1]] = False
+    touched, rest = (read(tank.folder / f"{name}.csv").masked(usable, "half") for name in ("touched", "rest"))
+    settings = ImagingSettings(num_points=300, contact="fixed")
+    result = compare_on_data(touched, rest, settings, rules=["discrepancy", "gcv"])
+    assert list(result.outcomes) == ["gcv"]
+    assert "needs to know the noise" in result.refused["discrepancy"]
+    assert report(result)["refused"] == result.refused
+    show(Console(width=200), result)
+    assert "needs to know the noise" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="needs to know the noise"):
+        compare_on_data(touched, rest, settings, rules=["discrepancy"])
+    with pytest.raises(ValueError, match="none is named"):
+        compare_on_data(touched, rest, settings, rules=[])
+
+
+BAD = {
+    "unknown rule": (lambda t: good(t, "--rule", "luck"), "there is no 'luck'; give some of gcv"),
+    "unknown prior": (lambda t: good(t, "--prior", "flat"), "tikhonov, laplace, noser, gaussian"),
+    "no reference": (lambda t: [t.folder / "touched.csv"], "reference"),
+    "no such file": (lambda t: ["absent.csv", "--reference", t.folder / "rest.csv"], "There is no file"),
+    "mesh of three nodes": (lambda t: good(t, "--num-points", "3"), "50 to 100,000"),
+    "equal frames": (lambda t: [t.folder / "rest.csv", "--reference", t.folder / "rest.csv"], "no difference to image"),
+}
+
+
+def good(tank, *options):
+    return [tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv", *options]
+
+
+@pytest.mark.parametrize(("arguments", "words"), BAD.values(), ids=BAD.keys())
+def test_bad_input_is_refused_in_one_line(arguments, words, tank, run, tmp_path):
+    status, _, error = run("choose", *arguments(tank), "--output", tmp_path / "out")
+    assert status == 1
+    assert words in error
+    assert error.count("\n") == 1
+
+
+def test_output_that_is_a_file_is_refused_before_any_work(tank, run):
+    status, output, error = run("choose", *good(tank), "--output", tank.folder / "rest.csv")
+    assert (status, output) == (1, "")
+    assert "is a file" in error
+
+
+@pytest.mark.slow
+def test_measured_tank(data_folder, run, tmp_path):
+    """Three metal rods: the rules that look at the system or at the corner find them; gcv, misled by the model, does
+    not, and discrepancy says that it ran to the edge."""
+    folder = data_folder / "kit4"
+    files = (folder / "datamat_3_4.mat", "--reference", folder / "datamat_1_0.mat")
+    _, written = choose(run, tmp_path / "out", *files, "--num-points", 600)
+    found = {entry["rule"]: [i["sign"] for i in entry["inclusions"]] for entry in written["rules"]}
+    for rule in ("noise-figure", "best-resolution", "l-curve"):
+        assert found[rule] == [1, 1, 1]
+    assert len(found["gcv"]) > 3
+    assert [entry["rule"] for entry in written["rules"] if entry["edge_of_grid"]] == ["discrepancy"]
