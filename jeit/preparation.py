@@ -97,14 +97,34 @@ def prepare_difference(
     with clock("check"):
         one, base = select_frames(measurement, reference, frame)
         (quality,) = check_imageable(one, base)
-        domain, electrodes = _setup(one, base)
+        domain, electrodes = body_of(one, base)
         both = one.mask[0] & base.mask[0]
         difference = jnp.where(both, one.voltages[0] - base.voltages[0], 0)
+    calibration, chosen = calibrated_model(
+        base, domain, electrodes, contact=contact, num_points=num_points, clock=clock
+    )
+    return PreparedDifference(one, base, quality, domain, chosen, calibration, difference, both)
+
+
+def calibrated_model(
+    base: Measurement,
+    domain: Domain,
+    electrodes: AbstractElectrodes,
+    *,
+    contact: str | None = None,
+    num_points: int = 2000,
+    clock: Clock | None = None,
+) -> tuple[Calibration, str]:
+    """A forward model on a new mesh, calibrated on a frame of the undisturbed body; and how its contact was.
+
+    `contact`: "each", "common" or "fixed"; decided by the protocol, and by what converges, unless given. Raises
+    `ValueError` if the calibration fails.
+    """
+    clock = Clock(None) if clock is None else clock
     with clock("mesh"):
-        mesh = imaging_mesh(domain, electrodes, num_points)
-        model = ForwardModel(mesh, electrodes, one.protocol)
+        model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
     with clock("calibrate"):
-        chosen = contact or default_contact(one)
+        chosen = contact or default_contact(base)
         calibration = calibrate(model, base.voltages[0], mask=base.mask[0], contact=chosen)
         if contact is None and chosen == "each" and calibration.status != "converged":
             chosen = "common"  # the data do not tell so many impedances apart
@@ -115,7 +135,7 @@ def prepare_difference(
                 f"'{base.name}': calibration on it failed ({calibration.status}); is this a frame of the empty body, "
                 "and are geometry and protocol right?"
             )
-    return PreparedDifference(one, base, quality, domain, chosen, calibration, difference, both)
+    return calibration, chosen
 
 
 def select_frames(
@@ -159,7 +179,8 @@ def default_contact(measurement: Measurement) -> str:
     return "each" if measurement.protocol.channels_on_driven_electrodes().any() else "fixed"
 
 
-def _setup(measurement: Measurement, reference: Measurement) -> tuple[Domain, AbstractElectrodes]:
+def body_of(measurement: Measurement, reference: Measurement) -> tuple[Domain, AbstractElectrodes]:
+    """Outline and electrodes, from whichever of the two says them; raises `ValueError` where neither does."""
     domain = measurement.domain if measurement.domain is not None else reference.domain
     electrodes = measurement.electrodes if measurement.electrodes is not None else reference.electrodes
     if domain is None or electrodes is None:

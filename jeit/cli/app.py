@@ -14,6 +14,7 @@ from jeit.cli.choose import choose
 from jeit.cli.demo import demo
 from jeit.cli.info import info
 from jeit.cli.reconstruct import reconstruct
+from jeit.cli.stream import stream
 
 app = typer.Typer(
     name="jeit",
@@ -24,6 +25,7 @@ app = typer.Typer(
 )
 app.command()(demo)
 app.command()(reconstruct)
+app.command()(stream)
 app.command()(choose)
 app.command()(info)
 
@@ -47,9 +49,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0: done. 1: something is wrong with the data or the values given. 2: the command was not called as it should be.
     Whatever is wrong is said in one line on standard error; JEIT_DEBUG=1 shows the traceback instead.
     """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal that knows no Greek must not end the run
+    for output in (sys.stdout, sys.stderr):
+        if isinstance(output, io.TextIOWrapper):
+            output.reconfigure(errors="replace")  # a terminal that knows no Greek must not end the run
     command = typer.main.get_command(app)
     try:
         with warnings.catch_warnings():

@@ -36,10 +36,6 @@ class AbstractBasis(eqx.Module):
     def scaled(self, factor) -> "AbstractBasis":
         """S times a number."""
 
-    def single(self) -> "AbstractBasis":
-        """For products in single precision, where they cost most of the time; the same basis where they do not."""
-        return self
-
     @abc.abstractmethod
     def pooled(self, regions: "Regions") -> "AbstractBasis":
         """S with the rows of every region replaced by their mean, and by zero where the image is held fixed."""
@@ -96,10 +92,6 @@ class DenseBasis(AbstractBasis):
     def scaled(self, factor):
         """The matrix times a number."""
         return DenseBasis(self.shapes * factor)
-
-    def single(self):
-        """Shapes in single precision."""
-        return DenseBasis(self.shapes.astype(jnp.float32))
 
     def pooled(self, regions):
         """Shapes that are constant in every region."""

@@ -1,9 +1,10 @@
 """`Imager`: frame after frame to images, linear or by Gauss-Newton from the last image, in a bounded time.
 
 All that does not depend on the frame is worked out once: which channels are independent, the prior's basis, the
-hyperparameter, the electrodes' integrals, the linear image's matrix. The prior's shapes are kept in single precision,
-which alters an image by a millionth. Array shapes never change, so nothing is compiled again: a channel that is masked
-keeps its place, and gets a variance so large that it does not count.
+hyperparameter, the electrodes' integrals, the linear image's matrix; and which combinations of the prior's shapes the
+data can tell of at all, some dozens, kept in single precision, which alters an image by a millionth. Array shapes never
+change, so nothing is compiled again: a channel that is masked keeps its place, and gets a variance so large that it
+does not count.
 """
 
 import equinox as eqx
@@ -15,8 +16,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jeit.electrodes import IntegratedElectrodes
 from jeit.forward import ForwardModel
+from jeit.inverse.bases import DenseBasis
 from jeit.inverse.channels import IndependentChannels, Weighing
-from jeit.inverse.inversion import Inversion
+from jeit.inverse.inversion import Inversion, Ridge
 from jeit.inverse.links import AbstractLink, Log
 from jeit.inverse.priors import AbstractPrior, Gaussian
 from jeit.inverse.reconstruct import check_background, check_frame, check_noise, pose
@@ -87,16 +89,21 @@ class Imager(eqx.Module):
         mask: Bool[Array, " M"] | None = None,
         steps: int = 4,
         rtol: float = 1e-3,
+        informative: float = 0.03,
     ) -> "Imager":
         """`background`: conductivity of the undisturbed body, S/m (2-D: S). `reference` (M,): a measured frame of it,
         volts; frames are then imaged by their difference to it, which frees images from what the model gets wrong.
-        `prior`: `Gaussian` of a twelfth of the body's width unless given. The rest as in `reconstruct`. Raises
+        `prior`: `Gaussian` of a twelfth of the body's width unless given. `informative`: images are built of shapes
+        that the data of the undisturbed body tell more of than this, in standard deviations of the noise for one of the
+        prior, the rest staying as the prior has it; 0 takes all shapes. The rest as in `reconstruct`. Raises
         `ValueError` for arguments that do not fit.
         """
         if method not in METHODS:
             raise ValueError(f"method: there is no '{method}'; give one of {', '.join(METHODS)}.")
         if steps < 1 or not rtol >= 0:
             raise ValueError(f"steps must be at least 1 and rtol not negative; they are {steps} and {rtol}.")
+        if not 0 <= informative < 1:
+            raise ValueError(f"informative must lie between 0 and 1; it is {informative}.")
         if method == "linear" and isinstance(prior, TotalVariation):
             raise ValueError("prior: total variation is not linear; take method 'gauss-newton', or another prior.")
         background = check_background(model, background)
@@ -115,9 +122,12 @@ class Imager(eqx.Module):
             Gaussian(0.085 * width) if prior is None else prior,
             hyperparameter,
         )
+        if informative > 0 and isinstance(inversion.penalty, Ridge):
+            shapes = _informed_shapes(inversion, _singular_values(inversion), informative)
+            inversion = eqx.tree_at(lambda i: i.basis, inversion, DenseBasis(shapes))
         return cls(
             channels=channels,
-            inversion=eqx.tree_at(lambda i: i.basis, inversion, inversion.basis.single()),
+            inversion=inversion,
             noise=deviation,
             mask=jnp.asarray(used),
             expected=jnp.where(used, frame, predicted),
@@ -147,6 +157,23 @@ class Imager(eqx.Module):
         Channels that do not count must hold some finite voltage, best that of the last frame.
         """
         return _estimate(self, frame, weighing, start)
+
+
+@jax.jit
+def _singular_values(inversion: Inversion):
+    """Of the whitened Jacobian at the background: squared singular values, and right vectors times their roots."""
+    start = jnp.zeros(inversion.num_coefficients)
+    rows = inversion.data.whiten(inversion.linearise(start)[1])
+    squares, left = jnp.linalg.eigh(rows @ rows.T)
+    return squares, left.T @ rows
+
+
+def _informed_shapes(inversion: Inversion, decomposition, least: float) -> Float[Array, "m k"]:
+    """The shapes, of unit variance in the prior, that the data tell more of than `least`; in single precision."""
+    squares, rows = (np.asarray(values) for values in decomposition)
+    kept = squares > max(least**2, 1e-12 * squares[-1])
+    directions = rows[kept] / np.sqrt(squares[kept])[:, None]
+    return jax.vmap(inversion.basis.expand)(jnp.asarray(directions)).T.astype(jnp.float32)
 
 
 def _blinded(noise, used) -> Float[Array, " M"]:

@@ -97,12 +97,14 @@ class _Session:
         self.weighing = self.imager.weighing(jnp.asarray(usable))
         if self.imager.method == "linear":
             linear = self.imager.linear_map(self.weighing)
-            self.matrix, self.estimator, self.level = (
-                np.asarray(a) for a in (linear.matrix, linear.estimator, linear.level)
-            )
+            # Reading the matrix takes most of a linear image's time; it multiplies differences, so single will do.
+            self.matrix = np.asarray(linear.matrix, np.float32)
+            self.estimator = np.asarray(linear.estimator)
+            self.resting = self.estimator @ self.expected
+            self.level = np.asarray(linear.level) + np.asarray(linear.matrix) @ self.resting
 
     def _linear(self, frame):
-        return self.level + self.matrix @ (self.estimator @ frame)
+        return self.level + self.matrix @ (self.estimator @ frame - self.resting).astype(np.float32)
 
     def _iterate(self, frame):
         if self.imager.method == "linear":

@@ -1,0 +1,104 @@
+"""Iterative methods, segmentation and streams from the command line."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+
+FEW = ("--num-points", 250)
+
+
+@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "total-variation"])
+def test_iterative_images(method, tank, run, tmp_path):
+    output = tmp_path / "out"
+    status, text, error = run(
+        "reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv", "--output", output,
+        "--method", method, *FEW,
+    )  # fmt: skip
+    assert (status, error) == (0, "")
+    assert "converged" in text
+    report = json.loads((output / "report.json").read_text())["reconstruction"]
+    assert report["method"] == method
+    assert report["status"] == "converged"
+    objective = report["objective_per_iteration"]
+    assert len(objective) == report["iterations"] + 1
+    assert (np.diff(objective) < 0).all()
+    content = np.load(output / "image.npz")
+    assert (content["conductivity"] > -content["background"]).all()
+    assert "labels" not in content
+
+
+def test_segmentation(tank, run, tmp_path):
+    status, _, error = run(
+        "reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv",
+        "--output", tmp_path / "out", "--segment", "--quiet", *FEW,
+    )  # fmt: skip
+    assert (status, error) == (0, "")
+    content = np.load(tmp_path / "out" / "image.npz")
+    assert content["labels"].shape == (256, 256)
+    assert content["labels"].dtype == np.uint8
+    assert set(np.unique(content["labels"])) <= {0, 1, 2}
+    assert content["labels"].any()
+    report = json.loads((tmp_path / "out" / "report.json").read_text())["reconstruction"]
+    assert report["method"] == "total-variation"
+    assert report["prior"] == "total variation"
+
+
+def rows_of(folder):
+    with open(folder / "frames.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("method", ["linear", "gauss-newton"])
+def test_a_stream_from_a_file(method, tank, run, tmp_path):
+    bad = tank.touched.copy()
+    bad[3] = np.nan
+    data = tank.write("many", np.stack([tank.touched, 5 * tank.touched, bad, tank.touched]))
+    output = tmp_path / "out"
+    status, text, error = run(
+        "stream", data, "--reference", tank.folder / "rest.csv", "--output", output, "--method", method, *FEW
+    )
+    assert (status, error) == (0, "")
+    assert "4 frames" in text
+    rows = rows_of(output)
+    assert [row["status"] for row in rows][1:3] == ["refused", "partial"]
+    assert "another sensor" in rows[1]["reason"]
+    images = np.load(output / "images.npz")["conductivity"]
+    assert np.isnan(images[1]).all()
+    assert np.isfinite(images[[0, 2, 3]]).all()
+    np.testing.assert_allclose(images[0], images[3], rtol=0.02)
+
+
+def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
+    good = " ".join(map(repr, map(float, tank.touched)))
+    monkeypatch.setattr("sys.stdin", io.StringIO(f"{good}\n\nrubbish\n{good.replace(' ', ',')}\n1 2 3\n"))
+    status, _, error = run(
+        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "linear",
+        "--quiet", *FEW,
+    )  # fmt: skip
+    assert (status, error) == (0, "")
+    assert [row["status"] for row in rows_of(tmp_path / "out")] == ["imaged", "refused", "imaged", "refused"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("reconstruct", "--method", "newton"), "gauss-newton"),
+        (("reconstruct", "--method", "total-variation", "--prior", "noser"), "--prior"),
+        (("reconstruct", "--method", "total-variation", "--hyperparameter", "gcv"), "takes a number"),
+        (("stream", "--method", "one-step"), "gauss-newton"),
+        (("stream", "--steps", "0"), "steps"),
+        (("stream", "--hyperparameter", "magic"), "magic"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(arguments, words, tank, run, tmp_path):
+    command, *options = arguments
+    status, _, error = run(
+        command, tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out",
+        *options, *FEW,
+    )  # fmt: skip
+    assert status == 1
+    assert words in error
+    assert error.count("\n") == 1
