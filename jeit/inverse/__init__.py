@@ -19,6 +19,7 @@ from jeit.inverse.links import Bounded as Bounded
 from jeit.inverse.links import Linear as Linear
 from jeit.inverse.links import Log as Log
 from jeit.inverse.noise import relative_noise as relative_noise
+from jeit.inverse.noise import repeated_noise as repeated_noise
 from jeit.inverse.posterior import Posterior as Posterior
 from jeit.inverse.posterior import posterior as posterior
 from jeit.inverse.priors import AbstractPrior as AbstractPrior

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 
@@ -19,3 +20,31 @@ def relative_noise(
     used = jnp.isfinite(size) if mask is None else jnp.asarray(mask) & jnp.isfinite(size)
     typical = jnp.nanmedian(jnp.where(used, size, jnp.nan))
     return jnp.where(used, relative * jnp.sqrt(jnp.where(used, size, 0) ** 2 + (floor * typical) ** 2), 1.0)
+
+
+def repeated_noise(frames, mask=None, *, prior_frames: float = 4.0) -> Float[np.ndarray, " M"]:
+    """Standard deviation of a single frame's channels (M,), volts, measured from repeated frames of a body at rest.
+
+    `frames` (F, M) volts, F at least 2. `mask` (F, M) or (M,): True for usable voltages; a channel with fewer than two
+    comes out as 1. A deviation of few frames is itself uncertain: variances are drawn towards the channels' median
+    as if that had been seen in `prior_frames` frames more. Raises `ValueError` for other shapes, for frames that are
+    all alike, and for NaN in what is used.
+    """
+    values = np.asarray(frames, float)
+    if values.ndim != 2 or len(values) < 2:
+        raise ValueError(f"frames has shape {values.shape}; give at least two repeated frames, (frames, channels).")
+    used = np.ones(values.shape, bool) if mask is None else np.asarray(mask)
+    if used.dtype != bool or used.shape not in (values.shape, values.shape[1:]):
+        raise ValueError(f"mask must be booleans of shape {values.shape} or {values.shape[1:]}.")
+    used = np.broadcast_to(used, values.shape)
+    if not np.isfinite(values[used]).all():
+        raise ValueError("frames: some voltages in use are NaN or infinite; mask them.")
+    count = used.sum(axis=0)
+    mean = np.where(used, values, 0).sum(axis=0) / np.maximum(count, 1)
+    squares = np.where(used, (values - mean) ** 2, 0).sum(axis=0)
+    known = count >= 2
+    if not squares[known].any():
+        raise ValueError("frames: all are alike, so they tell nothing of the noise; is one frame repeated?")
+    typical = np.median((squares[known] / (count[known] - 1))[squares[known] > 0])
+    freedom = np.where(known, count - 1, 1) + prior_frames
+    return np.where(known, np.sqrt((squares + prior_frames * typical) / freedom), 1.0)
