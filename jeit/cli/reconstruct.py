@@ -84,7 +84,7 @@ def reconstruct(
         "num_points": num_points,
     }
     if method in ("back-projection", "filtered-back-projection", "total-variation") and prior is not None:
-        raise ValueError(f"--prior: --method {method} has its own; leave it out, or choose another method.")
+        raise ValueError(f"--prior does not go with --method {method}; leave it out, or choose another method.")
     if method == "back-projection" and hyperparameter is not None:
         raise ValueError("--hyperparameter: plain back-projection has none; leave it out.")
     settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})

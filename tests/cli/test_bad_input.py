@@ -276,7 +276,7 @@ COMMANDS = {
     ),
     "prior for back-projection": (
         lambda t: good(t, "--method", "back-projection", "--prior", "noser"),
-        "belongs to one-step",
+        "does not go with",
     ),
     "hyperparameter for back-projection": (
         lambda t: good(t, "--method", "back-projection", "--hyperparameter", "5"),
