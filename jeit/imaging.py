@@ -30,6 +30,7 @@ from jeit.inverse import (
     reconstruct,
 )
 from jeit.inverse.hyperparameter import Rule, discrepancy
+from jeit.inverse.reconstruct import EDGE_PRICE
 from jeit.mesh import Domain, Mesh
 from jeit.preparation import Clock, PreparedDifference, prepare_difference
 from jeit.preparation import default_contact as default_contact
@@ -40,6 +41,13 @@ LINEAR_METHODS = ("one-step", "back-projection", "filtered-back-projection")
 ITERATIVE_METHODS = ("gauss-newton", "levenberg-marquardt", "total-variation")
 METHODS = (*LINEAR_METHODS, *ITERATIVE_METHODS)
 CONTACTS = ("each", "common", "fixed")
+
+DEFAULT_HYPERPARAMETERS: dict[str, float | str] = {
+    "one-step": "noise-figure",
+    "gauss-newton": 5.0,
+    "levenberg-marquardt": 5.0,
+    "total-variation": EDGE_PRICE,
+}
 
 # Priors by name, made for a body of a given size: the longer side of its outline in metres.
 PRIORS: dict[str, Callable[[float], AbstractPrior]] = {
@@ -56,8 +64,9 @@ class ImagingSettings:
 
     - `method`: one of `METHODS`: linear ones, and iterative ones that solve for conductivity itself.
     - `prior`: a name in `PRIORS`, or a prior; used by one-step, Gauss-Newton and Levenberg-Marquardt imaging.
-    - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; not used by plain back-projection; a number
-      for total variation, where the default's place is taken by `jeit.inverse.reconstruct.EDGE_PRICE`.
+    - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; a number for total variation and filtered
+      back-projection; not used by plain back-projection. None: "noise-figure" for one-step images, 5 for Gauss-Newton
+      and Levenberg-Marquardt, 300 for total variation, what served on measured tanks.
     - `contact`: how the contact impedance is calibrated ("each", "common", "fixed"); None decides by the protocol: each
       electrode's own where voltages are read on driven electrodes, else fixed, for then nothing shows it.
     - `num_points`: nodes of the mesh, about.
@@ -68,7 +77,7 @@ class ImagingSettings:
 
     method: str = "one-step"
     prior: str | AbstractPrior = "gaussian"
-    hyperparameter: float | str = "noise-figure"
+    hyperparameter: float | str | None = None
     contact: str | None = None
     num_points: int = 2000
     raster_shape: tuple[int, int] = (256, 256)
@@ -82,15 +91,17 @@ class ImagingSettings:
         known = self.prior in PRIORS if isinstance(self.prior, str) else isinstance(self.prior, AbstractPrior)
         if not known:
             raise ValueError(f"prior: there is no {self.prior!r}; give one of {', '.join(PRIORS)}, or a prior.")
-        if isinstance(self.hyperparameter, str):
+        if self.hyperparameter is None:
+            object.__setattr__(self, "hyperparameter", DEFAULT_HYPERPARAMETERS.get(self.method))
+        elif isinstance(self.hyperparameter, str):
             if self.hyperparameter not in RULES:
                 raise ValueError(
                     f"hyperparameter: '{self.hyperparameter}' is neither a number nor a rule; the rules are "
                     f"{', '.join(RULES)}."
                 )
-            if self.method == "filtered-back-projection" and self.hyperparameter != type(self).hyperparameter:
+            if self.method == "filtered-back-projection":
                 raise ValueError("hyperparameter: filtered back-projection takes a number such as 0.05, not a rule.")
-            if self.method == "total-variation" and self.hyperparameter != type(self).hyperparameter:
+            if self.method == "total-variation":
                 raise ValueError("hyperparameter: total variation takes a number such as 300, not a rule.")
         elif isinstance(self.hyperparameter, bool) or not (
             np.isfinite(self.hyperparameter) and self.hyperparameter > 0
@@ -251,8 +262,9 @@ def _reconstruction(prepared: PreparedDifference, settings: ImagingSettings) -> 
     hyperparameter = settings.hyperparameter
     if settings.method != "one-step":
         filtered = settings.method.startswith("filtered")
-        given = {} if isinstance(hyperparameter, str) else {"hyperparameter": hyperparameter}
+        given = {"hyperparameter": hyperparameter} if isinstance(hyperparameter, (int, float)) else {}
         return back_projection(model, conductivity, filtered=filtered, mask=prepared.mask, **given)
+    assert hyperparameter is not None
     return one_step(
         model,
         conductivity,
@@ -273,7 +285,7 @@ def _iterated(prepared: PreparedDifference, settings: ImagingSettings) -> Recons
     total_variation = settings.method == "total-variation"
     hyperparameter = settings.hyperparameter
     if isinstance(hyperparameter, str):
-        hyperparameter = None if total_variation else rule_for(hyperparameter, prepared)
+        hyperparameter = rule_for(hyperparameter, prepared)
     found = reconstruct(
         model,
         model.voltages(background) + prepared.difference,
@@ -284,6 +296,7 @@ def _iterated(prepared: PreparedDifference, settings: ImagingSettings) -> Recons
         mask=prepared.mask,
         solver="gauss-newton" if total_variation else settings.method,
         max_steps=100,
+        rtol=1e-4,
     )
     if found.status == "failed":
         raise ValueError(f"'{prepared.measurement.name}': the reconstruction failed. {found.reason}")

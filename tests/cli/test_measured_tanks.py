@@ -3,12 +3,15 @@
 import csv
 import re
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jeit.data import read
-from jeit.image import Raster
+from jeit.image import Raster, find_inclusions
 from jeit.imaging import image_difference
+from jeit.inverse import Gaussian, reconstruct
+from jeit.preparation import prepare_difference
 
 PITCH = 22.5  # degrees between electrodes of the 6 cm tank
 
@@ -95,3 +98,41 @@ def test_ktc2023_images_correlate_with_their_truth(number, data_folder):
     inside = np.isfinite(raster)
     correlation = np.corrcoef(raster[inside], truth[inside])[0, 1]
     assert correlation > LEAST_CORRELATION[number]
+
+
+@pytest.mark.slow
+def test_kit4_gauss_newton_converges_on_every_file(data_folder):
+    """At the command's settings; calibrated once, as all files share their reference."""
+    folder = data_folder / "kit4"
+    truth: dict[str, list[tuple[int, np.ndarray]]] = {}
+    with open(folder / "truth_centroids.csv", newline="") as file:
+        for row in csv.DictReader(file):
+            place = KIT4_RADIUS * np.array([float(row["x_over_R"]), float(row["y_over_R"])])
+            truth.setdefault(row["case"], []).append((1 if row["kind"] == "conductive" else -1, place))
+    reference = read(folder / "datamat_1_0.mat")
+    prepared = prepare_difference(read(folder / "datamat_1_1.mat"), reference, num_points=1500)
+    model, background = prepared.model, prepared.calibration.conductivity
+    errors = []
+    for case, inclusions in truth.items():
+        difference = read(folder / f"datamat_{case}.mat").filled()[0] - reference.filled()[0]
+        result = reconstruct(
+            model, model.voltages(background) + difference, background, prior=Gaussian(0.085 * 2 * KIT4_RADIUS),
+            hyperparameter=5.0, noise=prepared.deviation, mask=prepared.mask, rtol=1e-4,
+        )  # fmt: skip
+        assert result.status == "converged"
+        assert result.iterations <= 10
+        found = find_inclusions(model.mesh, jnp.log(result.conductivity / background), level=0.65, least_peak=0.3)
+        assert len(found) == len(inclusions)
+        for sign, place in inclusions:
+            errors.append(min(np.hypot(*(one.centroid - place)) for one in found if one.sign == sign) / KIT4_RADIUS)
+    assert max(errors) <= 0.11
+    assert np.median(errors) <= 0.032
+
+
+@pytest.mark.slow
+def test_ktc2023_segmentation(data_folder):
+    """Level 1 of the challenge's training targets; the asked mean of 0.85."""
+    from benchmarks.ktc2023 import scores
+
+    table = scores(data_folder / "ktc2023", levels=(1,), report=lambda line: None)
+    assert table.mean() >= 0.85
