@@ -48,8 +48,8 @@ def reconstruct(
         str | None,
         typer.Option(
             help="A number, or the rule that chooses it: noise-figure (default), l-curve, gcv, discrepancy, "
-            "best-resolution, see jeit choose; for gauss-newton and levenberg-marquardt 5, for total-variation 300 unless "
-            "given.",
+            "best-resolution, see jeit choose; unless given 5 for gauss-newton and levenberg-marquardt, 300 for "
+            "total-variation.",
             metavar="VALUE|RULE",
         ),
     ] = None,
