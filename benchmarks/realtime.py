@@ -134,7 +134,6 @@ def main() -> int:
 
     import numpy as np
 
-    import jeit  # noqa: F401
     from jeit.inverse import Imager
 
     lines = ["| sensor | image | median ms | 99 % ms | limit ms | iterations | error |", "|---" * 7 + "|"]

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from jeit.forward import ForwardModel
 from jeit.inverse.linear import LinearReconstruction
+from jeit.inverse.linearisation import used_channels
 from jeit.mesh import Mesh, centroids, measures
 
 # Desired images fall from their height to zero over this much of their radius to either side of it.
@@ -57,7 +58,7 @@ def greit(
         raise ValueError("GREIT is for plane bodies, and this mesh is 3-D; use one_step, which takes either.")
     radius = model.electrodes.num_electrodes**-0.5 if radius is None else radius
     _check(radius, target_radius, num_targets, hyperparameter, noise_figure)
-    channels, root_weight = _channels(model, noise, mask)
+    channels, root_weight = used_channels(model, noise, mask)
     if jnp.iscomplexobj(conductivity):
         raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
     if np.shape(conductivity) not in ((), (mesh.num_cells,)):
@@ -172,23 +173,6 @@ def _of_noise_figure(target: float, eigenvalues, signal, level: float, painted, 
         )
     bracket = (grid[below[0] - 1], grid[below[0]])
     return float(np.exp(scipy.optimize.root_scalar(excess, bracket=bracket, rtol=1e-10).root))
-
-
-def _channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the channels in use, and the reciprocal of their noise."""
-    num_channels = model.protocol.num_measurements
-    used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
-    if used.shape != (num_channels,) or not used.any():
-        raise ValueError(f"mask must be ({num_channels},) booleans with at least one True: one for each channel.")
-    deviation = np.asarray(noise, float)
-    if deviation.shape not in ((), (num_channels,)):
-        raise ValueError(
-            f"noise has shape {deviation.shape}; give one number, or one for each channel: ({num_channels},)."
-        )
-    deviation = np.broadcast_to(deviation, (num_channels,))[used]
-    if not (np.isfinite(deviation) & (deviation > 0)).all():
-        raise ValueError("noise must be positive and finite for every channel in use.")
-    return np.flatnonzero(used), 1 / deviation
 
 
 def _check(radius, target_radius, num_targets, hyperparameter, noise_figure) -> None:

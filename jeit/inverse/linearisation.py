@@ -41,21 +41,11 @@ class Linearisation(eqx.Module):
             raise ValueError(f"prior must be one of those in jeit.inverse, such as Noser(), not {prior!r}.")
         if jnp.iscomplexobj(conductivity):
             raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
-        num_channels = model.protocol.num_measurements
-        used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
-        if used.shape != (num_channels,) or not used.any():
-            raise ValueError(f"mask must be ({num_channels},) booleans with at least one True: one for each channel.")
-        if np.shape(noise) not in ((), (num_channels,)):
-            raise ValueError(f"noise has shape {np.shape(noise)}; give one number, or one for each channel.")
-        deviation = np.broadcast_to(np.asarray(noise, float), (num_channels,))
-        if not (np.isfinite(deviation[used]) & (deviation[used] > 0)).all():
-            raise ValueError("noise must be positive and finite for every channel in use.")
-        channels = np.flatnonzero(used)
-        root_weight = 1 / deviation[used]
+        channels, root_weight = used_channels(model, noise, mask)
         whitened = _whitened(model.jacobian(conductivity), channels, root_weight)
         product = prior.covariance_product(model.mesh, whitened)
         spectrum = Spectrum.create(whitened, product, prior.null_space(model.mesh))
-        return cls(spectrum, prior, channels, root_weight, num_channels)
+        return cls(spectrum, prior, channels, root_weight, model.protocol.num_measurements)
 
     def whiten(self, difference: ArrayLike) -> Float[Array, " K"]:
         """A change of voltages (M,) in standard deviations, channels in use only.
@@ -82,3 +72,20 @@ class Linearisation(eqx.Module):
 @jax.jit
 def _whitened(jacobian, channels, root_weight):
     return root_weight[:, None] * jacobian[channels]
+
+
+def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (K,) of the channels in use, and 1 / their noise (K,), 1 / volts; raises `ValueError`."""
+    num_channels = model.protocol.num_measurements
+    used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
+    if used.shape != (num_channels,) or not used.any():
+        raise ValueError(f"mask must be ({num_channels},) booleans with at least one True: one for each channel.")
+    deviation = np.asarray(noise, float)
+    if deviation.shape not in ((), (num_channels,)):
+        raise ValueError(
+            f"noise has shape {deviation.shape}; give one number, or one for each channel: ({num_channels},)."
+        )
+    deviation = np.broadcast_to(deviation, (num_channels,))[used]
+    if not (np.isfinite(deviation) & (deviation > 0)).all():
+        raise ValueError("noise must be positive and finite for every channel in use.")
+    return np.flatnonzero(used), 1 / deviation

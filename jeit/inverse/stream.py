@@ -67,7 +67,7 @@ class _Session:
         self.coefficients = imager.start
         self.last = self.expected
         self._weigh(self.mask)
-        self._iterate(self.expected)  # compiles
+        self._estimate(self.expected)  # compiles
         self.coefficients = imager.start
 
     def image(self, number: int, frame) -> FrameImage:
@@ -79,10 +79,7 @@ class _Session:
         if usable is not self.usable and not np.array_equal(usable, self.usable):
             self._weigh(usable)
         filled = values if usable is self.mask else np.where(usable, values, self.last)
-        if self.imager.method == "linear":
-            conductivity, misfit, iterations, converged = self._linear(filled), np.nan, 1, True
-        else:
-            conductivity, misfit, iterations, converged = self._iterate(filled)
+        conductivity, misfit, iterations, converged = self._estimate(filled)
         if not np.isfinite(conductivity).all():
             reason = "The image became NaN; the next frame starts from the background again."
             self.coefficients = self.imager.start
@@ -103,12 +100,11 @@ class _Session:
             self.resting = self.estimator @ self.expected
             self.level = np.asarray(linear.level) + np.asarray(linear.matrix) @ self.resting
 
-    def _linear(self, frame):
-        return self.level + self.matrix @ (self.estimator @ frame - self.resting).astype(np.float32)
-
-    def _iterate(self, frame):
+    def _estimate(self, frame):
+        """Conductivity, misfit, iterations, and whether they converged."""
         if self.imager.method == "linear":
-            return self._linear(frame), np.nan, 1, True
+            change = self.matrix @ (self.estimator @ frame - self.resting).astype(np.float32)
+            return self.level + change, np.nan, 1, True
         found = self.imager.estimate(frame, self.weighing, self.coefficients)
         self.coefficients = found.coefficients
         return np.asarray(found.conductivity), float(found.misfit), int(found.iterations), bool(found.converged)
@@ -147,6 +143,7 @@ class _Session:
         electrode = int(np.argmin(left))
         own, rest = usable & self.touching[electrode], usable & ~self.touching[electrode]
         lost = np.median(np.abs(difference[own]) / np.abs(self.expected[own])) > _LOST
-        if not lost or left[electrode] > _EXPLAINED * total or rest.sum() < _LEAST_CHANNELS * self.mask.sum():
+        explained = left[electrode] <= min(_EXPLAINED * total, _LARGEST_DIFFERENCE * self.size)
+        if not (lost and explained) or rest.sum() < _LEAST_CHANNELS * self.mask.sum():
             return usable, ""
         return rest, f"Electrode {electrode + 1} seems to be dead; its channels are left out."

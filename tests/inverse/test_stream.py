@@ -108,6 +108,10 @@ def dead_electrode(frame, electrode=4):
     return frame
 
 
+def dead_part(frame, electrode=4):
+    return np.where(adjacent(16).channels_touching(electrode), frame, 0)
+
+
 def with_nan(frame):
     frame[[3, 60, 61]] = np.nan
     return frame
@@ -120,6 +124,7 @@ def half_gone(frame):
 
 REFUSED = {
     "all zero": (np.zeros_like, "current source"),
+    "another sensor, one electrode worse": (lambda frame: dead_electrode(3 * frame) - 20 * dead_part(frame), "another"),
     "all NaN": (lambda frame: frame * np.nan, "Only 0 of 208"),
     "half gone": (half_gone, "can be used"),
     "another protocol": (lambda frame: frame[:96], "208 real voltages"),
