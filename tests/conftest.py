@@ -22,6 +22,13 @@ def _shared(variable: str, folder: str) -> Path | None:
     return next((path for path in candidates if path.is_dir()), None)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_code_goes_with_its_module():
+    """Linux gives a process 65,530 memory maps; compiled code takes several a program, and XLA crashes at the end."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def data_folder() -> Path:
     """The folder of measured data (kit4, ktc2023, tank6cm); skips the test where there is none."""
