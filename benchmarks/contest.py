@@ -19,6 +19,10 @@ ROOT = Path(__file__).resolve().parents[1]
 REST = 0.06
 TURN = 0.1
 CORES = 2
+# A call this long, in seconds, is timed alone and not warmed up for.
+SLOW = 1.0
+# A first call this long, in seconds, is not compilation, and is not repeated.
+LONG = 60.0
 
 
 class GaveUpError(Exception):
@@ -113,25 +117,31 @@ class Contestant:
 
 def _probe(name, result, contestants, task) -> float:
     """About how long a repeat takes, in seconds, once what is compiled is compiled."""
-    if result.first > 5:
+    if result.first > LONG:
         return result.first
     contestant = next(one for one in contestants if one.name == name)
-    return contestant.ask(do="time", task=task, round=0, calls=1, warm=True)["seconds"][0]
+    return contestant.ask(do="time", task=task, round=0, calls=1, warm=result.first < SLOW)["seconds"][0]
 
 
-def compete(contestants: list[Contestant], task: str, *, rounds: int, budget: float) -> dict[str, Figures]:
+def compete(
+    contestants: list[Contestant], task: str, *, rounds: int, budget: float, folder: Path | None = None
+) -> dict[str, Figures]:
     """Median times of a task, the contestants taking turns so that a drifting machine is unfair to none.
 
     Each turn makes as many calls as fit in `TURN` seconds (at most 25), after one that is not timed. `budget`:
-    seconds a contestant may use in all; a slow one gets fewer rounds, at least one.
+    seconds a contestant may use in all; a slow one gets fewer rounds, at least one (its first, if that is very long).
+    `folder`: where to leave the results of the first conductivity, NAME.npz.
     """
     figures = {}
+    saved = {} if folder is None else {one.name: {"path": str(folder / f"{one.name}.npz")} for one in contestants}
     for contestant in contestants:
         if task not in contestant.tasks:
             continue
         figures[contestant.name] = result = Figures()
         try:
-            result.first = contestant.ask(do="first", task=task)["seconds"]
+            result.first = contestant.ask(do="first", task=task, **saved.get(contestant.name, {}))["seconds"]
+            if result.first > LONG:
+                result.seconds = [result.first]
         except GaveUpError as reason:
             result.remark = str(reason)
     expected = {name: _probe(name, result, contestants, task) for name, result in figures.items() if not result.remark}
@@ -141,7 +151,7 @@ def compete(contestants: list[Contestant], task: str, *, rounds: int, budget: fl
             result = figures.get(name)
             if result is None or result.remark or (result.seconds and sum(result.seconds) > budget):
                 continue
-            slow = expected[name] > 1
+            slow = expected[name] > SLOW
             calls = 1 if slow else int(np.clip(TURN / expected[name], 1, 25))
             time.sleep(REST)
             try:

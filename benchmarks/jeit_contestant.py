@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.problem import GAUSS_NEWTON, STEPS
 from jeit.electrodes import BoundaryElectrodes, NodeElectrodes
 from jeit.forward import ForwardModel
-from jeit.inverse import Noser, one_step
+from jeit.inverse import Imager, Noser, one_step
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 
@@ -55,6 +56,28 @@ class JeitContestant:
             "linear image": lambda k: ready(self.reconstruction.image(each_frame[k % 64])),
             "1000 linear images": lambda _: ready(self.reconstruction.image(frames)),
         }
+
+        if "measured" in problem:
+            measured, imager = list(jnp.asarray(problem["measured"])), self._imager(problem)
+            every, start = imager.weighing(imager.mask), imager.start
+            self.tasks[GAUSS_NEWTON] = lambda k: ready(imager.estimate(measured[k % count], every, start).conductivity)
+
+    def voltages(self, conductivity) -> np.ndarray:
+        """Voltages (M,) in volts for a conductivity (m,) in siemens."""
+        return np.asarray(self._model.voltages(jnp.asarray(conductivity)))
+
+    def _imager(self, problem):
+        """NOSER on log σ, with every shape there is, so that opponents can minimise the same."""
+        return Imager.create(
+            self._model,
+            self._background,
+            prior=Noser(),
+            hyperparameter=float(problem["hyperparameter"]),
+            noise=problem["noise"],
+            steps=STEPS,
+            rtol=0.0,
+            informative=0.0,
+        )
 
     @property
     def reconstruction(self):

@@ -13,6 +13,9 @@ COVERED = 0.5  # part of the boundary that electrodes cover
 FIRST = 0.25  # centre of the first electrode, in spacings from angle 0
 NUM_CONDUCTIVITIES = 64
 NUM_FRAMES = 1000
+GAUSS_NEWTON, STEPS = "Gauss-Newton", 5  # a task's name, and the iterations of each of its images
+NOISE = 1e-3  # standard deviation, of each voltage
+HYPERPARAMETER = 0.5  # the data are fitted a little closer than pyEIT does with its best setting
 
 
 def make(
@@ -60,6 +63,14 @@ def make(
     problem["conductivities"] = _smooth_conductivities(points[cells].mean(axis=1), conductivities, random)
     problem["frames"] = 1e-4 * random.normal(size=(frames, protocol.num_measurements))
     return problem
+
+
+def measure(problem: dict[str, np.ndarray], voltages, rest) -> None:
+    """Add `measured` (c, M): the conductivities' voltages with `noise` (M,) in volts; and NOSER's λ."""
+    problem["noise"] = NOISE * np.abs(rest) + 1e-2 * NOISE * np.abs(rest).max()
+    random = np.random.default_rng(3)
+    problem["measured"] = voltages + problem["noise"] * random.normal(size=np.shape(voltages))
+    problem["hyperparameter"] = np.array(HYPERPARAMETER)
 
 
 def _smooth_conductivities(centroids, count, random):

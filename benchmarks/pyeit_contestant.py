@@ -10,8 +10,15 @@ from importlib.metadata import version
 
 import numpy as np
 from pyeit.eit.fem import EITForward
+from pyeit.eit.jac import JAC
 from pyeit.eit.protocol import PyEITProtocol
 from pyeit.mesh import PyEITMesh
+
+from benchmarks.problem import GAUSS_NEWTON, STEPS
+
+# Of fifteen settings tried (its three methods, weights from 1e-4 to 1e4, falling and constant, its example's among
+# them), the one whose images come nearest to the truth; its misfit is within 5 % of the lowest.
+SETTING = {"method": "kotre", "p": 0.5, "lamb": 0.1}
 
 
 class PyeitContestant:
@@ -48,9 +55,19 @@ class PyeitContestant:
             "homogeneous": lambda _: forward.solve_eit(homogeneous),
             "voltages and Jacobian": voltages_and_jacobian,
         }
+        if "measured" in problem:
+            measured, solver = problem["measured"] / current, JAC(mesh, protocol)
+            # `setup` inverts once for linear images, which `gn` does not use: only its parameters are wanted.
+            solver.params, solver.is_ready = SETTING, True
+            self.description += f", {SETTING}"
+            self.tasks[GAUSS_NEWTON] = lambda k: solver.gn(
+                measured[k % count], x0=homogeneous, maxiter=STEPS, gtol=0.0, **SETTING
+            )
 
-    def in_si(self, results):
-        """Volts, and volts per siemens, at the problem's current."""
+    def in_si(self, task, results):
+        """Volts, and volts per siemens, at the problem's current; images are in siemens already."""
+        if task == GAUSS_NEWTON:
+            return results
         if isinstance(results, tuple):
             return self.current * results[0], -self.current * results[1]
         return self.current * results

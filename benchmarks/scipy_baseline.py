@@ -57,6 +57,17 @@ class ScipyBaseline:
             self._choose_product(conductivity)
 
     @property
+    def reciprocal_pairs(self) -> list[tuple[int, int]]:
+        """Channels of equal reading, each pair once; -1 for one without a twin."""
+        return [(channel, twin) for channel, twin, _, _ in self._reciprocal]
+
+    @property
+    def ways(self) -> list[Any]:
+        """All ways of forming the Jacobian's products."""
+        ways = [self._by_drive, self._by_channel, self._by_matrix_products]
+        return [*ways, self._by_reciprocal_pair] if self.tuned else ways
+
+    @property
     def choices(self) -> str:
         """Which ordering and which way of forming products won on this mesh."""
         return f"{self.ordering}; {self.product.__name__.strip('_').replace('_', ' ')}"
@@ -227,11 +238,8 @@ class ScipyBaseline:
 
     def _choose_product(self, conductivity):
         gradients = self._gradients(self._solve(conductivity)[1])
-        ways = [self._by_drive, self._by_channel, self._by_matrix_products]
-        if self.tuned:
-            ways.append(self._by_reciprocal_pair)
-        timings = _time_each({way.__name__: (lambda way=way: way(gradients)) for way in ways})
-        self.product = min(ways, key=lambda way: timings[way.__name__])
+        timings = _time_each({way.__name__: (lambda way=way: way(gradients)) for way in self.ways})
+        self.product = min(self.ways, key=lambda way: timings[way.__name__])
 
 
 class _Permuted:

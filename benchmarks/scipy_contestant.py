@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
+from benchmarks.problem import GAUSS_NEWTON, STEPS
 from benchmarks.scipy_baseline import ScipyBaseline
+from benchmarks.scipy_newton import ScipyNewton
 
 
 class ScipyContestant:
@@ -23,6 +25,10 @@ class ScipyContestant:
             "homogeneous": lambda _: baseline.voltages(homogeneous),
             "64 conductivities": lambda _: np.stack([baseline.voltages(one) for one in conductivities]),
         }
+        if "measured" in problem:
+            newton, measured = ScipyNewton(baseline, problem, STEPS), problem["measured"]
+            self.description += f"; {newton.choice}"
+            self.tasks[GAUSS_NEWTON] = lambda k: newton.conductivity(measured[k % count])
         if "reconstruction" in problem:
             matrix = problem["reconstruction"]
             self.tasks["linear image"] = lambda k: matrix @ frames[k % len(frames)]

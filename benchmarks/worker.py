@@ -45,6 +45,14 @@ def reset_peak_memory() -> None:
         return
 
 
+def store(contestant, task: str, results, path: str) -> None:
+    """Write a task's results, in SI units, as the arrays of an NPZ file."""
+    if hasattr(contestant, "in_si"):
+        results = contestant.in_si(task, results)
+    arrays = results if isinstance(results, tuple) else (results,)
+    np.savez(path, *[np.asarray(array) for array in arrays])
+
+
 def answer(contestant, command: dict) -> dict:
     """Carry out one command: `describe`, `first`, `time`, `memory` or `save`."""
     match command["do"]:
@@ -52,8 +60,11 @@ def answer(contestant, command: dict) -> dict:
             return {"tasks": list(contestant.tasks), "description": contestant.description, "peak": peak_memory()}
         case "first":
             start = time.perf_counter()
-            contestant.tasks[command["task"]](0)
-            return {"seconds": time.perf_counter() - start}
+            results = contestant.tasks[command["task"]](0)
+            seconds = time.perf_counter() - start
+            if "path" in command:
+                store(contestant, command["task"], results, command["path"])
+            return {"seconds": seconds}
         case "time":
             run, seconds = contestant.tasks[command["task"]], []
             if command["warm"]:
@@ -68,11 +79,7 @@ def answer(contestant, command: dict) -> dict:
             contestant.tasks[command["task"]](0)
             return {"peak": peak_memory()}
         case "save":
-            results = contestant.tasks[command["task"]](0)
-            if hasattr(contestant, "in_si"):
-                results = contestant.in_si(results)
-            arrays = results if isinstance(results, tuple) else (results,)
-            np.savez(command["path"], *[np.asarray(array) for array in arrays])
+            store(contestant, command["task"], contestant.tasks[command["task"]](0), command["path"])
             return {}
     raise ValueError(f"Unknown command {command!r}.")
 

@@ -46,10 +46,13 @@ class Estimate(eqx.Module):
 
 
 class LinearMap(eqx.Module):
-    """The linear image: σ = `level` (m,) + `matrix` (m, r) · `estimator` (r, M) · voltages (M,), S/m (2-D: S)."""
+    """The linear image: σ = `level` (m,) + `matrix` (m, k) · `estimator` (k, M) · voltages (M,), S/m (2-D: S).
 
-    matrix: Float[Array, "m r"]
-    estimator: Float[Array, "r M"]
+    k is the number of independent channels or of the prior's shapes, whichever is smaller.
+    """
+
+    matrix: Float[Array, "m k"]
+    estimator: Float[Array, "k M"]
     level: Float[Array, " m"]
 
 
@@ -186,10 +189,14 @@ def _linear_map(inversion: Inversion, weighing: Weighing, offset) -> LinearMap:
     posed = eqx.tree_at(lambda i: i.data, inversion, weighing.combine(offset))
     residual, jacobian = posed.linearise(start)
     lower = jnp.linalg.cholesky(jacobian @ jacobian.T + posed.data.covariance)
-    gain = jax.scipy.linalg.cho_solve((lower, True), jacobian)
-    matrix = jax.vmap(inversion.basis.expand)(gain).T * inversion.link.slope(inversion.reference)[:, None]
-    level = inversion.link.conductivity(inversion.reference) - matrix @ residual
-    return LinearMap(matrix * weighing.weight, weighing.estimator, level)
+    gain = jax.scipy.linalg.cho_solve((lower, True), jacobian).T
+    if inversion.num_coefficients < len(residual):
+        shapes = jnp.eye(inversion.num_coefficients)
+    else:
+        shapes, gain = gain.T, jnp.eye(len(residual))
+    matrix = jax.vmap(inversion.basis.expand)(shapes).T * inversion.link.slope(inversion.reference)[:, None]
+    level = inversion.link.conductivity(inversion.reference) - matrix @ (gain @ residual)
+    return LinearMap(matrix, gain @ (weighing.weight[:, None] * weighing.estimator), level)
 
 
 def _residual(coefficients, inversion: Inversion):

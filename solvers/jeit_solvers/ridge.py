@@ -8,6 +8,7 @@ residual and ridge stacked on each other: 50 times the work for 200 data and 2,0
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -24,6 +25,7 @@ def ridge_model(
     precision: Float[Array, "M M"],
 ) -> Model:
     """The cost ½ rᵀ C⁻¹ r + ½ ‖c‖² and its `step`, for `Descent`; `covariance` C of the data, and its inverse."""
+    jacobian = jax.lax.optimization_barrier(jacobian)
     weighted = precision @ residual
     cost = 0.5 * (residual @ weighted + point @ point)
 
@@ -54,7 +56,7 @@ def ridge_step(
         weighted = jacobian.T @ precision
         return -solve_definite(weighted @ jacobian + ridge * jnp.eye(columns), weighted @ residual + point)
     inner = solve_definite(jacobian @ jacobian.T + ridge * covariance, residual - jacobian @ point / ridge)
-    return -point / ridge - jacobian.T @ inner
+    return -point / ridge - inner @ jacobian
 
 
 def solve_definite(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Array, " n"]:
