@@ -61,6 +61,7 @@ class _Session:
     def __init__(self, imager: Imager):
         self.imager = imager
         self.mask = np.asarray(imager.mask)
+        self.unmasked = bool(self.mask.all())
         self.expected = np.asarray(imager.expected)
         self.touching = np.asarray(imager.touching)
         self.size = np.linalg.norm(self.expected[self.mask])
@@ -79,7 +80,7 @@ class _Session:
             return FrameImage(number, None, status, reason, usable, np.nan, 0, time.perf_counter() - begin)
         if usable is not self.usable and not np.array_equal(usable, self.usable):
             self._weigh(usable)
-        filled = values if usable is self.mask else np.where(usable, values, self.last)
+        filled = values if usable is self.mask and self.unmasked else np.where(usable, values, self.last)
         conductivity, misfit, iterations, converged = self._estimate(filled)
         if not np.isfinite(conductivity).all():
             reason = "The image became NaN; the next frame starts from the background again."
@@ -111,6 +112,7 @@ class _Session:
         self.coefficients = found.coefficients
         return np.asarray(found.conductivity), float(found.misfit), int(found.iterations), bool(found.converged)
 
+    @np.errstate(over="ignore")  # a square that overflows is not an ordinary one
     def _inspect(self, frame):
         """Values, usable channels, status and reason of a frame as it came."""
         values, none = np.asarray(frame), np.zeros_like(self.mask)
