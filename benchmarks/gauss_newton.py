@@ -93,7 +93,10 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=15, help="turns each contestant has")
     parser.add_argument("--time-limit", type=float, default=1200.0, help="seconds for one image, then it has given up")
     parser.add_argument("--without-pyeit", action="store_true")
+    parser.add_argument("--quick", action="store_true", help="a smoke run: one small mesh, figures not judged")
     options = parser.parse_args()
+    if options.quick:
+        options.nodes, options.rounds = [200], 2
     machine.use_cores(CORES)
     heading = machine.heading()
     pyeit = None if options.without_pyeit else pyeit_environment.python()
@@ -111,7 +114,7 @@ def main() -> int:
     print("\n".join(f"- {line}" for line in [*heading, *notes]))
     print("\n" + markdown(HEADER, rows))
     print("\n" + markdown(["asked", "measured", ""], checks))
-    return int(any(check[-1] == "missed" for check in checks))
+    return int(not options.quick and any(check[-1] == "missed" for check in checks))
 
 
 if __name__ == "__main__":
