@@ -5,21 +5,29 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.reconstruct import Description, Format, Quiet, make_folder, number_or_name
+from jeit.cli.options import (
+    Contact,
+    Data,
+    Description,
+    Format,
+    Frame,
+    Nodes,
+    Quiet,
+    Reference,
+    make_folder,
+    number_or_name,
+)
 
 if TYPE_CHECKING:
     from jeit.choosing import ComparedRules
 
 
 def choose(
-    data: Annotated[Path, typer.Argument(help="Measured file to image.", show_default=False)],
+    data: Data,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for choice.png and choice.json.", show_default=False)
     ],
-    reference: Annotated[
-        Path | None,
-        typer.Option(help="Measured file of the undisturbed body; may be left out if DATA has a frame 'reference'."),
-    ] = None,
+    reference: Reference = None,
     rule: Annotated[
         list[str] | None,
         typer.Option(
@@ -29,14 +37,9 @@ def choose(
     format: Format = None,
     description: Description = None,
     prior: Annotated[str | None, typer.Option(help="tikhonov, laplace, noser or gaussian (default).")] = None,
-    contact: Annotated[
-        str | None,
-        typer.Option(help="Contact impedance in the calibration: each, common or fixed; found from the protocol."),
-    ] = None,
-    num_points: Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000).")] = None,
-    frame: Annotated[
-        str | None, typer.Option(help="Frame of DATA to image, by number from 0 or by name; the first unless given.")
-    ] = None,
+    contact: Contact = None,
+    num_points: Nodes = None,
+    frame: Frame = None,
     quiet: Quiet = False,
 ) -> None:
     """Compare the rules that choose the hyperparameter of DATA's image; writes choice.png and choice.json."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.reconstruct import Quiet
+from jeit.cli.options import Quiet, make_folder
 
 
 def demo(
@@ -24,7 +24,6 @@ def demo(
     from rich.console import Console
 
     from jeit.cli.console import Steps, pairs
-    from jeit.cli.reconstruct import make_folder
     from jeit.data.simulated import RoundSkin, simulate_press
     from jeit.imaging import image_difference
     from jeit.report import write

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.reconstruct import Description, Format
+from jeit.cli.options import Description, Format
 
 
 def info(

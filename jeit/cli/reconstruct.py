@@ -1,34 +1,33 @@
 """`jeit reconstruct`: a measured file in; a picture, arrays and a report out."""
 
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from jeit.cli.options import (
+    Contact,
+    Data,
+    Description,
+    Format,
+    Frame,
+    Nodes,
+    Quiet,
+    Reference,
+    make_folder,
+    number_or_name,
+)
+
 if TYPE_CHECKING:
     from jeit.imaging import ImagedDifference
 
-Format = Annotated[
-    str | None,
-    typer.Option(help="kit4, ktc2023, eidors, table or tank6cm; found from the content unless given."),
-]
-Description = Annotated[
-    str | None,
-    typer.Option(help="TOML file that says what the numbers mean; looked for beside the data unless given."),
-]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
-
 
 def reconstruct(
-    data: Annotated[Path, typer.Argument(help="Measured file to image.", show_default=False)],
+    data: Data,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for image.png, image.npz, report.json.", show_default=False)
     ],
-    reference: Annotated[
-        Path | None,
-        typer.Option(help="Measured file of the undisturbed body; may be left out if DATA has a frame 'reference'."),
-    ] = None,
+    reference: Reference = None,
     format: Format = None,
     description: Description = None,
     method: Annotated[
@@ -53,17 +52,12 @@ def reconstruct(
             metavar="VALUE|RULE",
         ),
     ] = None,
-    contact: Annotated[
-        str | None,
-        typer.Option(help="Contact impedance in the calibration: each, common or fixed; found from the protocol."),
-    ] = None,
+    contact: Contact = None,
     segment: Annotated[
         bool, typer.Option("--segment", help="Add labels to image.npz: 0 background, 1 resistive, 2 conductive.")
     ] = False,
-    num_points: Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000).")] = None,
-    frame: Annotated[
-        str | None, typer.Option(help="Frame of DATA to image, by number from 0 or by name; the first unless given.")
-    ] = None,
+    num_points: Nodes = None,
+    frame: Frame = None,
     quiet: Quiet = False,
 ) -> None:
     """Image what changed between REFERENCE and DATA; writes image.png, image.npz and report.json."""
@@ -147,27 +141,3 @@ def show(console, result: "ImagedDifference") -> None:
         table.add_row(inclusion.kind, *numbers)
     console.print(table if result.inclusions else "  no inclusion found")
     console.print()
-
-
-def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json")) -> None:
-    """Make the folder for results of these names before any work is done. Raises `ValueError` if it cannot be one."""
-    if output.exists() and not output.is_dir():
-        raise ValueError(f"--output {output} is a file; give a folder for the results.")
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=output):
-            pass
-        taken = [name for name in names if (output / name).is_dir()]
-    except OSError as error:
-        reason = error.strerror or error
-        raise ValueError(f"--output {output} cannot be written to ({reason}); give another folder.") from None
-    if taken:
-        raise ValueError(f"--output {output}: there is a folder named {taken[0]} in it; give another.")
-
-
-def number_or_name(text: str, number: type = float):
-    """The number that `text` spells, or else the text."""
-    try:
-        return number(text)
-    except ValueError:
-        return text

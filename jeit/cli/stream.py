@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.reconstruct import Description, Format, Quiet
+from jeit.cli.options import Contact, Description, Format, Quiet, make_folder, number_or_name
 
 _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
 
@@ -36,9 +36,7 @@ def stream(
         typer.Option(help="A number, or the rule that chooses it (default noise-figure).", metavar="VALUE|RULE"),
     ] = None,
     steps: Annotated[int, typer.Option(help="Most iterations for a frame.")] = 4,
-    contact: Annotated[
-        str | None, typer.Option(help="Contact impedance in the calibration: each, common, fixed.")
-    ] = None,
+    contact: Contact = None,
     num_points: Annotated[int, typer.Option(help="Nodes of the mesh, about.")] = 1200,
     quiet: Quiet = False,
 ) -> None:
@@ -53,7 +51,6 @@ def stream(
     from rich.console import Console
 
     from jeit.cli.console import Steps, scaled
-    from jeit.cli.reconstruct import make_folder, number_or_name
     from jeit.data import read
     from jeit.inverse import Imager
     from jeit.inverse import stream as images_of

@@ -1,0 +1,54 @@
+"""Options and arguments that several commands share."""
+
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Data = Annotated[Path, typer.Argument(help="Measured file to image.", show_default=False)]
+Reference = Annotated[
+    Path | None,
+    typer.Option(help="Measured file of the undisturbed body; may be left out if DATA has a frame 'reference'."),
+]
+Format = Annotated[
+    str | None,
+    typer.Option(help="kit4, ktc2023, eidors, table or tank6cm; found from the content unless given."),
+]
+Description = Annotated[
+    str | None,
+    typer.Option(help="TOML file that says what the numbers mean; looked for beside the data unless given."),
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+Contact = Annotated[
+    str | None,
+    typer.Option(help="Contact impedance in the calibration: each, common or fixed; found from the protocol."),
+]
+Nodes = Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000).")]
+Frame = Annotated[
+    str | None, typer.Option(help="Frame of DATA to image, by number from 0 or by name; the first unless given.")
+]
+
+
+def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json")) -> None:
+    """Make the folder for results of these names before any work is done. Raises `ValueError` if it cannot be one."""
+    if output.exists() and not output.is_dir():
+        raise ValueError(f"--output {output} is a file; give a folder for the results.")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=output):
+            pass
+        taken = [name for name in names if (output / name).is_dir()]
+    except OSError as error:
+        reason = error.strerror or error
+        raise ValueError(f"--output {output} cannot be written to ({reason}); give another folder.") from None
+    if taken:
+        raise ValueError(f"--output {output}: there is a folder named {taken[0]} in it; give another.")
+
+
+def number_or_name(text: str, number: type = float):
+    """The number that `text` spells, or else the text."""
+    try:
+        return number(text)
+    except ValueError:
+        return text
