@@ -36,6 +36,9 @@ def stream(
         typer.Option(help="A number, or the rule that chooses it (default noise-figure).", metavar="VALUE|RULE"),
     ] = None,
     steps: Annotated[int, typer.Option(help="Most iterations for a frame.")] = 4,
+    memory: Annotated[
+        float, typer.Option(help="Frames over which an image changes: smooths in time (Kalman). 0: every frame alone.")
+    ] = 0.0,
     contact: Contact = None,
     num_points: Annotated[int, typer.Option(help="Nodes of the mesh, about.")] = 1200,
     quiet: Quiet = False,
@@ -80,6 +83,7 @@ def stream(
             method=method,
             hyperparameter=None if hyperparameter is None else number_or_name(hyperparameter),
             steps=steps,
+            memory=memory,
         )
     mesh = calibration.model.mesh
     centre, kept, latencies, counts = np.asarray(centroids(mesh)), [], [], {}

@@ -7,6 +7,8 @@ change, so nothing is compiled again: a channel that is masked keeps its place, 
 does not count.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -48,12 +50,14 @@ class Estimate(eqx.Module):
 class LinearMap(eqx.Module):
     """The linear image: σ = `level` (m,) + `matrix` (m, k) · `estimator` (k, M) · voltages (M,), S/m (2-D: S).
 
-    k is the number of independent channels or of the prior's shapes, whichever is smaller.
+    k is the number of independent channels or of the prior's shapes, whichever is smaller. With a memory, the weights
+    of the last image's shapes (k,), less those of an undisturbed frame, come in times `carry` (k, k).
     """
 
     matrix: Float[Array, "m k"]
     estimator: Float[Array, "k M"]
     level: Float[Array, " m"]
+    carry: Float[Array, "k k"]
 
 
 class Imager(eqx.Module):
@@ -63,7 +67,8 @@ class Imager(eqx.Module):
     frame's; `noise` (M,), volts; `mask` (M,), the channels used at all; `expected` (M,) volts, an undisturbed frame;
     `offset` (M,) volts, added to frames: what the model's voltages have and the sensor's have not; `touching` (L, M),
     channels that drive or read each electrode; `method`; `steps`, the most iterations a frame is given; `rtol`, the
-    relative change of the objective that ends them sooner.
+    relative change of the objective that ends them sooner; `persistence`, the share of the last image that the next one
+    is expected to keep, 0 without a memory.
     """
 
     channels: IndependentChannels
@@ -76,6 +81,7 @@ class Imager(eqx.Module):
     method: str = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     rtol: float = eqx.field(static=True)
+    persistence: float = eqx.field(static=True)
 
     @classmethod
     def create(
@@ -93,13 +99,18 @@ class Imager(eqx.Module):
         steps: int = 4,
         rtol: float = 1e-3,
         informative: float = 0.03,
+        memory: float = 0.0,
     ) -> "Imager":
         """`background`: conductivity of the undisturbed body, S/m (2-D: S). `reference` (M,): a measured frame of it,
         volts; frames are then imaged by their difference to it, which frees images from what the model gets wrong.
         `prior`: `Gaussian` of a twelfth of the body's width unless given. `informative`: images are built of shapes
         that the data of the undisturbed body tell more of than this, in standard deviations of the noise for one of the
-        prior, the rest staying as the prior has it; 0 takes all shapes. The rest as in `reconstruct`. Raises
-        `ValueError` for arguments that do not fit.
+        prior, the rest staying as the prior has it; 0 takes all shapes. `memory`: frames over which an image changes;
+        the last image then tells of the next (a Kalman filter in its steady state, of coefficients with covariance
+        exp(-|t - t'| / memory) in time), which takes noise out and lags by a part of it; 0 takes every frame alone. The
+        rest as in `reconstruct`. Raises `ValueError` for arguments that do not fit.
+
+        Kaipio, Karjalainen, Somersalo and Vauhkonen, Ann. N. Y. Acad. Sci. 873 (1999) 430-439.
         """
         if method not in METHODS:
             raise ValueError(f"method: there is no '{method}'; give one of {', '.join(METHODS)}.")
@@ -107,6 +118,10 @@ class Imager(eqx.Module):
             raise ValueError(f"steps must be at least 1 and rtol not negative; they are {steps} and {rtol}.")
         if not 0 <= informative < 1:
             raise ValueError(f"informative must lie between 0 and 1; it is {informative}.")
+        if not (np.isfinite(memory) and memory >= 0):
+            raise ValueError(f"memory must be a number of frames, or 0 for none; it is {memory}.")
+        if memory > 0 and isinstance(prior, TotalVariation):
+            raise ValueError("memory: total variation has no covariance to carry on; take another prior, or memory 0.")
         if method == "linear" and isinstance(prior, TotalVariation):
             raise ValueError("prior: total variation is not linear; take method 'gauss-newton', or another prior.")
         background = check_background(model, background)
@@ -125,8 +140,9 @@ class Imager(eqx.Module):
             Gaussian(0.085 * width) if prior is None else prior,
             hyperparameter,
         )
-        if informative > 0 and isinstance(inversion.penalty, Ridge):
-            shapes = _informed_shapes(inversion, _singular_values(inversion), informative)
+        persistence = float(np.exp(-1 / memory)) if memory > 0 else 0.0
+        if (informative > 0 or memory > 0) and isinstance(inversion.penalty, Ridge):
+            shapes = _informed_shapes(inversion, _singular_values(inversion), informative, persistence)
             inversion = eqx.tree_at(lambda i: i.basis, inversion, DenseBasis(shapes))
         return cls(
             channels=channels,
@@ -139,6 +155,7 @@ class Imager(eqx.Module):
             method=method,
             steps=int(steps),
             rtol=float(rtol),
+            persistence=persistence,
         )
 
     @property
@@ -152,11 +169,12 @@ class Imager(eqx.Module):
 
     def linear_map(self, weighing: Weighing) -> LinearMap:
         """The linear image for frames combined in this way: one Gauss-Newton step from the background."""
-        return _linear_map(self.inversion, weighing, self.offset)
+        return _linear_map(self.inversion, weighing, self.offset, self.persistence)
 
     def estimate(self, frame: Float[Array, " M"], weighing: Weighing, start: Float[Array, " n"]) -> Estimate:
         """The image of a frame (M,) in volts, by at most `steps` iterations from coefficients `start`.
 
+        With a memory, `start` is also what the prior expects: `persistence` times the last image's coefficients.
         Channels that do not count must hold some finite voltage, best that of the last frame.
         """
         return _estimate(self, frame, weighing, start)
@@ -171,32 +189,42 @@ def _singular_values(inversion: Inversion):
     return squares, left.T @ rows
 
 
-def _informed_shapes(inversion: Inversion, decomposition, least: float) -> Float[Array, "m k"]:
-    """The shapes, of unit variance in the prior, that the data tell more of than `least`; in single precision."""
+def _informed_shapes(inversion: Inversion, decomposition, least: float, persistence: float) -> Float[Array, "m k"]:
+    """The shapes that the data tell more of than `least`, as large as expected of a frame; in single precision."""
     squares, rows = (np.asarray(values) for values in decomposition)
     kept = squares > max(least**2, 1e-12 * squares[-1])
-    directions = rows[kept] / np.sqrt(squares[kept])[:, None]
-    return jax.vmap(inversion.basis.expand)(jnp.asarray(directions)).T.astype(jnp.float32)
+    size = np.sqrt(_expected_variance(squares[kept], persistence) / squares[kept])
+    return jax.vmap(inversion.basis.expand)(jnp.asarray(size[:, None] * rows[kept])).T.astype(jnp.float32)
+
+
+def _expected_variance(strength, persistence: float):
+    """Variance of a coefficient before its frame comes, p = a² p / (1 + s p) + 1 - a², for data of `strength` s."""
+    fresh = 1 - persistence**2
+    half = fresh * (1 - strength) / 2
+    root = np.sqrt(half**2 + strength * fresh)
+    return np.where(half > 0, fresh / (half + root), (root - half) / strength)
 
 
 def _blinded(noise, used) -> Float[Array, " M"]:
     return jnp.where(used, noise, _BLIND * jnp.max(jnp.where(used, noise, 0)))
 
 
-@jax.jit
-def _linear_map(inversion: Inversion, weighing: Weighing, offset) -> LinearMap:
+@functools.partial(jax.jit, static_argnames="persistence")
+def _linear_map(inversion: Inversion, weighing: Weighing, offset, persistence: float) -> LinearMap:
     start = jnp.zeros(inversion.num_coefficients)
     posed = eqx.tree_at(lambda i: i.data, inversion, weighing.combine(offset))
     residual, jacobian = posed.linearise(start)
     lower = jnp.linalg.cholesky(jacobian @ jacobian.T + posed.data.covariance)
     gain = jax.scipy.linalg.cho_solve((lower, True), jacobian).T
-    if inversion.num_coefficients < len(residual):
+    if inversion.num_coefficients <= len(residual):
         shapes = jnp.eye(inversion.num_coefficients)
-    else:
+        carry = persistence * (shapes - gain @ jacobian)
+    else:  # never with a memory, whose shapes are no more than the data
         shapes, gain = gain.T, jnp.eye(len(residual))
+        carry = jnp.zeros_like(gain)
     matrix = jax.vmap(inversion.basis.expand)(shapes).T * inversion.link.slope(inversion.reference)[:, None]
     level = inversion.link.conductivity(inversion.reference) - matrix @ (gain @ residual)
-    return LinearMap(matrix, gain @ (weighing.weight[:, None] * weighing.estimator), level)
+    return LinearMap(matrix, gain @ (weighing.weight[:, None] * weighing.estimator), level, carry)
 
 
 def _residual(coefficients, inversion: Inversion):
@@ -211,6 +239,10 @@ def _expand(coefficients, inversion: Inversion):
 def _estimate(imager: Imager, frame, weighing: Weighing, start) -> Estimate:
     data = weighing.combine(frame + imager.offset)
     inversion = eqx.tree_at(lambda i: i.data, imager.inversion, data)
+    expected = jnp.zeros_like(start)
+    if imager.persistence > 0:  # the prior's centre moves, and the coefficients count from there
+        expected, start = start, expected
+        inversion = eqx.tree_at(lambda i: i.reference, inversion, inversion.estimate(expected))
     damping = 1.0 if imager.method == "levenberg-marquardt" else 0.0
     solver = Descent(rtol=imager.rtol, damping=damping, history=imager.steps)
     solution = optx.least_squares(
@@ -225,7 +257,7 @@ def _estimate(imager: Imager, frame, weighing: Weighing, start) -> Estimate:
     squares = 2 * (jnp.where(better, cost, state.cost) - penalty) + data.rest
     return Estimate(
         conductivity=inversion.conductivity(coefficients),
-        coefficients=coefficients,
+        coefficients=expected + coefficients,
         misfit=jnp.sqrt(squares / jnp.sum(weighing.noise <= jnp.max(imager.noise))),
         iterations=state.num_accepted - 1 + better,
         converged=state.converged,

@@ -45,10 +45,11 @@ class FrameImage(eqx.Module):
 def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     """Images of frames (M,) in volts, each as soon as its frame has come. NaN marks channels without a reading.
 
-    Iterative methods start from the last image. Everything is compiled before the first frame is asked for. A frame is
-    refused, and the stream goes on, when it has another number of channels or is not real, when fewer than half of the
-    channels can be used, when all read zero (the current source has failed), or when it differs from an undisturbed
-    frame by more than half of it. A dead electrode's channels are left out, and named.
+    Iterative methods start from the last image, and an imager with a memory expects the next one near it. Everything is
+    compiled before the first frame is asked for. A frame is refused, and the stream goes on, when it has another number
+    of channels or is not real, when fewer than half of the channels can be used, when all read zero (the current source
+    has failed), or when it differs from an undisturbed frame by more than half of it. A dead electrode's channels are
+    left out, and named.
     """
     session = _Session(imager)
     for number, frame in enumerate(frames):
@@ -66,11 +67,11 @@ class _Session:
         self.touching = np.asarray(imager.touching)
         self.size = np.linalg.norm(self.expected[self.mask])
         self.ordinary = (_SUSPICIOUS * self.size) ** 2
-        self.coefficients = imager.start
+        self.coefficients = np.asarray(imager.start)
         self.last = self.expected
         self._weigh(self.mask)
         self._estimate(self.expected)  # compiles
-        self.coefficients = imager.start
+        self.coefficients = np.asarray(imager.start)
 
     def image(self, number: int, frame) -> FrameImage:
         """The image of one frame, or why there is none."""
@@ -84,7 +85,7 @@ class _Session:
         conductivity, misfit, iterations, converged = self._estimate(filled)
         if not np.isfinite(conductivity).all():
             reason = "The image became NaN; the next frame starts from the background again."
-            self.coefficients = self.imager.start
+            self.coefficients = np.asarray(self.imager.start)
             return FrameImage(number, None, "refused", reason, usable, np.nan, iterations, time.perf_counter() - begin)
         self.last = filled
         if not converged and status == "imaged":
@@ -101,15 +102,18 @@ class _Session:
             self.matrix = np.asfortranarray(linear.matrix, np.float32)
             self.estimator = np.asarray(linear.estimator)
             self.resting = self.estimator @ self.expected
+            self.carry = np.asarray(linear.carry)
             self.level = np.asarray(linear.level) + np.asarray(linear.matrix) @ self.resting
 
     def _estimate(self, frame):
         """Conductivity, misfit, iterations, and whether they converged."""
         if self.imager.method == "linear":
-            change = self.matrix @ (self.estimator @ frame - self.resting).astype(np.float32)
-            return self.level + change, np.nan, 1, True
-        found = self.imager.estimate(frame, self.weighing, self.coefficients)
-        self.coefficients = found.coefficients
+            weights = self.estimator @ frame - self.resting
+            if self.imager.persistence > 0:
+                weights = self.coefficients = weights + self.carry @ self.coefficients
+            return self.level + self.matrix @ weights.astype(np.float32), np.nan, 1, True
+        found = self.imager.estimate(frame, self.weighing, jnp.asarray(self.coefficients))
+        self.coefficients = found.coefficients * (self.imager.persistence or 1.0)
         return np.asarray(found.conductivity), float(found.misfit), int(found.iterations), bool(found.converged)
 
     @np.errstate(over="ignore")  # a square that overflows is not an ordinary one

@@ -96,6 +96,52 @@ def test_total_variation_streams_too(model, frames, options):
     assert np.linalg.norm(darkest(model, image.conductivity) - PLACES[1]) < 0.03
 
 
+@pytest.fixture(scope="module")
+def noisy(model):
+    """Sixty frames of one press, with ten times the noise."""
+    rest, pressed = model.voltages(1.0), model.voltages(jnp.where(near(model, PLACES[0]), 0.9, 1.0))
+    noise = 1e-2 * np.abs(rest)
+    return np.asarray(pressed) + noise * np.random.default_rng(0).normal(size=(60, 208)), noise
+
+
+@pytest.mark.parametrize("memory", [3.0, 20.0])
+def test_a_memory_is_the_kalman_filter(memory, model, noisy):
+    """The textbook's, with all covariances, long enough for them to be steady."""
+    frames, noise = noisy
+    options = {"prior": Gaussian(0.03), "noise": noise, "hyperparameter": 2.0, "method": "linear", "informative": 0.0}
+    image = list(stream(Imager.create(model, 1.0, memory=memory, **options), frames))[-1].conductivity
+
+    inversion = Imager.create(model, 1.0, **options).inversion
+    shapes = np.asarray(inversion.basis.shapes, float)
+    voltages, jacobian = model.voltages_and_jacobian(jnp.ones(model.mesh.num_cells))
+    rows = np.asarray(jacobian) @ shapes
+    keep, state, covariance = np.exp(-1 / memory), np.zeros(len(shapes.T)), np.eye(len(shapes.T))
+    # The press has gone on for long before the filter's variances are steady: so start it from its steady state.
+    for _ in range(300):
+        inverse = np.linalg.inv(rows @ covariance @ rows.T + np.diag(noise**2))
+        gain = covariance @ rows.T @ inverse
+        covariance = keep**2 * (covariance - gain @ rows @ covariance) + (1 - keep**2) * np.eye(len(state))
+    for frame in frames:
+        state = keep * state
+        state = state + gain @ (frame - np.asarray(voltages) - rows @ state)
+    np.testing.assert_allclose(image - 1, shapes @ state, atol=1e-3 * np.abs(shapes @ state).max())
+
+
+@pytest.mark.parametrize("method", ["linear", "gauss-newton"])
+def test_a_memory_takes_noise_out_and_leaves_the_press(method, model, noisy):
+    """Where a frame alone tells little: a prior of 5 % and much noise."""
+    frames, noise = noisy
+    options = {"prior": Gaussian(0.03), "noise": noise, "hyperparameter": 20.0, "method": method}
+    alone, kept = (
+        np.array([one.conductivity for one in stream(Imager.create(model, 1.0, memory=memory, **options), frames)])
+        for memory in (0.0, 50.0)
+    )
+    inside = near(model, PLACES[0])
+    press = [images[20:, inside].mean(axis=1) for images in (alone, kept)]
+    assert press[1].std() < 0.75 * press[0].std()
+    assert abs(press[1].mean() - 0.9) < abs(press[0].mean() - 0.9)
+
+
 def spoil(frames, fault):
     """Frames with one of them spoilt; the third."""
     spoilt = [frame.copy() for frame in frames]
@@ -197,6 +243,9 @@ def test_a_frame_that_needs_more_steps_is_said_so(model, frames, options):
         ({"reference": np.zeros(208)}, "current source"),
         ({"mask": np.zeros(208, bool)}, "every channel"),
         ({"noise": 0.0}, "noise"),
+        ({"memory": -1.0}, "memory"),
+        ({"memory": np.nan}, "memory"),
+        ({"memory": 5.0, "prior": TotalVariation(), "hyperparameter": 30.0}, "memory"),
     ],
 )
 def test_bad_input(change, message, model, options):
