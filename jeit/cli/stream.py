@@ -57,10 +57,13 @@ def stream(
     from jeit.data import read
     from jeit.inverse import Imager
     from jeit.inverse import stream as images_of
+    from jeit.inverse.imager import check_settings
     from jeit.mesh import centroids
     from jeit.preparation import Clock, body_of, calibrated_model, select_frames
 
+    check_settings(method, steps, memory)
     make_folder(output, ("frames.csv", "images.npz"))
+    (output / "images.npz").unlink(missing_ok=True)  # an earlier stream's, which would not go with these frames
     console = Console(highlight=False)
     with Steps(console, quiet=quiet) as step:
         step("read")
@@ -130,8 +133,9 @@ def stream(
 def _lines(file) -> Iterator[object]:
     """A frame for every line that is not empty; one that does not hold numbers comes as its text, and is refused."""
     for line in file:
-        words = line.replace(",", " ").replace(";", " ").split()
-        if not words:
+        parts = line.strip().rstrip(",;").replace(";", ",").split(",")
+        words = line.split() if len(parts) == 1 else [part.strip() or "nan" for part in parts]
+        if not line.strip():
             continue
         try:
             yield [float(word) for word in words]

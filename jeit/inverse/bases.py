@@ -119,6 +119,8 @@ class Regions(eqx.Module):
                 f"regions must be integers, one for each of the {mesh.num_cells} cells: from 0, or -1 for cells held "
                 f"at the background; got {label.dtype} of shape {label.shape}."
             )
+        if number > len(label):
+            raise ValueError(f"regions: the label {number - 1} is more than there are cells; use all from 0.")
         empty = np.setdiff1d(np.arange(number), label)
         if empty.size:
             raise ValueError(f"regions: no cell has the label {empty[0]}; use all from 0 to {number - 1}.")
@@ -141,8 +143,9 @@ class Regions(eqx.Module):
 
 def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
     """Labels for `Regions`: the pixels of a grid (rows, columns) over the mesh that hold the centre of any cell."""
-    if len(shape) != 2 or min(shape) < 1:
-        raise ValueError(f"shape must be (rows, columns), both positive; it is {shape}.")
+    sides = np.asarray(shape)
+    if sides.shape != (2,) or sides.dtype.kind not in "iu" or sides.min() < 1:
+        raise ValueError(f"shape must be (rows, columns), both whole numbers from 1; it is {shape}.")
     centre = np.asarray(centroids(mesh))[:, :2]
     low, high = centre.min(axis=0), centre.max(axis=0)
     place = np.minimum((centre - low) / (high - low) * [shape[1], shape[0]], np.array([shape[1], shape[0]]) - 1)

@@ -20,16 +20,34 @@ from jeit.electrodes import IntegratedElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.bases import DenseBasis
 from jeit.inverse.channels import IndependentChannels, Weighing
+from jeit.inverse.checks import (
+    check_background,
+    check_frame,
+    check_link,
+    check_noise,
+    check_prior,
+    check_steps,
+    check_tolerance,
+)
 from jeit.inverse.inversion import Inversion, Ridge
 from jeit.inverse.links import AbstractLink, Log
 from jeit.inverse.priors import AbstractPrior, Gaussian
-from jeit.inverse.reconstruct import check_background, check_frame, check_noise, pose
+from jeit.inverse.reconstruct import pose
 from jeit.inverse.total_variation import TotalVariation
 from jeit_solvers import Descent
 
 METHODS = ("linear", "gauss-newton", "levenberg-marquardt")
 # Standard deviation of a masked channel over the largest noise.
 _BLIND = 1e5
+
+
+def check_settings(method: str, steps, memory) -> None:
+    """Raises `ValueError` for what `Imager.create` would refuse, before there is a model."""
+    if method not in METHODS:
+        raise ValueError(f"method: there is no '{method}'; give one of {', '.join(METHODS)}.")
+    check_steps("steps", steps)
+    if not (np.isfinite(memory) and memory >= 0):
+        raise ValueError(f"memory must be a number of frames, or 0 for none; it is {memory}.")
 
 
 class Estimate(eqx.Module):
@@ -112,14 +130,15 @@ class Imager(eqx.Module):
 
         Kaipio, Karjalainen, Somersalo and Vauhkonen, Ann. N. Y. Acad. Sci. 873 (1999) 430-439.
         """
-        if method not in METHODS:
-            raise ValueError(f"method: there is no '{method}'; give one of {', '.join(METHODS)}.")
-        if steps < 1 or not rtol >= 0:
-            raise ValueError(f"steps must be at least 1 and rtol not negative; they are {steps} and {rtol}.")
+        check_settings(method, steps, memory)
+        rtol = check_tolerance(rtol)
         if not 0 <= informative < 1:
             raise ValueError(f"informative must lie between 0 and 1; it is {informative}.")
-        if not (np.isfinite(memory) and memory >= 0):
-            raise ValueError(f"memory must be a number of frames, or 0 for none; it is {memory}.")
+        width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
+        prior = Gaussian(0.085 * width) if prior is None else prior
+        link = Log() if link is None else link
+        check_prior(prior)
+        check_link(link)
         if memory > 0 and isinstance(prior, TotalVariation):
             raise ValueError("memory: total variation has no covariance to carry on; take another prior, or memory 0.")
         if method == "linear" and isinstance(prior, TotalVariation):
@@ -127,17 +146,17 @@ class Imager(eqx.Module):
         background = check_background(model, background)
         predicted = model.voltages(background)
         frame, used = check_frame(model, predicted if reference is None else reference, mask)
+        _check_reference(np.asarray(frame)[used], np.asarray(predicted)[used])
         deviation = check_noise(noise, frame, used)
-        width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
         channels = IndependentChannels.create(model.protocol)
         weighing = channels.weigh(_blinded(deviation, used))
         small = model.with_protocol(model.protocol.subset(np.asarray(channels.index)))
         inversion, _ = pose(
             eqx.tree_at(lambda m: m.electrodes, small, IntegratedElectrodes(model.electrodes, model.mesh)),
             weighing.combine(predicted),
-            Log() if link is None else link,
+            link,
             background,
-            Gaussian(0.085 * width) if prior is None else prior,
+            prior,
             hyperparameter,
         )
         persistence = float(np.exp(-1 / memory)) if memory > 0 else 0.0
@@ -203,6 +222,16 @@ def _expected_variance(strength, persistence: float):
     half = fresh * (1 - strength) / 2
     root = np.sqrt(half**2 + strength * fresh)
     return np.where(half > 0, fresh / (half + root), (root - half) / strength)
+
+
+def _check_reference(measured, predicted) -> None:
+    """Units and polarity: what is wrong by ten times, or in sign, is not the model's error."""
+    ratio = measured @ predicted / (predicted @ predicted)
+    if not 0.1 < ratio < 10:
+        raise ValueError(
+            f"reference: it is {ratio:.2g} times what the model predicts for the background; are both in SI units, and "
+            "the signs right? See calibrate."
+        )
 
 
 def _blinded(noise, used) -> Float[Array, " M"]:

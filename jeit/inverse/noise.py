@@ -30,6 +30,10 @@ def repeated_noise(frames, mask=None, *, prior_frames: float = 4.0) -> Float[np.
     as if that had been seen in `prior_frames` frames more. Raises `ValueError` for other shapes, for frames that are
     all alike, and for NaN in what is used.
     """
+    if np.iscomplexobj(frames):
+        raise ValueError("frames are complex; give their real part or magnitude.")
+    if not (np.isfinite(prior_frames) and prior_frames >= 0):
+        raise ValueError(f"prior_frames must be a number from 0; it is {prior_frames}.")
     values = np.asarray(frames, float)
     if values.ndim != 2 or len(values) < 2:
         raise ValueError(f"frames has shape {values.shape}; give at least two repeated frames, (frames, channels).")
@@ -43,6 +47,8 @@ def repeated_noise(frames, mask=None, *, prior_frames: float = 4.0) -> Float[np.
     mean = np.where(used, values, 0).sum(axis=0) / np.maximum(count, 1)
     squares = np.where(used, (values - mean) ** 2, 0).sum(axis=0)
     known = count >= 2
+    if not known.any():
+        raise ValueError("mask: it leaves no channel with two frames.")
     if not squares[known].any():
         raise ValueError("frames: all are alike, so they tell nothing of the noise; is one frame repeated?")
     typical = np.median((squares[known] / (count[known] - 1))[squares[known] > 0])

@@ -144,7 +144,10 @@ class Gaussian(AbstractPrior):
 
     def precision(self, mesh, jacobian):
         """Not to be had: the inverse of a Gaussian covariance is dense and ill-conditioned. Raises `ValueError`."""
-        raise ValueError("The Gaussian prior has no usable precision matrix; use its covariance_product.")
+        raise ValueError(
+            "prior: Gaussian has no usable precision matrix, which bounds need; take Noser, Tikhonov, Laplace or "
+            "TotalVariation, or link=Bounded(lower, upper) in place of bounds."
+        )
 
 
 @jax.jit

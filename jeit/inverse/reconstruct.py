@@ -13,11 +13,21 @@ from jeit.forward import ForwardModel
 from jeit.inverse.bases import DiagonalBasis, Regions
 from jeit.inverse.bounded import BOUNDED_METHODS, QuadraticForm, minimise_between
 from jeit.inverse.channels import IndependentChannels
+from jeit.inverse.checks import (
+    check_background,
+    check_bounds,
+    check_frame,
+    check_link,
+    check_noise,
+    check_prior,
+    check_steps,
+    check_tolerance,
+    check_unknowns,
+)
 from jeit.inverse.choice import Choice
 from jeit.inverse.hyperparameter import Rule, choose
 from jeit.inverse.inversion import Inversion, Ridge
 from jeit.inverse.links import AbstractLink, Bounded, Log
-from jeit.inverse.noise import relative_noise
 from jeit.inverse.priors import AbstractPrior, Noser
 from jeit.inverse.spectrum import Spectrum
 from jeit.inverse.total_variation import TotalVariation
@@ -115,12 +125,21 @@ def reconstruct(
     measured, used = check_frame(model, voltages, mask)
     link = Log() if link is None else link
     prior = Noser() if prior is None else prior
-    if not isinstance(prior, (AbstractPrior, TotalVariation)) or not isinstance(link, AbstractLink):
-        raise ValueError(f"prior and link must be of those in jeit.inverse, such as Noser() and Log(), not {prior!r}.")
+    check_prior(prior)
+    check_link(link)
+    unknowns = check_unknowns(unknowns, model)
+    if rtol is None:
+        rtol = 1e-4 if isinstance(prior, TotalVariation) and solver not in BOUNDED_METHODS else 1e-6
+    tolerance = check_tolerance(rtol)
+    limits = check_bounds(bounds)
     background = check_background(model, background)
     deviation = check_noise(noise, measured, used)
     if bounds is not None and solver == "gauss-newton":
         solver = "l-bfgs-b"
+    bounded = solver if isinstance(solver, str) and solver in BOUNDED_METHODS else None
+    if max_steps is None:
+        max_steps = 30 if bounded is None else 1000
+    max_steps = check_steps("max_steps", max_steps)
     kept = np.flatnonzero(used)
     observed = model.with_protocol(model.protocol.subset(kept))
     channels = IndependentChannels.create(observed.protocol)
@@ -132,36 +151,37 @@ def reconstruct(
         prior,
         hyperparameter,
         regions=regions,
-        unknowns=tuple(unknowns),
-        bounded=solver in BOUNDED_METHODS,
+        unknowns=unknowns,
+        bounded=bounded is not None,
     )
     coefficients = jnp.zeros(inversion.num_coefficients)
     if start is not None:
-        if start.coefficients.shape != coefficients.shape:
+        if not isinstance(start, Reconstruction):
+            raise ValueError(f"start must be what reconstruct has returned, not {type(start).__name__}.")
+        if start.coefficients.shape != coefficients.shape or not _alike(start.inversion, inversion):
             raise ValueError(
-                f"start has {start.coefficients.size} coefficients and this problem {coefficients.size}; give a "
-                "reconstruction of the same model and prior."
+                f"start has {start.coefficients.size} coefficients of another kind of problem; this one has "
+                f"{coefficients.size}. Give a reconstruction of the same model, prior and link."
             )
         size = inversion.basis.num_coefficients
         scale = choice.hyperparameter / start.choice.hyperparameter if isinstance(inversion.penalty, Ridge) else 1.0
         coefficients = start.coefficients.at[:size].multiply(scale)
-    if isinstance(solver, str) and solver in BOUNDED_METHODS:
-        box = _box(bounds, inversion, link)
-        limit = 1000 if max_steps is None else max_steps
-        found = _solve_between(inversion, coefficients, box, solver, limit, 1e-6 if rtol is None else rtol)
+    if bounded is not None:
+        box = _box(limits, inversion, link)
+        found = _solve_between(inversion, coefficients, box, bounded, max_steps, tolerance)
     else:
         if bounds is not None:
             raise ValueError(
                 f"bounds: '{solver}' knows none; use {' or '.join(BOUNDED_METHODS)}, or link=Bounded(lower, upper)."
             )
-        limit = 30 if max_steps is None else max_steps
-        tolerance = (1e-4 if isinstance(prior, TotalVariation) else 1e-6) if rtol is None else rtol
-        found = _solve(inversion, coefficients, _solver(solver, prior, limit, tolerance), limit)
+        found = _solve(inversion, coefficients, _solver(solver, prior, max_steps, tolerance), max_steps)
     coefficients, iterations, costs, status, reason = found
     conductivity, fitted, predicted = _outcome(inversion, model, coefficients)
     excess = ((predicted - measured) / deviation)[kept]
-    if not np.isfinite(np.asarray(conductivity)).all():
-        status, reason = "failed", "The conductivity became NaN; give better data, more noise or a greater λ."
+    if not (np.isfinite(conductivity).all() and np.isfinite(excess).all()):
+        status, reason = "failed", "Conductivity or voltages are NaN; give better data, more noise or a greater λ."
+    elif status != "converged":
+        reason += _mismatch(model, measured[kept], background, kept)
     return Reconstruction(
         conductivity=conductivity,
         voltages=predicted,
@@ -184,8 +204,8 @@ def pose(model, data, link, background, prior, hyperparameter, *, regions=None, 
     if isinstance(prior, TotalVariation):
         if pooled is not None:
             raise ValueError("regions: total variation finds its own; leave them out, or take another prior.")
-        if isinstance(hyperparameter, str):
-            raise ValueError(f"hyperparameter: total variation takes a number, not the rule '{hyperparameter}'.")
+        if isinstance(hyperparameter, str) or callable(hyperparameter):
+            raise ValueError(f"hyperparameter: total variation takes a number, not the rule {hyperparameter!r}.")
         value = EDGE_PRICE if hyperparameter is None else hyperparameter
         if not (np.isfinite(value) and value > 0):
             raise ValueError(f"hyperparameter must be positive and finite; it is {value}.")
@@ -210,48 +230,6 @@ def pose(model, data, link, background, prior, hyperparameter, *, regions=None, 
 
 def _every_cell(mesh: Mesh) -> DiagonalBasis:
     return DiagonalBasis(jnp.ones(mesh.num_cells))
-
-
-def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
-    """Voltages as an array with zeros for what is left out, and which channels are used; raises `ValueError`."""
-    if jnp.iscomplexobj(voltages):
-        raise ValueError("voltages are complex; reconstruct from their real part or magnitude.")
-    shape = (model.protocol.num_measurements,)
-    measured = jnp.asarray(voltages, float)
-    used = np.ones(shape, bool) if mask is None else np.asarray(mask)
-    if measured.shape != shape or used.shape != shape or used.dtype != bool:
-        raise ValueError(
-            f"voltages has shape {measured.shape} and mask {used.shape} of {used.dtype}; protocol "
-            f"'{model.protocol.name}' has {shape[0]} channels, and the mask must be booleans."
-        )
-    if not used.any():
-        raise ValueError("mask: every channel is left out, so there is nothing to reconstruct from.")
-    values = np.asarray(measured)[used]
-    if not np.isfinite(values).all():
-        raise ValueError(f"voltages: {(~np.isfinite(values)).sum()} channels in use are NaN or infinite; mask them.")
-    if not values.any():
-        raise ValueError("voltages: all channels in use read zero; was the current source on?")
-    return jnp.where(used, measured, 0), used
-
-
-def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
-    """The background per cell; raises `ValueError` for what is not one real number or one for each cell."""
-    if jnp.iscomplexobj(background) or jnp.shape(background) not in ((), (model.mesh.num_cells,)):
-        raise ValueError(
-            f"background must be one real conductivity, or one for each of the {model.mesh.num_cells} cells; it is "
-            f"{jnp.asarray(background).dtype} of shape {jnp.shape(background)}."
-        )
-    return jnp.broadcast_to(jnp.asarray(background, float), (model.mesh.num_cells,))
-
-
-def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[Array, " M"]:
-    """Standard deviation of every channel, volts (1 where left out); raises `ValueError`."""
-    if noise is not None and jnp.shape(noise) not in ((), measured.shape):
-        raise ValueError(f"noise has shape {jnp.shape(noise)}; give one number, or one for each channel.")
-    deviation = relative_noise(measured, used) if noise is None else np.broadcast_to(np.asarray(noise), measured.shape)
-    if not (np.isfinite(deviation)[used] & (np.asarray(deviation)[used] > 0)).all():
-        raise ValueError("noise must be positive and finite for every channel in use.")
-    return jnp.where(used, deviation, 1)
 
 
 def _solver(solver, prior, max_steps: int, rtol: float) -> optx.AbstractLeastSquaresSolver:
@@ -303,12 +281,28 @@ def _solve_between(inversion: Inversion, start, box, method: str, max_steps: int
     return coefficients, int(steps), costs, *_status(optx.RESULTS.nonlinear_max_steps_reached, int(steps))
 
 
-def _box(bounds, inversion: Inversion, link: AbstractLink):
-    """Bounds on the coefficients, (n,) each, from bounds on conductivity; unknowns have none."""
+def _alike(one: Inversion, other: Inversion) -> bool:
+    """Whether the coefficients of two problems mean the same kind of thing."""
+
+    def kinds(inversion):
+        return [type(part) for part in (inversion.link, inversion.basis, inversion.penalty, *inversion.unknowns)]
+
+    return kinds(one) == kinds(other)
+
+
+def _mismatch(model: ForwardModel, measured, background, kept) -> str:
+    """A hint where voltages and background are of different size or sign: units, or polarity."""
+    expected = model.voltages(background)[kept]
+    ratio = float(jnp.vdot(measured, expected) / jnp.vdot(expected, expected))
+    if 0.1 < ratio < 10:
+        return ""
+    return f" The voltages are {ratio:.2g} times those of the background; are they in volts, and their signs right?"
+
+
+def _box(limits, inversion: Inversion, link: AbstractLink):
+    """Bounds on the coefficients, (n,) each, from `limits` on conductivity; unknowns have none."""
     rest = inversion.num_coefficients - inversion.basis.num_coefficients
-    lower, upper = (0.0, np.inf) if bounds is None else bounds
-    if not 0 <= lower < upper:
-        raise ValueError(f"bounds: give 0 ≤ lower < upper, S/m (2-D: S); they are {bounds}.")
+    lower, upper = limits
     if isinstance(link, Bounded):
         raise ValueError("bounds: the link is bounded already; give bounds or link=Bounded(lower, upper), not both.")
     with np.errstate(divide="ignore"):
@@ -341,5 +335,5 @@ def _status(result, max_steps: int) -> tuple[str, str]:
     if result == optx.RESULTS.successful:
         return "converged", "The next step would change the objective by less than the tolerance."
     if result == optx.RESULTS.nonlinear_max_steps_reached:
-        return "not converged", f"Stopped after {max_steps} steps; raise max_steps, or the hyperparameter."
+        return "not converged", f"Stopped after {max_steps} trial steps; raise max_steps, or the hyperparameter."
     return "stalled", "No shorter step lowered the objective; the model is at odds with the data."

@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterable, Iterator
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -51,6 +52,8 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     has failed), or when it differs from an undisturbed frame by more than half of it. A dead electrode's channels are
     left out, and named.
     """
+    if isinstance(frames, (np.ndarray, jax.Array)) and frames.ndim != 2:
+        raise ValueError(f"frames has shape {frames.shape}; give (frames, channels), or for one frame [frame].")
     session = _Session(imager)
     for number, frame in enumerate(frames):
         yield session.image(number, frame)
@@ -119,7 +122,15 @@ class _Session:
     @np.errstate(over="ignore")  # a square that overflows is not an ordinary one
     def _inspect(self, frame):
         """Values, usable channels, status and reason of a frame as it came."""
-        values, none = np.asarray(frame), np.zeros_like(self.mask)
+        none = np.zeros_like(self.mask)
+        if np.ma.isMaskedArray(frame):
+            frame = np.ma.filled(frame.astype(float), np.nan)
+        try:
+            values = np.asarray(frame)
+        except ValueError:
+            return none, none, "refused", f"The frame is ragged, not {self.mask.size} real voltages."
+        if values.dtype.kind in "US":
+            return values, none, "refused", f"The frame is text, not {self.mask.size} real voltages."
         if values.shape != self.mask.shape or values.dtype.kind not in "iuf":
             reason = f"The frame is {values.dtype} of shape {values.shape}, not {self.mask.size} real voltages."
             return values, none, "refused", reason

@@ -27,6 +27,10 @@ class AbstractUnknown(eqx.Module):
         """Number of values k."""
         return self.deviation.shape[0]
 
+    def fits(self, model: ForwardModel) -> bool:
+        """Whether it was made for a model like this one."""
+        return True
+
     @abc.abstractmethod
     def apply(
         self, model: ForwardModel, estimate: Float[Array, " m"], values: Float[Array, " k"]
@@ -44,6 +48,10 @@ class ContactImpedance(AbstractUnknown):
         if model.electrodes.is_point:
             raise ValueError("ContactImpedance: point electrodes have no contact impedance to estimate.")
         self.deviation = _deviation("ContactImpedance", deviation, model.electrodes.num_electrodes)
+
+    def fits(self, model):
+        """As many electrodes, with contact."""
+        return not model.electrodes.is_point and self.size == model.electrodes.num_electrodes
 
     def apply(self, model, estimate, values):
         """z exp(values)."""
@@ -73,6 +81,11 @@ class ElectrodePosition(AbstractUnknown):
             )
         self.direction = jnp.asarray(direction)
         self.deviation = _deviation("ElectrodePosition", deviation, direction.shape[0] * direction.shape[1])
+
+    def fits(self, model):
+        """As many electrodes, of a kind that can move."""
+        movable = isinstance(model.electrodes, (BoundaryElectrodes, SheetDiscs))
+        return movable and self.direction.shape[0] == model.electrodes.num_electrodes
 
     def apply(self, model, estimate, values):
         """Positions moved."""

@@ -73,13 +73,26 @@ def test_a_stream_from_a_file(method, tank, run, tmp_path):
 
 def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
     good = " ".join(map(repr, map(float, tank.touched)))
-    monkeypatch.setattr("sys.stdin", io.StringIO(f"{good}\n\nrubbish\n{good.replace(' ', ',')}\n1 2 3\n"))
+    first, *others = good.split()
+    gap = ",".join([first, "", *others[1:]])
+    monkeypatch.setattr("sys.stdin", io.StringIO(f"{good}\n\nrubbish\n{good.replace(' ', ',')}\n1 2 3\n{gap}\n"))
     status, _, error = run(
         "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "linear",
         "--quiet", *FEW,
     )  # fmt: skip
     assert (status, error) == (0, "")
-    assert [row["status"] for row in rows_of(tmp_path / "out")] == ["imaged", "refused", "imaged", "refused"]
+    assert [row["status"] for row in rows_of(tmp_path / "out")] == [
+        "imaged", "refused", "imaged", "refused", "partial",
+    ]  # fmt: skip
+    # A stream that fails leaves no images of an earlier one behind.
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    assert (tmp_path / "out" / "images.npz").exists()
+    status, _, error = run(
+        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "linear",
+        "--quiet", *FEW,
+    )  # fmt: skip
+    assert (status, "no frame" in error) == (1, True)
+    assert not (tmp_path / "out" / "images.npz").exists()
 
 
 @pytest.mark.parametrize(

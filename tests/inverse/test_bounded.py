@@ -74,9 +74,13 @@ def test_bounds_alone_choose_a_bounded_solver_and_too_few_steps_are_said_so(mode
     [
         ({"bounds": (2.0, 1.0)}, "lower < upper"),
         ({"bounds": (1.5, 2.0)}, "background must lie"),
+        ({"bounds": 5}, "two numbers"),
+        ({"bounds": (1.0,)}, "two numbers"),
+        ({"bounds": "ab"}, "two numbers"),
+        ({"bounds": (2.0, 1.0), "prior": Gaussian(0.02)}, "lower < upper"),
         ({"bounds": (0.5, 2.0), "link": Bounded(0.1, 4.0)}, "bounded already"),
         ({"bounds": (0.5, 2.0), "solver": "levenberg-marquardt"}, "knows none"),
-        ({"bounds": (0.5, 2.0), "prior": Gaussian(0.02)}, "no usable precision"),
+        ({"bounds": (0.5, 2.0), "prior": Gaussian(0.02)}, "in place of bounds"),
         ({"bounds": (0.5, 2.0), "regions": True}, "every cell"),
     ],
 )

@@ -43,8 +43,16 @@ def test_masked_voltages_do_not_count():
         (np.ones((3, 5)), None, "alike"),
         (np.full((3, 5), np.nan), None, "NaN"),
         (np.ones((3, 5)), np.ones(4, bool), "booleans"),
+        (1j * np.ones((3, 5)), None, "complex"),
+        (np.ones((3, 5)), np.zeros(5, bool), "leaves no channel"),
     ],
 )
 def test_bad_input(frames, mask, message):
     with pytest.raises(ValueError, match=message):
         repeated_noise(frames, mask)
+
+
+@pytest.mark.parametrize("prior_frames", [-5.0, np.nan, np.inf])
+def test_frames_seen_before_are_a_number_from_zero(prior_frames):
+    with pytest.raises(ValueError, match="prior_frames"):
+        repeated_noise(draw(5), prior_frames=prior_frames)

@@ -8,7 +8,22 @@ import pytest
 
 from jeit.electrodes import BoundaryElectrodes, ring
 from jeit.forward import ForwardModel
-from jeit.inverse import Bounded, Gaussian, Laplace, Linear, Log, Noser, Tikhonov, reconstruct
+from jeit.inverse import (
+    Background,
+    Bounded,
+    ContactImpedance,
+    ElectrodePosition,
+    Gaussian,
+    Laplace,
+    Linear,
+    Log,
+    Noser,
+    Tikhonov,
+    TotalVariation,
+    posterior,
+    reconstruct,
+)
+from jeit.inverse.hyperparameter import noise_figure
 from jeit.mesh import Disk, Refine, centroids, measures
 from jeit.protocol import adjacent
 
@@ -122,7 +137,7 @@ def test_too_few_steps_are_said_so(model, frame):
     voltages, noise = frame
     result = reconstruct(model, voltages, 1.0, prior=Gaussian(0.02), noise=noise, max_steps=2)
     assert result.status == "not converged"
-    assert "2 steps" in result.reason
+    assert "2 trial steps" in result.reason
 
 
 @pytest.mark.parametrize(
@@ -145,12 +160,48 @@ def test_too_few_steps_are_said_so(model, frame):
         ({"solver": "newton"}, "gauss-newton"),
         ({"hyperparameter": "magic"}, "magic"),
         ({"hyperparameter": -1.0}, "positive"),
+        ({"hyperparameter": noise_figure, "prior": TotalVariation()}, "takes a number"),
+        ({"noise": 1e-4 + 1j}, "real number"),
+        ({"noise": "small"}, "real number"),
+        ({"rtol": np.inf}, "rtol"),
+        ({"rtol": -1.0}, "rtol"),
+        ({"rtol": np.nan}, "rtol"),
+        ({"rtol": "fine"}, "rtol"),
+        ({"max_steps": 0}, "max_steps"),
+        ({"max_steps": 2.5}, "max_steps"),
+        ({"max_steps": "3"}, "max_steps"),
+        ({"unknowns": [Background(), Background()]}, "more than once"),
+        ({"unknowns": Background()}, "list of those"),
+        ({"unknowns": [Background]}, "list of those"),
+        ({"start": "there"}, "what reconstruct has returned"),
     ],
 )
 def test_bad_input(change, message, model, frame):
     arguments = {"voltages": frame[0], "background": 1.0, "noise": frame[1], **change}
     with pytest.raises(ValueError, match=message):
         reconstruct(model, **arguments)
+
+
+def test_unknowns_of_another_model_are_refused(model, frame):
+    electrodes = BoundaryElectrodes(ring(RADIUS, 8), 0.012, 1e-3)
+    other = ForwardModel(model.mesh, electrodes, adjacent(8))
+    for unknown in (ContactImpedance(other), ElectrodePosition(other, 1e-3)):
+        with pytest.raises(ValueError, match="another model"):
+            reconstruct(model, frame[0], 1.0, unknowns=[unknown])
+
+
+def test_a_misfit_that_is_not_finite_is_a_failure(model, frame):
+    """However fine the conductivity looks; and nothing is built on it."""
+    result = reconstruct(model, frame[0], 1.0, noise=1e-300, hyperparameter=3.0, max_steps=2)
+    assert result.status == "failed"
+    with pytest.raises(ValueError, match="failed"):
+        posterior(result)
+
+
+def test_voltages_in_other_units_are_hinted_at(model, frame):
+    result = reconstruct(model, 1e3 * frame[0], 1.0, noise=1e3 * frame[1], hyperparameter=3.0, max_steps=2)
+    assert result.status == "not converged"
+    assert "times those of the background" in result.reason
 
 
 def test_bounds_in_the_wrong_order():
@@ -167,7 +218,7 @@ def test_data_that_no_body_explains_show_in_the_misfit(model, frame):
 def test_a_start_from_another_problem_is_refused(model, frame):
     options = {"noise": frame[1], "hyperparameter": 100.0}
     other = reconstruct(model, frame[0], 1.0, prior=Gaussian(0.05), **options)
-    with pytest.raises(ValueError, match="same model and prior"):
+    with pytest.raises(ValueError, match="same model, prior and link"):
         reconstruct(model, frame[0], 1.0, prior=Gaussian(0.03), start=other, **options)
 
 

@@ -76,6 +76,7 @@ def test_means_are_weighted_by_area(model):
         (np.full(551, -1), "integers"),
         (np.full(551, 0.5), "integers"),
         (np.full(551, 2), "no cell has the label 0"),
+        (np.r_[np.zeros(550, int), 10**9], "more than there are cells"),
         (np.full(551, -2), "integers"),
     ],
 )

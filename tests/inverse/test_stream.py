@@ -178,7 +178,9 @@ REFUSED = {
     "another sensor": (lambda frame: 3 * frame, "another sensor"),
     "shuffled": (lambda frame: np.roll(frame, 5), "another sensor"),
     "complex": (lambda frame: frame + 1j, "real voltages"),
-    "text": (lambda frame: "no frame at all", "real voltages"),
+    "text": (lambda frame: "no frame at all", "is text"),
+    "ragged": (lambda frame: [[1.0, 2.0], [3.0]], "ragged"),
+    "masked": (lambda frame: np.ma.masked_array(frame, mask=True), "Only 0 of 208"),
     "nothing": (lambda frame: None, "real voltages"),
 }
 
@@ -244,10 +246,21 @@ def test_a_frame_that_needs_more_steps_is_said_so(model, frames, options):
         ({"mask": np.zeros(208, bool)}, "every channel"),
         ({"noise": 0.0}, "noise"),
         ({"memory": -1.0}, "memory"),
+        ({"steps": 2.5}, "steps"),
+        ({"prior": "noser"}, "Noser"),
+        ({"reference": np.array(-1.0)}, "signs"),
+        ({"reference": np.array(1e3)}, "SI units"),
         ({"memory": np.nan}, "memory"),
         ({"memory": 5.0, "prior": TotalVariation(), "hyperparameter": 30.0}, "memory"),
     ],
 )
 def test_bad_input(change, message, model, options):
+    if "reference" in change and change["reference"].shape == ():
+        change = {"reference": change["reference"] * np.asarray(model.voltages(1.0))}
     with pytest.raises(ValueError, match=message):
         Imager.create(model, 1.0, **{**options, **change})
+
+
+def test_one_frame_is_not_a_stream(frames, imager):
+    with pytest.raises(ValueError, match=r"\[frame\]"):
+        list(stream(imager, frames[0]))
