@@ -17,8 +17,8 @@ import numpy as np
 
 from benchmarks import machine, problem, pyeit_environment
 from benchmarks.accuracy import difference
-from benchmarks.contest import CORES, Contestant, Figures, compete
-from benchmarks.report import cell, duration, markdown, ratio
+from benchmarks.contest import CORES, ROOT, Contestant, Figures, compete
+from benchmarks.report import cell, duration, markdown, ratio, write_between_markers
 
 HEADER = ["nodes", "electrodes", "contestant", "one image", "times jeit's", "compile", "misfit", "error of image"]
 # Times faster than pyEIT asked for, up to so many nodes; and than SciPy.
@@ -94,6 +94,7 @@ def main() -> int:
     parser.add_argument("--time-limit", type=float, default=1200.0, help="seconds for one image, then it has given up")
     parser.add_argument("--without-pyeit", action="store_true")
     parser.add_argument("--quick", action="store_true", help="a smoke run: one small mesh, figures not judged")
+    parser.add_argument("--write-readme", action="store_true", help="put the table into benchmarks/README.md")
     options = parser.parse_args()
     if options.quick:
         options.nodes, options.rounds = [200], 2
@@ -111,9 +112,16 @@ def main() -> int:
                     found = play(num_points, model, opponents, options.rounds, options.time_limit, Path(folder))
                     for everything, new in zip((rows, checks, notes), found, strict=True):
                         everything += new
-    print("\n".join(f"- {line}" for line in [*heading, *notes]))
-    print("\n" + markdown(HEADER, rows))
-    print("\n" + markdown(["asked", "measured", ""], checks))
+    text = "\n\n".join(
+        [
+            "\n".join(f"- {line}" for line in dict.fromkeys([*heading, *notes])),
+            markdown(HEADER, rows),
+            markdown(["asked", "measured", ""], checks),
+        ]
+    )
+    print(text)
+    if options.write_readme:
+        write_between_markers(ROOT / "benchmarks" / "README.md", text, "gauss-newton")
     return int(not options.quick and any(check[-1] == "missed" for check in checks))
 
 

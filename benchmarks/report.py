@@ -8,8 +8,6 @@ from pathlib import Path
 from benchmarks.contest import Figures
 from benchmarks.match import Match
 
-BEGIN, END = "<!-- benchmark:begin -->", "<!-- benchmark:end -->"
-
 
 def duration(seconds: float) -> str:
     """A time with three figures and a fitting unit."""
@@ -94,11 +92,12 @@ def markdown(header: list[str], rows: list[list[str]]) -> str:
     )
 
 
-def write_between_markers(path: Path, text: str) -> None:
-    """Replace what stands between the markers in a file. Raises `ValueError` if it has no markers."""
+def write_between_markers(path: Path, text: str, name: str = "benchmark") -> None:
+    """Replace what stands between the markers of this name in a file. Raises `ValueError` if it has no markers."""
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
     content = path.read_text(encoding="utf-8")
-    if content.count(BEGIN) != 1 or content.count(END) != 1:
-        raise ValueError(f"{path.name} needs the lines {BEGIN} and {END}, once each, where the table is to go.")
-    before, rest = content.split(BEGIN)
-    _, after = rest.split(END)
-    path.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}", encoding="utf-8")
+    if content.count(begin) != 1 or content.count(end) != 1:
+        raise ValueError(f"{path.name} needs the lines {begin} and {end}, once each, where the table is to go.")
+    before, rest = content.split(begin)
+    _, after = rest.split(end)
+    path.write_text(f"{before}{begin}\n{text}\n{end}{after}", encoding="utf-8")
