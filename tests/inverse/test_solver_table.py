@@ -63,10 +63,9 @@ def pose(name):
 
 
 def cases():
-    """All pairs; the quick suite takes every solver once, and Gauss-Newton on everything."""
+    """All pairs; the quick suite takes every solver once."""
     for problem, solver in itertools.product(PROBLEMS, SOLVERS):
-        quick = solver == "gauss-newton" or problem == "conductive in a disk"
-        yield pytest.param(problem, solver, marks=() if quick else pytest.mark.slow)
+        yield pytest.param(problem, solver, marks=() if problem == "conductive in a disk" else pytest.mark.slow)
 
 
 @pytest.mark.parametrize(("problem", "name"), list(cases()))

@@ -104,7 +104,7 @@ def noisy(model):
     return np.asarray(pressed) + noise * np.random.default_rng(0).normal(size=(60, 208)), noise
 
 
-@pytest.mark.parametrize("memory", [3.0, 20.0])
+@pytest.mark.parametrize("memory", [3.0, pytest.param(20.0, marks=pytest.mark.slow)])
 def test_a_memory_is_the_kalman_filter(memory, model, noisy):
     """The textbook's, with all covariances, long enough for them to be steady."""
     frames, noise = noisy
