@@ -142,6 +142,18 @@ def test_a_memory_takes_noise_out_and_leaves_the_press(method, model, noisy):
     assert abs(press[1].mean() - 0.9) < abs(press[0].mean() - 0.9)
 
 
+def test_a_memory_is_the_same_to_gauss_newton_where_all_is_linear(model, noisy):
+    """Changes a hundred times smaller, and noise too: one step from the expected image is the filter's update."""
+    rest, (frames, noise) = np.asarray(model.voltages(1.0)), noisy
+    options = {"prior": Gaussian(0.03), "noise": noise / 100, "hyperparameter": 200.0, "memory": 2.0}
+    small = rest + (frames[:6] - rest) / 100
+    linear, iterated = (
+        list(stream(Imager.create(model, 1.0, method=method, **options), small))[-1].conductivity - 1
+        for method in ("linear", "gauss-newton")
+    )
+    np.testing.assert_allclose(iterated, linear, atol=0.01 * np.abs(linear).max())
+
+
 def spoil(frames, fault):
     """Frames with one of them spoilt; the third."""
     spoilt = [frame.copy() for frame in frames]
