@@ -10,6 +10,7 @@ from .choose import choose_solver
 from .conjugate_gradient import ConjugateGradient
 from .dense_cholesky import symmetric_inverse
 from .descent import Descent
+from .few_unknowns import Minimum, inverse_few, minimise_few, solve_few
 from .multifrontal import Factor, factorise, half_solve, quadratic_form, solve
 from .operator import SparseSymmetric
 from .pattern import SparsityPattern
@@ -22,6 +23,7 @@ __all__ = [
     "Descent",
     "Factor",
     "FactorisationPlan",
+    "Minimum",
     "Model",
     "SparseCholesky",
     "SparseSymmetric",
@@ -31,10 +33,13 @@ __all__ = [
     "factorise",
     "half_solve",
     "in_turn",
+    "inverse_few",
+    "minimise_few",
     "quadratic_form",
     "ridge_model",
     "ridge_step",
     "solve",
     "solve_definite",
+    "solve_few",
     "symmetric_inverse",
 ]
