@@ -46,7 +46,19 @@ if TYPE_CHECKING:
 if "JAX_ENABLE_X64" not in os.environ:
     jax.config.update("jax_enable_x64", True)
 
-_ROOMS = ("data", "electrodes", "forward", "image", "imaging", "inverse", "mesh", "plot", "protocol", "report")
+_ROOMS = (
+    "acoustic",
+    "data",
+    "electrodes",
+    "forward",
+    "image",
+    "imaging",
+    "inverse",
+    "mesh",
+    "plot",
+    "protocol",
+    "report",
+)
 _HOMES = {
     "BoundaryElectrodes": "electrodes",
     "Disk": "mesh",

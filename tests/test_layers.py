@@ -15,8 +15,9 @@ ALLOWED = {
     "forward": {"mesh", "electrodes", "protocol"},
     "inverse": {"mesh", "electrodes", "protocol", "forward"},
     "image": {"mesh"},
+    "acoustic": {"mesh"},
     "data": {"mesh", "electrodes", "protocol", "forward"},
-    "plot": {"mesh", "electrodes", "protocol", "forward", "inverse", "image", "data"},
+    "plot": {"mesh", "electrodes", "protocol", "forward", "inverse", "image", "acoustic", "data"},
 }
 LAYERS = sorted(ALLOWED)
 

@@ -1,0 +1,247 @@
+"""From a recording to places: which frames hold a touch, where it is, and what is wrong with the others."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.stats import chi2
+
+from jeit.acoustic.calibration import Calibration
+from jeit.acoustic.intensity import IntensitySettings, intensities
+from jeit.acoustic.likelihood import Listeners
+from jeit.acoustic.localiser import Estimate, Localiser
+from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.recording import Intensities, Recording
+from jeit.acoustic.swaps import find_swaps
+from jeit.acoustic.two_sources import locate_two
+
+STATUSES = ("touch", "no touch", "outside", "two touches", "ambiguous", "misfit", "unusable")
+# Chance that a silent frame is taken for a touch; that a frame one source explains is said not to be.
+_FALSE_ALARM, _FALSE_MISFIT = 1e-6, 1e-4
+# Standard deviations of unknown distribution that a false alarm needs.
+_HEARD_DEVIATIONS = 6.0
+# −2 log-likelihood by which a place beyond the outline must be better to be said outside, and a rival valley worse not
+# to make a frame ambiguous: three standard deviations, and two.
+_OUTSIDE, _RIVAL = 9.0, 4.0
+# Two sources are believed that leave this part of what one leaves, even where they do not explain everything.
+_BOTH = 0.2
+# Share of touches that no source on the skin explains, from which something is wrong with the array.
+_ODD = 0.25
+# Intensities this much below the loudest frame's are no touch, where no floor is known (60 dB).
+_DYNAMIC_RANGE = 1e-6
+
+
+class Locations(eqx.Module):
+    """What was found of F frames of M microphones.
+
+    - `times`: (F,) seconds; `status`: (F,) one of `STATUSES`.
+    - `position`: (F, d) metres; `covariance`: (F, d, d) m²; `strength`: (F,). NaN where there is no touch.
+    - `misfit`: (F,) chi-square of what one source leaves unexplained, with `freedom`: (F,) degrees.
+    - `used`: (F, M) which microphones were looked at. `faults`: M strings, what is wrong with one ("" if nothing).
+    - `second`: (F, d) and `second_strength`: (F,), of the weaker of two touches, NaN elsewhere.
+    - `notes`: what to know of all of it.
+
+    Status: "touch"; "no touch", nothing is above the floor; "outside", the intensities say a place beyond the outline,
+    and the place given is the best on it; "two touches", one source does not explain the frame but two do; "misfit",
+    neither does, and the covariance is widened accordingly; "ambiguous", two places explain the frame about as well;
+    "unusable", fewer than three microphones could be used.
+    """
+
+    times: Float[np.ndarray, " F"]
+    position: Float[np.ndarray, "F d"]
+    covariance: Float[np.ndarray, "F d d"]
+    strength: Float[np.ndarray, " F"]
+    status: np.ndarray
+    misfit: Float[np.ndarray, " F"]
+    freedom: Int[np.ndarray, " F"]
+    used: Bool[np.ndarray, "F M"]
+    second: Float[np.ndarray, "F d"]
+    second_strength: Float[np.ndarray, " F"]
+    faults: tuple[str, ...] = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    @property
+    def located(self) -> Bool[np.ndarray, " F"]:
+        """Frames that have a position."""
+        return np.asarray(np.isfinite(self.position).all(axis=1))
+
+    def counts(self) -> dict[str, int]:
+        """How many frames there are of each status."""
+        return {status: int((self.status == status).sum()) for status in STATUSES if (self.status == status).any()}
+
+
+def locate(
+    recording: Recording | Intensities,
+    calibration: Calibration,
+    *,
+    method: str = "likelihood",
+    map_shape: tuple[int, int] | None = None,
+    intensity: IntensitySettings | None = None,
+) -> Locations:
+    """Locate the touch in every frame of a recording.
+
+    `method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster that is
+    searched, (200, 200) in the paper; a coarse grid unless given (both are refined). `intensity`: band and window for
+    samples, those of the calibration unless given. Raises `ValueError` for a recording of another number of
+    microphones, and where fewer than three can be used.
+    """
+    heard = measure(recording, calibration, intensity)
+    listeners, use, faults = prepare(heard, calibration)
+    touched = use.any(axis=1) & _above_floor(heard, listeners.noise, use)
+    enough = use.sum(axis=1) >= 3
+    solve = touched & enough
+    localiser = Localiser.create(listeners, method=method, map_shape=map_shape)
+    frames, d = len(heard.times), calibration.listeners.microphones.shape[1]
+    status = np.where(touched, "touch", "no touch").astype(object)
+    status[~enough] = "unusable"
+    result = {
+        "position": np.full((frames, d), np.nan),
+        "covariance": np.full((frames, d, d), np.nan),
+        "strength": np.full(frames, np.nan),
+        "misfit": np.full(frames, np.nan),
+        "freedom": np.zeros(frames, int),
+        "second": np.full((frames, d), np.nan),
+        "second_strength": np.full(frames, np.nan),
+    }
+    notes: list[str] = []
+    if solve.any():
+        power, used = _padded(heard.power[solve], use[solve])
+        found = localiser(power, used)
+        # The likelihood judges frames, whichever loss has placed them.
+        judge = found if method == "likelihood" else Localiser.create(listeners)(power, used)
+        number = int(solve.sum())
+        for key in ("position", "covariance", "strength"):
+            result[key][solve] = getattr(found, key)[:number]
+        for key in ("misfit", "freedom"):
+            result[key][solve] = getattr(judge, key)[:number]
+        status[solve] = _judge(judge, found)[:number]
+        _explain(status, result, heard.power, use, listeners)
+        notes = _notes(status, heard, use, listeners)
+    return Locations(
+        np.asarray(heard.times),
+        **result,
+        status=status.astype(str),
+        used=use,
+        faults=faults,
+        notes=tuple(notes),
+        name=heard.name,
+    )
+
+
+def _judge(judge: Estimate, found: Estimate) -> np.ndarray:
+    """The status of frames with a touch, but for two touches."""
+    misfit, freedom = np.asarray(judge.misfit), np.asarray(judge.freedom)
+    unexplained = (freedom > 0) & (chi2.sf(misfit, np.maximum(freedom, 1)) < _FALSE_MISFIT)
+    status = np.where(np.asarray(judge.rival) < _RIVAL, "ambiguous", "touch").astype(object)
+    status[unexplained] = "misfit"
+    status[np.asarray(judge.excess) > _OUTSIDE] = "outside"
+    status[~np.isfinite(np.asarray(found.position)).all(axis=1)] = "unusable"
+    return status
+
+
+def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, listeners: Listeners) -> None:
+    """Try two sources where one does not explain the frame; widen the covariance where neither does."""
+    tried = np.flatnonzero((status == "misfit") & (use.sum(axis=1) > 6))
+    if tried.size:
+        two = locate_two(listeners, *_padded(power[tried], use[tried]))
+        misfit, freedom = np.asarray(two.misfit)[: tried.size], np.asarray(two.freedom)[: tried.size]
+        both = (chi2.sf(misfit, np.maximum(freedom, 1)) > _FALSE_MISFIT) | (misfit < _BOTH * result["misfit"][tried])
+        chosen, index = tried[both], np.flatnonzero(both)
+        status[chosen] = "two touches"
+        result["misfit"][chosen], result["freedom"][chosen] = misfit[both], freedom[both]
+        position, strength = np.asarray(two.position)[index], np.asarray(two.strength)[index]
+        result["position"][chosen], result["second"][chosen] = position[:, 0], position[:, 1]
+        result["strength"][chosen], result["second_strength"][chosen] = strength.T
+        result["covariance"][chosen] = np.asarray(two.covariance)[index, 0]
+    left = np.flatnonzero(status == "misfit")
+    wide = result["misfit"][left] / np.maximum(result["freedom"][left], 1)
+    result["covariance"][left] *= np.maximum(wide, 1.0)[:, None, None]
+
+
+def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, listeners: Listeners) -> list[str]:
+    """What the user should know beyond the status of frames."""
+    notes = []
+    single = ~np.isin(status, ["no touch", "unusable", "two touches"])
+    odd = np.isin(status, ["misfit", "outside"])
+    if odd.sum() > _ODD * single.sum():
+        swaps = find_swaps(listeners, heard.power[single], use[single])
+        notes += [
+            f"microphones {one} and {other} look exchanged since the calibration: exchanged back, their intensities "
+            "fit one source."
+            for one, other in swaps
+        ]
+        if not swaps and (status == "misfit").sum() > 2 * _ODD * single.sum():
+            notes.append("most touches fit no single source: is this the calibration of this array?")
+    return notes
+
+
+def measure(
+    recording: Recording | Intensities, calibration: Calibration, intensity: IntensitySettings | None = None
+) -> Intensities:
+    """Intensities of a recording, as the calibration took them.
+
+    Raises `ValueError` for another number of microphones.
+    """
+    number = recording.samples.shape[0] if isinstance(recording, Recording) else recording.power.shape[1]
+    if number != calibration.num_microphones:
+        raise ValueError(
+            f"'{recording.name}' has {number} microphones and the calibration '{calibration.name}' "
+            f"{calibration.num_microphones}; give the calibration of this array."
+        )
+    if isinstance(recording, Intensities):
+        return recording
+    return intensities(recording, intensity or calibration.intensity or IntensitySettings())
+
+
+def prepare(heard: Intensities, calibration: Calibration) -> tuple[Listeners, np.ndarray, tuple[str, ...]]:
+    """The listeners with the noise of these intensities, which are to be used (F, M), and what is wrong with others.
+
+    Raises `ValueError` if fewer than three microphones are left.
+    """
+    use = np.asarray(heard.usable) & calibration.usable
+    faults = tuple(
+        "; ".join(part for part in (fault, reason and f"not calibrated: {reason}") if part)
+        for fault, reason in zip(heard.faults, calibration.reasons, strict=True)
+    )
+    if use.any(axis=0).sum() < 3:
+        told = "; ".join(f"microphone {k}: {fault}" for k, fault in enumerate(faults) if fault)
+        raise ValueError(
+            f"'{heard.name}': {use.any(axis=0).sum()} of {len(faults)} microphones can be used, and three are needed "
+            f"to locate a touch. {told}."
+        )
+    known = calibration.listeners.noise
+    if np.any(heard.floor > 0):
+        noise = IntensityNoise.create(
+            len(faults), floor=heard.floor, freedom=heard.freedom, relative=np.asarray(known.relative)
+        )
+    else:
+        # What is negative betrays noise that the calibration may not have had.
+        below = np.where(use & (heard.power < 0), heard.power, 0.0)
+        deviation = np.sqrt((below**2).sum(axis=0) / np.maximum((below < 0).sum(axis=0), 1))
+        wider = np.maximum(deviation, np.asarray(known.deviation))
+        noise = eqx.tree_at(
+            lambda n: (n.deviation, n.floor),
+            known,
+            (jnp.asarray(wider), jnp.maximum(known.floor, IntensityNoise.create(len(wider), deviation=wider).floor)),
+        )
+    return eqx.tree_at(lambda listeners: listeners.noise, calibration.listeners, noise), use, faults
+
+
+def _above_floor(heard: Intensities, noise: IntensityNoise, use: np.ndarray) -> np.ndarray:
+    """Frames in which a microphone hears what silence would not make it hear."""
+    power = np.where(use, heard.power, -np.inf)
+    if np.any(heard.floor > 0) and np.isfinite(heard.freedom):
+        least = heard.floor * (chi2.isf(_FALSE_ALARM / use.shape[1], heard.freedom) / heard.freedom - 1)
+    else:
+        loudest = power.max(initial=0.0)
+        least = np.maximum(_HEARD_DEVIATIONS * np.asarray(noise.deviation), _DYNAMIC_RANGE * loudest)
+    return np.asarray((power > least).any(axis=1))
+
+
+def _padded(power: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frames repeated up to a round number of them, so that few sizes are ever compiled."""
+    number = len(power)
+    round_number = 1 << (number - 1).bit_length() if number <= 1024 else -(-number // 1024) * 1024
+    index = np.minimum(np.arange(round_number), number - 1)
+    return power[index], use[index]

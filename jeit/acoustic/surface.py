@@ -1,0 +1,200 @@
+"""Surfaces on which a source may be: charts of two coordinates u (m), with an outline in them.
+
+A plane is its own chart. A curved surface is a height over its best plane, interpolated by a thin-plate spline through
+points known to lie on it; it may curve as it likes as long as no two of its points lie above each other.
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from jeit.mesh import Disk, Domain, Polygon, Rectangle
+
+# Knots of the spline: more make every evaluation slower and the surface no smoother.
+_MOST_KNOTS = 200
+# Of the polygon that stands for a disk: it is nowhere more than 0.04 % of the radius inside it.
+_DISK_VERTICES = 120
+
+
+class AbstractSurface(eqx.Module):
+    """A surface with its outline."""
+
+    outline: eqx.AbstractVar[Polygon]
+
+    @abc.abstractmethod
+    def place(self, chart: Float[Array, "2 ..."]) -> Float[Array, "d ..."]:
+        """Points in space of chart coordinates."""
+
+    @abc.abstractmethod
+    def project(self, points: Float[Array, "d ..."]) -> Float[Array, "2 ..."]:
+        """Chart coordinates of points in space, along the normal of the chart's plane."""
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int:
+        """Of the space: 2 or 3."""
+
+
+class Plane(AbstractSurface):
+    """The plane itself: coordinates are positions (x, y)."""
+
+    outline: Polygon
+
+    def place(self, chart):
+        """Nothing to do."""
+        return chart
+
+    def project(self, points):
+        """Nothing to do."""
+        return points
+
+    @property
+    def dimension(self):
+        """2."""
+        return 2
+
+
+class CurvedSurface(AbstractSurface):
+    """x(u) = origin + axes u + normal h(u), with a thin-plate spline h = Σ w_k ρ_k² log ρ_k + affine."""
+
+    outline: Polygon
+    origin: Float[Array, " 3"]
+    axes: Float[Array, "3 2"]
+    normal: Float[Array, " 3"]
+    knots: Float[Array, "N 2"]
+    weights: Float[Array, " N"]
+    affine: Float[Array, " 3"]
+
+    def place(self, chart):
+        """The point above u."""
+        flat = chart.reshape(2, -1)
+        squared = jnp.sum((flat[:, None] - self.knots.T[:, :, None]) ** 2, axis=0)
+        height = self.weights @ _thin_plate(squared) + self.affine[0] + self.affine[1:] @ flat
+        points = self.origin[:, None] + self.axes @ flat + self.normal[:, None] * height
+        return points.reshape(3, *chart.shape[1:])
+
+    def project(self, points):
+        """Coordinates in the plane."""
+        flat = points.reshape(3, -1) - self.origin[:, None]
+        return (self.axes.T @ flat).reshape(2, *points.shape[1:])
+
+    @property
+    def dimension(self):
+        """3."""
+        return 3
+
+
+def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -> AbstractSurface:
+    """The surface within `outline`: vertices (K, 2), or a `Rectangle`, `Disk` or `Polygon`; or (K, 3) in space.
+
+    In space the surface passes through the outline and `points` (T, 3), places of taps for instance. Raises
+    `ValueError` for outlines that are none, and for surfaces that fold over their best plane.
+    """
+    if isinstance(outline, Disk):
+        outline = Polygon(outline.boundary(np.linspace(0, outline.perimeter, _DISK_VERTICES, endpoint=False)))
+    if isinstance(outline, Rectangle):
+        outline = Polygon(outline.vertices)
+    if isinstance(outline, Polygon):
+        return Plane(outline)
+    vertices = np.asarray(outline, float)
+    if vertices.ndim != 2 or vertices.shape[1] not in (2, 3) or len(vertices) < 3:
+        raise ValueError(f"outline: give at least three vertices (K, 2) or (K, 3) in metres; got {vertices.shape}.")
+    if vertices.shape[1] == 2:
+        return Plane(Polygon(vertices))
+    known = vertices if points is None else np.vstack([vertices, np.asarray(points, float)])
+    if not np.isfinite(known).all():
+        raise ValueError("outline: every coordinate of the outline and of the points on it must be finite.")
+    return _curved(vertices, np.unique(known, axis=0))
+
+
+def box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
+    """Lower left and upper right corner of the outline's box in the chart, metres."""
+    vertices = surface.outline.vertices
+    return jnp.min(vertices, axis=0), jnp.max(vertices, axis=0)
+
+
+def in_space(
+    surface: AbstractSurface, chart: Float[Array, "2 F"], covariance: Float[Array, "2 2 F"]
+) -> tuple[Float[Array, "F d"], Float[Array, "F d d"]]:
+    """Places in space, and their covariances, of places and covariances in the chart."""
+    place, push = jax.linearize(surface.place, chart)
+    slopes = jnp.stack([push(direction) for direction in jnp.eye(2)[:, :, None] * jnp.ones_like(chart)])
+    return place.T, jnp.einsum("kaf,klf,lbf->fab", slopes, covariance, slopes)
+
+
+def size(surface: AbstractSurface) -> Float[Array, ""]:
+    """The longer side of the outline's box, metres."""
+    low, high = box(surface)
+    return jnp.max(high - low)
+
+
+def chart_grid(surface: AbstractSurface, columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Middles of columns × rows pixels that fill the outline's box, (2, rows, columns), bottom row first; and which of
+    them lie inside the outline, (rows, columns)."""
+    (left, bottom), (right, top) = (np.asarray(corner) for corner in box(surface))
+    x = left + (right - left) * (np.arange(columns) + 0.5) / columns
+    y = bottom + (top - bottom) * (np.arange(rows) + 0.5) / rows
+    grid = np.stack(np.meshgrid(x, y))
+    return grid, np.asarray(surface.outline.contains(np.moveaxis(grid, 0, -1)))
+
+
+def sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[Array, "2 K"]]:
+    """Where each side of the outline, and of its holes, starts and ends, in the chart."""
+    loops = (surface.outline.vertices, *surface.outline.holes)
+    start, end = (jnp.concatenate([jnp.roll(loop, -shift, axis=0) for loop in loops]) for shift in (0, 1))
+    return start.T, end.T
+
+
+def _thin_plate(squared):
+    """ρ² log ρ of ρ², and 0 at 0."""
+    positive = squared > 0
+    safe = jnp.where(positive, squared, 1.0)
+    return jnp.where(positive, 0.5 * safe * jnp.log(safe), 0.0)
+
+
+def _curved(vertices: np.ndarray, known: np.ndarray) -> CurvedSurface:
+    origin = known.mean(axis=0)
+    _, spread, directions = np.linalg.svd(known - origin, full_matrices=False)
+    if spread[1] <= 1e-6 * spread[0]:
+        raise ValueError("outline: its vertices lie on one line; give the outline of a surface, in metres.")
+    normal = directions[2] * (1.0 if directions[2][np.argmax(np.abs(directions[2]))] > 0 else -1.0)
+    # The chart's first axis follows that of space which is most nearly in its plane.
+    leading = np.eye(3)[np.argmin(np.abs(normal) + np.array([0.0, 1e-3, 2e-3]))]
+    first = leading - normal * (normal @ leading)
+    first /= np.linalg.norm(first)
+    axes = np.stack([first, np.cross(normal, first)], axis=1)
+    chart, height = (known - origin) @ axes, (known - origin) @ normal
+    scale = np.ptp(chart, axis=0).max()
+    keep = _spread(chart, _MOST_KNOTS)
+    chart, height = chart[keep], height[keep]
+    apart = np.linalg.norm(chart[:, None] - chart, axis=-1) + 2 * scale * np.eye(len(chart))
+    first_of, second_of = np.unravel_index(apart.argmin(), apart.shape)
+    if apart.min() < 1e-3 * scale and abs(height[first_of] - height[second_of]) > 10 * apart.min():
+        raise ValueError(
+            "positions: the surface folds over its best plane (two points lie above each other), which jeit cannot "
+            "chart; calibrate its parts one by one."
+        )
+    squared = np.sum((chart[:, None] - chart) ** 2, axis=-1)
+    kernel = np.asarray(_thin_plate(jnp.asarray(squared)))
+    polynomial = np.column_stack([np.ones(len(chart)), chart])
+    # A little smoothing, so that points known to a fraction of a per cent do not make waves.
+    system = np.block([[kernel + 1e-9 * scale**2 * np.eye(len(chart)), polynomial], [polynomial.T, np.zeros((3, 3))]])
+    solution = np.linalg.lstsq(system, np.concatenate([height, np.zeros(3)]), rcond=None)[0]
+    arrays = (origin, axes, normal, chart, solution[:-3], solution[-3:])
+    return CurvedSurface(Polygon((vertices - origin) @ axes), *(jnp.asarray(array) for array in arrays))
+
+
+def _spread(points: np.ndarray, most: int) -> np.ndarray:
+    """Indices of at most `most` points, far from each other."""
+    if len(points) <= most:
+        return np.arange(len(points))
+    chosen, distance = [0], np.full(len(points), np.inf)
+    while len(chosen) < most:
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        chosen.append(int(distance.argmax()))
+    return np.array(chosen)

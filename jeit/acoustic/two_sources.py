@@ -1,0 +1,105 @@
+"""Two sources at once: where both are, for frames that one source does not explain."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from jeit.acoustic.likelihood import Likelihood, Listeners
+from jeit.acoustic.localiser import Pixels
+from jeit.acoustic.surface import box, in_space, size
+from jeit_solvers import inverse_few, minimise_few
+
+# Places of which all pairs are screened.
+_PLACES = 150
+
+
+class TwoSources(eqx.Module):
+    """`position` (F, 2, d) metres, the stronger source first; `covariance` (F, 2, d, d) m²; `strength` (F, 2); `misfit`
+    (F,), chi-square with `freedom` (F,); `converged` (F,)."""
+
+    position: Float[Array, "F 2 d"]
+    covariance: Float[Array, "F 2 d d"]
+    strength: Float[Array, "F 2"]
+    misfit: Float[Array, " F"]
+    freedom: Int[Array, " F"]
+    converged: Bool[Array, " F"]
+
+
+def locate_two(listeners: Listeners, power: ArrayLike, use: ArrayLike | None = None) -> TwoSources:
+    """The most probable pair of sources of each frame: all pairs of a coarse grid are screened, the best is refined.
+
+    `power` (F, M): intensities above the floor; `use`: which to look at, all that are finite unless given. Six unknowns
+    need six microphones or more: frames with fewer give NaN. Both are found inside the outline's box.
+    """
+    power = jnp.asarray(power, float)
+    use = jnp.isfinite(power) if use is None else jnp.isfinite(power) & jnp.asarray(use, bool)
+    low, high = (np.asarray(corner) for corner in box(listeners.surface))
+    spacing = np.sqrt(np.prod(high - low) / _PLACES)
+    columns, rows = (max(3, round(side / spacing)) for side in high - low)
+    pixels = Pixels.create(listeners.surface, columns, rows)
+    return _locate_two(listeners, pixels, power.T, use.T)
+
+
+@eqx.filter_jit
+def _locate_two(listeners: Listeners, pixels: Pixels, power, use) -> TwoSources:
+    use = use & (power + listeners.noise.floor[:, None] > 0)
+    likelihood = Likelihood.create(power, use, listeners)
+    response = jnp.exp(listeners.log_response(pixels.chart))
+    start = jax.lax.map(lambda frame: _best_pair(frame, response, pixels, listeners), (power.T, use.T)).T
+    low, high = box(listeners.surface)
+    reach = size(listeners.surface)
+    far = jnp.full(1, jnp.inf)
+    found = minimise_few(
+        likelihood.expand,
+        start,
+        lower=jnp.concatenate([low, -far, low, -far])[:, None],
+        upper=jnp.concatenate([high, far, high, far])[:, None],
+        largest_step=jnp.tile(jnp.array([0.1, 0.1, 2.3]) * jnp.array([reach, reach, 1.0]), 2)[:, None],
+        max_steps=60,
+        tolerance=1e-10,
+    )
+    x = found.x
+    x = jnp.where(x[5] > x[2], jnp.roll(x, 3, axis=0), x)
+    _, _, matrix = likelihood.expand(x)
+    spread = inverse_few(matrix)
+    number = jnp.sum(use, axis=0)
+    known = (number >= 6) & jnp.isfinite(found.value)
+    each = [in_space(listeners.surface, x[k : k + 2], spread[k : k + 2, k : k + 2]) for k in (0, 3)]
+
+    def shown(array):
+        return jnp.where(known.reshape(-1, *(1,) * (array.ndim - 1)), array, jnp.nan)
+
+    return TwoSources(
+        position=shown(jnp.stack([place for place, _ in each], axis=1)),
+        covariance=shown(jnp.stack([covariance for _, covariance in each], axis=1)),
+        strength=shown(jnp.exp(x[2::3]).T),
+        misfit=shown(likelihood.misfit(x)),
+        freedom=jnp.maximum(number - 6, 0),
+        converged=found.converged & known,
+    )
+
+
+def _best_pair(frame, response, pixels: Pixels, listeners: Listeners) -> Float[Array, " 6"]:
+    """Of all pairs of places, the one whose best two strengths leave least of the frame unexplained."""
+    power, use = frame
+    weight = jnp.where(use, 1 / listeners.noise.variance(jnp.maximum(power, 0.0)), 0.0)
+    # All numbers near one: intensities may be of any unit.
+    scale = jnp.max(jnp.where(use, power, 0.0))
+    weight = weight * scale**2
+    seen = jnp.where(use, power, 0.0) / scale
+    gram = (weight[:, None] * response).T @ response
+    moment = (weight * seen) @ response
+    own = jnp.diag(gram)
+    determinant = own[:, None] * own - gram**2
+    first = (own * moment[:, None] - gram * moment) / determinant
+    second = first.T
+    both = (first > 0) & (second > 0) & (determinant > 1e-9 * own[:, None] * own)
+    both = both & pixels.inside[:, None] & pixels.inside
+    gained = jnp.where(both, first * moment[:, None] + second * moment, -jnp.inf)
+    one, other = jnp.unravel_index(jnp.argmax(gained), gained.shape)
+    strengths = jnp.log(jnp.maximum(scale * jnp.stack([first[one, other], second[one, other]]), 1e-300))
+    chart = pixels.chart
+    return jnp.stack([*chart[:, one], strengths[0], *chart[:, other], strengths[1]])
