@@ -22,8 +22,11 @@ from jeit.acoustic.localiser import Estimate as Estimate
 from jeit.acoustic.localiser import Localiser as Localiser
 from jeit.acoustic.locate import Locations as Locations
 from jeit.acoustic.locate import locate as locate
+from jeit.acoustic.locate import measure as measure
+from jeit.acoustic.locate import prepare as prepare
 from jeit.acoustic.noise import IntensityNoise as IntensityNoise
 from jeit.acoustic.overlay import brightness as brightness
+from jeit.acoustic.overlay import faded as faded
 from jeit.acoustic.overlay import overlay as overlay
 from jeit.acoustic.recording import Intensities as Intensities
 from jeit.acoustic.recording import Recording as Recording

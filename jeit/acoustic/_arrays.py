@@ -69,7 +69,7 @@ def real(value, label: str, axes: str) -> np.ndarray:
         raise ValueError(f"{label} has shape {array.shape}; give ({axes}).")
     if array.size == 0:
         raise ValueError(f"{label} is empty: its shape is {array.shape}.")
-    return array if array.dtype == np.float32 else array.astype(float)
+    return array if array.dtype == np.float32 else array.astype(float, copy=False)
 
 
 def number(value, label: str) -> float:

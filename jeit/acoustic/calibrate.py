@@ -30,6 +30,8 @@ from jeit.acoustic.surface import make_surface
 _ALTERNATIONS, _ROUNDS = 6, 8
 # Student's t with so many degrees of freedom weighs residuals; beyond so many deviations they say nothing of the noise.
 _TAIL, _BEYOND = 5.0, 4.0
+# Taps that the mean of all microphones counts for in the noise of each.
+_DRAWN = 20.0
 # A tap whose mean square residual is so many times the median tap's is left out.
 _OUTLIER = 12.0
 # A microphone is of no use whose model explains less of its levels' variance, or is known no better (relative error).
@@ -40,8 +42,8 @@ class CalibrationFit(eqx.Module):
     """A `calibration`, and the T taps it comes from.
 
     - `distance`: (T, M) metres; `power`: (T, M) intensities above the floor; `usable`: (T, M) which were fitted.
-    - `strength`: (T,) of the taps; NaN where none was heard. `outlier`: (T,), taps left out because no single source
-      at the place given explains them.
+    - `strength`: (T,) of the taps; NaN where none was heard, or the tap left out.
+    - `outlier`: (T,), taps left out because no single source at the place given explains them.
     - `explained`: (M,) share of the variance of a microphone's levels that its model explains.
     """
 
@@ -227,7 +229,7 @@ class _Fit:
     def _weights(self, received: np.ndarray, residual: np.ndarray | None) -> np.ndarray:
         """Inverse variances of levels where `received` is expected, less for what is far off."""
         floor = 1e-6 * np.nanmax(np.where(self.use, self.power, np.nan), axis=1, initial=1e-300)[:, None]
-        variance = np.exp(np.asarray(self.noise.log_variance(jnp.asarray(np.maximum(received, floor)))))
+        variance = np.asarray(self.noise.level_variance(jnp.asarray(np.maximum(received, floor))))
         if residual is None:
             return 1 / np.maximum(variance, 0.04)  # at first the model is good to 20 % at best
         tail = (_TAIL + 1) / (_TAIL + residual**2 / variance)
@@ -248,7 +250,7 @@ class _Fit:
         self.noise = eqx.tree_at(
             lambda n: n.relative, self.noise, jnp.asarray(self._relative(received, residual, inflation))
         )
-        variance = np.exp(np.asarray(self.noise.log_variance(jnp.asarray(np.maximum(received, 1e-300)))))
+        variance = np.asarray(self.noise.level_variance(jnp.asarray(np.maximum(received, 1e-150))))
         variance = np.maximum(variance, LEAST_RELATIVE**2)
         square = residual**2 / variance
         number = np.maximum(self.usable.sum(axis=0), 1)
@@ -258,13 +260,16 @@ class _Fit:
         return self._weights(received, residual)
 
     def _relative(self, received, residual, inflation) -> np.ndarray:
-        """τ of each microphone: what its residuals show beyond the floor's noise (moments, without what is far off)."""
-        result = np.full(len(received), LEAST_RELATIVE)
+        """τ of each microphone: what its residuals show beyond the floor's noise (moments, without what is far off).
+
+        Drawn towards the mean of all, as much as if that had been seen in a few more taps: of few taps the moments may
+        well come out as nothing, or less.
+        """
         floor, rest, cross = (np.asarray(x) for x in (self.noise.floor, self.noise.deviation, self.noise.cross))
+        seen, excess = np.zeros(len(received)), np.zeros(len(received))
         for k in range(len(received)):
             used = self.use[k] & (received[k] > 3 * rest[k])
             if used.sum() < 3:
-                result[k] = 0.5
                 continue
             signal, off = received[k, used], residual[k, used]
             share = (signal / (signal + floor[k])) ** 2
@@ -272,9 +277,13 @@ class _Fit:
             near = np.abs(off) <= _BEYOND * max(1.4826 * np.median(np.abs(off)), 1e-15)
             for _ in range(3):
                 near = np.abs(off) <= _BEYOND * np.sqrt(np.mean(off[near] ** 2))
-            excess = inflation * np.mean(off[near] ** 2) - np.mean(other[near])
-            result[k] = np.sqrt(max(excess / np.mean(share[near]), LEAST_RELATIVE**2))
-        return result
+            seen[k] = near.sum()
+            excess[k] = (inflation * np.mean(off[near] ** 2) - np.mean(other[near])) / np.mean(share[near])
+        if not seen.any():
+            return np.full(len(received), 0.5)
+        mean = max(np.average(excess, weights=seen), 0.0)
+        drawn = (seen * np.minimum(excess, 1.0) + _DRAWN * mean) / (seen + _DRAWN)
+        return np.sqrt(np.maximum(drawn, LEAST_RELATIVE**2))
 
     def _find_noise(self, received, inflation) -> None:
         """What each microphone reads of nothing, where only intensities are known: the likeliest pair of relative and

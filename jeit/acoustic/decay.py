@@ -28,6 +28,10 @@ class AbstractDecay(eqx.Module):
     def log_response(self, squared_distance: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
         """log f_i at squared distances r² (m²) of each microphone."""
 
+    @abc.abstractmethod
+    def response(self, squared_distance: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
+        """f_i itself, by the cheapest way to it."""
+
     @property
     @abc.abstractmethod
     def gain(self) -> Float[Array, " M"]:
@@ -64,6 +68,10 @@ class InverseSquare(AbstractDecay):
     def log_response(self, squared_distance):
         """log a − log(r² + b)."""
         return column(jnp.log(self.a), squared_distance) - jnp.log(squared_distance + column(self.b, squared_distance))
+
+    def response(self, squared_distance):
+        """a / (r² + b)."""
+        return column(self.a, squared_distance) / (squared_distance + column(self.b, squared_distance))
 
     @property
     def gain(self):
@@ -103,6 +111,11 @@ class Exponential(AbstractDecay):
         """log a − r / l."""
         distance = jnp.sqrt(squared_distance + _TIP)
         return column(jnp.log(self.a), squared_distance) - distance / column(self.length, squared_distance)
+
+    def response(self, squared_distance):
+        """a exp(−r / l)."""
+        distance = jnp.sqrt(squared_distance + _TIP)
+        return column(self.a, squared_distance) * jnp.exp(-distance / column(self.length, squared_distance))
 
     @property
     def gain(self):
@@ -144,6 +157,12 @@ class AttenuatedInverseSquare(AbstractDecay):
         spreading = jnp.log(squared_distance + column(self.b, squared_distance))
         attenuation = distance / column(self.length, squared_distance)
         return column(jnp.log(self.a), squared_distance) - spreading - attenuation
+
+    def response(self, squared_distance):
+        """a exp(−r / l) / (r² + b)."""
+        distance = jnp.sqrt(squared_distance + _TIP)
+        left = column(self.a, squared_distance) * jnp.exp(-distance / column(self.length, squared_distance))
+        return left / (squared_distance + column(self.b, squared_distance))
 
     @property
     def gain(self):

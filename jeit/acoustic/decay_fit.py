@@ -55,17 +55,25 @@ class DecayProblem(eqx.Module):
 def fit_strengths(problem: DecayProblem, logarithms: Float[Array, "K M"], start: Float[Array, " T"]):
     """The strengths of all taps, the microphones' models given, (T,)."""
 
-    def expand(unknown):
-        mean, share, _ = problem.expected(logarithms, unknown[0])
-        off = jnp.where(problem.weight > 0, problem.level - mean, 0.0)
-        value = 0.5 * jnp.sum(problem.weight * off**2, axis=0)
-        gradient = -jnp.sum(problem.weight * share * off, axis=0)
-        curvature = jnp.sum(problem.weight * share**2, axis=0)
+    def expand(unknown, taps):
+        level, squared_distance, weight = taps
+        some = DecayProblem(level, squared_distance, weight, problem.floor, problem.decay)
+        mean, share, _ = some.expected(logarithms, unknown[0])
+        off = jnp.where(weight > 0, level - mean, 0.0)
+        value = 0.5 * jnp.sum(weight * off**2, axis=0)
+        gradient = -jnp.sum(weight * share * off, axis=0)
+        curvature = jnp.sum(weight * share**2, axis=0)
         return value, gradient[None], jnp.maximum(curvature, 1e-30)[None, None]
 
     limit = jnp.full((1, 1), jnp.inf)
     return minimise_few(
-        expand, start[None], lower=-limit, upper=limit, largest_step=jnp.full((1, 1), 3.0), max_steps=40
+        expand,
+        start[None],
+        (problem.level, problem.squared_distance, problem.weight),
+        lower=-limit,
+        upper=limit,
+        largest_step=jnp.full((1, 1), 3.0),
+        max_steps=40,
     ).x[0]
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float
 from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.noise import IntensityNoise
 from jeit.acoustic.surface import AbstractSurface
+from jeit_solvers import symmetric_few
 
 
 class Listeners(eqx.Module):
@@ -28,19 +29,19 @@ class Listeners(eqx.Module):
     decay: AbstractDecay
     noise: IntensityNoise
 
-    def log_response(self, chart: Float[Array, "2 ..."]) -> Float[Array, "M ..."]:
-        """log f_i of sources at chart coordinates."""
+    def response(self, chart: Float[Array, "2 ..."]) -> Float[Array, "M ..."]:
+        """f_i of sources at chart coordinates."""
         place = self.surface.place(chart)
         mine = self.microphones.reshape(self.microphones.shape + (1,) * (place.ndim - 1))
         squares = [(place[k] - mine[:, k]) ** 2 for k in range(place.shape[0])]
-        return self.decay.log_response(sum(squares[1:], squares[0]))
+        return self.decay.response(sum(squares[1:], squares[0]))
 
     def expected(self, unknowns: Float[Array, "n F"]) -> tuple[Float[Array, "M F"], Float[Array, "M F"]]:
-        """Expected levels m and the logarithms of their variances, log v."""
+        """Expected levels m and their variances v."""
         each = [unknowns[k : k + 3] for k in range(0, len(unknowns), 3)]
-        sent = [jnp.exp(one[2] + self.log_response(one[:2])) for one in each]
+        sent = [jnp.exp(one[2]) * self.response(one[:2]) for one in each]
         received = sum(sent[1:], sent[0])
-        return jnp.log(received + self.noise.floor[:, None]), self.noise.log_variance(received)
+        return jnp.log(received + self.noise.floor[:, None]), self.noise.level_variance(received)
 
 
 class Likelihood(eqx.Module):
@@ -57,10 +58,15 @@ class Likelihood(eqx.Module):
         known = jnp.where(use, power, 1.0)
         return cls(known, listeners.noise.level(known), use, listeners)
 
+    @property
+    def frames(self) -> tuple[Array, ...]:
+        """All that differs from frame to frame."""
+        return self.power, self.level, self.use
+
     def cost(self, unknowns: Float[Array, "n F"]) -> Float[Array, " F"]:
         """Negative log-likelihood, up to a constant."""
-        mean, log_variance = self.listeners.expected(unknowns)
-        terms = 0.5 * (self.level - mean) ** 2 * jnp.exp(-log_variance) + 0.5 * log_variance
+        mean, variance = self.listeners.expected(unknowns)
+        terms = 0.5 * (self.level - mean) ** 2 / variance + 0.5 * jnp.log(variance)
         return jnp.sum(jnp.where(self.use, terms, 0.0), axis=0)
 
     def misfit(self, unknowns: Float[Array, "n F"]) -> Float[Array, " F"]:
@@ -70,32 +76,35 @@ class Likelihood(eqx.Module):
 
     def residual(self, unknowns: Float[Array, "n F"]) -> Float[Array, "M F"]:
         """(y − m) / √v, and 0 for what is not used."""
-        mean, log_variance = self.listeners.expected(unknowns)
-        return jnp.where(self.use, (self.level - mean) * jnp.exp(-0.5 * log_variance), 0.0)
+        mean, variance = self.listeners.expected(unknowns)
+        return jnp.where(self.use, (self.level - mean) / jnp.sqrt(variance), 0.0)
 
     def expand(self, unknowns: Float[Array, "n F"]) -> tuple[Array, Array, Array]:
         """Cost, its gradient, and Fisher's matrix."""
-        (mean, log_variance), push = jax.linearize(self.listeners.expected, unknowns)
-        weight = jnp.where(self.use, jnp.exp(-log_variance), 0.0)
+        (mean, variance), push = jax.linearize(self.listeners.expected, unknowns)
+        basis = jnp.eye(len(unknowns))[:, :, None] * jnp.ones_like(unknowns)
+        slopes = [(dm, dv / variance) for dm, dv in (push(direction) for direction in basis)]
+        # Kept, or XLA would work the logarithms out anew for every one of the sums below.
+        mean, variance, slopes = jax.lax.optimization_barrier((mean, variance, slopes))
         used = jnp.where(self.use, 1.0, 0.0)
         off = self.level - mean
+        weight = used / variance
         scaled = off * weight
-        cost = 0.5 * jnp.sum(scaled * off + used * log_variance, axis=0)
+        cost = 0.5 * jnp.sum(scaled * off + used * jnp.log(variance), axis=0)
         excess = 0.5 * (used - scaled * off)
-        basis = jnp.eye(len(unknowns))[:, :, None] * jnp.ones_like(unknowns)
-        slopes = [push(direction) for direction in basis]
+        weight, scaled, excess, used = jax.lax.optimization_barrier((weight, scaled, excess, used))
         gradient = jnp.stack([jnp.sum(excess * dv - scaled * dm, axis=0) for dm, dv in slopes])
-        matrix = jnp.stack(
+        matrix = symmetric_few(
             [
-                jnp.stack([jnp.sum(weight * dm * em + 0.5 * used * dv * ev, axis=0) for em, ev in slopes])
-                for dm, dv in slopes
+                [jnp.sum(weight * dm * em + 0.5 * used * dv * ev, axis=0) for em, ev in slopes[: k + 1]]
+                for k, (dm, dv) in enumerate(slopes)
             ]
         )
         return cost, gradient, matrix
 
     def start(self, chart: Float[Array, "2 F"]) -> Float[Array, "3 F"]:
         """Unknowns at given places, with the strength that suits them best."""
-        response = jnp.exp(self.listeners.log_response(chart))
+        response = self.listeners.response(chart)
         return jnp.concatenate([chart, jnp.log(self.strength(response))[None]])
 
     def strength(self, response: Float[Array, "M F"]) -> Float[Array, " F"]:
@@ -105,8 +114,13 @@ class Likelihood(eqx.Module):
         loudest = jnp.max(jnp.where(self.use, self.power / response, 0.0), axis=0)
         return jnp.maximum(fitted, 1e-6 * loudest)
 
+    @staticmethod
+    def features(listeners: Listeners, chart: Float[Array, "2 P"]) -> Float[Array, "M P"]:
+        """What `screen` needs of candidate places: their responses f."""
+        return listeners.response(chart)
+
     def screen(self, response: Float[Array, "M P"]) -> Float[Array, "F P"]:
-        """What is left unexplained by candidate places of known responses f, with weights from the observed power and
+        """What is left unexplained by candidate places of responses f, with weights from the observed power and
         the best strength: ½ (Σ w p² − (Σ w p f)² / Σ w f²). Two matrix products for all frames and places."""
         weight = self._weight()
         seen = weight * self.power

@@ -14,16 +14,21 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic.consistency import Consistency
 from jeit.acoustic.likelihood import Likelihood, Listeners
-from jeit.acoustic.surface import AbstractSurface, box, chart_grid, in_space, sides, size
-from jeit_solvers import Minimum, inverse_few, minimise_few, solve_few
+from jeit.acoustic.surface import box, chart_grid, in_space, sides, size
+from jeit_solvers import Minimum, definite_few, hessian_few, inverse_few, minimise_few, solve_few
 
 METHODS = {"likelihood": Likelihood, "consistency": Consistency}
 # Places screened: in the outline's box, and along the outline.
 _COARSE, _EDGE = 400, 240
 # Frames worked on together: all their arrays stay in the cache.
-_CHUNK = 1024
-# Two valleys closer than this part of the skin's size are one.
-_SAME_VALLEY = 0.05
+_CHUNK, _CHUNK_OF_MAPS = 256, 32
+# Two valleys closer than this part of the skin's size are one; another is worth a descent if it is not deeper than so
+# many times the best; on rasters of more pixels only the best is descended.
+_SAME_VALLEY, _WORTH, _FINE = 0.05, 4.0, 2000
+# Relative error of the decay models with which frames are screened, at least.
+_SCREENED_AT = 0.2
+# What a step must promise, relative to the cost; an exact Newton step follows.
+_TOLERANCE = 1e-12
 
 
 class Estimate(eqx.Module):
@@ -46,11 +51,13 @@ class Estimate(eqx.Module):
 
 
 class Pixels(eqx.Module):
-    """A raster over the outline's box: chart coordinates (2, P), which are `inside` (P,), rows and columns."""
+    """A raster over the outline's box: chart coordinates (2, P), which are `inside` (P,), rows and columns, and
+    whether all are inside (`full`)."""
 
     chart: Float[Array, "2 P"]
     inside: Bool[Array, " P"]
     shape: tuple[int, int] = eqx.field(static=True)
+    full: bool = eqx.field(static=True)
 
     @classmethod
     def create(cls, surface, columns: int, rows: int) -> "Pixels":
@@ -58,7 +65,7 @@ class Pixels(eqx.Module):
         grid, within = chart_grid(surface, columns, rows)
         if not within.any():
             raise ValueError(f"shape: none of {columns} × {rows} pixels has its middle inside the outline; take more.")
-        return cls(jnp.asarray(grid.reshape(2, -1)), jnp.asarray(within.ravel()), (rows, columns))
+        return cls(jnp.asarray(grid.reshape(2, -1)), jnp.asarray(within.ravel()), (rows, columns), bool(within.all()))
 
 
 class Localiser(eqx.Module):
@@ -67,7 +74,7 @@ class Localiser(eqx.Module):
     listeners: Listeners
     coarse: Pixels
     pixels: Pixels | None
-    responses: Float[Array, "M P"] | None
+    features: Float[Array, "N P"] | None
     method: str = eqx.field(static=True)
 
     @classmethod
@@ -94,24 +101,29 @@ class Localiser(eqx.Module):
         if len(map_shape) != 2 or min(map_shape) < 2:
             raise ValueError(f"map_shape must be (rows, columns) of at least two each; it is {map_shape!r}.")
         pixels = Pixels.create(listeners.surface, int(map_shape[1]), int(map_shape[0]))
-        responses = jnp.exp(listeners.log_response(pixels.chart))
-        return cls(listeners, coarse, pixels, responses, method)
+        return cls(listeners, coarse, pixels, METHODS[method].features(listeners, pixels.chart), method)
 
     def __call__(self, power: ArrayLike, use: ArrayLike | None = None) -> Estimate:
         """Locate the source of each frame. `power` (F, M): intensities above the floor; `use`: which to look at, all
         that are finite unless given. Frames with fewer than three usable microphones give NaN."""
-        return self._run(power, use, False)[0]
+        return _locate(self, *self._checked(power, use))
+
+    def maps(self, power: ArrayLike, use: ArrayLike | None = None) -> Float[Array, "F rows columns"]:
+        """The map of each frame: the paper's loss, relative to the square of the loudest intensity, or minus the
+        log-likelihood at the best strength; bottom row first, NaN outside the outline. Raises `ValueError` where the
+        localiser was made without `map_shape`."""
+        if self.pixels is None:
+            raise ValueError("maps were not asked for: make the Localiser with map_shape=(rows, columns).")
+        return _maps(self, *self._checked(power, use))
 
     def with_maps(
         self, power: ArrayLike, use: ArrayLike | None = None
     ) -> tuple[Estimate, Float[Array, "F rows columns"]]:
-        """The same, and the map of each frame: the paper's loss, relative to the square of the loudest intensity, or
-        minus the log-likelihood; bottom row first, NaN outside the outline. Raises `ValueError` without `map_shape`."""
-        if self.pixels is None:
-            raise ValueError("maps were not asked for: make the Localiser with map_shape=(rows, columns).")
-        return self._run(power, use, True)
+        """Both: what is found of each frame, and its map."""
+        return self(power, use), self.maps(power, use)
 
-    def _run(self, power, use, with_maps):
+    def _checked(self, power, use) -> tuple[Array, Array]:
+        """Intensities as an array, and which are to be looked at."""
         power = jnp.asarray(power, float)
         finite = jnp.isfinite(power)
         use = finite if use is None else finite & jnp.asarray(use, bool)
@@ -120,127 +132,188 @@ class Localiser(eqx.Module):
                 f"power has shape {power.shape} and use {use.shape}; give (frames, microphones) with "
                 f"{len(self.listeners.microphones)} microphones."
             )
-        return _locate(self, power, use, with_maps)
+        return power, use
 
 
-@eqx.filter_jit
-def _locate(localiser: Localiser, power, use, with_maps):
-    number = power.shape[0]
-    size_of_chunk = min(_CHUNK if localiser.pixels is None else 32, max(number, 1))
+def _in_chunks(function, most: int, *arrays):
+    """`function` of a few frames at a time: `arrays` (F, M) are cut, padded, turned to (M, F); results lead with F."""
+    number = arrays[0].shape[0]
+    size_of_chunk = min(most, max(number, 1))
     chunks = -(-number // size_of_chunk)
     pad = ((0, chunks * size_of_chunk - number), (0, 0))
 
     def cut(array):
         return jnp.pad(array, pad).reshape(chunks, size_of_chunk, -1).transpose(0, 2, 1)
 
-    def work(chunk):
-        return _locate_chunk(localiser, chunk[0], chunk[1], with_maps)
-
-    found = jax.lax.map(work, (cut(power), cut(use)))
+    found = jax.lax.map(lambda chunk: function(*chunk), tuple(cut(array) for array in arrays))
     return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:number], found)
 
 
-def _locate_chunk(localiser: Localiser, power, use, with_maps) -> tuple[Estimate, Array | None]:
-    """`power` and `use` (M, F)."""
+def _raster(localiser: Localiser, listeners: Listeners) -> tuple[Pixels, Array]:
+    """The paper's raster where maps were asked for, the coarse one otherwise, and the features of its pixels."""
+    if localiser.pixels is not None and localiser.features is not None:
+        return localiser.pixels, localiser.features
+    return localiser.coarse, METHODS[localiser.method].features(listeners, localiser.coarse.chart)
+
+
+@eqx.filter_jit
+def _maps(localiser: Localiser, power, use) -> Array:
+    """Of all frames at once: one product, with nothing to copy."""
+    pixels, features = _raster(localiser, localiser.listeners)
+    use = _usable(localiser, power, use)
+    maps = METHODS[localiser.method].create(power.T, use.T, localiser.listeners).screen(features)
+    return (maps if pixels.full else jnp.where(pixels.inside, maps, jnp.nan)).reshape(-1, *pixels.shape)
+
+
+def _starts(localiser: Localiser, power, use):
+    """Where the descents of each frame start: first (F, 2), second (F, 2), and whether that is worth it (F,)."""
+    still = jax.lax.stop_gradient(localiser.listeners)
+    pixels, features = _raster(localiser, still)
+    # Valleys of a model known to be exact are narrower than pixels are apart: screened as if it were not.
+    still = eqx.tree_at(lambda one: one.noise.relative, still, jnp.maximum(still.noise.relative, _SCREENED_AT))
+
+    def screen(power, use):
+        maps = METHODS[localiser.method].create(power, use, still).screen(features)
+        first, second, worth = _valleys(maps, pixels)
+        return first.T, second.T, worth
+
+    most = _CHUNK if localiser.pixels is None else _CHUNK_OF_MAPS
+    return _in_chunks(screen, most, jax.lax.stop_gradient(power), use)
+
+
+def _usable(localiser: Localiser, power, use):
+    """Without a floor, what is not positive has no logarithm: nothing is known of such a reading."""
+    return use & (power + localiser.listeners.noise.floor > 0)
+
+
+@eqx.filter_jit
+def _locate(localiser: Localiser, power, use) -> Estimate:
+    use = _usable(localiser, power, use)
+    first, second, worth = _starts(localiser, power, use)
+
+    def refine(power, use, first, second, worth):
+        return _refine(localiser, power, use, first, second, worth[0])
+
+    return _in_chunks(refine, _CHUNK, power, use, first, second, worth[:, None])
+
+
+def _refine(localiser: Localiser, power, use, first, second, worth) -> Estimate:
+    """From the starts (2, F) of each frame; `power` and `use` (M, F)."""
     listeners = localiser.listeners
-    # Without a floor, what is not positive has no logarithm: nothing is known of such a reading.
-    use = use & (power + listeners.noise.floor[:, None] > 0)
     fixed = jax.lax.stop_gradient(listeners)
-    frozen = jax.lax.stop_gradient(power)
-    still = METHODS[localiser.method].create(frozen, use, fixed)
-    # The paper's map is searched where maps are made; the coarse grid otherwise.
-    if localiser.pixels is None:
-        pixels, response = localiser.coarse, jnp.exp(fixed.log_response(localiser.coarse.chart))
-    else:
-        pixels, response = localiser.pixels, localiser.responses
-    maps = still.screen(response)
-    starts = jnp.concatenate(_valleys(maps, pixels), axis=1)
-    twice = METHODS[localiser.method].create(jnp.tile(frozen, 2), jnp.tile(use, 2), fixed)
-    reach = size(fixed.surface)
-    unknowns, excess, rival, converged, side = _descend(still, twice, starts)
+    still = METHODS[localiser.method].create(jax.lax.stop_gradient(power), use, fixed)
+    # Where one pixel of many was the start there is no second valley to try.
+    unknowns, excess, rival, converged, side = _descend(
+        still, first, second, worth if localiser.pixels is None else None
+    )
     likelihood = Likelihood.create(power, use, listeners)
     objective = likelihood if localiser.method == "likelihood" else Consistency.create(power, use, listeners)
-    unknowns = _differentiable(objective, unknowns, side, reach)
-    estimate = _describe(objective, likelihood, unknowns, excess, rival, converged)
-    if not with_maps:
-        return estimate, None
-    shown = jnp.where(pixels.inside, maps, jnp.nan)
-    return estimate, shown.reshape(-1, *pixels.shape)
+    unknowns = _differentiable(objective, unknowns, side, size(fixed.surface))
+    return _describe(objective, likelihood, unknowns, excess, rival, converged)
 
 
 def _valleys(maps, pixels: Pixels):
-    """Chart coordinates (2, F) of each map's least pixel, and of the least local minimum elsewhere (the same again if
-    there is none)."""
-    values = jnp.where(pixels.inside, maps, jnp.inf)
-    values = jnp.where(jnp.isnan(values), jnp.inf, values)
+    """Chart coordinates (2, F) of each map's least pixel, and of the least local minimum elsewhere, with which frames
+    have one worth a descent (F,)."""
+    known = ~jnp.isnan(maps) if pixels.full else pixels.inside & ~jnp.isnan(maps)
+    values = jnp.where(known, maps, jnp.inf)
     best = jnp.argmin(values, axis=1)
     first = pixels.chart[:, best]
-    if pixels.shape[0] * pixels.shape[1] > 2000:  # a fine map: valleys are found by the descent's own grid
-        return first, first
-    square = values.reshape(-1, *pixels.shape)
-    wide = jnp.pad(square, ((0, 0), (1, 1), (1, 1)), constant_values=jnp.inf)
     rows, columns = pixels.shape
-    least = square
-    for i in range(3):
-        for j in range(3):
-            least = jnp.minimum(least, wide[:, i : i + rows, j : j + columns])
-    lowest = (square <= least).reshape(values.shape) & jnp.isfinite(values)
-    lowest = lowest.at[jnp.arange(len(best)), best].set(False)
-    other = jnp.argmin(jnp.where(lowest, values, jnp.inf), axis=1)
-    return first, jnp.where(jnp.any(lowest, axis=1), pixels.chart[:, other], first)
+    if rows * columns > _FINE:  # where pixels are that fine, noise makes valleys of its own
+        return first, first, jnp.zeros(best.shape, bool)
+    square = values.reshape(-1, rows, columns)
+    wide = jnp.pad(square, ((0, 0), (1, 1), (1, 1)), constant_values=jnp.inf)
+    around = [wide[:, i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    lowest = jnp.isfinite(square)
+    for neighbour in around:
+        lowest &= square <= neighbour
+    lowest = lowest.reshape(values.shape).at[jnp.arange(len(best)), best].set(False)
+    rivals = jnp.where(lowest, values, jnp.inf)
+    other = jnp.argmin(rivals, axis=1)
+    least, second = jnp.min(values, axis=1), jnp.min(rivals, axis=1)
+    return first, pixels.chart[:, other], second < _WORTH * (least + 1)
 
 
-def _descend(objective, twice, starts):
-    """From both starts, (2, 2 F), of the objective's frames: unknowns (n, F), by how much the outline costs more than
-    what lies beyond, by how much the rival valley does, whether converged, and the (start, end) of the side of the
-    outline on which frames were held, NaN for those inside."""
+def _descend(objective, first, second, worth):
+    """From both starts (2, F), the second only where that is worth it: unknowns (n, F), by how much the outline costs
+    more than what lies beyond, by how much the rival valley does, whether converged, and the (start, end) of the side
+    of the outline on which frames were held, NaN for those inside."""
     surface = objective.listeners.surface
-    found = _minimise(twice.expand, twice.start(starts), surface)
-    half = starts.shape[1] // 2
+    found = _minimise(objective, first, None)
+    unknowns, converged = found.x, found.converged
     value = jnp.where(jnp.isfinite(found.value), found.value, jnp.inf)
-    one, other = value[:half], value[half:]
-    swap = other < one
-    unknowns = jnp.where(swap, found.x[:, half:], found.x[:, :half])
-    apart = jnp.linalg.norm(found.x[:2, :half] - found.x[:2, half:], axis=0) > _SAME_VALLEY * size(surface)
-    rival = jnp.where(apart, jnp.abs(one - other), jnp.inf)
-    converged = jnp.where(swap, found.converged[half:], found.converged[:half])
-    value = jnp.minimum(one, other)
-    outside = ~surface.outline.contains(unknowns[:2].T) & jnp.isfinite(value)
-    nowhere = jnp.full((2, 2, half), jnp.nan)
+    within = surface.outline.contains(unknowns[:2].T)
+    rival, least = jnp.full(value.shape, jnp.inf), value
+    if worth is not None:
+        other = _minimise(objective, second, ~worth)
+        other_value = jnp.where(worth & jnp.isfinite(other.value), other.value, jnp.inf)
+        other_within = surface.outline.contains(other.x[:2].T)
+        apart = jnp.linalg.norm(other.x[:2] - unknowns[:2], axis=0) > _SAME_VALLEY * size(surface)
+        rival = jnp.where(apart & worth & within & other_within, jnp.abs(other_value - value), jnp.inf)
+        least = jnp.minimum(value, other_value)
+        # Of two valleys of which one lies beyond the outline, the other is taken; the outline itself may yet be better.
+        better = jnp.where(other_within == within, other_value < value, other_within & jnp.isfinite(other_value))
+        unknowns = jnp.where(better, other.x, unknowns)
+        converged = jnp.where(better, other.converged, converged)
+        value, within = jnp.where(better, other_value, value), jnp.where(better, other_within, within)
+    # Places beyond the outline give way to the best on it; so do valleys inside that are worse than one beyond.
+    beyond = jnp.isfinite(value) & (~within | (least < value))
+    nowhere = jnp.full((2, 2, value.size), jnp.nan)
 
     def hold(_):
-        held, side = _on_edge(objective)
+        held, side = _on_edge(objective, ~beyond)
+        moved = beyond & (~within | (held.value < value))
         return (
-            jnp.where(outside, held.x, unknowns),
-            jnp.where(outside, held.value - value, 0.0),
-            jnp.where(outside, held.converged, converged),
-            jnp.where(outside, side, nowhere),
+            jnp.where(moved, held.x, unknowns),
+            jnp.where(beyond, jnp.where(moved, held.value, value) - least, 0.0),
+            jnp.where(moved, held.converged, converged),
+            jnp.where(moved, side, nowhere),
         )
 
     def leave(_):
         return unknowns, jnp.zeros_like(value), converged, nowhere
 
-    unknowns, excess, converged, side = jax.lax.cond(jnp.any(outside), hold, leave, None)
+    unknowns, excess, converged, side = jax.lax.cond(jnp.any(beyond), hold, leave, None)
     return unknowns, excess, rival, converged, side
 
 
-def _minimise(expand, start, surface: AbstractSurface) -> Minimum:
+def _minimise(objective, chart, skip) -> Minimum:
     """Within three times the outline's box; steps of at most a quarter of the skin, and a factor of ten in strength."""
+    surface, start = objective.listeners.surface, objective.start(chart)
     low, high = box(surface)
     rest = jnp.full(start.shape[0] - 2, jnp.inf)
     reach = size(surface)
+
+    def of(frames):
+        return type(objective)(*frames, objective.listeners)
+
     return minimise_few(
-        expand,
+        lambda x, frames: of(frames).expand(x),
         start,
+        objective.frames,
+        finish=lambda x, frames: _exactly(of(frames), x),
         lower=jnp.concatenate([low - reach, -rest])[:, None],
         upper=jnp.concatenate([high + reach, rest])[:, None],
         largest_step=jnp.concatenate([jnp.full(2, reach / 4), jnp.full_like(rest, 2.3)])[:, None],
-        tolerance=1e-12,
+        tolerance=_TOLERANCE,
+        skip=skip,
     )
 
 
-def _on_edge(objective) -> tuple[Minimum, Array]:
-    """The best place on the outline: the best of many, refined along its side. Also the side, (2, 2, F)."""
+def _exactly(objective, x) -> tuple[Array, Array, Array]:
+    """The objective's expansion with the exact Hessian, where that is positive definite: near a minimum the last steps
+    are few then, however badly the minimum fits."""
+    value, gradient, model = objective.expand(x)
+    hessian = hessian_few(objective.cost, x)
+    return value, gradient, jnp.where(definite_few(hessian), hessian, model)
+
+
+def _on_edge(objective, skip) -> tuple[Minimum, Array]:
+    """The best place on the outline: the best of many, refined along its side. Also the side, (2, 2, F).
+
+    Not of the frames to `skip` (F,).
+    """
     start, end = sides(objective.listeners.surface)
     length = jnp.linalg.norm(end - start, axis=0)
     # Places at equal steps along the whole outline, as (side, share of the side).
@@ -249,16 +322,18 @@ def _on_edge(objective) -> tuple[Minimum, Array]:
     which = jnp.clip(jnp.searchsorted(stops, walked, side="right") - 1, 0, length.size - 1)
     share = (walked - stops[which]) / length[which]
     chart = start[:, which] + share * (end - start)[:, which]
-    maps = objective.screen(jnp.exp(objective.listeners.log_response(chart)))
+    maps = objective.screen(type(objective).features(objective.listeners, chart))
     best = jnp.argmin(jnp.where(jnp.isnan(maps), jnp.inf, maps), axis=1)
     origin, along = start[:, which[best]], (end - start)[:, which[best]]
     first = objective.start(chart[:, best])[2:]
 
-    def unknowns_of(z):
+    def unknowns_of(z, origin, along):
         return jnp.concatenate([origin + z[0] * along, z[1:]])
 
-    def expand(z):
-        value, gradient, matrix = objective.expand(unknowns_of(z))
+    def expand(z, data):
+        origin, along, frames = data
+        some = type(objective)(*frames, objective.listeners)
+        value, gradient, matrix = some.expand(unknowns_of(z, origin, along))
         turned = jnp.concatenate([jnp.sum(along * gradient[:2], axis=0)[None], gradient[2:]])
         rows = jnp.concatenate([jnp.einsum("kf,klf->lf", along, matrix[:2])[None], matrix[2:]])
         columns = jnp.concatenate([jnp.einsum("klf,lf->kf", rows[:, :2], along)[:, None], rows[:, 2:]], axis=1)
@@ -268,16 +343,18 @@ def _on_edge(objective) -> tuple[Minimum, Array]:
     found = minimise_few(
         expand,
         jnp.concatenate([share[best][None], first]),
+        (origin, along, objective.frames),
         lower=jnp.array([0.0] + rest * [-jnp.inf])[:, None],
         upper=jnp.array([1.0] + rest * [jnp.inf])[:, None],
         largest_step=jnp.array([0.5] + rest * [2.3])[:, None],
-        tolerance=1e-12,
+        tolerance=_TOLERANCE,
+        skip=skip,
     )
     end_of = origin + along
     corner = (found.x[0] <= 0) | (found.x[0] >= 1)
     # Held in a corner, a frame moves nowhere: its side has no length.
     side = jnp.stack([origin, jnp.where(corner, origin, end_of)])
-    return Minimum(unknowns_of(found.x), found.value, found.converged, found.steps), side
+    return Minimum(unknowns_of(found.x, origin, along), found.value, found.converged, found.steps), side
 
 
 def _differentiable(objective, unknowns, side, reach):
@@ -285,16 +362,12 @@ def _differentiable(objective, unknowns, side, reach):
     and, H and x being constants, −H⁻¹ ∂∇cost in derivative, as the implicit function theorem has it."""
     at = jax.lax.stop_gradient(unknowns)
 
-    def slope(x, function):
-        return jax.grad(lambda y: jnp.sum(jnp.where(jnp.isfinite(cost := function(y)), cost, 0.0)))(x)
+    def finite_cost(at):
+        cost = objective.cost(at)
+        return jnp.where(jnp.isfinite(cost), cost, 0.0)
 
-    constant = jax.lax.stop_gradient(objective)
-    columns = [
-        jax.jvp(lambda x: slope(x, constant.cost), (at,), (direction,))[1]
-        for direction in jnp.eye(len(at))[:, :, None] * jnp.ones_like(at)
-    ]
-    matrix = jnp.stack(columns)
-    gradient = slope(at, objective.cost)
+    matrix = hessian_few(jax.lax.stop_gradient(objective).cost, at)
+    gradient = jax.grad(lambda at: jnp.sum(finite_cost(at)))(at)
     # Frames held on the outline move along their side only: the rest of the step is projected out.
     held = ~jnp.isnan(side[0, 0])
     along = jnp.where(held, side[1] - side[0], 0.0)
@@ -318,7 +391,7 @@ def _describe(objective, likelihood: Likelihood, unknowns, excess, rival, conver
         strength = jnp.exp(unknowns[2])
         spread = inverse_few(likelihood.expand(unknowns)[2])[:2, :2]
     else:
-        strength = likelihood.strength(jnp.exp(likelihood.listeners.log_response(chart)))
+        strength = likelihood.strength(likelihood.listeners.response(chart))
         spread = objective.covariance(chart, strength)
     misfit = likelihood.misfit(jnp.concatenate([chart, jnp.log(strength)[None]]))
     place, covariance = in_space(surface, chart, spread)

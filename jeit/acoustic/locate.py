@@ -23,8 +23,9 @@ _HEARD_DEVIATIONS = 6.0
 # −2 log-likelihood by which a place beyond the outline must be better to be said outside, and a rival valley worse not
 # to make a frame ambiguous: three standard deviations, and two.
 _OUTSIDE, _RIVAL = 9.0, 4.0
-# Two sources are believed that leave this part of what one leaves, even where they do not explain everything.
-_BOTH = 0.2
+# Two sources are believed that leave this part of what one leaves, even where they do not explain everything; but not
+# one so much weaker than the other: errors of a model look like that.
+_BOTH, _WEAKEST = 0.2, 0.05
 # Share of touches that no source on the skin explains, from which something is wrong with the array.
 _ODD = 0.25
 # Intensities this much below the loudest frame's are no touch, where no floor is known (60 dB).
@@ -146,7 +147,9 @@ def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, list
     if tried.size:
         two = locate_two(listeners, *_padded(power[tried], use[tried]))
         misfit, freedom = np.asarray(two.misfit)[: tried.size], np.asarray(two.freedom)[: tried.size]
-        both = (chi2.sf(misfit, np.maximum(freedom, 1)) > _FALSE_MISFIT) | (misfit < _BOTH * result["misfit"][tried])
+        explained = chi2.sf(misfit, np.maximum(freedom, 1)) > _FALSE_MISFIT
+        stronger, weaker = np.asarray(two.strength)[: tried.size].T
+        both = (explained | (misfit < _BOTH * result["misfit"][tried])) & (weaker > _WEAKEST * stronger)
         chosen, index = tried[both], np.flatnonzero(both)
         status[chosen] = "two touches"
         result["misfit"][chosen], result["freedom"][chosen] = misfit[both], freedom[both]
@@ -162,16 +165,17 @@ def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, list
 def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, listeners: Listeners) -> list[str]:
     """What the user should know beyond the status of frames."""
     notes = []
-    single = ~np.isin(status, ["no touch", "unusable", "two touches"])
+    placed = ~np.isin(status, ["no touch", "unusable"])
     odd = np.isin(status, ["misfit", "outside"])
-    if odd.sum() > _ODD * single.sum():
+    if odd.sum() > _ODD * placed.sum():
+        single = placed & (status != "two touches")
         swaps = find_swaps(listeners, heard.power[single], use[single])
         notes += [
             f"microphones {one} and {other} look exchanged since the calibration: exchanged back, their intensities "
             "fit one source."
             for one, other in swaps
         ]
-        if not swaps and (status == "misfit").sum() > 2 * _ODD * single.sum():
+        if not swaps and (status == "misfit").sum() > 2 * _ODD * placed.sum():
             notes.append("most touches fit no single source: is this the calibration of this array?")
     return notes
 
@@ -242,6 +246,6 @@ def _above_floor(heard: Intensities, noise: IntensityNoise, use: np.ndarray) -> 
 def _padded(power: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Frames repeated up to a round number of them, so that few sizes are ever compiled."""
     number = len(power)
-    round_number = 1 << (number - 1).bit_length() if number <= 1024 else -(-number // 1024) * 1024
+    round_number = max(64, 1 << (number - 1).bit_length()) if number <= 1024 else -(-number // 1024) * 1024
     index = np.minimum(np.arange(round_number), number - 1)
     return power[index], use[index]

@@ -65,9 +65,9 @@ class IntensityNoise(eqx.Module):
         floor = column(self.floor, power)
         return jnp.log(jnp.maximum(power + floor, 0.05 * floor))
 
-    def log_variance(self, received: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """Logarithm of the variance of y."""
-        return jnp.log(self.variance(received)) - 2 * jnp.log(received + column(self.floor, received))
+    def level_variance(self, received: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
+        """Of y, where `received` is expected."""
+        return self.variance(received) / (received + column(self.floor, received)) ** 2
 
 
 def column(values: Float[Array, " M"], like: Array) -> Array:

@@ -54,3 +54,13 @@ def overlay(images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3) 
         left = np.maximum(fade * left, frames[number])
         result[number] = left
     return result
+
+
+def faded(images: ArrayLike, times: ArrayLike, *, at: float, time_constant: float) -> Float[np.ndarray, "rows columns"]:
+    """What is left `at` a time (seconds) of some frames: the last picture of their `overlay`, without those before it.
+
+    Of a long recording, the maximum of the pictures of its parts is that of the whole.
+    """
+    age = np.maximum(at - np.asarray(times, float), 0.0)
+    weight = np.exp(-age / time_constant)
+    return np.max(np.nan_to_num(np.asarray(images, float)) * weight[:, None, None], axis=0)

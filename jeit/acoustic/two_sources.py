@@ -47,14 +47,15 @@ def locate_two(listeners: Listeners, power: ArrayLike, use: ArrayLike | None = N
 def _locate_two(listeners: Listeners, pixels: Pixels, power, use) -> TwoSources:
     use = use & (power + listeners.noise.floor[:, None] > 0)
     likelihood = Likelihood.create(power, use, listeners)
-    response = jnp.exp(listeners.log_response(pixels.chart))
-    start = jax.lax.map(lambda frame: _best_pair(frame, response, pixels, listeners), (power.T, use.T)).T
+    response = listeners.response(pixels.chart)
+    start = jax.lax.map(lambda frame: _best_pair(frame[0], frame[1], response, pixels, listeners), (power.T, use.T)).T
     low, high = box(listeners.surface)
     reach = size(listeners.surface)
     far = jnp.full(1, jnp.inf)
     found = minimise_few(
-        likelihood.expand,
+        lambda x, data: Likelihood(data[0], data[1], data[2], listeners).expand(x),
         start,
+        likelihood.frames,
         lower=jnp.concatenate([low, -far, low, -far])[:, None],
         upper=jnp.concatenate([high, far, high, far])[:, None],
         largest_step=jnp.tile(jnp.array([0.1, 0.1, 2.3]) * jnp.array([reach, reach, 1.0]), 2)[:, None],
@@ -82,9 +83,8 @@ def _locate_two(listeners: Listeners, pixels: Pixels, power, use) -> TwoSources:
     )
 
 
-def _best_pair(frame, response, pixels: Pixels, listeners: Listeners) -> Float[Array, " 6"]:
+def _best_pair(power, use, response, pixels: Pixels, listeners: Listeners) -> Float[Array, " 6"]:
     """Of all pairs of places, the one whose best two strengths leave least of the frame unexplained."""
-    power, use = frame
     weight = jnp.where(use, 1 / listeners.noise.variance(jnp.maximum(power, 0.0)), 0.0)
     # All numbers near one: intensities may be of any unit.
     scale = jnp.max(jnp.where(use, power, 0.0))

@@ -10,9 +10,11 @@ from typing import Annotated
 
 import typer
 
+from jeit.cli.calibrate_microphones import calibrate_microphones
 from jeit.cli.choose import choose
 from jeit.cli.demo import demo
 from jeit.cli.info import info
+from jeit.cli.locate import locate
 from jeit.cli.reconstruct import reconstruct
 from jeit.cli.stream import stream
 
@@ -21,13 +23,16 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
-    help="Electrical impedance tomography: from a measured tank or skin to an image.",
+    help="Electrical impedance tomography, from a measured tank or skin to an image; and passive acoustic tomography, "
+    "from a skin's microphones to where it was touched.",
 )
 app.command()(demo)
 app.command()(reconstruct)
 app.command()(stream)
 app.command()(choose)
 app.command()(info)
+app.command()(calibrate_microphones)
+app.command()(locate)
 
 
 @app.callback(invoke_without_command=True)

@@ -28,6 +28,21 @@ Nodes = Annotated[int | None, typer.Option(help="Nodes of the mesh, about (defau
 Frame = Annotated[
     str | None, typer.Option(help="Frame of DATA to image, by number from 0 or by name; the first unless given.")
 ]
+BandLow = Annotated[float | None, typer.Option(help="Lowest frequency of the band, hertz (default 50).")]
+BandHigh = Annotated[float | None, typer.Option(help="Highest frequency of the band, hertz (default 1000).")]
+Window = Annotated[float | None, typer.Option(help="Length of a window, seconds (default 0.05).")]
+Hop = Annotated[float | None, typer.Option(help="From one window to the next, seconds (default 0.0125).")]
+
+
+def intensity_settings(low: float | None, high: float | None, window: float | None, hop: float | None):
+    """`IntensitySettings` with what was given, None if nothing was."""
+    given = {"low": low, "high": high, "window": window, "hop": hop}
+    given = {name: value for name, value in given.items() if value is not None}
+    if not given:
+        return None
+    from jeit.acoustic import IntensitySettings
+
+    return IntensitySettings(**given)
 
 
 def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json")) -> None:

@@ -1,4 +1,4 @@
-"""Pictures, with matplotlib: images on meshes, rasters, electrodes, sensitivity, voltages.
+"""Pictures, with matplotlib: meshes, images, electrodes, sensitivity, voltages, microphones and touches.
 
 Every function takes `ax`, makes a figure of its own where none is given, and returns the axes it drew on. Lengths are
 in metres in the arguments and in millimetres in the pictures.
@@ -7,10 +7,15 @@ in metres in the arguments and in millimetres in the pictures.
 from jeit.plot.choice import plot_choice as plot_choice
 from jeit.plot.electrodes import draw_electrodes as draw_electrodes
 from jeit.plot.figures_of_merit import plot_figures_of_merit as plot_figures_of_merit
+from jeit.plot.hearing import plot_loss_map as plot_loss_map
+from jeit.plot.hearing import plot_receptive_fields as plot_receptive_fields
 from jeit.plot.image import plot_image as plot_image
 from jeit.plot.image import plot_raster as plot_raster
 from jeit.plot.inclusions import draw_inclusions as draw_inclusions
 from jeit.plot.labels import draw_labels as draw_labels
+from jeit.plot.localisation_error import plot_error_curve as plot_error_curve
+from jeit.plot.localisation_error import plot_pairs as plot_pairs
 from jeit.plot.mesh import plot_mesh as plot_mesh
 from jeit.plot.sensitivity import plot_sensitivity as plot_sensitivity
+from jeit.plot.touch import plot_track as plot_track
 from jeit.plot.voltages import plot_voltages as plot_voltages

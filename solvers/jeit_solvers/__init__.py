@@ -10,7 +10,7 @@ from .choose import choose_solver
 from .conjugate_gradient import ConjugateGradient
 from .dense_cholesky import symmetric_inverse
 from .descent import Descent
-from .few_unknowns import Minimum, inverse_few, minimise_few, solve_few
+from .few_unknowns import Minimum, definite_few, hessian_few, inverse_few, minimise_few, solve_few, symmetric_few
 from .multifrontal import Factor, factorise, half_solve, quadratic_form, solve
 from .operator import SparseSymmetric
 from .pattern import SparsityPattern
@@ -30,8 +30,10 @@ __all__ = [
     "SparsityPattern",
     "analyse",
     "choose_solver",
+    "definite_few",
     "factorise",
     "half_solve",
+    "hessian_few",
     "in_turn",
     "inverse_few",
     "minimise_few",
@@ -41,5 +43,6 @@ __all__ = [
     "solve",
     "solve_definite",
     "solve_few",
+    "symmetric_few",
     "symmetric_inverse",
 ]

@@ -7,7 +7,14 @@ import matplotlib
 import pytest
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples"
-MOST = {"press_on_a_skin": 3e-3, "design_gradient": 1e-5, "every_method": 0.25}
+MOST = {
+    "press_on_a_skin": 3e-3,
+    "design_gradient": 1e-5,
+    "every_method": 0.25,
+    "hear_a_touch": 0.01,
+    "hear_a_stroke": 3e-3,
+    "localisation_error": 2.5e-3,
+}
 
 
 @pytest.mark.slow

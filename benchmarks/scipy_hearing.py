@@ -1,0 +1,50 @@
+"""Localisation as one writes it plainly with NumPy and SciPy: frame by frame, each a map over pixels and a refinement.
+
+Text S2 of Park 2022: the loss on a raster, the least pixel, then a bounded solver from there. What does not change from
+frame to frame (distances, responses) is worked out once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.optimize
+
+
+class PlainLocaliser:
+    """For one array: microphones (M, 2), a and b (M,) of the decay model, half the skin's width (m), pixels a side."""
+
+    def __init__(self, microphones, a, b, half: float, pixels: int):
+        self.microphones, self.a, self.b, self.half = microphones, a, b, half
+        middles = -half + 2 * half * (np.arange(pixels) + 0.5) / pixels
+        self.x, self.y = np.meshgrid(middles, middles)
+        squared = (self.x - microphones[:, 0, None, None]) ** 2 + (self.y - microphones[:, 1, None, None]) ** 2
+        self.inverse = (squared + b[:, None, None]) / a[:, None, None]
+
+    def map(self, intensity: np.ndarray) -> np.ndarray:
+        """The loss of one frame on the raster, relative to the square of the loudest intensity."""
+        loudest = intensity.argmax()
+        told = (intensity / intensity[loudest])[:, None, None] * self.inverse
+        return np.sum((told[loudest] - told) ** 2, axis=0)
+
+    def locate(self, intensity: np.ndarray, start: np.ndarray | None = None) -> np.ndarray:
+        """The least pixel of the map, or `start`, refined within the skin by L-BFGS-B with the exact gradient."""
+        loudest = intensity.argmax()
+        relative = intensity / intensity[loudest] / self.a
+        if start is None:
+            row, column = np.unravel_index(self.map(intensity).argmin(), self.x.shape)
+            start = np.array([self.x[row, column], self.y[row, column]])
+
+        def loss(place):
+            offset = place - self.microphones
+            told = relative * (np.sum(offset**2, axis=1) + self.b)
+            slope = 2 * relative[:, None] * offset
+            off = told[loudest] - told
+            return np.sum(off**2), 2 * off @ (slope[loudest] - slope)
+
+        bounds = [(-self.half, self.half)] * 2
+        found = scipy.optimize.minimize(loss, start, jac=True, bounds=bounds, method="L-BFGS-B", tol=1e-14)
+        return found.x
+
+    def locate_near(self, intensity: np.ndarray) -> np.ndarray:
+        """Refined from the loudest microphone, without a map."""
+        return self.locate(intensity, self.microphones[intensity.argmax()])

@@ -1,0 +1,54 @@
+"""A pat, a tickle and a stroke on a simulated skin, followed by 25 microphones; see `hear_a_stroke.png`."""
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+from jeit.acoustic import Localiser, Recording, Taps, brightness, calibrate_microphones, intensities, locate, overlay
+from jeit.acoustic import track as follow
+from jeit.data.sounding_skin import SoundingSkin
+from jeit.data.touches import calibration_taps, pat, stroke, tickle
+from jeit.electrodes import grid
+from jeit.plot import plot_track
+
+OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
+KEYS = jax.random.split(jax.random.key(1), 4)
+LASTS = 1.5  # seconds, each touch
+
+
+def main() -> float:
+    skin = SoundingSkin(jax.random.key(0))
+    taps = calibration_taps(skin, KEYS[0], grid(0.18, 0.18, 10, 10), repeats=2)
+    known = Taps(skin.microphones, OUTLINE, taps.positions, samples=taps.samples, rate=taps.rate)
+    calibration = calibrate_microphones(known).calibration
+
+    touches = {
+        "pat": pat(skin, KEYS[1], (0.03, 0.02), duration=LASTS),
+        "tickle": tickle(skin, KEYS[2], (-0.04, 0.03), strength=1.5, duration=LASTS),
+        "stroke": stroke(skin, KEYS[3], [(-0.07, -0.06), (0.0, 0.06), (0.07, -0.05)], strength=1.5, duration=LASTS),
+    }
+    samples = np.concatenate([touch.samples for touch in touches.values()], axis=1)
+    heard = intensities(Recording(samples, skin.rate))
+    found = locate(heard, calibration)
+    localiser = Localiser.create(calibration.listeners, method="consistency", map_shape=(100, 100))
+    images = brightness(localiser.maps(heard.power), method="consistency") * found.located[:, None, None]
+
+    figure = Figure(figsize=(13.5, 4.8), layout="compressed")
+    paths = {}
+    for number, (ax, name) in enumerate(zip(figure.subplots(1, 3), touches, strict=True)):
+        during = heard.times // LASTS == number
+        places = jax.tree.map(lambda values, during=during: values[during], found)
+        path = paths[name] = follow(places, overlap=4)  # windows of 50 ms begin every 12.5 ms
+        seen = overlay(images[during], path.times, time_constant=0.7)[path.touches[-1].last]
+        plot_track(path, places, calibration, overlay=seen, title=name.capitalize(), ax=ax)
+    figure.savefig("hear_a_stroke.png", dpi=120)
+
+    path, finger = paths["stroke"], touches["stroke"]
+    truth = [np.interp(path.times - 2 * LASTS, finger.position_times, along) for along in finger.position.T]
+    return float(np.nanmean(np.linalg.norm(path.position - np.transpose(truth), axis=1)))
+
+
+if __name__ == "__main__":
+    error = main()
+    print(f"mean error of the stroke {1e3 * error:.1f} mm")
+    assert error < 0.003  # metres; microphones are 40 mm apart
