@@ -10,6 +10,7 @@ The names used most, and where the rest is:
 - `ForwardModel`: conductivity to voltages and Jacobian (`jeit.forward`);
 - `calibrate`, `one_step`, `reconstruct`: linear and nonlinear imaging (`jeit.inverse`);
 - `Raster`, `find_inclusions`: what an image shows (`jeit.image`);
+- microphones under a skin, and where it was touched: `jeit.acoustic`;
 - `plot_image`: pictures (`jeit.plot`).
 
 Importing jeit turns on JAX's 64-bit mode, unless JAX_ENABLE_X64 is set. Rooms are imported when first used.

@@ -1,0 +1,202 @@
+"""`jeit calibrate-microphones` and `jeit locate`: files in, files out, and every bad input in one line."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from scipy.io import wavfile
+
+from jeit.cli import main
+from jeit.electrodes import grid
+
+OUTLINE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
+MICROPHONES = grid(0.14, 0.14, 3, 3)
+RATE = 4000.0
+
+
+def received(places, strength=1.0):
+    """Intensities (P, 9) of exact inverse-square decays."""
+    random = np.random.default_rng(0)
+    a, b = 1e-3 * np.exp(0.3 * random.standard_normal((2, 9)))
+    squared = np.sum((np.atleast_2d(places)[:, None] - MICROPHONES) ** 2, axis=-1)
+    return a / (squared + b) * np.reshape(strength, (-1, 1))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Taps and recordings, as intensities and as samples."""
+    folder = tmp_path_factory.mktemp("hearing")
+    random = np.random.default_rng(1)
+    places = grid(0.16, 0.16, 7, 7)
+    geometry = {"microphones": MICROPHONES, "outline": OUTLINE, "positions": places}
+    np.savez(folder / "taps.npz", **geometry, intensity=received(places, np.exp(random.standard_normal(49))))
+    times = 0.05 * np.arange(40)
+    path = np.stack([0.07 * np.cos(3 * times), 0.06 * np.sin(3 * times)], axis=1)
+    intensity = received(path)
+    intensity[25:] = 0
+    np.savez(folder / "recording.npz", intensity=intensity, times=times)
+    np.save(folder / "path.npy", path)
+    # Noise of a touch in the second half of each recording; a little of the microphones' own throughout.
+    burst = np.r_[np.zeros(800), np.ones(800)]
+
+    def sound(place):
+        common = random.standard_normal(1600) * burst
+        return np.sqrt(received(place)[0])[:, None] * common + 0.01 * random.standard_normal((9, 1600))
+
+    np.savez(folder / "sounds.npz", **geometry, samples=np.stack([sound(place) for place in places]), rate=RATE)
+    touch = sound([0.03, 0.02])
+    np.savez(folder / "touch.npz", samples=touch, rate=RATE)
+    scaled = touch / np.abs(touch).max() * 0.9
+    wavfile.write(folder / "touch.wav", int(RATE), (32767 * scaled.T).astype(np.int16))
+    assert main(["calibrate-microphones", str(folder / "taps.npz"), "--output", str(folder / "cal.json"), "-q"]) == 0
+    assert main(["calibrate-microphones", str(folder / "sounds.npz"), "-o", str(folder / "sound.json"), "-q"]) == 0
+    return folder
+
+
+def rows(folder):
+    with open(folder / "track.csv", newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_intensities_to_a_track(folder, tmp_path, capsys):
+    """Exact intensities: every place to a micrometre, silence called silence, all three files."""
+    assert (folder / "cal.png").stat().st_size > 10_000
+    status = main(
+        ["locate", str(folder / "recording.npz"), "--calibration", str(folder / "cal.json"), "-o", str(tmp_path)]
+    )
+    assert status == 0
+    table, path = rows(tmp_path), np.load(folder / "path.npy")
+    columns = ["time_s", "x_m", "y_m", "std_x_m", "std_y_m", "covariance", "strength", "status"]
+    assert list(table[0])[:8] == columns
+    assert [row["status"] for row in table] == ["touch"] * 25 + ["no touch"] * 15
+    found = np.array([[float(row["x_m"]), float(row["y_m"])] for row in table[:25]])
+    assert np.abs(found - path[:25]).max() < 1e-6
+    assert all(row["x_m"] == "" and row["strength"] == "" for row in table[25:])
+    report = json.loads((tmp_path / "report.json").read_text("utf-8"))
+    assert report["status"] == {"touch": 25, "no touch": 15}
+    assert len(report["touches"]) == 1
+    assert report["touches"][0]["offset_s"] == pytest.approx(1.2)
+    assert (tmp_path / "track.png").stat().st_size > 10_000
+    assert "25 touch, 15 no touch" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("name", ["touch.npz", "touch.wav"])
+def test_samples_to_a_track(name, folder, tmp_path):
+    """A burst of noise: found within three standard deviations and a centimetre, from its onset on."""
+    assert main(["locate", str(folder / name), "-c", str(folder / "sound.json"), "-o", str(tmp_path), "-q"]) == 0
+    table = [row for row in rows(tmp_path) if row["x_m"]]
+    assert table
+    # The window must reach into the burst, which begins at 0.2 s.
+    assert 0.17 < float(table[0]["time_s"]) < 0.24
+    late = [row for row in table if float(row["time_s"]) > 0.25]
+    for axis, truth in (("x", 0.03), ("y", 0.02)):
+        off = np.array([float(row[f"{axis}_m"]) - truth for row in late])
+        assert np.abs(off).max() < 0.01
+        assert (np.abs(off) < 5 * np.array([float(row[f"std_{axis}_m"]) for row in late])).all()
+
+
+def test_the_papers_loss(folder, tmp_path):
+    """`--method consistency` finds exact places too."""
+    command = ["locate", str(folder / "recording.npz"), "-c", str(folder / "cal.json"), "-o", str(tmp_path), "-q"]
+    assert main([*command, "--method", "consistency"]) == 0
+    found = np.array([[float(row["x_m"]), float(row["y_m"])] for row in rows(tmp_path)[:25]])
+    assert np.abs(found - np.load(folder / "path.npy")[:25]).max() < 1e-6
+
+
+def test_silence_is_no_error(folder, tmp_path):
+    """All silent: a table of "no touch", a report, and a picture."""
+    np.savez(tmp_path / "noise.npz", samples=0.01 * np.random.default_rng(5).standard_normal((9, 4000)), rate=RATE)
+    command = ["locate", str(tmp_path / "noise.npz"), "-c", str(folder / "sound.json"), "-o", str(tmp_path), "-q"]
+    assert main(command) == 0
+    assert {row["status"] for row in rows(tmp_path)} == {"no touch"}
+    assert json.loads((tmp_path / "report.json").read_text("utf-8"))["touches"] == []
+
+
+def test_exchanged_microphones_are_named(folder, tmp_path):
+    """Two plugs exchanged since the calibration: the report's notes name them."""
+    with np.load(folder / "recording.npz") as arrays:
+        intensity, times = arrays["intensity"], arrays["times"]
+    intensity[:, [2, 6]] = intensity[:, [6, 2]]
+    np.savez(tmp_path / "swapped.npz", intensity=intensity, times=times)
+    assert (
+        main(["locate", str(tmp_path / "swapped.npz"), "-c", str(folder / "cal.json"), "-o", str(tmp_path), "-q"]) == 0
+    )
+    notes = " ".join(json.loads((tmp_path / "report.json").read_text("utf-8"))["notes"])
+    assert "2 and 6" in notes
+
+
+def _bad_files(folder):
+    """Files that are no calibration, no taps or no recording of these."""
+    text = (folder / "cal.json").read_text("utf-8")
+    (folder / "version.json").write_text(text.replace('"version": 1', '"version": 7'))
+    (folder / "unit.json").write_text(text.replace('"length": "m"', '"length": "mm"'))
+    (folder / "cut.json").write_text(text[:500])
+    np.savez(folder / "few.npz", intensity=np.ones((3, 4)), times=np.arange(3.0))
+    dead = np.full((3, 9), np.nan)
+    dead[:, :2] = 1.0
+    np.savez(folder / "dead.npz", intensity=dead, times=np.arange(3.0))
+    with np.load(folder / "taps.npz") as arrays:
+        taps = dict(arrays)
+    np.savez(folder / "millimetres.npz", **{**taps, "microphones": 1e3 * taps["microphones"]})
+    np.savez(
+        folder / "two.npz", **{**taps, "microphones": taps["microphones"][:2], "intensity": taps["intensity"][:, :2]}
+    )
+    np.savez(folder / "deaf.npz", **{**taps, "intensity": np.ones((49, 9))})
+    np.savez(
+        folder / "three_taps.npz", **{**taps, "positions": taps["positions"][:3], "intensity": taps["intensity"][:3]}
+    )
+    (folder / "text.npz").write_text("not an archive")
+
+
+LOCATE = ["locate", "recording.npz", "-c", "cal.json", "-o", "out"]
+CALIBRATE = ["calibrate-microphones", "taps.npz", "-o", "new.json"]
+
+
+def instead(command, **changes):
+    """A command with some words changed."""
+    return [changes.get(word.replace(".", "_"), word) for word in command]
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (instead(LOCATE, cal_json="version.json"), "version 7"),
+        (instead(LOCATE, cal_json="unit.json"), "mm"),
+        (instead(LOCATE, cal_json="cut.json"), "no calibration"),
+        (instead(LOCATE, cal_json="taps.npz"), "no calibration"),
+        (instead(LOCATE, cal_json="missing.json"), "missing.json"),
+        (instead(LOCATE, recording_npz="few.npz"), "has 4 microphones"),
+        (instead(LOCATE, recording_npz="dead.npz"), "three are needed"),
+        (instead(LOCATE, recording_npz="text.npz"), "neither an NPZ nor a WAV"),
+        (instead(LOCATE, recording_npz="sounds.npz"), "read_taps"),
+        (instead(LOCATE, recording_npz="missing.wav"), "missing.wav"),
+        ([*LOCATE, "--method", "magic"], "likelihood, consistency"),
+        ([*LOCATE, "--gap", "0"], "--gap"),
+        ([*LOCATE, "--low", "100"], "for samples"),
+        (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--high", "5000"], "2000"),
+        (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--window", "-1"], "window"),
+        (instead(LOCATE, out="cal.json"), "is a file"),
+        (instead(CALIBRATE, taps_npz="millimetres.npz"), "metres"),
+        (instead(CALIBRATE, taps_npz="two.npz"), "three are needed"),
+        (instead(CALIBRATE, taps_npz="deaf.npz"), "three are needed"),
+        (instead(CALIBRATE, taps_npz="three_taps.npz"), "three are needed"),
+        (instead(CALIBRATE, taps_npz="recording.npz"), "microphones"),
+        (instead(CALIBRATE, taps_npz="text.npz"), "NPZ"),
+        ([*CALIBRATE, "--decay", "magic"], "inverse-square"),
+        ([*CALIBRATE, "--low", "10"], "samples"),
+        (instead(CALIBRATE, new_json="new.png"), "JSON"),
+        (instead(CALIBRATE, new_json="."), "folder"),
+    ],
+)
+def test_bad_input_is_explained(command, said, folder, monkeypatch, capsys):
+    """Exit status 1, one line on standard error, and nothing like a traceback."""
+    monkeypatch.chdir(folder)
+    if not (folder / "version.json").exists():
+        _bad_files(folder)
+    assert main(command) == 1
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+    assert "Traceback" not in told
+    assert "should not have happened" not in told
