@@ -27,10 +27,10 @@ from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise
 from jeit.acoustic.recording import Taps
 from jeit.acoustic.surface import make_surface
 
-_ALTERNATIONS, _ROUNDS = 6, 8
+_ALTERNATIONS, _ROUNDS = 6, 12
 # Student's t with so many degrees of freedom weighs residuals; beyond so many deviations they say nothing of the noise.
 _TAIL, _BEYOND = 5.0, 4.0
-# Taps that the mean of all microphones counts for in the noise of each.
+# Taps that the median of all microphones counts for in the noise of each.
 _DRAWN = 20.0
 # A tap whose mean square residual is so many times the median tap's is left out.
 _OUTLIER = 12.0
@@ -87,6 +87,9 @@ def calibrate_microphones(
     fit.run(taps.microphones)
     reasons = fit.judge(faults)
     good = np.array([not reason for reason in reasons])
+    tried = fit.use.T
+    if good.sum() >= 3 and not good.all():
+        fit.refine_without(~good)
     if good.sum() < 3:
         told = "; ".join(f"microphone {k}: {reason}" for k, reason in enumerate(reasons) if reason)
         raise ValueError(
@@ -105,7 +108,7 @@ def calibrate_microphones(
         calibration,
         np.linalg.norm(difference, axis=-1),
         fit.power.T,
-        fit.use.T,
+        tried,
         np.where(fit.heard, np.exp(strength), np.nan),
         fit.outlier,
         fit.explained,
@@ -165,15 +168,25 @@ class _Fit:
             values = jnp.clip(fit_each(self._problem(), values, shift), lower[:, None], upper[:, None])
             shift = fit_strengths(self._problem(with_outliers=True), values, shift)
             self.weight = self._reweighed(values, shift)
+        self.start, self.values, self.strength, self.bounds = start, values, shift, (lower, upper)
+        self._refine()
+
+    def refine_without(self, bad: np.ndarray) -> None:
+        """Once more, without the microphones that were found to be of no use."""
+        self.usable = self.usable & ~bad[:, None]
+        self.free = self.free & ~bad
+        self._refine()
+
+    def _refine(self) -> None:
+        """All microphones together, and what their residuals say, until nothing changes."""
         for _ in range(_ROUNDS):
-            before = values
-            values, shift = fit_together(self._problem(), values, shift, jnp.asarray(self.free))
-            values = self._keep_between(values, shift, lower, upper)
-            shift = fit_strengths(self._problem(with_outliers=True), values, shift)
-            self.weight = self._reweighed(values, shift)
-            if float(jnp.max(jnp.abs(values - before)[:, self.free], initial=0.0)) < 1e-9:
+            before = self.values
+            values, shift = fit_together(self._problem(), before, self.strength, jnp.asarray(self.free))
+            self.values = self._keep_between(values, shift)
+            self.strength = fit_strengths(self._problem(with_outliers=True), self.values, shift)
+            self.weight = self._reweighed(self.values, self.strength)
+            if float(jnp.max(jnp.abs(self.values - before)[:, self.free], initial=0.0)) < 1e-9:
                 break
-        self.values, self.strength = values, shift
 
     def judge(self, faults) -> tuple[str, ...]:
         """Why each microphone is of no use, "" where it is."""
@@ -186,15 +199,15 @@ class _Fit:
             heard = used & (self.power[k] > 3 * float(self.noise.deviation[k]))
             reason = fault if not used.any() else ""
             number = len(self.kind.parameters)
+            if not reason and self.at_bound.get(k) == "above":
+                reason = "what it hears does not fall with distance"
             if not reason and heard.sum() < number + 2:
                 reason = f"it heard {heard.sum()} taps only, {number + 2} are needed"
             if not reason:
                 left = np.mean((level - mean)[k, used] ** 2)
                 spread = np.var(level[k, used])
                 self.explained[k] = 1 - left / spread if spread > 0 else 0.0
-                if k in self.at_bound and self.at_bound[k] == "above":
-                    reason = "what it hears does not fall with distance"
-                elif not self.explained[k] >= _LEAST_EXPLAINED:
+                if not self.explained[k] >= _LEAST_EXPLAINED:
                     reason = f"its model explains {100 * max(self.explained[k], 0):.0f} % of what it heard"
                 elif self.free[k] and not np.nanmax(errors[1:, k]) < _MOST_ERROR:
                     reason = "its taps do not determine its model (relative error above 100 %)"
@@ -262,8 +275,8 @@ class _Fit:
     def _relative(self, received, residual, inflation) -> np.ndarray:
         """τ of each microphone: what its residuals show beyond the floor's noise (moments, without what is far off).
 
-        Drawn towards the mean of all, as much as if that had been seen in a few more taps: of few taps the moments may
-        well come out as nothing, or less.
+        Drawn towards the median of all, as much as if that had been seen in a few more taps: of few taps the moments
+        may well come out as nothing, or less.
         """
         floor, rest, cross = (np.asarray(x) for x in (self.noise.floor, self.noise.deviation, self.noise.cross))
         seen, excess = np.zeros(len(received)), np.zeros(len(received))
@@ -281,8 +294,8 @@ class _Fit:
             excess[k] = (inflation * np.mean(off[near] ** 2) - np.mean(other[near])) / np.mean(share[near])
         if not seen.any():
             return np.full(len(received), 0.5)
-        mean = max(np.average(excess, weights=seen), 0.0)
-        drawn = (seen * np.minimum(excess, 1.0) + _DRAWN * mean) / (seen + _DRAWN)
+        typical = max(float(np.median(excess[seen > 0])), 0.0)
+        drawn = (seen * np.minimum(excess, 1.0) + _DRAWN * typical) / (seen + _DRAWN)
         return np.sqrt(np.maximum(drawn, LEAST_RELATIVE**2))
 
     def _find_noise(self, received, inflation) -> None:
@@ -312,15 +325,25 @@ class _Fit:
             np.nan_to_num(self.power, nan=-np.inf) + np.asarray(self.noise.floor)[:, None] > 0
         )
 
-    def _keep_between(self, values, shift, lower, upper):
-        """Fit microphones that left the bounds again between them, and hold them there."""
+    def _keep_between(self, values, shift):
+        """Fit microphones that left the bounds again between them, also from the first guess, and hold them there until
+        they have come back inside."""
+        lower, upper = self.bounds
         array = np.array(values)
-        beyond = (array <= lower[:, None]) | (array >= upper[:, None]) | ~np.isfinite(array)
-        for k in np.flatnonzero(beyond.any(axis=0) & self.free):
-            found = fit_between(self._problem(), jnp.nan_to_num(values), shift, int(k), (lower, upper))
-            array[:, k] = found
-            self.free[k] = False
-            self.at_bound[int(k)] = "above" if (found[1:] >= upper[1:] - 1e-9).any() else "below"
+        beyond = ((array <= lower[:, None]) | (array >= upper[:, None]) | ~np.isfinite(array)).any(axis=0)
+        for k in np.flatnonzero(self.use.any(axis=1) & (beyond | ~self.free)):
+            problem = self._problem()
+            array[:, k] = min(
+                (
+                    fit_between(problem, jnp.nan_to_num(first), shift, int(k), self.bounds)
+                    for first in (values, self.start)
+                ),
+                key=lambda found, k=k, problem=problem: problem.cost_of(found, shift, int(k)),
+            )
+            self.free[k] = bool(((array[:, k] > lower + 1e-6) & (array[:, k] < upper - 1e-6)).all())
+            self.at_bound[int(k)] = "above" if (array[1:, k] >= upper[1:] - 1e-6).any() else "below"
+            if self.free[k]:
+                del self.at_bound[int(k)]
         return jnp.asarray(array)
 
 

@@ -61,7 +61,7 @@ class Calibration(eqx.Module):
         name = Path(path).name
         try:
             content = json.loads(Path(path).read_text("utf-8"))
-        except (json.JSONDecodeError, UnicodeDecodeError):
+        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
             content = None
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError(f"{name} is no calibration of microphones; make one with 'jeit calibrate-microphones'.")

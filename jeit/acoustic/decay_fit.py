@@ -6,7 +6,6 @@ complement): what is left is no larger than the array. Both run through optimist
 """
 
 import warnings
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,13 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
 
 from jeit.acoustic.decay import AbstractDecay
 from jeit_solvers import Descent, minimise_few, solve_definite, solve_few
 
 _MOST_STEPS = 100
 # In units of the weights, which are inverse variances: what is left once the data are met to rounding.
-_SOLVER = Descent(rtol=1e-10, atol=1e-16, damping=1e-2, history=1)
+_SOLVER = Descent(rtol=1e-10, atol=1e-20, damping=1e-2, history=1)
 
 
 class DecayProblem(eqx.Module):
@@ -49,6 +49,11 @@ class DecayProblem(eqx.Module):
         """y − m, and 0 for what has no weight."""
         mean = self.expected(logarithms, strength)[0]
         return jnp.where(self.weight > 0, self.level - mean, 0.0)
+
+    def cost_of(self, values: ArrayLike, strength: Float[Array, " T"], microphone: int) -> Float[Array, ""]:
+        """½ Σ weight · residual² of one microphone with these parameters."""
+        mine: DecayProblem = jax.tree.map(lambda array: array[microphone][None], self)
+        return 0.5 * jnp.sum(mine.weight * mine.residual(jnp.asarray(values)[:, None], strength) ** 2)
 
 
 @eqx.filter_jit
@@ -152,12 +157,10 @@ def fit_between(
         warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says on import that it is not developed further
         import jaxopt
 
-    mine: Any = jax.tree.map(lambda array: array[microphone][None], problem)
     lower, upper = (jnp.asarray(bound) for bound in bounds)
 
     def cost(values):
-        off = mine.residual(values[:, None], strength)
-        return 0.5 * jnp.sum(mine.weight * off**2)
+        return problem.cost_of(values, strength, microphone)
 
     solver = jaxopt.ScipyBoundedMinimize(fun=cost, method="L-BFGS-B", tol=1e-12)
     return np.asarray(solver.run(jnp.clip(start[:, microphone], lower, upper), bounds=(lower, upper)).params)

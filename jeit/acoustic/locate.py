@@ -23,9 +23,9 @@ _HEARD_DEVIATIONS = 6.0
 # −2 log-likelihood by which a place beyond the outline must be better to be said outside, and a rival valley worse not
 # to make a frame ambiguous: three standard deviations, and two.
 _OUTSIDE, _RIVAL = 9.0, 4.0
-# Two sources are believed that leave this part of what one leaves, even where they do not explain everything; but not
-# one so much weaker than the other: errors of a model look like that.
-_BOTH, _WEAKEST = 0.2, 0.05
+# Two sources are believed that leave this part of what one leaves, and not too much per degree of freedom, even where
+# they do not explain everything; but not one so much weaker than the other: errors of a model look like that.
+_BOTH, _STILL_FAIR, _WEAKEST = 0.2, 10.0, 0.05
 # Share of touches that no source on the skin explains, from which something is wrong with the array.
 _ODD = 0.25
 # Intensities this much below the loudest frame's are no touch, where no floor is known (60 dB).
@@ -118,6 +118,9 @@ def locate(
             result[key][solve] = getattr(judge, key)[:number]
         status[solve] = _judge(judge, found)[:number]
         _explain(status, result, heard.power, use, listeners)
+        excess = np.zeros(frames)
+        excess[solve] = np.asarray(judge.excess)[:number]
+        status[(status == "misfit") & (excess > _OUTSIDE)] = "outside"
         notes = _notes(status, heard, use, listeners)
     return Locations(
         np.asarray(heard.times),
@@ -133,12 +136,18 @@ def locate(
 def _judge(judge: Estimate, found: Estimate) -> np.ndarray:
     """The status of frames with a touch, but for two touches."""
     misfit, freedom = np.asarray(judge.misfit), np.asarray(judge.freedom)
-    unexplained = (freedom > 0) & (chi2.sf(misfit, np.maximum(freedom, 1)) < _FALSE_MISFIT)
+    excess = np.asarray(judge.excess)
     status = np.where(np.asarray(judge.rival) < _RIVAL, "ambiguous", "touch").astype(object)
-    status[unexplained] = "misfit"
-    status[np.asarray(judge.excess) > _OUTSIDE] = "outside"
+    status[_unexplained(misfit, freedom)] = "misfit"
+    # A source beyond the outline explains what none on it does, but for two sources, which nothing explains.
+    status[(excess > _OUTSIDE) & ~_unexplained(misfit - excess, freedom)] = "outside"
     status[~np.isfinite(np.asarray(found.position)).all(axis=1)] = "unusable"
     return status
+
+
+def _unexplained(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+    """Whether a misfit is too great for chance."""
+    return (freedom > 0) & (chi2.sf(misfit, np.maximum(freedom, 1)) < _FALSE_MISFIT)
 
 
 def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, listeners: Listeners) -> None:
@@ -147,9 +156,9 @@ def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, list
     if tried.size:
         two = locate_two(listeners, *_padded(power[tried], use[tried]))
         misfit, freedom = np.asarray(two.misfit)[: tried.size], np.asarray(two.freedom)[: tried.size]
-        explained = chi2.sf(misfit, np.maximum(freedom, 1)) > _FALSE_MISFIT
         stronger, weaker = np.asarray(two.strength)[: tried.size].T
-        both = (explained | (misfit < _BOTH * result["misfit"][tried])) & (weaker > _WEAKEST * stronger)
+        much_better = (misfit < _BOTH * result["misfit"][tried]) & (misfit < _STILL_FAIR * freedom)
+        both = (~_unexplained(misfit, freedom) | much_better) & (weaker > _WEAKEST * stronger)
         chosen, index = tried[both], np.flatnonzero(both)
         status[chosen] = "two touches"
         result["misfit"][chosen], result["freedom"][chosen] = misfit[both], freedom[both]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from jeit.mesh import Disk, Domain, Polygon, Rectangle
 
 # Knots of the spline: more make every evaluation slower and the surface no smoother.
-_MOST_KNOTS = 200
+_MOST_KNOTS = 300
 # Of the polygon that stands for a disk: it is nowhere more than 0.04 % of the radius inside it.
 _DISK_VERTICES = 120
 

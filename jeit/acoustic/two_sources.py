@@ -12,8 +12,8 @@ from jeit.acoustic.localiser import Pixels
 from jeit.acoustic.surface import box, in_space, size
 from jeit_solvers import inverse_few, minimise_few
 
-# Places of which all pairs are screened.
-_PLACES = 150
+# Places of which all pairs are screened, and pairs that are tried.
+_PLACES, _STARTS = 150, 3
 
 
 class TwoSources(eqx.Module):
@@ -29,7 +29,7 @@ class TwoSources(eqx.Module):
 
 
 def locate_two(listeners: Listeners, power: ArrayLike, use: ArrayLike | None = None) -> TwoSources:
-    """The most probable pair of sources of each frame: all pairs of a coarse grid are screened, the best is refined.
+    """The most probable pair of sources of each frame: all pairs of a coarse grid are screened, the best three refined.
 
     `power` (F, M): intensities above the floor; `use`: which to look at, all that are finite unless given. Six unknowns
     need six microphones or more: frames with fewer give NaN. Both are found inside the outline's box.
@@ -48,26 +48,30 @@ def _locate_two(listeners: Listeners, pixels: Pixels, power, use) -> TwoSources:
     use = use & (power + listeners.noise.floor[:, None] > 0)
     likelihood = Likelihood.create(power, use, listeners)
     response = listeners.response(pixels.chart)
-    start = jax.lax.map(lambda frame: _best_pair(frame[0], frame[1], response, pixels, listeners), (power.T, use.T)).T
+    starts = jax.lax.map(lambda frame: _best_pairs(frame[0], frame[1], response, pixels, listeners), (power.T, use.T))
+    start = jnp.moveaxis(starts, 0, -1).transpose(1, 0, 2).reshape(6, -1)  # (6, starts · F)
     low, high = box(listeners.surface)
     reach = size(listeners.surface)
     far = jnp.full(1, jnp.inf)
     found = minimise_few(
         lambda x, data: Likelihood(data[0], data[1], data[2], listeners).expand(x),
         start,
-        likelihood.frames,
+        jax.tree.map(lambda array: jnp.tile(array, _STARTS), likelihood.frames),
         lower=jnp.concatenate([low, -far, low, -far])[:, None],
         upper=jnp.concatenate([high, far, high, far])[:, None],
         largest_step=jnp.tile(jnp.array([0.1, 0.1, 2.3]) * jnp.array([reach, reach, 1.0]), 2)[:, None],
         max_steps=60,
         tolerance=1e-10,
     )
-    x = found.x
+    number = power.shape[1]
+    value = jnp.where(jnp.isfinite(found.value), found.value, jnp.inf).reshape(_STARTS, number)
+    best = jnp.argmin(value, axis=0) * number + jnp.arange(number)
+    x, converged = found.x[:, best], found.converged[best]
     x = jnp.where(x[5] > x[2], jnp.roll(x, 3, axis=0), x)
     _, _, matrix = likelihood.expand(x)
     spread = inverse_few(matrix)
     number = jnp.sum(use, axis=0)
-    known = (number >= 6) & jnp.isfinite(found.value)
+    known = (number >= 6) & jnp.isfinite(jnp.min(value, axis=0))
     each = [in_space(listeners.surface, x[k : k + 2], spread[k : k + 2, k : k + 2]) for k in (0, 3)]
 
     def shown(array):
@@ -79,12 +83,13 @@ def _locate_two(listeners: Listeners, pixels: Pixels, power, use) -> TwoSources:
         strength=shown(jnp.exp(x[2::3]).T),
         misfit=shown(likelihood.misfit(x)),
         freedom=jnp.maximum(number - 6, 0),
-        converged=found.converged & known,
+        converged=converged & known,
     )
 
 
-def _best_pair(power, use, response, pixels: Pixels, listeners: Listeners) -> Float[Array, " 6"]:
-    """Of all pairs of places, the one whose best two strengths leave least of the frame unexplained."""
+def _best_pairs(power, use, response, pixels: Pixels, listeners: Listeners) -> Float[Array, "starts 6"]:
+    """Of all pairs of places, those whose best two strengths leave least of the frame unexplained, apart from each
+    other."""
     weight = jnp.where(use, 1 / listeners.noise.variance(jnp.maximum(power, 0.0)), 0.0)
     # All numbers near one: intensities may be of any unit.
     scale = jnp.max(jnp.where(use, power, 0.0))
@@ -99,7 +104,14 @@ def _best_pair(power, use, response, pixels: Pixels, listeners: Listeners) -> Fl
     both = (first > 0) & (second > 0) & (determinant > 1e-9 * own[:, None] * own)
     both = both & pixels.inside[:, None] & pixels.inside
     gained = jnp.where(both, first * moment[:, None] + second * moment, -jnp.inf)
-    one, other = jnp.unravel_index(jnp.argmax(gained), gained.shape)
-    strengths = jnp.log(jnp.maximum(scale * jnp.stack([first[one, other], second[one, other]]), 1e-300))
     chart = pixels.chart
-    return jnp.stack([*chart[:, one], strengths[0], *chart[:, other], strengths[1]])
+    apart = jnp.linalg.norm(chart[:, :, None] - chart[:, None], axis=0)
+    near = apart < 1.6 * jnp.sort(apart[0])[1]
+    pairs = []
+    for _ in range(_STARTS):
+        one, other = jnp.unravel_index(jnp.argmax(gained), gained.shape)
+        strengths = jnp.log(jnp.maximum(scale * jnp.stack([first[one, other], second[one, other]]), 1e-300))
+        pairs.append(jnp.stack([*chart[:, one], strengths[0], *chart[:, other], strengths[1]]))
+        same = near[one][:, None] & near[other]
+        gained = jnp.where(same | same.T, -jnp.inf, gained)
+    return jnp.stack(pairs)

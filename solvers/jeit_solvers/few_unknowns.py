@@ -139,7 +139,8 @@ def minimise_few(
             trial, promised = step_from(state)
             value, gradient, matrix = expand(trial, data)
             better = (value <= state.value) & ~state.done
-            settled = (promised <= tolerance * (1 + jnp.abs(state.value))) & ~fresh
+            # Cut off at a bound, a step may lead uphill: then a more damped one, closer to the gradient, is tried.
+            settled = (promised >= 0) & (promised <= tolerance * (1 + jnp.abs(state.value))) & ~fresh
             damping = jnp.where(better, jnp.maximum(state.damping / 10, 1e-12), 8 * jnp.maximum(state.damping, 1e-4))
             taken = state.taken + ~(state.done | fresh)
             # A step too small to tell better from worse ends the search as well.

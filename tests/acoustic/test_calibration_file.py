@@ -1,0 +1,212 @@
+"""The file of a calibration: what is written is read again to the bit, and what is no calibration is refused."""
+
+import json
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from microphone_arrays import MICROPHONES, OUTLINE, array
+
+from jeit.acoustic import AttenuatedInverseSquare, Calibration, Exponential, IntensitySettings, Listeners, make_surface
+from jeit.acoustic.noise import IntensityNoise
+from jeit.mesh import Polygon
+
+HOLE = [[0.01, 0.01], [0.01, 0.03], [0.03, 0.03], [0.03, 0.01]]
+
+
+def calibration(listeners, intensity=None):
+    count = len(listeners.microphones)
+    errors = np.abs(np.random.default_rng(0).normal(size=(len(listeners.decay.parameters), count)))
+    errors[:, 2] = np.nan
+    usable = np.arange(count) != 2
+    reasons = tuple("" if good else "dead: every intensity is 0" for good in usable)
+    return Calibration(listeners, usable, reasons, errors, intensity, "taps of Friday – Ü")
+
+
+def curved():
+    height = np.array([[0.0], [0.0], [0.01], [0.02]])
+    bowl = np.random.default_rng(1).uniform(-0.09, 0.09, (30, 2))
+    points = np.column_stack([bowl, 0.3 * bowl[:, 0] ** 2 - bowl[:, 0] * bowl[:, 1]])
+    surface = make_surface(np.hstack([OUTLINE, height]), points)
+    flat = array(9)
+    place = np.column_stack([MICROPHONES[9], np.full(9, -0.01)])
+    return Listeners(jnp.asarray(place), surface, flat.decay, flat.noise)
+
+
+def other_decay(kind, *values):
+    flat = array(9, relative=0.05, floor=0.3, freedom=12.0)
+    return Listeners(flat.microphones, flat.surface, kind(*(jnp.asarray(value) for value in values)), flat.noise)
+
+
+RNG = np.random.default_rng(3)
+NINE = RNG.random((3, 9)) + 0.01
+CASES = {
+    "plane": lambda: calibration(array(9, relative=0.1)),
+    "with a band": lambda: calibration(array(9, floor=1e-9, freedom=7.0), IntensitySettings(high=900.0)),
+    "with a hole": lambda: calibration(array(9, outline=Polygon(OUTLINE, [HOLE]))),
+    "curved": lambda: calibration(curved()),
+    "exponential": lambda: calibration(other_decay(Exponential, *NINE[:2])),
+    "attenuated": lambda: calibration(other_decay(AttenuatedInverseSquare, *NINE)),
+    "huge and tiny": lambda: calibration(array(9, deviation=np.geomspace(1e-300, 1e300, 9))),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_there_and_back(name, tmp_path):
+    """Every array to the last bit."""
+    one = CASES[name]()
+    one.save(tmp_path / "array.json")
+    again = Calibration.load(tmp_path / "array.json")
+    assert eqx.tree_equal(one.listeners, again.listeners)
+    assert type(again.listeners.surface) is type(one.listeners.surface)
+    assert type(again.listeners.decay) is type(one.listeners.decay)
+    np.testing.assert_array_equal(again.usable, one.usable)
+    np.testing.assert_array_equal(again.standard_errors, one.standard_errors)
+    assert (again.reasons, again.name, again.num_microphones) == (one.reasons, one.name, 9)
+    assert eqx.tree_equal(again.intensity, one.intensity)
+    again.save(str(tmp_path / "again.json"))
+    assert (tmp_path / "again.json").read_bytes() == (tmp_path / "array.json").read_bytes()
+
+
+def test_the_file_says_what_it_holds(tmp_path):
+    """Units, version, scale; and plain JSON, that others read: NaN is null."""
+    CASES["with a band"]().save(tmp_path / "array.json")
+    text = (tmp_path / "array.json").read_text("utf-8")
+    content = json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert content["units"]["length"] == "m"
+    assert content["version"] == 1
+    assert "geometric mean 1" in content["scale"]
+    assert content["microphones"][2]["relative_standard_error"] == {"a": None, "b": None}
+    assert content["intensity"] == {"low": 50.0, "high": 900.0, "window": 0.05, "hop": 0.0125}
+    assert len(content["microphones"]) == 9
+
+
+def test_values_that_no_file_can_hold_are_not_written(tmp_path):
+    flat = array(9)
+    noise = IntensityNoise(
+        flat.noise.floor.at[0].set(jnp.nan), flat.noise.deviation, flat.noise.cross, flat.noise.relative
+    )
+    with pytest.raises(ValueError, match="JSON"):
+        calibration(Listeners(flat.microphones, flat.surface, flat.decay, noise)).save(tmp_path / "array.json")
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory):
+    path = tmp_path_factory.mktemp("file") / "array.json"
+    CASES["with a hole"]().save(path)
+    return path.read_text("utf-8")
+
+
+def load(tmp_path, written):
+    path = tmp_path / "array.json"
+    path.write_bytes(written if isinstance(written, bytes) else written.encode())
+    return Calibration.load(path)
+
+
+def put(*where):
+    """A change of the content: the last argument goes to the place that the others say; `del` removes it."""
+    *keys, last, value = where
+
+    def change(content):
+        for key in keys:
+            content = content[key]
+        if value is del_:
+            del content[last]
+        else:
+            content[last] = value
+
+    return change
+
+
+def del_():
+    """Stands for removal."""
+
+
+EDITED = {
+    "another version": (put("version", 2), "version 2 .* reads version 1"),
+    "no version": (put("version", del_), "version None"),
+    "millimetres": (put("units", "length", "mm"), "units"),
+    "no units": (put("units", del_), "units are None"),
+    "another format": (put("format", "something else"), "no calibration"),
+    "another model": (put("decay", "linear"), "decay is 'linear'"),
+    "model not a word": (put("decay", ["inverse-square"]), "."),
+    "negative b": (put("microphones", 3, "b", -1e-3), "b of microphone 3 is not positive"),
+    "zero a": (put("microphones", 0, "a", 0), "a of microphone 0 is not positive"),
+    "NaN": (put("microphones", 3, "b", float("nan")), "b of microphone 3 is nan"),
+    "infinite": (put("microphones", 3, "noise_floor", float("inf")), "noise_floor of microphone 3 is inf"),
+    "text for a number": (put("microphones", 3, "a", "0.001"), "a of microphone 3 is '0.001'"),
+    "yes for a number": (put("microphones", 3, "a", True), "a of microphone 3 is True"),
+    "null": (put("microphones", 3, "a", None), "a of microphone 3 is None"),
+    "negative noise": (put("microphones", 1, "relative_noise", -0.1), "noise .* negative"),
+    "missing key": (put("microphones", 4, "b", del_), "incomplete or changed by hand"),
+    "no microphones": (put("microphones", []), "."),
+    "microphones no list": (put("microphones", 7), "incomplete or changed by hand"),
+    "a microphone no dictionary": (put("microphones", 3, 5), "incomplete or changed by hand"),
+    "no surface": (put("surface", del_), "incomplete or changed by hand"),
+    "outline of two": (put("surface", "outline", [[0, 0], [1, 0]]), "."),
+    "outline of text": (put("surface", "outline", "square"), "."),
+    "position of one more": (put("microphones", 3, "position", [0.0, 0.0, 0.0]), "."),
+    "positions in space": (
+        lambda content: [one.update(position=[*one["position"], 0.0]) for one in content["microphones"]],
+        "positions of microphones must be 2 finite",
+    ),
+    "position NaN": (put("microphones", 3, "position", [0.0, float("nan")]), "positions"),
+    "position of text": (put("microphones", 3, "position", ["a", "b"]), "."),
+    "band without a window": (put("intensity", {"low": 50.0}), None),
+    "band upside down": (put("intensity", {"low": 500.0, "high": 50.0, "window": 0.05, "hop": 0.01}), "low and high"),
+    "band of another kind": (put("intensity", {"lowest": 500.0}), "incomplete or changed by hand"),
+    "error of text": (put("microphones", 3, "relative_standard_error", {"a": "x", "b": 0.1}), "."),
+    "error missing": (put("microphones", 3, "relative_standard_error", {"a": 0.1}), "incomplete or changed by hand"),
+}
+
+
+@pytest.mark.parametrize("name", EDITED)
+def test_what_was_changed_by_hand_is_refused(name, content, tmp_path):
+    """With the file's name, and what is wrong in it."""
+    change, message = EDITED[name]
+    edited = json.loads(content)
+    change(edited)
+    if message is None:  # the defaults stand in
+        assert load(tmp_path, json.dumps(edited)).intensity == IntensitySettings()
+        return
+    with pytest.raises(ValueError, match=message) as caught:
+        load(tmp_path, json.dumps(edited))
+    assert "array.json" in str(caught.value)
+
+
+OTHERS = {
+    "other JSON": '{"name": "something"}',
+    "a list": "[1, 2, 3]",
+    "a number": "7",
+    "null": "null",
+    "empty": "",
+    "text": "Dear reader,",
+    "binary": bytes(range(256)) * 20,
+    "UTF-16": '{"format": "x"}'.encode("utf-16"),
+    "an archive": b"PK\x03\x04" + bytes(100),
+    "very deep": "[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_other_files_are_refused(name, tmp_path):
+    with pytest.raises(ValueError, match=r"array\.json is no calibration"):
+        load(tmp_path, OTHERS[name])
+
+
+def test_a_file_cut_off_is_refused(content, tmp_path):
+    """Wherever it is cut."""
+    for part in (0.01, 0.3, 0.9, 0.999):
+        with pytest.raises(ValueError, match=r"array\.json is no calibration"):
+            load(tmp_path, content[: int(part * len(content))])
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        Calibration.load(tmp_path / "nothing.json")
+    (tmp_path / "array").mkdir()
+    with pytest.raises(OSError, match="array"):
+        Calibration.load(tmp_path / "array")
+    with pytest.raises(OSError, match="folder"):
+        CASES["plane"]().save(tmp_path / "no folder" / "array.json")

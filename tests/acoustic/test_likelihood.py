@@ -1,0 +1,143 @@
+"""The likelihood against NumPy formulas, its gradient against JAX's, its matrix against the spread of scores."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from microphone_arrays import array, hear, inside, listen, noisy, variance
+
+from jeit.acoustic.likelihood import Likelihood
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def listeners():
+    return array(9, relative=0.1, floor=0.05, freedom=30.0)
+
+
+@pytest.fixture(scope="module")
+def frames(listeners):
+    places = inside(FRAMES)
+    strength = np.exp(np.linspace(-2, 3, FRAMES))
+    power = noisy(listeners.noise, hear(listeners, places, strength), np.random.default_rng(0))
+    use = np.ones(power.shape, bool)
+    use[3, [1, 4]] = use[5, 7] = False
+    power[3, 1], power[5, 7] = np.inf, np.nan
+    return power, use
+
+
+def likelihood(listeners, frames):
+    return Likelihood.create(jnp.asarray(frames[0].T), jnp.asarray(frames[1].T), listeners)
+
+
+def unknowns(number, seed=1):
+    places, rng = inside(number, seed=seed), np.random.default_rng(seed)
+    return np.concatenate([places.T, rng.normal(size=(1, number))])
+
+
+def terms_of(listeners, power, use, x):
+    """(y − m)² / v and log v for sources x = (u, s, u', s', …), one frame, of the microphones used, in NumPy."""
+    a, b, noise = listeners.decay.a, listeners.decay.b, listeners.noise
+    received = sum(
+        listen(listeners.microphones, a, b, [x[k : k + 2]], np.exp(x[k + 2]))[0] for k in range(0, len(x), 3)
+    )
+    floor = np.asarray(noise.floor)
+    deviation2 = np.asarray(variance(noise, received)) / (received + floor) ** 2
+    with np.errstate(invalid="ignore"):
+        off = np.log(power + floor) - np.log(received + floor)
+    return (off**2 / deviation2)[use], np.log(deviation2)[use]
+
+
+@pytest.mark.parametrize("sources", [1, 2])
+def test_cost_is_the_formula(sources, listeners, frames):
+    """Σ ½ (y − m)² / v + ½ log v; the misfit is twice its first part."""
+    x = np.concatenate([unknowns(FRAMES, seed=k) for k in range(sources)])
+    cost, misfit = (
+        f(jnp.asarray(x)) for f in (likelihood(listeners, frames).cost, likelihood(listeners, frames).misfit)
+    )
+    for frame in range(FRAMES):
+        squares, logarithms = terms_of(listeners, frames[0][frame], frames[1][frame], x[:, frame])
+        assert float(cost[frame]) == pytest.approx(0.5 * (squares + logarithms).sum(), rel=1e-11)
+        assert float(misfit[frame]) == pytest.approx(squares.sum(), rel=1e-11)
+
+
+def test_a_level_far_below_the_floor_is_finite(listeners):
+    """Power that is minus the floor has no logarithm: the level stops at a twentieth of the floor."""
+    power = np.full((1, 9), -0.06)
+    one = Likelihood.create(jnp.asarray(power.T), jnp.ones((9, 1), bool), listeners)
+    np.testing.assert_allclose(one.level[:, 0], np.log(0.05 * np.asarray(listeners.noise.floor)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("sources", [1, 2])
+def test_gradient(sources, listeners, frames):
+    one = likelihood(listeners, frames)
+    x = jnp.asarray(np.concatenate([unknowns(FRAMES, seed=k) for k in range(sources)]))
+    value, gradient, matrix = one.expand(x)
+    np.testing.assert_allclose(value, one.cost(x), rtol=1e-12)
+    expected = jax.grad(lambda y: jnp.sum(one.cost(y)))(x)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-8, atol=1e-10 * float(jnp.abs(expected).max()))
+    np.testing.assert_allclose(matrix, np.swapaxes(matrix, 0, 1), rtol=1e-12)
+    assert (np.linalg.eigvalsh(np.moveaxis(np.asarray(matrix), -1, 0)) > 0).all()
+
+
+def test_matrix_is_the_covariance_of_scores(listeners):
+    """Fisher's: E[∇cost ∇costᵀ] over draws at the truth, where the mean of ∇cost is nothing. 20,000 draws: 2 %."""
+    number = 20_000
+    place, strength = np.array([0.02, -0.03]), 0.3
+    power = noisy(
+        listeners.noise, np.repeat(hear(listeners, [place], strength), number, axis=0), np.random.default_rng(2)
+    )
+    truth = jnp.asarray(np.repeat([[*place, np.log(strength)]], number, axis=0).T)
+    one = Likelihood.create(jnp.asarray(power.T), jnp.ones((9, number), bool), listeners)
+    _, gradient, matrix = jax.jit(lambda x: one.expand(x))(truth)
+    score, fisher = np.asarray(gradient), np.asarray(matrix)[:, :, 0]
+    scale = np.sqrt(np.diag(fisher))
+    spread = score @ score.T / number
+    np.testing.assert_allclose(spread / np.outer(scale, scale), fisher / np.outer(scale, scale), atol=0.05)
+    # The level stops where power goes below minus the floor: in few draws, which moves the mean a little.
+    assert (np.abs(score.mean(axis=1)) < 0.03 * scale).all()
+
+
+@pytest.mark.slow
+def test_matrix_is_the_expected_hessian(listeners):
+    """E[∇²cost] over draws, by JAX's Hessian of the cost, at the truth."""
+    number = 2000
+    place, strength = np.array([-0.05, 0.04]), 3.0
+    power = noisy(
+        listeners.noise, np.repeat(hear(listeners, [place], strength), number, axis=0), np.random.default_rng(3)
+    )
+    one = Likelihood.create(jnp.asarray(power.T), jnp.ones((9, number), bool), listeners)
+    truth = jnp.asarray([*place, np.log(strength)])
+    hessian = jax.jit(jax.hessian(lambda x: jnp.mean(one.cost(x[:, None] * jnp.ones(number)))))(truth)
+    fisher = one.expand(truth[:, None] * jnp.ones(number))[2][:, :, 0]
+    scale = np.sqrt(np.diag(fisher))
+    np.testing.assert_allclose(hessian / np.outer(scale, scale), fisher / np.outer(scale, scale), atol=0.05)
+
+
+def test_strength_at_a_known_place(listeners):
+    """Exact data: the strength itself, whatever the unit; and then the cost cannot be lower at another."""
+    exact = array(9)
+    places, strength = inside(5), np.array([1e-12, 0.1, 1.0, 10.0, 1e12])
+    one = Likelihood.create(jnp.asarray(hear(exact, places, strength).T), jnp.ones((9, 5), bool), exact)
+    start = one.start(jnp.asarray(places.T))
+    np.testing.assert_allclose(start[2], np.log(strength), atol=1e-10)
+    np.testing.assert_allclose(start[:2], places.T)
+    np.testing.assert_allclose(one.misfit(start), 0, atol=1e-15)
+
+
+def test_screen_leaves_least_at_the_place(listeners):
+    """½ Σ w (p − s f)² at the best s, written out; and nothing at the place of exact data."""
+    exact = array(9)
+    places, candidates = inside(6), np.concatenate([inside(6), inside(20, seed=5)])
+    power = hear(exact, places, np.exp(np.linspace(-3, 3, 6)))
+    one = Likelihood.create(jnp.asarray(power.T), jnp.ones((9, 6), bool), exact)
+    screened = np.asarray(one.screen(one.features(exact, jnp.asarray(candidates.T))))
+    response = hear(exact, candidates)
+    for frame in range(6):
+        weight = 1 / np.asarray(variance(exact.noise, power[frame]))
+        for number, f in enumerate(response):
+            best = np.sum(weight * power[frame] * f) / np.sum(weight * f**2)
+            expected = 0.5 * np.sum(weight * (power[frame] - best * f) ** 2)
+            assert screened[frame, number] == pytest.approx(expected, rel=1e-6, abs=1e-3)
+    np.testing.assert_array_equal(screened.argmin(axis=1), np.arange(6))

@@ -1,0 +1,356 @@
+"""From intensities to places and statuses: every status where it belongs, and faults that are said and survived."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from microphone_arrays import array, hear, inside, noisy
+
+from jeit.acoustic import Calibration, Intensities, Locations, cramer_rao, locate
+from jeit.acoustic.locate import STATUSES
+
+FRAMES = 64
+FLOOR, FREEDOM = 0.01, 50.0
+
+
+def calibration(listeners, usable=None, reasons=None):
+    count = len(listeners.microphones)
+    good = np.ones(count, bool) if usable is None else usable
+    return Calibration(listeners, good, reasons or ("",) * count, np.zeros((2, count)), None, "array")
+
+
+@pytest.fixture(scope="module")
+def listeners():
+    return array(9, relative=0.05, floor=FLOOR, freedom=FREEDOM)
+
+
+@pytest.fixture(scope="module")
+def known(listeners):
+    return calibration(listeners)
+
+
+def heard(power, *, floor=FLOOR, freedom=FREEDOM, **options):
+    count = power.shape[1]
+    times = 0.05 * np.arange(len(power))
+    if floor == 0:
+        return Intensities(times, power, **options)
+    return Intensities(times, power, floor=np.full(count, floor), freedom=freedom, **options)
+
+
+def silence(number, count=9, seed=0):
+    """Windows of noise alone, the floor subtracted: chi-square."""
+    draws = np.random.default_rng(seed).chisquare(FREEDOM, (number, count))
+    return FLOOR * (draws / FREEDOM - 1)
+
+
+@pytest.fixture(scope="module")
+def touches(listeners):
+    """64 touches all over the skin, strengths over a factor of ten."""
+    places = inside(FRAMES, reach=0.7)
+    rng = np.random.default_rng(1)
+    return places, noisy(listeners.noise, hear(listeners, places, np.exp(rng.uniform(0, 2.3, FRAMES))), rng)
+
+
+def coverage(found, places, frames=slice(None)):
+    error = (found.position - places)[frames]
+    square = np.einsum("fi,fij,fj->f", error, np.linalg.inv(found.covariance[frames]), error)
+    return np.mean(square < 5.991)
+
+
+def test_touches(known, touches):
+    places, power = touches
+    found = locate(heard(power, name="desk"), known)
+    # One in ten thousand is called a misfit, and places near the rim may look outside.
+    assert np.mean(found.status == "touch") > 0.95
+    assert found.counts()["touch"] == (found.status == "touch").sum()
+    assert found.located.all()
+    # 64 draws: 0.95 within 0.08 or so, and at the rim a little less.
+    assert coverage(found, places) > 0.85
+    assert np.median(np.linalg.norm(found.position - places, axis=1)) < 0.003
+    assert found.used.all()
+    assert (found.freedom == 6).all()
+    assert found.faults == ("",) * 9
+    assert found.notes == ()
+    assert found.name == "desk"
+    np.testing.assert_array_equal(found.times, 0.05 * np.arange(FRAMES))
+    assert np.isnan(found.second).all()
+    assert np.isnan(found.second_strength).all()
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e12])
+def test_any_unit(scale, known, touches):
+    """Intensities and their floor in another unit: the same places."""
+    plain, other = locate(heard(touches[1]), known), locate(heard(scale * touches[1], floor=scale * FLOOR), known)
+    np.testing.assert_allclose(other.position, plain.position, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(other.strength, scale * plain.strength, rtol=1e-6)
+    np.testing.assert_array_equal(other.status, plain.status)
+
+
+def test_silence_is_no_touch(known):
+    """A thousand windows of it, and between touches."""
+    found = locate(heard(silence(1000)), known)
+    assert found.counts() == {"no touch": 1000}
+    assert not found.located.any()
+    for values in (found.position, found.covariance, found.strength, found.misfit):
+        assert np.isnan(values).all()
+    assert found.notes == ()
+
+
+def test_silence_between_touches(known, touches):
+    power = touches[1].copy()
+    quiet = np.arange(FRAMES) % 3 == 0
+    power[quiet] = silence(quiet.sum())
+    found = locate(heard(power), known)
+    assert (found.status[quiet] == "no touch").all()
+    assert (found.status[~quiet] != "no touch").all()
+    np.testing.assert_array_equal(found.located, ~quiet)
+
+
+def test_frames_of_zeros_are_no_touch(known, touches):
+    """Intensities whose floor nobody knows."""
+    power = touches[1].copy()
+    power[10:20] = 0
+    power[20:25] *= 1e-9
+    found = locate(heard(power, floor=0), calibration(array(9, relative=0.05)))
+    assert (found.status[10:25] == "no touch").all()
+    assert found.located.sum() == FRAMES - 15
+
+
+def test_nothing_but_zeros(known):
+    """Every channel is dead then, which is said."""
+    with pytest.raises(ValueError, match=r"0 of 9 microphones can be used.*microphone 8: dead: every intensity is 0"):
+        locate(heard(np.zeros((10, 9)), floor=0), known)
+
+
+def test_outside(known, listeners):
+    """Two to five centimetres beyond: flagged, and held on the outline, on the near side."""
+    along = np.linspace(-0.08, 0.08, 16)
+    beyond = np.concatenate(
+        [np.stack([along, np.full(16, sign * 0.14)], axis=1)[:, ::step] for sign in (1, -1) for step in (1, -1)]
+    )
+    power = noisy(listeners.noise, hear(listeners, beyond, 10.0), np.random.default_rng(2))
+    found = locate(heard(power), known)
+    assert np.mean(found.status == "outside") > 0.95
+    assert np.mean(np.abs(np.abs(found.position).max(axis=1) - 0.1) < 1e-9) > 0.95
+    nearest = np.clip(beyond, -0.1, 0.1)
+    # Not the nearest: what is 2 cm beyond the corner microphones sounds, on the outline, somewhat aside.
+    assert np.median(np.linalg.norm(found.position - nearest, axis=1)) < 0.015
+    # So many touches beyond the outline make one ask whether microphones are exchanged: they are not.
+    assert found.notes == ()
+
+
+def pair_of_places():
+    """On either side of the middle, some 10 cm apart."""
+    aside = np.array([0.04, 0.03])
+    return inside(FRAMES, seed=4, reach=0.3) - aside, inside(FRAMES, seed=5, reach=0.3) + aside
+
+
+def test_two_touches(known, listeners):
+    """Both are found within millimetres, the stronger first."""
+    rng = np.random.default_rng(3)
+    first, second = pair_of_places()
+    power = hear(listeners, first, 8.0) + hear(listeners, second, 5.0)
+    found = locate(heard(noisy(listeners.noise, power, rng)), known)
+    both = found.status == "two touches"
+    assert both.sum() > 0.7 * FRAMES
+    error = np.stack([found.position - first, found.second - second], axis=1)[both]
+    crossed = np.stack([found.position - second, found.second - first], axis=1)[both]
+    best = np.minimum(np.linalg.norm(error, axis=-1).max(axis=1), np.linalg.norm(crossed, axis=-1).max(axis=1))
+    assert np.median(best) < 0.005
+    assert (found.strength[both] >= found.second_strength[both]).all()
+    assert (found.freedom[both] == 3).all()
+    assert np.isnan(found.second[~both]).all()
+
+
+def test_exact_two_touches(known):
+    """Without noise: to a micrometre."""
+    listeners = array(9, relative=0.01)
+    first, second = pair_of_places()
+    power = hear(listeners, first, 8.0) + hear(listeners, second, 5.0)
+    found = locate(heard(power, floor=0), calibration(listeners))
+    both = found.status == "two touches"
+    # One in ten looks, to one source, as if from beyond the outline, and is said to be outside.
+    assert both.mean() > 0.8
+    assert set(found.status) <= {"two touches", "outside"}
+    error = np.linalg.norm(found.position - first, axis=1) + np.linalg.norm(found.second - second, axis=1)
+    assert np.mean(error[both] < 1e-6) > 0.95
+
+
+def test_ambiguous():
+    """Four microphones on a line cannot tell the two sides of it apart: one of the mirror images, and said so."""
+    line = np.array([[-0.07, 0.0], [-0.02, 0.0], [0.03, 0.0], [0.08, 0.0]])
+    listeners = array(4, microphones=line, relative=0.05, floor=FLOOR, freedom=FREEDOM)
+    places = inside(FRAMES, seed=6, reach=0.7)
+    places = places[np.abs(places[:, 1]) > 0.025]
+    power = noisy(listeners.noise, hear(listeners, places, 10.0), np.random.default_rng(7))
+    found = locate(heard(power), calibration(listeners))
+    inside_ones = found.status != "outside"
+    assert np.mean(found.status[inside_ones] == "ambiguous") > 0.9
+    folded = np.stack([found.position[:, 0], np.abs(found.position[:, 1])], axis=1)
+    error = np.linalg.norm(folded - np.stack([places[:, 0], np.abs(places[:, 1])], axis=1), axis=1)
+    assert np.median(error) < 0.01
+
+
+def test_misfit(known):
+    """Intensities at random are no source: said, and the covariance is as much wider."""
+    power = np.exp(np.random.default_rng(8).normal(size=(FRAMES, 9)))
+    found = locate(heard(power), known)
+    assert np.isin(found.status, ["misfit", "outside", "two touches"]).all()
+    wrong = found.status == "misfit"
+    assert wrong.mean() > 0.5
+    bound = cramer_rao(known.listeners, jnp.asarray(found.position[wrong]), jnp.asarray(found.strength[wrong]))
+    wider = np.trace(found.covariance[wrong], axis1=1, axis2=2) / np.trace(bound, axis1=1, axis2=2)
+    np.testing.assert_allclose(wider, found.misfit[wrong] / found.freedom[wrong], rtol=1e-6)
+    assert (wider > 4).all()  # chi-square of 6 degrees of freedom is beyond 27.9 with a chance of 1e-4
+    assert any("is this the calibration of this array" in note for note in found.notes)
+
+
+def test_unusable_frames(known, touches):
+    """Two readings are not enough; three are."""
+    power = touches[1].copy()
+    power[5, 2:] = np.nan
+    power[6] = np.nan
+    power[7, 3:] = np.nan
+    found = locate(heard(power), known)
+    assert (found.status[[5, 6]] == "unusable").all()
+    assert found.status[7] != "unusable"
+    assert not found.located[[5, 6]].any()
+    assert found.located.sum() == FRAMES - 2
+    np.testing.assert_array_equal(found.used[5], np.arange(9) < 2)
+    others = np.setdiff1d(np.arange(FRAMES), [5, 6, 7])
+    whole = locate(heard(touches[1]), known)
+    np.testing.assert_allclose(found.position[others], whole.position[others], rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(found.status[others], whole.status[others])
+    assert "NaN or infinite in 3 of 64 windows" in found.faults[8]
+
+
+def test_too_few_microphones(known, touches):
+    power = touches[1].copy()
+    power[:, 3:] = np.nan
+    power[:, 2] = 0
+    with pytest.raises(ValueError, match=r"'intensities': 2 of 9 microphones can be used.*microphone 2: dead"):
+        locate(heard(power), known)
+
+
+def test_another_number_of_microphones(known):
+    with pytest.raises(ValueError, match=r"'intensities' has 8 microphones and the calibration 'array' 9"):
+        locate(heard(np.ones((4, 8))), known)
+
+
+@pytest.mark.parametrize("dead", range(1, 6))
+def test_dead_microphones(dead, listeners):
+    """Exact data stay exact, noisy ones near the bound of what is left; the faults are told."""
+    places = inside(FRAMES, seed=9, reach=0.6)
+    gone = np.array([4, 0, 7, 2, 5])[:dead]
+    exact = array(9)
+    power = hear(exact, places)
+    power[:, gone[::2]] = 0
+    power[:, gone[1::2]] = np.nan
+    found = locate(heard(power, floor=0), calibration(exact))
+    error = np.linalg.norm(found.position - places, axis=1)
+    clear = ~np.isin(found.status, ["ambiguous"])
+    assert error[clear].max() < 1e-6
+    assert clear.mean() > 0.9
+    np.testing.assert_array_equal(found.used, np.broadcast_to(~np.isin(np.arange(9), gone), (FRAMES, 9)))
+    for k in range(9):
+        expected = "" if k not in gone else "dead: every intensity is " + ("0" if k in gone[::2] else "NaN or infinite")
+        assert found.faults[k] == expected
+
+    received = hear(listeners, places, 10.0)
+    received[:, gone] = np.nan
+    found = locate(heard(noisy(listeners.noise, received, np.random.default_rng(10))), calibration(listeners))
+    error = np.linalg.norm(found.position - places, axis=1)
+    bound = cramer_rao(listeners, jnp.asarray(places), 10.0, use=~np.isin(np.arange(9), gone))
+    typical = np.median(error / np.sqrt(np.trace(bound, axis1=1, axis2=2)))
+    # The median of the length of a plane normal error is 0.83 of its root mean square if round, 0.67 if a line.
+    assert 0.5 < typical < 1.1
+    assert np.median(error) < 0.01
+
+
+def test_a_microphone_that_was_not_calibrated_is_not_used(listeners, touches):
+    usable = np.arange(9) != 3
+    reasons = tuple("" if good else "what it hears does not fall with distance" for good in usable)
+    power = touches[1].copy()
+    power[:, 3] = 1e6
+    power[0, 3] = np.nan
+    found = locate(heard(power), calibration(listeners, usable, reasons))
+    assert not found.used[:, 3].any()
+    assert found.used[:, usable].all()
+    assert found.faults[3] == (
+        "NaN or infinite in 1 of 64 windows; not calibrated: what it hears does not fall with distance"
+    )
+    assert np.median(np.linalg.norm(found.position - touches[0], axis=1)) < 0.003
+    assert coverage(found, touches[0]) > 0.85
+
+
+def test_swapped_microphones_are_named(known, touches):
+    order = np.arange(9)
+    order[[2, 6]] = [6, 2]
+    found = locate(heard(touches[1][:, order]), known)
+    assert len(found.notes) == 1
+    assert found.notes[0].startswith("microphones 2 and 6 look exchanged")
+    assert np.isin(found.status, ["misfit", "outside", "two touches"]).mean() > 0.3
+
+
+@pytest.mark.parametrize("method", ["likelihood", "consistency"])
+def test_exact_data(method):
+    """Both methods, all over the skin, judged alike."""
+    listeners, places = array(9), inside(FRAMES, seed=11)
+    found = locate(heard(hear(listeners, places), floor=0), calibration(listeners), method=method)
+    np.testing.assert_allclose(found.position, places, atol=1e-6)
+    np.testing.assert_allclose(found.strength, 1.0, rtol=1e-6)
+    assert (found.status == "touch").all()
+    assert found.misfit.max() < 1e-6
+
+
+def test_the_papers_loss_is_judged_by_the_likelihood(known, touches):
+    """The same misfits and statuses, other places."""
+    mine, papers = locate(heard(touches[1]), known), locate(heard(touches[1]), known, method="consistency")
+    np.testing.assert_array_equal(papers.status, mine.status)
+    np.testing.assert_allclose(papers.misfit, mine.misfit)
+    apart = np.linalg.norm(papers.position - mine.position, axis=1)
+    assert 1e-5 < np.median(apart) < 0.01
+    assert np.median(np.linalg.norm(papers.position - touches[0], axis=1)) < 0.01
+
+
+@pytest.mark.slow
+def test_a_fine_raster_finds_the_same(known, touches):
+    """The paper's 200 × 200."""
+    plain = locate(heard(touches[1]), known)
+    fine = locate(heard(touches[1]), known, map_shape=(200, 200))
+    apart = np.linalg.norm(fine.position - plain.position, axis=1)
+    assert np.mean(apart < 1e-6) > 0.95
+
+
+def test_noise_that_only_negative_intensities_betray():
+    """No floor is known, and silence scatters about zero: still no touch, and touches are found."""
+    listeners = array(9, relative=0.05)
+    places = inside(32, seed=12, reach=0.7)
+    rng = np.random.default_rng(13)
+    power = np.concatenate([hear(listeners, places), np.zeros((32, 9))]) + 0.01 * rng.normal(size=(64, 9))
+    found = locate(heard(power, floor=0), calibration(listeners))
+    assert (found.status[32:] == "no touch").all()
+    assert found.located[:32].all()
+    assert np.median(np.linalg.norm(found.position[:32] - places, axis=1)) < 0.004
+    assert coverage(found, np.concatenate([places, places]), slice(0, 32)) > 0.8
+
+
+def test_frames_do_not_see_each_other(known, touches):
+    """But for what is judged of all, notes: a part of the frames gives what the whole does."""
+    whole = locate(heard(touches[1]), known)
+    for part in (slice(0, 33), slice(31, 64)):
+        some = locate(heard(touches[1][part]), known)
+        np.testing.assert_allclose(some.position, whole.position[part], rtol=1e-6, atol=1e-9)
+        np.testing.assert_array_equal(some.status, whole.status[part])
+
+
+def test_every_status_is_documented():
+    for status in STATUSES:
+        assert f'"{status}"' in Locations.__doc__
+
+
+@pytest.mark.parametrize(
+    ("options", "message"), [({"method": "magic"}, "consistency"), ({"map_shape": (1, 1)}, "rows")]
+)
+def test_bad_options(options, message, known, touches):
+    with pytest.raises(ValueError, match=message):
+        locate(heard(touches[1]), known, **options)

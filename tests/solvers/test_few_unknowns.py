@@ -1,0 +1,262 @@
+"""Small systems in batches against NumPy's own, and small minimisations between bounds against SciPy's."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from jeit_solvers import inverse_few, minimise_few, solve_few
+
+
+def definite(number, batch, seed=0, spread=3.0):
+    """Symmetric positive definite matrices (batch, n, n), of condition numbers up to some thousand."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(batch, number, number)))[0]
+    return (turn * np.exp(spread * rng.random((batch, 1, number)) * np.log(10) / 2)) @ turn.transpose(0, 2, 1)
+
+
+@pytest.mark.parametrize("number", range(1, 7))
+def test_systems_are_solved(number):
+    matrices = definite(number, 20)
+    right = np.random.default_rng(1).normal(size=(20, number))
+    expected = np.linalg.solve(matrices, right[..., None])[..., 0]
+    # Rounding times the condition number.
+    solved = solve_few(jnp.asarray(matrices.transpose(1, 2, 0)), jnp.asarray(right.T))
+    np.testing.assert_allclose(solved.T, expected, rtol=1e-10, atol=1e-10)
+    inverse = inverse_few(jnp.asarray(matrices.transpose(1, 2, 0)))
+    np.testing.assert_allclose(np.moveaxis(np.asarray(inverse), -1, 0), np.linalg.inv(matrices), rtol=1e-9, atol=1e-10)
+
+
+def test_scales_do_not_matter_to_systems():
+    """Unknowns of units as unlike as metres and logarithms: the matrix is scaled by D on both sides."""
+    matrix, right = definite(4, 1)[0], np.arange(1.0, 5.0)
+    scale = np.array([1e-9, 1.0, 1e6, 1e12])
+    solved = solve_few(jnp.asarray(matrix * np.outer(scale, scale))[:, :, None], jnp.asarray(right * scale)[:, None])
+    np.testing.assert_allclose(solved[:, 0] * scale, np.linalg.solve(matrix, right), rtol=1e-10)
+
+
+def test_only_the_broken_system_of_a_batch_is_nan():
+    matrices = np.array(definite(3, 4))
+    matrices[2] = -matrices[2]
+    solved = np.asarray(solve_few(jnp.asarray(matrices.transpose(1, 2, 0)), jnp.ones((3, 4))))
+    assert np.isnan(solved[:, 2]).all()
+    np.testing.assert_allclose(solved[:, [0, 1, 3]].T, np.linalg.solve(matrices[[0, 1, 3]], np.ones((3, 3, 1)))[..., 0])
+
+
+def test_systems_can_be_differentiated():
+    """d(A⁻¹ b) = -A⁻¹ dA A⁻¹ b + A⁻¹ db."""
+    matrix, change = definite(3, 2)
+    right, shift = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -1.0])
+    solved = np.linalg.solve(matrix, right)
+    expected = np.linalg.solve(matrix, shift - change @ solved)
+
+    def solve(matrix, right):
+        return solve_few(matrix[:, :, None], right[:, None])[:, 0]
+
+    _, slope = jax.jvp(solve, (jnp.asarray(matrix), jnp.asarray(right)), (jnp.asarray(change), jnp.asarray(shift)))
+    np.testing.assert_allclose(slope, expected, rtol=1e-10)
+
+
+# A quarter of the batch is enough for those that need more steps to be gathered.
+NUMBER, BATCH = 3, 200
+LOW, HIGH = np.array([-1.0, -0.5, -2.0]), np.array([1.0, 0.8, 0.3])
+
+
+@pytest.fixture(scope="module")
+def problems():
+    """Σ log cosh(A (x - c)) + ½ ridge: not quadratic, convex, with minima inside the box, on sides, in corners."""
+    rng = np.random.default_rng(2)
+    # The batch is the last axis of what is handed on.
+    return rng.normal(size=(5, NUMBER, BATCH)), 1.5 * rng.normal(size=(NUMBER, BATCH))
+
+
+def value_of(x, matrix, centre):
+    off = matrix @ (x - centre)
+    return np.sum(np.logaddexp(off, -off)) + 0.05 * np.sum((x - centre) ** 2)
+
+
+def expand(x, data):
+    matrix, centre = data
+    off = jnp.einsum("ijf,jf->if", matrix, x - centre)
+    value = jnp.sum(jnp.logaddexp(off, -off), axis=0) + 0.05 * jnp.sum((x - centre) ** 2, axis=0)
+    gradient = jnp.einsum("ijf,if->jf", matrix, jnp.tanh(off)) + 0.1 * (x - centre)
+    curvature = jnp.einsum("ijf,if,ikf->jkf", matrix, 1 - jnp.tanh(off) ** 2, matrix)
+    return value, gradient, curvature + 0.1 * jnp.eye(NUMBER)[:, :, None]
+
+
+@jax.jit
+def descend(start, problems, skip=None):
+    return minimise_few(
+        expand,
+        start,
+        problems,
+        lower=jnp.asarray(LOW)[:, None],
+        upper=jnp.asarray(HIGH)[:, None],
+        largest_step=jnp.full((NUMBER, 1), 0.5),
+        max_steps=100,
+        tolerance=1e-14,
+        skip=skip,
+    )
+
+
+@pytest.fixture(scope="module")
+def found(problems):
+    start = np.random.default_rng(3).uniform(LOW[:, None], HIGH[:, None], (NUMBER, BATCH))
+    return start, descend(jnp.asarray(start), problems)
+
+
+def test_same_minimum_as_scipy(problems, found):
+    """Inside the box, on its sides and in its corners: the problems hold all of them."""
+    x = np.asarray(found[1].x).T
+    assert found[1].converged.all()
+    for k in range(60):
+        mine, matrix, centre, value = x[k], problems[0][..., k], problems[1][:, k], found[1].value[k]
+        theirs = minimize(
+            value_of,
+            np.zeros(NUMBER),
+            args=(matrix, centre),
+            bounds=list(zip(LOW, HIGH, strict=True)),
+            method="L-BFGS-B",
+            options={"ftol": 1e-15, "gtol": 1e-9, "maxiter": 1000},
+        )
+        # SciPy differentiates numerically: its minimum is good to about 1e-5.
+        np.testing.assert_allclose(mine, theirs.x, atol=3e-5)
+        assert value <= theirs.fun + 1e-10
+        assert float(value) == pytest.approx(value_of(mine, matrix, centre), rel=1e-12)
+    held = ((x <= LOW + 1e-12) | (x >= HIGH - 1e-12)).sum(axis=1)
+    assert set(held) == {0, 1, 2, 3}
+
+
+def test_first_order_conditions(problems, found):
+    """The gradient is zero where x is free, and points out of the box where it is held."""
+    x = np.asarray(found[1].x)
+    gradient = np.asarray(expand(jnp.asarray(x), problems)[1])
+    free = (x > LOW[:, None]) & (x < HIGH[:, None])
+    assert np.abs(gradient[free]).max() < 1e-5
+    assert (gradient[x == LOW[:, None]] >= 0).all()
+    assert (gradient[x == HIGH[:, None]] <= 0).all()
+
+
+def test_the_start_does_not_matter(problems, found):
+    far = np.full((NUMBER, BATCH), 50.0)  # beyond the bounds
+    np.testing.assert_allclose(descend(jnp.asarray(far), problems).x, found[1].x, atol=1e-6)
+
+
+def test_a_batch_gives_what_a_loop_gives(problems, found):
+    start = jnp.asarray(found[0])
+    for k in range(0, BATCH, 40):
+        alone = descend(start[:, k : k + 1], tuple(part[..., k : k + 1] for part in problems))
+        np.testing.assert_allclose(alone.x[:, 0], found[1].x[:, k], atol=1e-10)
+        assert int(alone.steps) <= int(found[1].steps)
+    order = np.random.default_rng(4).permutation(BATCH)
+    shuffled = descend(start[:, order], tuple(part[..., order] for part in problems))
+    np.testing.assert_allclose(shuffled.x, found[1].x[:, order], atol=1e-12)
+
+
+def test_a_start_that_is_not_finite_stays_and_is_said(problems, found):
+    """And does no harm to the others."""
+    matrix = problems[0].copy()
+    matrix[..., 7] = np.nan
+    start = jnp.asarray(found[0])
+    result = descend(start, (matrix, problems[1]))
+    assert not result.converged[7]
+    np.testing.assert_array_equal(result.x[:, 7], start[:, 7])
+    others = np.arange(BATCH) != 7
+    assert result.converged[others].all()
+    np.testing.assert_allclose(result.x[:, others], found[1].x[:, others], atol=1e-12)
+
+
+def test_what_is_skipped_stays_and_is_not_converged(problems, found):
+    skip = np.random.default_rng(5).random(BATCH) < 0.6
+    start = jnp.asarray(found[0])
+    result = descend(start, problems, jnp.asarray(skip))
+    np.testing.assert_array_equal(result.converged, ~skip)
+    np.testing.assert_array_equal(result.x[:, skip], start[:, skip])
+    np.testing.assert_allclose(result.x[:, ~skip], found[1].x[:, ~skip], atol=1e-10)
+    nothing = descend(start, problems, jnp.ones(BATCH, bool))
+    np.testing.assert_array_equal(nothing.x, start)
+    assert int(nothing.steps) == 0
+
+
+def test_none_takes_more_steps_than_allowed(problems, found):
+    """Nor of those that are gathered after the first steps: then some are not converged, and none lies about it."""
+    limits = [jnp.asarray(bound)[:, None] for bound in (LOW, HIGH)]
+    options = {"lower": limits[0], "upper": limits[1], "largest_step": jnp.full((NUMBER, 1), 0.5), "tolerance": 1e-14}
+    some = minimise_few(expand, jnp.asarray(found[0]), problems, max_steps=8, **options)
+    assert int(some.steps) == 8
+    assert 0 < int(some.converged.sum()) < BATCH
+    done = np.asarray(some.converged)
+    np.testing.assert_allclose(some.x[:, done], found[1].x[:, done], atol=1e-6)
+
+
+def test_a_step_cut_off_at_a_bound_is_still_a_descent():
+    """The second unknown's bound cuts the Newton step so that what is left of it points up: that is no minimum."""
+    matrix, target = jnp.array([[8.55, -2.94], [-2.94, 1.14]]), jnp.array([[0.5], [2.3]])
+
+    def expand(x, _):
+        off = x - target
+        return 0.5 * jnp.sum(off * (matrix @ off), axis=0), matrix @ off, matrix[:, :, None]
+
+    limit = jnp.ones((2, 1))
+    result = minimise_few(expand, jnp.zeros((2, 1)), lower=-limit, upper=limit, largest_step=jnp.inf * limit)
+    # At y = 1 the least is where the first slope is nothing: 8.55 (x - 0.5) = 2.94 (1 - 2.3).
+    np.testing.assert_allclose(result.x[:, 0], [0.5 - 2.94 * 1.3 / 8.55, 1.0], atol=1e-6)
+    assert result.converged.all()
+
+
+def test_a_quadratic_takes_few_steps():
+    """Newton: the damping of a thousandth leaves a thousandth of the error a step, at first."""
+    matrix, target = jnp.asarray(definite(2, 1)[0]), jnp.array([0.3, -0.2])
+
+    def expand(x, _):
+        off = x - target[:, None]
+        return 0.5 * jnp.einsum("if,ij,jf->f", off, matrix, off), matrix @ off, matrix[:, :, None]
+
+    limit = jnp.full((2, 1), jnp.inf)
+    result = minimise_few(expand, jnp.zeros((2, 1)), lower=-limit, upper=limit, largest_step=limit)
+    assert result.converged.all()
+    assert int(result.steps) <= 6
+    np.testing.assert_allclose(result.x[:, 0], target, atol=1e-7)
+
+
+def test_steps_are_no_longer_than_asked():
+    """Where curvature promises a step of a thousand, one of at most 0.25 is made in each: after four, at most one."""
+
+    def expand(x, _):
+        slope = jnp.full_like(x, -1.0)
+        return -x[0], slope, jnp.full((1, 1, x.shape[1]), 1e-3)
+
+    limit = jnp.full((1, 1), jnp.inf)
+    result = minimise_few(
+        expand, jnp.zeros((1, 3)), lower=-limit, upper=limit, largest_step=jnp.full((1, 1), 0.25), max_steps=4
+    )
+    np.testing.assert_allclose(result.x, 1.0, rtol=1e-12)
+    assert not result.converged.any()
+    assert int(result.steps) == 4
+
+
+def test_never_higher_than_the_start():
+    """Along a valley that turns (Rosenbrock's), where full steps would go up; compared with SciPy's place, (1, 1)."""
+
+    def expand(x, _):
+        off = jnp.stack([1 - x[0], 10 * (x[1] - x[0] ** 2)])
+        one = jnp.ones_like(x[0])
+        rows = jnp.stack([jnp.stack([-one, 0 * one]), jnp.stack([-20 * x[0], 10 * one])])
+        return (
+            0.5 * jnp.sum(off**2, axis=0),
+            jnp.einsum("ijf,if->jf", rows, off),
+            jnp.einsum("ijf,ikf->jkf", rows, rows),
+        )
+
+    start = jnp.array([[-1.2, 0.0, 2.0], [1.0, 3.0, -2.0]])
+    limit = jnp.full((2, 1), jnp.inf)
+    costs = []
+    for steps in (1, 2, 4, 8, 100):
+        result = minimise_few(
+            expand, start, lower=-limit, upper=limit, largest_step=limit, max_steps=steps, tolerance=1e-16
+        )
+        costs.append(np.asarray(result.value))
+    assert (np.diff(costs, axis=0) <= 0).all()
+    assert result.converged.all()
+    np.testing.assert_allclose(result.x, 1.0, atol=1e-6)
