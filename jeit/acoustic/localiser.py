@@ -21,12 +21,14 @@ METHODS = {"likelihood": Likelihood, "consistency": Consistency}
 # Places screened: in the outline's box, and along the outline.
 _COARSE, _EDGE = 400, 240
 # Frames worked on together: all their arrays stay in the cache.
-_CHUNK, _CHUNK_OF_MAPS = 256, 32
-# Two valleys closer than this part of the skin's size are one; another is worth a descent if it is not deeper than so
-# many times the best; on rasters of more pixels only the best is descended.
-_SAME_VALLEY, _WORTH, _FINE = 0.05, 4.0, 2000
+_CHUNK, _CHUNK_OF_MAPS = 1024, 32
+# Two valleys closer than this part of the skin's size are one; another is worth a descent if, screened, it is not worse
+# than so many times the best and so much more; on rasters of more pixels only the best is descended.
+_SAME_VALLEY, _WORTH, _WORTH_MORE, _FINE = 0.05, 1.5, 8.0, 2000
 # Relative error of the decay models with which frames are screened, at least.
 _SCREENED_AT = 0.2
+# Steps into a second valley before it is compared with the first, and by how much its cost may then be greater.
+_TRIAL_STEPS, _PROMISING, _MOST_STEPS = 8, 8.0, 30
 # What a step must promise, relative to the cost; an exact Newton step follows.
 _TOLERANCE = 1e-12
 
@@ -215,14 +217,23 @@ def _refine(localiser: Localiser, power, use, first, second, worth) -> Estimate:
 def _valleys(maps, pixels: Pixels):
     """Chart coordinates (2, F) of each map's least pixel, and of the least local minimum elsewhere, with which frames
     have one worth a descent (F,)."""
-    known = ~jnp.isnan(maps) if pixels.full else pixels.inside & ~jnp.isnan(maps)
-    values = jnp.where(known, maps, jnp.inf)
-    best = jnp.argmin(values, axis=1)
-    first = pixels.chart[:, best]
     rows, columns = pixels.shape
+    inside = pixels.inside.reshape(rows, columns)
+
+    def known(values, inside):
+        fair = ~jnp.isnan(values) if pixels.full else inside & ~jnp.isnan(values)
+        return jnp.where(fair, values, jnp.inf)
+
+    # The least row first, then the least pixel in it, which is quicker than to look for the pixel at once.
+    square = maps.reshape(-1, rows, columns)
+    row = jnp.argmin(jnp.min(known(square, inside), axis=2), axis=1)
+    in_row = known(jnp.take_along_axis(square, row[:, None, None], axis=1)[:, 0], inside[row])
+    best = row * columns + jnp.argmin(in_row, axis=1)
+    first = pixels.chart[:, best]
     if rows * columns > _FINE:  # where pixels are that fine, noise makes valleys of its own
         return first, first, jnp.zeros(best.shape, bool)
-    square = values.reshape(-1, rows, columns)
+    square = known(square, inside)
+    values = square.reshape(len(best), -1)
     wide = jnp.pad(square, ((0, 0), (1, 1), (1, 1)), constant_values=jnp.inf)
     around = [wide[:, i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
     lowest = jnp.isfinite(square)
@@ -232,7 +243,7 @@ def _valleys(maps, pixels: Pixels):
     rivals = jnp.where(lowest, values, jnp.inf)
     other = jnp.argmin(rivals, axis=1)
     least, second = jnp.min(values, axis=1), jnp.min(rivals, axis=1)
-    return first, pixels.chart[:, other], second < _WORTH * (least + 1)
+    return first, pixels.chart[:, other], second < _WORTH * least + _WORTH_MORE
 
 
 def _descend(objective, first, second, worth):
@@ -240,13 +251,16 @@ def _descend(objective, first, second, worth):
     more than what lies beyond, by how much the rival valley does, whether converged, and the (start, end) of the side
     of the outline on which frames were held, NaN for those inside."""
     surface = objective.listeners.surface
-    found = _minimise(objective, first, None)
+    found = _minimise(objective, objective.start(first), None)
     unknowns, converged = found.x, found.converged
     value = jnp.where(jnp.isfinite(found.value), found.value, jnp.inf)
     within = surface.outline.contains(unknowns[:2].T)
     rival, least = jnp.full(value.shape, jnp.inf), value
     if worth is not None:
-        other = _minimise(objective, second, ~worth)
+        # A few steps show whether that valley is any good; only then is its bottom sought.
+        tried = _minimise(objective, objective.start(second), ~worth, max_steps=_TRIAL_STEPS)
+        worth = worth & (tried.value < value + _PROMISING)
+        other = _minimise(objective, tried.x, ~worth)
         other_value = jnp.where(worth & jnp.isfinite(other.value), other.value, jnp.inf)
         other_within = surface.outline.contains(other.x[:2].T)
         apart = jnp.linalg.norm(other.x[:2] - unknowns[:2], axis=0) > _SAME_VALLEY * size(surface)
@@ -278,9 +292,12 @@ def _descend(objective, first, second, worth):
     return unknowns, excess, rival, converged, side
 
 
-def _minimise(objective, chart, skip) -> Minimum:
-    """Within three times the outline's box; steps of at most a quarter of the skin, and a factor of ten in strength."""
-    surface, start = objective.listeners.surface, objective.start(chart)
+def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimum:
+    """Within three times the outline's box; steps of at most a quarter of the skin, and a factor of ten in strength.
+
+    The last of many steps are taken with exact Hessians; the first `max_steps`, where so many are asked for, are not.
+    """
+    surface = objective.listeners.surface
     low, high = box(surface)
     rest = jnp.full(start.shape[0] - 2, jnp.inf)
     reach = size(surface)
@@ -292,7 +309,8 @@ def _minimise(objective, chart, skip) -> Minimum:
         lambda x, frames: of(frames).expand(x),
         start,
         objective.frames,
-        finish=lambda x, frames: _exactly(of(frames), x),
+        finish=None if max_steps is not None else lambda x, frames: _exactly(of(frames), x),
+        max_steps=max_steps or _MOST_STEPS,
         lower=jnp.concatenate([low - reach, -rest])[:, None],
         upper=jnp.concatenate([high + reach, rest])[:, None],
         largest_step=jnp.concatenate([jnp.full(2, reach / 4), jnp.full_like(rest, 2.3)])[:, None],

@@ -140,7 +140,7 @@ def chart_grid(surface: AbstractSurface, columns: int, rows: int) -> tuple[np.nd
     x = left + (right - left) * (np.arange(columns) + 0.5) / columns
     y = bottom + (top - bottom) * (np.arange(rows) + 0.5) / rows
     grid = np.stack(np.meshgrid(x, y))
-    return grid, np.asarray(surface.outline.contains(np.moveaxis(grid, 0, -1)))
+    return grid, np.asarray(_contains(surface.outline, jnp.asarray(np.moveaxis(grid, 0, -1))))
 
 
 def sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[Array, "2 K"]]:
@@ -148,6 +148,10 @@ def sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[Array, "
     loops = (surface.outline.vertices, *surface.outline.holes)
     start, end = (jnp.concatenate([jnp.roll(loop, -shift, axis=0) for loop in loops]) for shift in (0, 1))
     return start.T, end.T
+
+
+# Compiled once for each size, not at every call.
+_contains = eqx.filter_jit(Polygon.contains)
 
 
 def _thin_plate(squared):

@@ -103,7 +103,7 @@ def minimise_few(
     largest_step: Float[Array, "n 1"],
     max_steps: int = 30,
     tolerance: float = 1e-10,
-    whole_steps: int = 6,
+    whole_steps: int = 8,
     skip: Bool[Array, " F"] | None = None,
 ) -> Minimum:
     """Minimise F functions of n unknowns between bounds by projected, damped Newton steps (Bertsekas 1982).
