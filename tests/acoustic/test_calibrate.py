@@ -159,6 +159,7 @@ def drawn(exact):
     return errors, np.array([fit.calibration.standard_errors for fit in fits]), fits
 
 
+@pytest.mark.slow
 def test_standard_errors_are_the_errors(drawn):
     """Root mean square of z-scores. The 25 of a draw are correlated through the scale: 6 draws are good to 12 %."""
     errors, said, _ = drawn

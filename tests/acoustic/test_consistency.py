@@ -125,6 +125,7 @@ def test_expansion(listeners, frames):
     np.testing.assert_allclose(matrix, 2 * np.einsum("kmf,lmf->klf", rise, rise), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_minimum_is_scipys(listeners, frames):
     """From four starts each: the localiser's is as low as the lowest of them."""
     power, use = frames

@@ -99,7 +99,8 @@ def both_places(place, power, a, b, microphones):
     return places[np.argsort(np.linalg.norm(places - place, axis=1))]
 
 
-@quick_likelihood
+@pytest.mark.slow
+@both
 def test_three_microphones(method):
     """Three are enough where the other place that they allow is off the skin; else that one is as good."""
     listeners, places = array(3), inside(300)
@@ -119,7 +120,8 @@ def test_three_microphones(method):
     assert (found["freedom"] == 0).all()
 
 
-@quick_likelihood
+@pytest.mark.slow
+@both
 def test_an_outline_that_is_no_rectangle(method):
     """Inside an L to a micrometre; what sounds from its notch is held on its edge."""
     listeners, places = array(9, outline=L_SHAPE), inside(300, outline=L_SHAPE)
@@ -146,7 +148,8 @@ def cylinder():
     return array(9, outline=on(rim), points=on(taps), microphones=on(MICROPHONES[9], 0.01), relative=0.02)
 
 
-@quick_consistency
+@pytest.mark.slow
+@both
 def test_on_a_curved_skin(cylinder, method):
     places = np.asarray(cylinder.surface.place(jnp.asarray(inside(200, reach=0.9).T))).T
     found = localise(cylinder, hear(cylinder, places), method, number=256)
@@ -213,7 +216,7 @@ def stepped(point, direction, step):
 PARTS = {"microphones": [0], "a": [1], "b": [2], "power": [3], "all": [0, 1, 2, 3]}
 
 
-@both
+@quick_likelihood
 def test_gradients(method, moving):
     """Forward mode, reverse mode and central differences agree, in each of what positions depend on."""
     point, direction, located = moving
@@ -417,7 +420,8 @@ def test_too_few_readings_give_nan(method, mixed):
     np.testing.assert_array_equal(found["freedom"][:4], [0, 0, 0, 6])
 
 
-@quick_consistency
+@pytest.mark.slow
+@both
 def test_maps(method):
     """Least where the source is found, to a pixel; blank beyond the outline; bottom row first."""
     listeners, places = array(9, outline=L_SHAPE, relative=0.02), inside(20, outline=L_SHAPE, reach=0.9)

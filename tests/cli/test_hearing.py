@@ -96,6 +96,7 @@ def test_samples_to_a_track(name, folder, tmp_path):
         assert (np.abs(off) < 5 * np.array([float(row[f"std_{axis}_m"]) for row in late])).all()
 
 
+@pytest.mark.slow
 def test_the_papers_loss(folder, tmp_path):
     """`--method consistency` finds exact places too."""
     command = ["locate", str(folder / "recording.npz"), "-c", str(folder / "cal.json"), "-o", str(tmp_path), "-q"]
@@ -113,6 +114,7 @@ def test_silence_is_no_error(folder, tmp_path):
     assert json.loads((tmp_path / "report.json").read_text("utf-8"))["touches"] == []
 
 
+@pytest.mark.slow
 def test_exchanged_microphones_are_named(folder, tmp_path):
     """Two plugs exchanged since the calibration: the report's notes name them."""
     with np.load(folder / "recording.npz") as arrays:
