@@ -13,24 +13,19 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.acoustic.consistency import Consistency
+from jeit.acoustic.descent import descend, differentiable
 from jeit.acoustic.likelihood import Likelihood, Listeners
-from jeit.acoustic.surface import box, chart_grid, in_space, sides, size
-from jeit_solvers import Minimum, definite_few, hessian_few, inverse_few, minimise_few, solve_few
+from jeit.acoustic.raster import Pixels, valleys
+from jeit.acoustic.surface import box, in_space, size
+from jeit_solvers import inverse_few
 
 METHODS = {"likelihood": Likelihood, "consistency": Consistency}
-# Places screened: in the outline's box, and along the outline.
-_COARSE, _EDGE = 400, 240
+# Places screened, in the outline's box.
+_COARSE = 400
 # Frames worked on together: all their arrays stay in the cache.
 _CHUNK, _CHUNK_OF_MAPS = 1024, 32
-# Two valleys closer than this part of the skin's size are one; another is worth a descent if, screened, it is not worse
-# than so many times the best and so much more; on rasters of more pixels only the best is descended.
-_SAME_VALLEY, _WORTH, _WORTH_MORE, _FINE = 0.05, 1.5, 8.0, 2000
 # Relative error of the decay models with which frames are screened, at least.
 _SCREENED_AT = 0.2
-# Steps into a second valley before it is compared with the first, and by how much its cost may then be greater.
-_TRIAL_STEPS, _PROMISING, _MOST_STEPS = 8, 8.0, 30
-# What a step must promise, relative to the cost; an exact Newton step follows.
-_TOLERANCE = 1e-12
 
 
 class Estimate(eqx.Module):
@@ -50,24 +45,6 @@ class Estimate(eqx.Module):
     excess: Float[Array, " F"]
     rival: Float[Array, " F"]
     converged: Bool[Array, " F"]
-
-
-class Pixels(eqx.Module):
-    """A raster over the outline's box: chart coordinates (2, P), which are `inside` (P,), rows and columns, and
-    whether all are inside (`full`)."""
-
-    chart: Float[Array, "2 P"]
-    inside: Bool[Array, " P"]
-    shape: tuple[int, int] = eqx.field(static=True)
-    full: bool = eqx.field(static=True)
-
-    @classmethod
-    def create(cls, surface, columns: int, rows: int) -> "Pixels":
-        """Of so many pixels; bottom row first."""
-        grid, within = chart_grid(surface, columns, rows)
-        if not within.any():
-            raise ValueError(f"shape: none of {columns} × {rows} pixels has its middle inside the outline; take more.")
-        return cls(jnp.asarray(grid.reshape(2, -1)), jnp.asarray(within.ravel()), (rows, columns), bool(within.all()))
 
 
 class Localiser(eqx.Module):
@@ -176,7 +153,7 @@ def _starts(localiser: Localiser, power, use):
 
     def screen(power, use):
         maps = METHODS[localiser.method].create(power, use, still).screen(features)
-        first, second, worth = _valleys(maps, pixels)
+        first, second, worth = valleys(maps, pixels)
         return first.T, second.T, worth
 
     most = _CHUNK if localiser.pixels is None else _CHUNK_OF_MAPS
@@ -205,202 +182,13 @@ def _refine(localiser: Localiser, power, use, first, second, worth) -> Estimate:
     fixed = jax.lax.stop_gradient(listeners)
     still = METHODS[localiser.method].create(jax.lax.stop_gradient(power), use, fixed)
     # Where one pixel of many was the start there is no second valley to try.
-    unknowns, excess, rival, converged, side = _descend(
+    unknowns, excess, rival, converged, side = descend(
         still, first, second, worth if localiser.pixels is None else None
     )
     likelihood = Likelihood.create(power, use, listeners)
     objective = likelihood if localiser.method == "likelihood" else Consistency.create(power, use, listeners)
-    unknowns = _differentiable(objective, unknowns, side, size(fixed.surface))
+    unknowns = differentiable(objective, unknowns, side, size(fixed.surface))
     return _describe(objective, likelihood, unknowns, excess, rival, converged)
-
-
-def _valleys(maps, pixels: Pixels):
-    """Chart coordinates (2, F) of each map's least pixel, and of the least local minimum elsewhere, with which frames
-    have one worth a descent (F,)."""
-    rows, columns = pixels.shape
-    inside = pixels.inside.reshape(rows, columns)
-
-    def known(values, inside):
-        fair = ~jnp.isnan(values) if pixels.full else inside & ~jnp.isnan(values)
-        return jnp.where(fair, values, jnp.inf)
-
-    # The least row first, then the least pixel in it, which is quicker than to look for the pixel at once.
-    square = maps.reshape(-1, rows, columns)
-    row = jnp.argmin(jnp.min(known(square, inside), axis=2), axis=1)
-    in_row = known(jnp.take_along_axis(square, row[:, None, None], axis=1)[:, 0], inside[row])
-    best = row * columns + jnp.argmin(in_row, axis=1)
-    first = pixels.chart[:, best]
-    if rows * columns > _FINE:  # where pixels are that fine, noise makes valleys of its own
-        return first, first, jnp.zeros(best.shape, bool)
-    square = known(square, inside)
-    values = square.reshape(len(best), -1)
-    wide = jnp.pad(square, ((0, 0), (1, 1), (1, 1)), constant_values=jnp.inf)
-    around = [wide[:, i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
-    lowest = jnp.isfinite(square)
-    for neighbour in around:
-        lowest &= square <= neighbour
-    lowest = lowest.reshape(values.shape).at[jnp.arange(len(best)), best].set(False)
-    rivals = jnp.where(lowest, values, jnp.inf)
-    other = jnp.argmin(rivals, axis=1)
-    least, second = jnp.min(values, axis=1), jnp.min(rivals, axis=1)
-    return first, pixels.chart[:, other], second < _WORTH * least + _WORTH_MORE
-
-
-def _descend(objective, first, second, worth):
-    """From both starts (2, F), the second only where that is worth it: unknowns (n, F), by how much the outline costs
-    more than what lies beyond, by how much the rival valley does, whether converged, and the (start, end) of the side
-    of the outline on which frames were held, NaN for those inside."""
-    surface = objective.listeners.surface
-    found = _minimise(objective, objective.start(first), None)
-    unknowns, converged = found.x, found.converged
-    value = jnp.where(jnp.isfinite(found.value), found.value, jnp.inf)
-    within = surface.outline.contains(unknowns[:2].T)
-    rival, least = jnp.full(value.shape, jnp.inf), value
-    if worth is not None:
-        # A few steps show whether that valley is any good; only then is its bottom sought.
-        tried = _minimise(objective, objective.start(second), ~worth, max_steps=_TRIAL_STEPS)
-        worth = worth & (tried.value < value + _PROMISING)
-        other = _minimise(objective, tried.x, ~worth)
-        other_value = jnp.where(worth & jnp.isfinite(other.value), other.value, jnp.inf)
-        other_within = surface.outline.contains(other.x[:2].T)
-        apart = jnp.linalg.norm(other.x[:2] - unknowns[:2], axis=0) > _SAME_VALLEY * size(surface)
-        rival = jnp.where(apart & worth & within & other_within, jnp.abs(other_value - value), jnp.inf)
-        least = jnp.minimum(value, other_value)
-        # Of two valleys of which one lies beyond the outline, the other is taken; the outline itself may yet be better.
-        better = jnp.where(other_within == within, other_value < value, other_within & jnp.isfinite(other_value))
-        unknowns = jnp.where(better, other.x, unknowns)
-        converged = jnp.where(better, other.converged, converged)
-        value, within = jnp.where(better, other_value, value), jnp.where(better, other_within, within)
-    # Places beyond the outline give way to the best on it; so do valleys inside that are worse than one beyond.
-    beyond = jnp.isfinite(value) & (~within | (least < value))
-    nowhere = jnp.full((2, 2, value.size), jnp.nan)
-
-    def hold(_):
-        held, side = _on_edge(objective, ~beyond)
-        moved = beyond & (~within | (held.value < value))
-        return (
-            jnp.where(moved, held.x, unknowns),
-            jnp.where(beyond, jnp.where(moved, held.value, value) - least, 0.0),
-            jnp.where(moved, held.converged, converged),
-            jnp.where(moved, side, nowhere),
-        )
-
-    def leave(_):
-        return unknowns, jnp.zeros_like(value), converged, nowhere
-
-    unknowns, excess, converged, side = jax.lax.cond(jnp.any(beyond), hold, leave, None)
-    return unknowns, excess, rival, converged, side
-
-
-def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimum:
-    """Within three times the outline's box; steps of at most a quarter of the skin, and a factor of ten in strength.
-
-    The last of many steps are taken with exact Hessians; the first `max_steps`, where so many are asked for, are not.
-    """
-    surface = objective.listeners.surface
-    low, high = box(surface)
-    rest = jnp.full(start.shape[0] - 2, jnp.inf)
-    reach = size(surface)
-
-    def of(frames):
-        return type(objective)(*frames, objective.listeners)
-
-    return minimise_few(
-        lambda x, frames: of(frames).expand(x),
-        start,
-        objective.frames,
-        finish=None if max_steps is not None else lambda x, frames: _exactly(of(frames), x),
-        max_steps=max_steps or _MOST_STEPS,
-        lower=jnp.concatenate([low - reach, -rest])[:, None],
-        upper=jnp.concatenate([high + reach, rest])[:, None],
-        largest_step=jnp.concatenate([jnp.full(2, reach / 4), jnp.full_like(rest, 2.3)])[:, None],
-        tolerance=_TOLERANCE,
-        skip=skip,
-    )
-
-
-def _exactly(objective, x) -> tuple[Array, Array, Array]:
-    """The objective's expansion with the exact Hessian, where that is positive definite: near a minimum the last steps
-    are few then, however badly the minimum fits."""
-    value, gradient, model = objective.expand(x)
-    hessian = hessian_few(objective.cost, x)
-    return value, gradient, jnp.where(definite_few(hessian), hessian, model)
-
-
-def _on_edge(objective, skip) -> tuple[Minimum, Array]:
-    """The best place on the outline: the best of many, refined along its side. Also the side, (2, 2, F).
-
-    Not of the frames to `skip` (F,).
-    """
-    start, end = sides(objective.listeners.surface)
-    length = jnp.linalg.norm(end - start, axis=0)
-    # Places at equal steps along the whole outline, as (side, share of the side).
-    stops = jnp.concatenate([jnp.zeros(1), jnp.cumsum(length)])
-    walked = stops[-1] * (jnp.arange(_EDGE) + 0.5) / _EDGE
-    which = jnp.clip(jnp.searchsorted(stops, walked, side="right") - 1, 0, length.size - 1)
-    share = (walked - stops[which]) / length[which]
-    chart = start[:, which] + share * (end - start)[:, which]
-    maps = objective.screen(type(objective).features(objective.listeners, chart))
-    best = jnp.argmin(jnp.where(jnp.isnan(maps), jnp.inf, maps), axis=1)
-    origin, along = start[:, which[best]], (end - start)[:, which[best]]
-    first = objective.start(chart[:, best])[2:]
-
-    def unknowns_of(z, origin, along):
-        return jnp.concatenate([origin + z[0] * along, z[1:]])
-
-    def expand(z, data):
-        origin, along, frames = data
-        some = type(objective)(*frames, objective.listeners)
-        value, gradient, matrix = some.expand(unknowns_of(z, origin, along))
-        turned = jnp.concatenate([jnp.sum(along * gradient[:2], axis=0)[None], gradient[2:]])
-        rows = jnp.concatenate([jnp.einsum("kf,klf->lf", along, matrix[:2])[None], matrix[2:]])
-        columns = jnp.concatenate([jnp.einsum("klf,lf->kf", rows[:, :2], along)[:, None], rows[:, 2:]], axis=1)
-        return value, turned, columns
-
-    rest = first.shape[0]
-    found = minimise_few(
-        expand,
-        jnp.concatenate([share[best][None], first]),
-        (origin, along, objective.frames),
-        lower=jnp.array([0.0] + rest * [-jnp.inf])[:, None],
-        upper=jnp.array([1.0] + rest * [jnp.inf])[:, None],
-        largest_step=jnp.array([0.5] + rest * [2.3])[:, None],
-        tolerance=_TOLERANCE,
-        skip=skip,
-    )
-    end_of = origin + along
-    corner = (found.x[0] <= 0) | (found.x[0] >= 1)
-    # Held in a corner, a frame moves nowhere: its side has no length.
-    side = jnp.stack([origin, jnp.where(corner, origin, end_of)])
-    return Minimum(unknowns_of(found.x, origin, along), found.value, found.converged, found.steps), side
-
-
-def _differentiable(objective, unknowns, side, reach):
-    """The minimum as a function of everything in `objective`: one Newton step from it, x − H⁻¹ ∇cost, is zero in value
-    and, H and x being constants, −H⁻¹ ∂∇cost in derivative, as the implicit function theorem has it."""
-    at = jax.lax.stop_gradient(unknowns)
-
-    def finite_cost(at):
-        cost = objective.cost(at)
-        return jnp.where(jnp.isfinite(cost), cost, 0.0)
-
-    matrix = hessian_few(jax.lax.stop_gradient(objective).cost, at)
-    gradient = jax.grad(lambda at: jnp.sum(finite_cost(at)))(at)
-    # Frames held on the outline move along their side only: the rest of the step is projected out.
-    held = ~jnp.isnan(side[0, 0])
-    along = jnp.where(held, side[1] - side[0], 0.0)
-    length = jnp.linalg.norm(jnp.where(along == 0, 1e-300, along), axis=0)
-    along = jnp.where(length > 1e-12 * reach, along / length, 0.0)
-    plane = jnp.where(held, along[:, None] * along[None], jnp.eye(2)[:, :, None])
-    keep = jnp.zeros_like(matrix) + jnp.eye(len(at))[:, :, None]
-    keep = keep.at[:2, :2].set(plane)
-    gradient = jnp.einsum("klf,lf->kf", keep, gradient)
-    inner = jnp.einsum("klf,lmf,mnf->knf", keep, matrix, keep)
-    trace = jnp.maximum(jnp.einsum("kkf->f", inner), 1e-300)
-    matrix = inner + (jnp.eye(len(at))[:, :, None] - keep) * trace
-    step = solve_few(matrix, gradient)
-    usable = jnp.all(jnp.isfinite(step), axis=0) & (jnp.max(jnp.abs(step[:2]), axis=0) < 1e-3 * reach)
-    return at - jnp.where(usable, step, 0.0)
 
 
 def _describe(objective, likelihood: Likelihood, unknowns, excess, rival, converged) -> Estimate:

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.acoustic.likelihood import Likelihood, Listeners
-from jeit.acoustic.localiser import Pixels
+from jeit.acoustic.raster import Pixels
 from jeit.acoustic.surface import box, in_space, size
 from jeit_solvers import inverse_few, minimise_few
 
