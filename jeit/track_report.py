@@ -61,13 +61,15 @@ def report(
     for number, touch in enumerate(track.touches, 1):
         frames = slice(touch.first, touch.last + 1)
         strength = locations.strength[frames]
+        kinds = [str(kind) for kind in locations.status[frames] if kind != "no touch"]
         touches.append(
             {
                 "touch": number,
                 "onset_s": touch.onset,
                 "offset_s": touch.offset,
-                "path_length_m": touch.length,
+                "path_length_m": _number(touch.length),
                 "mean_position_m": _numbers(np.nanmean(track.position[frames], axis=0)),
+                "status": {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)},
                 "greatest_strength": _number(np.nanmax(strength)),
             }
         )

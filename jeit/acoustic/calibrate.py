@@ -87,9 +87,14 @@ def calibrate_microphones(
     fit.run(taps.microphones)
     reasons = fit.judge(faults)
     good = np.array([not reason for reason in reasons])
-    tried = fit.use.T
-    if good.sum() >= 3 and not good.all():
-        fit.refine_without(~good)
+    tried, bad = fit.use.T, ~good
+    while good.sum() >= 3 and bad.any():
+        fit.refine_without(bad)
+        # What others were left out for may show in these only now.
+        again = fit.judge(("",) * len(good))
+        bad = np.array([ok and bool(reason) for ok, reason in zip(good, again, strict=True)])
+        reasons = tuple(new if worse else old for new, old, worse in zip(again, reasons, bad, strict=True))
+        good = good & ~bad
     if good.sum() < 3:
         told = "; ".join(f"microphone {k}: {reason}" for k, reason in enumerate(reasons) if reason)
         raise ValueError(

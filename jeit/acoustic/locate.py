@@ -12,6 +12,7 @@ from jeit.acoustic.likelihood import Listeners
 from jeit.acoustic.localiser import Estimate, Localiser
 from jeit.acoustic.noise import IntensityNoise
 from jeit.acoustic.recording import Intensities, Recording
+from jeit.acoustic.surface import size
 from jeit.acoustic.swaps import find_swaps
 from jeit.acoustic.two_sources import locate_two
 
@@ -121,6 +122,7 @@ def locate(
         excess = np.zeros(frames)
         excess[solve] = np.asarray(judge.excess)[:number]
         status[(status == "misfit") & (excess > _OUTSIDE)] = "outside"
+        _bound(status, result, float(size(listeners.surface)))
         notes = _notes(status, heard, use, listeners)
     return Locations(
         np.asarray(heard.times),
@@ -169,6 +171,17 @@ def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, list
     left = np.flatnonzero(status == "misfit")
     wide = result["misfit"][left] / np.maximum(result["freedom"][left], 1)
     result["covariance"][left] *= np.maximum(wide, 1.0)[:, None, None]
+
+
+def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> None:
+    """A touch not known to a fourth of the skin's size is ambiguous; no covariance is wider than the skin."""
+    located = np.isfinite(result["position"]).all(axis=1)
+    finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
+    width = np.zeros(len(status))
+    width[finite] = np.sqrt(np.abs(np.linalg.eigvalsh(result["covariance"][finite])).max(axis=1))
+    status[located & (status == "touch") & (~finite | (width > reach / 4))] = "ambiguous"
+    boundless = located & (~finite | (width > reach))
+    result["covariance"][boundless] = (reach / 2) ** 2 * np.eye(result["covariance"].shape[1])
 
 
 def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, listeners: Listeners) -> list[str]:

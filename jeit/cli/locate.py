@@ -69,6 +69,7 @@ def locate(
         write_track(output, found, path, known, heard, method=method)
     if quiet:
         return
+    import numpy as np
     from rich.table import Table
 
     from jeit.cli.console import pairs
@@ -81,13 +82,17 @@ def locate(
     console.print(pairs(found.name, rows))
     if path.touches:
         console.print()
-        table = Table("touch", "from / s", "to / s", "x / mm", "y / mm", "path / mm", box=None, padding=(0, 2))
+        table = Table("touch", "from / s", "to / s", "x / mm", "y / mm", "± / mm", "path / mm", "frames", box=None)
         for column in table.columns:
             column.justify = "right"
         for number, touch in enumerate(path.touches, 1):
-            x, y = 1e3 * path.position[touch.first : touch.last + 1, :2].mean(axis=0)
-            figures = (f"{touch.onset:.3f}", f"{touch.offset:.3f}", f"{x:.1f}", f"{y:.1f}", f"{1e3 * touch.length:.0f}")
-            table.add_row(str(number), *figures)
+            frames = slice(touch.first, touch.last + 1)
+            x, y = 1e3 * path.position[frames, :2].mean(axis=0)
+            off = 1e3 * float(np.median(np.sqrt(np.linalg.eigvalsh(path.covariance[frames])[:, -1])))
+            places = (f"{x:.1f}", f"{y:.1f}", f"{off:.1f}", f"{1e3 * touch.length:.0f}")
+            kinds = [kind for kind in found.status[frames] if kind != "no touch"]
+            said = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+            table.add_row(str(number), f"{touch.onset:.3f}", f"{touch.offset:.3f}", *places, said)
         console.print(table)
     console.print()
     console.print(f"[dim]Written:[/dim] {output / 'track.csv'}, report.json, track.png", soft_wrap=True)

@@ -354,3 +354,16 @@ def test_every_status_is_documented():
 def test_bad_options(options, message, known, touches):
     with pytest.raises(ValueError, match=message):
         locate(heard(touches[1]), known, **options)
+
+
+def test_a_place_known_to_nothing_is_ambiguous():
+    """Covariances wider than the skin, or none at all, are bounded, and such places are not called touches."""
+    from jeit.acoustic.locate import _bound
+
+    status = np.array(["touch", "touch", "touch", "outside"], object)
+    covariance = np.stack([1e-6 * np.eye(2), np.full((2, 2), np.nan), 4e10 * np.ones((2, 2)), np.full((2, 2), np.nan)])
+    result = {"position": np.zeros((4, 2)), "covariance": covariance}
+    _bound(status, result, 0.2)
+    assert list(status) == ["touch", "ambiguous", "ambiguous", "outside"]
+    np.testing.assert_allclose(result["covariance"][1:], np.broadcast_to(0.01 * np.eye(2), (3, 2, 2)))
+    np.testing.assert_allclose(result["covariance"][0], 1e-6 * np.eye(2))
