@@ -5,6 +5,7 @@ the noise; then weights from it. Taps that no microphone agrees with are left ou
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -23,7 +24,7 @@ from jeit.acoustic.decay_fit import (
 from jeit.acoustic.faults import intensity_faults
 from jeit.acoustic.intensity import IntensitySettings, tap_intensities
 from jeit.acoustic.likelihood import Listeners
-from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise
+from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise, below_nothing
 from jeit.acoustic.recording import Taps
 from jeit.acoustic.surface import make_surface
 
@@ -74,7 +75,7 @@ def calibrate_microphones(
     if taps.samples is None:
         assert taps.power is not None
         power, (usable, faults) = taps.power, intensity_faults(taps.power)
-        noise = IntensityNoise.create(power.shape[1], deviation=_below_nothing(power, usable))
+        noise = IntensityNoise.create(power.shape[1], deviation=below_nothing(power, usable))
         known_noise = False
     else:
         settings = intensity if intensity is not None else IntensitySettings()
@@ -230,11 +231,9 @@ class _Fit:
         free = np.asarray(self.free & good)
         if free.sum() < 2:
             return np.full(values.shape, np.nan)
-        ones = np.zeros(values.shape)
-        ones[0] = free
-        if "b" in self.kind.parameters:
-            ones[self.kind.parameters.index("b")] = -1.0 * free
-        covariance = log_covariance(self._problem(), values, jnp.asarray(strength), free, ones.ravel())
+        # The convention that fixes the scale, the sum of log f_i(0), as the parameters move it.
+        scale = jax.grad(lambda v: jnp.sum(jnp.where(free, jnp.log(self.kind.from_logarithms(v).gain), 0.0)))(values)
+        covariance = log_covariance(self._problem(), values, jnp.asarray(strength), free, np.asarray(scale).ravel())
         return np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(values.shape)
 
     def _level(self) -> Array:
@@ -324,7 +323,7 @@ class _Fit:
             if score[best] < score[0] - 6:
                 deviation[k] = top * shares[best]
         self.noise = IntensityNoise.create(
-            len(received), deviation=np.maximum(deviation, _below_nothing(self.power.T, np.isfinite(self.power.T)))
+            len(received), deviation=np.maximum(deviation, below_nothing(self.power.T, np.isfinite(self.power.T)))
         )
         self.usable = np.isfinite(self.power) & (
             np.nan_to_num(self.power, nan=-np.inf) + np.asarray(self.noise.floor)[:, None] > 0
@@ -350,10 +349,3 @@ class _Fit:
             if self.free[k]:
                 del self.at_bound[int(k)]
         return jnp.asarray(array)
-
-
-def _below_nothing(power: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """The deviation that negative intensities betray, (M,): what is below nothing can only be noise."""
-    below = np.where(usable & (power < 0), power, 0.0)
-    number = (below < 0).sum(axis=0)
-    return np.sqrt((below**2).sum(axis=0) / np.maximum(number, 1))

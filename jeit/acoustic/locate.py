@@ -10,7 +10,7 @@ from jeit.acoustic.calibration import Calibration
 from jeit.acoustic.intensity import IntensitySettings, intensities
 from jeit.acoustic.likelihood import Listeners
 from jeit.acoustic.localiser import Estimate, Localiser
-from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.noise import IntensityNoise, below_nothing
 from jeit.acoustic.recording import Intensities, Recording
 from jeit.acoustic.surface import size
 from jeit.acoustic.swaps import find_swaps
@@ -243,9 +243,7 @@ def prepare(heard: Intensities, calibration: Calibration) -> tuple[Listeners, np
         )
     else:
         # What is negative betrays noise that the calibration may not have had.
-        below = np.where(use & (heard.power < 0), heard.power, 0.0)
-        deviation = np.sqrt((below**2).sum(axis=0) / np.maximum((below < 0).sum(axis=0), 1))
-        wider = np.maximum(deviation, np.asarray(known.deviation))
+        wider = np.maximum(below_nothing(heard.power, use), np.asarray(known.deviation))
         noise = eqx.tree_at(
             lambda n: (n.deviation, n.floor),
             known,

@@ -73,3 +73,10 @@ class IntensityNoise(eqx.Module):
 def column(values: Float[Array, " M"], like: Array) -> Array:
     """One value for each microphone, along the first axis of `like`."""
     return jnp.reshape(values, (-1,) + (1,) * (like.ndim - 1))
+
+
+def below_nothing(power: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """The deviation that negative intensities (F, M) betray, (M,): what is below nothing can only be noise."""
+    below = np.where(usable & (power < 0), power, 0.0)
+    number = (below < 0).sum(axis=0)
+    return np.sqrt((below**2).sum(axis=0) / np.maximum(number, 1))

@@ -49,7 +49,7 @@ def _locate_two(listeners: Listeners, pixels: Pixels, power, use) -> TwoSources:
     likelihood = Likelihood.create(power, use, listeners)
     response = listeners.response(pixels.chart)
     starts = jax.lax.map(lambda frame: _best_pairs(frame[0], frame[1], response, pixels, listeners), (power.T, use.T))
-    start = jnp.moveaxis(starts, 0, -1).transpose(1, 0, 2).reshape(6, -1)  # (6, starts · F)
+    start = starts.transpose(2, 1, 0).reshape(6, -1)  # (6, starts · F)
     low, high = box(listeners.surface)
     reach = size(listeners.surface)
     far = jnp.full(1, jnp.inf)
@@ -63,9 +63,9 @@ def _locate_two(listeners: Listeners, pixels: Pixels, power, use) -> TwoSources:
         max_steps=60,
         tolerance=1e-10,
     )
-    number = power.shape[1]
-    value = jnp.where(jnp.isfinite(found.value), found.value, jnp.inf).reshape(_STARTS, number)
-    best = jnp.argmin(value, axis=0) * number + jnp.arange(number)
+    frames = power.shape[1]
+    value = jnp.where(jnp.isfinite(found.value), found.value, jnp.inf).reshape(_STARTS, frames)
+    best = jnp.argmin(value, axis=0) * frames + jnp.arange(frames)
     x, converged = found.x[:, best], found.converged[best]
     x = jnp.where(x[5] > x[2], jnp.roll(x, 3, axis=0), x)
     _, _, matrix = likelihood.expand(x)

@@ -313,8 +313,8 @@ def test_bad_settings(change, word):
             "one for each of the 2 microphones",
         ),
         (lambda: intensities(Recording(white((2, 8000)), RATE), floor=-np.ones(2)), "not negative"),
-        (lambda: intensities(Intensities([0.0], [[1.0]])), "must be a Recording"),  # type: ignore
-        (lambda: tap_intensities(Recording(white((2, 8000)), RATE)), "must be Taps"),  # type: ignore
+        (lambda: intensities(Intensities([0.0], [[1.0]])), "must be a Recording"),
+        (lambda: tap_intensities(Recording(white((2, 8000)), RATE)), "must be Taps"),
         (lambda: noise_floor(np.ones((4, 2)), np.ones(4, bool), 9.0), "usable"),
         (lambda: noise_floor(np.ones((4, 2)), np.ones((4, 2), bool), 0.0), "freedom"),
         (lambda: noise_floor(np.ones((4, 2)), np.ones((4, 2), bool), 9.0, share=20), "share"),
