@@ -154,7 +154,7 @@ def recording(rounds: int) -> tuple[float, float, int]:
     ).calibration
     sound = stroke(skin, jax.random.key(2), np.array([[-0.07, -0.06], [0.07, 0.05]]), strength=2.0)
     heard = Recording(sound.samples, sound.rate)
-    spent, compiling = seconds(lambda: track(locate(heard, calibration), overlap=4), rounds)
+    spent, compiling = seconds(lambda: track(locate(heard, calibration)), rounds)
     return spent, compiling, sound.samples.shape[1]
 
 

@@ -38,7 +38,7 @@ def main() -> float:
     for number, (ax, name) in enumerate(zip(figure.subplots(1, 3), touches, strict=True)):
         during = heard.times // LASTS == number
         places = jax.tree.map(lambda values, during=during: values[during], found)
-        path = paths[name] = follow(places, overlap=4)  # windows of 50 ms begin every 12.5 ms
+        path = paths[name] = follow(places)
         seen = overlay(images[during], path.times, time_constant=0.7)[path.touches[-1].last]
         plot_track(path, places, calibration, overlay=seen, title=name.capitalize(), ax=ax)
     figure.savefig("hear_a_stroke.png", dpi=120)

@@ -9,6 +9,8 @@ from jeit.acoustic.bound import cramer_rao as cramer_rao
 from jeit.acoustic.calibrate import CalibrationFit as CalibrationFit
 from jeit.acoustic.calibrate import calibrate_microphones as calibrate_microphones
 from jeit.acoustic.calibration import Calibration as Calibration
+from jeit.acoustic.changes import Changes as Changes
+from jeit.acoustic.changes import find_changes as find_changes
 from jeit.acoustic.decay import AbstractDecay as AbstractDecay
 from jeit.acoustic.decay import AttenuatedInverseSquare as AttenuatedInverseSquare
 from jeit.acoustic.decay import Exponential as Exponential
@@ -22,8 +24,8 @@ from jeit.acoustic.localiser import Estimate as Estimate
 from jeit.acoustic.localiser import Localiser as Localiser
 from jeit.acoustic.locate import Locations as Locations
 from jeit.acoustic.locate import locate as locate
-from jeit.acoustic.locate import measure as measure
 from jeit.acoustic.locate import prepare as prepare
+from jeit.acoustic.measure import measure as measure
 from jeit.acoustic.noise import IntensityNoise as IntensityNoise
 from jeit.acoustic.overlay import brightness as brightness
 from jeit.acoustic.overlay import faded as faded
@@ -36,7 +38,6 @@ from jeit.acoustic.recording import read_taps as read_taps
 from jeit.acoustic.recording import write_recording as write_recording
 from jeit.acoustic.recording import write_taps as write_taps
 from jeit.acoustic.surface import make_surface as make_surface
-from jeit.acoustic.swaps import find_swaps as find_swaps
 from jeit.acoustic.track import Touch as Touch
 from jeit.acoustic.track import Track as Track
 from jeit.acoustic.track import track as track

@@ -5,9 +5,16 @@ import zlib
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
+
+from jeit.mesh._outline import distance, inside
 
 # Below this no vibration of a touch would be left in a recording.
 LOWEST_RATE = 100.0  # Hz
+# No skin is known that is longer: its coordinates would be in millimetres.
+LARGEST_EXTENT = 5.0  # m
+# Taps may miss the outline by so much of the skin's length; microphones nearer than this are at one place.
+_BESIDE, _SAME = 0.05, 1e-6  # of the length; m
 
 
 def npz_arrays(path: Path, start: bytes, *keys: str) -> dict[str, np.ndarray]:
@@ -111,3 +118,47 @@ def coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
     if bad.size:
         raise ValueError(f"{label}: row {bad[0]} is {points[bad[0]].tolist()}; every coordinate must be finite.")
     return points
+
+
+def check_extent(points: np.ndarray, label: str) -> None:
+    """Raise `ValueError` where points (n, d) are farther apart than a skin is long."""
+    extent = np.ptp(points, axis=0).max()
+    if extent > LARGEST_EXTENT:
+        raise ValueError(
+            f"{label} spread over {extent:.4g}: are these metres? Divide millimetres by 1000; no side may be longer "
+            f"than {LARGEST_EXTENT:g} m."
+        )
+
+
+def check_microphones(places: np.ndarray, skin: np.ndarray) -> None:
+    """Raise `ValueError` for microphones (M, d) farther from the box of points of the skin (n, d) than it is long, and
+    for two at one place."""
+    low, high = skin.min(axis=0), skin.max(axis=0)
+    extent = (high - low).max()
+    beyond = np.linalg.norm(places - np.clip(places, low, high), axis=1)
+    far = int(beyond.argmax())
+    if beyond[far] > extent:
+        raise ValueError(
+            f"microphones: number {far} at {places[far].tolist()} is {beyond[far]:.3g} m away from a skin that is only "
+            f"{extent:.3g} m long: are these metres, in the outline's coordinates? Divide millimetres by 1000."
+        )
+    pairs = sorted(KDTree(places).query_pairs(_SAME))
+    if pairs:
+        one, other = pairs[0]
+        raise ValueError(
+            f"microphones: numbers {one} and {other} are at the same place, {places[one].tolist()}; give each its own."
+        )
+
+
+def check_taps(places: np.ndarray, outline: np.ndarray) -> None:
+    """Raise `ValueError` for taps (T, 2) well outside the outline (K, 2)."""
+    extent = np.ptp(outline, axis=0).max()
+    outside = np.flatnonzero(~inside(places, [outline]))
+    beyond = distance(places[outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)
+    if outside.size and beyond.max() > _BESIDE * extent:
+        row = int(outside[beyond.argmax()])
+        raise ValueError(
+            f"positions: row {row}, {places[row].tolist()}, is {1e3 * beyond.max():.3g} mm outside the outline; taps "
+            f"must be on the skin, or within {1e3 * _BESIDE * extent:.3g} mm of it. Correct the place, or leave the "
+            "tap out."
+        )

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jeit.acoustic._arrays import check_extent, check_microphones, real
 from jeit.acoustic.decay import DECAYS
 from jeit.acoustic.intensity import IntensitySettings
 from jeit.acoustic.likelihood import Listeners
@@ -20,7 +21,8 @@ from jeit.mesh import Polygon
 FORMAT, VERSION = "jeit microphone calibration", 1
 _UNITS = {"length": "m", "intensity": "square of the samples' unit"}
 _SCALE = "strength 1 is the source whose intensity upon a microphone has geometric mean 1 over the usable ones"
-_CURVE = ("origin", "axes", "normal", "knots", "weights", "affine")
+# Shapes of the arrays of a curved surface; -1 is any length.
+_CURVE = {"origin": (3,), "axes": (3, 2), "normal": (3,), "knots": (-1, 2), "weights": (-1,), "affine": (3,)}
 
 
 class Calibration(eqx.Module):
@@ -31,6 +33,7 @@ class Calibration(eqx.Module):
     - `standard_errors`: (K, M), relative, of the decay model's K parameters.
     - `intensity`: band and window with which the taps' samples were read; None where intensities were given.
     - `name`: of the taps.
+    - `strengths`: of the weakest and the strongest tap; None where not known.
 
     The data fix parameters and strengths but for a factor. It is chosen so that the geometric mean of f_i(0) over the
     usable microphones is 1: a source's strength is the intensity that a typical microphone right under it would read.
@@ -42,6 +45,7 @@ class Calibration(eqx.Module):
     standard_errors: Float[np.ndarray, "K M"]
     intensity: IntensitySettings | None
     name: str = eqx.field(static=True)
+    strengths: tuple[float, float] | None = None
 
     @property
     def num_microphones(self) -> int:
@@ -61,7 +65,7 @@ class Calibration(eqx.Module):
         name = Path(path).name
         try:
             content = json.loads(Path(path).read_text("utf-8"))
-        except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
+        except (ValueError, RecursionError):
             content = None
         if not isinstance(content, dict) or content.get("format") != FORMAT:
             raise ValueError(f"{name} is no calibration of microphones; make one with 'jeit calibrate-microphones'.")
@@ -74,7 +78,7 @@ class Calibration(eqx.Module):
             raise ValueError(f"{name}: units are {content.get('units')}; they must be {_UNITS}. Calibrate again.")
         try:
             return cls._from_content(content)
-        except (KeyError, TypeError, AttributeError) as error:
+        except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"{name}: incomplete or changed by hand ({error!r}); calibrate again.") from None
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
@@ -117,12 +121,15 @@ class Calibration(eqx.Module):
             "intensity": None
             if settings is None
             else {key: float(getattr(settings, key)) for key in ("low", "high", "window", "hop")},
+            "strengths": None if self.strengths is None else [float(value) for value in self.strengths],
             "microphones": microphones,
         }
 
     @classmethod
     def _from_content(cls, content: dict[str, Any]) -> "Calibration":
         each = content["microphones"]
+        if each == []:
+            raise ValueError("it lists no microphones; calibrate again.")
         if content["decay"] not in DECAYS:
             raise ValueError(f"decay is {content['decay']!r}; it must be one of {', '.join(DECAYS)}.")
         kind = DECAYS[content["decay"]]
@@ -139,9 +146,11 @@ class Calibration(eqx.Module):
         noise = [column(f"noise_{key}") for key in ("floor", "deviation", "cross")]
         if min(float(jnp.min(values)) for values in (*noise, column("relative_noise"))) < 0:
             raise ValueError("noise of a microphone is negative.")
-        positions = np.array([one["position"] for one in each], float)
-        if positions.ndim != 2 or positions.shape[1] != surface.dimension or not np.isfinite(positions).all():
-            raise ValueError(f"positions of microphones must be {surface.dimension} finite coordinates in metres.")
+        positions = np.array([_place(one["position"], surface.dimension, k) for k, one in enumerate(each)])
+        known = surface.outline.vertices
+        if isinstance(surface, CurvedSurface):
+            known = jnp.concatenate([known, surface.knots])
+        check_microphones(positions, np.asarray(surface.place(known.T)).T)
         listeners = Listeners(
             jnp.asarray(positions),
             surface,
@@ -149,22 +158,62 @@ class Calibration(eqx.Module):
             IntensityNoise(noise[0], noise[1], noise[2], column("relative_noise")),
         )
         errors = [[one["relative_standard_error"][key] for one in each] for key in kind.parameters]
-        settings = content["intensity"]
+        what = "relative_standard_error of a microphone"
+        settings, strengths = content["intensity"], content["strengths"]
         return cls(
             listeners,
-            np.array([bool(one["usable"]) for one in each]),
+            np.array([_flag(one["usable"], f"usable of microphone {k}") for k, one in enumerate(each)]),
             tuple(str(one["reason"]) for one in each),
-            np.array([[math.nan if value is None else float(value) for value in row] for row in errors]),
+            np.array([[math.nan if value is None else _real(value, what) for value in row] for row in errors]),
             None if settings is None else IntensitySettings(**settings),
             str(content["name"]),
+            None if strengths is None else _strengths(strengths),
         )
 
 
 def _surface(content: dict[str, Any]) -> AbstractSurface:
-    outline = Polygon(np.array(content["outline"], float), [np.array(hole, float) for hole in content["holes"]])
+    vertices = _array(content["outline"], "outline", (-1, 2))
+    check_extent(vertices, "outline")
+    outline = Polygon(vertices, [_array(hole, f"holes[{k}]", (-1, 2)) for k, hole in enumerate(content["holes"])])
     if "curve" not in content:
         return Plane(outline)
-    return CurvedSurface(outline, *(jnp.asarray(np.array(content["curve"][key], float)) for key in _CURVE))
+    arrays = [_array(content["curve"][key], f"curve, {key}", shape) for key, shape in _CURVE.items()]
+    if len(arrays[3]) != len(arrays[4]):
+        raise ValueError(f"curve: {len(arrays[3])} knots and {len(arrays[4])} weights; give a weight for each knot.")
+    return CurvedSurface(outline, *(jnp.asarray(array) for array in arrays))
+
+
+def _array(value, what: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Finite numbers of this shape, in which -1 is any length."""
+    wanted = ", ".join("n" if length < 0 else str(length) for length in shape)
+    array = real(value, what, wanted)
+    if any(length not in (-1, found) for length, found in zip(shape, array.shape, strict=True)):
+        raise ValueError(f"{what} has shape {array.shape}; it must be ({wanted}).")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{what} holds NaN or infinity; every number must be finite.")
+    return array
+
+
+def _place(value, dimension: int, number: int) -> list[float]:
+    what = f"position of microphone {number}"
+    if not isinstance(value, list) or len(value) != dimension:
+        raise ValueError(f"{what} is {value!r}; it must be {dimension} coordinates in metres.")
+    return [_real(coordinate, f"a coordinate of the {what}") for coordinate in value]
+
+
+def _strengths(value) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError(f"strengths is {value!r}; it must be the weakest and the strongest tap's.")
+    low, high = (_real(one, "one of strengths") for one in value)
+    if not 0 < low <= high:
+        raise ValueError(f"strengths are {low:g} and {high:g}; they must be positive, the weaker first.")
+    return low, high
+
+
+def _flag(value, what: str) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"{what} is {value!r}; it must be true or false.")
+    return value
 
 
 def _list(array) -> list:

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from jeit.acoustic.noise import column
 
-# Metres²: r = √r² has no derivative at r = 0; a tenth of a micrometre rounds off the tip.
-_TIP = 1e-14
+# Metres²: r = √r² has no derivative at r = 0; a hundredth of a micrometre rounds off the tip.
+_TIP = 1e-16
 
 
 class AbstractDecay(eqx.Module):

@@ -6,6 +6,7 @@ complement): what is left is no larger than the array. Both run through optimist
 """
 
 import warnings
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -13,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
-from numpy.typing import ArrayLike
 
 from jeit.acoustic.decay import AbstractDecay
 from jeit_solvers import Descent, minimise_few, solve_definite, solve_few
@@ -49,11 +49,6 @@ class DecayProblem(eqx.Module):
         """y − m, and 0 for what has no weight."""
         mean = self.expected(logarithms, strength)[0]
         return jnp.where(self.weight > 0, self.level - mean, 0.0)
-
-    def cost_of(self, values: ArrayLike, strength: Float[Array, " T"], microphone: int) -> Float[Array, ""]:
-        """½ Σ weight · residual² of one microphone with these parameters."""
-        mine: DecayProblem = jax.tree.map(lambda array: array[microphone][None], self)
-        return 0.5 * jnp.sum(mine.weight * mine.residual(jnp.asarray(values)[:, None], strength) ** 2)
 
 
 @eqx.filter_jit
@@ -113,9 +108,9 @@ def fit_each(problem: DecayProblem, start: Float[Array, "K M"], strength: Float[
 
 @eqx.filter_jit
 def fit_together(
-    problem: DecayProblem, start: Float[Array, "K M"], strength: Float[Array, " T"], free: Bool[Array, " M"]
+    problem: DecayProblem, start: Float[Array, "K M"], strength: Float[Array, " T"], free: Bool[Array, "K M"]
 ) -> tuple[Float[Array, "K M"], Float[Array, " T"]]:
-    """Parameters of the microphones that are `free`, and the strengths of all taps, at once."""
+    """The parameters that are `free`, and the strengths of all taps, at once."""
     shape = start.shape
 
     def unpack(unknowns):
@@ -151,30 +146,37 @@ def fit_together(
 
 def fit_between(
     problem: DecayProblem, start: Float[Array, "K M"], strength: Float[Array, " T"], microphone: int, bounds
-) -> np.ndarray:
-    """The parameters of one microphone, (K,), between bounds on their logarithms, by jaxopt."""
+) -> tuple[Float[np.ndarray, " K"], float]:
+    """The parameters of one microphone, (K,), between bounds on their logarithms, and their cost, by jaxopt."""
+    lower, upper = (jnp.asarray(bound) for bound in bounds)
+    first = jnp.clip(start[:, microphone], lower, upper)
+    mine = jax.tree.map(lambda array: array[microphone][None], problem)
+    found = _bounded_solver().run(first, (lower, upper), mine, strength)
+    return np.asarray(found.params), float(found.state.fun_val)
+
+
+@cache
+def _bounded_solver():
+    """One for all microphones: it compiles its cost once."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says on import that it is not developed further
         import jaxopt
 
-    lower, upper = (jnp.asarray(bound) for bound in bounds)
+    def cost(values, mine, strength):
+        return 0.5 * jnp.sum(mine.weight * mine.residual(values[:, None], strength) ** 2)
 
-    def cost(values):
-        return problem.cost_of(values, strength, microphone)
-
-    solver = jaxopt.ScipyBoundedMinimize(fun=cost, method="L-BFGS-B", tol=1e-12)
-    return np.asarray(solver.run(jnp.clip(start[:, microphone], lower, upper), bounds=(lower, upper)).params)
+    return jaxopt.ScipyBoundedMinimize(fun=cost, method="L-BFGS-B", tol=1e-12)
 
 
 def log_covariance(
     problem: DecayProblem, logarithms: Float[Array, "K M"], strength: Float[Array, " T"], free: np.ndarray, scale
 ) -> np.ndarray:
     """Covariance (K M, K M) of the logarithms of parameters, parameter by parameter, where weights are inverse
-    variances and the overall scale is fixed by `scale` · logarithms = constant, (K M,); NaN where not free."""
+    variances and the overall scale is fixed by `scale` · logarithms = constant, (K M,); NaN where not `free` (K, M)."""
     _, system = jax.jit(_normal_equations)(problem, logarithms, strength, jnp.asarray(free))
     schur = np.array(_schur(system, 0.0))
     number, count = logarithms.shape
-    kept = np.tile(free, number)
+    kept = np.asarray(free).ravel()
     shift = np.concatenate([np.ones(count), np.zeros((number - 1) * count)])[kept]
     normal = np.asarray(scale)[kept]
     result = np.full((number * count, number * count), np.nan)
@@ -201,7 +203,7 @@ def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[A
     off = jnp.where(problem.weight > 0, problem.level - mean, 0.0)
     weight = problem.weight
     cost = 0.5 * jnp.sum(weight * off**2)
-    jacobian = jnp.where(free[:, None], share * slopes, 0.0)
+    jacobian = jnp.where(free[:, :, None], share * slopes, 0.0)
     weighted = weight * jacobian
     system = _System(
         matrix=jnp.einsum("kmt,lmt->mkl", weighted, jacobian),
@@ -218,10 +220,10 @@ def _step(system: _System, damping):
     number, count = system.gradient.shape
     diagonal = _tap_diagonal(system, damping)
     schur = _schur(system, damping)
-    # What data cannot see, all responses up and all strengths down, is held; so are microphones that are not free.
-    shift = jnp.concatenate([jnp.where(system.free, 1.0, 0.0), jnp.zeros((number - 1) * count)])
+    # What data cannot see, all responses up and all strengths down, is held; so are parameters that are not free.
+    shift = jnp.concatenate([jnp.where(system.free[0], 1.0, 0.0), jnp.zeros((number - 1) * count)])
     typical = jnp.trace(schur) / schur.shape[0] + 1e-300
-    held = jnp.tile(~system.free, number)
+    held = ~system.free.ravel()
     schur = schur + typical * (jnp.outer(shift, shift) / count + jnp.diag(jnp.where(held, 1.0, 1e-14)))
     right = -system.gradient + jnp.einsum("kmt,t->km", system.coupling, system.tap_gradient / diagonal)
     change = solve_definite(schur, right.ravel()).reshape(number, count)

@@ -5,6 +5,8 @@ of its range (clipping), and samples that are no numbers. What looks like one of
 that holds each value for several samples, a quiet channel of a few steps of its converter, one loud peak.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
@@ -91,6 +93,24 @@ def intensity_faults(power: Float[np.ndarray, "F M"]) -> tuple[Bool[np.ndarray, 
         else:
             reasons.append("" if channel.all() else f"NaN or infinite in {_share(~channel)} windows")
     return finite & ~dead, tuple(reasons)
+
+
+def tell(reasons: Sequence[str]) -> str:
+    """What is wrong with each microphone, "" for nothing, in one line: "microphones 0-2, 5: dead; microphone 3: …"."""
+    groups: dict[str, list[int]] = {}
+    for k, reason in enumerate(reasons):
+        if reason:
+            groups.setdefault(reason, []).append(k)
+    return "; ".join(
+        f"microphone{'s' if len(which) > 1 else ''} {_ranges(np.array(which))}: {reason}"
+        for reason, which in groups.items()
+    )
+
+
+def _ranges(numbers: np.ndarray) -> str:
+    """Rising whole numbers as text: 0, 1, 2, 5 are "0-2, 5"."""
+    parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+    return ", ".join(f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts)
 
 
 def _share(hit: np.ndarray) -> str:

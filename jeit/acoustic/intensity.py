@@ -86,7 +86,14 @@ def intensities(
     times = (grid.hop * np.arange(len(power)) + grid.length / 2) / rate
     faults = tuple(reason for _, reason in found)
     return Intensities(
-        times, power - noise, floor=noise, freedom=freedom, usable=usable, faults=faults, name=recording.name
+        times,
+        power - noise,
+        floor=noise,
+        freedom=freedom,
+        overlap=grid.length / grid.hop,
+        usable=usable,
+        faults=faults,
+        name=recording.name,
     )
 
 

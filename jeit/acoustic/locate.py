@@ -7,13 +7,15 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
 from jeit.acoustic.calibration import Calibration
-from jeit.acoustic.intensity import IntensitySettings, intensities
+from jeit.acoustic.changes import find_changes
+from jeit.acoustic.faults import tell
+from jeit.acoustic.intensity import IntensitySettings
 from jeit.acoustic.likelihood import Listeners
 from jeit.acoustic.localiser import Estimate, Localiser
+from jeit.acoustic.measure import measure
 from jeit.acoustic.noise import IntensityNoise, below_nothing
 from jeit.acoustic.recording import Intensities, Recording
 from jeit.acoustic.surface import size
-from jeit.acoustic.swaps import find_swaps
 from jeit.acoustic.two_sources import locate_two
 
 STATUSES = ("touch", "no touch", "outside", "two touches", "ambiguous", "misfit", "unusable")
@@ -31,6 +33,8 @@ _BOTH, _STILL_FAIR, _WEAKEST = 0.2, 10.0, 0.05
 _ODD = 0.25
 # Intensities this much below the loudest frame's are no touch, where no floor is known (60 dB).
 _DYNAMIC_RANGE = 1e-6
+# No touch is so much stronger or weaker than the calibration's taps (40 dB).
+_SAME_UNIT = 1e4
 
 
 class Locations(eqx.Module):
@@ -41,6 +45,7 @@ class Locations(eqx.Module):
     - `misfit`: (F,) chi-square of what one source leaves unexplained, with `freedom`: (F,) degrees.
     - `used`: (F, M) which microphones were looked at. `faults`: M strings, what is wrong with one ("" if nothing).
     - `second`: (F, d) and `second_strength`: (F,), of the weaker of two touches, NaN elsewhere.
+    - `overlap`: windows that share a sample, whose errors are alike.
     - `notes`: what to know of all of it.
 
     Status: "touch"; "no touch", nothing is above the floor; "outside", the intensities say a place beyond the outline,
@@ -59,6 +64,7 @@ class Locations(eqx.Module):
     used: Bool[np.ndarray, "F M"]
     second: Float[np.ndarray, "F d"]
     second_strength: Float[np.ndarray, " F"]
+    overlap: float = eqx.field(static=True)
     faults: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
@@ -80,15 +86,16 @@ def locate(
     method: str = "likelihood",
     map_shape: tuple[int, int] | None = None,
     intensity: IntensitySettings | None = None,
+    silence: Recording | None = None,
 ) -> Locations:
     """Locate the touch in every frame of a recording.
 
     `method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster that is
     searched, (200, 200) in the paper; a coarse grid unless given (both are refined). `intensity`: band and window for
-    samples, those of the calibration unless given. Raises `ValueError` for a recording of another number of
-    microphones, and where fewer than three can be used.
+    samples, those of the calibration unless given; `silence`: the array untouched, as of `measure`. Raises
+    `ValueError` for a recording of another number of microphones, and where fewer than three can be used.
     """
-    heard = measure(recording, calibration, intensity)
+    heard = measure(recording, calibration, intensity, silence=silence)
     listeners, use, faults = prepare(heard, calibration)
     touched = use.any(axis=1) & _above_floor(heard, listeners.noise, use)
     enough = use.sum(axis=1) >= 3
@@ -106,7 +113,7 @@ def locate(
         "second": np.full((frames, d), np.nan),
         "second_strength": np.full(frames, np.nan),
     }
-    notes: list[str] = []
+    notes = list(heard.notes)
     if solve.any():
         power, used = _padded(heard.power[solve], use[solve])
         found = localiser(power, used)
@@ -123,14 +130,15 @@ def locate(
         excess[solve] = np.asarray(judge.excess)[:number]
         status[(status == "misfit") & (excess > _OUTSIDE)] = "outside"
         _bound(status, result, float(size(listeners.surface)))
-        notes = _notes(status, heard, use, listeners)
+        notes += _notes(status, heard, use, listeners)
     return Locations(
         np.asarray(heard.times),
         **result,
         status=status.astype(str),
         used=use,
+        overlap=heard.overlap,
         faults=faults,
-        notes=tuple(notes),
+        notes=(*notes, *_unit(result["strength"], heard, use, calibration)),
         name=heard.name,
     )
 
@@ -191,33 +199,39 @@ def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, listeners: L
     odd = np.isin(status, ["misfit", "outside"])
     if odd.sum() > _ODD * placed.sum():
         single = placed & (status != "two touches")
-        swaps = find_swaps(listeners, heard.power[single], use[single])
+        exchanged, altered = find_changes(listeners, heard.power[single], use[single])
         notes += [
             f"microphones {one} and {other} look exchanged since the calibration: exchanged back, their intensities "
-            "fit one source."
-            for one, other in swaps
+            "fit one source. The places are not corrected: exchange the channels and locate again."
+            for one, other in exchanged
         ]
-        if not swaps and (status == "misfit").sum() > 2 * _ODD * placed.sum():
+        notes += [
+            f"microphone {one} does not hear as when it was calibrated: without it, one source explains the others. "
+            "The places are not corrected: make its channel NaN and locate again, or calibrate anew."
+            for one in altered
+        ]
+        if not exchanged and not altered and (status == "misfit").sum() > 2 * _ODD * placed.sum():
             notes.append("most touches fit no single source: is this the calibration of this array?")
     return notes
 
 
-def measure(
-    recording: Recording | Intensities, calibration: Calibration, intensity: IntensitySettings | None = None
-) -> Intensities:
-    """Intensities of a recording, as the calibration took them.
-
-    Raises `ValueError` for another number of microphones.
-    """
-    number = recording.samples.shape[0] if isinstance(recording, Recording) else recording.power.shape[1]
-    if number != calibration.num_microphones:
-        raise ValueError(
-            f"'{recording.name}' has {number} microphones and the calibration '{calibration.name}' "
-            f"{calibration.num_microphones}; give the calibration of this array."
-        )
-    if isinstance(recording, Intensities):
-        return recording
-    return intensities(recording, intensity or calibration.intensity or IntensitySettings())
+def _unit(strength: np.ndarray, heard: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
+    """A note where what was heard is of another order than what the calibration's taps were."""
+    asked = "do the recording and the taps have the same gain and unit?"
+    if np.isfinite(strength).any():
+        typical = float(np.nanmedian(strength))
+        ratio = typical / np.clip(typical, *(calibration.strengths or (typical, typical)))
+        if max(ratio, 1 / ratio) > _SAME_UNIT:
+            return [f"touches are {ratio:.3g} times as strong as the calibration's taps: {asked}"]
+        return []
+    # Silence whose floor nobody knows scatters as it did in the calibration.
+    deviation = np.asarray(calibration.listeners.noise.deviation)
+    known = use.any(axis=0) & (deviation > 0)
+    if heard.floor.any() or not known.any():
+        return []
+    ratio = float(np.median(np.where(use, np.abs(heard.power), 0.0).max(axis=0)[known] / deviation[known]))
+    low = ratio < 1 / _SAME_UNIT
+    return [f"what is heard is {ratio:.3g} times as loud as the calibration's noise: {asked}"] if low else []
 
 
 def prepare(heard: Intensities, calibration: Calibration) -> tuple[Listeners, np.ndarray, tuple[str, ...]]:
@@ -231,10 +245,9 @@ def prepare(heard: Intensities, calibration: Calibration) -> tuple[Listeners, np
         for fault, reason in zip(heard.faults, calibration.reasons, strict=True)
     )
     if use.any(axis=0).sum() < 3:
-        told = "; ".join(f"microphone {k}: {fault}" for k, fault in enumerate(faults) if fault)
         raise ValueError(
             f"'{heard.name}': {use.any(axis=0).sum()} of {len(faults)} microphones can be used, and three are needed "
-            f"to locate a touch. {told}."
+            f"to locate a touch. {tell(faults)}."
         )
     known = calibration.listeners.noise
     if np.any(heard.floor > 0):

@@ -15,7 +15,10 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.acoustic._arrays import (
+    check_extent,
     check_full_scale,
+    check_microphones,
+    check_taps,
     coordinates,
     either,
     need,
@@ -27,9 +30,6 @@ from jeit.acoustic._arrays import (
 )
 from jeit.acoustic.faults import intensity_faults
 from jeit.mesh._outline import check_loop
-
-# No skin is known that is longer: its coordinates would be in millimetres.
-LARGEST_EXTENT = 5.0  # m
 
 
 class Recording(eqx.Module):
@@ -67,21 +67,34 @@ class Intensities(eqx.Module):
     - `floor`: (M,) noise power that was subtracted; zeros when unknown.
     - `freedom`: degrees of freedom ν of one window's power of white noise, so that its variance is 2 floor² / ν;
       infinite when unknown.
+    - `overlap`: windows that share a sample, window / hop; 1 where none do.
     - `usable`: (F, M) False where a fault spoils the window.
     - `faults`: M strings, what is wrong with a channel in words; "" for a sound one.
-    - `name`: where they come from.
+    - `name`: where they come from. `notes`: what to know of how they were measured.
     """
 
     times: Float[np.ndarray, " F"]
     power: Float[np.ndarray, "F M"]
     floor: Float[np.ndarray, " M"]
     freedom: float
+    overlap: float
     usable: Bool[np.ndarray, "F M"]
     faults: tuple[str, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
-        self, times, power, *, floor=None, freedom: ArrayLike = np.inf, usable=None, faults=None, name="intensities"
+        self,
+        times,
+        power,
+        *,
+        floor=None,
+        freedom: ArrayLike = np.inf,
+        overlap: ArrayLike = 1.0,
+        usable=None,
+        faults=None,
+        name="intensities",
+        notes=(),
     ):
         """`usable` and `faults` are worked out from NaN and dead channels when not given.
 
@@ -103,6 +116,11 @@ class Intensities(eqx.Module):
         self.freedom = number(freedom, "freedom")
         if not self.freedom > 0:
             raise ValueError(f"freedom must be positive (infinite when unknown); it is {self.freedom}.")
+        self.overlap = number(overlap, "overlap")
+        if not 1 <= self.overlap < np.inf:
+            raise ValueError(
+                f"overlap must be at least 1, how many windows share a sample (window / hop); it is {self.overlap}."
+            )
         found, reasons = intensity_faults(self.power)
         given = found if usable is None else np.asarray(usable)
         self.faults = reasons if faults is None else tuple(str(reason) for reason in faults)
@@ -111,7 +129,7 @@ class Intensities(eqx.Module):
                 f"usable is {given.dtype} of shape {given.shape} with {len(self.faults)} faults; give booleans of "
                 f"shape {shape}, and one string a microphone."
             )
-        self.usable, self.name = given & np.isfinite(self.power), name
+        self.usable, self.name, self.notes = given & np.isfinite(self.power), name, tuple(notes)
 
 
 class Taps(eqx.Module):
@@ -136,7 +154,11 @@ class Taps(eqx.Module):
     def __init__(
         self, microphones, outline, positions, *, power=None, samples=None, rate=None, full_scale=None, name="taps"
     ):
-        """Give either `power`, or `samples` and `rate`. Raises `ValueError` for what is no such thing."""
+        """Give either `power`, or `samples` and `rate`.
+
+        Raises `ValueError` for what is no such thing: also for microphones farther from the skin than it is long, two
+        at one place, and in the plane taps farther outside the outline than 5 % of its length.
+        """
         self.outline = coordinates(outline, "outline", np.shape(microphones)[-1:])
         self.microphones = coordinates(microphones, "microphones", self.outline.shape[1:])
         self.positions = coordinates(positions, "positions", self.outline.shape[1:])
@@ -149,12 +171,11 @@ class Taps(eqx.Module):
             ("microphones", self.microphones),
             ("positions", self.positions),
         ):
-            extent = np.ptp(np.concatenate([self.outline, points]), axis=0).max()
-            if extent > LARGEST_EXTENT:
-                raise ValueError(
-                    f"{label} spread over {extent:.4g}: are these metres? Divide millimetres by 1000; no side may be "
-                    f"longer than {LARGEST_EXTENT:g} m."
-                )
+            check_extent(np.concatenate([self.outline, points]), label)
+        flat = self.outline.shape[1] == 2
+        check_microphones(self.microphones, self.outline if flat else np.vstack([self.outline, self.positions]))
+        if flat:
+            check_taps(self.positions, self.outline)
         if (power is None) == (samples is None):
             both = "neither" if power is None else "both"
             raise ValueError(f"taps need either intensity or samples with their rate; {both} were given.")
@@ -180,8 +201,8 @@ def read_recording(path: str | Path) -> Recording | Intensities:
     """Read what a skin heard: a multichannel WAV file, or an NPZ file.
 
     An NPZ file holds `samples` (M, S) and `rate` in Hz, optionally `full_scale`; or `intensity` (F, M) and `times` (F,)
-    in seconds, optionally `floor` (M,) and `freedom`. A WAV file's integers become parts of full scale, -1 to 1.
-    Raises `ValueError` for any other content, and `OSError` where there is no such file.
+    in seconds, optionally `floor` (M,), `freedom` and `overlap`. A WAV file's integers become parts of full scale, -1
+    to 1. Raises `ValueError` for any other content, and `OSError` where there is no such file.
     """
     path = Path(path)
     with path.open("rb") as file:
@@ -189,7 +210,8 @@ def read_recording(path: str | Path) -> Recording | Intensities:
     try:
         if start in (b"RIFF", b"RIFX", b"RF64"):
             return _read_wav(path)
-        arrays = npz_arrays(path, start, "samples", "rate", "full_scale", "intensity", "times", "floor", "freedom")
+        optional = ("floor", "freedom", "overlap")
+        arrays = npz_arrays(path, start, "samples", "rate", "full_scale", "intensity", "times", *optional)
         kind = either(arrays, "intensity", "samples")
         if kind == "samples":
             if arrays["samples"].ndim == 3:
@@ -197,8 +219,8 @@ def read_recording(path: str | Path) -> Recording | Intensities:
             need(arrays, "rate")
             return Recording(arrays["samples"], arrays["rate"], full_scale=arrays.get("full_scale"), name=path.stem)
         need(arrays, "times")
-        floor, freedom = arrays.get("floor"), arrays.get("freedom", np.array(np.inf))
-        return Intensities(arrays["times"], arrays["intensity"], floor=floor, freedom=freedom, name=path.stem)
+        known = {key: arrays[key] for key in optional if key in arrays}
+        return Intensities(arrays["times"], arrays["intensity"], **known, name=path.stem)
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
 
@@ -232,8 +254,8 @@ def write_recording(path: str | Path, recording: Recording | Intensities) -> Non
     if isinstance(recording, Recording):
         _write(path, samples=recording.samples, rate=recording.rate, full_scale=recording.full_scale)
     else:
-        power = np.where(recording.usable, recording.power, np.nan)
-        _write(path, intensity=power, times=recording.times, floor=recording.floor, freedom=recording.freedom)
+        known = {key: getattr(recording, key) for key in ("times", "floor", "freedom", "overlap")}
+        _write(path, intensity=np.where(recording.usable, recording.power, np.nan), **known)
 
 
 def write_taps(path: str | Path, taps: Taps) -> None:

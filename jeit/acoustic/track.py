@@ -45,18 +45,15 @@ class Track(eqx.Module):
     rejected: Bool[np.ndarray, " F"]
 
 
-def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None = None, overlap: float = 1.0) -> Track:
+def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None = None) -> Track:
     """Smooth the places of a recording, touch by touch.
 
     `gap`: seconds without a place after which a touch has ended. `acceleration`: spectral density q of the random
-    acceleration (m²/s³), the likeliest of a range unless given. `overlap`: windows that share a sample (window / hop),
-    whose errors are alike; covariances are taken as many times as wide. Raises `ValueError` for a gap that is not
-    positive or an overlap below 1.
+    acceleration (m²/s³), the likeliest of a range unless given. Errors of windows that share a sample are alike:
+    covariances are taken `locations.overlap` times as wide. Raises `ValueError` for what is not positive.
     """
     if not (np.isfinite(gap) and gap > 0):
         raise ValueError(f"gap must be positive, in seconds; it is {gap}.")
-    if not (np.isfinite(overlap) and overlap >= 1):
-        raise ValueError(f"overlap must be at least 1 (window / hop); it is {overlap}.")
     if acceleration is not None and not (np.isfinite(acceleration) and acceleration > 0):
         raise ValueError(f"acceleration must be positive, in m²/s³; it is {acceleration}.")
     frames, d = locations.position.shape
@@ -69,7 +66,7 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
     for first, last in runs:
         part = slice(first, last + 1)
         measured = np.where(located[part, None], locations.position[part], 0.0)
-        spread = np.where(located[part, None, None], locations.covariance[part], np.eye(d)) * overlap
+        spread = np.where(located[part, None, None], locations.covariance[part], np.eye(d)) * locations.overlap
         # A covariance may be singular, on a curved surface; nothing is known better than a tenth of a micrometre.
         spread = spread + 1e-14 * np.eye(d)
         size = 1 << int(last - first).bit_length()
@@ -142,7 +139,10 @@ def _filter(step, measured, spread, located, density):
         # A place not believed still counts against a density, as much as one at the limit.
         score = jnp.where(there, -0.5 * (jnp.minimum(square, limit) + logarithm), 0.0)
         new_mean = jnp.where(believed, mean + gain @ off, mean)
-        new_error = jnp.where(believed, error - gain @ inner @ gain.T, error)
+        # Joseph's form, and symmetric: the difference of the textbook's is lost in rounding where places are exact.
+        keep = jnp.eye(2 * d).at[:, :d].add(-gain)
+        updated = keep @ error @ keep.T + gain @ spread @ gain.T
+        new_error = jnp.where(believed, (updated + updated.T) / 2, error)
         return (new_mean, new_error), (score, new_mean, new_error, mean, error, believed)
 
     begin = jnp.concatenate([measured[0], jnp.zeros(d)])

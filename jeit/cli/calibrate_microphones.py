@@ -92,6 +92,9 @@ def _show(console, fit: "CalibrationFit") -> None:
         ),
         ("scale", "strength 1 reads 1 at a typical microphone right under the source"),
     ]
+    if fit.shared.any():
+        which = ", ".join(str(k) for k in np.flatnonzero(fit.shared))
+        rows.append(("tap nearer to", f"{which}: no tap says how their response falls off; it is that of the others"))
     console.print()
     console.print(pairs(calibration.name, rows))
     console.print()

@@ -80,12 +80,13 @@ def plot_track(
     for touch in track.touches:
         handles += _draw_touch(ax, view, track, touch, path, times, named={handle.get_label() for handle in handles})
     plain = locations.located & ~np.isin(locations.status, list(_ODD))
-    believed, doubted = plain & ~track.rejected, plain & track.rejected
+    believed, doubted = plain & ~track.rejected, locations.located & track.rejected
     dots = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
     ax.scatter(*places[believed].T, color=times.to_rgba(track.times[believed]), **dots)
     if doubted.any():
-        rings: dict[str, Any] = {"s": 16, "linewidths": 0.8, "facecolors": "none", "zorder": 3.7}
-        rings["edgecolors"] = times.to_rgba(track.times[doubted])
+        # Around the marker of a frame that is no plain touch.
+        rings: dict[str, Any] = {"s": np.where(plain, 16, 60)[doubted], "linewidths": 0.8, "facecolors": "none"}
+        rings |= {"zorder": 3.7, "edgecolors": times.to_rgba(track.times[doubted])}
         ax.scatter(*places[doubted].T, **rings)
         ring: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markeredgecolor": SOFT}
         handles.append(Line2D([], [], marker="o", markersize=4, label=f"not believed ({doubted.sum()})", **ring))

@@ -2,9 +2,17 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from jeit.acoustic import IntensityNoise, InverseSquare, Listeners, make_surface
+from jeit.acoustic import IntensityNoise, InverseSquare, Listeners, Localiser, make_surface
+from jeit.acoustic.localiser import METHODS
 from jeit.electrodes import grid
+
+both = pytest.mark.parametrize("method", METHODS)
+# Programs take long to compile: of some, only the likelihood's is for the quick suite.
+quick_likelihood = pytest.mark.parametrize(
+    "method", [pytest.param(one, marks=[] if one == "likelihood" else [pytest.mark.slow]) for one in METHODS]
+)
 
 OUTLINE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
 L_SHAPE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.01], [0.0, 0.01], [0.0, 0.1], [-0.1, 0.1]])
@@ -73,3 +81,13 @@ def same_shape(localiser, power, number=1024, **options):
     """What a localiser finds of frames, by a program of `number` frames."""
     found = localiser(padded(np.asarray(power), number), **options)
     return {key: np.asarray(getattr(found, key))[: len(power)] for key in found.__dataclass_fields__}
+
+
+def localise(listeners, power, method="likelihood", **options):
+    """The same, of a localiser made for it."""
+    return same_shape(Localiser.create(listeners, method=method), power, **options)
+
+
+def distance(found, places):
+    """Of what was found from where it is, metres."""
+    return np.linalg.norm(found["position"] - places, axis=1)

@@ -21,7 +21,7 @@ def calibration(listeners, intensity=None):
     errors[:, 2] = np.nan
     usable = np.arange(count) != 2
     reasons = tuple("" if good else "dead: every intensity is 0" for good in usable)
-    return Calibration(listeners, usable, reasons, errors, intensity, "taps of Friday – Ü")
+    return Calibration(listeners, usable, reasons, errors, intensity, "taps of Friday – Ü", (0.25, 8.0))
 
 
 def curved():
@@ -64,6 +64,7 @@ def test_there_and_back(name, tmp_path):
     np.testing.assert_array_equal(again.usable, one.usable)
     np.testing.assert_array_equal(again.standard_errors, one.standard_errors)
     assert (again.reasons, again.name, again.num_microphones) == (one.reasons, one.name, 9)
+    assert again.strengths == one.strengths == (0.25, 8.0)
     assert eqx.tree_equal(again.intensity, one.intensity)
     again.save(str(tmp_path / "again.json"))
     assert (tmp_path / "again.json").read_bytes() == (tmp_path / "array.json").read_bytes()
@@ -80,6 +81,7 @@ def test_the_file_says_what_it_holds(tmp_path):
     assert content["microphones"][2]["relative_standard_error"] == {"a": None, "b": None}
     assert content["intensity"] == {"low": 50.0, "high": 900.0, "window": 0.05, "hop": 0.0125}
     assert len(content["microphones"]) == 9
+    assert content["strengths"] == [0.25, 8.0]
 
 
 def test_values_that_no_file_can_hold_are_not_written(tmp_path):
@@ -140,23 +142,45 @@ EDITED = {
     "null": (put("microphones", 3, "a", None), "a of microphone 3 is None"),
     "negative noise": (put("microphones", 1, "relative_noise", -0.1), "noise .* negative"),
     "missing key": (put("microphones", 4, "b", del_), "incomplete or changed by hand"),
-    "no microphones": (put("microphones", []), "."),
+    "no microphones": (put("microphones", []), "it lists no microphones"),
     "microphones no list": (put("microphones", 7), "incomplete or changed by hand"),
     "a microphone no dictionary": (put("microphones", 3, 5), "incomplete or changed by hand"),
     "no surface": (put("surface", del_), "incomplete or changed by hand"),
-    "outline of two": (put("surface", "outline", [[0, 0], [1, 0]]), "."),
-    "outline of text": (put("surface", "outline", "square"), "."),
-    "position of one more": (put("microphones", 3, "position", [0.0, 0.0, 0.0]), "."),
+    "outline of two": (put("surface", "outline", [[0, 0], [1, 0]]), "at least three vertices"),
+    "outline of text": (put("surface", "outline", "square"), "outline is <U6; give real numbers"),
+    "outline in space": (put("surface", "outline", [[0, 0, 0], [1, 0, 0], [0, 1, 0]]), r"\(3, 3\); .* \(n, 2\)"),
+    "outline NaN": (put("surface", "outline", [[0, 0], [1, 0], [0, float("nan")]]), "outline holds NaN"),
+    "outline in millimetres": (put("surface", "outline", [[0, 0], [100, 0], [0, 100]]), "are these metres"),
+    "hole of text": (put("surface", "holes", ["round"]), r"holes\[0\] is <U5"),
+    "position of one more": (
+        put("microphones", 3, "position", [0.0, 0.0, 0.0]),
+        r"position of microphone 3 is \[0.0, 0.0, 0.0\]; it must be 2 coordinates",
+    ),
+    "position in millimetres": (put("microphones", 3, "position", [-70.0, 0.0]), "number 3 .* Divide millimetres"),
+    "position twice": (put("microphones", 3, "position", [-0.07, -0.07]), "numbers 0 and 3 are at the same place"),
     "positions in space": (
         lambda content: [one.update(position=[*one["position"], 0.0]) for one in content["microphones"]],
-        "positions of microphones must be 2 finite",
+        "position of microphone 0 .* must be 2 coordinates",
     ),
-    "position NaN": (put("microphones", 3, "position", [0.0, float("nan")]), "positions"),
-    "position of text": (put("microphones", 3, "position", ["a", "b"]), "."),
-    "band without a window": (put("intensity", {"low": 50.0}), None),
+    "position NaN": (put("microphones", 3, "position", [0.0, float("nan")]), "position of microphone 3 is nan"),
+    "position of text": (put("microphones", 3, "position", ["a", "b"]), "position of microphone 3 is 'a'"),
+    "position a number": (put("microphones", 3, "position", 0.1), "position of microphone 3 is 0.1"),
+    "usable in words": (put("microphones", 3, "usable", "yes"), "usable of microphone 3 is 'yes'; .* true or false"),
+    "usable as a number": (put("microphones", 3, "usable", 1), "usable of microphone 3 is 1"),
+    "no strengths": (put("strengths", del_), "incomplete or changed by hand"),
+    "strengths not known": (put("strengths", None), None),
+    "one strength": (put("strengths", [1.0]), "strengths is \\[1.0\\]"),
+    "strength of nothing": (put("strengths", [0.0, 1.0]), "strengths are 0 and 1; they must be positive"),
+    "strengths upside down": (put("strengths", [2.0, 1.0]), "the weaker first"),
+    "strength of text": (put("strengths", ["a", 1.0]), "one of strengths is 'a'"),
+    "a number without end": (put("microphones", 3, "b", 10**400), "incomplete or changed by hand"),
+    "band without a window": (put("intensity", {"low": 50.0}), None),  # the defaults stand in
     "band upside down": (put("intensity", {"low": 500.0, "high": 50.0, "window": 0.05, "hop": 0.01}), "low and high"),
     "band of another kind": (put("intensity", {"lowest": 500.0}), "incomplete or changed by hand"),
-    "error of text": (put("microphones", 3, "relative_standard_error", {"a": "x", "b": 0.1}), "."),
+    "error of text": (
+        put("microphones", 3, "relative_standard_error", {"a": "x", "b": 0.1}),
+        "relative_standard_error of a microphone is 'x'",
+    ),
     "error missing": (put("microphones", 3, "relative_standard_error", {"a": 0.1}), "incomplete or changed by hand"),
 }
 
@@ -167,12 +191,33 @@ def test_what_was_changed_by_hand_is_refused(name, content, tmp_path):
     change, message = EDITED[name]
     edited = json.loads(content)
     change(edited)
-    if message is None:  # the defaults stand in
-        assert load(tmp_path, json.dumps(edited)).intensity == IntensitySettings()
+    if message is None:
+        read = load(tmp_path, json.dumps(edited))
+        assert read.intensity in (None, IntensitySettings())
+        assert read.strengths in (None, (0.25, 8.0))
         return
     with pytest.raises(ValueError, match=message) as caught:
         load(tmp_path, json.dumps(edited))
     assert "array.json" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("knots", [[0.0, 0.0, 0.0]], r"curve, knots has shape \(1, 3\); it must be \(n, 2\)"),
+        ("weights", [1.0], "knots and 1 weights"),
+        ("normal", [0.0, 1.0], r"curve, normal has shape \(2,\)"),
+        ("axes", "flat", "curve, axes is <U4"),
+        ("origin", [0.0, 0.0, float("inf")], "curve, origin holds NaN or infinity"),
+    ],
+)
+def test_a_curve_changed_by_hand_is_refused(key, value, message, tmp_path):
+    CASES["curved"]().save(tmp_path / "array.json")
+    edited = json.loads((tmp_path / "array.json").read_text("utf-8"))
+    edited["surface"]["curve"][key] = value
+    with pytest.raises(ValueError, match=message):
+        load(tmp_path, json.dumps(edited))
 
 
 OTHERS = {
@@ -185,6 +230,7 @@ OTHERS = {
     "binary": bytes(range(256)) * 20,
     "UTF-16": '{"format": "x"}'.encode("utf-16"),
     "an archive": b"PK\x03\x04" + bytes(100),
+    "a number of many digits": "1" * 5000,
     "very deep": "[" * 100_000,
 }
 

@@ -26,7 +26,7 @@ def model(name):
 def test_formula(name):
     parameters, formula = FORMULAS[name]
     expected = formula(DISTANCE, *(values[:, None] for values in parameters))
-    # The tip of exp(-r / l) is rounded off by a tenth of a micrometre: 5e-6 of the length.
+    # The tip of exp(-r / l) is rounded off by a hundredth of a micrometre: 5e-7 of the length.
     np.testing.assert_allclose(jnp.exp(model(name).log_response(jnp.asarray(DISTANCE**2))), expected, rtol=1e-5)
     away = DISTANCE[:, 1:]
     expected = formula(away, *(values[:, None] for values in parameters))

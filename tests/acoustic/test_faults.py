@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.acoustic.faults import CLIPPING, NOT_FINITE, STUCK, intensity_faults, sample_faults, window_faults
+from jeit.acoustic.faults import CLIPPING, NOT_FINITE, STUCK, intensity_faults, sample_faults, tell, window_faults
 
 RATE = 40e3
 TIME = np.arange(40_000) / RATE
@@ -210,3 +210,20 @@ def test_intensities_without_samples():
     expected[:, [0, 3]] = True
     expected[2, 3] = False
     np.testing.assert_array_equal(usable, expected)
+
+
+@pytest.mark.parametrize(
+    ("reasons", "said"),
+    [
+        ((), ""),
+        (("", ""), ""),
+        (("", "dead"), "microphone 1: dead"),
+        (("dead",) * 25, "microphones 0-24: dead"),
+        (
+            ("dead", "", "dead", "dead", "stuck", "dead", "", "stuck"),
+            "microphones 0, 2-3, 5: dead; microphones 4, 7: stuck",
+        ),
+    ],
+)
+def test_one_reason_is_told_once(reasons, said):
+    assert tell(reasons) == said

@@ -36,6 +36,7 @@ def test_sine(settings, frequency):
     np.testing.assert_array_equal(found.floor, 0)
     assert found.usable.all()
     assert found.faults == ("", "", "")
+    assert found.overlap == round(settings.window * RATE) / round(settings.hop * RATE) > 1
 
 
 @pytest.mark.parametrize("low", [0.0, 20.0])
@@ -273,7 +274,7 @@ def test_faults_of_taps():
 def test_taps_of_intensities_pass():
     power = np.abs(white((6, 3)))
     power[2, 1] = np.nan
-    found = tap_intensities(Taps(white((3, 2)) * 0.05, OUTLINE, white((6, 2)) * 0.05, power=power))
+    found = tap_intensities(Taps(0.02 + white((3, 2)) * 0.01, OUTLINE, 0.1 + white((6, 2)) * 0.01, power=power))
     np.testing.assert_array_equal(found.power, power)
     np.testing.assert_array_equal(found.usable, np.isfinite(power))
     assert found.faults == ("", "NaN or infinite in 1 of 6 windows", "")

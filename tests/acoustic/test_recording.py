@@ -85,7 +85,7 @@ def test_intensities_round_trip(tmp_path):
     power = POWER.copy()
     power[2, 1], power[:, 2] = np.nan, np.nan
     written = Intensities(
-        TIMES, power, floor=[0.1, 0.2, 0.3], freedom=49.5, usable=np.isfinite(power) & (TIMES > 0)[:, None]
+        TIMES, power, floor=[0.1, 0.2, 0.3], freedom=49.5, overlap=4.0, usable=np.isfinite(power) & (TIMES > 0)[:, None]
     )
     write_recording(tmp_path / "touch.npz", written)
     found = read_recording(str(tmp_path / "touch.npz"))
@@ -94,7 +94,7 @@ def test_intensities_round_trip(tmp_path):
     np.testing.assert_array_equal(found.power[found.usable], power[written.usable])
     np.testing.assert_array_equal(found.times, TIMES)
     np.testing.assert_array_equal(found.floor, [0.1, 0.2, 0.3])
-    assert found.freedom == 49.5
+    assert (found.freedom, found.overlap) == (49.5, 4.0)
     assert found.faults[1:] == ("NaN or infinite in 2 of 6 windows", "dead: every intensity is NaN or infinite")
 
 
@@ -105,6 +105,7 @@ def test_intensities_alone(tmp_path):
     np.testing.assert_array_equal(found.power, POWER - 0.5)
     np.testing.assert_array_equal(found.floor, 0)
     assert np.isinf(found.freedom)
+    assert found.overlap == 1
     assert found.usable.all()
     assert found.faults == ("", "", "")
 
@@ -136,6 +137,12 @@ def test_numbers_keep_their_kind():
     assert sorted(map(tuple, clockwise.outline)) == sorted(map(tuple, SQUARE))
     x, y = clockwise.outline.T
     assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == pytest.approx(0.04)
+
+
+def test_microphones_and_taps_may_be_a_little_beside_the_outline():
+    """Under a rim, or pressed at the very edge: a skin's length off, and a twentieth of it."""
+    beside = Taps(SQUARE[:2] - np.array([0.0, 0.199]), SQUARE, SQUARE + np.array([0.0099, 0.0]), power=np.ones((4, 2)))
+    np.testing.assert_allclose(beside.positions[1], [0.2099, 0])
 
 
 def without(arrays, *keys):
@@ -186,6 +193,10 @@ MISSING = np.where(np.arange(10).reshape(5, 2) == 3, np.nan, 0.1)
         ({**FRAMES, "floor": [0.1, np.nan, 0.1]}, "finite"),
         ({**FRAMES, "freedom": 0.0}, "freedom must be positive"),
         ({**FRAMES, "freedom": np.nan}, "freedom must be positive"),
+        ({**FRAMES, "overlap": 0.25}, r"overlap must be at least 1, .*window / hop.* it is 0.25"),
+        ({**FRAMES, "overlap": np.inf}, "overlap must be at least 1"),
+        ({**FRAMES, "overlap": np.nan}, "overlap must be at least 1"),
+        ({**FRAMES, "overlap": [4.0, 4.0]}, "overlap must be one real number"),
     ],
 )
 def test_bad_recordings(tmp_path, arrays, said):
@@ -226,6 +237,27 @@ def test_bad_recordings(tmp_path, arrays, said):
         ({**HEARD, "samples": HEARD["samples"][0]}, r"\(taps, microphones, samples\)"),
         ({**TAPS, "microphones": np.array([["a", "b"]] * 3)}, "microphones is <U1"),
         ({**TAPS, **{k: np.insert(TAPS[k][:2], 2, 0, axis=1) for k in GEOMETRY}}, "at least three"),
+        ({**TAPS, "microphones": SQUARE[[0, 1, 1]]}, r"numbers 1 and 2 are at the same place, \[0.2, 0.0\]"),
+        (
+            {**TAPS, "microphones": 10 * SQUARE[:3]},
+            r"number 2 at \[2.0, 2.0\] is 2.55 m away .* 0.2 m long: .* Divide millimetres by 1000",
+        ),
+        (
+            {**TAPS, **{k: np.insert(TAPS[k], 2, 0, axis=1) for k in GEOMETRY}, "microphones": np.eye(3)},
+            r"number 2 at \[0.0, 0.0, 1.0\] .* metres",
+        ),
+        (
+            {**TAPS, "positions": [*TAPS["positions"][:4], [0.1, -0.0101]]},
+            r"positions: row 4, \[0.1, -0.0101\], is 10.1 mm outside the outline; .* within 10 mm",
+        ),
+        (
+            {
+                **TAPS,
+                "outline": np.insert(SQUARE, 3, [0.1, 0.1], axis=0)[[0, 1, 3, 4]],
+                "positions": [[0.15, 0.15]] * 5,
+            },
+            "row 0, .* is 70.7 mm outside",
+        ),
     ],
 )
 def test_bad_taps(tmp_path, arrays, said):

@@ -2,11 +2,15 @@
 
 import csv
 import json
+import re
+from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pytest
 from scipy.io import wavfile
 
+from jeit.acoustic import Calibration, measure, read_recording, write_recording
 from jeit.cli import main
 from jeit.electrodes import grid
 
@@ -78,7 +82,10 @@ def test_intensities_to_a_track(folder, tmp_path, capsys):
     assert len(report["touches"]) == 1
     assert report["touches"][0]["offset_s"] == pytest.approx(1.2)
     assert (tmp_path / "track.png").stat().st_size > 10_000
-    assert "25 touch, 15 no touch" in " ".join(capsys.readouterr().out.split())
+    said = " ".join(capsys.readouterr().out.split())
+    assert "25 touch, 15 no touch" in said
+    # A stroke: from (70, 0) mm to where it is 1.2 s later.
+    assert f"1 0.000 1.200 70.0 → {70 * np.cos(3.6):.1f} 0.0 → {60 * np.sin(3.6):.1f}" in said
 
 
 @pytest.mark.parametrize("name", ["touch.npz", "touch.wav"])
@@ -94,6 +101,49 @@ def test_samples_to_a_track(name, folder, tmp_path):
         off = np.array([float(row[f"{axis}_m"]) - truth for row in late])
         assert np.abs(off).max() < 0.01
         assert (np.abs(off) < 5 * np.array([float(row[f"std_{axis}_m"]) for row in late])).all()
+
+
+def test_intensities_of_samples_are_smoothed_as_those_are(folder, tmp_path):
+    """Written to a file, with their overlap: the same track, and as sure of it."""
+    heard = measure(read_recording(folder / "touch.npz"), Calibration.load(folder / "sound.json"))
+    assert heard.overlap == 4
+    write_recording(tmp_path / "heard.npz", heard)
+    for name, output in ((folder / "touch.npz", "samples"), (tmp_path / "heard.npz", "intensities")):
+        command = ["locate", str(name), "-c", str(folder / "sound.json"), "-o", str(tmp_path / output), "-q"]
+        assert main(command) == 0
+    assert rows(tmp_path / "samples") == rows(tmp_path / "intensities")
+
+
+def test_two_touches_are_both_printed(folder, tmp_path, capsys):
+    """The second beside the first, though for a moment it is the stronger."""
+    places = np.array([[0.05, 0.04], [-0.04, -2e-5]])
+    first, second = received(places)
+    share = np.where(np.isin(np.arange(12), [4, 8]), 1.6, 0.6)[:, None]
+    np.savez(tmp_path / "two.npz", intensity=first + share * second, times=0.05 * np.arange(12))
+    command = ["locate", str(tmp_path / "two.npz"), "-c", str(folder / "cal.json"), "-o", str(tmp_path)]
+    assert main(command) == 0
+    table = capsys.readouterr().out
+    (line,) = [line for line in table.splitlines() if "1, other" in line]
+    assert " -40.0 0.0 " in " ".join(line.split())  # what rounds to nothing has no sign
+    assert "12 two" in line
+
+
+def test_a_touch_without_pauses(folder, tmp_path, capsys):
+    """Silence to a recording by itself, which is said; found with a recording of silence."""
+    random = np.random.default_rng(6)
+    times = np.arange(4000) / RATE
+    tones = np.sin(2 * np.pi * np.arange(100, 900, 20)[:, None] * times + random.uniform(0, 6, (40, 1))).sum(axis=0)
+    shaken = np.sqrt(received([0.03, 0.02])[0])[:, None] * tones
+    np.savez(tmp_path / "shaken.npz", samples=shaken + 0.01 * random.standard_normal((9, 4000)), rate=RATE)
+    np.savez(tmp_path / "hush.npz", samples=0.01 * random.standard_normal((9, 4000)), rate=RATE)
+    command = ["locate", str(tmp_path / "shaken.npz"), "-c", str(folder / "sound.json"), "-o", str(tmp_path)]
+    assert main(command) == 0
+    assert {row["status"] for row in rows(tmp_path)} == {"no touch"}
+    assert "never pauses" in " ".join(capsys.readouterr().out.split())
+    assert "--silence" in json.loads((tmp_path / "report.json").read_text("utf-8"))["notes"][0]
+    assert main([*command, "--silence", str(tmp_path / "hush.npz"), "-q"]) == 0
+    found = np.array([[float(row["x_m"]), float(row["y_m"])] for row in rows(tmp_path)])
+    assert np.abs(found - [0.03, 0.02]).max() < 0.003
 
 
 @pytest.mark.slow
@@ -126,6 +176,20 @@ def test_exchanged_microphones_are_named(folder, tmp_path):
     )
     notes = " ".join(json.loads((tmp_path / "report.json").read_text("utf-8"))["notes"])
     assert "2 and 6" in notes
+
+
+@pytest.mark.slow
+def test_the_documentation_runs(tmp_path, monkeypatch):
+    """Every block of Python of the page, one after the other."""
+    matplotlib.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).resolve().parents[2] / "docs" / "hearing.md").read_text("utf-8")
+    names: dict = {}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        exec(compile(block, "hearing.md", "exec"), names)
+    assert len(names["path"].touches) == 3
+    assert names["jacobian"].shape == names["power"].shape[:1] + names["fit"].calibration.listeners.microphones.shape
+    assert (tmp_path / "track.png").stat().st_size > 10_000
 
 
 def _bad_files(folder):
@@ -176,6 +240,9 @@ def instead(command, **changes):
         ([*LOCATE, "--method", "magic"], "likelihood, consistency"),
         ([*LOCATE, "--gap", "0"], "--gap"),
         ([*LOCATE, "--low", "100"], "for samples"),
+        ([*LOCATE, "--silence", "touch.npz"], "--silence is for samples"),
+        (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--silence", "recording.npz"], "must hold samples"),
+        (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--silence", "none.npz"], "none.npz"),
         (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--high", "5000"], "2000"),
         (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--window", "-1"], "window"),
         (instead(LOCATE, out="cal.json"), "is a file"),

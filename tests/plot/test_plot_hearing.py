@@ -58,7 +58,7 @@ def fitted(number=9, reasons=(), outliers=()):
         if reason == DEAD:
             power[:, index], usable[:, index] = np.nan, False
     told = np.where(outlier, np.nan, strength)
-    return CalibrationFit(known, distance, power, usable, told, outlier, np.ones(number))
+    return CalibrationFit(known, distance, power, usable, told, outlier, np.ones(number), ~known.usable)
 
 
 def recorded(position, statuses=None, *, spread=1e-6, rejected=(), touches=None, used=None, number=9, second=None):
@@ -80,6 +80,7 @@ def recorded(position, statuses=None, *, spread=1e-6, rejected=(), touches=None,
         used=np.ones((frames, number), bool) if used is None else used,
         second=np.full((frames, d), np.nan) if second is None else second,
         second_strength=nothing,
+        overlap=1.0,
         faults=("",) * number,
         notes=(),
         name="made",
@@ -313,14 +314,14 @@ def test_frames_that_are_no_plain_touch_are_named(ax):
     statuses[[2, 3]], statuses[5], statuses[8] = "outside", "misfit", "two touches"
     second = np.full((20, 2), np.nan)
     second[8] = [-0.05, 0.06]
-    track, locations = recorded(stroke(), statuses, rejected=[12], second=second)
+    track, locations = recorded(stroke(), statuses, rejected=[3, 12], second=second)
     plot_track(track, locations, calibration(), truth=stroke(3), ax=ax)
-    known = ["not believed (1)", "two touches (1)", "outside (2)", "misfit (1)"]
+    known = ["not believed (2)", "two touches (1)", "outside (2)", "misfit (1)"]
     assert named(ax) == ["microphone", "truth", "onset", "offset", *known]
     marked = [np.asarray(c.get_offsets()) for c in ax.collections if not isinstance(c, LineCollection)]
     plain, doubted, other, first, outside, misfit = marked
     assert len(plain) == 15
-    np.testing.assert_allclose(doubted, stroke()[[12]])
+    np.testing.assert_allclose(doubted, stroke()[[3, 12]])
     np.testing.assert_allclose(other, second[[8]])
     np.testing.assert_allclose(first, stroke()[[8]])
     np.testing.assert_allclose(outside, stroke()[[2, 3]])

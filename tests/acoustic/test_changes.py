@@ -1,10 +1,10 @@
-"""Swapped microphones: found and named, and not found where nothing is swapped."""
+"""What has changed since the calibration: found and named, and not found where nothing has."""
 
 import numpy as np
 import pytest
 from microphone_arrays import array, hear, inside, noisy
 
-from jeit.acoustic import find_swaps
+from jeit.acoustic import find_changes
 
 # Large programs; test_locate has an exchange in the quick suite.
 pytestmark = pytest.mark.slow
@@ -25,7 +25,26 @@ def swapped(power, *pairs):
 
 
 def found(listeners, power):
-    return find_swaps(listeners, power, np.isfinite(power))
+    """Exchanged pairs, where nothing is altered otherwise."""
+    exchanged, altered = find_changes(listeners, power, np.isfinite(power))
+    assert altered == []
+    return exchanged
+
+
+@pytest.mark.parametrize("factor", [0.02, 30.0])
+def test_another_gain_is_no_exchange(factor):
+    """Deaf, or too loud: named as such."""
+    listeners, power = frames()
+    power[:, 4] *= factor
+    assert find_changes(listeners, power, np.isfinite(power)) == ([], [4])
+
+
+def test_of_five_microphones_none_is_left_out():
+    """Four explain anything: what says nothing is not believed."""
+    listeners, power = frames()
+    power[:, 5:] = np.nan
+    power[:, 4] *= 0.02
+    assert find_changes(listeners, power, np.isfinite(power)).altered == []
 
 
 @pytest.mark.parametrize("pair", [(0, 8), (3, 4), (1, 2)])

@@ -315,8 +315,68 @@ def test_on_a_curved_skin():
 def test_too_few_microphones(exact):
     power = exact[2].copy()
     power[:, 2:] = 0
-    with pytest.raises(ValueError, match=r"only 2 microphones heard 4 taps or more.*microphone 2: dead"):
+    with pytest.raises(ValueError, match=r"only 2 microphones heard taps from 4 distances.*microphones 2-24: dead"):
         calibrated(power)
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    """Taps 60 mm apart, receptive fields of 15 mm, errors of a fifth: some microphones are far from any tap."""
+    places = grid(0.18, 0.18, 4, 4).repeat(3, axis=0)
+    values = np.array(parameters("inverse-square")) / np.array([[1], [16]])
+    squared = ((places[:, None] - MICROPHONE) ** 2).sum(axis=-1)
+    power = heard("inverse-square", values, squared)
+    return values, places, power * np.exp(0.2 * np.random.default_rng(3).normal(size=power.shape))
+
+
+def test_a_shape_that_no_tap_determines_is_that_of_the_others(coarse):
+    """No microphone is held at its bound, where it would draw all places to itself."""
+    values, places, power = coarse
+    fit = calibrated(power, places)
+    b = logarithms_of(fit)[1]
+    assert fit.calibration.usable.all()
+    assert 0 < fit.shared.sum() < COUNT
+    own = b[~fit.shared]
+    assert len(np.unique(b[fit.shared])) == 1
+    assert own.min() - 0.5 < b[fit.shared][0] < own.max() + 0.5
+    assert np.abs(b - np.log(values[1])).max() < 2.5
+    errors = fit.calibration.standard_errors
+    assert np.isnan(errors[1, fit.shared]).all()
+    assert np.isfinite(errors[0]).all()
+    assert (errors[1, ~fit.shared] < 1).all()
+
+
+@pytest.mark.parametrize(
+    ("places", "said"),
+    [
+        (np.repeat(PLACES[80:81], 20, axis=0), r"only 0 microphones heard taps from 4 distances"),
+        (np.repeat(PLACES[[10, 80, 150]], 7, axis=0), r"tap all over the skin"),
+        pytest.param(
+            np.random.default_rng(4).permutation(PLACES), r"can be calibrated|order of the taps", marks=pytest.mark.slow
+        ),
+    ],
+    ids=["one place", "three places", "another order"],
+)
+def test_taps_that_say_nothing_are_refused(places, said, exact):
+    power = exact[2][: len(places)] * np.exp(0.2 * np.random.default_rng(5).normal(size=(len(places), COUNT)))
+    with pytest.raises(ValueError, match=said):
+        calibrated(power, places)
+
+
+@pytest.mark.slow
+def test_microphones_are_judged_again_without_those_left_out(exact):
+    """What is left is fitted as if the others had never been there, until all that is left is of use."""
+    rng = np.random.default_rng(1)
+    power = exact[2] * np.exp(0.2 * rng.normal(size=exact[2].shape))
+    mixture = np.linspace(0.5, 0.95, 8)
+    power[:, :8] = np.exp((1 - mixture) * np.log(power[:, :8]) + mixture * rng.normal(size=(NUMBER, 8)))
+    fit = calibrated(power)
+    good = fit.calibration.usable
+    assert good.sum() == 18
+    assert np.isfinite(fit.calibration.standard_errors[:, good]).all()
+    assert all(fit.explained[good] >= 0.3)
+    alone = np.where(good, power, np.nan)
+    np.testing.assert_allclose(logarithms_of(fit)[1, good], logarithms_of(calibrated(alone))[1, good], atol=0.03)
 
 
 @pytest.mark.slow

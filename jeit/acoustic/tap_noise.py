@@ -1,0 +1,74 @@
+"""What the residuals of a calibration say of the noise: each microphone's relative error, and what it reads of nothing.
+
+Arrays are (M, T): M microphones, T taps. Residuals are of levels, log(power + floor).
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise
+
+# Beyond so many deviations residuals say nothing of the noise.
+_BEYOND = 4.0
+# Taps that the median of all microphones counts for in the noise of each.
+_DRAWN = 20.0
+
+
+def relative_errors(
+    noise: IntensityNoise,
+    received: Float[np.ndarray, "M T"],
+    residual: Float[np.ndarray, "M T"],
+    use: Bool[np.ndarray, "M T"],
+    inflation: float,
+) -> Float[np.ndarray, " M"]:
+    """τ of each microphone: what its residuals show beyond the floor's noise (moments, without what is far off).
+
+    `received` is expected; `inflation` makes up for what fitted parameters took out of the residuals' squares. Each is
+    drawn towards the median of all, as much as if that had been seen in a few more taps: of few taps the moments may
+    well come out as nothing, or less.
+    """
+    floor, rest, cross = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
+    seen, excess = np.zeros(len(received)), np.zeros(len(received))
+    for k in range(len(received)):
+        used = use[k] & (received[k] > 3 * rest[k])
+        if used.sum() < 3:
+            continue
+        signal, off = received[k, used], residual[k, used]
+        share = (signal / (signal + floor[k])) ** 2
+        other = (cross[k] * signal + rest[k] ** 2) / (signal + floor[k]) ** 2
+        near = np.abs(off) <= _BEYOND * max(1.4826 * np.median(np.abs(off)), 1e-15)
+        for _ in range(3):
+            near = np.abs(off) <= _BEYOND * np.sqrt(np.mean(off[near] ** 2))
+        seen[k] = near.sum()
+        excess[k] = (inflation * np.mean(off[near] ** 2) - np.mean(other[near])) / np.mean(share[near])
+    if not seen.any():
+        return np.full(len(received), 0.5)
+    typical = max(float(np.median(excess[seen > 0])), 0.0)
+    drawn = (seen * np.minimum(excess, 1.0) + _DRAWN * typical) / (seen + _DRAWN)
+    return np.sqrt(np.maximum(drawn, LEAST_RELATIVE**2))
+
+
+def additive_deviations(
+    power: Float[np.ndarray, "M T"], received: Float[np.ndarray, "M T"], use: Bool[np.ndarray, "M T"], inflation: float
+) -> Float[np.ndarray, " M"]:
+    """s of each microphone, where only intensities are known: what it reads of nothing.
+
+    The likeliest pair of relative and additive deviation, on a grid; 0 unless that is clearly better than none.
+    """
+    deviation = np.zeros(len(received))
+    shares = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 50)])
+    scatter = np.geomspace(LEAST_RELATIVE, 1.0, 30)
+    for k in range(len(received)):
+        if use[k].sum() < 8:
+            continue
+        read, signal = power[k, use[k]], received[k, use[k]]
+        top = np.abs(read).max()
+        if top == 0:
+            continue
+        trial = (scatter[:, None, None] * signal) ** 2 + (top * shares[:, None]) ** 2 + 1e-30 * top**2
+        ratio = np.minimum(inflation * (read - signal) ** 2 / trial, _BEYOND**2)
+        score = np.sum(ratio + np.log(trial), axis=-1).min(axis=0)
+        best = int(score.argmin())
+        if score[best] < score[0] - 6:
+            deviation[k] = top * shares[best]
+    return deviation

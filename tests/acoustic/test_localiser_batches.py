@@ -1,0 +1,147 @@
+"""Batches of frames: independent, in chunks, compiled or not, with readings missing; maps; bad input."""
+
+import jax
+import numpy as np
+import pytest
+from microphone_arrays import L_SHAPE, array, both, distance, hear, inside, localise, noisy, same_shape
+
+from jeit.acoustic import Localiser
+
+
+@pytest.fixture(scope="module")
+def mixed():
+    """Noisy frames inside and beyond, some with readings missing."""
+    listeners = array(9, relative=0.1)
+    rng = np.random.default_rng(7)
+    places = np.concatenate([inside(40), inside(10, seed=1) + np.array([0.2, 0.0])])
+    power = noisy(listeners.noise, hear(listeners, places), rng)
+    power[rng.random(power.shape) < 0.1] = np.nan
+    return listeners, power
+
+
+@pytest.mark.slow
+@both
+def test_frames_do_not_see_each_other(method, mixed):
+    """One by one, in another order, or padded with others: the same to rounding."""
+    listeners, power = mixed
+    localiser = Localiser.create(listeners, method=method)
+    together = same_shape(localiser, power)
+    for frame in range(0, 50, 7):
+        alone = localiser(power[frame : frame + 1])
+        for key, values in together.items():
+            np.testing.assert_allclose(getattr(alone, key)[0], values[frame], rtol=1e-6, atol=1e-9)
+    order = np.random.default_rng(8).permutation(50)
+    shuffled = same_shape(localiser, power[order])
+    for key in ("position", "covariance", "strength", "excess", "misfit"):
+        np.testing.assert_allclose(shuffled[key], together[key][order], rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.slow
+@both
+def test_many_frames_are_worked_on_in_chunks(method, mixed):
+    listeners, power = mixed
+    localiser = Localiser.create(listeners, method=method)
+    many = localiser(power[np.arange(2500) % 50])
+    np.testing.assert_allclose(many.position, localiser(power).position[np.arange(2500) % 50], rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.slow
+@both
+def test_compiled_or_not(method, mixed):
+    listeners, power = mixed
+    localiser = Localiser.create(listeners, method=method)
+    with jax.disable_jit():
+        eager = localiser(power[:3])
+    for key, values in same_shape(localiser, power[:3]).items():
+        np.testing.assert_allclose(getattr(eager, key), values, rtol=1e-6, atol=1e-9)
+
+
+@both
+def test_missing_readings(method):
+    """NaN, not used, or used and infinite are one; exact data stay exact with up to five of nine gone."""
+    exact, places = array(9), inside(200, reach=0.6)
+    power = hear(exact, places)
+    rng = np.random.default_rng(9)
+    use = np.ones(power.shape, bool)
+    for frame in range(200):
+        use[frame, rng.choice(9, frame % 5 + 1, replace=False)] = False
+    found = localise(exact, np.where(use, power, np.nan), method)
+    several = use.sum(axis=1) >= 5
+    assert distance(found, places)[several].max() < 1e-6
+    # Four leave one degree of freedom, and now and then a second place that is nearly as good.
+    assert np.mean(distance(found, places) < 1e-6) > 0.97
+    np.testing.assert_array_equal(found["freedom"], use.sum(axis=1) - 3)
+    localiser = Localiser.create(exact, method=method)
+    rubbish = np.where(use, power, 1e9)
+    padded = np.arange(1024) % 200
+    np.testing.assert_array_equal(localiser(rubbish[padded], use[padded]).position[:200], found["position"])
+    infinite = np.where(use, power, np.inf)
+    np.testing.assert_array_equal(localise(exact, infinite, method)["position"], found["position"])
+
+
+@both
+def test_too_few_readings_give_nan(method, mixed):
+    listeners, power = mixed
+    power = np.where(np.isnan(power), 1.0, power)
+    power[0, 2:] = np.nan
+    power[1] = np.nan
+    power[2, 3:] = np.nan
+    found = localise(listeners, power, method)
+    for key in ("position", "covariance", "strength", "misfit"):
+        assert np.isnan(found[key][:2]).all()
+        assert np.isfinite(found[key][2:]).all()
+    assert not found["converged"][:2].any()
+    np.testing.assert_array_equal(found["freedom"][:4], [0, 0, 0, 6])
+
+
+@pytest.mark.slow
+@both
+def test_maps(method):
+    """Least where the source is found, to a pixel; blank beyond the outline; bottom row first."""
+    listeners, places = array(9, outline=L_SHAPE, relative=0.02), inside(20, outline=L_SHAPE, reach=0.9)
+    localiser = Localiser.create(listeners, method=method, map_shape=(40, 30))
+    power = noisy(listeners.noise, hear(listeners, places), np.random.default_rng(10))
+    found, maps = localiser.with_maps(power[np.arange(32) % 20])
+    assert maps.shape == (32, 40, 30)
+    x, y = -0.1 + 0.2 * (np.arange(30) + 0.5) / 30, -0.1 + 0.2 * (np.arange(40) + 0.5) / 40
+    np.testing.assert_array_equal(np.isnan(maps[0]), (x > 0) & (y[:, None] > 0.01))
+    for one, place in zip(np.asarray(maps), np.asarray(found.position), strict=True):
+        row, column = np.unravel_index(np.nanargmin(one), one.shape)
+        assert np.hypot(x[column] - place[0], y[row] - place[1]) < 0.009
+    coarse = same_shape(Localiser.create(listeners, method=method), power)
+    np.testing.assert_allclose(found.position[:20], coarse["position"], atol=1e-8)
+
+
+@pytest.mark.slow
+@both
+def test_the_papers_raster(method):
+    """200 × 200 pixels of a millimetre: the map of the loss is the formula's, and its minimum the place."""
+    listeners, places = array(9, relative=0.02), inside(5, reach=0.9)
+    power = hear(listeners, places)
+    found, maps = Localiser.create(listeners, method=method, map_shape=(200, 200)).with_maps(power)
+    np.testing.assert_allclose(found.position, places, atol=1e-6)
+    for one, place in zip(np.asarray(maps), places, strict=True):
+        row, column = np.unravel_index(np.nanargmin(one), one.shape)
+        assert np.abs(-0.1 + 1e-3 * (np.array([column, row]) + 0.5) - place).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"method": "magic"}, "likelihood, consistency"),
+        ({"map_shape": (10,)}, "rows, columns"),
+        ({"map_shape": (1, 10)}, "at least two"),
+    ],
+)
+def test_bad_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        Localiser.create(array(9), **options)
+
+
+def test_bad_frames():
+    localiser = Localiser.create(array(9))
+    for power, use in ((np.ones(9), None), (np.ones((4, 8)), None), (np.ones((4, 9)), np.ones((4, 8), bool))):
+        with pytest.raises((ValueError, TypeError), match=r"frames, microphones|broadcast|shape"):
+            localiser(power, use)
+    with pytest.raises(ValueError, match="map_shape"):
+        localiser.with_maps(np.ones((4, 9)))

@@ -1,0 +1,96 @@
+"""Derivatives of the place found, in all that it depends on, against finite differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from microphone_arrays import array, both, hear, inside, noisy, quick_likelihood
+
+from jeit.acoustic import Localiser
+from jeit.acoustic.localiser import METHODS
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """Listeners, power, a direction in which all of them are moved, and what is found as a function of them."""
+    listeners = array(9, relative=0.1, floor=1e-4, freedom=100.0)
+    beyond = [[0.14, 0.02], [0.15, -0.05], [-0.14, 0.03], [0.01, 0.15], [-0.04, -0.14], [0.05, 0.16]]
+    places = np.concatenate([inside(20, reach=0.8), beyond, [[0.16, 0.16], [-0.17, 0.15]]])
+    rng = np.random.default_rng(0)
+    power = noisy(listeners.noise, hear(listeners, places, np.exp(rng.normal(size=len(places)))), rng)
+    point = (listeners.microphones, jnp.log(listeners.decay.a), jnp.log(listeners.decay.b), jnp.asarray(power))
+    direction = (
+        0.01 * rng.normal(size=(9, 2)),
+        rng.normal(size=9),
+        rng.normal(size=9),
+        power * rng.normal(size=power.shape),
+    )
+
+    made = {method: Localiser.create(listeners, method=method) for method in METHODS}
+
+    def located(method, microphones, log_a, log_b, power):
+        moved = eqx.tree_at(
+            lambda one: (one.listeners.microphones, one.listeners.decay.a, one.listeners.decay.b),
+            made[method],
+            (microphones, jnp.exp(log_a), jnp.exp(log_b)),
+        )
+        return moved(power)
+
+    return point, tuple(jnp.asarray(part) for part in direction), located
+
+
+def stepped(point, direction, step):
+    return [at + step * by for at, by in zip(point, direction, strict=True)]
+
+
+PARTS = {"microphones": [0], "a": [1], "b": [2], "power": [3], "all": [0, 1, 2, 3]}
+
+
+@quick_likelihood
+def test_gradients(method, moving):
+    """Forward mode, reverse mode and central differences agree, in each of what positions depend on."""
+    point, direction, located = moving
+    found = located(method, *point)
+    # What needs more steps is said not to have converged, and its slopes are as far off as its place.
+    done = np.asarray(found.converged)
+    assert done.mean() > 0.9
+    weight = jnp.asarray(np.where(done[:, None], np.random.default_rng(2).normal(size=(28, 2)), 0.0))
+    forward = jax.jit(lambda tangent: jax.jvp(lambda *x: located(method, *x).position, point, tangent)[1])
+    reverse = jax.jit(jax.grad(lambda x: jnp.sum(weight * located(method, *x).position)))(tuple(point))
+    # Frames on a side of the outline move along it, those in a corner stay in it.
+    on = np.abs(np.abs(np.asarray(found.position)) - 0.1) < 1e-9
+    corner = on.all(axis=1)
+    assert (on.sum(axis=1) == 0).sum() >= 20
+    assert (on.sum(axis=1) == 1).sum() >= 2
+    assert corner.any() or method == "consistency"
+    for parts in PARTS.values():
+        mine = tuple(by if k in parts else jnp.zeros_like(by) for k, by in enumerate(direction))
+        slope = np.asarray(forward(mine))
+        step = 3e-6
+        ahead, behind = (np.asarray(located(method, *stepped(point, mine, sign * step)).position) for sign in (1, -1))
+        difference = (ahead - behind) / (2 * step)
+        size = np.linalg.norm(difference, axis=1)
+        assert (size[done & ~corner] > 1e-6).all()
+        error = np.linalg.norm(slope - difference, axis=1) / np.where(corner, 1.0, size)
+        assert error[done].max() < 1e-5, (np.flatnonzero(done & (error > 1e-5)), error[done].max())
+        np.testing.assert_allclose(slope[on], 0, atol=1e-12)
+        product = sum(float(jnp.sum(by * gradient)) for by, gradient in zip(mine, reverse, strict=True))
+        # Two programs, whose descents end where rounding lets them.
+        assert product == pytest.approx(float(np.sum(np.asarray(weight) * slope)), rel=1e-6)
+
+
+@pytest.mark.slow
+@both
+def test_the_gradient_of_exact_data_is_the_place_itself(method):
+    """Moved together with all microphones, the source moves along: the Jacobian in them adds up to the identity."""
+    listeners = array(9)
+    power = jnp.asarray(hear(listeners, inside(28, reach=0.8)))
+    localiser = Localiser.create(listeners, method=method)
+
+    def positions(shift):
+        moved = listeners.microphones + shift
+        return eqx.tree_at(lambda one: one.listeners.microphones, localiser, moved)(power).position
+
+    jacobian = jax.jacfwd(positions)(jnp.zeros(2))
+    np.testing.assert_allclose(jacobian, np.broadcast_to(np.eye(2), (28, 2, 2)), atol=1e-6)
