@@ -10,7 +10,10 @@ import pytest
 FEW = ("--num-points", 250)
 
 
-@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "total-variation"])
+@pytest.mark.parametrize(
+    "method",
+    [pytest.param("gauss-newton", marks=pytest.mark.slow), "levenberg-marquardt", "total-variation"],
+)
 def test_iterative_images(method, tank, run, tmp_path):
     output = tmp_path / "out"
     status, text, error = run(

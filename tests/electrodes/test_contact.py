@@ -185,6 +185,7 @@ def test_position_gradient_where_an_electrode_slides_over_corners(offset):
     assert difference == pytest.approx(float(derivative), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_single_precision_is_enough_to_make_a_model():
     """Rounding in the covered length must not be taken for an electrode wider than the boundary."""
     with jax.enable_x64(False):

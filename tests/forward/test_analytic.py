@@ -129,6 +129,7 @@ def test_driven_arcs_converge_with_a_logarithm():
 
 @pytest.mark.parametrize("levels", LEVELS)
 @pytest.mark.parametrize("physics", [HOMOGENEOUS, INCLUSION], ids=["homogeneous", "inclusion"])
+@pytest.mark.slow
 def test_points_converge_to_the_logarithm(levels, physics):
     angles = 2.0 * np.pi * np.arange(16) / 16.0
     exact = adjacent_voltages(point_transfer_impedance(physics, angles))
@@ -210,16 +211,13 @@ DISC_RADIUS = RADIUS * np.array([0.1, 0.15, 0.12, 0.2, 0.12])
 DISC_IMPEDANCE = RADIUS**2 / CONDUCTIVITY * np.array([0.003, 0.02, 0.01, 0.005, 0.004])
 
 
-@pytest.mark.parametrize(
-    "levels",
-    [(24, 48), pytest.param((24, 32, 48, 64, 96), marks=pytest.mark.slow)],
-    ids=["to 7,000 nodes", "to 28,000 nodes"],
-)
-def test_disc_windows_converge_to_sharp_discs(levels):
+@pytest.mark.slow
+def test_disc_windows_converge_to_sharp_discs():
     """Window and cells shrink together; the sharp discs' own field has no singularity, so the order is 2."""
     exact = disc_transfer_impedance(HOMOGENEOUS, DISC_POSITION, DISC_RADIUS, DISC_IMPEDANCE)
     electrodes = SheetDiscs(DISC_POSITION, DISC_RADIUS, DISC_IMPEDANCE)
     protocol = adjacent(5, current=1.0)
+    levels = (24, 32, 48, 64, 96)
     errors = [
         overall(ForwardModel(ring_mesh(rings), electrodes, protocol).transfer_impedance(CONDUCTIVITY), exact)
         for rings in levels
@@ -228,6 +226,7 @@ def test_disc_windows_converge_to_sharp_discs(levels):
     assert errors[levels.index(48)] < 2.5e-3
 
 
+@pytest.mark.slow
 def test_disc_in_the_middle_and_the_whole_rim():
     """Two kinds of electrode on one sheet; Bessel functions under the disc."""
     radius, impedance, rim = 0.3 * RADIUS, 0.01 * RADIUS**2 / CONDUCTIVITY, 0.2 * RADIUS / CONDUCTIVITY

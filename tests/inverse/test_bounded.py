@@ -53,6 +53,7 @@ def test_bounds_hold_and_are_reached(solver, prior, model, frame):
 
 
 @pytest.mark.parametrize("solver", ["l-bfgs-b", "projected-gradient"])
+@pytest.mark.slow
 def test_bounds_that_are_not_reached_change_nothing(solver, model, frame):
     options = {"prior": Laplace(), "noise": frame[1], "hyperparameter": 3.0}
     free = reconstruct(model, frame[0], 1.0, **options)
@@ -62,6 +63,7 @@ def test_bounds_that_are_not_reached_change_nothing(solver, model, frame):
     np.testing.assert_allclose(result.conductivity, free.conductivity, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_bounds_alone_choose_a_bounded_solver_and_too_few_steps_are_said_so(model, frame):
     options = {"prior": Noser(), "noise": frame[1], "hyperparameter": 1.0, "bounds": (0.9, 2.0)}
     result = reconstruct(model, frame[0], 1.0, max_steps=2, **options)
@@ -92,7 +94,7 @@ def test_bad_input(change, message, model, frame):
         reconstruct(model, frame[0], 1.0, **arguments)
 
 
-@pytest.mark.parametrize("link", [Linear(), Log()], ids=["linear", "log"])
+@pytest.mark.parametrize("link", [Linear(), pytest.param(Log(), marks=pytest.mark.slow)], ids=["linear", "log"])
 def test_lower_bound_of_zero(link, model, frame):
     """Zero is outside what the logarithm can take, and no bound at all there."""
     result = reconstruct(

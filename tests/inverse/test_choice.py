@@ -265,6 +265,7 @@ def test_bad_input_is_refused(call, words, model, frame):
         call(model, frame[0])
 
 
+@pytest.mark.slow
 def test_rules_on_a_measured_tank(data_folder):
     """A metal rod beside electrode 1: discrepancy, told of the noise but not of the model's error, ends at the edge."""
     from jeit.choosing import compare_on_data

@@ -181,6 +181,7 @@ def test_little_ringing_and_displacement(figures):
     assert found.resolution.min() > 0.25
 
 
+@pytest.mark.slow
 def test_a_rectangle():
     position = np.array([[0.0, 0.0], [0.06, 0.0], [0.1, 0.02], [0.0, 0.06], [-0.08, -0.05], [-0.11, 0.06]])
     (found,) = judge(on_a_rectangle(1200), position, [greit(on_a_rectangle(600), 1.0)])

@@ -66,6 +66,7 @@ def test_credible_intervals_and_samples(model, noise):
     assert 0 < float(found.unknowns()["Background"][0]) < 0.2
 
 
+@pytest.mark.slow
 def test_the_truth_is_covered_at_the_nominal_rate(model, noise):
     """200 bodies drawn from the prior, with noise: intervals hold the truth as often as they say, within 5 points."""
     scale = 5.0  # deviations of log σ of a fifth

@@ -47,6 +47,7 @@ def edge_width(mesh, conductivity):
     return np.interp(-0.1, -share, bins) - np.interp(-0.9, -share, bins)
 
 
+@pytest.mark.slow
 def test_an_edge_is_sharper_than_with_any_smooth_prior(model, frame):
     voltages, noise = frame
     sharp = reconstruct(model, voltages, 1.0, prior=TotalVariation(), noise=noise, hyperparameter=100.0, max_steps=60)

@@ -48,6 +48,7 @@ def model():
     return model_of(900)
 
 
+@pytest.mark.slow
 def test_positions_repair_an_image(model):
     """Every electrode 2 mm off. A disk cannot tell of three motions: those of its conformal maps onto itself.
 
@@ -72,6 +73,7 @@ def test_positions_repair_an_image(model):
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.abs(right.unknowns["ElectrodePosition"]), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_contact_impedances(model):
     factor = np.exp(0.4 * np.cos(3 * ANGLE))
     truth = model_of(2500, contact=1e-3 * factor, driven=True)
@@ -91,6 +93,7 @@ def test_contact_impedances(model):
     assert (np.asarray(deviation) < 0.2).all()
 
 
+@pytest.mark.slow
 def test_background_and_scale(model):
     """Each by itself: only the contact impedance tells a scale from a background. The image takes a share of it."""
     truth = model_of(900, driven=True)
