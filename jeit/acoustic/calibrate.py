@@ -16,11 +16,13 @@ from jeit.acoustic.intensity import IntensitySettings, tap_intensities
 from jeit.acoustic.likelihood import Listeners
 from jeit.acoustic.noise import IntensityNoise, below_nothing
 from jeit.acoustic.recording import Taps
-from jeit.acoustic.rounds import ABOVE, SHARED, TapFit, first_fit, standard_errors, without
+from jeit.acoustic.rounds import ABOVE, BELOW, FREE, SHARED, TapFit, first_fit, standard_errors, without
 from jeit.acoustic.surface import make_surface
 
 # A microphone is of no use whose model explains less of its levels' variance, or is known no better (relative error).
 _LEAST_EXPLAINED, _MOST_ERROR = 0.3, 1.0
+# Nor one whose relative error is so many times the median of all, which counts as this much at least.
+_UNLIKE, _WELL = 2.5, 0.1
 # Where less than this part of the microphones that heard enough follow the model, the places given are not those.
 _LEAST_SHARE = 0.5
 
@@ -86,15 +88,11 @@ def calibrate_microphones(
         reasons = tuple(new if worse else old for new, old, worse in zip(again, reasons, bad, strict=True))
     good = ~fit.dropped & ~bad
     told = tell(reasons)
-    if good.sum() < 3:
+    if good.sum() < max(3, _LEAST_SHARE * enough.sum()):
         raise ValueError(
-            f"only {good.sum()} of {len(good)} microphones can be calibrated, and three are needed. {told}."
-        )
-    if good.sum() < _LEAST_SHARE * enough.sum():
-        raise ValueError(
-            f"only {good.sum()} of the {enough.sum()} microphones that heard the taps follow a decay model: are the "
-            "rows of positions in the order of the taps, and those of microphones in the order of the channels? "
-            f"{told}."
+            f"only {good.sum()} of the {enough.sum()} microphones that heard the taps follow a decay model, and three "
+            "are needed, or half: are the rows of positions in the order of the taps, and those of microphones in the "
+            f"order of the channels? {told}."
         )
     # The factor between parameters and strengths, as `Calibration` has it.
     gain = np.log(np.asarray(kind.from_logarithms(fit.values).gain))[good].mean()
@@ -106,11 +104,17 @@ def calibrate_microphones(
         standard_errors(fit),
         settings,
         taps.name,
-        (float(np.nanmin(strength)), float(np.nanmax(strength))),
+        _range(strength[(fit.use & (power > 3 * np.asarray(fit.noise.deviation)[:, None])).any(axis=0)]),
     )
     return CalibrationFit(
         calibration, distance, power.T, tried, strength, fit.outlier, explained, (fit.held == SHARED) & good
     )
+
+
+def _range(strength: np.ndarray) -> tuple[float, float] | None:
+    """Of the weakest and the strongest tap."""
+    known = strength[strength > 0]
+    return (float(known.min()), float(known.max())) if known.size else None
 
 
 def _check(kind: type[AbstractDecay], distance, power, faults) -> Bool[np.ndarray, " M"]:
@@ -134,8 +138,10 @@ def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[
     as it was `explained` before for those that are left out."""
     expected, level, use = fit.expected(), np.asarray(fit.level), fit.use
     errors = standard_errors(fit)
+    well = (errors[1:] < _MOST_ERROR).all(axis=0)
     needed = len(fit.kind.parameters) + 2
-    deviation = np.asarray(fit.noise.deviation)
+    deviation, relative = np.asarray(fit.noise.deviation), np.asarray(fit.noise.relative)
+    typical = float(np.median(relative[use.any(axis=1)])) if use.any() else 0.0
     share = np.zeros(len(faults)) if explained is None else explained.copy()
     reasons = []
     for k, fault in enumerate(faults):
@@ -146,13 +152,18 @@ def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[
             continue
         spread = np.var(level[k, used])
         share[k] = 1 - np.mean((level - expected)[k, used] ** 2) / spread if spread > 0 else 0.0
-        undetermined = fit.free[1:, k].all() and not np.nanmax(errors[1:, k]) < _MOST_ERROR
+        undetermined = (fit.held[k] == FREE and not well[k]) or (fit.held[k] == BELOW and well.sum() < 3)
         if fit.held[k] == ABOVE:
             reasons.append("what it hears does not fall with distance")
         elif heard < needed:
             reasons.append(f"it heard {heard} taps only, {needed} are needed")
         elif not share[k] >= _LEAST_EXPLAINED:
             reasons.append(f"its model explains {100 * max(share[k], 0):.0f} % of what it heard")
+        elif relative[k] > _UNLIKE * max(typical, _WELL):
+            reasons.append(
+                f"its model is off by {100 * relative[k]:.0f} %, and those of others by {100 * typical:.0f} %: is it "
+                "where it is said to be, and was its gain the same throughout?"
+            )
         elif undetermined:
             reasons.append("its taps do not determine its model (relative error above 100 %): tap nearer to it")
         else:

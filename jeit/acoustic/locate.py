@@ -196,10 +196,9 @@ def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, listeners: L
     """What the user should know beyond the status of frames."""
     notes = []
     placed = ~np.isin(status, ["no touch", "unusable"])
-    odd = np.isin(status, ["misfit", "outside"])
+    odd = np.isin(status, ["misfit", "outside", "two touches"])
     if odd.sum() > _ODD * placed.sum():
-        single = placed & (status != "two touches")
-        exchanged, altered = find_changes(listeners, heard.power[single], use[single])
+        exchanged, altered = find_changes(listeners, heard.power[placed], use[placed])
         notes += [
             f"microphones {one} and {other} look exchanged since the calibration: exchanged back, their intensities "
             "fit one source. The places are not corrected: exchange the channels and locate again."

@@ -45,7 +45,10 @@ def measure(
         return _above_silence(heard, intensities(silence, settings))
     # Only a floor measured in the same way can be compared.
     if settings != calibration.intensity:
-        return heard
+        if calibration.intensity is None:
+            return heard
+        note = "band or window are not the calibration's: its decay models may not hold; calibrate with the same."
+        return dataclasses.replace(heard, notes=(note,))
     usual = np.asarray(calibration.listeners.noise.floor)
     ratio = np.where(calibration.usable, heard.floor / np.where(usual > 0, usual, np.inf), 0.0)
     higher = f"the noise floor, taken from the quietest windows, is up to {ratio.max():.3g} times the calibration's"

@@ -117,9 +117,10 @@ class Intensities(eqx.Module):
         if not self.freedom > 0:
             raise ValueError(f"freedom must be positive (infinite when unknown); it is {self.freedom}.")
         self.overlap = number(overlap, "overlap")
-        if not 1 <= self.overlap < np.inf:
+        if not 1 <= self.overlap <= max(length, 1):
             raise ValueError(
-                f"overlap must be at least 1, how many windows share a sample (window / hop); it is {self.overlap}."
+                f"overlap must be at least 1 and no more than the {length} windows: how many of them share a sample "
+                f"(window / hop); it is {self.overlap:g}."
             )
         found, reasons = intensity_faults(self.power)
         given = found if usable is None else np.asarray(usable)

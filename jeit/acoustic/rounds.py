@@ -243,9 +243,9 @@ def _reweighed(fit: TapFit) -> TapFit:
         deviation = additive_deviations(fit.power, received, use, inflation)
         betrayed = below_nothing(fit.power.T, np.isfinite(fit.power.T))
         fit = replace(fit, noise=IntensityNoise.create(len(received), deviation=np.maximum(deviation, betrayed)))
-    residual = np.where(fit.usable, np.asarray(fit.level) - expected, 0.0)
-    relative = relative_errors(fit.noise, received, residual, fit.use, inflation)
+    relative = relative_errors(fit.noise, received, _residual_of_equals(fit, received), fit.use, inflation)
     fit = replace(fit, noise=replace(fit.noise, relative=jnp.asarray(relative)))
+    residual = np.where(fit.usable, np.asarray(fit.level) - expected, 0.0)
     square = residual**2 / np.maximum(_variance(fit, np.maximum(received, 1e-150)), LEAST_RELATIVE**2)
     usable = fit.usable
     level = np.minimum(square, 100.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
@@ -253,6 +253,18 @@ def _reweighed(fit: TapFit) -> TapFit:
     fit = replace(fit, outlier=level > _OUTLIER * max(typical, 0.2))
     variance = _level_variance(fit, received)
     return replace(fit, weight=(_TAIL + 1) / (_TAIL + residual**2 / variance) / variance)
+
+
+def _residual_of_equals(fit: TapFit, received: np.ndarray) -> Float[np.ndarray, "M T"]:
+    """Residuals where all microphones say alike how strong a tap was.
+
+    With weights of their own one could be believed ever more for agreeing with strengths that it alone decides.
+    """
+    relative = np.asarray(fit.noise.relative)
+    alike = replace(fit, noise=replace(fit.noise, relative=jnp.full(len(relative), np.median(relative))))
+    alike = replace(alike, weight=1 / _level_variance(alike, received))
+    strength = fit_strengths(alike.problem(with_outliers=True), fit.values, fit.strength)
+    return np.where(fit.usable, np.asarray(fit.level) - replace(alike, strength=strength).expected(), 0.0)
 
 
 def _level_variance(fit: TapFit, received: np.ndarray) -> np.ndarray:

@@ -10,6 +10,9 @@ from jeit.cli.options import BandHigh, BandLow, Hop, Quiet, Window, intensity_se
 if TYPE_CHECKING:
     from jeit.acoustic import CalibrationFit
 
+# A relative error of the models that taps at places slightly wrong give.
+_MUCH = 0.3
+
 
 def calibrate_microphones(
     taps: Annotated[
@@ -82,13 +85,15 @@ def _show(console, fit: "CalibrationFit") -> None:
     calibration = fit.calibration
     decay, noise = calibration.listeners.decay, calibration.listeners.noise
     usable = calibration.usable
+    typical = float(np.median(np.asarray(noise.relative)[usable]))
     rows = [
         ("microphones", f"{int(usable.sum())} of {len(usable)} usable"),
         ("taps", f"{len(fit.outlier)}, {int(fit.outlier.sum())} left out as outliers"),
         ("decay model", decay.name),
         (
             "error of the model",
-            f"{100 * float(np.median(np.asarray(noise.relative)[usable])):.1f} % of an intensity, median",
+            f"{100 * typical:.1f} % of an intensity, median"
+            + (": much; are all taps where they are said to be?" if typical > _MUCH else ""),
         ),
         ("scale", "strength 1 reads 1 at a typical microphone right under the source"),
     ]

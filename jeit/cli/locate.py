@@ -48,6 +48,7 @@ def locate(
     quiet: Quiet = False,
 ) -> None:
     """Locate every touch of a recording; writes track.csv, report.json and track.png."""
+    import numpy as np
     from rich.console import Console
 
     from jeit.acoustic import Calibration, Recording, measure, read_recording, track
@@ -75,6 +76,11 @@ def locate(
             raise ValueError("--silence is for samples, and must hold samples: intensities have their floor.")
         step("measure intensities")
         heard = measure(sound, known, settings, silence=quiet_sound)
+        if len(heard.times) > 1 and np.median(np.diff(heard.times)) > gap:
+            raise ValueError(
+                f"frames are {np.median(np.diff(heard.times)):g} s apart, more than the --gap of {gap:g} s that ends a "
+                "touch: give times in seconds, or a longer --gap."
+            )
         step("locate")
         found = find(heard, known, method=method, map_shape=(200, 200) if method == "consistency" else None)
         step("track")

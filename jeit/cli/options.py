@@ -28,10 +28,16 @@ Nodes = Annotated[int | None, typer.Option(help="Nodes of the mesh, about (defau
 Frame = Annotated[
     str | None, typer.Option(help="Frame of DATA to image, by number from 0 or by name; the first unless given.")
 ]
-BandLow = Annotated[float | None, typer.Option(help="Lowest frequency of the band, hertz (default 50).")]
-BandHigh = Annotated[float | None, typer.Option(help="Highest frequency of the band, hertz (default 1000).")]
-Window = Annotated[float | None, typer.Option(help="Length of a window, seconds (default 0.05).")]
-Hop = Annotated[float | None, typer.Option(help="From one window to the next, seconds (default 0.0125).")]
+BandLow = Annotated[
+    float | None, typer.Option(help="Lowest frequency of the band, hertz (default 50, or the calibration's).")
+]
+BandHigh = Annotated[
+    float | None, typer.Option(help="Highest frequency of the band, hertz (default 1000, or the calibration's).")
+]
+Window = Annotated[float | None, typer.Option(help="Length of a window, seconds (default 0.05, or the calibration's).")]
+Hop = Annotated[
+    float | None, typer.Option(help="From one window to the next, seconds (default 0.0125, or the calibration's).")
+]
 
 
 def intensity_settings(low: float | None, high: float | None, window: float | None, hop: float | None):

@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -65,16 +64,10 @@ def test_contents_page():
         _ = jeit.disc
 
 
-def test_import_is_quick_and_leaves_heavy_things_alone():
+def test_import_leaves_heavy_things_alone():
+    """That keeps it quick, which is a benchmark."""
     code = (
         "import sys, jeit; print([m for m in ('matplotlib', 'optimistix', 'meshio', 'scipy.io') if m in sys.modules])"
     )
-    seconds = []
-    for _ in range(3):  # the least of three: the machine may be busy
-        start = time.perf_counter()
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        seconds.append(time.perf_counter() - start)
-        if seconds[-1] < 2:
-            break
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
-    assert min(seconds) < 2

@@ -198,10 +198,11 @@ def _bad_files(folder):
     (folder / "version.json").write_text(text.replace('"version": 1', '"version": 7'))
     (folder / "unit.json").write_text(text.replace('"length": "m"', '"length": "mm"'))
     (folder / "cut.json").write_text(text[:500])
-    np.savez(folder / "few.npz", intensity=np.ones((3, 4)), times=np.arange(3.0))
+    np.savez(folder / "milliseconds.npz", intensity=np.ones((3, 9)), times=50.0 * np.arange(3))
+    np.savez(folder / "few.npz", intensity=np.ones((3, 4)), times=0.05 * np.arange(3))
     dead = np.full((3, 9), np.nan)
     dead[:, :2] = 1.0
-    np.savez(folder / "dead.npz", intensity=dead, times=np.arange(3.0))
+    np.savez(folder / "dead.npz", intensity=dead, times=0.05 * np.arange(3))
     with np.load(folder / "taps.npz") as arrays:
         taps = dict(arrays)
     np.savez(folder / "millimetres.npz", **{**taps, "microphones": 1e3 * taps["microphones"]})
@@ -234,6 +235,7 @@ def instead(command, **changes):
         (instead(LOCATE, cal_json="missing.json"), "missing.json"),
         (instead(LOCATE, recording_npz="few.npz"), "has 4 microphones"),
         (instead(LOCATE, recording_npz="dead.npz"), "three are needed"),
+        (instead(LOCATE, recording_npz="milliseconds.npz"), "times in seconds"),
         (instead(LOCATE, recording_npz="text.npz"), "neither an NPZ nor a WAV"),
         (instead(LOCATE, recording_npz="sounds.npz"), "read_taps"),
         (instead(LOCATE, recording_npz="missing.wav"), "missing.wav"),
