@@ -50,6 +50,7 @@ if "JAX_ENABLE_X64" not in os.environ:
 _ROOMS = (
     "acoustic",
     "data",
+    "design",
     "electrodes",
     "forward",
     "image",

@@ -16,8 +16,9 @@ ALLOWED = {
     "inverse": {"mesh", "electrodes", "protocol", "forward"},
     "image": {"mesh"},
     "acoustic": {"mesh"},
+    "design": {"mesh", "electrodes", "protocol", "forward", "inverse"},
     "data": {"mesh", "electrodes", "protocol", "forward"},
-    "plot": {"mesh", "electrodes", "protocol", "forward", "inverse", "image", "acoustic", "data"},
+    "plot": {"mesh", "electrodes", "protocol", "forward", "inverse", "image", "acoustic", "data", "design"},
 }
 LAYERS = sorted(ALLOWED)
 

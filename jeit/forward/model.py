@@ -113,7 +113,7 @@ def _check(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol) -> No
         electrodes.check(mesh)
 
 
-def _select(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
+def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
     """Voltages of the channels: entries of measurement · Z · driveᵀ."""
     table = protocol.measurement @ impedance @ protocol.drive.T
     return table.at[protocol.measurement_index, protocol.drive_index].get(mode="promise_in_bounds")
@@ -126,7 +126,7 @@ def _transfer_impedance(model: ForwardModel, conductivity):
 
 @jax.jit
 def _voltages(model: ForwardModel, conductivity):
-    return _select(model.protocol, _transfer_impedance(model, conductivity))
+    return select_channels(model.protocol, _transfer_impedance(model, conductivity))
 
 
 @jax.jit
@@ -156,4 +156,4 @@ def _voltages_and_jacobian(model: ForwardModel, conductivity):
             jax.ops.segment_sum(per_corner.T, mesh.cells[:, k], num_segments=mesh.num_points).T
             for k in range(mesh.cells.shape[1])
         )
-    return _select(protocol, impedance), jacobian
+    return select_channels(protocol, impedance), jacobian

@@ -60,6 +60,24 @@ def electrode_fields(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, s
     return fields - (contact.load.T @ fields).mean(axis=0), impedance
 
 
+def fields_and_inverse(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System, nodes):
+    """F (u, L) at some nodes (u,), and the block of K⁻¹ among them (u, u), ohms, but for a constant in each.
+
+    K is the matrix of the electrode model with all electrodes floating: the potential at one node for a unit current
+    into another. What it leaves open, a constant, no change of conductivity sees.
+    """
+    contact = electrodes.contact(mesh)
+    operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
+    fields, _ = electrode_fields(mesh, conductivity, electrodes, system)
+    inverse = system.inverse_block(operator, nodes)
+    if electrodes.is_point:
+        return fields[nodes], inverse
+    # Electrodes carry what enters at the nodes back out: with X = A⁻¹ load, K⁻¹ = A⁻¹ + X Z Xᵀ, and X Z = F.
+    at_nodes = fields[nodes]
+    loads = system.solve(operator, contact.load)[nodes]
+    return at_nodes, inverse + at_nodes @ loads.T
+
+
 def _impedance(electrodes: AbstractElectrodes, product: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:
     """Z from the product loadᵀ A⁻¹ load, A being the stiffness with contact mass (complete) or grounding (point).
 

@@ -26,7 +26,7 @@ def _traced(*values: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
-def _length(name: str, value: Any) -> Any:
+def check_length(name: str, value: Any) -> Any:
     """Check a length in metres and make it a float (traced values pass)."""
     if _traced(value):
         return value
@@ -57,7 +57,7 @@ class Disk(eqx.Module):
 
     def __init__(self, radius: float, centre: Sequence[float] = (0.0, 0.0)):
         """`radius` > 0 and `centre` (x, y) in metres; raises `ValueError` otherwise."""
-        self.radius = _length("radius", radius)
+        self.radius = check_length("radius", radius)
         self.centre = _position("centre", centre)
 
     @property
@@ -100,8 +100,8 @@ class Rectangle(eqx.Module):
 
     def __init__(self, width: float, height: float, centre: Sequence[float] = (0.0, 0.0)):
         """`width` (along x), `height` (along y) > 0 and `centre` in metres; raises `ValueError` otherwise."""
-        self.width = _length("width", width)
-        self.height = _length("height", height)
+        self.width = check_length("width", width)
+        self.height = check_length("height", height)
         self.centre = _position("centre", centre)
 
     @property

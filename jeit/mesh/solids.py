@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jeit.mesh import _unstructured
-from jeit.mesh.domain import _length
+from jeit.mesh.domain import check_length
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.refine import Refinement
 from jeit.mesh.shapes import disk, rectangle
@@ -27,7 +27,7 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1) -> Mesh:
     """
     if mesh.dimension != 2:
         raise ValueError("mesh: a layer is made from a plane (2-D) mesh, this one is 3-D.")
-    thickness = _length("thickness", thickness)
+    thickness = check_length("thickness", thickness)
     num_layers = _unstructured.check_count("num_layers", num_layers, 1)
     plane, cells, facets = np.asarray(mesh.points), np.asarray(mesh.cells), np.asarray(mesh.facets)
     count = len(plane)
@@ -79,8 +79,8 @@ def box(
     'right' (across x), 'front', 'back' (across y), 'bottom', 'top' (across z), and 'side'. Raises `ValueError`
     on bad or contradicting arguments.
     """
-    width, depth = _length("width", width), _length("depth", depth)
-    height = _length("height", height)
+    width, depth = check_length("width", width), check_length("depth", depth)
+    height = check_length("height", height)
     base_points, layers = _stack(width * depth, height, num_points, cell_size, num_layers)
     base = rectangle(width, depth, num_points=base_points, cell_size=cell_size, refine=refine)
     return layer(base, height, layers)
@@ -104,7 +104,7 @@ def cylinder(
     `jeit.mesh.disk`, seen from above. Tags: 'bottom', 'top', 'side'. Raises `ValueError` on bad or
     contradicting arguments.
     """
-    radius, height = _length("radius", radius), _length("height", height)
+    radius, height = check_length("radius", radius), check_length("height", height)
     base_points, layers = _stack(np.pi * radius**2, height, num_points, cell_size, num_layers)
     base = disk(
         radius,

@@ -11,6 +11,7 @@ from .conjugate_gradient import ConjugateGradient
 from .dense_cholesky import symmetric_inverse
 from .descent import Descent
 from .few_unknowns import Minimum, definite_few, hessian_few, inverse_few, minimise_few, solve_few, symmetric_few
+from .kmeans import KMeans, kmeans
 from .multifrontal import Factor, factorise, half_solve, quadratic_form, solve
 from .operator import SparseSymmetric
 from .pattern import SparsityPattern
@@ -23,6 +24,7 @@ __all__ = [
     "Descent",
     "Factor",
     "FactorisationPlan",
+    "KMeans",
     "Minimum",
     "Model",
     "SparseCholesky",
@@ -36,6 +38,7 @@ __all__ = [
     "hessian_few",
     "in_turn",
     "inverse_few",
+    "kmeans",
     "minimise_few",
     "quadratic_form",
     "ridge_model",

@@ -1,0 +1,75 @@
+"""Touch as an indentation of a skin's surface: how deep it goes, as a function of the distance from its middle."""
+
+import abc
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jeit.mesh.domain import check_length
+
+
+class AbstractIndentation(eqx.Module):
+    """Depth of an indentation. Add another by writing one class."""
+
+    @abc.abstractmethod
+    def depth_at(self, distance: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Depth in metres at horizontal distances (metres) from the middle."""
+
+    @property
+    @abc.abstractmethod
+    def reach(self) -> float:
+        """Distance in metres beyond which there is none."""
+
+
+class Bell(AbstractIndentation):
+    """depth · exp(−r² / (2 deviation²)): the unit deformation of Park et al. 2022, text S4, unless told otherwise.
+
+    Cut off at three deviations, where it is a hundredth of its depth.
+    """
+
+    depth: float
+    deviation: float
+
+    def __init__(self, depth: float = 2.5e-3, deviation: float = 7.5e-3):
+        """Both in metres."""
+        self.depth = check_length("depth", depth)
+        self.deviation = check_length("deviation", deviation)
+
+    def depth_at(self, distance):
+        """The bell."""
+        inside = jnp.asarray(distance) < self.reach
+        return jnp.where(inside, self.depth * jnp.exp(-0.5 * (distance / self.deviation) ** 2), 0.0)
+
+    @property
+    def reach(self) -> float:
+        """Three deviations."""
+        return 3 * self.deviation
+
+
+class Hemisphere(AbstractIndentation):
+    """A rigid ball pressed in: depth − (R − √(R² − r²)) where that is positive; 15 mm across, as in the experiments."""
+
+    depth: float
+    diameter: float
+
+    def __init__(self, depth: float = 2.5e-3, diameter: float = 15e-3):
+        """Both in metres. Raises `ValueError` for a ball pressed in beyond its middle."""
+        self.depth = check_length("depth", depth)
+        self.diameter = check_length("diameter", diameter)
+        if self.depth > self.diameter / 2:
+            raise ValueError(
+                f"depth is {1e3 * self.depth:g} mm, but a hemisphere {1e3 * self.diameter:g} mm across goes in no "
+                f"deeper than {5e2 * self.diameter:g} mm; give less depth, or a larger one."
+            )
+
+    def depth_at(self, distance):
+        """The cap of the ball."""
+        radius = self.diameter / 2
+        height = jnp.sqrt(jnp.maximum(radius**2 - jnp.asarray(distance) ** 2, 0.0))
+        return jnp.maximum(self.depth - radius + height, 0.0)
+
+    @property
+    def reach(self) -> float:
+        """Radius of the cap's rim."""
+        return float((self.depth * (self.diameter - self.depth)) ** 0.5)

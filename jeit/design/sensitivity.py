@@ -1,0 +1,117 @@
+"""Sensitivity maps: how much the voltages of a skin change where it is touched."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jeit.design.changes import touch_changes
+from jeit.design.indentation import AbstractIndentation, Bell
+from jeit.design.press import press
+from jeit.forward import ForwardModel
+from jeit.mesh import Domain
+
+
+class TouchGrid(eqx.Module):
+    """Where a skin is touched: the middles of equal rectangles that cover it.
+
+    - `places`: (n, 2) metres; `rows`, `columns`: (n,) of each in the raster, row 0 at the least y.
+    - `shape`: (rows, columns) of the raster; `pitch`: (width, height) of a rectangle, metres.
+    """
+
+    places: Float[np.ndarray, "n 2"]
+    rows: np.ndarray
+    columns: np.ndarray
+    shape: tuple[int, int] = eqx.field(static=True)
+    pitch: tuple[float, float] = eqx.field(static=True)
+
+    @property
+    def cell_area(self) -> float:
+        """Of a rectangle, m²."""
+        return self.pitch[0] * self.pitch[1]
+
+    def raster(self, values) -> Float[np.ndarray, "rows columns"]:
+        """Values (n,) as an image, NaN off the skin."""
+        image = np.full(self.shape, np.nan)
+        image[self.rows, self.columns] = np.asarray(values)
+        return image
+
+
+def touch_grid(outline: Domain, columns: int = 48, rows: int = 48) -> TouchGrid:
+    """Rectangles over the bounding box of `outline`, those whose middle lies inside; 48 × 48 as in Park et al. 2022.
+
+    Raises `ValueError` for fewer than one row or column.
+    """
+    if columns < 1 or rows < 1:
+        raise ValueError(
+            f"a grid needs one column and one row at least; {columns} columns and {rows} rows were asked for."
+        )
+    low_x, high_x, low_y, high_y = outline.extent
+    width, height = (high_x - low_x) / columns, (high_y - low_y) / rows
+    x, y = low_x + width * (np.arange(columns) + 0.5), low_y + height * (np.arange(rows) + 0.5)
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    inside = np.asarray(outline.contains(places))
+    row, column = np.divmod(np.flatnonzero(inside), columns)
+    return TouchGrid(places[inside], row, column, (rows, columns), (float(width), float(height)))
+
+
+class SensitivityMap(eqx.Module):
+    """Sensitivity Θ of a skin at n places: ‖Δv‖₂ of the voltages' changes Δv by a touch there (Park et al. 2022).
+
+    - `grid`: the places; `changes`: (n, M) volts, Δv of the protocol's M channels.
+    """
+
+    grid: TouchGrid
+    changes: Float[Array, "n M"]
+
+    @property
+    def values(self) -> Float[Array, " n"]:
+        """Θ (n,), volts."""
+        return jnp.linalg.norm(self.changes, axis=-1)
+
+    @property
+    def minimum(self) -> Float[Array, ""]:
+        """Least Θ, volts: the worst place."""
+        return self.values.min(axis=-1)
+
+    @property
+    def mean(self) -> Float[Array, ""]:
+        """Mean Θ, volts."""
+        return self.values.mean(axis=-1)
+
+    @property
+    def uniformity(self) -> Float[Array, ""]:
+        """Mean Θ over its root mean square: 1 where all places are alike, less the more they differ."""
+        return self.mean / jnp.sqrt(jnp.mean(self.values**2, axis=-1))
+
+    def blind_spot(self, level) -> Float[Array, ""]:
+        """Share of the area that is less sensitive than `level` (volts), such as another layout's minimum."""
+        return jnp.mean(self.values < level, axis=-1)
+
+    def histogram(self, bins=40) -> tuple[np.ndarray, np.ndarray]:
+        """Share of the area in each of some bins of Θ, and the bins' edges in volts; `bins` as of `numpy.histogram`."""
+        counts, edges = np.histogram(np.asarray(self.values), bins=bins)
+        return counts / self.values.size, edges
+
+    def image(self) -> Float[np.ndarray, "rows columns"]:
+        """Θ as an image (rows, columns), row 0 at the least y, NaN off the skin."""
+        return self.grid.raster(self.values)
+
+
+def sensitivity_map(
+    model: ForwardModel,
+    conductivity,
+    grid: TouchGrid,
+    *,
+    indentation: AbstractIndentation | None = None,
+    thickness: float | None = None,
+    contrast: float = 0.0,
+    linear: bool = False,
+) -> SensitivityMap:
+    """Touch a skin at every place of `grid` and see how its voltages change.
+
+    `indentation`: the unit deformation of Park et al. 2022 unless given. `thickness` (a sheet's) and `contrast` as in
+    `press`; `linear` as in `touch_changes`. Raises `ValueError` as they do.
+    """
+    presses = press(model.mesh, indentation or Bell(), grid.places, thickness=thickness, contrast=contrast)
+    return SensitivityMap(grid, touch_changes(model, conductivity, presses, linear=linear))

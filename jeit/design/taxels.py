@@ -1,0 +1,175 @@
+"""Virtual taxels: the parts of a skin whose touches look alike in the voltages (Park et al. 2022, text S4)."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from jeit_solvers import KMeans, kmeans
+
+
+class Taxels(eqx.Module):
+    """The k virtual taxels of a layout, from touches at n places; make them with `find_taxels`.
+
+    **Fields**: `places` (n, 2) metres; `cell_area` (n,), the part of the skin that each place stands for, m²;
+    `clusters`, of the voltage changes of the touches, with their means; `similarity` (k, n), cosine of the angle
+    between the mean change of each taxel and the change of each place; `threshold`, from which on a place belongs to a
+    taxel. After `jax.vmap` all arrays, and what is worked out from them, lead with the axis of the layouts.
+    """
+
+    places: Float[Array, "*layouts n 2"]
+    cell_area: Float[Array, "*layouts n"]
+    clusters: KMeans
+    similarity: Float[Array, "*layouts k n"]
+    threshold: float = eqx.field(static=True)
+
+    @property
+    def labels(self) -> Int[Array, "*layouts n"]:
+        """The taxel whose cluster each place is in: every place is in one."""
+        return self.clusters.labels
+
+    @property
+    def members(self) -> Bool[Array, "*layouts k n"]:
+        """Which places each taxel covers. Taxels overlap, and some places may be in none."""
+        return self.similarity >= self.threshold
+
+    @property
+    def positions(self) -> Float[Array, "*layouts k 2"]:
+        """The centroid of each cluster's places, metres."""
+        count = self.similarity.shape[-2]
+        weight = (self.labels[..., None, :] == jnp.arange(count)[:, None]) * self.cell_area[..., None, :]
+        return weight @ self.places / jnp.sum(weight, axis=-1, keepdims=True)
+
+    @property
+    def areas(self) -> Float[Array, "*layouts k"]:
+        """Area that each taxel covers, m²; 0 for a mean change that is like no place's own."""
+        return jnp.sum(jnp.where(self.members, self.cell_area[..., None, :], 0), axis=-1)
+
+    @property
+    def mean_area(self) -> Float[Array, "*layouts"]:
+        """Mean of the `areas`, m²."""
+        return jnp.mean(self.areas, axis=-1)
+
+    @property
+    def std_area(self) -> Float[Array, "*layouts"]:
+        """Standard deviation of the `areas` among the k taxels, m²."""
+        return jnp.std(self.areas, axis=-1)
+
+    @property
+    def max_area(self) -> Float[Array, "*layouts"]:
+        """Largest of the `areas`, m²."""
+        return jnp.max(self.areas, axis=-1)
+
+    @property
+    def coverage(self) -> Int[Array, "*layouts n"]:
+        """How many taxels cover each place."""
+        return jnp.sum(self.members, axis=-2)
+
+    @property
+    def overlap(self) -> Float[Array, "*layouts"]:
+        """How many taxels cover a point of the skin on average: their areas' sum over the skin's."""
+        return jnp.sum(self.areas, axis=-1) / jnp.sum(self.cell_area, axis=-1)
+
+    @property
+    def diameters(self) -> Float[Array, "*layouts k"]:
+        """Diameter of the circle of each taxel's area, 2 √(area / π), metres."""
+        return 2 * jnp.sqrt(self.areas / jnp.pi)
+
+    @property
+    def two_point_discrimination(self) -> Float[Array, "*layouts"]:
+        """Distance from which on two touches can be told apart, metres: the mean of the `diameters`.
+
+        The paper's estimate, "average diameter of the virtual taxels". Two touches nearer than that are within one
+        taxel, on average: their changes differ in strength rather than in pattern.
+        """
+        return jnp.mean(self.diameters, axis=-1)
+
+
+def find_taxels(
+    changes: ArrayLike,
+    places: ArrayLike,
+    cell_area: ArrayLike,
+    *,
+    num_taxels: int = 90,
+    threshold: float = 0.7,
+    key: Any,
+    directions: bool = False,
+    restarts: int = 10,
+) -> Taxels:
+    """Virtual taxels from the voltage `changes` (n, m) of one and the same touch at `places` (n, 2), metres.
+
+    The changes are parted into clusters by k-means; a taxel is where the cosine of the angle between its cluster's mean
+    and a place's change is at least `threshold`. Park et al. 2022, text S4: 48 × 48 places, 90 clusters, 0.7. Places
+    whose touches change nothing are in no taxel.
+
+    For a batch of layouts with changes (B, n, m), and `keys` from `jax.random.split(key, B)`::
+
+        jax.vmap(lambda changes, key: find_taxels(changes, places, cell_area, key=key))(changes, keys)
+
+    **Arguments:**
+
+    - `cell_area`: of the part of the skin that each place stands for, m²; a number or (n,).
+    - `num_taxels`: k, how many clusters.
+    - `threshold`: a cosine, more than 0 and less than 1.
+    - `key`: for k-means, from `jax.random.key`.
+    - `directions`: part the changes scaled to length 1. As they are, as in the paper, places of low sensitivity are
+      lumped together, since their changes are all small; scaled, each cluster is of places of like pattern.
+    - `restarts`: of k-means, of which the best is kept.
+
+    Raises `ValueError` for shapes that disagree, changes that are not finite or all zero, and lengths and areas whose
+    units do not fit together.
+    """
+    _check(changes, places, cell_area, num_taxels, threshold)
+    change, place = jnp.asarray(changes, float), jnp.asarray(places, float)
+    unit = _unit(change)
+    clusters = kmeans(unit if directions else change, num_taxels, key, restarts=restarts)
+    area = jnp.broadcast_to(jnp.asarray(cell_area, float), place.shape[:1])
+    return Taxels(place, area, clusters, _unit(clusters.centres) @ unit.T, float(threshold))
+
+
+def _unit(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """Scaled to length 1, and zero where they are zero, with a derivative that is zero there as well."""
+    square = jnp.sum(vectors**2, axis=1, keepdims=True)
+    return jnp.where(square > 0, vectors / jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+
+
+def _check(changes, places, cell_area, num_taxels, threshold) -> None:
+    """Raise `ValueError`; what is traced is judged by its shape alone."""
+    shape = np.shape(changes)
+    if len(shape) != 2 or 0 in shape or np.shape(places) != (shape[0], 2) or np.shape(cell_area) not in ((), shape[:1]):
+        raise ValueError(
+            f"changes has shape {shape}, places {np.shape(places)} and cell_area {np.shape(cell_area)}; give (n, m), "
+            "(n, 2) and a number or (n,): one touch for each of n places, m voltages each."
+        )
+    if jnp.iscomplexobj(changes):
+        raise ValueError("changes are complex; give their real part or the changes of the magnitudes.")
+    if not isinstance(num_taxels, (int, np.integer)) or not 1 <= num_taxels <= shape[0]:
+        raise ValueError(f"num_taxels must be a whole number from 1 to the {shape[0]} places; it is {num_taxels!r}.")
+    if not 0 < threshold < 1:
+        raise ValueError(f"threshold is a cosine, more than 0 and less than 1; it is {threshold!r}.")
+    if not isinstance(changes, Tracer):
+        silent = ~np.isfinite(changes).all(axis=1)
+        if silent.any():
+            raise ValueError(f"changes: those of {silent.sum()} of {shape[0]} places are NaN or infinite.")
+        if not np.any(changes):
+            raise ValueError("changes are all zero: none of the touches changes any voltage.")
+    if not isinstance(places, Tracer) and not isinstance(cell_area, Tracer):
+        _check_lengths(np.asarray(places, float), np.broadcast_to(np.asarray(cell_area, float), shape[:1]))
+
+
+def _check_lengths(places: np.ndarray, cell_area: np.ndarray) -> None:
+    if not np.isfinite(places).all():
+        raise ValueError("places must be finite, in metres.")
+    if not (np.isfinite(cell_area) & (cell_area > 0)).all():
+        raise ValueError("cell_area must be positive and finite, in m².")
+    box = float(np.prod(np.ptp(places, axis=0)))
+    # Cells fill about the box round the places; of a factor of 100 the units are to blame.
+    if box > 0 and not 0.01 < cell_area.sum() / box < 100:
+        raise ValueError(
+            f"cell_area: the cells are {cell_area.sum():.3g} m² together, but the box round the places is {box:.3g} "
+            "m²; give places in metres and cell_area in m²."
+        )

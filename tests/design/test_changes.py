@@ -1,0 +1,136 @@
+"""Changes of voltages by touches: equal to solving the model anew, and to first order to the Jacobian's."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.design import Bell, Hemisphere, press, touch_changes
+from jeit.electrodes import FaceDiscs, PointElectrodes, SheetDiscs, grid
+from jeit.forward import ForwardModel
+from jeit.mesh import layer, rectangle
+from jeit.protocol import adjacent
+
+CENTRES = grid(0.06, 0.06, 3, 3)
+PLACES = np.array([[0.0, 0.0], [0.021, -0.013], [-0.03, 0.03], [0.04, 0.04], [0.001, 0.0]])
+SHEET = {"thickness": 0.01}
+
+
+@pytest.fixture(scope="module")
+def models():
+    plane = rectangle(0.1, 0.1, cell_size=0.008)
+    solid = layer(rectangle(0.1, 0.1, cell_size=0.009), 0.01, 4)
+    protocol = adjacent(9)
+    on_bottom = np.column_stack([CENTRES, np.zeros(9)])
+    nodes = np.asarray(plane.points)[
+        np.linalg.norm(np.asarray(plane.points)[:, None] - CENTRES, axis=-1).argmin(axis=0)
+    ]
+    return {
+        "sheet": ForwardModel(plane, SheetDiscs(CENTRES, 0.006, 1e-4), protocol),
+        "points": ForwardModel(plane, PointElectrodes(nodes), protocol),
+        "layer": ForwardModel(solid, FaceDiscs(on_bottom, 0.006, 1e-4), protocol),
+        "iterative": ForwardModel(plane, SheetDiscs(CENTRES, 0.006, 1e-4), protocol, solver="cg"),
+    }
+
+
+def anew(model, conductivity, presses):
+    """The straightforward way: the model solved for every touch; what is cut off keeps a billionth."""
+    before = np.asarray(model.voltages(conductivity))
+    found = []
+    for cells, change in zip(np.asarray(presses.cells), np.asarray(presses.change), strict=True):
+        values = np.array(conductivity)
+        np.add.at(values, cells, values[cells] * change)
+        found.append(np.asarray(model.voltages(np.maximum(values, 1e-9 * conductivity))) - before)
+    return np.array(found)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("sheet", SHEET),
+        ("points", SHEET),
+        ("layer", {}),
+        pytest.param("layer", {"edge": 1e-3}, marks=pytest.mark.slow),
+        ("layer", {"contrast": 50.0}),
+        pytest.param("iterative", SHEET, marks=pytest.mark.slow),
+    ],
+    ids=["sheet", "points", "layer", "smooth layer", "conductor", "conjugate gradients"],
+)
+def test_exact_changes_are_those_of_solving_anew(kind, options, models):
+    model = models[kind]
+    conductivity = 0.5 + 0.4 * np.random.default_rng(0).random(model.mesh.num_cells)
+    for indentation in (Bell(), Hemisphere(depth=3e-3, diameter=20e-3)):
+        presses = press(model.mesh, indentation, PLACES, **options)
+        expected = anew(model, conductivity, presses)
+        found = touch_changes(model, conductivity, presses)
+        np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_small_touches_are_linear(models):
+    """What is left beyond the Jacobian falls with the square of the touch."""
+    model = models["sheet"]
+    left = []
+    for depth in (1e-4, 2e-4):
+        presses = press(model.mesh, Bell(depth=depth), PLACES, **SHEET)
+        exact, linear = (touch_changes(model, 0.5, presses, linear=linear) for linear in (False, True))
+        left.append(np.abs(exact - linear).max())
+    assert left[1] / left[0] == pytest.approx(4, rel=0.05)
+    assert left[0] < 0.02 * np.abs(linear).max()
+
+
+def test_linear_changes_have_derivatives_in_electrode_positions_and_batch(models):
+    model = models["sheet"]
+    presses = press(model.mesh, Bell(), PLACES, **SHEET)
+    direction = np.random.default_rng(1).normal(size=CENTRES.shape)
+
+    def changes(move):
+        moved = eqx.tree_at(lambda e: e.position, model.electrodes, model.electrodes.position + move * direction)
+        return touch_changes(model.with_electrodes(moved), 0.5, presses, linear=True)
+
+    slope = jax.jvp(changes, (0.0,), (1.0,))[1]
+    step = 1e-6
+    difference = (changes(step) - changes(-step)) / (2 * step)
+    np.testing.assert_allclose(slope, difference, atol=1e-6 * np.abs(difference).max())
+    moves = jnp.array([0.0, 1e-3])
+    np.testing.assert_allclose(
+        jax.vmap(changes)(moves), np.stack([changes(move) for move in moves]), rtol=1e-9, atol=1e-15
+    )
+
+
+def test_touches_weaken_and_do_not_depend_on_their_order(models):
+    """An insulating touch raises every self-impedance; touches do not see each other."""
+    model = models["layer"]
+    presses = press(model.mesh, Bell(), PLACES)
+    turned = press(model.mesh, Bell(), PLACES[::-1])
+    found = touch_changes(model, 1.0, presses)
+    np.testing.assert_allclose(found[::-1], touch_changes(model, 1.0, turned), rtol=1e-9, atol=1e-18)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"places": [[0.3, 0.0]]}, "1 of 1 touches change no cell"),
+        ({"places": [0.0, 0.0]}, r"places must be \(n, 2\)"),
+        ({"thickness": None}, "thickness must be given"),
+        ({"thickness": 2e-3}, "press less"),
+        ({"contrast": 1}, "contrast"),
+        ({"contrast": -0.5}, "contrast"),
+        ({"edge": -1e-3}, "edge"),
+    ],
+)
+def test_bad_touches(change, said, models):
+    arguments = {"places": PLACES, **SHEET, **change}
+    with pytest.raises(ValueError, match=said):
+        press(models["sheet"].mesh, Bell(), arguments.pop("places"), **arguments)
+
+
+def test_bad_indentations(models):
+    with pytest.raises(ValueError, match="no deeper"):
+        Hemisphere(depth=9e-3, diameter=15e-3)
+    with pytest.raises(ValueError, match="depth"):
+        Bell(depth=-1e-3)
+    with pytest.raises(ValueError, match="that of a layer is in its mesh"):
+        press(models["layer"].mesh, Bell(), PLACES, thickness=0.01)
+    with pytest.raises(ValueError, match="real, scalar"):
+        touch_changes(models["sheet"], 1.0 + 0.1j, press(models["sheet"].mesh, Bell(), PLACES, **SHEET))
