@@ -138,7 +138,7 @@ def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[
     as it was `explained` before for those that are left out."""
     expected, level, use = fit.expected(), np.asarray(fit.level), fit.use
     errors = standard_errors(fit)
-    well = (errors[1:] < _MOST_ERROR).all(axis=0)
+    well = np.max(errors[1:], axis=0) < _MOST_ERROR
     needed = len(fit.kind.parameters) + 2
     deviation, relative = np.asarray(fit.noise.deviation), np.asarray(fit.noise.relative)
     typical = float(np.median(relative[use.any(axis=1)])) if use.any() else 0.0

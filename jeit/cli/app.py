@@ -14,9 +14,11 @@ from jeit.cli.calibrate_microphones import calibrate_microphones
 from jeit.cli.choose import choose
 from jeit.cli.demo import demo
 from jeit.cli.info import info
+from jeit.cli.layout import layout
 from jeit.cli.locate import locate
 from jeit.cli.reconstruct import reconstruct
 from jeit.cli.stream import stream
+from jeit.cli.study import study
 
 app = typer.Typer(
     name="jeit",
@@ -33,6 +35,8 @@ app.command()(choose)
 app.command()(info)
 app.command()(calibrate_microphones)
 app.command()(locate)
+app.add_typer(layout)
+app.add_typer(study)
 
 
 @app.callback(invoke_without_command=True)
@@ -62,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             if arguments is None:
-                _start_quickly()
+                _start(quickly=sys.argv[1:2] != ["study"])
             status = command.main(
                 args=sys.argv[1:] if arguments is None else list(arguments), prog_name="jeit", standalone_mode=False
             )
@@ -84,7 +88,7 @@ def _explain(error: Exception) -> int:
         return _fail(f"{message}. See '{path} --help'.", 2)
     if type(error).__name__ == "Abort":
         return _fail("stopped.", 130)
-    if isinstance(error, ValueError):
+    if isinstance(error, ValueError) or (isinstance(error, ImportError) and "pip install" in str(error)):
         return _fail(str(error), 1)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
@@ -107,13 +111,14 @@ def _show_warning(message, category, filename, lineno, file=None, line=None) -> 
     print(f"jeit: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
-def _start_quickly() -> None:
-    """Set JAX up for a process that computes one image: most of its time would be compilation.
+def _start(*, quickly: bool) -> None:
+    """Set JAX up for one process; `quickly` for one that computes one image: most of its time would be compilation.
 
-    Compiled code is kept between runs, in the user's cache folder or in JAX_COMPILATION_CACHE_DIR; and unless the user
-    has set XLA_FLAGS, code is compiled without optimisation: a quarter of the time to compile.
+    Compiled code is kept between runs, in the user's cache folder or in JAX_COMPILATION_CACHE_DIR; and quickly, unless
+    the user has set XLA_FLAGS, code is compiled without optimisation: a quarter of the time to compile.
     """
-    os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+    if quickly:
+        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
     import jax
 
     if jax.config.jax_compilation_cache_dir is not None:  # pyright: ignore[reportAttributeAccessIssue]

@@ -2,9 +2,13 @@
 
 import tempfile
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from jeit.electrodes import Layout
+    from jeit.mesh import Domain
 
 Data = Annotated[Path, typer.Argument(help="Measured file to image.", show_default=False)]
 Reference = Annotated[
@@ -38,6 +42,36 @@ Window = Annotated[float | None, typer.Option(help="Length of a window, seconds 
 Hop = Annotated[
     float | None, typer.Option(help="From one window to the next, seconds (default 0.0125, or the calibration's).")
 ]
+
+LayoutName = Annotated[
+    str,
+    typer.Argument(
+        help="Built-in layout (park-inner, park-boundary, grid-CxR), or a file: CSV in millimetres, DXF or SVG.",
+        show_default=False,
+    ),
+]
+Width = Annotated[float, typer.Option("--width-mm", help="Of the skin, centred at 0, if a file does not say it.")]
+Height = Annotated[float, typer.Option("--height-mm", help="Of the skin, centred at 0, if a file does not say it.")]
+
+
+def read_skin(name: str, width: float, height: float) -> "tuple[Layout, Domain]":
+    """A layout, by name or from a file, and its skin's outline: width × height (mm) where a file does not say it."""
+    from jeit.electrodes import named_layout, read_layout
+    from jeit.mesh import Rectangle
+
+    found = read_layout(name) if Path(name).suffix else named_layout(name)
+    if found.outline is None:
+        check_positive({"--width-mm": width, "--height-mm": height})
+        found = read_layout(name, outline=Rectangle(1e-3 * width, 1e-3 * height))
+    assert found.outline is not None
+    return found, found.outline
+
+
+def check_positive(options: dict[str, float]) -> None:
+    """Raise `ValueError` for options that are not positive and finite."""
+    for name, value in options.items():
+        if not 0 < value < float("inf"):
+            raise ValueError(f"{name} must be positive; it is {value:g}.")
 
 
 def intensity_settings(low: float | None, high: float | None, window: float | None, hop: float | None):

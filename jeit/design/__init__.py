@@ -7,11 +7,25 @@ Studies of many layouts, which survive a crash.
 
 from jeit.design.candidates import Candidates as Candidates
 from jeit.design.changes import touch_changes as touch_changes
+from jeit.design.compare import Felt as Felt
+from jeit.design.compare import comparison as comparison
+from jeit.design.compare import feel as feel
+from jeit.design.compare import touches_away_from_the_edge as touches_away_from_the_edge
+from jeit.design.constraints import Constraints as Constraints
 from jeit.design.indentation import AbstractIndentation as AbstractIndentation
 from jeit.design.indentation import Bell as Bell
 from jeit.design.indentation import Hemisphere as Hemisphere
+from jeit.design.optimise import Optimisation as Optimisation
+from jeit.design.optimise import balanced as balanced
+from jeit.design.optimise import optimise_layout as optimise_layout
 from jeit.design.press import Presses as Presses
 from jeit.design.press import press as press
+from jeit.design.scores import Score as Score
+from jeit.design.scores import Scores as Scores
+from jeit.design.scores import SheetTouches as SheetTouches
+from jeit.design.scores import TouchPrior as TouchPrior
+from jeit.design.scores import layout_scores as layout_scores
+from jeit.design.scores import sheet_touches as sheet_touches
 from jeit.design.selection import Selection as Selection
 from jeit.design.selection import farthest_pairs as farthest_pairs
 from jeit.design.selection import information as information
@@ -23,5 +37,11 @@ from jeit.design.sensitivity import SensitivityMap as SensitivityMap
 from jeit.design.sensitivity import TouchGrid as TouchGrid
 from jeit.design.sensitivity import sensitivity_map as sensitivity_map
 from jeit.design.sensitivity import touch_grid as touch_grid
+from jeit.design.study import Study as Study
+from jeit.design.study import open_results as open_results
+from jeit.design.study import read_study as read_study
+from jeit.design.study import run_study as run_study
+from jeit.design.study import study_progress as study_progress
+from jeit.design.study import write_study_report as write_study_report
 from jeit.design.taxels import Taxels as Taxels
 from jeit.design.taxels import find_taxels as find_taxels

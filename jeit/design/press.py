@@ -71,7 +71,7 @@ def press(
     if not layer:
         share = depth / thickness
     elif edge:
-        share = np.asarray(smooth_step((depth - below[cells]) / edge))
+        share = np.asarray(smooth_step(jnp.asarray((depth - below[cells]) / edge)))
     else:
         share = (depth > below[cells]).astype(float)
     changed = there & (share > 0)

@@ -88,7 +88,7 @@ class SensitivityMap(eqx.Module):
         """Share of the area that is less sensitive than `level` (volts), such as another layout's minimum."""
         return jnp.mean(self.values < level, axis=-1)
 
-    def histogram(self, bins=40) -> tuple[np.ndarray, np.ndarray]:
+    def histogram(self, bins: int | np.ndarray = 40) -> tuple[np.ndarray, np.ndarray]:
         """Share of the area in each of some bins of Θ, and the bins' edges in volts; `bins` as of `numpy.histogram`."""
         counts, edges = np.histogram(np.asarray(self.values), bins=bins)
         return counts / self.values.size, edges

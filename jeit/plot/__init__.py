@@ -1,4 +1,4 @@
-"""Pictures, with matplotlib: meshes, images, electrodes, sensitivity, voltages, microphones and touches.
+"""Pictures, with matplotlib: meshes, images, electrodes, sensitivity, taxels, layouts, voltages, microphones, touches.
 
 Every function takes `ax`, makes a figure of its own where none is given, and returns the axes it drew on. Lengths are
 in metres in the arguments and in millimetres in the pictures.
@@ -17,5 +17,11 @@ from jeit.plot.localisation_error import plot_error_curve as plot_error_curve
 from jeit.plot.localisation_error import plot_pairs as plot_pairs
 from jeit.plot.mesh import plot_mesh as plot_mesh
 from jeit.plot.sensitivity import plot_sensitivity as plot_sensitivity
+from jeit.plot.sensitivity_map import plot_sensitivity_histograms as plot_sensitivity_histograms
+from jeit.plot.sensitivity_map import plot_sensitivity_map as plot_sensitivity_map
+from jeit.plot.taxels import plot_similarity as plot_similarity
+from jeit.plot.taxels import plot_taxel_areas as plot_taxel_areas
+from jeit.plot.taxels import plot_taxels as plot_taxels
 from jeit.plot.touch import plot_track as plot_track
+from jeit.plot.travel import plot_travel as plot_travel
 from jeit.plot.voltages import plot_voltages as plot_voltages

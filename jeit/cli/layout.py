@@ -1,0 +1,150 @@
+"""`jeit layout`: layouts of electrodes compared and improved, before any material is cut."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jeit.cli.layout_optimise import optimise
+from jeit.cli.options import Height, LayoutName, Quiet, Width, check_positive, make_folder, read_skin
+
+if TYPE_CHECKING:
+    from jeit.design import Felt
+
+layout = typer.Typer(name="layout", help="Compare and optimise layouts of electrodes.")
+
+layout.command()(optimise)
+
+_FILES = ("report.json", "comparison.png")
+
+
+@layout.callback(invoke_without_command=True)
+def _top(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@layout.command()
+def compare(
+    first: LayoutName,
+    second: LayoutName,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for report.json and comparison.png.", show_default=False)
+    ],
+    thickness: Annotated[float, typer.Option("--thickness-mm", help="Of the layer, millimetres.")] = 10.0,
+    conductivity: Annotated[float, typer.Option(help="Of the layer, siemens per metre.")] = 1.0,
+    pairs: Annotated[
+        int, typer.Option(help="Two-terminal measurements, between nearest electrodes; 0 for all pairs.")
+    ] = 94,
+    taxels: Annotated[int, typer.Option(help="Virtual taxels to look for.")] = 90,
+    margin: Annotated[
+        float, typer.Option("--margin-mm", help="Touch no nearer to the edge, where a touch is partly off the skin.")
+    ] = 10.0,
+    places: Annotated[int, typer.Option(help="Places touched along a side.")] = 48,
+    cell: Annotated[float, typer.Option("--cell-mm", help="Size of the mesh's cells, millimetres.")] = 4.5,
+    seed: Annotated[int, typer.Option(help="Of the taxels' k-means.")] = 0,
+    width: Width = 200.0,
+    height: Height = 200.0,
+    quiet: Quiet = False,
+) -> None:
+    """Touch two layouts all over, and say what each feels: sensitivity, blind spots, virtual taxels."""
+    import jax
+    from rich.console import Console
+
+    from jeit.cli.console import Steps
+    from jeit.design import comparison, feel, touches_away_from_the_edge
+
+    check_positive({"--thickness-mm": thickness, "--conductivity": conductivity, "--cell-mm": cell})
+    for name, value, least in (("--pairs", pairs, 0), ("--taxels", taxels, 1), ("--places", places, 2)):
+        if value < least:
+            raise ValueError(f"{name} must be at least {least}; it is {value}.")
+    if not 0 <= margin < float("inf"):
+        raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
+    skins = [read_skin(name, width, height) for name in (first, second)]
+    make_folder(output, _FILES)
+    console = Console(highlight=False)
+    felt: list[Felt] = []
+    with Steps(console, quiet=quiet) as step:
+        for one, outline in skins:
+            step(f"touch {one.name}")
+            grid = touches_away_from_the_edge(outline, 1e-3 * margin, places, places)
+            felt.append(
+                feel(
+                    one,
+                    grid,
+                    key=jax.random.key(seed),
+                    thickness=1e-3 * thickness,
+                    conductivity=conductivity,
+                    cell_size=1e-3 * cell,
+                    num_pairs=pairs or None,
+                    num_taxels=taxels,
+                )
+            )
+        step("write")
+        told = comparison(felt[0], felt[1])
+        report = {
+            "layouts": told,
+            "options": {
+                "thickness_mm": thickness,
+                "conductivity_S_per_m": conductivity,
+                "pairs": pairs or None,
+                "taxels": taxels,
+                "margin_mm": margin,
+                "places": places,
+                "cell_mm": cell,
+                "seed": seed,
+            },
+        }
+        (output / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", "utf-8")
+        _draw(felt).savefig(output / "comparison.png", dpi=130)
+    if not quiet:
+        _show(console, told)
+        console.print(f"[dim]Written:[/dim] {output / 'report.json'}, comparison.png", soft_wrap=True)
+
+
+def _draw(felt: "list[Felt]"):
+    from matplotlib.figure import Figure
+
+    from jeit.plot import plot_sensitivity_histograms, plot_sensitivity_map, plot_taxel_areas, plot_taxels
+
+    figure = Figure(figsize=(15.5, 8.6), layout="constrained")
+    axes = figure.subplots(2, 3)
+    highest = max(float(one.sensitivity.values.max()) for one in felt)
+    largest = max(float(one.taxels.max_area) for one in felt)
+    for row, one in zip(axes, felt, strict=True):
+        centres = one.layout.centres
+        plot_sensitivity_map(one.sensitivity, electrodes=centres, limit=highest, title=one.layout.name, ax=row[0])
+        plot_taxels(one.taxels, electrodes=centres, limit=largest, title=f"{one.layout.name}: taxels", ax=row[1])
+    names = [one.layout.name for one in felt]
+    names = names if names[0] != names[1] else [f"{name} ({k})" for k, name in enumerate(names, 1)]
+    plot_sensitivity_histograms({name: one.sensitivity for name, one in zip(names, felt, strict=True)}, ax=axes[0, 2])
+    plot_taxel_areas({name: one.taxels for name, one in zip(names, felt, strict=True)}, ax=axes[1, 2])
+    return figure
+
+
+def _show(console, told: list[dict]) -> None:
+    from rich.table import Table
+
+    table = Table("", *(one["layout"] for one in told), box=None, padding=(0, 2, 0, 0))
+    for column in table.columns[1:]:
+        column.justify = "right"
+
+    def row(name: str, key: str, factor: float = 1.0, digits: int = 3) -> None:
+        table.add_row(name, *(f"{factor * one[key]:.{digits}g}" for one in told))
+
+    row("electrodes", "electrodes")
+    row("measurements", "measurements")
+    row("least sensitivity / mV", "sensitivity_min_V", 1e3)
+    row("mean sensitivity / mV", "sensitivity_mean_V", 1e3)
+    row("uniformity", "sensitivity_uniformity")
+    row("blind spot / % of the area", "blind_spot_fraction", 100)
+    row("taxels", "taxel_count")
+    for key in ("mean", "std", "max"):
+        table.add_row(f"taxel area, {key} / cm²", *(f"{one['taxel_area_cm2'][key]:.3g}" for one in told))
+    row("taxels over a place", "taxel_overlap")
+    row("two-point estimate / mm", "two_point_mm")
+    console.print()
+    console.print(table)
+    console.print("[dim]blind spot: less sensitive than the other layout's least sensitive place[/dim]")
+    console.print()

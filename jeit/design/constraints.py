@@ -1,0 +1,59 @@
+"""What a layout that can be made must satisfy: electrodes inside an outline, apart, and off regions kept free."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jeit.mesh import Disk, Domain
+
+
+class Constraints(eqx.Module):
+    """Discs wholly inside `outline` and wholly outside every domain of `keep_out`, their centres `minimum_spacing`
+    metres apart or more, and no two of them overlapping."""
+
+    outline: Domain
+    minimum_spacing: float
+    keep_out: tuple[Domain, ...] = ()
+
+    def __check_init__(self):
+        if not 0 <= self.minimum_spacing < np.inf:
+            raise ValueError(f"minimum_spacing must be in metres, not negative; it is {self.minimum_spacing!r}.")
+
+    def check_room(self, radii) -> None:
+        """Raise `ValueError` for more discs of `radii` (L,), metres, than the densest packing of circles allows."""
+        x_min, x_max, y_min, y_max = self.outline.extent
+        least = float(np.min(radii))
+        apart = max(self.minimum_spacing, 2 * least)
+        # Circles of half that distance lie apart, and reach beyond where centres may be by their radius.
+        room = (x_max - x_min - 2 * least + apart) * (y_max - y_min - 2 * least + apart)
+        if len(radii) * apart**2 > 2 / np.sqrt(3) * room:
+            raise ValueError(
+                f"minimum_spacing: {len(radii)} electrodes {1e3 * apart:.3g} mm apart do not fit the outline, "
+                f"{1e3 * (x_max - x_min):.3g} × {1e3 * (y_max - y_min):.3g} mm; give less, or fewer electrodes."
+            )
+
+    def shortfall(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> Float[Array, " q"]:
+        """How much each constraint lacks, metres: positive where it is violated. Differentiable almost everywhere."""
+        first, second = np.triu_indices(len(radii), 1)
+        distance = jnp.sqrt(jnp.sum((centres[first] - centres[second]) ** 2, axis=1) + 1e-24)
+        spacing = jnp.maximum(self.minimum_spacing, radii[first] + radii[second]) - distance
+        outside = [radii + signed_room(centres, domain) for domain in self.keep_out]
+        return jnp.concatenate([spacing, radii - signed_room(centres, self.outline), *outside])
+
+
+def signed_room(points: Float[Array, "p 2"], domain: Domain) -> Float[Array, " p"]:
+    """Distance (p,) of points from the edge of a domain, metres; negative outside."""
+    if isinstance(domain, Disk):
+        return domain.radius - jnp.sqrt(jnp.sum((points - jnp.asarray(domain.centre)) ** 2, axis=1) + 1e-24)
+    loops: Sequence = (domain.vertices, *getattr(domain, "holes", ()))
+    start = jnp.concatenate([jnp.asarray(loop) for loop in loops])
+    along = jnp.concatenate([jnp.roll(jnp.asarray(loop), -1, axis=0) for loop in loops]) - start
+    offset = points[:, None] - start
+    fraction = jnp.clip(jnp.sum(offset * along, axis=-1) / jnp.sum(along**2, axis=-1), 0, 1)
+    nearest = jnp.min(jnp.sum((offset - fraction[..., None] * along) ** 2, axis=-1), axis=1)
+    inside = jax.lax.stop_gradient(domain.contains(points))
+    return jnp.where(inside, 1.0, -1.0) * jnp.sqrt(nearest + 1e-24)

@@ -1,0 +1,239 @@
+"""Layout scores: how well a sheet with a given layout feels touches, as numbers that have gradients.
+
+A touch at place k of amplitude a_k changes the M voltages by a_k Δv_k, linearly; their noise has standard deviation σ.
+With the amplitudes of touches at all places a priori a = S c, c independent of unit variance, voltages that are
+y = Aᵀa + noise, the rows of A being the Δv_k, leave them the covariance
+
+    C = S (1 + Sᵀ A σ⁻² Aᵀ S)⁻¹ Sᵀ.
+
+Where a touch is, its amplitude unknown, is told no better than by the Cramér-Rao bound: for the parameters (x, y, a)
+the Fisher information is J_ij = ∂_i(a Δv)ᵀ σ⁻² ∂_j(a Δv), and the variance of the place, tr of the block x, y of J⁻¹.
+
+Atkinson, Donev and Tobias, Optimum Experimental Designs (Oxford, 2007), chapter 10; Kay, Fundamentals of Statistical
+Signal Processing: Estimation Theory (1993), chapter 3.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jeit.design.indentation import AbstractIndentation
+from jeit.design.press import Presses, press
+from jeit.forward import ForwardModel
+from jeit.forward.assembly import cell_conductivity, check_conductivity
+from jeit.mesh import Mesh, centroids
+from jeit_solvers.dense_cholesky import inverse_cholesky
+
+# The largest eigenvalue to ln(r) / 2^k, relative, however close the next.
+_SQUARINGS = 10
+
+
+class SheetTouches(eqx.Module):
+    """Touches of a sheet at n places, and how they change as the places move; make them with `sheet_touches`.
+
+    **Fields**: `presses`; `slope` (n, c, 2), the derivative of `presses.change` in the place, per metre.
+    """
+
+    presses: Presses
+    slope: Float[Array, "n c 2"]
+
+    def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:
+        """Change of every cell's conductivity by every touch, siemens, and its derivative in the place."""
+        cells = self.presses.cells
+        blank = jnp.zeros((len(cells), len(conductivity)))
+
+        def spread(change):
+            return blank.at[jnp.arange(len(cells))[:, None], cells].add(change * conductivity[cells])
+
+        return spread(self.presses.change), jnp.stack([spread(self.slope[..., axis]) for axis in range(2)])
+
+
+def sheet_touches(
+    mesh: Mesh, indentation: AbstractIndentation, places, *, thickness: float, contrast: float = 0.0
+) -> SheetTouches:
+    """Indent a sheet (2-D mesh) of a layer of `thickness` metres at `places` (n, 2), metres; the rest as in `press`.
+
+    The derivative is of the indentation's depth at the middles of the cells. Raises `ValueError` as `press` does, and
+    for a mesh that is no sheet.
+    """
+    if mesh.dimension != 2:
+        raise ValueError(f"mesh is {mesh.dimension}-D; scores are of the equivalent sheet, with a 2-D mesh.")
+    presses = press(mesh, indentation, places, thickness=thickness, contrast=contrast)
+
+    def change(place, middle):
+        # The root has no derivative at 0; a thousandth of a micrometre is nothing to a depth.
+        distance = jnp.sqrt(jnp.sum((place - middle) ** 2) + 1e-18)
+        return (contrast - 1) * indentation.depth_at(distance) / thickness
+
+    middles = centroids(mesh)[presses.cells]
+    slope = jax.jit(jax.vmap(jax.vmap(jax.grad(change), (None, 0))))(presses.places, middles)
+    return SheetTouches(presses, jnp.where(presses.change[..., None] != 0, slope, 0.0))
+
+
+class TouchPrior(eqx.Module):
+    """What is thought of the amplitudes of touches before any voltage is read: covariance SSᵀ.
+
+    **Fields**: `factor` S (n, r), relative to the touches that voltages are computed for.
+    """
+
+    factor: Float[Array, "n r"]
+
+    @classmethod
+    def create(cls, places, *, correlation: float, deviation: float = 1.0) -> "TouchPrior":
+        """deviation² exp(-d² / 2 correlation²) between places (n, 2) at a distance d, metres.
+
+        What holds less than a millionth of the largest variance is left out. Raises `ValueError` for a correlation or
+        deviation that is not positive.
+        """
+        if not (0 < correlation < np.inf and 0 < deviation < np.inf):
+            raise ValueError(
+                f"correlation (metres) and deviation must be positive; they are {correlation!r} and {deviation!r}."
+            )
+        place = np.asarray(places, float)
+        squared = np.sum((place[:, None] - place) ** 2, axis=-1)
+        values, vectors = np.linalg.eigh(deviation**2 * np.exp(-squared / (2 * correlation**2)))
+        kept = values > 1e-6 * values[-1]
+        return cls(jnp.asarray(vectors[:, kept] * np.sqrt(values[kept])))
+
+
+class Scores(eqx.Module):
+    """How good a layout is; after `jax.vmap` every array leads with the axis of the layouts.
+
+    **Fields**
+
+    - `sensitivity` (n,): Θ = ‖Δv‖₂ of a touch at each place, volts.
+    - `soft_worst`: smooth minimum of Θ, volts, (mean Θ^(-1/T))^(-T); its temperature T → 0 makes it the minimum.
+    - `variance` (n,): of the amplitude at each place after the voltages are read, relative, the diagonal of C.
+    - `log_information`: D-optimality, log det of the information over the prior's, nats.
+    - `largest_variance`: E-optimality, the largest eigenvalue of C: of the pattern of touches that is known worst.
+    - `localisation_error` (n,): Cramér-Rao bound of the root-mean-square distance of an unbiased estimate of the place
+      of one touch of amplitude 1, metres.
+    """
+
+    sensitivity: Float[Array, "*layouts n"]
+    soft_worst: Float[Array, "*layouts"]
+    variance: Float[Array, "*layouts n"]
+    log_information: Float[Array, "*layouts"]
+    largest_variance: Float[Array, "*layouts"]
+    localisation_error: Float[Array, "*layouts n"]
+
+    @property
+    def worst(self) -> Float[Array, "*layouts"]:
+        """Least Θ, volts."""
+        return self.sensitivity.min(axis=-1)
+
+    @property
+    def mean(self) -> Float[Array, "*layouts"]:
+        """Mean Θ, volts."""
+        return self.sensitivity.mean(axis=-1)
+
+    @property
+    def uniformity(self) -> Float[Array, "*layouts"]:
+        """Mean Θ over its root mean square, as in `SensitivityMap`."""
+        return self.mean / jnp.sqrt(jnp.mean(self.sensitivity**2, axis=-1))
+
+    @property
+    def mean_variance(self) -> Float[Array, "*layouts"]:
+        """A-optimality: tr C / n, the mean of `variance`."""
+        return self.variance.mean(axis=-1)
+
+
+Score = Callable[[Scores], Float[Array, ""]]
+
+
+def layout_scores(
+    model: ForwardModel,
+    conductivity,
+    touches: SheetTouches,
+    *,
+    prior: TouchPrior,
+    noise,
+    temperature: float = 0.1,
+) -> Scores:
+    """All scores of the layout of a model on a sheet, from one factorisation and the Jacobian.
+
+    Differentiable in the electrodes' positions, radii and contact impedances; for a batch of layouts of L electrodes
+    (the protocol, the places, and so on are the same)::
+
+        jax.vmap(lambda electrodes: layout_scores(model.with_electrodes(electrodes), …))(stacked_electrodes)
+
+    A protocol of all two-terminal pairs does not depend on the order of the electrodes, and spans all that they can
+    measure; one of neighbours depends on their numbers, which mean nothing once they move.
+
+    **Arguments:** `conductivity` of the sheet, siemens; `noise`, standard deviation of the channels, (M,) or one for
+    all, volts; `temperature` of the smooth minimum. Raises `ValueError` for a model that is not of a sheet and for
+    shapes and values that do not fit.
+    """
+    conductivity = check_conductivity(model.mesh, conductivity)
+    if conductivity.ndim == 3 or jnp.iscomplexobj(conductivity):
+        raise ValueError("conductivity: scores need a real, scalar one.")
+    noise = jnp.asarray(noise, float)
+    _check(model, touches, prior, noise, temperature)
+    return _scores(model, cell_conductivity(model.mesh, conductivity), touches, prior, noise, temperature)
+
+
+def _check(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> None:
+    channels = model.protocol.num_measurements
+    if model.mesh.dimension != 2:
+        raise ValueError(f"model is of a {model.mesh.dimension}-D body; scores are of the equivalent sheet.")
+    if len(prior.factor) != len(touches.slope):
+        raise ValueError(
+            f"prior is of {len(prior.factor)} places and there are {len(touches.slope)} touches; make it of theirs, "
+            "TouchPrior.create(touches.presses.places, …)."
+        )
+    if noise.shape not in ((), (channels,)):
+        raise ValueError(f"noise has shape {noise.shape}; give one number, or one for each of {channels} channels.")
+    if not isinstance(noise, Tracer) and not (np.isfinite(noise) & (np.asarray(noise) > 0)).all():
+        raise ValueError("noise must be positive and finite: the standard deviation of each channel, in volts.")
+    if not isinstance(temperature, Tracer) and not 0 < temperature < np.inf:
+        raise ValueError(f"temperature must be positive; it is {temperature!r}.")
+
+
+@jax.jit
+def _scores(model: ForwardModel, conductivity, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> Scores:
+    jacobian = model.jacobian(conductivity).T  # (m, M)
+    weights, slopes = touches.weights(conductivity)
+    changes = weights @ jacobian  # (n, M)
+    sensitivity = jnp.linalg.norm(changes, axis=1)
+    log_mean = jax.nn.logsumexp(-jnp.log(sensitivity) / temperature) - jnp.log(len(sensitivity))
+    seen = changes / noise
+    rows = prior.factor.T @ seen  # (r, M)
+    root = inverse_cholesky((jnp.eye(len(rows)) + rows @ rows.T)[None])[0]
+    half = prior.factor @ root.T  # C = half halfᵀ
+    return Scores(
+        sensitivity,
+        jnp.exp(-temperature * log_mean),
+        jnp.sum(half**2, axis=1),
+        -2 * jnp.sum(jnp.log(jnp.diagonal(root))),
+        _largest_eigenvalue(half.T @ half),
+        _localisation_error(seen, slopes @ jacobian / noise),
+    )
+
+
+def _largest_eigenvalue(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
+    """Of a symmetric matrix without negative ones, by repeated squaring: products alone, which batch.
+
+    The derivative of a simple eigenvalue is that of vᵀ(matrix)v with its vector v held.
+    """
+    power = jax.lax.stop_gradient(matrix)
+    for _ in range(_SQUARINGS):
+        power = power @ power
+        power = power / jnp.max(jnp.abs(power))
+    vector = power[:, jnp.argmax(jnp.diagonal(power))]
+    return vector @ matrix @ vector / (vector @ vector)
+
+
+def _localisation_error(along_a: Float[Array, "n M"], along: Float[Array, "2 n M"]) -> Float[Array, " n"]:
+    """√tr of the 2 × 2 block of the inverse of the information, by its Schur complement; infinite where singular."""
+    size = jnp.sum(along_a**2, axis=1)
+    # What of the slopes an amplitude cannot explain; formed before it is squared, for the difference may be small.
+    x, y = along - (jnp.sum(along * along_a, axis=2) / size)[..., None] * along_a
+    xx, yy, xy = jnp.sum(x * x, axis=1), jnp.sum(y * y, axis=1), jnp.sum(x * y, axis=1)
+    determinant = xx * yy - xy**2
+    known = determinant > 1e-12 * xx * yy
+    return jnp.where(known, jnp.sqrt((xx + yy) / jnp.where(known, determinant, 1.0)), jnp.inf)

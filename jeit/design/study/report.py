@@ -1,0 +1,161 @@
+"""A study as one HTML page that needs nothing else: its pictures, its table, and the exact configuration."""
+
+import base64
+import io
+import platform
+from html import escape
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jeit.design.study.batch import study_grid
+from jeit.design.study.run import study_progress
+from jeit.design.study.spec import Study
+from jeit.design.study.store import Store, open_results
+
+# More maps than that are no longer looked at.
+_MAPS, _COLUMNS = 24, 4
+_PACKAGES = ("jeit", "jax", "numpy", "zarr", "xarray", "matplotlib")
+_TEXT = ("layout", "protocol")
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 70em; margin: 2em auto; padding: 0 1em; color: #222 }
+table { border-collapse: collapse; font-size: 13px } th, td { padding: .2em .7em; text-align: right }
+th { border-bottom: 1px solid #888 } tr:nth-child(even) { background: #f4f4f4 } td.text, th.text { text-align: left }
+img { max-width: 100% } pre { background: #f4f4f4; padding: 1em; overflow-x: auto } div.wide { overflow-x: auto }
+"""
+
+
+def write_study_report(study: Study, store: str | Path, path: str | Path) -> None:
+    """Write what the study in `store` has found so far as one HTML file at `path`, replaced as a whole.
+
+    Maps of the first 24 finished points on one scale; mean against least sensitivity; every point's values and scores;
+    the study file, fingerprint and versions. Raises `ValueError` if no chunk is finished, and as `open_results` does.
+    """
+    data = open_results(study, store)
+    if not data.finished.values.any():
+        raise ValueError(f"{store}: no chunk of the study is finished, so there is nothing to report; resume it.")
+    progress = study_progress(study, store)
+    made_by, now = Store(study, store, create=False).versions, {name: metadata.version(name) for name in _PACKAGES}
+    parts = [
+        f"<h1>{escape(study.name)}</h1>",
+        f"<p>{progress.points} of {progress.all_points} points finished, in {progress.chunks} of {progress.all_chunks} "
+        "chunks. Sensitivity: ‖Δv‖₂ of all channels to one touch, linearised, on a sheet.</p>",
+        *([_picture(_scatter(data), "Mean and least sensitivity of every point")] if len(study.points) > 1 else []),
+        _picture(_maps(study, data), "Sensitivity maps, electrodes as circles"),
+        "<h2>Points</h2>",
+        _table(study, data),
+        "<h2>Configuration</h2>",
+        f"<pre>{escape(study.text)}</pre>",
+        f"<p>Fingerprint {study.fingerprint}</p>",
+        "<h2>Versions</h2>",
+        f"<p>Computed with {_listed(made_by)}.</p>",
+        f"<p>Reported with {_listed(now)}, Python {platform.python_version()}, {escape(platform.platform())}.</p>",
+    ]
+    page = (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(study.name)}</title>'
+        f"<style>{_STYLE}</style></head>\n<body>\n" + "\n".join(parts) + "\n</body></html>\n"
+    )
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        temporary.write_text(page, "utf-8")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _scatter(data):
+    """Mean against least sensitivity, a colour for each layout."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.5, 4.2), layout="constrained")
+    axes = figure.subplots()
+    least, mean = data.sensitivity.min("place"), data.sensitivity.mean("place")
+    for layout in dict.fromkeys(data.layout.values.tolist()):
+        these = data.layout.values == layout
+        axes.plot(1e3 * least[these], 1e3 * mean[these], "o", label=_plain(layout), alpha=0.8)
+    axes.set(xlabel="Least sensitivity (mV)", ylabel="Mean sensitivity (mV)", xscale="log", yscale="log")
+    axes.grid(alpha=0.3, which="both")
+    figure.legend(loc="outside right upper", frameon=False)
+    return figure
+
+
+def _maps(study: Study, data):
+    from matplotlib.collections import EllipseCollection
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    grid = study_grid(study)
+    numbers = np.flatnonzero(data.finished.values)[:_MAPS]
+    values = 1e3 * data.sensitivity.values[numbers]
+    positive = values[values > 0]
+    scale = LogNorm(positive.min(), positive.max())
+    columns = min(_COLUMNS, len(numbers))
+    rows = -(-len(numbers) // columns)
+    figure = Figure(figsize=(max(2.6 * columns, 4.0) + 0.8, 2.7 * rows + 0.3), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    low_x, high_x, low_y, high_y = (1e3 * length for length in study.skin.extent)
+    image = None
+    for axes, number, map_values in zip(panels, numbers, values, strict=False):
+        layout = study.points[number].layout
+        image = axes.imshow(
+            grid.raster(map_values), origin="lower", extent=(low_x, high_x, low_y, high_y), norm=scale, cmap="magma"
+        )
+        diameter = 1e3 * np.asarray(layout.diameters)
+        circles = EllipseCollection(
+            diameter,
+            diameter,
+            np.zeros_like(diameter),
+            units="xy",
+            offsets=1e3 * np.asarray(layout.centres),
+            offset_transform=axes.transData,
+            facecolors="none",
+            edgecolors="c",
+        )
+        axes.add_collection(circles)
+        axes.set_title(f"{number}: {_plain(layout.name)}", fontsize=9)
+        axes.tick_params(labelsize=7)
+    for axes in panels[len(numbers) :]:
+        axes.set_axis_off()
+    assert image is not None
+    figure.colorbar(image, ax=panels.tolist(), label="Sensitivity (mV)", shrink=min(1.0, 1.5 / rows))
+    return figure
+
+
+def _picture(figure: Any, caption: str) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    encoded = base64.b64encode(buffer.getvalue()).decode()
+    return f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{encoded}">' + (
+        f"<figcaption>{escape(caption)}.</figcaption></figure>"
+    )
+
+
+def _table(study: Study, data) -> str:
+    """A line for every point: what was swept, then what was found."""
+    swept = list(study.points[0].coordinates)
+    scores = [name for name in data.data_vars if data[name].dims == ("point",)]
+    units = {name: data[name].attrs.get("units", "1") for name in scores}
+    heads = ["point", *swept, *(name if units[name] == "1" else f"{name} / {units[name]}" for name in scores)]
+    lines = ["".join(f'<th class="{"text" if head in _TEXT else "number"}">{escape(head)}</th>' for head in heads)]
+    columns = [data[name].values.tolist() for name in (*swept, *scores)]
+    for number, row in enumerate(zip(*columns, strict=True)):
+        lines.append("".join(_cell(value) for value in (number, *row)))
+    return '<div class="wide"><table>' + "\n".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
+
+
+def _cell(value) -> str:
+    if isinstance(value, str):
+        return f'<td class="text">{escape(value)}</td>'
+    return f"<td>{'–' if value != value else f'{value:.4g}'}</td>"
+
+
+def _listed(versions: dict[str, str]) -> str:
+    return ", ".join(f"{escape(name)} {escape(version)}" for name, version in versions.items())
+
+
+def _plain(text: str) -> str:
+    """Text that matplotlib takes as it is: no formulas, and no label that begins with an underscore is left out."""
+    return " " * text.startswith("_") + text.replace("$", r"\$")

@@ -1,0 +1,221 @@
+"""`Study`: a sweep over layouts and what surrounds them, as a TOML file says; checked before anything runs."""
+
+import hashlib
+import json
+import tomllib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from jeit.design.indentation import AbstractIndentation, Bell, Hemisphere
+from jeit.design.study.keys import read_keys
+from jeit.design.study.layouts import is_file, study_layout
+from jeit.electrodes import Layout
+from jeit.mesh import Rectangle
+
+# Bump when the same study would give other numbers.
+_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """One skin of a study: its `layout` (with diameters and contact impedances) and what surrounds it, in SI units."""
+
+    layout: Layout
+    thickness: float
+    conductivity: float
+    protocol: str
+    noise: float
+    cell_size: float
+
+    @property
+    def shape(self) -> tuple[int, str, float]:
+        """Points of one shape, electrode count, protocol and mesh, can share a batch."""
+        return self.layout.num_electrodes, self.protocol, self.cell_size
+
+    @property
+    def coordinates(self) -> dict[str, str | int | float]:
+        """The swept values, by their names in the study file; means where electrodes differ."""
+        return {
+            "layout": self.layout.name,
+            "electrodes": self.layout.num_electrodes,
+            "diameter_mm": _tidy(1e3 * np.mean(self.layout.diameters)),
+            "contact_impedance_ohm_m2": _tidy(np.mean(np.asarray(self.layout.contact_impedance))),
+            "thickness_mm": _tidy(1e3 * self.thickness),
+            "conductivity_S_per_m": self.conductivity,
+            "protocol": self.protocol,
+            "noise_V": self.noise,
+            "cell_mm": _tidy(1e3 * self.cell_size),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A sweep: every combination of the lists in a study file. Make it with `read_study`.
+
+    - `points`: the skins, in the order of the lists, the last list fastest.
+    - `skin`: their outline; `indentation`: the touch; `columns`, `rows`: of the grid of touches.
+    - `current`: amperes. `scores`: those wanted; `num_taxels`, `threshold`, `seed`: of `find_taxels`.
+    - `chunk_points`: most points in a chunk. `text`: the study file.
+
+    Studies are equal if their results would be.
+    """
+
+    name: str
+    points: tuple[Point, ...]
+    skin: Rectangle
+    indentation: AbstractIndentation
+    columns: int
+    rows: int
+    current: float
+    scores: tuple[str, ...]
+    num_taxels: int
+    threshold: float
+    seed: int
+    chunk_points: int
+    text: str
+
+    @cached_property
+    def chunks(self) -> tuple[tuple[int, ...], ...]:
+        """Points (by number) of each chunk: of one shape, at most `chunk_points`."""
+        shapes: dict[tuple, list[int]] = {}
+        for number, point in enumerate(self.points):
+            shapes.setdefault(point.shape, []).append(number)
+        most = self.chunk_points
+        return tuple(
+            tuple(same[start : start + most]) for same in shapes.values() for start in range(0, len(same), most)
+        )
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of all that decides the results: not of comments or the study's name."""
+        content = [_VERSION, *map(float, self.skin.extent), type(self.indentation).__name__]
+        content += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
+        content += [*self.scores, self.num_taxels, self.threshold, self.seed, self.chunk_points]
+        for point in self.points:
+            content.append(point.coordinates)
+            if is_file(point.layout.name):  # the last digits of others depend on how they were compiled
+                arrays = (point.layout.centres, point.layout.diameters, point.layout.contact_impedance)
+                content += [(np.round(array, 12) + 0.0).tolist() for array in map(np.asarray, arrays)]
+        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+
+    def __eq__(self, other) -> bool:
+        return isinstance(other, Study) and self.fingerprint == other.fingerprint
+
+    def __hash__(self) -> int:
+        return hash(self.fingerprint)
+
+
+def read_study(path: str | Path) -> Study:
+    """The study that a TOML file describes. Lengths are in millimetres; lists are swept, in every combination::
+
+        name = "32 electrodes: inside or around"
+        [skin]
+        width_mm = 200                       # and height_mm, a rectangle about the origin
+        thickness_mm = [5, 10]
+        conductivity_S_per_m = 1.0
+        [electrodes]
+        layouts = ["park-inner", "park-boundary", "grid-8x4", "perimeter-32", "inner-32", "mine.csv"]
+        diameter_mm = [6, 8]                 # and contact_impedance_ohm_m2: the file's own, or 6 and 1e-3, unless given
+        minimum_gap_mm = 2
+        [measurement]
+        protocol = ["adjacent", "two-terminal"]    # or "opposite"; two-terminal: all pairs
+        current_mA = 1
+        noise_V = 1e-6
+        [touch]
+        indentation = "bell"                 # depth_mm, deviation_mm; or "hemisphere": depth_mm, diameter_mm
+        columns = 24                         # and rows
+        [mesh]
+        cell_mm = 4
+        [scores]
+        wanted = ["minimum", "mean", "uniformity", "blind_spot", "taxels"]    # num_taxels, threshold, seed
+
+    Only `electrodes.layouts` must be there. Files are looked for beside the study's. Raises `FileNotFoundError` if
+    there is no such file and `ValueError`, naming the key and what to do, for keys that are not known, values out of
+    range (such as metres for millimetres), electrodes that overlap, and impossible spacings.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
+    try:
+        text = path.read_text("utf-8")
+        return _study(text, read_keys(tomllib.loads(text)), path.parent)
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path.name} is no TOML file: {error}") from None
+    except UnicodeDecodeError:
+        raise ValueError(f"{path.name} is no TOML file: it is not text in UTF-8.") from None
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from None
+
+
+def _study(text: str, values: dict, folder: Path) -> Study:
+    skin = Rectangle(1e-3 * values["skin.width_mm"], 1e-3 * values["skin.height_mm"])
+    depth, thinnest = values["touch.depth_mm"], min(values["skin.thickness_mm"])
+    if depth >= thinnest:
+        raise ValueError(f"touch.depth_mm is {depth:g}, and the skin {thinnest:g} mm thick; press less.")
+    if values["touch.indentation"] == "bell":
+        indentation = Bell(1e-3 * depth, 1e-3 * values["touch.deviation_mm"])
+    else:
+        indentation = Hemisphere(1e-3 * depth, 1e-3 * values["touch.diameter_mm"])
+    layouts = [
+        study_layout(name, folder, skin, diameter, impedance, 1e-3 * values["electrodes.minimum_gap_mm"])
+        for name in values["electrodes.layouts"]
+        for diameter in _metres(values["electrodes.diameter_mm"])
+        for impedance in values["electrodes.contact_impedance_ohm_m2"]
+    ]
+    points = (
+        Point(layout, thickness, float(conductivity), protocol, float(noise), cell_size)
+        for layout in layouts
+        for thickness in _metres(values["skin.thickness_mm"])
+        for conductivity in values["skin.conductivity_S_per_m"]
+        for protocol in values["measurement.protocol"]
+        for noise in values["measurement.noise_V"]
+        for cell_size in _metres(values["mesh.cell_mm"])
+    )
+    study = Study(
+        name=values["name"],
+        points=tuple(points),
+        skin=skin,
+        indentation=indentation,
+        columns=values["touch.columns"],
+        rows=values["touch.rows"],
+        current=1e-3 * values["measurement.current_mA"],
+        scores=tuple(values["scores.wanted"]),
+        num_taxels=values["scores.num_taxels"],
+        threshold=float(values["scores.threshold"]),
+        seed=values["scores.seed"],
+        chunk_points=values["chunk_points"],
+        text=text,
+    )
+    _check(study)
+    return study
+
+
+def _check(study: Study) -> None:
+    touches = study.columns * study.rows
+    if "taxels" in study.scores and study.num_taxels > touches:
+        raise ValueError(f"scores.num_taxels is {study.num_taxels}, and there are {touches} touches; ask for fewer.")
+    for point in study.points:
+        if point.protocol == "opposite" and point.layout.num_electrodes % 2:
+            raise ValueError(
+                f"measurement.protocol: {point.layout.name!r} has {point.layout.num_electrodes} electrodes, and "
+                "'opposite' needs an even number."
+            )
+        smallest = float(np.min(point.layout.diameters))
+        if point.cell_size > 4 * smallest:
+            raise ValueError(
+                f"mesh.cell_mm is {1e3 * point.cell_size:g}, too coarse for electrodes {1e3 * smallest:.3g} mm across; "
+                f"{1e3 * smallest / 2:.3g} would do."
+            )
+
+
+def _metres(lengths: list[float]) -> list[float]:
+    """From millimetres."""
+    return [1e-3 * length for length in lengths]
+
+
+def _tidy(value) -> float:
+    """Without the digits that came with the conversion of units."""
+    return float(f"{float(value):.12g}")

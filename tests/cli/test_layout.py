@@ -1,0 +1,59 @@
+"""`jeit layout compare`: two layouts side by side, in a table, a report and a picture."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jeit.electrodes import Layout, grid, write_layout
+from jeit.mesh import Rectangle
+
+SKIN = Rectangle(0.06, 0.05)
+OPTIONS = ["--places", 10, "--margin-mm", 5, "--taxels", 8, "--cell-mm", 5, "--pairs", 6]
+
+
+@pytest.fixture
+def layouts(tmp_path):
+    write_layout(Layout(grid(0.04, 0.03, 3, 2), 8e-3, outline=SKIN), tmp_path / "inside.svg")
+    left = grid(0.02, 0.03, 3, 2) - np.array([0.016, 0.0])
+    write_layout(Layout(left, 8e-3, outline=SKIN), tmp_path / "left.csv")
+    return tmp_path / "inside.svg", tmp_path / "left.csv"
+
+
+def test_two_files_side_by_side(layouts, run, tmp_path):
+    folder = tmp_path / "out"
+    size = ["--width-mm", 60, "--height-mm", 50]
+    status, output, error = run("layout", "compare", *layouts, "--output", folder, *OPTIONS, *size)
+    assert (status, error) == (0, "")
+    assert "blind spot / % of the area" in output
+    assert (folder / "comparison.png").read_bytes().startswith(b"\x89PNG")
+    report = json.loads((folder / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
+    inside, left = report["layouts"]
+    assert [one["layout"] for one in report["layouts"]] == ["inside", "left"]
+    assert inside["measurements"] == 6
+    # Its right side is far from all electrodes.
+    assert left["sensitivity_min_V"] < 0.5 * inside["sensitivity_min_V"]
+    assert left["blind_spot_fraction"] > 0.1
+    assert inside["blind_spot_fraction"] == 0
+    assert 0 < inside["taxel_count"] <= 8
+    assert inside["taxel_area_cm2"]["mean"] <= inside["taxel_area_cm2"]["max"] < 30
+    assert report["options"]["margin_mm"] == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (["park-iner"], "park-inner"),
+        (["missing.svg"], "missing.svg"),
+        ([None, "--margin-mm", 40], "so far from its edge"),
+        ([None, "--thickness-mm", 2], "press less"),
+        ([None, "--thickness-mm", -1], "--thickness-mm must be positive"),
+        ([None, "--taxels", 0], "--taxels must be at least 1"),
+    ],
+)
+def test_bad_input_is_explained(change, said, layouts, run, tmp_path):
+    first = change[0] or layouts[0]
+    status, _, error = run("layout", "compare", first, layouts[0], "--output", tmp_path / "out", *OPTIONS, *change[1:])
+    assert status == 1
+    assert said in error
+    assert len(error.strip().splitlines()) == 1

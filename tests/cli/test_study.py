@@ -1,0 +1,97 @@
+"""`jeit study`: run, resume, status, report, and every fault in one line."""
+
+import errno
+import os
+import sys
+
+import pytest
+
+from jeit.design.study.store import Store
+
+pytest.importorskip("xarray")
+
+TEXT = """
+chunk_points = 1
+[skin]
+width_mm = 100
+height_mm = 80
+[electrodes]
+layouts = ["grid-4x2", "perimeter-8"]
+diameter_mm = 10
+[touch]
+columns = 6
+rows = 5
+[mesh]
+cell_mm = 8
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "sweep.toml"
+    path.write_text(TEXT, "utf-8")
+    return path
+
+
+def failed(result):
+    status, _, error = result
+    assert status == 1
+    assert error.startswith("jeit: ")
+    assert error.count("\n") == 1
+    return error
+
+
+def test_run_stop_resume_and_report(file, run, monkeypatch):
+    assert "not begun; 2 points in 2 chunks" in run("study", "status", file)[1]
+    assert "begin with 'jeit study run" in failed(run("study", "resume", file))
+    assert "no study at" in failed(run("study", "report", file))
+    write = Store.write_array
+
+    def full(self, name, points, values):
+        if 1 in points:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(self, name, points, values)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "write_array", full)
+        error = failed(run("study", "run", file, "--quiet"))
+    assert "sweep.zarr: No space left on device: a chunk could not be written; 1 of 2 chunks are finished" in error
+    assert "1 of 2 points finished, in 1 of 2 chunks" in run("study", "status", file)[1]
+    assert "there already: 'jeit study resume" in failed(run("study", "run", file))
+    status, out, _ = run("study", "resume", file)
+    assert status == 0
+    assert "2/2" in out
+    assert "Written:" in out
+    assert file.with_suffix(".html").stat().st_size > 10_000
+    assert "2 of 2 points finished" in run("study", "status", file)[1]
+    status, out, _ = run("study", "report", file, "--page", file.parent / "other.html")
+    assert (status, (file.parent / "other.html").is_file()) == (0, True)
+    file.write_text(TEXT.replace("rows = 5", "rows = 6"), "utf-8")
+    assert "another study, or of this one before it was changed" in failed(run("study", "resume", file))
+
+
+@pytest.mark.parametrize("command", ["run", "resume", "status", "report"])
+def test_bad_studies_are_refused_in_one_line(file, run, command):
+    file.write_text(TEXT + "cel_mm = 5\n", "utf-8")
+    assert "sweep.toml: mesh.cel_mm is no key of a study (did you mean 'cell_mm'?)" in failed(
+        run("study", command, file)
+    )
+    assert not file.with_suffix(".zarr").exists()
+
+
+def test_faults_are_said_before_anything_runs(file, run):
+    assert "no file" in failed(run("study", "run", file.parent / "none.toml"))
+    assert "cannot be made" in failed(run("study", "run", file, "--output", file / "in a file.zarr"))
+    assert run("study", "rerun", file)[0] == 2
+
+
+def test_a_missing_package_is_said_with_its_extra(file, run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    assert "Studies need zarr: pip install 'jeit[cluster]'" in failed(run("study", "run", file))
+
+
+def test_help_without_a_command(run):
+    status, out, _ = run("study")
+    assert status == 0
+    for command in ("run", "resume", "status", "report"):
+        assert command in out

@@ -1,0 +1,182 @@
+"""Layout optimisation: better, within all constraints, from several starts, the same every time."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.path import Path
+
+from jeit.design import (
+    Bell,
+    Constraints,
+    TouchPrior,
+    balanced,
+    layout_scores,
+    optimise_layout,
+    sensitivity_map,
+    sheet_touches,
+    touch_grid,
+)
+from jeit.electrodes import Layout, PointElectrodes, named_layout, perimeter
+from jeit.forward import ForwardModel
+from jeit.mesh import Disk, Polygon, Rectangle, rectangle
+from jeit.protocol import two_terminal
+
+SKIN = Rectangle(0.1, 0.1)
+SPACING, NUMBER = 0.02, 8
+MESH = rectangle(0.1, 0.1, num_points=200)
+PLACES = touch_grid(SKIN, 5, 5).places
+# A poor one: all along one side and a half.
+START = Layout(
+    np.array([[x, y] for y in (-0.04, -0.015) for x in (-0.036, -0.012, 0.012, 0.036)]), 8e-3, outline=SKIN, name="low"
+)
+MODEL = ForwardModel(MESH, START.sheet_discs(1e-4), two_terminal(NUMBER))
+TOUCHES = sheet_touches(MESH, Bell(deviation=12e-3), PLACES, thickness=0.01)
+KEEP_OUT = Disk(0.015, (0.02, 0.02))
+SETTING = {"prior": TouchPrior.create(PLACES, correlation=0.02), "noise": 1e-4}
+
+
+def optimise(layout=START, **options):
+    return optimise_layout(layout, MODEL, 2e-3, TOUCHES, **SETTING, **options)
+
+
+def optimise_from_three(**options):
+    limits = {"minimum_spacing": SPACING, "keep_out": (KEEP_OUT,)}
+    return optimise(starts=3, key=jax.random.key(1), steps=14, **limits, **options)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return optimise_from_three()
+
+
+def distances(centres):
+    return np.linalg.norm(centres[:, None] - centres, axis=-1)[np.triu_indices(len(centres), 1)]
+
+
+def test_optimised_layout_is_better_by_far(found):
+    assert found.value > found.start_value + 2
+    before = layout_scores(MODEL, 2e-3, TOUCHES, **SETTING)
+    np.testing.assert_allclose(found.start_value, balanced(before), rtol=1e-9)
+    np.testing.assert_allclose(found.value, balanced(found.scores), rtol=1e-9)
+    assert found.scores.soft_worst > 2 * before.soft_worst
+    assert found.scores.mean_variance < 0.7 * before.mean_variance
+    assert found.status in ("converged", "step limit")
+    assert "3 satisfy" in found.reason
+
+
+def test_all_starts_satisfy_all_constraints(found):
+    np.testing.assert_array_equal(found.shortfall, 0)
+    for centres in found.centres:
+        assert distances(centres).min() >= SPACING
+        assert np.abs(centres).max() <= 0.05 - 4e-3
+        assert np.linalg.norm(centres - KEEP_OUT.centre, axis=1).min() >= KEEP_OUT.radius + 4e-3
+    assert found.layout.labels == START.labels
+    assert found.layout.outline == SKIN
+
+
+def test_history_and_snapshots_tell_the_way(found):
+    steps = found.history.shape[1]
+    assert found.snapshots.shape == (3, steps, NUMBER, 2)
+    np.testing.assert_allclose(found.snapshots[0, 0], START.centres, atol=1e-12)
+    assert found.values.max() == found.value
+    assert 1 < steps <= 15
+
+
+def test_same_arguments_same_layout(found):
+    heard = []
+    again = optimise_from_three(callback=lambda step, scores: heard.append((step, scores)))
+    np.testing.assert_array_equal(again.centres, found.centres)
+    np.testing.assert_array_equal(np.stack([scores for _, scores in heard], axis=1), found.history)
+    assert [step for step, _ in heard] == list(range(len(heard)))
+
+
+def test_symmetry_and_sizes():
+    # A shift along the edge keeps electrodes off the axes and the symmetry of the quarters.
+    track = Rectangle(0.08, 0.08)
+    ring = Layout(perimeter(track, NUMBER, start=0.005), 8e-3, outline=SKIN)
+    found = optimise(ring, symmetry="rotate-4", sizes=(6e-3, 12e-3), steps=8, minimum_spacing=0.015)
+    centres, diameters = np.asarray(found.layout.centres), np.asarray(found.layout.diameters)
+    assert found.value > found.start_value + 0.1
+    turned = centres @ np.array([[0, 1], [-1, 0]])
+    match = np.linalg.norm(centres[:, None] - turned, axis=-1)
+    np.testing.assert_allclose(match.min(axis=1), 0, atol=1e-9)
+    np.testing.assert_allclose(diameters[match.argmin(axis=0)], diameters, rtol=1e-9)
+    assert 6e-3 <= diameters.min() < diameters.max() <= 12e-3
+    assert distances(centres).min() >= 0.015
+
+
+def test_shortfall_is_what_lacks():
+    angle = np.arange(6)
+    corners = 0.05 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    hexagon = Polygon(corners, [[[0, 0], [0, 0.01], [0.01, 0]]])
+    points = 0.06 * np.random.default_rng(0).uniform(-1, 1, (200, 2))
+    shortfall = eqx.filter_jit(Constraints(hexagon, 0.0).shortfall)
+    lacking = shortfall(jnp.asarray(points), jnp.full(200, 1e-9))[-200:]
+    loops = [np.asarray(loop) for loop in (hexagon.vertices, *hexagon.holes)]
+    inside = Path(loops[0]).contains_points(points) & ~Path(loops[1]).contains_points(points)
+    np.testing.assert_array_equal(lacking < 0, inside)
+    edge = np.concatenate(
+        [loop + t * (np.roll(loop, -1, axis=0) - loop) for loop in loops for t in np.linspace(0, 1, 2001)]
+    )
+    nearest = np.min(np.linalg.norm(points[:, None] - edge, axis=-1), axis=1)
+    np.testing.assert_allclose(np.abs(lacking), nearest, atol=5e-6)
+
+
+@pytest.mark.slow
+def test_optimised_skin_beats_the_paper_s_and_a_regular_grid():
+    """From the boundary layout, on a coarse sheet; judged on a finer one, at other places, by exact touches."""
+    skin, protocol, conductance = Rectangle(0.2, 0.2), two_terminal(32), 2e-3
+    start = named_layout("park-boundary")
+
+    def setting(nodes, columns):
+        mesh, grid = rectangle(0.2, 0.2, num_points=nodes), touch_grid(skin, columns, columns)
+        touches = sheet_touches(mesh, Bell(), grid.places, thickness=0.01)
+        prior = TouchPrior.create(grid.places, correlation=0.015)
+        return ForwardModel(mesh, start.sheet_discs(1e-4), protocol), grid, touches, {"prior": prior, "noise": 1e-4}
+
+    model, _, touches, options = setting(1300, 14)
+    found = optimise_layout(start, model, conductance, touches, **options, minimum_spacing=8e-3, steps=25)
+    model, grid, touches, options = setting(6000, 24)
+    worst, variance = {}, {}
+    for layout in (found.layout, start, named_layout("park-inner"), named_layout("grid-8x4")):
+        moved = model.with_electrodes(layout.sheet_discs(1e-4))
+        worst[layout.name] = sensitivity_map(moved, conductance, grid, thickness=0.01).minimum
+        variance[layout.name] = layout_scores(moved, conductance, touches, **options).mean_variance
+    best_worst, least_variance = worst.pop(found.layout.name), variance.pop(found.layout.name)
+    assert best_worst > 1.4 * worst["park-boundary"]
+    assert best_worst > 5 * max(worst["park-inner"], worst["grid-8x4"])
+    assert least_variance < 0.5 * min(variance.values())
+
+
+def test_errors_teach():
+    with pytest.raises(ValueError, match="do not fit the outline"):
+        optimise(minimum_spacing=0.06)
+    with pytest.raises(ValueError, match="key: random starts need one"):
+        optimise(starts=2)
+    with pytest.raises(ValueError, match="8 of 8 electrodes are in the first of 2 parts"):
+        optimise(Layout(START.centres - 5e-4, 8e-3, outline=Rectangle(0.1, 0.3)), symmetry="mirror-y")
+    with pytest.raises(ValueError, match="symmetry must be one of"):
+        optimise(symmetry="glide")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="keep_out: it leaves no room"):
+        optimise(starts=2, key=jax.random.key(0), keep_out=(Rectangle(0.2, 0.2),))
+    with pytest.raises(ValueError, match="outline: the layout does not know"):
+        optimise(Layout(START.centres, 8e-3))
+    with pytest.raises(ValueError, match="the model 8; their number cannot change"):
+        optimise(Layout(START.centres[:6], 8e-3, outline=SKIN))
+    with pytest.raises(ValueError, match="sizes must be two diameters"):
+        optimise(sizes=(8e-3, 4e-3))
+    with pytest.raises(ValueError, match="steps must be"):
+        optimise(steps=0)
+    points = ForwardModel(MESH, PointElectrodes(START.centres), two_terminal(NUMBER))
+    with pytest.raises(ValueError, match="model has PointElectrodes"):
+        optimise_layout(START, points, 2e-3, TOUCHES, **SETTING)
+
+
+def test_constraints_that_cannot_be_met_are_reported():
+    found = optimise(keep_out=(Rectangle(0.096, 0.096),), steps=1)
+    assert found.status == "infeasible"
+    assert found.shortfall[0] > 1e-3
+    assert "lack" in found.reason
+    assert found.layout is START

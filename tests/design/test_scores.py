@@ -1,0 +1,167 @@
+"""Layout scores, against dense linear algebra, exact touches and central differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.design import (
+    Bell,
+    TouchPrior,
+    layout_scores,
+    press,
+    sheet_touches,
+    touch_changes,
+    touch_grid,
+)
+from jeit.electrodes import SheetDiscs
+from jeit.forward import ForwardModel
+from jeit.mesh import Rectangle, box, rectangle
+from jeit.protocol import two_terminal
+
+SKIN = Rectangle(0.1, 0.08)
+THICKNESS, CONDUCTANCE, NOISE = 0.01, 2e-3, 1e-4
+MESH = rectangle(0.1, 0.08, num_points=220)
+PLACES = touch_grid(SKIN, 6, 5).places
+CENTRES = np.array([[-0.035, -0.028], [0.034, -0.026], [0.036, 0.025], [-0.033, 0.027], [0.004, 0.003], [0.001, -0.03]])
+DISCS = SheetDiscs(CENTRES, 5e-3, 1e-4)
+MODEL = ForwardModel(MESH, DISCS, two_terminal(len(CENTRES)))
+BELL = Bell(deviation=12e-3)
+TOUCHES = sheet_touches(MESH, BELL, PLACES, thickness=THICKNESS)
+WARM = jnp.array(0.1)
+PRIOR = TouchPrior.create(PLACES, correlation=0.02)
+NAMES = ("soft_worst", "mean_variance", "log_information", "largest_variance", "localisation")
+
+
+@eqx.filter_jit
+def scores_of(electrodes, temperature):
+    moved = MODEL.with_electrodes(electrodes)
+    return layout_scores(moved, CONDUCTANCE, TOUCHES, prior=PRIOR, noise=NOISE, temperature=temperature)
+
+
+def figures(electrodes):
+    """The scores with gradients, as logarithms: (5,)."""
+    scores = scores_of(electrodes, WARM)
+    localisation = jnp.mean(scores.localisation_error)
+    values = scores.soft_worst, scores.mean_variance, scores.log_information, scores.largest_variance, localisation
+    return jnp.log(jnp.stack(values))
+
+
+@jax.jit
+def figures_and_gradient(electrodes, weights):
+    """`figures`, and the gradient of their sum with `weights` (5,)."""
+    values, pull = jax.vjp(figures, electrodes)
+    return values, pull(weights)[0]
+
+
+@pytest.fixture(scope="module")
+def scores():
+    return scores_of(DISCS, WARM)
+
+
+@pytest.fixture(scope="module")
+def changes():
+    return np.asarray(touch_changes(MODEL, CONDUCTANCE, TOUCHES.presses, linear=True))
+
+
+def test_sensitivity_is_that_of_linear_touches(scores, changes):
+    np.testing.assert_allclose(scores.sensitivity, np.linalg.norm(changes, axis=1), rtol=1e-9)
+    np.testing.assert_allclose(scores.worst, np.linalg.norm(changes, axis=1).min(), rtol=1e-9)
+    assert scores.worst < scores.soft_worst < scores.mean
+    np.testing.assert_allclose(scores_of(DISCS, jnp.array(1e-3)).soft_worst, scores.worst, rtol=5e-3)  # n^T - 1
+    assert 0 < scores.uniformity < 1
+
+
+def test_optimality_is_that_of_dense_matrices(scores, changes):
+    squared = np.sum((PLACES[:, None] - PLACES) ** 2, axis=-1)
+    prior = np.exp(-squared / (2 * 0.02**2))
+    # In data space: another way to the same covariance. What the prior's factor leaves out is below a millionth.
+    data = changes.T @ prior @ changes + NOISE**2 * np.eye(changes.shape[1])
+    covariance = prior - prior @ changes @ np.linalg.solve(data, changes.T @ prior)
+    np.testing.assert_allclose(scores.variance, np.diag(covariance), atol=1e-4)
+    np.testing.assert_allclose(scores.mean_variance, np.trace(covariance) / len(PLACES), rtol=1e-3)
+    np.testing.assert_allclose(scores.log_information, np.linalg.slogdet(data / NOISE**2)[1], rtol=1e-3)
+    np.testing.assert_allclose(scores.largest_variance, np.linalg.eigvalsh(covariance)[-1], rtol=1e-3)
+
+
+def test_slopes_are_those_of_shifted_presses():
+    step = 1e-6
+    for axis in range(2):
+        shift = step * np.eye(2)[axis]
+        blank = np.zeros((2, len(PLACES), MESH.num_cells))
+        for one, sign in zip(blank, (1, -1), strict=True):
+            moved = press(MESH, BELL, PLACES + sign * shift, thickness=THICKNESS)
+            np.add.at(one, (np.arange(len(PLACES))[:, None], np.asarray(moved.cells)), np.asarray(moved.change))
+        wanted = (blank[0] - blank[1]) / (2 * step)
+        slope = np.asarray(TOUCHES.weights(jnp.ones(MESH.num_cells))[1][axis])
+        # Cells that enter or leave the reach in the step jump by a hundredth of the depth.
+        same = (blank[0] != 0) == (blank[1] != 0)
+        np.testing.assert_allclose(slope[same], wanted[same], atol=1e-6 * np.abs(slope).max())
+
+
+def test_localisation_error_is_that_of_the_inverse_information(scores, changes):
+    slopes = TOUCHES.weights(jnp.full(MESH.num_cells, CONDUCTANCE))[1]
+    jacobian = np.asarray(MODEL.jacobian(CONDUCTANCE)).T
+    x, y = np.asarray(slopes) @ jacobian
+    for k in range(len(PLACES)):
+        directions = np.stack([1e-2 * x[k], 1e-2 * y[k], changes[k]]) / NOISE  # centimetres, for the condition
+        variance = np.diag(np.linalg.inv(directions @ directions.T))
+        np.testing.assert_allclose(scores.localisation_error[k], 1e-2 * np.sqrt(variance[:2].sum()), rtol=1e-6)
+
+
+def test_estimates_of_a_place_scatter_as_the_bound_says(scores):
+    """The Gauss-Newton estimate of (x, y, a) from noisy voltages has the bound's error: noise is small."""
+    k = int(np.argmin(np.linalg.norm(PLACES, axis=1)))
+    weights, slopes = TOUCHES.weights(jnp.full(MESH.num_cells, CONDUCTANCE))
+    jacobian = np.asarray(MODEL.jacobian(CONDUCTANCE)).T
+    design = np.stack([*(np.asarray(slopes[:, k]) @ jacobian), np.asarray(weights[k]) @ jacobian], axis=1)
+    noise = NOISE * np.random.default_rng(1).normal(size=(len(jacobian.T), 4000))
+    estimate = np.linalg.lstsq(design, noise, rcond=None)[0][:2]
+    error = np.sqrt(np.mean(np.sum(estimate**2, axis=0)))
+    np.testing.assert_allclose(error, scores.localisation_error[k], rtol=0.05)
+
+
+def test_gradients_are_those_of_central_differences():
+    random = np.random.default_rng(0)
+    unit = jnp.eye(len(NAMES))
+    slopes = [figures_and_gradient(DISCS, one)[1] for one in unit]
+    for field, step in (("position", 1e-6), ("radius", 1e-6), ("contact_impedance", 1e-7)):
+        values = getattr(DISCS, field)
+        direction = jnp.asarray(random.normal(size=values.shape))
+        ends = []
+        for sign in (1, -1):
+            moved = eqx.tree_at(lambda discs, f=field: getattr(discs, f), DISCS, values + sign * step * direction)
+            ends.append(figures_and_gradient(moved, unit[0])[0])
+        wanted = (ends[0] - ends[1]) / (2 * step)
+        found = [jnp.sum(getattr(slope, field) * direction) for slope in slopes]
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, err_msg=f"{field}: {NAMES}")
+
+
+def test_a_batch_of_layouts_is_a_loop():
+    shifts = 1e-3 * np.random.default_rng(3).normal(size=(3, *CENTRES.shape))
+    every = [SheetDiscs(CENTRES + shift, 5e-3, 1e-4) for shift in shifts]
+    batch = jax.jit(jax.vmap(lambda discs: scores_of(discs, WARM)))(jax.tree.map(lambda *one: jnp.stack(one), *every))
+    assert batch.mean_variance.shape == batch.uniformity.shape == (3,)
+    for k, one in enumerate(every):
+        single = scores_of(one, WARM)
+        for name in ("sensitivity", "soft_worst", "worst", "variance", "largest_variance", "localisation_error"):
+            np.testing.assert_allclose(getattr(batch, name)[k], getattr(single, name), rtol=1e-6, err_msg=name)
+
+
+def test_errors_teach():
+    keywords = {"prior": PRIOR, "noise": NOISE}
+    with pytest.raises(ValueError, match="noise must be positive"):
+        layout_scores(MODEL, CONDUCTANCE, TOUCHES, prior=PRIOR, noise=0.0)
+    with pytest.raises(ValueError, match="one for each of 15 channels"):
+        layout_scores(MODEL, CONDUCTANCE, TOUCHES, prior=PRIOR, noise=np.ones(3))
+    with pytest.raises(ValueError, match="temperature must be positive"):
+        layout_scores(MODEL, CONDUCTANCE, TOUCHES, temperature=0.0, **keywords)
+    with pytest.raises(ValueError, match="real, scalar"):
+        layout_scores(MODEL, CONDUCTANCE + 1j, TOUCHES, **keywords)
+    with pytest.raises(ValueError, match=r"prior is of 2 places and there are 30 touches"):
+        layout_scores(MODEL, CONDUCTANCE, TOUCHES, prior=TouchPrior.create(PLACES[:2], correlation=0.02), noise=NOISE)
+    with pytest.raises(ValueError, match="correlation"):
+        TouchPrior.create(PLACES, correlation=0.0)
+    with pytest.raises(ValueError, match="equivalent sheet"):
+        sheet_touches(box(0.1, 0.08, 0.01, cell_size=0.02), BELL, PLACES, thickness=THICKNESS)

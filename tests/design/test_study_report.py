@@ -1,0 +1,100 @@
+"""The report: one page that needs nothing else, and holds what was asked for and found."""
+
+import base64
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from jeit.design.study import open_results, read_study, run_study, write_study_report
+from jeit.design.study.store import Store
+
+pytest.importorskip("xarray")
+
+TEXT = """
+# <script>alert("&")</script>
+name = "inside <b>or</b> around"
+chunk_points = 1
+[skin]
+width_mm = 100
+height_mm = 80
+[electrodes]
+layouts = ["grid-4x2", "perimeter-8"]
+diameter_mm = 10
+[touch]
+columns = 6
+rows = 5
+[mesh]
+cell_mm = 8
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    (folder / "study.toml").write_text(TEXT, "utf-8")
+    study = read_study(folder / "study.toml")
+    run_study(study, folder / "study.zarr")
+    write_study_report(study, folder / "study.zarr", folder / "study.html")
+    return folder
+
+
+class Page(HTMLParser):
+    """Tags, their sources, and the text in them."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.links, self.text, self.cells = [], [], "", []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [value for name, value in attrs if name in ("src", "href", "srcset", "data")]
+
+    def handle_data(self, data):
+        self.text += data
+        if self.tags and self.tags[-1] == "td" and data.strip():
+            self.cells.append(data)
+
+
+def test_the_page_needs_nothing_else_and_escapes_all(folder):
+    text = (folder / "study.html").read_text("utf-8")
+    page = Page(text)
+    assert not {"script", "link", "iframe", "b"} & set(page.tags)
+    assert "http" not in re.sub(r"base64,[^\"]*", "", text)
+    assert "@import" not in text
+    assert "url(" not in text
+    assert len(page.links) == page.tags.count("img") == 2
+    for link in page.links:
+        kind, content = link.split(",", 1)
+        assert kind == "data:image/png;base64"
+        assert base64.b64decode(content, validate=True).startswith(b"\x89PNG")
+    assert TEXT in page.text  # the exact configuration, as text
+    assert "inside <b>or</b> around" in page.text
+
+
+def test_the_table_holds_what_was_found(folder):
+    study = read_study(folder / "study.toml")
+    page, data = Page((folder / "study.html").read_text("utf-8")), open_results(study, folder / "study.zarr")
+    assert page.tags.count("tr") == 3
+    for value in [*data.minimum.values, *data.uniformity.values]:
+        assert f"{value:.4g}" in page.cells
+    assert study.fingerprint in page.text
+    assert re.search(r"Computed with jeit [\d.]+, jax [\d.]+", page.text)
+    assert "2 of 2 points finished" in page.text
+
+
+def test_a_half_finished_study_is_reported_without_what_is_missing(folder, tmp_path):
+    study = read_study(folder / "study.toml")
+    store = Store(study, tmp_path / "half.zarr")
+    with pytest.raises(ValueError, match=r"no chunk of the study is finished.*resume"):
+        write_study_report(study, store.path, tmp_path / "half.html")
+    assert not (tmp_path / "half.html").exists()
+    data = open_results(study, folder / "study.zarr")
+    store.write(1, {name: np.asarray(data[name])[1:] for name in data.data_vars})
+    write_study_report(study, store.path, tmp_path / "half.html")
+    page = Page((tmp_path / "half.html").read_text("utf-8"))
+    assert "1 of 2 points finished" in page.text
+    assert page.cells.count("–") == 3
+    assert [file.name for file in tmp_path.iterdir() if file.name.startswith(".")] == []

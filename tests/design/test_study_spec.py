@@ -1,0 +1,189 @@
+"""Study files: what a sweep is, and everything that is refused before anything runs."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jeit.design import Bell, Hemisphere
+from jeit.design.study import read_study
+from jeit.electrodes import Layout, grid, write_layout
+from jeit.mesh import Rectangle
+
+
+@pytest.fixture
+def read(tmp_path):
+    def call(text):
+        (tmp_path / "study.toml").write_text(text, "utf-8")
+        return read_study(tmp_path / "study.toml")
+
+    return call
+
+
+def one(layout="grid-4x4", electrodes="", rest=""):
+    return f'[electrodes]\nlayouts = "{layout}"\n{electrodes}\n{rest}'
+
+
+def test_a_sweep_is_the_product_of_its_lists(read):
+    study = read(
+        'name = "all"\nchunk_points = 4\n[skin]\nthickness_mm = [5, 10]\nconductivity_S_per_m = [0.5, 1, 2]\n'
+        '[electrodes]\nlayouts = ["grid-4x4", "perimeter-16", "inner-12"]\ndiameter_mm = [6, 8]\n'
+        '[measurement]\nprotocol = ["adjacent", "two-terminal"]\nnoise_V = [1e-6, 1e-5]\n[mesh]\ncell_mm = [5, 6]'
+    )
+    assert len(study.points) == 3 * 2 * 2 * 3 * 2 * 2 * 2
+    values = [tuple(point.coordinates.values()) for point in study.points]
+    assert len(set(values)) == len(values)
+    assert study.points[0].coordinates == {
+        "layout": "grid-4x4",
+        "electrodes": 16,
+        "diameter_mm": 6.0,
+        "contact_impedance_ohm_m2": 1e-3,
+        "thickness_mm": 5.0,
+        "conductivity_S_per_m": 0.5,
+        "protocol": "adjacent",
+        "noise_V": 1e-6,
+        "cell_mm": 5.0,
+    }
+    assert study.points[1].cell_size == pytest.approx(6e-3)
+    assert study.points[-1].thickness == pytest.approx(10e-3)
+
+
+def test_chunks_hold_every_point_once_and_one_shape(read):
+    text = 'chunk_points = 4\n[electrodes]\nlayouts = ["grid-4x4", "inner-12", "perimeter-16"]\ndiameter_mm = [6, 7, 8]'
+    study = read(text)
+    assert sorted(index for chunk in study.chunks for index in chunk) == list(range(9))
+    for chunk in study.chunks:
+        assert len(chunk) <= 4
+        assert len({study.points[index].shape for index in chunk}) == 1
+
+
+def test_generated_layouts_fill_the_skin_of_the_study(read):
+    study = read(
+        '[skin]\nwidth_mm = 100\nheight_mm = 60\n[electrodes]\nlayouts = ["grid-5x3", "perimeter-16", "inner-9"]\n'
+        "diameter_mm = 4\n[mesh]\ncell_mm = 2"
+    )
+    lattice, edge, inner = (np.asarray(point.layout.centres) for point in study.points)
+    np.testing.assert_allclose(lattice, grid(0.08, 0.04, 5, 3), atol=1e-12)
+    gap = np.minimum(0.05 - np.abs(edge[:, 0]), 0.03 - np.abs(edge[:, 1]))
+    np.testing.assert_allclose(gap, 4e-3, atol=1e-12)  # a radius and 2 mm of skin
+    assert (np.abs(inner) < [0.048, 0.028]).all()
+    assert [len(edge), len(inner)] == [16, 9]
+
+
+def test_files_lie_beside_the_study_and_keep_their_own_sizes(read, tmp_path):
+    centres = grid(0.1, 0.1, 3, 3)
+    write_layout(Layout(centres, 9e-3, contact_impedance=0.02, outline=Rectangle(0.2, 0.2)), tmp_path / "mine.csv")
+    write_layout(Layout(centres, 9e-3, outline=Rectangle(0.2, 0.2)), tmp_path / "mine.svg")
+    text = '[electrodes]\nlayouts = ["mine.csv", "mine.svg"]\n'
+    first, second = read(text).points
+    np.testing.assert_allclose(first.layout.centres, centres, atol=1e-9)
+    assert first.coordinates["diameter_mm"] == 9.0
+    assert first.coordinates["contact_impedance_ohm_m2"] == 0.02
+    assert second.coordinates["contact_impedance_ohm_m2"] == 1e-3
+    assert {point.coordinates["diameter_mm"] for point in read(text + "diameter_mm = 7").points} == {7.0}
+    with pytest.raises(ValueError, match=r"mine\.svg.*skin spans -100 to 100 mm.*skin\.width_mm"):
+        read(text + "[skin]\nwidth_mm = 300")
+
+
+def test_touches_are_those_of_the_library(read):
+    assert read(one()).indentation == Bell()
+    study = read(one(rest='[touch]\nindentation = "hemisphere"\ndepth_mm = 2'))
+    assert study.indentation == Hemisphere(2e-3, 15e-3)
+    assert (study.columns, study.rows) == (24, 24)
+
+
+def test_a_fingerprint_tells_what_decides_the_results(read, tmp_path):
+    base = read(one())
+    assert base == read("# a remark\nname = 'other'\n" + one())
+    assert pickle.loads(pickle.dumps(base)) == base
+    texts = [
+        one("grid-5x4"),
+        one(electrodes="diameter_mm = 7"),
+        one(rest="[skin]\nthickness_mm = 9"),
+        one(rest="[measurement]\ncurrent_mA = 2"),
+        one(rest="[touch]\nrows = 12"),
+        one(rest='[touch]\nindentation = "hemisphere"'),
+        one(rest="[touch]\ndeviation_mm = 8"),
+        one(rest='[scores]\nwanted = "minimum"'),
+        one(rest="[scores]\nseed = 1"),
+        "chunk_points = 2\n" + one(),
+    ]
+    prints = {read(text).fingerprint for text in texts}
+    assert len(prints | {base.fingerprint}) == len(texts) + 1
+    layout = Layout(grid(0.1, 0.1, 3, 3), 9e-3, outline=Rectangle(0.2, 0.2))
+    write_layout(layout, tmp_path / "a.csv")
+    before = read(one("a.csv")).fingerprint
+    write_layout(Layout(layout.centres + 1e-3, 9e-3, outline=Rectangle(0.2, 0.2)), tmp_path / "a.csv")
+    assert read(one("a.csv")).fingerprint != before
+
+
+REFUSED = {
+    "key": (one(rest="[skin]\nthicknes_mm = 5"), r"skin\.thicknes_mm is no key.*did you mean 'thickness_mm'"),
+    "section": (one(rest="[skn]\nwidth_mm = 5"), r"skn is no key.*did you mean 'skin'"),
+    "metre key": (one(electrodes="diameter_m = 0.006"), r"electrodes\.diameter_m is no key.*'diameter_mm'"),
+    "no layouts": ("[skin]\nwidth_mm = 100", r"electrodes\.layouts is missing"),
+    "no table": ("skin = 5\n" + one(), r"skin must be a table: a line \[skin\]"),
+    "metres, skin": (one(rest="[skin]\nwidth_mm = 0.2"), r"skin\.width_mm is 0\.2.*in metres\? Then write 200"),
+    "metres, sweep": (one(electrodes="diameter_mm = [6, 0.008]"), r"diameter_mm is 0\.008.*metres\? Then write 8\."),
+    "metres, cells": (one(rest="[mesh]\ncell_mm = 0.005"), r"mesh\.cell_mm is 0\.005.*metres\? Then write 5\."),
+    "micrometres": (one(electrodes="diameter_mm = 6000"), r"diameter_mm is 6000.*micrometres\? Then write 6\."),
+    "siemens": (one(rest="[skin]\nconductivity_S_per_m = 1e-8"), r"conductivity_S_per_m is 1e-08.*factor of 1000"),
+    "no number": (one(rest='[skin]\nwidth_mm = "200"'), r"skin\.width_mm must be a number; it has '200'"),
+    "not whole": (one(rest="[touch]\nrows = 2.5"), r"touch\.rows must be a whole number; it has 2\.5"),
+    "true": (one(rest="[touch]\nrows = true"), r"touch\.rows must be a whole number; it has True"),
+    "infinite": (
+        one(rest="[skin]\nthickness_mm = inf"),
+        r"thickness_mm must be a number or a list of them; it has inf",
+    ),
+    "not swept": (one(rest="[skin]\nwidth_mm = [100, 200]"), r"skin\.width_mm takes one value, not a list"),
+    "empty list": (one(electrodes="diameter_mm = []"), r"diameter_mm is an empty list"),
+    "twice": (one(electrodes="diameter_mm = [6, 6]"), r"diameter_mm lists a value twice"),
+    "layout": (one("park-iner"), r"electrodes\.layouts: 'park-iner': .*did you mean 'park-inner'"),
+    "no file": (one("mine.csv"), r"electrodes\.layouts: 'mine\.csv': .*no file"),
+    "overlap": (one("grid-40x4"), r"electrodes\.layouts: 'grid-40x4': .*overlap by 1 mm.*move them apart"),
+    "overlap, edge": (one("perimeter-200"), r"'perimeter-200': .*overlap by"),
+    "too large": (one(electrodes="diameter_mm = 60"), r"'grid-4x4': .*overlap|beyond the outline"),
+    "spacing": (
+        one(electrodes="minimum_gap_mm = 60"),
+        r"minimum_gap_mm is 60.*'grid-4x4' are 44 mm.*impossible spacing",
+    ),
+    "few": (one("perimeter-3"), r"it has 3 electrodes; give 4 to 1024"),
+    "wrong skin": (one("park-inner", rest="[skin]\nwidth_mm = 150"), r"'park-inner': its skin spans -100 to 100 mm"),
+    "protocol": (
+        one(rest='[measurement]\nprotocol = "adjcent"'),
+        r"protocol has no 'adjcent' \(did you mean 'adjacent'",
+    ),
+    "opposite": (one("grid-5x3", rest='[measurement]\nprotocol = "opposite"'), r"has 15 electrodes.*even number"),
+    "deep": (one(rest="[skin]\nthickness_mm = 2"), r"touch\.depth_mm is 2\.5, and the skin 2 mm thick; press less"),
+    "coarse": (
+        one(rest="[mesh]\ncell_mm = 30"),
+        r"mesh\.cell_mm is 30, too coarse for electrodes 6 mm across; 3 would",
+    ),
+    "taxels": (
+        one(rest='[touch]\ncolumns = 5\nrows = 5\n[scores]\nwanted = "taxels"'),
+        r"scores\.num_taxels is 90, and there are 25 touches",
+    ),
+    "score": (one(rest='[scores]\nwanted = ["mean", "minimun"]'), r"scores\.wanted has no 'minimun' \(did you mean"),
+    "no TOML": ("[electrodes\n", r"study\.toml is no TOML file"),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), REFUSED.values(), ids=REFUSED)
+def test_refused_naming_the_key_and_what_to_do(read, text, message):
+    with pytest.raises(ValueError, match=message):
+        read(text)
+
+
+def test_the_example_is_a_study():
+    study = read_study(Path(__file__).resolve().parents[2] / "examples" / "study.toml")
+    assert len(study.points) == 32
+    assert {point.layout.num_electrodes for point in study.points} == {32}
+
+
+def test_no_study_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no file .*none\.toml"):
+        read_study(tmp_path / "none.toml")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match="not text in UTF-8"):
+        read_study(tmp_path / "binary.toml")

@@ -1,0 +1,68 @@
+"""The picture of electrodes travelling, judged by what was drawn: ways, discs, regions, title."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.figure import Figure
+
+from jeit.design import Optimisation, Scores
+from jeit.electrodes import Layout, grid
+from jeit.mesh import Disk, Rectangle
+from jeit.plot import plot_travel
+
+SKIN = Rectangle(0.1, 0.1)
+BEGAN = grid(0.06, 0.06, 2, 2)
+ENDED = BEGAN + np.array([0.003, 0.004])
+
+
+def optimisation():
+    empty, one = jnp.zeros(1), jnp.zeros(())
+    snapshots = np.stack([[BEGAN, (BEGAN + ENDED) / 2], [ENDED, ENDED]])
+    return Optimisation(
+        Layout(ENDED, 6e-3, outline=SKIN),
+        Scores(empty, one, empty, one, one, empty),
+        value=1.0,
+        start_value=0.0,
+        centres=np.stack([ENDED, ENDED]),
+        radii=np.full((2, 4), 3e-3),
+        values=np.ones(2),
+        shortfall=np.zeros(2),
+        history=np.zeros((2, 2)),
+        snapshots=snapshots,
+        status="converged",
+        reason="",
+    )
+
+
+@pytest.fixture
+def ax():
+    return Figure(layout="constrained").subplots()
+
+
+def test_ways_lead_from_start_to_end(ax):
+    assert plot_travel(optimisation(), ax=ax) is ax
+    (ways,) = (one for one in ax.collections if isinstance(one, LineCollection))
+    segments = np.array(ways.get_segments())
+    assert segments.shape == (4, 3, 2)
+    np.testing.assert_allclose(segments[:, 0], BEGAN)
+    np.testing.assert_allclose(segments[:, -1], ENDED)
+    began, ended = (one for one in ax.collections if isinstance(one, PatchCollection))
+    for discs, places in ((began, BEGAN), (ended, ENDED)):
+        boxes = [path.get_extents() for path in discs.get_paths()]
+        np.testing.assert_allclose([(box.x0 + box.x1) / 2 for box in boxes], places[:, 0], atol=1e-12)
+        np.testing.assert_allclose([box.width for box in boxes], 6e-3, rtol=1e-6)
+    assert ax.get_title() == "Moved 5 mm on average"
+    (scale,) = (text for text in ax.texts if text.get_text().endswith("mm"))
+    (bar,) = ax.lines
+    assert ax.get_ylim()[0] < min(scale.get_position()[1], bar.get_ydata()[0])
+
+
+def test_regions_are_hatched_and_starts_chosen(ax):
+    plot_travel(optimisation(), 1, keep_out=(Disk(0.01, (0.02, 0.02)),), title="second", ax=ax)
+    assert [bool(patch.get_hatch()) for patch in ax.patches] == [False, True]
+    box = ax.patches[1].get_path().get_extents()
+    np.testing.assert_allclose([box.x0, box.x1], [0.01, 0.03], atol=1e-5)
+    assert ax.get_title() == "second"
+    with pytest.raises(ValueError, match="start must be from 0 to 1"):
+        plot_travel(optimisation(), 2, ax=ax)
