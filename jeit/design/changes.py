@@ -50,11 +50,11 @@ def _linear(model: ForwardModel, conductivity, presses: Presses):
     jacobian = model.jacobian(conductivity).T  # (m, M)
     changed = presses.change * conductivity[presses.cells]
 
-    def one(touch):
-        cells, amount = touch
-        return amount @ jacobian[cells]
+    def some(touches):
+        cells, amount = touches
+        return jnp.einsum("bc,bcm->bm", amount, jacobian[cells])
 
-    return jax.lax.map(one, (presses.cells, changed))
+    return _in_chunks(some, (presses.cells, changed))
 
 
 class _Touched(eqx.Module):

@@ -1,0 +1,52 @@
+"""Voltages of a touched skin as one writes it plainly with SciPy: the touched cells change, and all is solved anew.
+
+Per touch: the changed element matrices added to the sparse matrix, one SuperLU factorisation (minimum degree of Aᵀ + A,
+symmetric mode, no pivoting off the diagonal), one solve for all electrodes, the voltages of all pairs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.linalg import splu
+
+
+class PlainTouches:
+    """For one `model` of jeit (its mesh, contact integrals and protocol) and conductivity (m,)."""
+
+    def __init__(self, model, conductivity: np.ndarray):
+        from jeit.forward.assembly import stiffness
+
+        mesh = model.mesh
+        contact = model.electrodes.contact(mesh)
+        operator = model.system.operator(mesh, conductivity, model.electrodes, contact)
+        self.load = np.asarray(contact.load)
+        self.cells = np.asarray(mesh.cells)
+        packed = np.asarray(stiffness(mesh, conductivity))
+        rows, columns = np.tril_indices(self.cells.shape[1])
+        self.element = np.zeros((mesh.num_cells, self.cells.shape[1], self.cells.shape[1]))
+        self.element[:, rows, columns] = self.element[:, columns, rows] = packed.T
+        self.matrix = sparse.csc_matrix(operator.pattern.to_scipy(np.asarray(operator.values)))
+        self.protocol = model.protocol
+        self.drive, self.measurement = np.asarray(self.protocol.drive), np.asarray(self.protocol.measurement)
+        self.before = self.voltages(self.matrix)
+
+    def voltages(self, matrix) -> np.ndarray:
+        """Of the protocol, from a matrix of stiffness and contacts."""
+        factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        product = self.load.T @ factor.solve(self.load)
+        schur = np.diag(self.load.sum(axis=0)) - product
+        count = len(schur)
+        impedance = np.linalg.inv(schur + np.trace(schur) / count**2)
+        table = self.measurement @ impedance @ self.drive.T
+        return table[self.protocol.measurement_index, self.protocol.drive_index]
+
+    def change(self, cells: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Of the voltages, where the conductivity of `cells` (c,) becomes (1 + change) times what it was."""
+        kept = change != 0
+        cells, change = cells[kept], np.maximum(change[kept], 1e-9 - 1.0)
+        nodes = self.cells[cells]
+        added = self.element[cells] * change[:, None, None]
+        rows, columns = np.broadcast_arrays(nodes[:, :, None], nodes[:, None, :])
+        update = sparse.csc_matrix((added.ravel(), (rows.ravel(), columns.ravel())), shape=self.matrix.shape)
+        return self.voltages((self.matrix + update).tocsc()) - self.before
