@@ -92,7 +92,7 @@ def _explain(error: Exception) -> int:
         return _fail(str(error), 1)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{where}{error.strerror or error}.", 1)
+        return _fail(f"{where}{str(error.strerror or error).rstrip('.')}.", 1)
     if isinstance(error, MemoryError):
         return _fail("there is not enough memory; ask for fewer --num-points.", 1)
     return _fail(

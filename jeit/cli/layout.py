@@ -11,6 +11,8 @@ from jeit.cli.options import Height, LayoutName, Quiet, Width, check_positive, m
 
 if TYPE_CHECKING:
     from jeit.design import Felt
+    from jeit.electrodes import Layout
+    from jeit.mesh import Domain
 
 layout = typer.Typer(name="layout", help="Compare and optimise layouts of electrodes.")
 
@@ -62,6 +64,7 @@ def compare(
     if not 0 <= margin < float("inf"):
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
     skins = [read_skin(name, width, height) for name in (first, second)]
+    _check_same(*skins)
     make_folder(output, _FILES)
     console = Console(highlight=False)
     felt: list[Felt] = []
@@ -97,10 +100,30 @@ def compare(
             },
         }
         (output / "report.json").write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", "utf-8")
-        _draw(felt).savefig(output / "comparison.png", dpi=130)
+        _draw(felt).savefig(output / "comparison.png", dpi=130, bbox_inches="tight")
     if not quiet:
         _show(console, told)
         console.print(f"[dim]Written:[/dim] {output / 'report.json'}, comparison.png", soft_wrap=True)
+
+
+def _check_same(one: "tuple[Layout, Domain]", other: "tuple[Layout, Domain]") -> None:
+    """Raise `ValueError` unless both layouts are on the same skin, but for where its drawing has its origin."""
+    sizes = []
+    for layout, outline in (one, other):
+        low_x, high_x, low_y, high_y = outline.extent
+        sizes.append((high_x - low_x, high_y - low_y, outline.area))
+        count = layout.num_electrodes
+        if count < 3:
+            raise ValueError(f"'{layout.name}' has {count} electrodes; give layouts of three or more.")
+    if any(abs(a - b) > 1e-3 * a for a, b in zip(*sizes, strict=True)):
+        said = " and ".join(
+            f"'{layout.name}' {1e3 * width:.4g} × {1e3 * height:.4g} mm"
+            for (layout, _), (width, height, _) in zip((one, other), sizes, strict=True)
+        )
+        raise ValueError(
+            f"the layouts are on different skins, {said}; a file that does not say its skin takes --width-mm and "
+            "--height-mm."
+        )
 
 
 def _draw(felt: "list[Felt]"):
@@ -108,7 +131,7 @@ def _draw(felt: "list[Felt]"):
 
     from jeit.plot import plot_sensitivity_histograms, plot_sensitivity_map, plot_taxel_areas, plot_taxels
 
-    figure = Figure(figsize=(15.5, 8.6), layout="constrained")
+    figure = Figure(figsize=(15.5, 9.0), layout="constrained")
     axes = figure.subplots(2, 3)
     highest = max(float(one.sensitivity.values.max()) for one in felt)
     largest = max(float(one.taxels.max_area) for one in felt)

@@ -87,6 +87,8 @@ def optimise(
             starts=starts,
             key=jax.random.key(seed),
         )
+        if found.status == "infeasible":
+            raise ValueError(f"no layout found: {found.reason}")
         step("confirm")
         model, touches, options = setting(_FINER * num_points, _MORE_PLACES)
         scores = {}

@@ -64,7 +64,20 @@ def read_skin(name: str, width: float, height: float) -> "tuple[Layout, Domain]"
         check_positive({"--width-mm": width, "--height-mm": height})
         found = read_layout(name, outline=Rectangle(1e-3 * width, 1e-3 * height))
     assert found.outline is not None
-    return found, found.outline
+    return found, _plain(found.outline)
+
+
+def _plain(outline: "Domain") -> "Domain":
+    """A drawing's four corners are a rectangle if they are one: it is then meshed as one."""
+    from jeit.mesh import Disk, Rectangle
+
+    if isinstance(outline, Disk | Rectangle) or getattr(outline, "holes", ()) or len(outline.vertices) != 4:
+        return outline
+    low_x, high_x, low_y, high_y = outline.extent
+    width, height = high_x - low_x, high_y - low_y
+    if abs(width * height - outline.area) > 1e-6 * width * height:
+        return outline
+    return Rectangle(width, height, ((low_x + high_x) / 2, (low_y + high_y) / 2))
 
 
 def check_positive(options: dict[str, float]) -> None:

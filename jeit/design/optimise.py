@@ -207,7 +207,7 @@ class _Design(eqx.Module):
     @classmethod
     def create(cls, layout: Layout, outline: Domain, symmetry: str | None, sizes) -> "_Design":
         if symmetry not in _IMAGES:
-            raise ValueError(f"symmetry must be one of {', '.join(str(one) for one in _IMAGES)}; it is {symmetry!r}.")
+            raise ValueError(f"symmetry must be None or one of {', '.join(filter(None, _IMAGES))}; it is {symmetry!r}.")
         centres, radii = np.asarray(layout.centres), np.asarray(layout.diameters) / 2
         x_min, x_max, y_min, y_max = outline.extent
         least = span = None
@@ -220,6 +220,8 @@ class _Design(eqx.Module):
         low, size = np.array([x_min, y_min]) + room, np.array([x_max - x_min, y_max - y_min]) - 2 * room
         if (size <= 0).any():
             raise ValueError("outline: it is smaller than an electrode; give millimetres divided by 1000.")
+        if symmetry == "rotate-4" and not np.isclose(size[0], size[1]):
+            raise ValueError("symmetry: a quarter turn maps only a square onto itself, and the outline's box is none.")
         images = np.array(_IMAGES[symmetry], float).reshape(-1, 2, 2)
         middle = low + size / 2
         first = _in_first_part(centres - middle, symmetry)

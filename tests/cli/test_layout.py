@@ -40,6 +40,14 @@ def test_two_files_side_by_side(layouts, run, tmp_path):
     assert report["options"]["margin_mm"] == 5
 
 
+def test_layouts_on_different_skins_are_not_compared(layouts, run, tmp_path):
+    """A CSV file is taken to be of the usual skin unless its sides are given."""
+    status, _, error = run("layout", "compare", *layouts, "--output", tmp_path / "out", *OPTIONS)
+    assert status == 1
+    assert "different skins, 'inside' 60 × 50 mm and 'left' 200 × 200 mm" in error
+    assert "--width-mm" in error
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

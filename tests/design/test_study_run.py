@@ -236,6 +236,7 @@ def test_a_damaged_chunk_is_solved_again(study, whole, path, monkeypatch, damage
     else:
         victim.unlink()
     assert open_results(study, path).finished.values.tolist() == [True, True, False, False, True, True]
+    assert study_progress(study, path).points == 4
     solved = counted(monkeypatch)
     run_study(study, path)
     assert solved == [1]

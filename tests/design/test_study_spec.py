@@ -83,7 +83,7 @@ def test_files_lie_beside_the_study_and_keep_their_own_sizes(read, tmp_path):
     assert second.coordinates["contact_impedance_ohm_m2"] == 1e-3
     assert {point.coordinates["diameter_mm"] for point in read(text + "diameter_mm = 7").points} == {7.0}
     with pytest.raises(ValueError, match=r"mine\.svg.*skin spans -100 to 100 mm.*skin\.width_mm"):
-        read(text + "[skin]\nwidth_mm = 300")
+        read(text + "[skin]\nwidth_mm = 300\nheight_mm = 200")
 
 
 def test_touches_are_those_of_the_library(read):
@@ -122,6 +122,7 @@ REFUSED = {
     "key": (one(rest="[skin]\nthicknes_mm = 5"), r"skin\.thicknes_mm is no key.*did you mean 'thickness_mm'"),
     "section": (one(rest="[skn]\nwidth_mm = 5"), r"skn is no key.*did you mean 'skin'"),
     "metre key": (one(electrodes="diameter_m = 0.006"), r"electrodes\.diameter_m is no key.*'diameter_mm'"),
+    "one side": (one(rest="[skin]\nwidth_mm = 100"), r"skin\.width_mm is given alone; give both"),
     "no layouts": ("[skin]\nwidth_mm = 100", r"electrodes\.layouts is missing"),
     "no table": ("skin = 5\n" + one(), r"skin must be a table: a line \[skin\]"),
     "metres, skin": (one(rest="[skin]\nwidth_mm = 0.2"), r"skin\.width_mm is 0\.2.*in metres\? Then write 200"),
@@ -149,7 +150,7 @@ REFUSED = {
         r"minimum_gap_mm is 60.*'grid-4x4' are 44 mm.*impossible spacing",
     ),
     "few": (one("perimeter-3"), r"it has 3 electrodes; give 4 to 1024"),
-    "wrong skin": (one("park-inner", rest="[skin]\nwidth_mm = 150"), r"'park-inner': its skin spans -100 to 100 mm"),
+    "wrong skin": (one("park-inner", rest="[skin]\nwidth_mm = 150\nheight_mm = 150"), r"'park-inner': its skin spans -100 to 100 mm"),
     "protocol": (
         one(rest='[measurement]\nprotocol = "adjcent"'),
         r"protocol has no 'adjcent' \(did you mean 'adjacent'",

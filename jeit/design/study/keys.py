@@ -114,6 +114,9 @@ def read_keys(table: dict[str, Any]) -> dict[str, Any]:
             raise ValueError(f"{name} must be a table: a line [{name}], and its keys below.")
         _refuse_unknown(f"{name}.", section, keys)
         values |= _section(f"{name}.", section, keys)
+    one_side = {"width_mm", "height_mm"} & set(table.get("skin", {}))
+    if len(one_side) == 1:
+        raise ValueError(f"skin.{one_side.pop()} is given alone; give both skin.width_mm and skin.height_mm.")
     return values
 
 

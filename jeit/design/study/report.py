@@ -30,7 +30,7 @@ img { max-width: 100% } pre { background: #f4f4f4; padding: 1em; overflow-x: aut
 def write_study_report(study: Study, store: str | Path, path: str | Path) -> None:
     """Write what the study in `store` has found so far as one HTML file at `path`, replaced as a whole.
 
-    Maps of the first 24 finished points on one scale; mean against least sensitivity; every point's values and scores;
+    Maps of 24 finished points at most on one scale; mean against least sensitivity; every point's values and scores;
     the study file, fingerprint and versions. Raises `ValueError` if no chunk is finished, and as `open_results` does.
     """
     data = open_results(study, store)
@@ -43,7 +43,7 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
         f"<p>{progress.points} of {progress.all_points} points finished, in {progress.chunks} of {progress.all_chunks} "
         "chunks. Sensitivity: ‖Δv‖₂ of all channels to one touch, linearised, on a sheet.</p>",
         *([_picture(_scatter(data), "Mean and least sensitivity of every point")] if len(study.points) > 1 else []),
-        _picture(_maps(study, data), "Sensitivity maps, electrodes as circles"),
+        _picture(_maps(study, data), f"Sensitivity maps of {len(_shown(data))} points, electrodes as circles"),
         "<h2>Points</h2>",
         _table(study, data),
         "<h2>Configuration</h2>",
@@ -82,13 +82,20 @@ def _scatter(data):
     return figure
 
 
+def _shown(data) -> np.ndarray:
+    """Numbers of the finished points whose maps are drawn: all, or as many as are looked at, evenly among them."""
+    finished = np.flatnonzero(data.finished.values)
+    chosen = np.linspace(0, len(finished) - 1, min(len(finished), _MAPS)).round().astype(int)
+    return finished[chosen]
+
+
 def _maps(study: Study, data):
     from matplotlib.collections import EllipseCollection
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
     grid = study_grid(study)
-    numbers = np.flatnonzero(data.finished.values)[:_MAPS]
+    numbers = _shown(data)
     values = 1e3 * data.sensitivity.values[numbers]
     positive = values[values > 0]
     scale = LogNorm(positive.min(), positive.max())

@@ -52,8 +52,8 @@ def run_study(
 
 
 def study_progress(study: Study, path: str | Path) -> Progress:
-    """How far the study in a store is. Raises as `Store` does."""
-    finished = Store(study, path, create=False).finished()
+    """How far the study in a store is; chunks that no longer read as written do not count. Raises as `Store` does."""
+    finished = Store(study, path, create=False).sound()
     points = sum(len(study.chunks[number]) for number in finished)
     return Progress(points, len(study.points), len(finished), len(study.chunks), None)
 
