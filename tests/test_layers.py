@@ -50,6 +50,12 @@ def test_solvers_know_no_physics():
         assert not {name for name in imported(path) if name.split(".")[0] == "jeit"}, path
 
 
+def test_no_two_test_files_have_one_name():
+    """pytest imports them by name, and can collect only one of the two."""
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert len(names) == len(set(names))
+
+
 def test_every_module_belongs_to_a_known_layer():
     folders = {path.name for path in (ROOT / "jeit").iterdir() if path.is_dir() and path.name != "__pycache__"}
     assert folders <= set(ALLOWED) | {"cli"}

@@ -144,7 +144,7 @@ def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain 
     """Raise `ValueError` unless discs lie apart and inside `outline`, all in metres; `called` (L,) names them."""
     x_min, x_max, y_min, y_max = _bounds(centres, diameters) if outline is None else outline.extent
     size = max(x_max - x_min, y_max - y_min)
-    if not SMALLEST <= size <= LARGEST:
+    if not SMALLEST - _ROUNDING <= size <= LARGEST + _ROUNDING:
         raise ValueError(
             f"centres: the skin would be {size:.3g} m across; are millimetres taken for metres, or metres for "
             "millimetres? Lengths differ by a factor of 1000."
