@@ -150,7 +150,10 @@ REFUSED = {
         r"minimum_gap_mm is 60.*'grid-4x4' are 44 mm.*impossible spacing",
     ),
     "few": (one("perimeter-3"), r"it has 3 electrodes; give 4 to 1024"),
-    "wrong skin": (one("park-inner", rest="[skin]\nwidth_mm = 150\nheight_mm = 150"), r"'park-inner': its skin spans -100 to 100 mm"),
+    "wrong skin": (
+        one("park-inner", rest="[skin]\nwidth_mm = 150\nheight_mm = 150"),
+        r"'park-inner': its skin spans -100 to 100 mm",
+    ),
     "protocol": (
         one(rest='[measurement]\nprotocol = "adjcent"'),
         r"protocol has no 'adjcent' \(did you mean 'adjacent'",
