@@ -14,7 +14,7 @@ from jeit.electrodes.electrodes import (
     compiled_contact,
     is_concrete,
 )
-from jeit.electrodes.window import EDGE, smooth_step, triangle_quadrature, window_contact
+from jeit.electrodes.window import EDGE, nearest_electrodes, smooth_step, triangle_quadrature, window_contact
 from jeit.mesh import Mesh, facet_measures, measures
 
 
@@ -58,9 +58,10 @@ class SheetDiscs(AbstractElectrodes):
         area = measures(mesh)
         barycentric, _ = triangle_quadrature()
         points = jnp.einsum("pi,mid->mpd", barycentric, mesh.points[mesh.cells])
-        edge = EDGE * jnp.sqrt(area)[:, None, None]
-        window = disc_window(points, self.position, self.radius, edge)
-        return window_contact(mesh.cells, area, window, self.contact_impedance, mesh.num_points)
+        edge = EDGE * jnp.sqrt(area)
+        near = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
+        window = disc_window(points, self.position[near], self.radius[near], edge)
+        return window_contact(mesh.cells, area, window, near, self.contact_impedance, mesh.num_points)
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for discs off the sheet, overlapping, or too small for the mesh."""
@@ -105,10 +106,13 @@ class FaceDiscs(AbstractElectrodes):
         area = facet_measures(mesh)
         barycentric, _ = triangle_quadrature()
         points = jnp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
-        edge = EDGE * jnp.sqrt(area)[:, None, None]
-        window = disc_window(points, self.position, self.radius, edge)
-        window = window * same_face(mesh, self.position, 0.2 * self.radius)[:, None, :]
-        return window_contact(mesh.facets, area, window, self.contact_impedance, mesh.num_points)
+        edge = EDGE * jnp.sqrt(area)
+        near = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
+        window = disc_window(points, self.position[near], self.radius[near], edge)
+        reached = jnp.take_along_axis(same_face(mesh, self.position, 0.2 * self.radius), near, axis=1)
+        return window_contact(
+            mesh.facets, area, window * reached[..., None], near, self.contact_impedance, mesh.num_points
+        )
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for discs off the surface, overlapping, or too small for the mesh."""
@@ -117,10 +121,12 @@ class FaceDiscs(AbstractElectrodes):
 
 
 def disc_window(points, position, radius, edge):
-    """Share (q, p, L) of each quadrature point (q, p, d) that a disc covers; `edge` (q, 1, 1) its half-width."""
-    squared = jnp.sum((points[:, :, None, :] - position) ** 2, axis=-1)
+    """Share (q, k, p) that discs at `position` (q, k, d) with `radius` (q, k) cover of quadrature points (q, p, d);
+    `edge` (q,) is the half-width of theirs."""
+    squared = sum((points[:, None, :, i] - position[..., None, i]) ** 2 for i in range(points.shape[-1]))
+    radius = radius[..., None]
     # r² - ρ² = (r - ρ)(r + ρ) spares the square root, whose derivative does not exist at the centre.
-    return smooth_step((radius**2 - squared) / (2 * radius * edge))
+    return smooth_step((radius**2 - squared) / (2 * radius * edge[:, None, None]))
 
 
 def facet_normals(mesh: Mesh) -> Float[Array, "b 3"]:

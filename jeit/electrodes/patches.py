@@ -72,7 +72,9 @@ class FacePatches(AbstractElectrodes):
         depth = jnp.abs(jnp.sum(offset.mean(axis=1) * normal, axis=-1))
         near = depth < jnp.maximum(self.width, self.height) / 2
         window = window * jax.lax.stop_gradient(facing & near)[:, None, :]
-        return window_contact(mesh.facets, area, window, self.contact_impedance, mesh.num_points)
+        every = jnp.broadcast_to(jnp.arange(self.num_electrodes), (len(area), self.num_electrodes))
+        window = jnp.swapaxes(window, 1, 2)
+        return window_contact(mesh.facets, area, window, every, self.contact_impedance, mesh.num_points)
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for patches off the surface, overlapping, or too small for the mesh."""

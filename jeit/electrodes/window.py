@@ -1,5 +1,6 @@
 """Contact integrals of electrodes whose edge cuts through cells: a smooth window on a fixed quadrature."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -10,6 +11,7 @@ from jeit.electrodes.electrodes import Contact
 # Half-width of a window's edge, as a share of the local cell size. Smaller is closer to the sharp electrode, until
 # the edge falls between the quadrature points; see tests/electrodes for its convergence.
 EDGE = 0.5
+_MOST_AT_ONCE = 8
 
 
 def triangle_quadrature(order: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -32,21 +34,33 @@ def smooth_step(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     return t**3 * (10 - 15 * t + 6 * t**2)
 
 
+def nearest_electrodes(middles, position, radius) -> Int[Array, "q k"]:
+    """Electrodes (q, k) that can reach the triangles with these `middles` (q, d), k being 8 unless there are fewer.
+
+    Of round electrodes, `position` (L, d) and `radius` (L,), that do not overlap, no more than that reach a triangle,
+    unless it is so much larger than they are that the mesh is refused. Not differentiated.
+    """
+    distance = jnp.sum((middles[:, None] - position) ** 2, axis=-1) - radius**2
+    distance = jax.lax.stop_gradient(distance).astype(jnp.float32)  # the order of the farthest does not matter
+    return jax.lax.top_k(-distance, min(_MOST_AT_ONCE, len(radius)))[1]
+
+
 def window_contact(
     nodes: Int[Array, "q 3"],
     measure: Float[Array, " q"],
-    window: Float[Array, "q p L"],
+    window: Float[Array, "q k p"],
+    electrode: Int[Array, "q k"],
     contact_impedance: Float[Array, " L"],
     num_points: int,
 ) -> Contact:
     """Contact integrals from window values at the p quadrature points of q triangles.
 
-    `measure`: areas of the triangles; `window`: share of each quadrature point that each electrode covers.
+    `measure`: areas of the triangles; `window`: share that each `electrode` covers of each quadrature point.
     """
     barycentric, weights = triangle_quadrature()
-    admittance = window / contact_impedance
-    scaled = measure[:, None] * weights
-    mass = jnp.einsum("qp,pi,pj->qij", scaled * admittance.sum(axis=-1), barycentric, barycentric)
-    local = jnp.einsum("qp,pi,qpl->qil", scaled, barycentric, admittance)
-    load = jnp.zeros((num_points, contact_impedance.shape[0]), local.dtype).at[nodes].add(local)
+    current = measure[:, None, None] * weights * window / contact_impedance[electrode][..., None]
+    products = (barycentric[:, :, None] * barycentric[:, None]).reshape(len(weights), -1)
+    mass = (current.sum(axis=1) @ products).reshape(-1, *2 * barycentric.shape[1:])
+    load = jnp.zeros((num_points, contact_impedance.shape[0]), current.dtype)
+    load = load.at[nodes[:, None], electrode[..., None]].add(current @ barycentric)
     return Contact((nodes,), (mass,), load)
