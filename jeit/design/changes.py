@@ -7,9 +7,11 @@ currents into the electrodes and G = K⁻¹, both restricted to those nodes,
 
 (Sherman-Morrison-Woodbury), by conjugate gradients with G as the preconditioner: they need products with G and D only,
 never G⁻¹, in few steps, as touches of a bounded depth change the energy of any field by a bounded factor; nodes that a
-touch cuts off make the matrix singular, but nothing flows there. With the residual R of Y, the error of
-(D F)ᵀ Y + Yᵀ R is of the order of its square.
+touch cuts off make the matrix singular, but nothing flows there. With the residual R of Y, (D F)ᵀ Y + Yᵀ R lacks
+Rᵀ (G⁻¹ + D)⁻¹ R, and Rᵀ G R is most of that.
 """
+
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -23,11 +25,14 @@ from jeit.forward.assembly import cell_conductivity, check_conductivity, stiffne
 from jeit.forward.model import select_channels
 from jeit.forward.transfer import fields_and_inverse
 from jeit.mesh import Mesh
+from jeit_solvers import over_cores
 
-# Of the square of the residual, relative: the voltages are as exact as that.
-_TOLERANCE, _MOST_STEPS, _LEAST = 1e-10, 200, 1e-300
+# Of Rᵀ G R, relative: the voltages are more exact than that.
+_TOLERANCE, _MOST_STEPS, _LEAST = 1e-9, 200, 1e-300
 # Touches worked on at once: their blocks of the inverse are to stay in the cache.
-_CHUNK = 32
+_CHUNK = 8
+# Touches whose nodes are sought at once.
+_AT_ONCE = 64
 
 
 def touch_changes(model: ForwardModel, conductivity, presses: Presses, *, linear: bool = False) -> Float[Array, "n M"]:
@@ -41,8 +46,7 @@ def touch_changes(model: ForwardModel, conductivity, presses: Presses, *, linear
         raise ValueError("touches need a real, scalar conductivity.")
     if linear:
         return _linear(model, cell_conductivity(model.mesh, conductivity), presses)
-    touched = _nodes(model.mesh, presses)
-    return _exact(model, cell_conductivity(model.mesh, conductivity), presses, touched)
+    return _exact(model, cell_conductivity(model.mesh, conductivity), presses)
 
 
 @jax.jit
@@ -50,11 +54,12 @@ def _linear(model: ForwardModel, conductivity, presses: Presses):
     jacobian = model.jacobian(conductivity).T  # (m, M)
     changed = presses.change * conductivity[presses.cells]
 
-    def some(touches):
-        cells, amount = touches
-        return jnp.einsum("bc,bcm->bm", amount, jacobian[cells])
+    def some(index):
+        return jnp.einsum("bc,bcm->bm", changed[index], jacobian[presses.cells[index]])
 
-    return _in_chunks(some, (presses.cells, changed))
+    number = len(changed)
+    index = jnp.minimum(jnp.arange(-(-number // _CHUNK) * _CHUNK), number - 1).reshape(-1, _CHUNK)
+    return _joined(jax.lax.map(some, index))[:number]
 
 
 class _Touched(eqx.Module):
@@ -70,43 +75,52 @@ def _nodes(mesh: Mesh, presses: Presses) -> _Touched:
     cells, real = np.asarray(presses.cells), np.asarray(presses.change) != 0
     corners = np.asarray(mesh.cells)[cells]  # (n, c, q)
     union = np.unique(corners[real])
-    each, local = [], np.zeros(corners.shape, np.int32)
-    for k, (one, used) in enumerate(zip(corners, real, strict=True)):
-        nodes, places = np.unique(one[used], return_inverse=True)
-        local[k, used] = places.reshape(-1, corners.shape[-1])
-        each.append(np.searchsorted(union, nodes))
+    place = np.full(mesh.num_points, -1)
+    place[union] = np.arange(len(union))
+    own = np.where(real[..., None], place[corners], len(union))  # all that is not touched is one node more
+    local, each = np.zeros(corners.shape, np.int32), []
+    for some in np.array_split(np.arange(len(own)), -(-len(own) // _AT_ONCE)):
+        row = np.arange(len(some))[:, None, None]
+        reached = np.zeros((len(some), len(union) + 1), bool)
+        reached[row, own[some]] = True
+        local[some] = (np.cumsum(reached, axis=1, dtype=np.int32) - 1)[row, own[some]]
+        each += [np.flatnonzero(one) for one in reached[:, :-1]]
+    local[~real] = 0
     most = -(-max(map(len, each)) // 8) * 8
     padded = np.stack([np.pad(one, (0, most - len(one)), mode="edge") for one in each])
     return _Touched(union, padded.astype(np.int32), local)
 
 
-@jax.jit
-def _exact(model: ForwardModel, conductivity, presses: Presses, touched: _Touched):
-    fields, inverse = fields_and_inverse(model.mesh, conductivity, model.electrodes, model.system, touched.union)
-    element = _symmetric(stiffness(model.mesh, conductivity), model.mesh.dimension + 1)  # (m, q, q)
+def _exact(model: ForwardModel, conductivity, presses: Presses):
+    touched = _nodes(model.mesh, presses)
+    known = fields_and_inverse(model.mesh, conductivity, model.electrodes, model.system, jnp.asarray(touched.union))
+    touches = jax.tree.map(jnp.asarray, (presses.cells, presses.change, touched.nodes, touched.corners))
+    number = len(presses.cells)
+    return over_cores(partial(_changes, model, conductivity, known, touches), number, _CHUNK)[:number]
 
-    def some(touches):
-        cells, change, nodes, corners = touches
+
+@jax.jit
+def _changes(model: ForwardModel, conductivity, known, touches, index):
+    """Changes of the voltages by the touches with these numbers (c, s), s of them at a time."""
+    fields, inverse = known
+    element = _symmetric(stiffness(model.mesh, conductivity), model.mesh.dimension + 1)  # (m, q, q)
+    select = jax.vmap(lambda change: select_channels(model.protocol, change))
+
+    def some(index):
+        cells, change, nodes, corners = (array[index] for array in touches)
         blocks = element[cells] * change[..., None, None]
         return select(_impedance_changes(blocks, corners, inverse[nodes[:, :, None], nodes[:, None]], fields[nodes]))
 
-    select = jax.vmap(lambda change: select_channels(model.protocol, change))
-    return _in_chunks(some, (presses.cells, presses.change, touched.nodes, touched.corners))
+    return _joined(jax.lax.map(some, index))
 
 
-def _in_chunks(function, arrays):
-    number = len(arrays[0])
-    chunks = -(-number // _CHUNK)
-    index = jnp.minimum(jnp.arange(chunks * _CHUNK), number - 1).reshape(chunks, _CHUNK)
-    result = jax.lax.map(lambda some: function(tuple(array[some] for array in arrays)), index)
-    return result.reshape(-1, *result.shape[2:])[:number]
+def _joined(chunks: Float[Array, "c s *m"]) -> Float[Array, "cs *m"]:
+    return chunks.reshape(-1, *chunks.shape[2:])
 
 
 def _impedance_changes(blocks, corners, inverse, fields):
-    """ΔZ (b, L, L) of b touches: D as `blocks` (b, c, q, q) of cells at `corners` (b, c, q), G (b, k, k), F (b, k, L).
-
-    The steps are those of all touches together, until the last has converged.
-    """
+    """ΔZ (b, L, L) of b touches, from D as `blocks` (b, c, q, q) of cells at `corners` (b, c, q), G (b, k, k) and F
+    (b, k, L). The steps are those of all touches together, until the last has converged."""
     touch = jnp.arange(len(fields))[:, None, None]
     size = fields.shape[1]
     added = jnp.zeros((len(fields), size, size))
@@ -114,24 +128,27 @@ def _impedance_changes(blocks, corners, inverse, fields):
     load = added @ fields
 
     def step(state):
-        solution, residual, direction, scaled, energy, number = state
+        solution, residual, scaled_residual, direction, scaled, energy, ratio, number = state
+        direction = scaled_residual + ratio * direction
+        scaled = residual + ratio * scaled  # G⁻¹ of the direction, which is a combination of what G was applied to
         product = scaled + added @ direction
         length = energy / jnp.maximum(jnp.sum(direction * product, axis=1, keepdims=True), _LEAST)
         solution, residual = solution + length * direction, residual - length * product
-        preconditioned = inverse @ residual
-        new = jnp.sum(residual * preconditioned, axis=1, keepdims=True)
+        scaled_residual = inverse @ residual
+        new = jnp.sum(residual * scaled_residual, axis=1, keepdims=True)
         ratio = new / jnp.maximum(energy, _LEAST)
-        # G⁻¹ of the direction, which is a combination of what G was applied to.
-        return solution, residual, preconditioned + ratio * direction, residual + ratio * scaled, new, number + 1
+        return solution, residual, scaled_residual, direction, scaled, new, ratio, number + 1
 
     def unfinished(state):
-        return (state[-1] < _MOST_STEPS) & jnp.any(state[-2] > _TOLERANCE * first)
+        *_, energy, _, number = state
+        return (number < _MOST_STEPS) & jnp.any(energy > _TOLERANCE * first)
 
-    direction = inverse @ load
-    first = jnp.sum(load * direction, axis=1, keepdims=True)
-    start = jnp.zeros_like(load), load, direction, load, first, jnp.zeros((), int)
-    solution, residual, *_ = jax.lax.while_loop(unfinished, step, start)
-    change = _transposed(load) @ solution + _transposed(solution) @ residual - _transposed(fields) @ load
+    scaled_load, blank = inverse @ load, jnp.zeros_like(load)
+    first = jnp.sum(load * scaled_load, axis=1, keepdims=True)
+    start = blank, load, scaled_load, blank, blank, first, jnp.zeros_like(first), jnp.zeros((), int)
+    solution, residual, scaled_residual, *_ = jax.lax.while_loop(unfinished, step, start)
+    change = _transposed(solution) @ (load + residual) + _transposed(residual) @ scaled_residual
+    change -= _transposed(fields) @ load
     return (change + _transposed(change)) / 2
 
 

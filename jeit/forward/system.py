@@ -21,9 +21,6 @@ from jeit_solvers import (
     solve,
 )
 
-# Columns of an inverse that are solved for at once.
-_COLUMNS = 256
-
 
 class System(eqx.Module):
     """Where the entries of the system matrix go, and the lineax solver that solves with it.
@@ -86,24 +83,16 @@ class System(eqx.Module):
 
         return jax.vmap(column, in_axes=1, out_axes=1)(load)
 
-    def inverse_block(self, operator: SparseSymmetric, nodes: Int[Array, " u"]) -> Inexact[Array, "u u"]:
-        """Rows and columns `nodes` of A⁻¹, some hundreds of columns at once."""
-        state = self.solver.init(operator, {})
-        size, count = operator.pattern.size, len(nodes)
-        chunks = -(-count // _COLUMNS)
-        columns = jnp.minimum(jnp.arange(chunks * _COLUMNS), count - 1).reshape(chunks, _COLUMNS)
+    def inverse_columns(self, operator: SparseSymmetric, state, columns: Int[Array, " s"]) -> Inexact[Array, "n s"]:
+        """Columns of A⁻¹; `state`: what the solver's `init` made of A."""
+        load = jnp.zeros((self.pattern.size, len(columns))).at[columns, jnp.arange(len(columns))].set(1.0)
+        if isinstance(self.solver, SparseCholesky):
+            return solve(self.solver.plan, state, load)
 
-        def some(index):
-            load = jnp.zeros((size, _COLUMNS)).at[nodes[index], jnp.arange(_COLUMNS)].set(1.0)
-            if isinstance(self.solver, SparseCholesky):
-                return solve(self.solver.plan, state, load)[nodes].T
+        def column(vector):
+            return lx.linear_solve(operator, vector, self.solver, state=state, throw=False).value
 
-            def column(vector):
-                return lx.linear_solve(operator, vector, self.solver, state=state, throw=False).value[nodes]
-
-            return jax.vmap(column, in_axes=1)(load)
-
-        return jax.lax.map(some, columns).reshape(-1, count)[:count]
+        return jax.vmap(column, in_axes=1, out_axes=1)(load)
 
     def quadratic_form(self, operator: SparseSymmetric, load: Inexact[Array, "n L"]) -> Inexact[Array, "L L"]:
         """loadᵀ A⁻¹ load; half the work of `solve` where there is a factor."""

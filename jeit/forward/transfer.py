@@ -11,7 +11,10 @@ point electrodes the load depends on their position, and 2 ∂_θ⟨load, F⟩ d
 SIAM Review 41 (1999) 85-101; Polydorides and Lionheart, Meas. Sci. Technol. 13 (2002) 1871-1883.
 """
 
+from functools import partial
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
@@ -19,7 +22,10 @@ from jeit.electrodes import AbstractElectrodes, Contact
 from jeit.forward.assembly import cell_conductivity, field_gradients
 from jeit.forward.system import System
 from jeit.mesh import Mesh
-from jeit_solvers import symmetric_inverse
+from jeit_solvers import over_cores, symmetric_inverse
+
+# Rows of an inverse that are solved for at once.
+_ROWS = 32
 
 
 @eqx.filter_custom_jvp
@@ -64,18 +70,33 @@ def fields_and_inverse(mesh: Mesh, conductivity, electrodes: AbstractElectrodes,
     """F (u, L) at some nodes (u,), and the block of K⁻¹ among them (u, u), ohms, but for a constant in each.
 
     K is the matrix of the electrode model with all electrodes floating: the potential at one node for a unit current
-    into another. What it leaves open, a constant, no change of conductivity sees.
+    into another. What it leaves open, a constant, no change of conductivity sees. The last row may come repeatedly.
     """
+    known = _before_inverse(mesh, conductivity, electrodes, system, nodes)
+    inverse = over_cores(partial(_rows_of_inverse, system, known, nodes), len(nodes), _ROWS)
+    return known[0], inverse
+
+
+@eqx.filter_jit
+def _before_inverse(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System, nodes):
+    """F at nodes; what is to be added to A⁻¹ there, X (u, L) of X Fᵀ, or None; A, and what the solver made of it."""
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
     fields, _ = electrode_fields(mesh, conductivity, electrodes, system)
-    inverse = system.inverse_block(operator, nodes)
-    if electrodes.is_point:
-        return fields[nodes], inverse
     # Electrodes carry what enters at the nodes back out: with X = A⁻¹ load, K⁻¹ = A⁻¹ + X Z Xᵀ, and X Z = F.
-    at_nodes = fields[nodes]
-    loads = system.solve(operator, contact.load)[nodes]
-    return at_nodes, inverse + at_nodes @ loads.T
+    loads = None if electrodes.is_point else system.solve(operator, contact.load)[nodes]
+    return fields[nodes], loads, operator, system.solver.init(operator, {})
+
+
+@eqx.filter_jit
+def _rows_of_inverse(system: System, known, nodes, rows):
+    fields, loads, operator, state = known
+
+    def some(rows):
+        inverse = system.inverse_columns(operator, state, nodes[rows])[nodes].T
+        return inverse if loads is None else inverse + loads[rows] @ fields.T
+
+    return jax.lax.map(some, rows).reshape(-1, len(nodes))
 
 
 def _impedance(electrodes: AbstractElectrodes, product: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:

@@ -14,6 +14,7 @@ from .few_unknowns import Minimum, definite_few, hessian_few, inverse_few, minim
 from .kmeans import KMeans, kmeans
 from .multifrontal import Factor, factorise, half_solve, quadratic_form, solve
 from .operator import SparseSymmetric
+from .over_cores import over_cores
 from .pattern import SparsityPattern
 from .plan import FactorisationPlan, analyse
 from .ridge import Model, ridge_model, ridge_step, solve_definite
@@ -40,6 +41,7 @@ __all__ = [
     "inverse_few",
     "kmeans",
     "minimise_few",
+    "over_cores",
     "quadratic_form",
     "ridge_model",
     "ridge_step",
