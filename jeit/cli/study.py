@@ -93,6 +93,9 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
 
     from jeit.design.study import run_study, write_study_report
 
+    where = page or file.with_suffix(".html")
+    if not where.parent.is_dir():
+        raise ValueError(f"--page {where}: there is no folder {where.parent}; make it first.")
     console = Console(highlight=False)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with ExitStack() as stack:
@@ -105,7 +108,6 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
             bar.update(task, completed=now.points, left=left)
 
         run_study(sweep, store, client=client, progress=show)
-    where = page or file.with_suffix(".html")
     write_study_report(sweep, store, where)
     if not quiet:
         console.print(f"[dim]Written:[/dim] {store}, {where}", soft_wrap=True)

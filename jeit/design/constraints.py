@@ -38,11 +38,18 @@ class Constraints(eqx.Module):
 
     def shortfall(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> Float[Array, " q"]:
         """How much each constraint lacks, metres: positive where it is violated. Differentiable almost everywhere."""
+        return jnp.concatenate(list(self.shortfalls(centres, radii).values()))
+
+    def shortfalls(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> dict[str, Float[Array, " q"]]:
+        """The same by the names of the constraints: "minimum_spacing", "outline" and "keep_out"."""
         first, second = np.triu_indices(len(radii), 1)
         distance = jnp.sqrt(jnp.sum((centres[first] - centres[second]) ** 2, axis=1) + 1e-24)
-        spacing = jnp.maximum(self.minimum_spacing, radii[first] + radii[second]) - distance
         outside = [radii + signed_room(centres, domain) for domain in self.keep_out]
-        return jnp.concatenate([spacing, radii - signed_room(centres, self.outline), *outside])
+        return {
+            "minimum_spacing": jnp.maximum(self.minimum_spacing, radii[first] + radii[second]) - distance,
+            "outline": radii - signed_room(centres, self.outline),
+            "keep_out": jnp.concatenate(outside) if outside else jnp.zeros(0),
+        }
 
 
 def signed_room(points: Float[Array, "p 2"], domain: Domain) -> Float[Array, " p"]:

@@ -36,11 +36,20 @@ _SQUARINGS = 10
 class SheetTouches(eqx.Module):
     """Touches of a sheet at n places, and how they change as the places move; make them with `sheet_touches`.
 
-    **Fields**: `presses`; `slope` (n, c, 2), the derivative of `presses.change` in the place, per metre.
+    **Fields**: `presses`; `slope` (n, c, 2), the derivative of `presses.change` in the place, per metre; `thickness` of
+    the layer that the sheet stands for and `depth` of the touches, metres.
     """
 
     presses: Presses
     slope: Float[Array, "n c 2"]
+    thickness: Float[Array, ""]
+    depth: float
+
+    def at_thickness(self, thickness) -> "SheetTouches":
+        """The same touches of a layer of another thickness, metres: they take depth / thickness of the way."""
+        share = self.thickness / thickness
+        presses = Presses(self.presses.places, self.presses.cells, self.presses.change * share)
+        return SheetTouches(presses, self.slope * share, jnp.asarray(thickness), self.depth)
 
     def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:
         """Change of every cell's conductivity by every touch, siemens, and its derivative in the place."""
@@ -72,7 +81,8 @@ def sheet_touches(
 
     middles = centroids(mesh)[presses.cells]
     slope = jax.jit(jax.vmap(jax.vmap(jax.grad(change), (None, 0))))(presses.places, middles)
-    return SheetTouches(presses, jnp.where(presses.change[..., None] != 0, slope, 0.0))
+    slope = jnp.where(presses.change[..., None] != 0, slope, 0.0)
+    return SheetTouches(presses, slope, jnp.asarray(thickness, float), float(indentation.depth_at(jnp.zeros(()))))
 
 
 class TouchPrior(eqx.Module):

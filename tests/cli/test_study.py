@@ -66,6 +66,8 @@ def test_run_stop_resume_and_report(file, run, monkeypatch):
     assert "2 of 2 points finished" in run("study", "status", file)[1]
     status, out, _ = run("study", "report", file, "--page", file.parent / "other.html")
     assert (status, (file.parent / "other.html").is_file()) == (0, True)
+    error = failed(run("study", "report", file, "--page", file.parent / "none" / "other.html"))
+    assert "other.html: the report cannot be written (No such file or directory)" in error
     file.write_text(TEXT.replace("rows = 5", "rows = 6"), "utf-8")
     assert "another study, or of this one before it was changed" in failed(run("study", "resume", file))
 
@@ -82,6 +84,9 @@ def test_bad_studies_are_refused_in_one_line(file, run, command):
 def test_faults_are_said_before_anything_runs(file, run):
     assert "no file" in failed(run("study", "run", file.parent / "none.toml"))
     assert "cannot be made" in failed(run("study", "run", file, "--output", file / "in a file.zarr"))
+    page = file.parent / "none" / "page.html"
+    assert f"there is no folder {page.parent}" in failed(run("study", "run", file, "--page", page))
+    assert not file.with_suffix(".zarr").exists()
     assert run("study", "rerun", file)[0] == 2
 
 

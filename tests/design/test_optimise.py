@@ -18,6 +18,7 @@ from jeit.design import (
     sheet_touches,
     touch_grid,
 )
+from jeit.design.variables import Design, Skin
 from jeit.electrodes import Layout, PointElectrodes, named_layout, perimeter
 from jeit.forward import ForwardModel
 from jeit.mesh import Disk, Polygon, Rectangle, rectangle
@@ -107,6 +108,25 @@ def test_symmetry_and_sizes():
     assert distances(centres).min() >= 0.015
 
 
+def test_contact_impedance_and_thickness_are_varied():
+    """Within their ranges, for the better; and the scores told are those of such a skin, built anew."""
+    found = optimise(contact_impedance=(2e-5, 5e-4), thickness=(6e-3, 2e-2), steps=5)
+    assert found.best == 0
+    impedance, thickness = np.asarray(found.layout.contact_impedance), float(found.thickness[0])
+    assert impedance.shape == (NUMBER,)
+    assert 2e-5 <= impedance.min() < impedance.max() <= 5e-4
+    assert 6e-3 <= thickness < 0.01  # the thinner, the more a touch takes of the current's way
+    model = MODEL.with_electrodes(found.layout.sheet_discs())
+    touches = sheet_touches(MESH, Bell(deviation=12e-3), PLACES, thickness=thickness)
+    scores = layout_scores(model, 2e-3 * thickness / 0.01, touches, **SETTING)
+    np.testing.assert_allclose(found.value, balanced(scores), rtol=1e-6)
+    np.testing.assert_allclose(found.scores.sensitivity, scores.sensitivity, rtol=1e-6)
+    fixed = optimise(steps=5)
+    assert found.value > fixed.value + 0.3
+    np.testing.assert_array_equal(fixed.thickness, 0.01)
+    assert fixed.layout.contact_impedance is None
+
+
 def test_shortfall_is_what_lacks():
     angle = np.arange(6)
     corners = 0.05 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -167,7 +187,14 @@ def test_errors_teach():
         optimise(Layout(START.centres, 8e-3))
     with pytest.raises(ValueError, match="the model 8; their number cannot change"):
         optimise(Layout(START.centres[:6], 8e-3, outline=SKIN))
-    with pytest.raises(ValueError, match="sizes must be two diameters"):
+    five = Skin(START.centres[:5], START.diameters[:5] / 2, jnp.ones(5), jnp.ones(()))
+    with pytest.raises(ValueError, match="add or remove 1, or choose another symmetry"):
+        Design.create(SKIN, five, symmetry="mirror-x")
+    with pytest.raises(ValueError, match="contact_impedance must be two values"):
+        optimise(contact_impedance=(1e-3, 1e-4))
+    with pytest.raises(ValueError, match=r"the touches are 2\.5 mm deep"):
+        optimise(thickness=(2e-3, 2e-2))
+    with pytest.raises(ValueError, match="sizes must be two values"):
         optimise(sizes=(8e-3, 4e-3))
     with pytest.raises(ValueError, match="steps must be"):
         optimise(steps=0)
@@ -180,5 +207,5 @@ def test_constraints_that_cannot_be_met_are_reported():
     found = optimise(keep_out=(Rectangle(0.096, 0.096),), steps=1)
     assert found.status == "infeasible"
     assert found.shortfall[0] > 1e-3
-    assert "lack" in found.reason
+    assert "minimum_spacing lacks" in found.reason  # all are pressed into a corner
     assert found.layout is START

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from jeit.design.study import open_results, read_study, run_study, write_study_report
+from jeit.design.study import open_results, read_study, report, run_study, write_study_report
 from jeit.design.study.store import Store
 
 pytest.importorskip("xarray")
@@ -65,7 +65,7 @@ def test_the_page_needs_nothing_else_and_escapes_all(folder):
     assert "http" not in re.sub(r"base64,[^\"]*", "", text)
     assert "@import" not in text
     assert "url(" not in text
-    assert len(page.links) == page.tags.count("img") == 2
+    assert len(page.links) == page.tags.count("img") == 3
     for link in page.links:
         kind, content = link.split(",", 1)
         assert kind == "data:image/png;base64"
@@ -98,3 +98,38 @@ def test_a_half_finished_study_is_reported_without_what_is_missing(folder, tmp_p
     assert "1 of 2 points finished" in page.text
     assert page.cells.count("–") == 3
     assert [file.name for file in tmp_path.iterdir() if file.name.startswith(".")] == []
+
+
+def test_what_is_infinite_stands_in_table_and_picture(folder, tmp_path):
+    study = read_study(folder / "study.toml")
+    store, data = Store(study, tmp_path / "study.zarr"), open_results(study, folder / "study.zarr")
+    store.write(0, {name: np.asarray(data[name])[:1] for name in data.data_vars} | {"uniformity": np.array([np.inf])})
+    write_study_report(study, store.path, tmp_path / "study.html")
+    assert "∞" in Page((tmp_path / "study.html").read_text("utf-8")).cells
+    [uniformity] = [
+        axes for axes in report._panels(open_results(study, store.path)).axes if "uniform" in axes.get_title()
+    ]
+    marked = {line.get_marker(): line.get_xdata().tolist() for line in uniformity.lines if len(line.get_xdata())}
+    assert marked == {"^": [0]}
+
+
+def test_titles_tell_what_differs(tmp_path):
+    varied = TEXT.replace("diameter_mm = 10", "diameter_mm = [8, 10]").replace(
+        "[touch]", '[measurement]\nprotocol = "two-terminal"\npairs = [0, 9]\nnoise_V = [1e-6, 2e-6]\n[touch]'
+    )
+    (tmp_path / "study.toml").write_text(varied, "utf-8")
+    titles = report._titles(read_study(tmp_path / "study.toml"))
+    assert len(set(titles)) == 16
+    assert titles[0] == "0: grid-4x2\n⌀ 8 mm, all pairs\nnoise 1e-06 V"
+    assert titles[15] == "15: perimeter-8\n⌀ 10 mm, 9 pairs\nnoise 2e-06 V"
+
+
+@pytest.mark.parametrize("where", ["none/page.html", "file/page.html", "folder"])
+def test_a_page_that_cannot_be_written(folder, tmp_path, where):
+    (tmp_path / "file").write_text("in the way")
+    (tmp_path / "folder").mkdir()
+    study = read_study(folder / "study.toml")
+    with pytest.raises(OSError, match="the report cannot be written") as caught:
+        write_study_report(study, folder / "study.zarr", tmp_path / where)
+    assert caught.value.filename == str(tmp_path / where)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["file", "folder"]

@@ -8,7 +8,7 @@ import pytest
 
 from jeit.design import Bell, Hemisphere
 from jeit.design.study import read_study
-from jeit.electrodes import Layout, grid, write_layout
+from jeit.electrodes import FaceDiscs, Layout, grid, write_layout
 from jeit.mesh import Rectangle
 
 
@@ -42,6 +42,7 @@ def test_a_sweep_is_the_product_of_its_lists(read):
         "thickness_mm": 5.0,
         "conductivity_S_per_m": 0.5,
         "protocol": "adjacent",
+        "pairs": 0,
         "noise_V": 1e-6,
         "cell_mm": 5.0,
     }
@@ -107,6 +108,13 @@ def test_a_fingerprint_tells_what_decides_the_results(read, tmp_path):
         one(rest="[touch]\ndeviation_mm = 8"),
         one(rest='[scores]\nwanted = "minimum"'),
         one(rest="[scores]\nseed = 1"),
+        one(rest="[scores]\ncorrelation_mm = 20"),
+        one(rest="[touch]\ncontrast = 5"),
+        one(rest="[touch]\nexact = true"),
+        one(rest='[skin]\nmodel = "layer"'),
+        one(rest='[skin]\nmodel = "layer"\n[mesh]\nlayers = 4'),
+        one(rest='[measurement]\nprotocol = "two-terminal"'),
+        one(rest='[measurement]\nprotocol = "two-terminal"\npairs = 30'),
         "chunk_points = 2\n" + one(),
     ]
     prints = {read(text).fingerprint for text in texts}
@@ -159,6 +167,34 @@ REFUSED = {
         r"protocol has no 'adjcent' \(did you mean 'adjacent'",
     ),
     "opposite": (one("grid-5x3", rest='[measurement]\nprotocol = "opposite"'), r"has 15 electrodes.*even number"),
+    "pairs, other protocol": (
+        one(rest="[measurement]\npairs = 30"),
+        r"measurement\.pairs is 30, and measurement\.protocol 'adjacent': only 'two-terminal'",
+    ),
+    "pairs, too many": (
+        one(rest='[measurement]\nprotocol = "two-terminal"\npairs = [30, 121]'),
+        r"measurement\.pairs is 121, and 'grid-4x4' has 120 pairs of electrodes; ask for fewer",
+    ),
+    "pairs, not whole": (
+        one(rest="[measurement]\npairs = 1.5"),
+        r"measurement\.pairs must be a whole number or a list",
+    ),
+    "contrast": (one(rest="[touch]\ncontrast = 1"), r"touch\.contrast is 1, which changes nothing"),
+    "exact": (one(rest='[touch]\nexact = "yes"'), r"touch\.exact must be true or false, without quotes; it has 'yes'"),
+    "exact, swept": (one(rest="[touch]\nexact = [true, false]"), r"touch\.exact takes one value, not a list"),
+    "model": (one(rest='[skin]\nmodel = "leyer"'), r"skin\.model has no 'leyer' \(did you mean 'layer'"),
+    "layers": (
+        one(rest='[skin]\nmodel = "layer"\n[mesh]\nlayers = 0'),
+        r"mesh\.layers is 0, and must be from 1 to 50\.$",
+    ),
+    "scores of layers": (
+        one(rest='[skin]\nmodel = "layer"\n[scores]\nwanted = ["mean", "information", "localisation_error"]'),
+        r"scores\.wanted has information, localisation_error, known for sheets only.*skin\.model",
+    ),
+    "correlation": (
+        one(rest="[scores]\ncorrelation_mm = 0.015"),
+        r"correlation_mm is 0\.015.*metres\? Then write 15\.",
+    ),
     "deep": (one(rest="[skin]\nthickness_mm = 2"), r"touch\.depth_mm is 2\.5, and the skin 2 mm thick; press less"),
     "coarse": (
         one(rest="[mesh]\ncell_mm = 30"),
@@ -179,9 +215,33 @@ def test_refused_naming_the_key_and_what_to_do(read, text, message):
         read(text)
 
 
+@pytest.mark.parametrize(
+    ("protocol", "fewest"), [("adjacent", 4), ("opposite", 4), ("two-terminal", 2)], ids=lambda value: str(value)
+)
+def test_a_layout_with_too_few_electrodes_for_its_protocol(read, tmp_path, protocol, fewest):
+    rest = f'[measurement]\nprotocol = "{protocol}"'
+    for number in (fewest, fewest - 1):
+        write_layout(Layout(grid(0.1, 0.1, number, 1), 9e-3, outline=Rectangle(0.2, 0.2)), tmp_path / f"{number}.csv")
+    assert read(one(f"{fewest}.csv", rest=rest)).points
+    with pytest.raises(
+        ValueError, match=rf"measurement\.protocol: '{fewest - 1}\.csv' has {fewest - 1} .*'{protocol}' needs {fewest}"
+    ):
+        read(one(f"{fewest - 1}.csv", rest=rest))
+
+
+def test_points_of_one_shape_share_a_mesh(read):
+    thick = '[skin]\nthickness_mm = [5, 10]\nmodel = "{}"\n[measurement]\nprotocol = "two-terminal"\npairs = [20, 30]'
+    assert len({point.shape for point in read(one(rest=thick.format("sheet"))).points}) == 2
+    layers = read(one(rest=thick.format("layer"))).points
+    assert len({point.shape for point in layers}) == 4
+    assert {point.layers for point in layers} == {5}
+    assert isinstance(layers[0].electrodes, FaceDiscs)
+    assert not np.asarray(layers[0].electrodes.position)[:, 2].any()
+
+
 def test_the_example_is_a_study():
     study = read_study(Path(__file__).resolve().parents[2] / "examples" / "study.toml")
-    assert len(study.points) == 32
+    assert len(study.points) == 16
     assert {point.layout.num_electrodes for point in study.points} == {32}
 
 

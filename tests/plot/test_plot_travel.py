@@ -26,10 +26,13 @@ def optimisation():
         start_value=0.0,
         centres=np.stack([ENDED, ENDED]),
         radii=np.full((2, 4), 3e-3),
+        contact_impedance=np.ones((2, 4)),
+        thickness=np.ones(2),
         values=np.ones(2),
         shortfall=np.zeros(2),
         history=np.zeros((2, 2)),
         snapshots=snapshots,
+        best=0,
         status="converged",
         reason="",
     )

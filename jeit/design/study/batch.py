@@ -1,6 +1,7 @@
-"""The points of a chunk in one jitted batch: linear sensitivity maps, and the scores made of them."""
+"""The points of a chunk in one jitted batch, or one by one: sensitivity maps, and the scores made of them."""
 
 import itertools
+from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
 
 import equinox as eqx
@@ -12,64 +13,78 @@ from jaxtyping import Array, Float
 
 from jeit.design.changes import touch_changes
 from jeit.design.press import Presses, press
+from jeit.design.scores import SheetTouches, TouchPrior, layout_scores, sheet_touches
+from jeit.design.selection import nearest_pairs
 from jeit.design.sensitivity import SensitivityMap, TouchGrid, touch_grid
-from jeit.design.study.spec import Point, Study
+from jeit.design.study.keys import OPTIMALITY
+from jeit.design.study.spec import Point, Shape, Study
 from jeit.design.taxels import find_taxels
-from jeit.electrodes import SheetDiscs
+from jeit.electrodes import FaceDiscs, SheetDiscs
 from jeit.forward import ForwardModel
-from jeit.mesh import rectangle
+from jeit.mesh import layer, rectangle
 from jeit.protocol import Protocol, adjacent, opposite, two_terminal
 
 
 class _Shared(eqx.Module):
-    """What points of one shape have in common; `presses` on a skin of `thickness` metres."""
+    """What points of one shape have in common; `presses` on a skin of `thickness` metres, the same as `touches`, which
+    are None, as the `prior` is, unless a score needs them."""
 
     model: ForwardModel
     presses: Presses
+    touches: SheetTouches | None
+    prior: TouchPrior | None
     grid: TouchGrid
     thickness: float
     key: Array
 
 
-class _Skins(eqx.Module):
-    """Where points of one shape differ, along a leading axis; `conductance` of the sheet in siemens, noise in volts."""
+class _Skin(eqx.Module):
+    """Where points of one shape differ; `conductivity` of the mesh's cells, noise in volts. A batch of k of them is one
+    whose every array leads with an axis of k."""
 
-    position: Float[Array, "k L 2"]
-    radius: Float[Array, "k L"]
-    contact_impedance: Float[Array, "k L"]
-    thickness: Float[Array, " k"]
-    conductance: Float[Array, " k"]
-    noise: Float[Array, " k"]
+    electrodes: SheetDiscs | FaceDiscs
+    protocol: Protocol
+    thickness: Float[Array, ""]
+    conductivity: Float[Array, ""]
+    noise: Float[Array, ""]
 
 
 def check_points(study: Study) -> None:
-    """Make every mesh and place every electrode. Raises `ValueError` for electrodes too small for their mesh."""
+    """Make every mesh, touch it, and place every electrode. Raises `ValueError` for a mesh that is too coarse."""
     seen = set()
     for index in itertools.chain.from_iterable(study.chunks):  # one shape after the other
         point = study.points[index]
-        key = (id(point.layout), point.cell_size)
+        key = (id(point.layout), point.shape)
         if key in seen:
             continue
         seen.add(key)
         try:
-            point.layout.sheet_discs().check(_shared(study, point.shape).model.mesh)
+            point.electrodes.check(_shared(study, point.shape).model.mesh)
         except ValueError as error:
-            where = f"mesh.cell_mm = {1e3 * point.cell_size:g} with layout {point.layout.name!r}"
+            layers = f" and mesh.layers = {point.layers}" if point.layers else ""
+            where = f"mesh.cell_mm = {1e3 * point.cell_size:g}{layers} with layout {point.layout.name!r}"
             raise ValueError(f"{where}: {error}") from None
 
 
-def solve_chunk(study: Study, number: int) -> dict[str, np.ndarray]:
+def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None = None) -> dict[str, np.ndarray]:
     """Results of chunk `number` for each of its k points: "sensitivity" (k, n) in volts, and scores (k,).
 
-    In one compiled batch, as large for every chunk of a shape, and parted between the devices that JAX sees.
+    Linear maps in one compiled batch, as large for every chunk of a shape, and parted between the devices that JAX
+    sees; exact maps one after the other, and `solved` is told after each but the last how many there are.
     """
     points = [study.points[index] for index in study.chunks[number]]
     shared = _shared(study, points[0].shape)
-    devices = jax.devices()
-    same = sum(point.shape == points[0].shape for point in study.points)
-    size = -(-min(study.chunk_points, same) // len(devices)) * len(devices)
-    skins = _skins([*points, *[points[-1]] * (size - len(points))])
-    results = _solve(shared, skins, study.scores, study.num_taxels, study.threshold, len(devices))
+    options = {"scores": study.scores, "num_taxels": study.num_taxels, "threshold": study.threshold}
+    if study.exact:
+        results = _stacked(_exact(shared, [_skin(point, study.current) for point in points], options, solved))
+    else:
+        devices = jax.devices()
+        same = sum(point.shape == points[0].shape for point in study.points)
+        size = -(-min(study.chunk_points, same) // len(devices)) * len(devices)
+        skins = [_skin(point, study.current) for point in points]
+        results = _batch(
+            shared, _stacked(skins + skins[-1:] * (size - len(skins))), **options, num_devices=len(devices)
+        )
     return {name: np.asarray(values)[: len(points)] for name, values in results.items()}
 
 
@@ -79,37 +94,58 @@ def study_grid(study: Study) -> TouchGrid:
 
 
 @lru_cache(maxsize=4)
-def _shared(study: Study, shape: tuple[int, str, float]) -> _Shared:
-    number, protocol, cell_size = shape
-    points = [point for point in study.points if point.shape == shape]
-    mesh = rectangle(study.skin.width, study.skin.height, cell_size=cell_size)
-    model = ForwardModel(mesh, points[0].layout.sheet_discs(), _protocol(protocol, number, study.current))
-    grid, thickness = study_grid(study), points[0].thickness
-    presses = press(mesh, study.indentation, grid.places, thickness=thickness)
-    return _Shared(model, presses, grid, thickness, jax.random.key(study.seed))
+def _shared(study: Study, shape: Shape) -> _Shared:
+    point = next(point for point in study.points if point.shape == shape)
+    mesh = rectangle(study.skin.width, study.skin.height, cell_size=shape.cell_size)
+    if shape.layers:
+        mesh = layer(mesh, shape.thickness, shape.layers)
+    model = ForwardModel(mesh, point.electrodes, _protocol(point, study.current))
+    grid, touches, prior = study_grid(study), None, None
+    thickness = None if shape.layers else point.thickness
+    if set(OPTIMALITY) & set(study.scores):
+        assert thickness is not None
+        touches = sheet_touches(mesh, study.indentation, grid.places, thickness=thickness, contrast=study.contrast)
+        presses = touches.presses
+        prior = TouchPrior.create(grid.places, correlation=study.correlation)
+    else:
+        presses = press(mesh, study.indentation, grid.places, thickness=thickness, contrast=study.contrast)
+    return _Shared(model, presses, touches, prior, grid, point.thickness, jax.random.key(study.seed))
 
 
-def _protocol(name: str, number: int, current: float) -> Protocol:
-    return {"adjacent": adjacent, "opposite": opposite, "two-terminal": two_terminal}[name](number, current=current)
+def _protocol(point: Point, current: float) -> Protocol:
+    number = point.layout.num_electrodes
+    if not point.pairs:
+        return {"adjacent": adjacent, "opposite": opposite, "two-terminal": two_terminal}[point.protocol](
+            number, current=current
+        )
+    nearest = np.sort(nearest_pairs(point.layout.centres, point.pairs))
+    return two_terminal(number, np.column_stack(np.triu_indices(number, 1))[nearest], current=current)
 
 
-def _skins(points: list[Point]) -> _Skins:
-    thickness = jnp.array([point.thickness for point in points])
-    return _Skins(
-        position=jnp.stack([point.layout.centres for point in points]),
-        radius=jnp.stack([point.layout.diameters / 2 for point in points]),
-        contact_impedance=jnp.stack([point.layout.sheet_discs().contact_impedance for point in points]),
-        thickness=thickness,
-        conductance=thickness * jnp.array([point.conductivity for point in points]),
-        noise=jnp.array([point.noise for point in points]),
+def _skin(point: Point, current: float) -> _Skin:
+    return _Skin(
+        electrodes=point.electrodes,
+        protocol=_protocol(point, current),
+        thickness=jnp.asarray(point.thickness),
+        conductivity=jnp.asarray(point.conductivity * (1.0 if point.layers else point.thickness)),
+        noise=jnp.asarray(point.noise),
     )
 
 
+def _stacked(trees):
+    """Trees of arrays as one, with a leading axis."""
+    return jax.tree.map(lambda *arrays: jnp.stack(arrays), *trees)
+
+
 @partial(jax.jit, static_argnames=("scores", "num_taxels", "threshold", "num_devices"))
-def _solve(
-    shared: _Shared, skins: _Skins, scores: tuple[str, ...], num_taxels: int, threshold: float, num_devices: int
+def _batch(
+    shared: _Shared, skins: _Skin, *, scores: tuple[str, ...], num_taxels: int, threshold: float, num_devices: int
 ) -> dict[str, Array]:
-    one = partial(_one, scores=scores, num_taxels=num_taxels, threshold=threshold)
+    def one(shared: _Shared, skin: _Skin) -> dict[str, Array]:
+        model, presses = _touched(shared, skin)
+        changes = touch_changes(model, skin.conductivity, presses, linear=True)
+        return _results(shared, skin, changes, scores=scores, num_taxels=num_taxels, threshold=threshold)
+
     batch = jax.vmap(one, in_axes=(None, 0))
     if num_devices == 1:
         return batch(shared, skins)
@@ -120,13 +156,35 @@ def _solve(
     )
 
 
-def _one(shared: _Shared, skin: _Skins, *, scores, num_taxels: int, threshold: float) -> dict[str, Array]:
-    model = shared.model.with_electrodes(SheetDiscs(skin.position, skin.radius, skin.contact_impedance))
-    # A touch takes depth / thickness of the current's way.
+def _exact(
+    shared: _Shared, skins: list[_Skin], options: dict, solved: Callable[[int], None] | None
+) -> Iterator[dict[str, Array]]:
+    """Results of each skin, whose maps are exact."""
+    for number, skin in enumerate(skins, 1):
+        model, presses = _touched(shared, skin)
+        yield _results(shared, skin, touch_changes(model, skin.conductivity, presses), **options)
+        if solved is not None and number < len(skins):
+            solved(number)
+
+
+def _touched(shared: _Shared, skin: _Skin) -> tuple[ForwardModel, Presses]:
+    """The model of a skin, and its touches."""
+    model = shared.model.with_electrodes(skin.electrodes).with_protocol(skin.protocol)
     presses = eqx.tree_at(
-        lambda all: all.change, shared.presses, replace_fn=lambda c: c * (shared.thickness / skin.thickness)
+        # A touch of a sheet takes depth / thickness of the current's way; layers of one shape are equally thick.
+        lambda all: all.change,
+        shared.presses,
+        replace_fn=lambda change: change * (shared.thickness / skin.thickness),
     )
-    found = SensitivityMap(shared.grid, touch_changes(model, skin.conductance, presses, linear=True))
+    return model, presses
+
+
+@partial(jax.jit, static_argnames=("scores", "num_taxels", "threshold"))
+def _results(
+    shared: _Shared, skin: _Skin, changes: Float[Array, "n M"], *, scores, num_taxels: int, threshold: float
+) -> dict[str, Array]:
+    """What is told of one skin whose touches make these changes, volts."""
+    found = SensitivityMap(shared.grid, changes)
     results = {"sensitivity": found.values}
     for name in ("minimum", "mean", "uniformity"):
         if name in scores:
@@ -146,4 +204,27 @@ def _one(shared: _Shared, skin: _Skins, *, scores, num_taxels: int, threshold: f
         results["taxel_area_mean"] = 1e4 * taxels.mean_area
         results["taxel_area_std"] = 1e4 * taxels.std_area
         results["taxel_area_max"] = 1e4 * taxels.max_area
+    if shared.touches is not None and shared.prior is not None:
+        results |= _optimality(shared, skin, shared.touches, shared.prior, scores)
+    return results
+
+
+def _optimality(
+    shared: _Shared, skin: _Skin, touches: SheetTouches, prior: TouchPrior, scores: tuple[str, ...]
+) -> dict[str, Array]:
+    """Scores of linear changes. A batch has the Jacobian already, and XLA does not compute it again."""
+    model, _ = _touched(shared, skin)
+    touches = touches.at_thickness(skin.thickness)
+    found = layout_scores(model, skin.conductivity, touches, prior=prior, noise=skin.noise)
+    results = {}
+    if "information" in scores:
+        results["information"] = found.log_information
+    for name in ("mean_variance", "largest_variance"):
+        if name in scores:
+            results[name] = getattr(found, name)
+    if "localisation_error" in scores:
+        # Where a place cannot be told at all, mean and worst are infinite; the share says of how much of the skin.
+        results["localisation_error_mean"] = 1e3 * jnp.mean(found.localisation_error)
+        results["localisation_error_max"] = 1e3 * jnp.max(found.localisation_error)
+        results["localisation_lost"] = jnp.mean(jnp.isinf(found.localisation_error))
     return results

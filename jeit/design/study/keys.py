@@ -31,6 +31,8 @@ class Quantity(NamedTuple):
         return value
 
     def _hint(self, where: str, value: float) -> str:
+        if self.whole:
+            return ""
         for factor, metric in ((1000, "metres"), (1e-3, "micrometres")):
             if self.low <= factor * value <= self.high:
                 other = f"in {metric}" if where.endswith("_mm") else "off by a factor of 1000"
@@ -58,15 +60,33 @@ class Words(NamedTuple):
         return items
 
 
-SCORES = ("minimum", "mean", "uniformity", "blind_spot", "taxels")
+class Flag(NamedTuple):
+    """true or false."""
+
+    default: bool
+    swept: bool = False
+
+    def read(self, where: str, value: Any) -> list[bool]:
+        """The flag, as a list of one. Raises `ValueError`."""
+        [item] = _items(where, value, swept=False)
+        if not isinstance(item, bool):
+            raise ValueError(f"{where} must be true or false, without quotes; it has {item!r}.")
+        return [item]
+
+
+# Of linear changes of a sheet's voltages, with a prior: see `jeit.design.layout_scores`.
+OPTIMALITY = ("information", "mean_variance", "largest_variance", "localisation_error")
+SCORES = ("minimum", "mean", "uniformity", "blind_spot", "taxels", *OPTIMALITY)
 PROTOCOLS = ("adjacent", "opposite", "two-terminal")
 
-_TOP: dict[str, Quantity | Words] = {
+_Key = Quantity | Words | Flag
+_TOP: dict[str, _Key] = {
     "name": Words((), "study"),
     "chunk_points": Quantity(1, 4096, 16, whole=True),
 }
-_SECTIONS: dict[str, dict[str, Quantity | Words]] = {
+_SECTIONS: dict[str, dict[str, _Key]] = {
     "skin": {
+        "model": Words(("sheet", "layer"), "sheet"),
         "width_mm": Quantity(5, 5000, 200),
         "height_mm": Quantity(5, 5000, 200),
         "thickness_mm": Quantity(0.05, 200, 10, swept=True),
@@ -80,6 +100,7 @@ _SECTIONS: dict[str, dict[str, Quantity | Words]] = {
     },
     "measurement": {
         "protocol": Words(PROTOCOLS, "adjacent", swept=True),
+        "pairs": Quantity(0, 523_776, 0, swept=True, whole=True),
         "current_mA": Quantity(1e-4, 1e3, 1),
         "noise_V": Quantity(1e-12, 1, 1e-6, swept=True),
     },
@@ -88,14 +109,20 @@ _SECTIONS: dict[str, dict[str, Quantity | Words]] = {
         "depth_mm": Quantity(0.01, 100, 2.5),
         "deviation_mm": Quantity(0.1, 200, 7.5),
         "diameter_mm": Quantity(0.1, 200, 15),
+        "contrast": Quantity(0, 1e6, 0),
+        "exact": Flag(False),
         "columns": Quantity(1, 1000, 24, whole=True),
         "rows": Quantity(1, 1000, 24, whole=True),
     },
-    "mesh": {"cell_mm": Quantity(0.1, 200, 4, swept=True)},
+    "mesh": {
+        "cell_mm": Quantity(0.1, 200, 4, swept=True),
+        "layers": Quantity(1, 50, 5, whole=True),
+    },
     "scores": {
         "wanted": Words(SCORES, ["minimum", "mean", "uniformity"], swept=True),
         "num_taxels": Quantity(1, 10_000, 90, whole=True),
         "threshold": Quantity(0.01, 0.99, 0.7),
+        "correlation_mm": Quantity(0.1, 1000, 15),
         "seed": Quantity(0, 2**31 - 1, 0, whole=True),
     },
 }
@@ -120,7 +147,7 @@ def read_keys(table: dict[str, Any]) -> dict[str, Any]:
     return values
 
 
-def _section(prefix: str, table: dict[str, Any], keys: dict[str, Quantity | Words]) -> dict[str, Any]:
+def _section(prefix: str, table: dict[str, Any], keys: dict[str, _Key]) -> dict[str, Any]:
     values = {}
     for name, key in keys.items():
         if name in table:

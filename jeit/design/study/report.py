@@ -1,7 +1,9 @@
 """A study as one HTML page that needs nothing else: its pictures, its table, and the exact configuration."""
 
 import base64
+import contextlib
 import io
+import math
 import platform
 from html import escape
 from importlib import metadata
@@ -19,6 +21,17 @@ from jeit.design.study.store import Store, open_results
 _MAPS, _COLUMNS = 24, 4
 _PACKAGES = ("jeit", "jax", "numpy", "zarr", "xarray", "matplotlib")
 _TEXT = ("layout", "protocol")
+# Swept values as they stand above a map; electrodes are told by the layout.
+_LABELS = {
+    "diameter_mm": "⌀ {:g} mm",
+    "contact_impedance_ohm_m2": "{:g} Ω m²",
+    "thickness_mm": "{:g} mm thick",
+    "conductivity_S_per_m": "{:g} S/m",
+    "protocol": "{}",
+    "pairs": "{} pairs",
+    "noise_V": "noise {:g} V",
+    "cell_mm": "cells {:g} mm",
+}
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 70em; margin: 2em auto; padding: 0 1em; color: #222 }
 table { border-collapse: collapse; font-size: 13px } th, td { padding: .2em .7em; text-align: right }
@@ -31,7 +44,8 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
     """Write what the study in `store` has found so far as one HTML file at `path`, replaced as a whole.
 
     Maps of 24 finished points at most on one scale; mean against least sensitivity; every point's values and scores;
-    the study file, fingerprint and versions. Raises `ValueError` if no chunk is finished, and as `open_results` does.
+    the study file, fingerprint and versions. Raises `ValueError` if no chunk is finished, `OSError` if the page cannot
+    be written, and as `open_results` does.
     """
     data = open_results(study, store)
     if not data.finished.values.any():
@@ -41,8 +55,10 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
     parts = [
         f"<h1>{escape(study.name)}</h1>",
         f"<p>{progress.points} of {progress.all_points} points finished, in {progress.chunks} of {progress.all_chunks} "
-        "chunks. Sensitivity: ‖Δv‖₂ of all channels to one touch, linearised, on a sheet.</p>",
+        f"chunks. Sensitivity: ‖Δv‖₂ of all channels to one touch, {'exact' if study.exact else 'linearised'}, on "
+        f"{'a layer' if study.points[0].layers else 'a sheet'}.</p>",
         *([_picture(_scatter(data), "Mean and least sensitivity of every point")] if len(study.points) > 1 else []),
+        *([_picture(_panels(data), "Scores of every point; triangles are infinite")] if _scores(data) else []),
         _picture(_maps(study, data), f"Sensitivity maps of {len(_shown(data))} points, electrodes as circles"),
         "<h2>Points</h2>",
         _table(study, data),
@@ -62,8 +78,11 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
     try:
         temporary.write_text(page, "utf-8")
         temporary.replace(path)
+    except OSError as error:
+        raise OSError(error.errno, f"the report cannot be written ({error.strerror})", str(path)) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
 
 
 def _scatter(data):
@@ -82,6 +101,39 @@ def _scatter(data):
     return figure
 
 
+def _scores(data) -> list[str]:
+    return [name for name in data.data_vars if data[name].dims == ("point",)]
+
+
+def _panels(data):
+    """Every score, point by point, a colour for each layout."""
+    from matplotlib.figure import Figure
+
+    names = _scores(data)
+    columns = min(_COLUMNS, len(names))
+    rows = -(-len(names) // columns)
+    figure = Figure(figsize=(2.8 * columns + 1.8, 2.2 * rows + 0.3), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    point = np.arange(data.sizes["point"])
+    for axes, name in zip(panels, names, strict=False):
+        values, unit = data[name].values, data[name].attrs.get("units", "1")
+        for number, layout in enumerate(dict.fromkeys(data.layout.values.tolist())):
+            these = data.layout.values == layout
+            finite, infinite = these & np.isfinite(values), these & np.isinf(values)
+            axes.plot(point[finite], values[finite], "o", ms=4, color=f"C{number}", label=_plain(layout))
+            top = np.ones(infinite.sum())
+            axes.plot(point[infinite], top, "^", ms=5, color=f"C{number}", transform=axes.get_xaxis_transform())
+        axes.set_title(name.replace("_", " ") + ("" if unit == "1" else f" ({unit})"), fontsize=9)
+        axes.tick_params(labelsize=7)
+        axes.grid(alpha=0.3)
+    for axes in panels[len(names) :]:
+        axes.set_axis_off()
+    figure.supxlabel("Point", fontsize=9)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", frameon=False, fontsize=8)
+    return figure
+
+
 def _shown(data) -> np.ndarray:
     """Numbers of the finished points whose maps are drawn: all, or as many as are looked at, evenly among them."""
     finished = np.flatnonzero(data.finished.values)
@@ -96,12 +148,14 @@ def _maps(study: Study, data):
 
     grid = study_grid(study)
     numbers = _shown(data)
+    titles = _titles(study)
     values = 1e3 * data.sensitivity.values[numbers]
     positive = values[values > 0]
     scale = LogNorm(positive.min(), positive.max())
     columns = min(_COLUMNS, len(numbers))
     rows = -(-len(numbers) // columns)
-    figure = Figure(figsize=(max(2.6 * columns, 4.0) + 0.8, 2.7 * rows + 0.3), layout="constrained")
+    height = 2.4 + 0.15 * max(title.count("\n") for title in titles)
+    figure = Figure(figsize=(max(2.6 * columns, 4.0) + 0.8, height * rows + 0.3), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     low_x, high_x, low_y, high_y = (1e3 * length for length in study.skin.extent)
     image = None
@@ -122,13 +176,29 @@ def _maps(study: Study, data):
             edgecolors="c",
         )
         axes.add_collection(circles)
-        axes.set_title(f"{number}: {_plain(layout.name)}", fontsize=9)
+        axes.set_title(titles[number], fontsize=8)
         axes.tick_params(labelsize=7)
     for axes in panels[len(numbers) :]:
         axes.set_axis_off()
     assert image is not None
     figure.colorbar(image, ax=panels.tolist(), label="Sensitivity (mV)", shrink=min(1.0, 1.5 / rows))
     return figure
+
+
+def _titles(study: Study) -> list[str]:
+    """Number and layout of every point, and below them what else differs between the points, two values a line."""
+    coordinates = [point.coordinates for point in study.points]
+    varying = [name for name in _LABELS if len({values[name] for values in coordinates}) > 1]
+    titles = []
+    for number, values in enumerate(coordinates):
+        told = [_label(name, values[name]) for name in varying]
+        lines = [", ".join(told[start : start + 2]) for start in range(0, len(told), 2)]
+        titles.append("\n".join([f"{number}: {_plain(str(values['layout']))}", *lines]))
+    return titles
+
+
+def _label(name: str, value) -> str:
+    return "all pairs" if name == "pairs" and not value else _LABELS[name].format(value)
 
 
 def _picture(figure: Any, caption: str) -> str:
@@ -143,7 +213,7 @@ def _picture(figure: Any, caption: str) -> str:
 def _table(study: Study, data) -> str:
     """A line for every point: what was swept, then what was found."""
     swept = list(study.points[0].coordinates)
-    scores = [name for name in data.data_vars if data[name].dims == ("point",)]
+    scores = _scores(data)
     units = {name: data[name].attrs.get("units", "1") for name in scores}
     heads = ["point", *swept, *(name if units[name] == "1" else f"{name} / {units[name]}" for name in scores)]
     lines = ["".join(f'<th class="{"text" if head in _TEXT else "number"}">{escape(head)}</th>' for head in heads)]
@@ -156,7 +226,9 @@ def _table(study: Study, data) -> str:
 def _cell(value) -> str:
     if isinstance(value, str):
         return f'<td class="text">{escape(value)}</td>'
-    return f"<td>{'–' if value != value else f'{value:.4g}'}</td>"
+    if math.isinf(value):
+        return "<td>∞</td>"
+    return f"<td>{'–' if math.isnan(value) else f'{value:.4g}'}</td>"
 
 
 def _listed(versions: dict[str, str]) -> str:

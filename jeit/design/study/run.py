@@ -13,8 +13,10 @@ from jeit.design.study.store import Store, open_results, require
 
 
 class Progress(NamedTuple):
-    """How far a study is: finished and all points and chunks; `seconds_left`, None until the first chunk of this run is
-    finished."""
+    """How far a study is: finished and all points and chunks; `seconds_left`, None until the first of this run.
+
+    With exact maps, `points` also counts those of a chunk that is not finished, and would be solved again.
+    """
 
     points: int
     all_points: int
@@ -33,11 +35,11 @@ def run_study(
     - `path`: of the Zarr store; made if there is none.
     - `client`: a `dask.distributed.Client`, whose workers have jeit installed; chunks of a worker that is lost are
       solved again, and only this process writes. In this process unless given.
-    - `progress`: called with a `Progress` at the start and after each chunk.
+    - `progress`: called with a `Progress` at the start and after each chunk; in this process, after each exact map too.
 
-    Raises `ValueError` for electrodes too small for their mesh and for another study's store, before anything runs,
-    `ImportError` without the extra `cluster`, and `OSError` where the store cannot be written, such as on a full disk:
-    finished chunks are kept.
+    Raises `ValueError` for meshes too coarse for their electrodes or touches, and for another study's store, before
+    anything runs, `ImportError` without the extra `cluster`, and `OSError` where the store cannot be written, such as
+    on a full disk: finished chunks are kept.
     """
     require("xarray")
     check_points(study)
@@ -45,9 +47,9 @@ def run_study(
     done = set(store.sound())
     left = [number for number in range(len(study.chunks)) if number not in done]
     tell = _Teller(study, done, progress)
-    for number, results in _solved(study, left, client):
+    for number, results in _solved(study, left, client, tell.solved):
         store.write(number, results)
-        tell(number)
+        tell.finished(number)
     return open_results(study, path)
 
 
@@ -64,27 +66,37 @@ class _Teller:
     def __init__(self, study: Study, done: set[int], progress: Callable[[Progress], None] | None):
         self._study, self._done, self._progress = study, set(done), progress
         self._first, self._start = self._points(), time.monotonic()
-        self._tell(None)
+        self._tell(self._first, None)
 
-    def __call__(self, number: int) -> None:
+    def finished(self, number: int) -> None:
+        """A chunk is."""
         self._done.add(number)
-        pace = (time.monotonic() - self._start) / (self._points() - self._first)
-        self._tell(pace * (len(self._study.points) - self._points()))
+        self._reckon(self._points())
+
+    def solved(self, points: int) -> None:
+        """So many points of the chunk under way are."""
+        self._reckon(self._points() + points)
+
+    def _reckon(self, points: int) -> None:
+        pace = (time.monotonic() - self._start) / (points - self._first)
+        self._tell(points, pace * (len(self._study.points) - points))
 
     def _points(self) -> int:
         return sum(len(self._study.chunks[number]) for number in self._done)
 
-    def _tell(self, seconds_left: float | None) -> None:
+    def _tell(self, points: int, seconds_left: float | None) -> None:
         if self._progress is not None:
             all_points, all_chunks = len(self._study.points), len(self._study.chunks)
-            self._progress(Progress(self._points(), all_points, len(self._done), all_chunks, seconds_left))
+            self._progress(Progress(points, all_points, len(self._done), all_chunks, seconds_left))
 
 
-def _solved(study: Study, numbers: list[int], client: Any) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Chunks with their results, as they are solved."""
+def _solved(
+    study: Study, numbers: list[int], client: Any, solved: Callable[[int], None]
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Chunks with their results, as they are solved; `solved` as in `solve_chunk`."""
     if client is None:
         for number in numbers:
-            yield number, solve_chunk(study, number)
+            yield number, solve_chunk(study, number, solved)
         return
     distributed = require("distributed")
     [shared] = client.scatter([study], broadcast=True)

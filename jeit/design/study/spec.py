@@ -6,34 +6,65 @@ import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from jeit.design.indentation import AbstractIndentation, Bell, Hemisphere
-from jeit.design.study.keys import read_keys
+from jeit.design.study.keys import OPTIMALITY, read_keys
 from jeit.design.study.layouts import is_file, study_layout
-from jeit.electrodes import Layout
+from jeit.electrodes import FaceDiscs, Layout, SheetDiscs
 from jeit.mesh import Rectangle
 
 # Bump when the same study would give other numbers.
-_VERSION = 1
+_VERSION = 2
+# Fewest electrodes of a protocol.
+_FEWEST = {"adjacent": 4, "opposite": 4, "two-terminal": 2}
+
+
+class Shape(NamedTuple):
+    """What points must share to share a mesh and a batch: see `Point`. `thickness` is 0 for sheets, which differ in it
+    without another mesh."""
+
+    electrodes: int
+    protocol: str
+    pairs: int
+    cell_size: float
+    layers: int
+    thickness: float
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """One skin of a study: its `layout` (with diameters and contact impedances) and what surrounds it, in SI units."""
+    """One skin of a study: its `layout` (with diameters and contact impedances) and what surrounds it, in SI units.
+
+    `pairs`: of the nearest electrodes, that a two-terminal `protocol` measures, 0 for all. `layers`: of cells of a
+    solid skin's mesh, 0 for a sheet.
+    """
 
     layout: Layout
     thickness: float
     conductivity: float
     protocol: str
+    pairs: int
     noise: float
     cell_size: float
+    layers: int
 
     @property
-    def shape(self) -> tuple[int, str, float]:
-        """Points of one shape, electrode count, protocol and mesh, can share a batch."""
-        return self.layout.num_electrodes, self.protocol, self.cell_size
+    def shape(self) -> Shape:
+        """Points of one shape can share a batch."""
+        thickness = self.thickness if self.layers else 0.0
+        return Shape(self.layout.num_electrodes, self.protocol, self.pairs, self.cell_size, self.layers, thickness)
+
+    @property
+    def electrodes(self) -> SheetDiscs | FaceDiscs:
+        """In the sheet, or on the bottom of the layer."""
+        discs = self.layout.sheet_discs()
+        if not self.layers:
+            return discs
+        bottom = np.column_stack([discs.position, np.zeros(discs.num_electrodes)])
+        return FaceDiscs(bottom, discs.radius, discs.contact_impedance)
 
     @property
     def coordinates(self) -> dict[str, str | int | float]:
@@ -46,6 +77,7 @@ class Point:
             "thickness_mm": _tidy(1e3 * self.thickness),
             "conductivity_S_per_m": self.conductivity,
             "protocol": self.protocol,
+            "pairs": self.pairs,
             "noise_V": self.noise,
             "cell_mm": _tidy(1e3 * self.cell_size),
         }
@@ -56,8 +88,10 @@ class Study:
     """A sweep: every combination of the lists in a study file. Make it with `read_study`.
 
     - `points`: the skins, in the order of the lists, the last list fastest.
-    - `skin`: their outline; `indentation`: the touch; `columns`, `rows`: of the grid of touches.
-    - `current`: amperes. `scores`: those wanted; `num_taxels`, `threshold`, `seed`: of `find_taxels`.
+    - `skin`: their outline; `indentation`, `contrast`: the touch, as in `press`; `exact`: whether its changes are, or
+      linear; `columns`, `rows`: of the grid of touches.
+    - `current`: amperes. `scores`: those wanted; `num_taxels`, `threshold`, `seed`: of `find_taxels`; `correlation`: of
+      `TouchPrior`, metres.
     - `chunk_points`: most points in a chunk. `text`: the study file.
 
     Studies are equal if their results would be.
@@ -67,12 +101,15 @@ class Study:
     points: tuple[Point, ...]
     skin: Rectangle
     indentation: AbstractIndentation
+    contrast: float
+    exact: bool
     columns: int
     rows: int
     current: float
     scores: tuple[str, ...]
     num_taxels: int
     threshold: float
+    correlation: float
     seed: int
     chunk_points: int
     text: str
@@ -93,9 +130,10 @@ class Study:
         """SHA-256 of all that decides the results: not of comments or the study's name."""
         content = [_VERSION, *map(float, self.skin.extent), type(self.indentation).__name__]
         content += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
-        content += [*self.scores, self.num_taxels, self.threshold, self.seed, self.chunk_points]
+        content += [self.contrast, self.exact, *self.scores, self.num_taxels, self.threshold, self.correlation]
+        content += [self.seed, self.chunk_points]
         for point in self.points:
-            content.append(point.coordinates)
+            content += [point.coordinates, point.layers]
             if is_file(point.layout.name):  # the last digits of others depend on how they were compiled
                 arrays = (point.layout.centres, point.layout.diameters, point.layout.contact_impedance)
                 content += [(np.round(array, 12) + 0.0).tolist() for array in map(np.asarray, arrays)]
@@ -113,6 +151,7 @@ def read_study(path: str | Path) -> Study:
 
         name = "32 electrodes: inside or around"
         [skin]
+        model = "sheet"                      # or "layer": solid, electrodes on its bottom, mesh.layers (5) of cells
         width_mm = 200                       # and height_mm, a rectangle about the origin
         thickness_mm = [5, 10]
         conductivity_S_per_m = 1.0
@@ -121,20 +160,25 @@ def read_study(path: str | Path) -> Study:
         diameter_mm = [6, 8]                 # and contact_impedance_ohm_m2: the file's own, or 6 and 1e-3, unless given
         minimum_gap_mm = 2
         [measurement]
-        protocol = ["adjacent", "two-terminal"]    # or "opposite"; two-terminal: all pairs
+        protocol = "two-terminal"            # or "adjacent", "opposite"
+        pairs = [0, 94]                      # of two-terminal: so many between the nearest electrodes; 0: all
         current_mA = 1
         noise_V = 1e-6
         [touch]
         indentation = "bell"                 # depth_mm, deviation_mm; or "hemisphere": depth_mm, diameter_mm
+        contrast = 0                         # of the touched part's conductivity; above 1 for a conductor
+        exact = false                        # true: solved anew for every touch, one point after the other
         columns = 24                         # and rows
         [mesh]
         cell_mm = 4
         [scores]
         wanted = ["minimum", "mean", "uniformity", "blind_spot", "taxels"]    # num_taxels, threshold, seed
+        # of sheets also "information", "mean_variance", "largest_variance", "localisation_error": correlation_mm
 
     Only `electrodes.layouts` must be there. Files are looked for beside the study's. Raises `FileNotFoundError` if
     there is no such file and `ValueError`, naming the key and what to do, for keys that are not known, values out of
-    range (such as metres for millimetres), electrodes that overlap, and impossible spacings.
+    range (such as metres for millimetres), electrodes that overlap, impossible spacings, and layouts that do not
+    have the electrodes that a protocol needs.
     """
     path = Path(path)
     if not path.is_file():
@@ -159,6 +203,11 @@ def _study(text: str, values: dict, folder: Path) -> Study:
         indentation = Bell(1e-3 * depth, 1e-3 * values["touch.deviation_mm"])
     else:
         indentation = Hemisphere(1e-3 * depth, 1e-3 * values["touch.diameter_mm"])
+    if values["touch.contrast"] == 1:
+        raise ValueError(
+            "touch.contrast is 1, which changes nothing; take 0 for an insulator, above 1 for a conductor."
+        )
+    layers = values["mesh.layers"] if values["skin.model"] == "layer" else 0
     layouts = [
         study_layout(name, folder, skin, diameter, impedance, 1e-3 * values["electrodes.minimum_gap_mm"])
         for name in values["electrodes.layouts"]
@@ -166,11 +215,12 @@ def _study(text: str, values: dict, folder: Path) -> Study:
         for impedance in values["electrodes.contact_impedance_ohm_m2"]
     ]
     points = (
-        Point(layout, thickness, float(conductivity), protocol, float(noise), cell_size)
+        Point(layout, thickness, float(conductivity), protocol, pairs, float(noise), cell_size, layers)
         for layout in layouts
         for thickness in _metres(values["skin.thickness_mm"])
         for conductivity in values["skin.conductivity_S_per_m"]
         for protocol in values["measurement.protocol"]
+        for pairs in values["measurement.pairs"]
         for noise in values["measurement.noise_V"]
         for cell_size in _metres(values["mesh.cell_mm"])
     )
@@ -179,12 +229,15 @@ def _study(text: str, values: dict, folder: Path) -> Study:
         points=tuple(points),
         skin=skin,
         indentation=indentation,
+        contrast=float(values["touch.contrast"]),
+        exact=values["touch.exact"],
         columns=values["touch.columns"],
         rows=values["touch.rows"],
         current=1e-3 * values["measurement.current_mA"],
         scores=tuple(values["scores.wanted"]),
         num_taxels=values["scores.num_taxels"],
         threshold=float(values["scores.threshold"]),
+        correlation=1e-3 * values["scores.correlation_mm"],
         seed=values["scores.seed"],
         chunk_points=values["chunk_points"],
         text=text,
@@ -197,18 +250,45 @@ def _check(study: Study) -> None:
     touches = study.columns * study.rows
     if "taxels" in study.scores and study.num_taxels > touches:
         raise ValueError(f"scores.num_taxels is {study.num_taxels}, and there are {touches} touches; ask for fewer.")
+    of_sheets = [score for score in OPTIMALITY if score in study.scores]
+    if of_sheets and study.points[0].layers:
+        raise ValueError(
+            f"scores.wanted has {', '.join(of_sheets)}, known for sheets only, and skin.model is 'layer'; leave them "
+            "out, or take 'sheet'."
+        )
     for point in study.points:
-        if point.protocol == "opposite" and point.layout.num_electrodes % 2:
-            raise ValueError(
-                f"measurement.protocol: {point.layout.name!r} has {point.layout.num_electrodes} electrodes, and "
-                "'opposite' needs an even number."
-            )
+        _check_measurement(point)
         smallest = float(np.min(point.layout.diameters))
         if point.cell_size > 4 * smallest:
             raise ValueError(
                 f"mesh.cell_mm is {1e3 * point.cell_size:g}, too coarse for electrodes {1e3 * smallest:.3g} mm across; "
                 f"{1e3 * smallest / 2:.3g} would do."
             )
+
+
+def _check_measurement(point: Point) -> None:
+    """Whether the layout has electrodes enough for its protocol and pairs."""
+    name, number = point.layout.name, point.layout.num_electrodes
+    fewest = _FEWEST[point.protocol]
+    if number < fewest:
+        raise ValueError(
+            f"measurement.protocol: {name!r} has {number} electrodes, and {point.protocol!r} needs {fewest} at least."
+        )
+    if point.protocol == "opposite" and number % 2:
+        raise ValueError(
+            f"measurement.protocol: {name!r} has {number} electrodes, and 'opposite' needs an even number."
+        )
+    if point.pairs and point.protocol != "two-terminal":
+        raise ValueError(
+            f"measurement.pairs is {point.pairs}, and measurement.protocol {point.protocol!r}: only 'two-terminal' has "
+            "pairs; put other protocols into a study of their own."
+        )
+    all_pairs = number * (number - 1) // 2
+    if point.pairs > all_pairs:
+        raise ValueError(
+            f"measurement.pairs is {point.pairs}, and {name!r} has {all_pairs} pairs of electrodes; ask for fewer, or "
+            "for 0: all."
+        )
 
 
 def _metres(lengths: list[float]) -> list[float]:

@@ -31,6 +31,14 @@ _SCORES = {
         "taxel_area_std": ("cm²", "standard deviation of the virtual taxels' areas"),
         "taxel_area_max": ("cm²", "largest area of a virtual taxel"),
     },
+    "information": {"information": ("nat", "log-determinant of the information on touches (D)")},
+    "mean_variance": {"mean_variance": ("1", "mean posterior variance of a touch's amplitude (A)")},
+    "largest_variance": {"largest_variance": ("1", "largest posterior variance of a pattern of touches (E)")},
+    "localisation_error": {
+        "localisation_error_mean": ("mm", "mean Cramér-Rao bound of a touch's place, infinite if one cannot be told"),
+        "localisation_error_max": ("mm", "largest Cramér-Rao bound of a touch's place"),
+        "localisation_lost": ("1", "share of the area where a touch's place cannot be told"),
+    },
 }
 
 
@@ -39,7 +47,8 @@ class Store:
 
     def __init__(self, study: Study, path: str | Path, *, create: bool = True):
         """Raises `FileNotFoundError` if there is no store and none is to be made, `ValueError` if there is another
-        study's or something else, `ImportError` without the extra `cluster`, and `OSError` if it cannot be written."""
+        study's or something else, or if it is damaged, `ImportError` without the extra `cluster`, and `OSError` if it
+        cannot be written."""
         zarr = require("zarr")
         self.study, self.path = study, Path(path)
         if not self.path.exists():
@@ -114,11 +123,18 @@ class Store:
             return None  # a file that cannot be decoded
 
     def _attributes(self) -> dict:
+        """Those of a study's store; none if it is something else. Raises `ValueError` if they cannot be read."""
         try:
-            attributes = _read_json(self.path)["attributes"]
-            return attributes if "finished" in attributes else {}
-        except (OSError, ValueError, KeyError, TypeError):
+            content = _read_json(self.path)
+        except (FileNotFoundError, NotADirectoryError):
             return {}
+        except (OSError, ValueError) as error:
+            raise ValueError(
+                f"{self.path / 'zarr.json'} cannot be read ({error}): the store is damaged, and does not say what is "
+                "finished. Put that file back from a copy; or move the store away and run the study again."
+            ) from None
+        attributes = content.get("attributes", {}) if isinstance(content, dict) else {}
+        return attributes if "finished" in attributes else {}
 
 
 def open_results(study: Study, path: str | Path):

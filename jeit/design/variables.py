@@ -1,0 +1,172 @@
+"""The variables of a layout to be optimised: numbers between 0 and 1, and the electrodes that they stand for."""
+
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.optimize import linear_sum_assignment
+
+from jeit.mesh import Domain
+
+Symmetry = Literal["mirror-x", "mirror-y", "rotate-2", "rotate-4"]
+_IMAGES = {
+    None: ((1, 0, 0, 1),),
+    "mirror-x": ((1, 0, 0, 1), (-1, 0, 0, 1)),
+    "mirror-y": ((1, 0, 0, 1), (1, 0, 0, -1)),
+    "rotate-2": ((1, 0, 0, 1), (-1, 0, 0, -1)),
+    "rotate-4": ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0)),
+}
+
+
+class Skin(NamedTuple):
+    """Electrodes on a sheet: `centres` (L, 2) and `radii` (L,) in metres, `contact_impedance` (L,) in ohm·m², and the
+    sheet's `thickness` in metres."""
+
+    centres: Float[Array, "L 2"]
+    radii: Float[Array, " L"]
+    contact_impedance: Float[Array, " L"]
+    thickness: Float[Array, ""]
+
+
+class Range(eqx.Module):
+    """Positive values between `least` (k,) and `least` · exp(`span`), evenly in their logarithm."""
+
+    least: Float[np.ndarray, " k"]
+    span: Float[np.ndarray, " k"]
+
+    @classmethod
+    def create(cls, name: str, ends, start, unit: str) -> "Range":
+        """From two `ends`, each for all of `start` (k,) or one each. Raises `ValueError`."""
+        least, most = (np.broadcast_to(np.asarray(end, float), np.shape(start)) for end in ends)
+        if not ((least > 0) & (most > least) & np.isfinite(most)).all():
+            raise ValueError(f"{name} must be two values in {unit}, the smaller one first; they are {ends!r}.")
+        return cls(least, np.log(most / least))
+
+    def variables(self, values) -> Float[np.ndarray, " k"]:
+        """Numbers between 0 and 1 that stand for `values`, or for the nearest end."""
+        return np.minimum(np.maximum(np.log(np.asarray(values) / self.least) / self.span, 0), 1)
+
+    def values(self, variables) -> Float[Array, " k"]:
+        """What numbers between 0 and 1 stand for."""
+        return jnp.asarray(self.least) * jnp.exp(self.span * variables)
+
+
+class Design(eqx.Module):
+    """From variables between 0 and 1 to a `Skin`: G generators, of which the other electrodes are images.
+
+    **Fields**: `low`, `size` (2,) of the box of centres, metres; `images` (k, 2, 2); `order` (L,) of the images in the
+    layout; `given`, the skin to start from; `sizes` (G), `contacts` (G) and `thickness` (1), the ranges of what is
+    varied besides the places; `start`, its variables; `pitch`, side of the square that each electrode would have to
+    itself, metres.
+    """
+
+    low: np.ndarray
+    size: np.ndarray
+    images: np.ndarray
+    order: np.ndarray
+    given: Skin
+    sizes: Range | None
+    contacts: Range | None
+    thickness: Range | None
+    start: np.ndarray
+    pitch: float
+
+    @classmethod
+    def create(
+        cls, outline: Domain, given: Skin, *, symmetry=None, sizes=False, contacts=None, thickness=None
+    ) -> "Design":
+        """The variables of a `given` skin. Raises `ValueError` for what cannot be."""
+        if symmetry not in _IMAGES:
+            raise ValueError(f"symmetry must be None or one of {', '.join(filter(None, _IMAGES))}; it is {symmetry!r}.")
+        centres, radii = np.asarray(given.centres), np.asarray(given.radii)
+        images = np.array(_IMAGES[symmetry], float).reshape(-1, 2, 2)
+        x_min, x_max, y_min, y_max = outline.extent
+        if symmetry == "rotate-4" and not np.isclose(x_max - x_min, y_max - y_min):
+            raise ValueError("symmetry: a quarter turn maps only a square onto itself, and the outline's box is none.")
+        middle = np.array([x_min + x_max, y_min + y_max]) / 2
+        first = _first_part(centres - middle, symmetry)
+        _check_shares(first.sum(), len(images), len(centres), symmetry)
+        size_range = contact_range = None
+        if sizes is not False:
+            ends = (radii[first] / 2, radii[first] * 2) if sizes is True else np.asarray(sizes) / 2
+            size_range = Range.create("sizes", ends, radii[first], "metres")
+        if contacts is not None:
+            contact_range = Range.create("contact_impedance", contacts, radii[first], "ohm·m²")
+        thickness_range = None if thickness is None else Range.create("thickness", thickness, np.ones(1), "metres")
+        room = radii.min() if size_range is None else size_range.least.min()
+        low, size = np.array([x_min, y_min]) + room, np.array([x_max - x_min, y_max - y_min]) - 2 * room
+        if (size <= 0).any():
+            raise ValueError("outline: it is smaller than an electrode; give millimetres divided by 1000.")
+        every = (np.einsum("kij,gj->kgi", images, centres[first] - middle) + middle).reshape(-1, 2)
+        # Which image is which electrode: the nearest, all in all.
+        order = linear_sum_assignment(np.linalg.norm(centres[:, None] - every, axis=-1))[1]
+        start = [np.clip((centres[first] - low) / size, 0, 1).ravel()]
+        if size_range is not None:
+            start.append(size_range.variables(radii[first]))
+        if contact_range is not None:
+            start.append(contact_range.variables(np.asarray(given.contact_impedance)[first]))
+        if thickness_range is not None:
+            start.append(thickness_range.variables(np.asarray(given.thickness)[None]))
+        radii, impedance = (
+            jnp.tile(jnp.asarray(values)[first], len(images))[order] for values in (radii, given.contact_impedance)
+        )
+        repeated = Skin(given.centres, radii, impedance, given.thickness)
+        pitch = float(np.sqrt(np.prod(size) / len(order)))
+        ranges = size_range, contact_range, thickness_range
+        return cls(low, size, images, order, repeated, *ranges, np.concatenate(start), pitch)
+
+    @property
+    def num_generators(self) -> int:
+        """G."""
+        return len(self.order) // len(self.images)
+
+    @property
+    def smallest(self) -> Float[np.ndarray, " L"]:
+        """Radii (L,) that the electrodes may shrink to, metres."""
+        if self.sizes is None:
+            return np.asarray(self.given.radii)
+        return np.tile(self.sizes.least, len(self.images))[self.order]
+
+    def skin(self, variables: Float[Array, " v"]) -> Skin:
+        """What the variables stand for."""
+        number = self.num_generators
+        place, rest = variables[: 2 * number].reshape(number, 2) * self.size - self.size / 2, variables[2 * number :]
+        centres = jnp.einsum("kij,gj->kgi", self.images, place).reshape(-1, 2) + self.low + self.size / 2
+        _, radii, contact_impedance, thickness = self.given
+        if self.sizes is not None:
+            radii, rest = self._repeated(self.sizes.values(rest[:number])), rest[number:]
+        if self.contacts is not None:
+            contact_impedance, rest = self._repeated(self.contacts.values(rest[:number])), rest[number:]
+        if self.thickness is not None:
+            thickness = self.thickness.values(rest)[0]
+        return Skin(centres[self.order], radii, contact_impedance, thickness)
+
+    def _repeated(self, values: Float[Array, " G"]) -> Float[Array, " L"]:
+        return jnp.tile(values, len(self.images))[self.order]
+
+
+def _first_part(offset: np.ndarray, symmetry: str | None) -> np.ndarray:
+    x, y = offset.T
+    if symmetry == "mirror-x":
+        return x < 0
+    if symmetry in ("mirror-y", "rotate-2"):
+        return y < 0
+    return (x > 0) & (y >= 0) if symmetry == "rotate-4" else np.ones(len(offset), bool)
+
+
+def _check_shares(number: int, parts: int, total: int, symmetry: str | None) -> None:
+    if number * parts == total:
+        return
+    if total % parts:
+        advice = (
+            f"{total} electrodes cannot be shared equally among {parts} parts; add or remove {total % parts}, or "
+            "choose another symmetry."
+        )
+    else:
+        advice = "give a layout with the same number in each."
+    raise ValueError(
+        f"symmetry: {number} of {total} electrodes are in the first of {parts} parts of the skin for '{symmetry}'; "
+        f"{advice}"
+    )
