@@ -9,7 +9,7 @@ from rich.table import Table
 class Steps:
     """Progress on standard output: the step under way with a spinner, steps done with the seconds they took.
 
-    Call it with the name of each step as it begins. Prints nothing when `quiet`.
+    Call it with the name of each step as it begins; `tell` says how far it is. Prints nothing when `quiet`.
     """
 
     def __init__(self, console: Console, *, quiet: bool):
@@ -25,6 +25,11 @@ class Steps:
         if not self.quiet:
             self._status = self.console.status(f"{step} …")
             self._status.start()
+
+    def tell(self, detail: str) -> None:
+        """Say how far the step under way is, beside its spinner."""
+        if self._status is not None:
+            self._status.update(f"{self._step} … {detail}")
 
     def __enter__(self) -> "Steps":
         return self

@@ -7,7 +7,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jeit.cli.layout_optimise import optimise
-from jeit.cli.options import Height, LayoutName, Quiet, Width, check_positive, make_folder, read_skin
+from jeit.cli.options import (
+    Conductivity,
+    Height,
+    LayoutName,
+    Quiet,
+    Thickness,
+    Width,
+    check_layer,
+    check_positive,
+    check_within,
+    make_folder,
+    naming_options,
+    read_skin,
+)
 
 if TYPE_CHECKING:
     from jeit.design import Felt
@@ -19,6 +32,12 @@ layout = typer.Typer(name="layout", help="Compare and optimise layouts of electr
 layout.command()(optimise)
 
 _FILES = ("report.json", "comparison.png")
+# Measurements and taxels, as in Park et al. 2022, where a skin has so many pairs of electrodes and places.
+_PAIRS, _TAXELS = 94, 90
+# Letters of a name in the picture.
+_LONGEST = 32
+# Along a side: 65,536 touches in all.
+_MOST_PLACES = 256
 
 
 @layout.callback(invoke_without_command=True)
@@ -34,12 +53,17 @@ def compare(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for report.json and comparison.png.", show_default=False)
     ],
-    thickness: Annotated[float, typer.Option("--thickness-mm", help="Of the layer, millimetres.")] = 10.0,
-    conductivity: Annotated[float, typer.Option(help="Of the layer, siemens per metre.")] = 1.0,
+    thickness: Thickness = 10.0,
+    conductivity: Conductivity = 1.0,
     pairs: Annotated[
-        int, typer.Option(help="Two-terminal measurements, between nearest electrodes; 0 for all pairs.")
-    ] = 94,
-    taxels: Annotated[int, typer.Option(help="Virtual taxels to look for.")] = 90,
+        int | None,
+        typer.Option(
+            help=f"Two-terminal measurements, between nearest electrodes; 0 for all pairs (default {_PAIRS}, or all)."
+        ),
+    ] = None,
+    taxels: Annotated[
+        int | None, typer.Option(help=f"Virtual taxels to look for (default {_TAXELS}, or one a place).")
+    ] = None,
     margin: Annotated[
         float, typer.Option("--margin-mm", help="Touch no nearer to the edge, where a touch is partly off the skin.")
     ] = 10.0,
@@ -57,21 +81,31 @@ def compare(
     from jeit.cli.console import Steps
     from jeit.design import comparison, feel, touches_away_from_the_edge
 
-    check_positive({"--thickness-mm": thickness, "--conductivity": conductivity, "--cell-mm": cell})
-    for name, value, least in (("--pairs", pairs, 0), ("--taxels", taxels, 1), ("--places", places, 2)):
-        if value < least:
+    check_layer(thickness, conductivity)
+    check_positive({"--cell-mm": cell})
+    check_within("--places", places, 2, _MOST_PLACES)
+    for name, value, least in (("--pairs", pairs, 0), ("--taxels", taxels, 1), ("--seed", seed, 0)):
+        if value is not None and value < least:
             raise ValueError(f"{name} must be at least {least}; it is {value}.")
     if not 0 <= margin < float("inf"):
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
     skins = [read_skin(name, width, height) for name in (first, second)]
     _check_same(*skins)
     make_folder(output, _FILES)
+    arguments = {
+        "thickness": "--thickness-mm",
+        "cell_size": "--cell-mm",
+        "num_pairs": "--pairs",
+        "num_taxels": "--taxels",
+        "margin": "--margin-mm",
+    }
     console = Console(highlight=False)
     felt: list[Felt] = []
-    with Steps(console, quiet=quiet) as step:
+    with naming_options(arguments), Steps(console, quiet=quiet) as step:
         for one, outline in skins:
             step(f"touch {one.name}")
             grid = touches_away_from_the_edge(outline, 1e-3 * margin, places, places)
+            every = one.num_electrodes * (one.num_electrodes - 1) // 2
             felt.append(
                 feel(
                     one,
@@ -80,8 +114,8 @@ def compare(
                     thickness=1e-3 * thickness,
                     conductivity=conductivity,
                     cell_size=1e-3 * cell,
-                    num_pairs=pairs or None,
-                    num_taxels=taxels,
+                    num_pairs=min(_PAIRS, every) if pairs is None else pairs or None,
+                    num_taxels=min(_TAXELS, len(grid.places)) if taxels is None else taxels,
                 )
             )
         step("write")
@@ -91,7 +125,7 @@ def compare(
             "options": {
                 "thickness_mm": thickness,
                 "conductivity_S_per_m": conductivity,
-                "pairs": pairs or None,
+                "pairs": pairs,
                 "taxels": taxels,
                 "margin_mm": margin,
                 "places": places,
@@ -109,12 +143,9 @@ def compare(
 def _check_same(one: "tuple[Layout, Domain]", other: "tuple[Layout, Domain]") -> None:
     """Raise `ValueError` unless both layouts are on the same skin, but for where its drawing has its origin."""
     sizes = []
-    for layout, outline in (one, other):
+    for _, outline in (one, other):
         low_x, high_x, low_y, high_y = outline.extent
         sizes.append((high_x - low_x, high_y - low_y, outline.area))
-        count = layout.num_electrodes
-        if count < 3:
-            raise ValueError(f"'{layout.name}' has {count} electrodes; give layouts of three or more.")
     if any(abs(a - b) > 1e-3 * a for a, b in zip(*sizes, strict=True)):
         said = " and ".join(
             f"'{layout.name}' {1e3 * width:.4g} × {1e3 * height:.4g} mm"
@@ -128,22 +159,37 @@ def _check_same(one: "tuple[Layout, Domain]", other: "tuple[Layout, Domain]") ->
 
 def _draw(felt: "list[Felt]"):
     from matplotlib.figure import Figure
+    from matplotlib.patches import PathPatch
 
     from jeit.plot import plot_sensitivity_histograms, plot_sensitivity_map, plot_taxel_areas, plot_taxels
+    from jeit.plot._axes import INK, bare, draw_scale_bar
+    from jeit.plot.travel import outline_path
 
     figure = Figure(figsize=(15.5, 9.0), layout="constrained")
     axes = figure.subplots(2, 3)
     highest = max(float(one.sensitivity.values.max()) for one in felt)
     largest = max(float(one.taxels.max_area) for one in felt)
-    for row, one in zip(axes, felt, strict=True):
-        centres = one.layout.centres
-        plot_sensitivity_map(one.sensitivity, electrodes=centres, limit=highest, title=one.layout.name, ax=row[0])
-        plot_taxels(one.taxels, electrodes=centres, limit=largest, title=f"{one.layout.name}: taxels", ax=row[1])
-    names = [one.layout.name for one in felt]
+    names = [_shortened(one.layout.name) for one in felt]
     names = names if names[0] != names[1] else [f"{name} ({k})" for k, name in enumerate(names, 1)]
+    for row, name, one in zip(axes, names, felt, strict=True):
+        centres, skin = one.layout.centres, one.layout.skin
+        plot_sensitivity_map(one.sensitivity, electrodes=centres, limit=highest, title=name, ax=row[0])
+        plot_taxels(one.taxels, electrodes=centres, limit=largest, title=f"{name}: taxels", ax=row[1])
+        # Its bar, drawn last, is placed by the touched part; both maps are of the whole skin.
+        for bar in (row[1].lines[-1], row[1].texts[-1]):
+            bar.remove()
+        draw_scale_bar(row[1], skin.extent)
+        for ax in row[:2]:
+            ax.add_patch(PathPatch(outline_path(skin), facecolor="none", edgecolor=INK, linewidth=0.9))
+            bare(ax, skin.extent)
     plot_sensitivity_histograms({name: one.sensitivity for name, one in zip(names, felt, strict=True)}, ax=axes[0, 2])
     plot_taxel_areas({name: one.taxels for name, one in zip(names, felt, strict=True)}, ax=axes[1, 2])
     return figure
+
+
+def _shortened(name: str) -> str:
+    """A layout's name, as much of it as there is room for above a map."""
+    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"
 
 
 def _show(console, told: list[dict]) -> None:

@@ -1,6 +1,8 @@
 """Options and arguments that several commands share."""
 
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -52,19 +54,54 @@ LayoutName = Annotated[
 ]
 Width = Annotated[float, typer.Option("--width-mm", help="Of the skin, centred at 0, if a file does not say it.")]
 Height = Annotated[float, typer.Option("--height-mm", help="Of the skin, centred at 0, if a file does not say it.")]
+Thickness = Annotated[float, typer.Option("--thickness-mm", help="Of the skin, millimetres.")]
+Conductivity = Annotated[float, typer.Option("--conductivity", help="Of the skin, siemens per metre.")]
+# Of conductivities in S/m: deionised water and silver, with room to spare.
+_LEAST_CONDUCTIVITY, _MOST_CONDUCTIVITY = 1e-9, 1e9
 
 
 def read_skin(name: str, width: float, height: float) -> "tuple[Layout, Domain]":
-    """A layout, by name or from a file, and its skin's outline: width × height (mm) where a file does not say it."""
+    """A layout, by name or from a file, and its skin's outline: width × height (mm) where a file does not say it.
+
+    Raises `ValueError` for fewer than three electrodes.
+    """
     from jeit.electrodes import named_layout, read_layout
+    from jeit.electrodes.layout import LARGEST, SMALLEST
     from jeit.mesh import Rectangle
 
     found = read_layout(name) if Path(name).suffix else named_layout(name)
     if found.outline is None:
-        check_positive({"--width-mm": width, "--height-mm": height})
+        for option, side in (("--width-mm", width), ("--height-mm", height)):
+            check_within(option, side, 1e3 * SMALLEST, 1e3 * LARGEST, "mm")
         found = read_layout(name, outline=Rectangle(1e-3 * width, 1e-3 * height))
-    assert found.outline is not None
-    return found, _plain(found.outline)
+    if found.num_electrodes < 3:
+        raise ValueError(f"'{found.name}' has {found.num_electrodes} electrodes; give a layout of three or more.")
+    return found, _plain(found.skin)
+
+
+def check_layer(thickness: float, conductivity: float) -> None:
+    """Raise `ValueError` unless --thickness-mm is more than a touch is deep and --conductivity one that a skin has."""
+    from jeit.design import Bell
+
+    deepest = 1e3 * Bell().depth
+    if not deepest < thickness < float("inf"):
+        raise ValueError(
+            f"--thickness-mm must be more than the {deepest:g} mm that a touch is deep; it is {thickness:g}."
+        )
+    check_within("--conductivity", conductivity, _LEAST_CONDUCTIVITY, _MOST_CONDUCTIVITY, "S/m")
+
+
+@contextmanager
+def naming_options(options: dict[str, str]) -> Iterator[None]:
+    """Errors that begin with the name of one of these arguments begin with that of its option instead."""
+    try:
+        yield
+    except ValueError as error:
+        said = str(error)
+        for argument, option in options.items():
+            if said.startswith((f"{argument} ", f"{argument}:")):
+                raise ValueError(option + said.removeprefix(argument)) from error
+        raise
 
 
 def _plain(outline: "Domain") -> "Domain":
@@ -85,6 +122,13 @@ def check_positive(options: dict[str, float]) -> None:
     for name, value in options.items():
         if not 0 < value < float("inf"):
             raise ValueError(f"{name} must be positive; it is {value:g}.")
+
+
+def check_within(name: str, value: float, least: float, most: float, unit: str = "") -> None:
+    """Raise `ValueError` for an option that is not a number from `least` to `most`."""
+    if not least <= value <= most:
+        unit = f" {unit}" if unit else ""
+        raise ValueError(f"{name} must be from {least:g} to {most:g}{unit}; it is {value:g}.")
 
 
 def intensity_settings(low: float | None, high: float | None, window: float | None, hop: float | None):

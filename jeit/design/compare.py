@@ -1,6 +1,7 @@
 """Two layouts of a skin side by side, as in text S4 of Park et al. 2022: sensitivity, blind spots, virtual taxels."""
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -15,6 +16,10 @@ from jeit.protocol import two_terminal
 
 # Of a hydrogel's electrodes, ohm·m², where a layout does not say.
 _CONTACT_IMPEDANCE = 1e-4
+# Of a layer of cells, times a touch's depth: the middle of its uppermost cells is a quarter of it below the surface.
+_THICKEST = 3.0
+# Of cells, times the smallest diameter of electrodes.
+_COARSEST = 1.5
 
 
 class Felt(eqx.Module):
@@ -54,24 +59,45 @@ def feel(
 
     `thickness` and `cell_size` in metres, `conductivity` in S/m, `current` in amperes. `num_pairs`: two-terminal
     measurements, of the electrodes nearest to each other; None for all pairs. `key`: for the taxels' k-means.
-    Raises `ValueError` for a layout without an outline, and for electrodes too small for the mesh.
+    Raises `ValueError` for a layout without an outline, more pairs or taxels than there are pairs or places, a layer
+    that is thinner than touches are deep or so thick that they change no cell, and electrodes too small for the mesh.
     """
-    if layout.outline is None:
-        raise ValueError(f"outline: '{layout.name}' does not say the skin's; read it with read_layout(..., outline=…).")
+    outline = layout.skin
+    indentation = Bell() if indentation is None else indentation
     pairs = layout.num_electrodes * (layout.num_electrodes - 1) // 2
-    number = pairs if num_pairs is None else min(num_pairs, pairs)
-    mesh = layer(_plane(layout.outline, cell_size), thickness, num_layers)
+    number = pairs if num_pairs is None else num_pairs
+    if not 1 <= number <= pairs:
+        raise ValueError(
+            f"num_pairs is {number}; '{layout.name}' has {layout.num_electrodes} electrodes, and they make {pairs} "
+            "pairs; give so many or fewer."
+        )
+    if not 1 <= num_taxels <= len(grid.places):
+        raise ValueError(f"num_taxels is {num_taxels}; give from 1 to the {len(grid.places)} places touched.")
+    deepest = float(indentation.depth_at(jnp.asarray(0.0)))
+    most = _THICKEST * num_layers * deepest
+    if not deepest < thickness <= most:
+        raise ValueError(
+            f"thickness is {1e3 * thickness:g} mm; give more than the {1e3 * deepest:g} mm that a touch is deep, and "
+            f"no more than {1e3 * most:g} mm, where {num_layers} layers of cells become too coarse for it."
+        )
+    smallest = float(np.min(layout.diameters))
+    if not 0 < cell_size <= _COARSEST * smallest:
+        raise ValueError(
+            f"cell_size is {1e3 * cell_size:g} mm; give no more than {1e3 * _COARSEST * smallest:.3g} mm, as "
+            f"electrodes of '{layout.name}' are {1e3 * smallest:.3g} mm across."
+        )
+    mesh = layer(_plane(outline, cell_size), thickness, num_layers)
     centres = np.asarray(layout.centres)
     impedance = _CONTACT_IMPEDANCE if layout.contact_impedance is None else layout.contact_impedance
     electrodes = FaceDiscs(np.column_stack([centres, np.zeros(len(centres))]), layout.diameters / 2, impedance)
     everything = two_terminal(layout.num_electrodes, current=current)
     model = ForwardModel(mesh, electrodes, everything.subset(np.sort(nearest_pairs(centres, number))))
-    sensitivity = sensitivity_map(model, conductivity, grid, indentation=indentation or Bell())
+    sensitivity = sensitivity_map(model, conductivity, grid, indentation=indentation)
     taxels = find_taxels(
         sensitivity.changes,
         grid.places,
         grid.cell_area,
-        num_taxels=min(num_taxels, len(grid.places)),
+        num_taxels=num_taxels,
         threshold=threshold,
         key=key,
     )

@@ -76,11 +76,20 @@ class Layout(eqx.Module):
         return self.centres.shape[0]
 
     @property
+    def skin(self) -> Domain:
+        """The outline, for what cannot do without. Raises `ValueError` if it is not known."""
+        if self.outline is None:
+            raise ValueError(
+                f"outline: '{self.name}' does not say the skin's; give it, as in read_layout(…, outline=…)."
+            )
+        return self.outline
+
+    @property
     def extent(self) -> tuple[float, float, float, float]:
         """Bounding box (x_min, x_max, y_min, y_max) in metres: of the outline, or of the discs if there is none."""
         if self.outline is not None:
             return self.outline.extent
-        return _bounds(np.asarray(self.centres), np.asarray(self.diameters))
+        return bounds(np.asarray(self.centres), np.asarray(self.diameters))
 
     def sheet_discs(self, contact_impedance=None) -> SheetDiscs:
         """The electrodes for a forward model on a sheet; `contact_impedance` in ohm·m² replaces the layout's.
@@ -142,11 +151,11 @@ def named_layout(name: str) -> Layout:
 
 def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain | None, called: Sequence[str]) -> None:
     """Raise `ValueError` unless discs lie apart and inside `outline`, all in metres; `called` (L,) names them."""
-    x_min, x_max, y_min, y_max = _bounds(centres, diameters) if outline is None else outline.extent
+    x_min, x_max, y_min, y_max = bounds(centres, diameters) if outline is None else outline.extent
     size = max(x_max - x_min, y_max - y_min)
     if not SMALLEST - _ROUNDING <= size <= LARGEST + _ROUNDING:
         raise ValueError(
-            f"centres: the skin would be {size:.3g} m across; are millimetres taken for metres, or metres for "
+            f"centres: the skin would be {_told(size)} across; are millimetres taken for metres, or metres for "
             "millimetres? Lengths differ by a factor of 1000."
         )
     gap = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
@@ -166,15 +175,20 @@ def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain 
             hint = " Are they in millimetres? Divide by 1000."
         elif diameters[worst] > size:
             hint = " Is its diameter in metres?"
-        x, y = centres[worst]
+        x, y = 1e3 * centres[worst]
         raise ValueError(
-            f"centres: {called[worst]}, {diameters[worst]:g} m across at ({x:g}, {y:g}) m, reaches "
-            f"{-1e3 * room[worst]:.3g} mm beyond the outline, which spans {x_min:g} to {x_max:g} m by {y_min:g} to "
-            f"{y_max:g} m.{hint}"
+            f"centres: {called[worst]}, {1e3 * diameters[worst]:g} mm across at ({x:g}, {y:g}) mm, reaches "
+            f"{-1e3 * room[worst]:.3g} mm beyond the outline, which spans {1e3 * x_min:g} to {1e3 * x_max:g} mm by "
+            f"{1e3 * y_min:g} to {1e3 * y_max:g} mm.{hint}"
         )
 
 
-def _bounds(centres: np.ndarray, diameters: np.ndarray) -> tuple[float, float, float, float]:
+def _told(length: float) -> str:
+    return f"{length:.3g} m" if length > LARGEST else f"{1e3 * length:.3g} mm"
+
+
+def bounds(centres: np.ndarray, diameters: np.ndarray) -> tuple[float, float, float, float]:
+    """Box (x_min, x_max, y_min, y_max) round discs, in the unit of their centres (L, 2) and diameters (L,)."""
     low = (centres - diameters[:, None] / 2).min(axis=0)
     high = (centres + diameters[:, None] / 2).max(axis=0)
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.electrodes.layout import Layout, check_discs_fit
+from jeit.electrodes.layout import LARGEST, SMALLEST, Layout, bounds, check_discs_fit
 from jeit.mesh import Domain
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -65,10 +65,27 @@ def read_csv(path: Path, outline: Domain | None) -> Layout:
         if _LABEL in columns
         else None
     )
+    _check_unit(centres, diameters, [header[columns[name][0]] for name in _LENGTHS])
     check_discs_fit(centres, diameters, outline, [f"the electrode of line {number}" for number, _ in rows])
     return Layout(
         centres, diameters, contact_impedance=contact_impedance, outline=outline, labels=labels, name=path.stem
     )
+
+
+def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -> None:
+    """Raise `ValueError` for lengths that must be of another unit than the columns' titles say."""
+    x_min, x_max, y_min, y_max = bounds(centres, diameters)
+    size = max(x_max - x_min, y_max - y_min)
+    if size < SMALLEST:
+        raise ValueError(
+            f"the electrodes would span {1e3 * size:.3g} mm under the columns {', '.join(titles)}; if the values are "
+            "in metres, multiply them by 1000 and call the columns x_mm, y_mm, diameter_mm."
+        )
+    if size > LARGEST:
+        raise ValueError(
+            f"the electrodes would span {size:.3g} m under the columns {', '.join(titles)}; if the values are in "
+            "millimetres, call the columns x_mm, y_mm, diameter_mm."
+        )
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:

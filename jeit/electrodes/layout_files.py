@@ -27,7 +27,10 @@ def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
     - `.dxf` (needs the extra `cad`): circles on the layer ELECTRODES; on OUTLINE closed polylines of straight sides,
       the largest the skin and others holes in it, or one circle; text on LABELS that begins or is centred in a circle
       is its label. In the unit that the drawing states, in millimetres if it states none.
-    - `.svg`: a drawing that `write_layout` wrote. Other drawings may be in pixels, or moved by transforms.
+    - `.svg`: circles in the group ELECTRODES (its id, class or Inkscape layer), or all circles; in the group OUTLINE
+      shapes of straight sides, the largest the skin and others holes in it, or one circle; without that group the only
+      closed shape of straight sides; text in LABELS, in the electrodes' order. Moved by any transforms. The document
+      says its size with a unit (mm, cm, in, pt, or px of 1/96 inch); y is turned up, as `write_layout` turns it down.
 
     `outline`: of the skin, in metres, for a file that has none. Raises `FileNotFoundError` if there is no such file,
     `ImportError` if the extra is missing, and `ValueError` for what is no layout, naming the line or electrode.

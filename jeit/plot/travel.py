@@ -13,6 +13,7 @@ from jeit.plot.electrodes import METAL
 
 # Corners that a round outline is drawn with.
 _CORNERS = 120
+_FREE = {"facecolor": "none", "edgecolor": SOFT, "hatch": "////", "linewidth": 0.5, "zorder": 1}
 
 
 def plot_travel(
@@ -36,12 +37,12 @@ def plot_travel(
     ax = axes_or_new(ax)
     outline = optimisation.layout.outline
     if outline is not None:
-        ax.add_patch(PathPatch(_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9, zorder=2))
+        ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9, zorder=2))
         extent = outline.extent
         bare(ax, extent)
         draw_scale_bar(ax, extent)
     for domain in keep_out:
-        ax.add_patch(PathPatch(_path(domain), facecolor="none", edgecolor=SOFT, hatch="////", linewidth=0.5, zorder=1))
+        ax.add_patch(PathPatch(outline_path(domain), **_FREE))
     began = [Circle((x, y), r) for (x, y), r in zip(ways[0], radii, strict=True)]
     ended = [Circle((x, y), r) for (x, y), r in zip(ends, radii, strict=True)]
     ax.add_collection(PatchCollection(began, facecolor="none", edgecolor=SOFT, linewidth=1.0, zorder=3))
@@ -52,7 +53,8 @@ def plot_travel(
     return ax
 
 
-def _path(domain: Domain) -> Path:
+def outline_path(domain: Domain) -> Path:
+    """The edge of a domain and of its holes, closed, in metres."""
     if isinstance(domain, Disk):
         return Path(np.asarray(domain.boundary(np.linspace(0, domain.perimeter, _CORNERS))), closed=True)
     loops = [np.asarray(loop) for loop in (domain.vertices, *getattr(domain, "holes", ()))]

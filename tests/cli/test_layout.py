@@ -38,6 +38,14 @@ def test_two_files_side_by_side(layouts, run, tmp_path):
     assert 0 < inside["taxel_count"] <= 8
     assert inside["taxel_area_cm2"]["mean"] <= inside["taxel_area_cm2"]["max"] < 30
     assert report["options"]["margin_mm"] == 5
+    assert report["options"]["pairs"] == 6
+
+
+@pytest.mark.parametrize(("option", "value"), [("--width-mm", 0), ("--height-mm", 1e6)])
+def test_the_side_of_a_skin_is_a_length(option, value, layouts, run, tmp_path):
+    status, _, error = run("layout", "compare", *layouts, "--output", tmp_path / "out", *OPTIONS, option, value)
+    assert status == 1
+    assert f"{option} must be from 1 to 5000 mm" in error
 
 
 def test_layouts_on_different_skins_are_not_compared(layouts, run, tmp_path):
@@ -54,9 +62,17 @@ def test_layouts_on_different_skins_are_not_compared(layouts, run, tmp_path):
         (["park-iner"], "park-inner"),
         (["missing.svg"], "missing.svg"),
         ([None, "--margin-mm", 40], "so far from its edge"),
-        ([None, "--thickness-mm", 2], "press less"),
-        ([None, "--thickness-mm", -1], "--thickness-mm must be positive"),
+        ([None, "--thickness-mm", 2], "--thickness-mm must be more than the 2.5 mm that a touch is deep"),
+        ([None, "--thickness-mm", 500], "--thickness-mm is 500 mm; give more than the 2.5 mm"),
+        ([None, "--conductivity", -1], "--conductivity must be from 1e-09 to 1e+09 S/m"),
+        ([None, "--cell-mm", 500], "--cell-mm is 500 mm; give no more than 12 mm"),
+        ([None, "--cell-mm", 0.001], "--cell-mm: this would make about"),
+        ([None, "--places", 100_000], "--places must be from 2 to 256"),
         ([None, "--taxels", 0], "--taxels must be at least 1"),
+        ([None, "--taxels", 101], "--taxels is 101; give from 1 to the"),
+        ([None, "--pairs", 16], "--pairs is 16; 'inside' has 6 electrodes, and they make 15 pairs"),
+        ([None, "--seed", -1], "--seed must be at least 0"),
+        (["grid-2x1"], "'grid-2x1' has 2 electrodes; give a layout of three or more"),
     ],
 )
 def test_bad_input_is_explained(change, said, layouts, run, tmp_path):

@@ -1,13 +1,18 @@
 """`jeit layout optimise`: a better layout, its drawing, its report."""
 
+import io
 import json
+import re
 
+import numpy as np
 import pytest
 import typer
+from rich.console import Console
 
-from jeit.cli.layout_optimise import RESULTS, optimise
+from jeit.cli.console import Steps
+from jeit.cli.layout_optimise import RESULTS, _region, optimise
 from jeit.electrodes import Layout, read_layout, write_layout
-from jeit.mesh import Rectangle
+from jeit.mesh import Disk, Rectangle
 
 APP = typer.Typer()
 APP.command()(optimise)
@@ -23,13 +28,41 @@ def test_optimised_layout_is_written_and_better(tmp_path):
     start = tmp_path / "low.svg"
     centres = [(x, y) for y in (-0.04, -0.015) for x in (-0.03, 0.0, 0.03)]
     write_layout(Layout(centres, 8e-3, outline=Rectangle(0.1, 0.1)), start)
-    run(start, "--output", tmp_path / "out", "--steps", 6, "--num-points", 200, "--minimum-spacing", 15, "--quiet")
+    options = ["--steps", 6, "--num-points", 200, "--minimum-spacing-mm", 15, "--keep-out", "-30,0,8", "--quiet"]
+    run(start, "--output", tmp_path / "out", *options)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(RESULTS)
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     before, after = report["start"], report["optimised"]
     assert after["worst_sensitivity_V"] > 1.5 * before["worst_sensitivity_V"]
     assert after["mean_variance"] < before["mean_variance"]
-    assert read_layout(tmp_path / "out" / "layout.svg").num_electrodes == 6
+    assert report["options"]["keep_out_mm"] == ["-30,0,8"]
+    found = read_layout(tmp_path / "out" / "layout.svg")
+    assert found.num_electrodes == 6
+    assert (np.linalg.norm(found.centres - np.array([-0.03, 0]), axis=1) > 0.012 - 1e-6).all()
+
+
+def test_progress_says_the_step_and_the_best_score(monkeypatch):
+    said = []
+    step = Steps(Console(file=io.StringIO(), force_terminal=True), quiet=False)
+    with step:
+        step.tell("nothing is under way yet")
+        step("optimise")
+        monkeypatch.setattr(step._status, "update", said.append)
+        step.tell("step 3 of at most 60, best score 1.234")
+    assert said == ["optimise … step 3 of at most 60, best score 1.234"]
+
+
+@pytest.mark.parametrize(
+    ("text", "region"),
+    [
+        ("10,-20,5", Disk(5e-3, (0.01, -0.02))),
+        ("-10, 20, 30, -5", Rectangle(0.04, 0.025, (0.01, 0.0075))),
+    ],
+)
+def test_regions_to_keep_out(text, region):
+    found = _region(text, Rectangle(0.2, 0.2))
+    assert type(found) is type(region)
+    np.testing.assert_allclose(found.extent, region.extent, atol=1e-15)
 
 
 def test_bad_input_is_refused(tmp_path):
@@ -39,3 +72,28 @@ def test_bad_input_is_refused(tmp_path):
         run(path, "--output", tmp_path)
     with pytest.raises(ValueError, match="--noise must be positive"):
         run("park-inner", "--output", tmp_path, "--noise", 0)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--thickness-mm", 0.01], "--thickness-mm must be more than the 2.5 mm"),
+        (["--conductivity", "nan"], "--conductivity must be from"),
+        (["--contact-impedance", -1], "--contact-impedance must be positive"),
+        (["--minimum-spacing-mm", -3], "--minimum-spacing-mm must not be negative; it is -3"),
+        (["--minimum-spacing-mm", 300], "--minimum-spacing-mm: 32 electrodes 300 mm apart"),
+        (["--steps", 0], "--steps must be at least 1"),
+        (["--starts", 0], "--starts must be at least 1"),
+        (["--num-points", 0], "--num-points: expected a whole number"),
+        (["--num-points", 20], "--num-points 20 makes cells too coarse for electrodes 6 mm across"),
+        (["--keep-out", "1,2"], "give a disc x,y,radius or a rectangle"),
+        (["--keep-out", "a,b,c"], "give a disc x,y,radius or a rectangle"),
+        (["--keep-out", "0,0,nan"], "give a disc x,y,radius or a rectangle"),
+        (["--keep-out", "0,0,-3"], "0,0,-3 has no size"),
+        (["--keep-out", "5,0,5,9"], "5,0,5,9 has no size"),
+        (["--keep-out", "0,0,5", "--keep-out", "500,0,10"], "500,0,10 lies off the skin, which spans -100 to 100 mm"),
+    ],
+)
+def test_options_are_named(options, said, tmp_path):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        run("park-inner", "--output", tmp_path, *options)

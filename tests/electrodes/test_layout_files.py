@@ -120,9 +120,12 @@ HEADER = "x_mm,y_mm,diameter_mm\n"
         (HEADER + "0,0,6\n40,0,-6\n", "line 3: diameter is not positive"),
         (HEADER + "0,0,6\n40,0,6\n0,0,6\n", "line 2 and the electrode of line 4 are at the same place"),
         (HEADER + "0,0,6\n4,0,6\n", "line 2 and the electrode of line 3 overlap by 2 mm"),
-        (HEADER + "0,0,6\n120,0,6\n", "line 3, 0.006 m across at .* reaches 23 mm beyond the outline"),
-        (HEADER.replace("mm", "m") + "0,0,6\n40,0,6\n", "factor of 1000"),
-        (HEADER + "0,0,.006\n.04,0,.006\n", "factor of 1000"),
+        (
+            HEADER + "0,0,6\n120,0,6\n",
+            "line 3, 6 mm across at .120, 0. mm, reaches 23 mm beyond the outline, which spans -100 to 100 mm",
+        ),
+        (HEADER.replace("mm", "m") + "0,0,6\n40,0,6\n", "span 46 m under the columns x_m.* call the columns x_mm"),
+        (HEADER + "0,0,.006\n.04,0,.006\n", "span 0.046 mm under the columns x_mm.* multiply them by 1000"),
         ("x_mm,y_mm,diameter_mm,label\n0,0,6,A\n40,0,6,A\n", "'A' is the label of several"),
         ("x_mm,y_mm,diameter_mm,label\n0,0,6,\xe9\n".encode("latin-1"), "UTF-8"),
     ],
@@ -130,9 +133,8 @@ HEADER = "x_mm,y_mm,diameter_mm\n"
 def test_bad_tables_are_refused(text, complaint, tmp_path):
     path = tmp_path / "bad.csv"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    outline = None if "factor" in complaint else Rectangle(0.2, 0.2)
     with pytest.raises(ValueError, match=complaint):
-        read_layout(path, outline=outline)
+        read_layout(path, outline=Rectangle(0.2, 0.2))
 
 
 def test_svg_is_to_scale_with_y_up(tmp_path):
@@ -153,15 +155,28 @@ def test_svg_is_to_scale_with_y_up(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
-        ('width="202.0mm"', 'width="202"', "bad.svg: width is '202', not in millimetres"),
-        ('viewBox="-101.0 -71.0 202.0 122.0"', 'viewBox="0 0 763 461"', "no millimetre"),
-        ('<g id="ELECTRODES"', '<g id="ELECTRODES" transform="scale(2)"', "moved by a transform"),
-        ('id="ELECTRODES"', 'id="layer1"', "no group ELECTRODES"),
+        ('width="202.0mm"', 'width="202"', "bad.svg: width is '202', which says no length; set the document's size"),
+        ('viewBox="-101.0 -71.0 202.0 122.0"', 'viewBox="0 0 763 763"', "a unit is 0.2647 mm across and 0.1599 mm up"),
+        ('viewBox="-101.0 -71.0 202.0 122.0"', 'viewBox="0 0 0 461"', "four numbers, the last two positive"),
+        ('<g id="ELECTRODES"', '<g id="ELECTRODES" transform="skewX(2)"', r"moved by skewX\(2\)"),
+        ('<g id="ELECTRODES"', '<g id="ELECTRODES" transform="scale(1,2)"', "12 mm long and 6 mm wide"),
+        ('<g id="ELECTRODES"', '<g id="ELECTRODES" transform="up"', "not a list of transforms"),
+        ('<g id="ELECTRODES"', '<use/><g id="ELECTRODES"', "a <use> in the drawing; unlink clones"),
+        ("<svg", "<!DOCTYPE svg []><svg", "has a <!DOCTYPE"),
         ('cx="-80.0"', 'cx="nan"', "cx of a <circle> is 'nan', not a number"),
         ('cx="-80.0"', 'cx="-8.0e4"', "beyond the outline"),
-        ("<polygon points", "<path d", "<path> stands where a <polygon> should"),
+        ("<polygon points", "<text d", "<text> stands where the skin should"),
+        ("<polygon points", '<path d="M0,0 C9,9 0,9 1,1" points', "<path> has curves"),
+        ("<polygon points", '<path d="M0,0 L9,9 0,9" points', "<path> is not closed"),
+        ("<polygon points", '<path d="M0,0 9" points', "is not a path: M0,0 9"),
+        ("<polygon points", '<rect width="9" height="9" rx="1" points', "round corners"),
+        (
+            'id="OUTLINE"',
+            'id="layer1"',
+            "there are 2 closed shapes, a <polygon> the first; put the skin's into a group",
+        ),
         ("-100.0,50.0", "-100.0", "9 numbers, not pairs"),
-        ("<text", "<tspan/><text", "there are 6; give one for each of the 3"),
+        ("<text", "<text/><text", "there are 6; give one for each of the 3"),
         ("</svg>", "", "not an SVG drawing"),
         ("http://www.w3.org/2000/svg", "http://www.w3.org/1999/xhtml", "not an SVG drawing"),
     ],
@@ -174,6 +189,63 @@ def test_foreign_svg_is_refused(old, new, complaint, tmp_path):
     path.write_text(text.replace(old, new), "utf-8")
     with pytest.raises(ValueError, match=complaint):
         read_layout(path)
+
+
+DRAWN = """<?xml version="1.0" encoding="UTF-8"?>
+<svg xmlns="http://www.w3.org/2000/svg" xmlns:inkscape="http://www.inkscape.org/namespaces/inkscape"
+  width="{width}" height="{height}" viewBox="0 0 100 50">
+  <defs><circle r="1"/></defs>
+  <g inkscape:groupmode="layer" inkscape:label="Layer 1" transform="translate(10)">
+    {skin}
+    <line x1="0" y1="0" x2="9" y2="9"/>
+    <circle r="1" style="display: none"/>
+    <g transform="matrix(2 0 0 2 10 30) rotate(90, 5, 5) translate(0,0) scale(-1 1)">
+      <circle cx="0" cy="0" r="2" transform="translate(3,4)"/>
+      <ellipse cx="-3" cy="4" rx="2" ry="2.0001" class="big red"/>
+    </g>
+  </g>
+</svg>"""
+RECT = '<rect x="-5" y="5" width="80" height="40"/>'
+
+
+@pytest.mark.parametrize(
+    "skin",
+    [
+        RECT,
+        '<polygon points="-5,5 75,5 75,45 -5,45"/>',
+        '<polyline points="-5,5 75,5 75,45 -5,45 -5,5"/>',
+        '<path d="m -5,5 h 80 v 40 H-5z"/>',
+        '<path d="M-5 5L75 5 75,45-5 45-5 5"/>',
+    ],
+)
+@pytest.mark.parametrize(("width", "unit"), [("100mm", 1.0), ("10cm", 1.0), ("4in", 1.016), ("192px", 0.508)])
+def test_svg_drawn_by_hand(skin, width, unit, tmp_path):
+    """Nested transforms, worked out on paper: (3, 4) is mirrored to (-3, 4), turned to (6, -3), then to (32, 24)."""
+    height = f"{float(width[:-2]) / 2:g}{width[-2:]}"
+    (tmp_path / "hand.svg").write_text(DRAWN.format(width=width, height=height, skin=skin))
+    layout = read_layout(tmp_path / "hand.svg")
+    np.testing.assert_allclose(layout.centres, unit * 1e-3 * np.array([[32, -24], [32, -36]]), atol=1e-9)
+    np.testing.assert_allclose(layout.diameters, unit * 8e-3, rtol=1e-4)
+    np.testing.assert_allclose(layout.outline.extent, unit * 1e-3 * np.array([5, 85, -45, -5]), atol=1e-9)
+
+
+def test_svg_roles_by_class_and_holes_in_a_path(tmp_path):
+    skin = """<path class="outline" d="M-5,5 h80 v40 h-80 z m2,2 h4 v4 h-4 z"/> <rect width="3" height="3"/>
+      <circle class="Electrodes" cx="9" cy="20" r="3"/> <circle class="Electrodes" cx="30" cy="20" r="3"/>
+      <text class="labels">A</text> <text class="labels">B</text>"""
+    (tmp_path / "hand.svg").write_text(DRAWN.format(width="100mm", height="50mm", skin=skin))
+    layout = read_layout(tmp_path / "hand.svg")
+    np.testing.assert_allclose(layout.centres, [[0.019, -0.02], [0.04, -0.02]], atol=1e-9)
+    assert layout.labels == ("A", "B")
+    assert len(layout.outline.holes) == 1
+    np.testing.assert_allclose(layout.skin.area, 3200e-6 - 16e-6)
+
+
+def test_svg_without_a_skin_takes_the_one_given(tmp_path):
+    (tmp_path / "hand.svg").write_text(DRAWN.format(width="100mm", height="50mm", skin=""))
+    assert read_layout(tmp_path / "hand.svg", outline=Rectangle(0.2, 0.2)).outline.width == 0.2
+    with pytest.raises(ValueError, match=r"'hand' does not say the skin's; give it, as in read_layout"):
+        _ = read_layout(tmp_path / "hand.svg").skin
 
 
 class TestDrawings:
