@@ -114,8 +114,13 @@ def _check(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol) -> No
 
 
 def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
-    """Voltages of the channels: entries of measurement · Z · driveᵀ."""
-    table = protocol.measurement @ impedance @ protocol.drive.T
+    """Voltages of the channels: entries of measurement · Z · driveᵀ, or they alone where that is less work."""
+    measured, driven = protocol.measurement, protocol.drive
+    each, every = protocol.num_measurements * len(impedance), len(measured) * (len(impedance) + len(driven))
+    if each < every:
+        products = (measured[protocol.measurement_index] @ impedance) * driven[protocol.drive_index]
+        return products.sum(axis=1)
+    table = measured @ impedance @ driven.T
     return table.at[protocol.measurement_index, protocol.drive_index].get(mode="promise_in_bounds")
 
 

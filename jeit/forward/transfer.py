@@ -25,7 +25,7 @@ from jeit.mesh import Mesh
 from jeit_solvers import over_cores, symmetric_inverse
 
 # Rows of an inverse that are solved for at once.
-_ROWS = 32
+_ROWS = 64
 
 
 @eqx.filter_custom_jvp
