@@ -79,8 +79,8 @@ def exact_map(kind: str, cell_size: float, places: int, sample: int, rounds: int
     return [*row, f"{worst:.0e}"], theirs / spent, worst < SAME, nodes, spent
 
 
-def many_layouts(number: int, rounds: int):
-    """A row: linear maps of so many layouts in one batch, and one after the other."""
+def many_layouts(numbers: tuple[int, ...], rounds: int):
+    """Rows: linear maps of so many layouts in one batch, and one after the other; and seconds of each batch."""
     import equinox as eqx
     import jax
     import jax.numpy as jnp
@@ -90,7 +90,6 @@ def many_layouts(number: int, rounds: int):
 
     model, conductivity, options = skin("sheet", 6.3e-3)
     presses = press(model.mesh, Bell(), touch_grid(Rectangle(SIDE, SIDE), 24, 24).places, **options)
-    moves = 1e-3 * jax.random.normal(jax.random.key(0), (number, 32, 2))
     sigma = jnp.asarray(conductivity)
 
     def theta(move):
@@ -99,13 +98,19 @@ def many_layouts(number: int, rounds: int):
         return jnp.linalg.norm(changes, axis=1)
 
     batch, one = jax.jit(lambda moves: jax.lax.map(theta, moves)), jax.jit(theta)
-    together, compiling = seconds(lambda: jax.block_until_ready(batch(moves)), rounds)
-    alone, _ = seconds(lambda: [jax.block_until_ready(one(move)) for move in moves], rounds)
-    same = float(jnp.max(jnp.abs(batch(moves)[-1] / one(moves[-1]) - 1)))
-    name = f"linear maps of {number} layouts, 576 touches, each"
-    nodes = str(model.mesh.num_points)
-    row = [name, nodes, duration(together / number), f"{duration(alone / number)} (a loop)", f"{alone / together:.1f}×"]
-    return [*row, duration(compiling), f"{same:.0e}"]
+    rows, cost = [], []
+    for number in numbers:
+        moves = 1e-3 * jax.random.normal(jax.random.key(0), (number, 32, 2))
+        together, compiling = seconds(lambda moves=moves: jax.block_until_ready(batch(moves)), rounds)
+        alone, _ = seconds(lambda moves=moves: [jax.block_until_ready(one(move)) for move in moves], rounds)
+        same = float(jnp.max(jnp.abs(batch(moves)[-1] / one(moves[-1]) - 1)))
+        needed = batch.lower(moves).compile().memory_analysis()
+        memory = (needed.temp_size_in_bytes + needed.output_size_in_bytes) / 2**20
+        name = f"linear maps of {number} layouts, 576 touches, each; {memory:.0f} MB for all"
+        row = [name, str(model.mesh.num_points), duration(together / number), f"{duration(alone / number)} (a loop)"]
+        rows.append([*row, f"{alone / together:.1f}×", duration(compiling), f"{same:.0e}"])
+        cost.append((number, together))
+    return rows, cost
 
 
 def clusters(rounds: int):
@@ -141,9 +146,10 @@ def main() -> int:
     machine.use_cores(CORES)
     heading = machine.heading()
     if options.quick:
-        cases, places, sample, rounds, number = [("sheet", 7e-3)], 12, 3, 1, 4
+        cases, places, sample, rounds, numbers = [("sheet", 7e-3)], 12, 3, 1, (2, 4)
     else:
-        cases, places, sample, rounds, number = [("sheet", 3.07e-3), ("layer", 4.42e-3)], 48, 6, 3, 256
+        cases, places, sample, rounds = [("sheet", 3.07e-3), ("layer", 4.34e-3)], 48, 6, 3
+        numbers = (16, 64, 256)
     rows, checks, agree, cost = [], [], True, {}
     for kind, cell_size in cases:
         row, faster, same, nodes, spent = exact_map(kind, cell_size, places, sample, rounds)
@@ -161,7 +167,10 @@ def main() -> int:
             slope = np.polyfit(*np.log(np.array(cost[kind]).T), 1)[0]
             checks.append([f"exact map, {kind}: cost grows as nodes to the power", f"{slope:.2f}", ""])
         rows.append(clusters(rounds))
-    rows.append(many_layouts(number, rounds))
+    maps, spent = many_layouts(numbers, rounds)
+    rows += maps
+    slope = np.polyfit(*np.log(np.array(spent).T), 1)[0]
+    checks.append(["linear maps: cost grows as layouts to the power", f"{slope:.2f}", ""])
     memory = f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB, of all together"
     text = "\n\n".join(
         [
