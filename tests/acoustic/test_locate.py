@@ -1,31 +1,19 @@
 """From intensities to places and statuses: every status where it belongs, and faults that are said and survived."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from microphone_arrays import MICROPHONES, OUTLINE, array, hear, inside, noisy
+from microphone_arrays import array, hear, inside, noisy
 
 from jeit.acoustic import (
     Calibration,
     Intensities,
-    IntensityNoise,
-    IntensitySettings,
-    InverseSquare,
-    Listeners,
     Locations,
-    Recording,
     cramer_rao,
-    intensities,
     locate,
-    make_surface,
-    measure,
 )
 from jeit.acoustic.locate import STATUSES
-from jeit.data.sounding_skin import SoundingSkin, expected_power, transfer
-from jeit.data.touches import quiet
-from jeit.electrodes import grid
 
 FRAMES = 64
 FLOOR, FREEDOM = 0.01, 50.0
@@ -420,97 +408,3 @@ def test_another_unit_is_noted_though_all_is_lost_in_the_noise():
     silent = locate(heard(0.01 * rng.normal(size=(32, 9)), floor=0), calibration(listeners))
     assert silent.counts() == {"no touch": 32}
     assert silent.notes == ()
-
-
-PLACE = np.array([0.02, -0.03])
-
-
-def recorded(skin, samples, name="recording"):
-    return Recording(samples, skin.rate, name=name)
-
-
-@pytest.fixture(scope="module")
-def skin():
-    return SoundingSkin(jax.random.key(0), MICROPHONES[9])
-
-
-@pytest.fixture(scope="module")
-def heard_before(skin):
-    """A calibration of the simulated skin: 1 / f = (r² + b) / a by linear least squares, and the floor of silence."""
-    places = grid(0.18, 0.18, 7, 7)
-    power = expected_power(skin, places)
-    squared = ((places[:, None] - MICROPHONES[9]) ** 2).sum(axis=-1)
-    models = []
-    for f, r2 in zip(power.T, squared.T, strict=True):
-        slope, constant = np.linalg.lstsq(np.stack([r2 * f, f], axis=1), np.ones(len(f)), rcond=None)[0]
-        models.append((1 / slope, constant / slope))
-    a, b = np.transpose(models)
-    silent = intensities(recorded(skin, quiet(skin, jax.random.key(1)).samples))
-    noise = IntensityNoise.create(9, floor=silent.floor, freedom=silent.freedom, relative=0.3)
-    listeners = Listeners(
-        jnp.asarray(MICROPHONES[9]), make_surface(OUTLINE), InverseSquare(jnp.asarray(a), jnp.asarray(b)), noise
-    )
-    return eqx.tree_at(
-        lambda one: one.intensity, calibration(listeners), IntensitySettings(), is_leaf=lambda one: one is None
-    )
-
-
-@pytest.fixture(scope="module")
-def vibration(skin):
-    """A motor that shakes the skin at `PLACE` all the time: tones every 20 Hz, so that all windows are alike."""
-    times, tones = np.arange(10_000) / skin.rate, np.arange(80.0, 800.0, 20.0)
-    phases = np.exp(2j * np.pi * np.random.default_rng(1).random(len(tones)))
-    waves = np.exp(2j * np.pi * tones[:, None] * times)
-    heard = np.real(np.asarray(transfer(skin, jnp.asarray(tones), jnp.asarray(PLACE))) * phases @ waves)
-    return recorded(skin, heard + quiet(skin, jax.random.key(2)).samples)
-
-
-@pytest.fixture(scope="module")
-def silent(skin):
-    return recorded(skin, quiet(skin, jax.random.key(3)).samples, "hush")
-
-
-def test_a_touch_without_pauses(vibration, silent, heard_before):
-    """Taken for silence, which a note says together with what to do; with that, it is found all the time."""
-    lost = locate(vibration, heard_before)
-    assert lost.counts() == {"no touch": len(lost.times)}
-    (note,) = lost.notes
-    assert note.startswith("microphones ")
-    assert "times the calibration's. If the recording never pauses" in note
-    assert "--silence" in note
-    found = locate(vibration, heard_before, silence=silent)
-    assert found.notes == ()
-    assert found.located.all()
-    assert np.isin(found.status, ["touch", "ambiguous"]).all()
-    # Nine microphones 7 cm apart, and a model that knows nothing of echoes.
-    assert np.median(np.linalg.norm(found.position - PLACE, axis=1)) < 0.012
-    np.testing.assert_allclose(measure(vibration, heard_before, silence=silent).floor, intensities(silent).floor)
-
-
-def test_a_floor_is_compared_with_its_own_kind(skin, vibration, silent, heard_before):
-    """No note of silence as it was in the calibration, nor of taps as intensities; another band is said."""
-    assert locate(silent, heard_before).notes == ()
-    (note,) = locate(vibration, heard_before, intensity=IntensitySettings(high=900.0)).notes
-    assert note.startswith("band or window are not the calibration's")
-    of_intensities = eqx.tree_at(lambda one: one.intensity, heard_before, None)
-    assert locate(vibration, of_intensities).notes == ()
-
-
-def test_a_microphone_that_has_no_silence_is_not_used(skin, vibration, silent, heard_before):
-    samples = silent.samples.copy()
-    samples[4] = 0
-    found = locate(vibration, heard_before, silence=recorded(skin, samples))
-    assert found.faults[4] == "in the silence: dead: every sample is 0"
-    assert not found.used[:, 4].any()
-    assert found.used[:, :4].all()
-    assert found.located.all()
-
-
-def test_silence_that_makes_no_sense(skin, vibration, silent, heard_before):
-    with pytest.raises(ValueError, match=r"silence 'recording' is .* times as loud as the quietest windows of 'hush'"):
-        locate(silent, heard_before, silence=recorded(skin, 3 * silent.samples))
-    with pytest.raises(ValueError, match="'hush' has 8 microphones"):
-        locate(vibration, heard_before, silence=recorded(skin, silent.samples[:8], "hush"))
-    for pair in ((intensities(vibration), silent), (vibration, intensities(silent))):
-        with pytest.raises(ValueError, match="silence is for a recording of samples"):
-            locate(pair[0], heard_before, silence=pair[1])
