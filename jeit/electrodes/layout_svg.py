@@ -10,10 +10,21 @@ import numpy as np
 
 from jeit.electrodes.layout import Layout
 from jeit.electrodes.layout_csv import millimetres
+from jeit.electrodes.svg_shapes import (
+    NUMBER,
+    ROUND,
+    composed,
+    described,
+    disc_of,
+    loops_of,
+    moved,
+    number_of,
+    tag_of,
+    transform_of,
+)
 from jeit.mesh import Disk, Domain, Polygon
 
 _SPACE = "http://www.w3.org/2000/svg"
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _MARGIN = 1e-3  # m, around the drawing, so that lines on its edge are seen whole
 # Metres; 96 pixels are an inch.
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "in": 25.4e-3, "px": 25.4e-3 / 96, "pt": 25.4e-3 / 72}
@@ -21,7 +32,6 @@ _ROLES = ("OUTLINE", "ELECTRODES", "LABELS")
 _INKSCAPE_LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 _GROUPS = ("svg", "g", "a", "switch")
 _UNSEEN = ("defs", "clipPath", "mask", "pattern", "symbol", "marker", "metadata", "style", "title", "desc")
-_ROUND = ("circle", "ellipse")
 _STRAIGHT = ("rect", "polygon", "polyline", "path")
 
 
@@ -63,12 +73,12 @@ def read_svg(path: Path, outline: Domain | None) -> Layout:
         raise ValueError(f"this is not an SVG drawing: it begins with <{root.tag}>.")
     shapes = list(_shapes(root))
     roles = {role for _, role, _ in shapes}
-    labels = ["".join(one.itertext()).strip() for one, role, _ in shapes if role == "LABELS" and _tag(one) == "text"]
+    labels = ["".join(one.itertext()).strip() for one, role, _ in shapes if role == "LABELS" and tag_of(one) == "text"]
     chosen = "ELECTRODES" if "ELECTRODES" in roles else None
-    electrodes = [(one, to) for one, role, to in shapes if role == chosen and (chosen or _tag(one) in _ROUND)]
+    electrodes = [(one, to) for one, role, to in shapes if role == chosen and (chosen or tag_of(one) in ROUND)]
     if not electrodes:
         raise ValueError("there is no circle in the drawing; electrodes are circles, in a group ELECTRODES or all.")
-    circles = np.array([_disc(one, to) for one, to in electrodes])
+    circles = np.array([disc_of(one, to) for one, to in electrodes])
     drawn = _outline([(one, to) for one, role, to in shapes if role == "OUTLINE"]) if "OUTLINE" in roles else None
     if "OUTLINE" not in roles:
         drawn = _only_outline([(one, to) for one, role, to in shapes if role is None])
@@ -96,15 +106,17 @@ def _shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, st
     waiting: list[tuple[ElementTree.Element, str | None, np.ndarray]] = [(root, None, _to_metres(root))]
     while waiting:
         element, role, to = waiting.pop()
-        tag = _tag(element)
+        tag = tag_of(element)
         if tag in _UNSEEN or not element.tag.startswith(f"{{{_SPACE}}}") or "display:none" in _style(element):
             continue
         if tag == "use" or (tag == "svg" and element is not root):
-            raise ValueError(f"there is {_called(element)} in the drawing; unlink clones and embedded drawings first.")
+            raise ValueError(
+                f"there is {described(element)} in the drawing; unlink clones and embedded drawings first."
+            )
         called = {element.get("id", ""), element.get(_INKSCAPE_LABEL, ""), *element.get("class", "").split()}
         role = next((name for name in _ROLES if name in {one.upper() for one in called}), role)
         if "transform" in element.attrib:
-            to = _compose(to, _transform(element))
+            to = composed(to, transform_of(element))
         if tag in _GROUPS:
             waiting += [(child, role, to) for child in reversed(element)]
         else:
@@ -113,10 +125,10 @@ def _shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, st
 
 def _to_metres(root: ElementTree.Element) -> np.ndarray:
     """The matrix (2, 3) from the drawing's unit to metres, y up. Raises `ValueError` if the drawing does not say it."""
-    box = [_value(root, "viewBox", part) for part in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if part]
+    box = [number_of(root, "viewBox", part) for part in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if part]
     scales = []
     for name, inside in (("width", box[2:3]), ("height", box[3:4])):
-        size = re.fullmatch(rf"({_NUMBER})\s*({'|'.join(_UNITS)})", root.get(name, "").strip())
+        size = re.fullmatch(rf"({NUMBER})\s*({'|'.join(_UNITS)})", root.get(name, "").strip())
         if size is None:
             raise ValueError(
                 f'{name} is {root.get(name)!r}, which says no length; set the document\'s size in mm ({name}="200mm").'
@@ -132,81 +144,16 @@ def _to_metres(root: ElementTree.Element) -> np.ndarray:
     return np.array([[scales[0], 0, 0], [0, -scales[0], 0]])
 
 
-def _transform(element: ElementTree.Element) -> np.ndarray:
-    """The matrix (2, 3) of an element's transform."""
-    text, found = element.get("transform", "").strip(), np.eye(2, 3)
-    if re.fullmatch(r"(\w+\s*\([^()]*\)[\s,]*)*", text) is None:
-        raise ValueError(f"transform of {_called(element)} is {text!r}, not a list of transforms.")
-    for kind, inside in re.findall(r"(\w+)\s*\(([^()]*)\)", text):
-        numbers = [_value(element, "transform", part) for part in re.split(r"[\s,]+", inside.strip()) if part]
-        match kind, numbers:
-            case "matrix", [_, _, _, _, _, _]:
-                one = np.array(numbers).reshape(3, 2).T
-            case "translate", [x, *rest] if len(rest) < 2:
-                one = np.array([[1, 0, x], [0, 1, rest[0] if rest else 0]])
-            case "scale", [x, *rest] if len(rest) < 2:
-                one = np.array([[x, 0, 0], [0, rest[0] if rest else x, 0]])
-            case "rotate", [degrees, *middle] if len(middle) in (0, 2):
-                angle, middle = math.radians(degrees), np.array(middle or [0.0, 0.0])
-                turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-                one = np.column_stack([turn, middle - turn @ middle])
-            case _:
-                raise ValueError(
-                    f"{_called(element)} is moved by {kind}({inside}); jeit reads matrix, translate, scale and rotate."
-                )
-        found = _compose(found, one)
-    return found
-
-
-def _compose(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    return outer[:, :2] @ inner + np.column_stack([np.zeros((2, 2)), outer[:, 2]])
-
-
-def _move(points, to: np.ndarray) -> np.ndarray:
-    return np.asarray(points, float).reshape(-1, 2) @ to[:, :2].T + to[:, 2]
-
-
-def _tag(element: ElementTree.Element) -> str:
-    return element.tag.split("}")[-1]
-
-
 def _style(element: ElementTree.Element) -> str:
     return "".join(f"{element.get('style', '')};display:{element.get('display', '')}".split())
 
 
-def _called(element: ElementTree.Element) -> str:
-    return f"<{_tag(element)} id={element.get('id')!r}>" if "id" in element.attrib else f"a <{_tag(element)}>"
-
-
-def _value(element: ElementTree.Element, name: str, text: str | None) -> float:
-    if text is None or re.fullmatch(_NUMBER, text.strip()) is None:
-        raise ValueError(f"{name} of {_called(element)} is {text!r}, not a number.")
-    return float(text)
-
-
-def _disc(element: ElementTree.Element, to: np.ndarray) -> tuple[float, float, float]:
-    """Centre and radius of a circle in metres, y up."""
-    if _tag(element) not in _ROUND:
-        raise ValueError(f"{_called(element)} stands where a circle should: electrodes are circles.")
-    x, y = (_value(element, name, element.get(name, "0")) for name in ("cx", "cy"))
-    names = ("r", "r") if _tag(element) == "circle" else ("rx", "ry")
-    radii = [_value(element, name, element.get(name)) for name in names]
-    half = np.linalg.svd(to[:, :2] * radii, compute_uv=False)
-    if half[0] > half[1] * (1 + 1e-3):
-        raise ValueError(
-            f"{_called(element)} is {2e3 * half[0]:.4g} mm long and {2e3 * half[1]:.4g} mm wide as it is drawn; "
-            "electrodes are circles."
-        )
-    centre = _move([x, y], to)[0]
-    return float(centre[0]), float(centre[1]), float(half.mean())
-
-
 def _outline(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain:
     """Of what is in the group OUTLINE: one circle, or shapes of straight sides, holes in the largest."""
-    if len(drawn) == 1 and _tag(drawn[0][0]) in _ROUND:
-        x, y, radius = _disc(*drawn[0])
+    if len(drawn) == 1 and tag_of(drawn[0][0]) in ROUND:
+        x, y, radius = disc_of(*drawn[0])
         return Disk(radius, (x, y))
-    loops = [_move(loop, to) for one, to in drawn for loop in _loops(one)]
+    loops = [moved(loop, to) for one, to in drawn for loop in loops_of(one)]
     loops.sort(key=lambda loop: -np.prod(np.ptp(loop, axis=0)))
     return Polygon(loops[0], loops[1:])
 
@@ -215,73 +162,17 @@ def _only_outline(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain
     """The only closed shape of straight sides in a drawing without a group OUTLINE; None if nothing could be one."""
     found, complaints = [], []
     for one, to in drawn:
-        if _tag(one) in _STRAIGHT:
+        if tag_of(one) in _STRAIGHT:
             try:
-                _loops(one)
+                loops_of(one)
                 found.append((one, to))
             except ValueError as error:
                 complaints.append(error)
     if len(found) > 1:
         raise ValueError(
-            f"there are {len(found)} closed shapes, {_called(found[0][0])} the first; put the skin's into a group "
+            f"there are {len(found)} closed shapes, {described(found[0][0])} the first; put the skin's into a group "
             "OUTLINE."
         )
     if not found and complaints:
         raise complaints[0]
     return _outline(found) if found else None
-
-
-def _loops(element: ElementTree.Element) -> list[np.ndarray]:
-    """Vertices (k, 2) of a closed shape of straight sides, in its own unit; `ValueError` if it is none."""
-    tag = _tag(element)
-    if tag == "rect":
-        x, y = (_value(element, name, element.get(name, "0")) for name in ("x", "y"))
-        width, height = (_value(element, name, element.get(name)) for name in ("width", "height"))
-        if any(_value(element, name, element.get(name, "0")) for name in ("rx", "ry")):
-            raise ValueError(f"{_called(element)} has round corners; draw the skin with straight sides.")
-        return [np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]])]
-    if tag in ("polygon", "polyline"):
-        values = [_value(element, "points", text) for text in re.split(r"[\s,]+", element.get("points", "").strip())]
-        if len(values) % 2:
-            raise ValueError(f"points of {_called(element)} are {len(values)} numbers, not pairs.")
-        return [_closed(element, np.array(values).reshape(-1, 2), tag == "polygon")]
-    if tag == "path":
-        return _path_loops(element)
-    raise ValueError(f"{_called(element)} stands where the skin should: draw a rectangle, polygon, path or circle.")
-
-
-def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
-    text = element.get("d", "")
-    if re.fullmatch(rf"(?:[MmLlHhVvZz]|{_NUMBER}|[\s,])*", text) is None or not text.strip():
-        raise ValueError(f"{_called(element)} has curves, or is no path; draw the skin with straight sides.")
-    loops: list[tuple[list[np.ndarray], bool]] = []
-    place = np.zeros(2)
-    for letter, inside in re.findall(r"([MmLlHhVvZz])([^MmLlHhVvZz]*)", text):
-        numbers = [float(number) for number in re.findall(_NUMBER, inside)]
-        kind, relative = letter.upper(), letter.islower()
-        size = {"H": 1, "V": 1}.get(kind, 2)
-        if kind == "Z" and loops:
-            loops[-1] = (loops[-1][0], True)
-            place = loops[-1][0][0]
-            continue
-        if kind == "Z" or not numbers or len(numbers) % size or (kind != "M" and not loops):
-            raise ValueError(f"d of {_called(element)} is not a path: {letter}{inside.strip()}.")
-        for index in range(0, len(numbers), size):
-            origin = place if relative else np.array({"H": [0, place[1]], "V": [place[0], 0]}.get(kind, [0, 0]))
-            step = {"H": [numbers[index], 0], "V": [0, numbers[index]]}.get(kind, numbers[index : index + 2])
-            start, place = place, origin + np.array(step)
-            if kind == "M" and index == 0:
-                loops.append(([place], False))
-            else:  # after a Z without an M, a line goes on from where the loop began
-                if loops[-1][1]:
-                    loops.append(([start], False))
-                loops[-1][0].append(place)
-    return [_closed(element, np.array(points), closed) for points, closed in loops]
-
-
-def _closed(element: ElementTree.Element, loop: np.ndarray, closed: bool) -> np.ndarray:
-    """Vertices of a loop, the first not repeated."""
-    meets = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-6 * np.ptp(loop))
-    if not (closed or meets):
-        raise ValueError(f"{_called(element)} is not closed; close the skin's outline.")
-    return loop[:-1] if meets else loop

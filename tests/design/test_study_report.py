@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from jeit.design.study import open_results, read_study, report, run_study, write_study_report
+from jeit.design.study import open_results, pictures, read_study, run_study, write_study_report
 from jeit.design.study.store import Store
 
 pytest.importorskip("xarray")
@@ -107,7 +107,7 @@ def test_what_is_infinite_stands_in_table_and_picture(folder, tmp_path):
     write_study_report(study, store.path, tmp_path / "study.html")
     assert "∞" in Page((tmp_path / "study.html").read_text("utf-8")).cells
     [uniformity] = [
-        axes for axes in report._panels(open_results(study, store.path)).axes if "uniform" in axes.get_title()
+        axes for axes in pictures.draw_scores(open_results(study, store.path)).axes if "uniform" in axes.get_title()
     ]
     marked = {line.get_marker(): line.get_xdata().tolist() for line in uniformity.lines if len(line.get_xdata())}
     assert marked == {"^": [0]}
@@ -118,7 +118,7 @@ def test_titles_tell_what_differs(tmp_path):
         "[touch]", '[measurement]\nprotocol = "two-terminal"\npairs = [0, 9]\nnoise_V = [1e-6, 2e-6]\n[touch]'
     )
     (tmp_path / "study.toml").write_text(varied, "utf-8")
-    titles = report._titles(read_study(tmp_path / "study.toml"))
+    titles = pictures.titles_of(read_study(tmp_path / "study.toml"))
     assert len(set(titles)) == 16
     assert titles[0] == "0: grid-4x2\n⌀ 8 mm, all pairs\nnoise 1e-06 V"
     assert titles[15] == "15: perimeter-8\n⌀ 10 mm, 9 pairs\nnoise 2e-06 V"

@@ -158,7 +158,7 @@ def test_svg_is_to_scale_with_y_up(tmp_path):
         ('width="202.0mm"', 'width="202"', "bad.svg: width is '202', which says no length; set the document's size"),
         ('viewBox="-101.0 -71.0 202.0 122.0"', 'viewBox="0 0 763 763"', "a unit is 0.2647 mm across and 0.1599 mm up"),
         ('viewBox="-101.0 -71.0 202.0 122.0"', 'viewBox="0 0 0 461"', "four numbers, the last two positive"),
-        ('<g id="ELECTRODES"', '<g id="ELECTRODES" transform="skewX(2)"', r"moved by skewX\(2\)"),
+        ('<g id="ELECTRODES"', '<g id="ELECTRODES" transform="skewX(2)"', r"has skewX\(2\)"),
         ('<g id="ELECTRODES"', '<g id="ELECTRODES" transform="scale(1,2)"', "12 mm long and 6 mm wide"),
         ('<g id="ELECTRODES"', '<g id="ELECTRODES" transform="up"', "not a list of transforms"),
         ('<g id="ELECTRODES"', '<use/><g id="ELECTRODES"', "a <use> in the drawing; unlink clones"),

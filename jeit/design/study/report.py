@@ -10,28 +10,13 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from jeit.design.study.batch import study_grid
+from jeit.design.study.pictures import draw_maps, draw_scatter, draw_scores, scores_of, shown
 from jeit.design.study.run import study_progress
 from jeit.design.study.spec import Study
 from jeit.design.study.store import Store, open_results
 
-# More maps than that are no longer looked at.
-_MAPS, _COLUMNS = 24, 4
 _PACKAGES = ("jeit", "jax", "numpy", "zarr", "xarray", "matplotlib")
 _TEXT = ("layout", "protocol")
-# Swept values as they stand above a map; electrodes are told by the layout.
-_LABELS = {
-    "diameter_mm": "⌀ {:g} mm",
-    "contact_impedance_ohm_m2": "{:g} Ω m²",
-    "thickness_mm": "{:g} mm thick",
-    "conductivity_S_per_m": "{:g} S/m",
-    "protocol": "{}",
-    "pairs": "{} pairs",
-    "noise_V": "noise {:g} V",
-    "cell_mm": "cells {:g} mm",
-}
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 70em; margin: 2em auto; padding: 0 1em; color: #222 }
 table { border-collapse: collapse; font-size: 13px } th, td { padding: .2em .7em; text-align: right }
@@ -57,9 +42,9 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
         f"<p>{progress.points} of {progress.all_points} points finished, in {progress.chunks} of {progress.all_chunks} "
         f"chunks. Sensitivity: ‖Δv‖₂ of all channels to one touch, {'exact' if study.exact else 'linearised'}, on "
         f"{'a layer' if study.points[0].layers else 'a sheet'}.</p>",
-        *([_picture(_scatter(data), "Mean and least sensitivity of every point")] if len(study.points) > 1 else []),
-        *([_picture(_panels(data), "Scores of every point; triangles are infinite")] if _scores(data) else []),
-        _picture(_maps(study, data), f"Sensitivity maps of {len(_shown(data))} points, electrodes as circles"),
+        *([_picture(draw_scatter(data), "Mean and least sensitivity of every point")] if len(study.points) > 1 else []),
+        *([_picture(draw_scores(data), "Scores of every point; triangles are infinite")] if scores_of(data) else []),
+        _picture(draw_maps(study, data), f"Sensitivity maps of {len(shown(data))} points, electrodes as circles"),
         "<h2>Points</h2>",
         _table(study, data),
         "<h2>Configuration</h2>",
@@ -85,122 +70,6 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
             temporary.unlink()
 
 
-def _scatter(data):
-    """Mean against least sensitivity, a colour for each layout."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.5, 4.2), layout="constrained")
-    axes = figure.subplots()
-    least, mean = data.sensitivity.min("place"), data.sensitivity.mean("place")
-    for layout in dict.fromkeys(data.layout.values.tolist()):
-        these = data.layout.values == layout
-        axes.plot(1e3 * least[these], 1e3 * mean[these], "o", label=_plain(layout), alpha=0.8)
-    axes.set(xlabel="Least sensitivity (mV)", ylabel="Mean sensitivity (mV)", xscale="log", yscale="log")
-    axes.grid(alpha=0.3, which="both")
-    figure.legend(loc="outside right upper", frameon=False)
-    return figure
-
-
-def _scores(data) -> list[str]:
-    return [name for name in data.data_vars if data[name].dims == ("point",)]
-
-
-def _panels(data):
-    """Every score, point by point, a colour for each layout."""
-    from matplotlib.figure import Figure
-
-    names = _scores(data)
-    columns = min(_COLUMNS, len(names))
-    rows = -(-len(names) // columns)
-    figure = Figure(figsize=(2.8 * columns + 1.8, 2.2 * rows + 0.3), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    point = np.arange(data.sizes["point"])
-    for axes, name in zip(panels, names, strict=False):
-        values, unit = data[name].values, data[name].attrs.get("units", "1")
-        for number, layout in enumerate(dict.fromkeys(data.layout.values.tolist())):
-            these = data.layout.values == layout
-            finite, infinite = these & np.isfinite(values), these & np.isinf(values)
-            axes.plot(point[finite], values[finite], "o", ms=4, color=f"C{number}", label=_plain(layout))
-            top = np.ones(infinite.sum())
-            axes.plot(point[infinite], top, "^", ms=5, color=f"C{number}", transform=axes.get_xaxis_transform())
-        axes.set_title(name.replace("_", " ") + ("" if unit == "1" else f" ({unit})"), fontsize=9)
-        axes.tick_params(labelsize=7)
-        axes.grid(alpha=0.3)
-    for axes in panels[len(names) :]:
-        axes.set_axis_off()
-    figure.supxlabel("Point", fontsize=9)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", frameon=False, fontsize=8)
-    return figure
-
-
-def _shown(data) -> np.ndarray:
-    """Numbers of the finished points whose maps are drawn: all, or as many as are looked at, evenly among them."""
-    finished = np.flatnonzero(data.finished.values)
-    chosen = np.linspace(0, len(finished) - 1, min(len(finished), _MAPS)).round().astype(int)
-    return finished[chosen]
-
-
-def _maps(study: Study, data):
-    from matplotlib.collections import EllipseCollection
-    from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
-
-    grid = study_grid(study)
-    numbers = _shown(data)
-    titles = _titles(study)
-    values = 1e3 * data.sensitivity.values[numbers]
-    positive = values[values > 0]
-    scale = LogNorm(positive.min(), positive.max())
-    columns = min(_COLUMNS, len(numbers))
-    rows = -(-len(numbers) // columns)
-    height = 2.4 + 0.15 * max(title.count("\n") for title in titles)
-    figure = Figure(figsize=(max(2.6 * columns, 4.0) + 0.8, height * rows + 0.3), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    low_x, high_x, low_y, high_y = (1e3 * length for length in study.skin.extent)
-    image = None
-    for axes, number, map_values in zip(panels, numbers, values, strict=False):
-        layout = study.points[number].layout
-        image = axes.imshow(
-            grid.raster(map_values), origin="lower", extent=(low_x, high_x, low_y, high_y), norm=scale, cmap="magma"
-        )
-        diameter = 1e3 * np.asarray(layout.diameters)
-        circles = EllipseCollection(
-            diameter,
-            diameter,
-            np.zeros_like(diameter),
-            units="xy",
-            offsets=1e3 * np.asarray(layout.centres),
-            offset_transform=axes.transData,
-            facecolors="none",
-            edgecolors="c",
-        )
-        axes.add_collection(circles)
-        axes.set_title(titles[number], fontsize=8)
-        axes.tick_params(labelsize=7)
-    for axes in panels[len(numbers) :]:
-        axes.set_axis_off()
-    assert image is not None
-    figure.colorbar(image, ax=panels.tolist(), label="Sensitivity (mV)", shrink=min(1.0, 1.5 / rows))
-    return figure
-
-
-def _titles(study: Study) -> list[str]:
-    """Number and layout of every point, and below them what else differs between the points, two values a line."""
-    coordinates = [point.coordinates for point in study.points]
-    varying = [name for name in _LABELS if len({values[name] for values in coordinates}) > 1]
-    titles = []
-    for number, values in enumerate(coordinates):
-        told = [_label(name, values[name]) for name in varying]
-        lines = [", ".join(told[start : start + 2]) for start in range(0, len(told), 2)]
-        titles.append("\n".join([f"{number}: {_plain(str(values['layout']))}", *lines]))
-    return titles
-
-
-def _label(name: str, value) -> str:
-    return "all pairs" if name == "pairs" and not value else _LABELS[name].format(value)
-
-
 def _picture(figure: Any, caption: str) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
@@ -213,7 +82,7 @@ def _picture(figure: Any, caption: str) -> str:
 def _table(study: Study, data) -> str:
     """A line for every point: what was swept, then what was found."""
     swept = list(study.points[0].coordinates)
-    scores = _scores(data)
+    scores = scores_of(data)
     units = {name: data[name].attrs.get("units", "1") for name in scores}
     heads = ["point", *swept, *(name if units[name] == "1" else f"{name} / {units[name]}" for name in scores)]
     lines = ["".join(f'<th class="{"text" if head in _TEXT else "number"}">{escape(head)}</th>' for head in heads)]
@@ -233,8 +102,3 @@ def _cell(value) -> str:
 
 def _listed(versions: dict[str, str]) -> str:
     return ", ".join(f"{escape(name)} {escape(version)}" for name, version in versions.items())
-
-
-def _plain(text: str) -> str:
-    """Text that matplotlib takes as it is: no formulas, and no label that begins with an underscore is left out."""
-    return " " * text.startswith("_") + text.replace("$", r"\$")
