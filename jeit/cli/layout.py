@@ -169,8 +169,7 @@ def _draw(felt: "list[Felt]"):
     axes = figure.subplots(2, 3)
     highest = max(float(one.sensitivity.values.max()) for one in felt)
     largest = max(float(one.taxels.max_area) for one in felt)
-    names = [_shortened(one.layout.name) for one in felt]
-    names = names if names[0] != names[1] else [f"{name} ({k})" for k, name in enumerate(names, 1)]
+    names = _told_apart([_shortened(one.layout.name) for one in felt])
     for row, name, one in zip(axes, names, felt, strict=True):
         centres, skin = one.layout.centres, one.layout.skin
         plot_sensitivity_map(one.sensitivity, electrodes=centres, limit=highest, title=name, ax=row[0])
@@ -187,6 +186,10 @@ def _draw(felt: "list[Felt]"):
     return figure
 
 
+def _told_apart(names: list[str]) -> list[str]:
+    return names if names[0] != names[1] else [f"{name} ({k})" for k, name in enumerate(names, 1)]
+
+
 def _shortened(name: str) -> str:
     """A layout's name, as much of it as there is room for above a map."""
     return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"
@@ -195,7 +198,7 @@ def _shortened(name: str) -> str:
 def _show(console, told: list[dict]) -> None:
     from rich.table import Table
 
-    table = Table("", *(one["layout"] for one in told), box=None, padding=(0, 2, 0, 0))
+    table = Table("", *_told_apart([one["layout"] for one in told]), box=None, padding=(0, 2, 0, 0))
     for column in table.columns[1:]:
         column.justify = "right"
 

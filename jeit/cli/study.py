@@ -35,6 +35,8 @@ def run(
 ) -> None:
     """Run a study from its beginning, and report."""
     sweep, store = _read(file, output)
+    if store.exists() and not (store / "zarr.json").is_file():
+        raise ValueError(f"--output {store}: there is something else already; choose another name.")
     if store.exists():
         raise ValueError(f"{store} is there already: 'jeit study resume {file}' goes on with it; or delete it.")
     _run(sweep, file, store, page, scheduler, quiet)
@@ -73,7 +75,7 @@ def report(file: File, output: Output = None, page: Page = None) -> None:
     from jeit.design.study import write_study_report
 
     sweep, store = _read(file, output)
-    where = page or file.with_suffix(".html")
+    where = _page(file, store, page)
     write_study_report(sweep, store, where)
     typer.echo(f"Written: {where}")
 
@@ -82,6 +84,16 @@ def _read(file: Path, output: Path | None) -> "tuple[Study, Path]":
     from jeit.design.study import read_study
 
     return read_study(file), output or file.with_suffix(".zarr")
+
+
+def _page(file: Path, store: Path, page: Path | None) -> Path:
+    """Where the report goes. Raises `ValueError` for a folder that is not there, and where something else would go."""
+    where = page or file.with_suffix(".html")
+    if not where.parent.is_dir():
+        raise ValueError(f"--page {where}: there is no folder {where.parent}; make it first.")
+    if where.resolve() in (file.resolve(), store.resolve()):
+        raise ValueError(f"--page {where}: that is the study itself; choose another name.")
+    return where
 
 
 def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: str | None, quiet: bool) -> None:
@@ -93,9 +105,7 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
 
     from jeit.design.study import run_study, write_study_report
 
-    where = page or file.with_suffix(".html")
-    if not where.parent.is_dir():
-        raise ValueError(f"--page {where}: there is no folder {where.parent}; make it first.")
+    where = _page(file, store, page)
     console = Console(highlight=False)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with ExitStack() as stack:

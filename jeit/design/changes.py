@@ -27,8 +27,8 @@ from jeit.forward.transfer import fields_and_inverse
 from jeit.mesh import Mesh
 from jeit_solvers import over_cores
 
-# Of Rᵀ G R, relative: the voltages are more exact than that.
-_TOLERANCE, _MOST_STEPS, _LEAST = 1e-9, 200, 1e-300
+# Of Rᵀ G R, relative to the voltages, which are more exact than that.
+_TOLERANCE, _SMALLEST, _MOST_STEPS = 1e-9, 1e-12, 200
 # Touches worked on at once: their blocks of the inverse are to stay in the cache.
 _CHUNK = 8
 # Touches whose nodes are sought at once.
@@ -39,11 +39,17 @@ def touch_changes(model: ForwardModel, conductivity, presses: Presses, *, linear
     """Changes (n, M) of the protocol's M voltages by n touches, one at a time, in volts.
 
     `linear`: J δσ, the Jacobian's, differentiable in everything and batched with `vmap`; else exact, as if the model
-    had been solved anew for every touch. Raises `ValueError` where a touch has cells that the mesh has not.
+    had been solved anew for every touch. Raises `ValueError` for touches of another mesh, and `RuntimeError`
+    where exact changes are not found.
     """
     conductivity = check_conductivity(model.mesh, conductivity)
     if conductivity.ndim == 3 or jnp.iscomplexobj(conductivity):
         raise ValueError("touches need a real, scalar conductivity.")
+    if presses.num_cells != model.mesh.num_cells:
+        raise ValueError(
+            f"the touches are of a mesh of {presses.num_cells} cells, and the model's has {model.mesh.num_cells}; "
+            "press on the model's own, press(model.mesh, …)."
+        )
     if linear:
         return _linear(model, cell_conductivity(model.mesh, conductivity), presses)
     return _exact(model, cell_conductivity(model.mesh, conductivity), presses)
@@ -96,7 +102,15 @@ def _exact(model: ForwardModel, conductivity, presses: Presses):
     known = fields_and_inverse(model.mesh, conductivity, model.electrodes, model.system, jnp.asarray(touched.union))
     touches = jax.tree.map(jnp.asarray, (presses.cells, presses.change, touched.nodes, touched.corners))
     number = len(presses.cells)
-    return over_cores(partial(_changes, model, conductivity, known, touches), number, _CHUNK)[:number]
+    found = over_cores(partial(_changes, model, conductivity, known, touches), number, _CHUNK)[:number]
+    lost = np.flatnonzero(~np.isfinite(np.asarray(found)).all(axis=1))
+    if lost.size:
+        x, y = np.asarray(presses.places)[lost[0]]
+        raise RuntimeError(
+            f"the changes by {lost.size} of {number} touches were not found in {_MOST_STEPS} steps, the first at "
+            f"({1e3 * x:.4g}, {1e3 * y:.4g}) mm; are conductivities many orders of magnitude apart?"
+        )
+    return found
 
 
 @jax.jit
@@ -132,24 +146,31 @@ def _impedance_changes(blocks, corners, inverse, fields):
         direction = scaled_residual + ratio * direction
         scaled = residual + ratio * scaled  # G⁻¹ of the direction, which is a combination of what G was applied to
         product = scaled + added @ direction
-        length = energy / jnp.maximum(jnp.sum(direction * product, axis=1, keepdims=True), _LEAST)
+        curvature = jnp.sum(direction * product, axis=1, keepdims=True)
+        # What has converged stays: nothing but rounding is left of it, and of its curvature.
+        going = (energy > _TOLERANCE * scale) & (curvature > 0)
+        length = jnp.where(going, energy / jnp.where(going, curvature, 1.0), 0.0)
         solution, residual = solution + length * direction, residual - length * product
         scaled_residual = inverse @ residual
         new = jnp.sum(residual * scaled_residual, axis=1, keepdims=True)
-        ratio = new / jnp.maximum(energy, _LEAST)
+        ratio = jnp.where(going, new / jnp.where(going, energy, 1.0), 0.0)
         return solution, residual, scaled_residual, direction, scaled, new, ratio, number + 1
 
     def unfinished(state):
         *_, energy, _, number = state
-        return (number < _MOST_STEPS) & jnp.any(energy > _TOLERANCE * first)
+        return (number < _MOST_STEPS) & jnp.any(energy > _TOLERANCE * scale)
 
     scaled_load, blank = inverse @ load, jnp.zeros_like(load)
     first = jnp.sum(load * scaled_load, axis=1, keepdims=True)
+    # Of what is to be found: conductors make the load large, and not the voltages.
+    small = jnp.sum(fields * load, axis=1, keepdims=True) ** 2 / jnp.where(first > 0, first, 1.0)
+    scale = jnp.clip(small, _SMALLEST * first, first)
     start = blank, load, scaled_load, blank, blank, first, jnp.zeros_like(first), jnp.zeros((), int)
-    solution, residual, scaled_residual, *_ = jax.lax.while_loop(unfinished, step, start)
+    solution, residual, scaled_residual, *_, energy, _, _ = jax.lax.while_loop(unfinished, step, start)
     change = _transposed(solution) @ (load + residual) + _transposed(residual) @ scaled_residual
     change -= _transposed(fields) @ load
-    return (change + _transposed(change)) / 2
+    converged = jnp.all(energy <= _TOLERANCE * scale, axis=(1, 2))
+    return jnp.where(converged[:, None, None], (change + _transposed(change)) / 2, jnp.nan)
 
 
 def _transposed(matrices):

@@ -103,7 +103,8 @@ def optimise_layout(
     - `outline`: of the sheet, the layout's unless given. `minimum_spacing`: of centres, metres; electrodes never
       overlap. `keep_out`: domains that no electrode may touch.
     - `symmetry`: about the middle of the outline's box. The layout must have an equal share of its electrodes in every
-      half (x or y below the middle) or quarter; those of the first are kept, and the others become their images.
+      half (x or y below the middle) or quarter; those of the first are kept, and the others become their images. Take
+      several starts: there are fewer ways out of a poor layout.
     - `sizes`: electrodes' sizes are moved too, between half and twice what they are, or between two diameters, metres.
     - `contact_impedance`: electrodes' are varied too, between two values, ohm·m². `thickness`: that of the sheet is
       varied too, between two values, metres, from that of `touches` on; `conductivity`, the sheet's, grows with it.
@@ -118,14 +119,16 @@ def optimise_layout(
     if outline is None:
         raise ValueError("outline: the layout does not know that of its skin; give one, such as Rectangle(0.2, 0.2).")
     _check(layout, model, steps, starts, key)
+    _check_keep_out(keep_out)
     constraints = Constraints(outline, float(minimum_spacing), tuple(keep_out))
     task = _Task(model, jnp.asarray(conductivity), touches, prior, jnp.asarray(noise, float), temperature)
     skin = Skin(layout.centres, layout.diameters / 2, _contacts(model), touches.thickness)
     options = {"sizes": sizes, "contacts": contact_impedance, "thickness": thickness}
     design = Design.create(outline, skin, symmetry=symmetry, **options)
-    if design.thickness is not None and design.thickness.least.min() <= touches.depth:
-        raise ValueError(f"thickness: the touches are {1e3 * touches.depth:.3g} mm deep; let the sheet be thicker.")
+    if thickness is not None:
+        _check_thickness(thickness, touches, outline)
     constraints.check_room(design.smallest)
+    _check_outline(outline, model)
     begin = np.stack([design.start, *_random(design, constraints, starts - 1, key)])
     # A layout given is taken as it is, unless symmetry or the constraints forbid.
     begin = np.array(_feasible(design, constraints, jnp.asarray(begin)))
@@ -151,7 +154,7 @@ def optimise_layout(
     ends = jax.tree.map(np.asarray, _skins(design, variables))
     values = np.asarray(cost(variables, 0.0)[1])
     lacking = np.array([_lacking(constraints, *one) for one in zip(ends.centres, ends.radii, strict=True)])
-    best, status, reason = _judge(layout, constraints, ends, values, lacking, start_value, settled)
+    best, status, reason = _judge(design.holds(skin), layout, constraints, ends, values, lacking, start_value, settled)
     found, scores = layout, given
     if best is not None:
         end = Skin(*(part[best] for part in ends))
@@ -252,10 +255,10 @@ def _skins(design: Design, variables) -> Skin:
     return jax.vmap(design.skin)(variables)
 
 
-def _judge(layout, constraints, ends, values, lacking, start_value, settled) -> tuple[int | None, str, str]:
+def _judge(holds, layout, constraints, ends, values, lacking, start_value, settled) -> tuple[int | None, str, str]:
     """Which start is best, None if not one improves on the layout given, and what to say of it."""
     good = (lacking <= 0) & np.isfinite(values)
-    fits = _lacking(constraints, layout.centres, layout.diameters / 2) <= 1e-9
+    fits = holds and _lacking(constraints, layout.centres, layout.diameters / 2) <= 1e-9
     if not good.any():
         nearest = int(lacking.argmin())
         parts = constraints.shortfalls(jnp.asarray(ends.centres[nearest]), jnp.asarray(ends.radii[nearest]))
@@ -269,6 +272,10 @@ def _judge(layout, constraints, ends, values, lacking, start_value, settled) -> 
     if fits and values[best] <= start_value:
         return None, status, "no start is better than the layout given."
     reason = f"start {best + 1} of {len(values)} is best; {good.sum()} satisfy the constraints."
+    if not fits:
+        reason += (
+            " The layout given does not satisfy what is asked, and was changed until it did before the first step."
+        )
     return best, status, reason
 
 
@@ -303,3 +310,24 @@ def _check(layout: Layout, model: ForwardModel, steps: int, starts: int, key) ->
             raise ValueError(f"{name} must be a whole number from 1; it is {number!r}.")
     if starts > 1 and key is None:
         raise ValueError("key: random starts need one, such as jax.random.key(0).")
+
+
+def _check_keep_out(keep_out) -> None:
+    if isinstance(keep_out, Domain) or not all(isinstance(one, Domain) for one in keep_out):
+        raise ValueError(f"keep_out must be a list of domains, such as [Disk(0.01, (0.02, 0.0))]; it is {keep_out!r}.")
+
+
+def _check_outline(outline: Domain, model: ForwardModel) -> None:
+    low_x, high_x, low_y, high_y = outline.extent
+    points = np.asarray(model.mesh.points)
+    off = max(*(points.min(axis=0) - (low_x, low_y)), *((high_x, high_y) - points.max(axis=0)))
+    if off > 1e-6:
+        raise ValueError(f"outline: it reaches {1e3 * off:.3g} mm beyond the model's mesh; give the skin's own.")
+
+
+def _check_thickness(thickness, touches: SheetTouches, outline: Domain) -> None:
+    low_x, high_x, low_y, high_y = outline.extent
+    if np.min(thickness) <= touches.depth:
+        raise ValueError(f"thickness: the touches are {1e3 * touches.depth:.3g} mm deep; let the sheet be thicker.")
+    if np.max(thickness) > max(high_x - low_x, high_y - low_y):
+        raise ValueError(f"thickness is {thickness!r} metres, more than the skin is wide; are they millimetres?")

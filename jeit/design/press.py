@@ -18,11 +18,13 @@ class Presses(eqx.Module):
 
     - `places`: (n, 2) metres, middles of the touches.
     - `cells`: (n, c), and `change`: (n, c), −1 for a cell that conducts no more; 0 where a touch has fewer cells.
+    - `num_cells`: of the mesh they are of.
     """
 
     places: Float[Array, "n 2"]
     cells: Int[Array, "n c"]
     change: Float[Array, "n c"]
+    num_cells: int = eqx.field(static=True)
 
 
 def press(
@@ -85,7 +87,7 @@ def press(
     kept, there = _padded([one[used] for one, used in zip(cells, changed, strict=True)])
     change = np.zeros(kept.shape)
     change[there] = (contrast - 1) * share[changed]
-    return Presses(jnp.asarray(places), jnp.asarray(kept), jnp.asarray(change))
+    return Presses(jnp.asarray(places), jnp.asarray(kept), jnp.asarray(change), mesh.num_cells)
 
 
 def _padded(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -48,7 +48,7 @@ class SheetTouches(eqx.Module):
     def at_thickness(self, thickness) -> "SheetTouches":
         """The same touches of a layer of another thickness, metres: they take depth / thickness of the way."""
         share = self.thickness / thickness
-        presses = Presses(self.presses.places, self.presses.cells, self.presses.change * share)
+        presses = eqx.tree_at(lambda one: one.change, self.presses, self.presses.change * share)
         return SheetTouches(presses, self.slope * share, jnp.asarray(thickness), self.depth)
 
     def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:

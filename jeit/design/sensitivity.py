@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jeit.design.changes import touch_changes
@@ -85,7 +86,12 @@ class SensitivityMap(eqx.Module):
         return self.mean / jnp.sqrt(jnp.mean(self.values**2, axis=-1))
 
     def blind_spot(self, level) -> Float[Array, ""]:
-        """Share of the area that is less sensitive than `level` (volts), such as another layout's minimum."""
+        """Share of the area that is less sensitive than `level` (volts), such as another layout's minimum.
+
+        Raises `ValueError` for a level that is negative or not a number.
+        """
+        if not isinstance(level, Tracer) and not np.all(np.asarray(level) >= 0):
+            raise ValueError(f"level must be a sensitivity in volts, not negative; it is {level!r}.")
         return jnp.mean(self.values < level, axis=-1)
 
     def histogram(self, bins: int | np.ndarray = 40) -> tuple[np.ndarray, np.ndarray]:

@@ -38,11 +38,11 @@ class Range(eqx.Module):
 
     @classmethod
     def create(cls, name: str, ends, start, unit: str) -> "Range":
-        """From two `ends`, each for all of `start` (k,) or one each. Raises `ValueError`."""
-        least, most = (np.broadcast_to(np.asarray(end, float), np.shape(start)) for end in ends)
-        if not ((least > 0) & (most > least) & np.isfinite(most)).all():
-            raise ValueError(f"{name} must be two values in {unit}, the smaller one first; they are {ends!r}.")
-        return cls(least, np.log(most / least))
+        """From two `ends`, for all of `start` (k,). Raises `ValueError`."""
+        least, most = ends if np.shape(ends) == (2,) else (0.0, 0.0)
+        if not 0 < least < most < np.inf:
+            raise ValueError(f"{name} must be two values in {unit}, the smaller one first; it is {ends!r}.")
+        return cls(np.full(np.shape(start), least), np.full(np.shape(start), np.log(most / least)))
 
     def variables(self, values) -> Float[np.ndarray, " k"]:
         """Numbers between 0 and 1 that stand for `values`, or for the nearest end."""
@@ -89,16 +89,19 @@ class Design(eqx.Module):
         first = _first_part(centres - middle, symmetry)
         _check_shares(first.sum(), len(images), len(centres), symmetry)
         size_range = contact_range = None
-        if sizes is not False:
-            ends = (radii[first] / 2, radii[first] * 2) if sizes is True else np.asarray(sizes) / 2
-            size_range = Range.create("sizes", ends, radii[first], "metres")
+        if sizes is True:
+            size_range = Range(radii[first] / 2, np.full(first.sum(), np.log(4.0)))
+        elif sizes is not False:
+            diameters = Range.create("sizes", sizes, radii[first], "metres")
+            size_range = Range(diameters.least / 2, diameters.span)
         if contacts is not None:
             contact_range = Range.create("contact_impedance", contacts, radii[first], "ohm·m²")
         thickness_range = None if thickness is None else Range.create("thickness", thickness, np.ones(1), "metres")
         room = radii.min() if size_range is None else size_range.least.min()
         low, size = np.array([x_min, y_min]) + room, np.array([x_max - x_min, y_max - y_min]) - 2 * room
         if (size <= 0).any():
-            raise ValueError("outline: it is smaller than an electrode; give millimetres divided by 1000.")
+            name = "outline: it" if size_range is None else "sizes: the outline"
+            raise ValueError(f"{name} is smaller than an electrode; give millimetres divided by 1000.")
         every = (np.einsum("kij,gj->kgi", images, centres[first] - middle) + middle).reshape(-1, 2)
         # Which image is which electrode: the nearest, all in all.
         order = linear_sum_assignment(np.linalg.norm(centres[:, None] - every, axis=-1))[1]
@@ -116,6 +119,12 @@ class Design(eqx.Module):
         pitch = float(np.sqrt(np.prod(size) / len(order)))
         ranges = size_range, contact_range, thickness_range
         return cls(low, size, images, order, repeated, *ranges, np.concatenate(start), pitch)
+
+    def holds(self, skin: Skin) -> bool:
+        """Whether the variables can stand for `skin`: it is symmetric as asked, and within the ranges."""
+        found = self.skin(jnp.asarray(self.start))
+        same = (np.allclose(one, other, rtol=1e-6, atol=0) for one, other in zip(found[1:], skin[1:], strict=True))
+        return bool(np.allclose(found.centres, skin.centres, atol=1e-6)) and all(same)
 
     @property
     def num_generators(self) -> int:

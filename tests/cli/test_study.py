@@ -67,7 +67,11 @@ def test_run_stop_resume_and_report(file, run, monkeypatch):
     status, out, _ = run("study", "report", file, "--page", file.parent / "other.html")
     assert (status, (file.parent / "other.html").is_file()) == (0, True)
     error = failed(run("study", "report", file, "--page", file.parent / "none" / "other.html"))
-    assert "other.html: the report cannot be written (No such file or directory)" in error
+    assert "there is no folder" in error
+    error = failed(run("study", "report", file, "--page", file))
+    assert "that is the study itself" in error
+    assert "[electrodes]" in file.read_text()
+    assert "something else already" in failed(run("study", "run", file, "--output", file))
     file.write_text(TEXT.replace("rows = 5", "rows = 6"), "utf-8")
     assert "another study, or of this one before it was changed" in failed(run("study", "resume", file))
 

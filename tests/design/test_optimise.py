@@ -183,6 +183,14 @@ def test_errors_teach():
         optimise(Layout(START.centres, 8e-3, outline=Rectangle(0.1, 0.3)), symmetry="rotate-4")
     with pytest.raises(ValueError, match="keep_out: it leaves no room"):
         optimise(starts=2, key=jax.random.key(0), keep_out=(Rectangle(0.2, 0.2),))
+    with pytest.raises(ValueError, match="outline: it reaches 50 mm beyond the model's mesh"):
+        optimise(outline=Rectangle(0.2, 0.2))
+    with pytest.raises(ValueError, match="keep_out must be a list of domains"):
+        optimise(keep_out=Disk(0.01))
+    with pytest.raises(ValueError, match="more than the skin is wide; are they millimetres"):
+        optimise(thickness=(5, 20))
+    with pytest.raises(ValueError, match="sizes: the outline is smaller than an electrode"):
+        optimise(sizes=(8, 20))
     with pytest.raises(ValueError, match="outline: the layout does not know"):
         optimise(Layout(START.centres, 8e-3))
     with pytest.raises(ValueError, match="the model 8; their number cannot change"):

@@ -40,6 +40,9 @@ def test_the_blind_spot_is_the_share_below_a_level(theta):
     assert float(theta.blind_spot(level)) == pytest.approx(0.5, abs=0.02)
     assert float(theta.blind_spot(theta.minimum)) == 0
     assert float(theta.blind_spot(np.inf)) == 1
+    for level in (np.nan, -1.0):
+        with pytest.raises(ValueError, match="level must be a sensitivity"):
+            theta.blind_spot(level)
 
 
 def test_a_grid_covers_the_skin():

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.design import Bell, Hemisphere, press, touch_changes
+from jeit.design import Bell, Hemisphere, Presses, press, touch_changes
 from jeit.electrodes import FaceDiscs, PointElectrodes, SheetDiscs, grid
 from jeit.forward import ForwardModel
 from jeit.mesh import layer, rectangle
@@ -65,6 +65,27 @@ def test_exact_changes_are_those_of_solving_anew(kind, options, models):
         expected = anew(model, conductivity, presses)
         found = touch_changes(model, conductivity, presses)
         np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_a_touch_that_is_found_at_once_waits_for_a_slow_one(models):
+    """One changes a single cell; the other's conductivities are seven orders of magnitude apart."""
+    model, draw = models["sheet"], np.random.default_rng(0)
+    middles = np.asarray(model.mesh.points)[np.asarray(model.mesh.cells)].mean(axis=1)
+    cells = np.argsort(np.linalg.norm(middles, axis=1))[:60]
+    change = np.zeros((8, 60))
+    change[:7, 0] = -np.linspace(0.1, 1, 7)
+    change[7] = 10 ** draw.uniform(-3, 4, 60) - 1
+    presses = Presses(jnp.zeros((8, 2)), jnp.asarray(np.tile(cells, (8, 1))), jnp.asarray(change), model.mesh.num_cells)
+    conductivity = np.full(model.mesh.num_cells, 0.5)
+    expected = anew(model, conductivity, presses)
+    found = touch_changes(model, conductivity, presses)
+    np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_touches_of_another_mesh_are_refused(models):
+    presses = press(models["layer"].mesh, Bell(), PLACES)
+    with pytest.raises(ValueError, match="the touches are of a mesh of"):
+        touch_changes(models["sheet"], 0.5, presses)
 
 
 def test_small_touches_are_linear(models):

@@ -44,6 +44,7 @@ def scores_of(data) -> list[str]:
 def draw_scores(data):
     """Every score, point by point, a colour for each layout."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     names = scores_of(data)
     columns = min(_COLUMNS, len(names))
@@ -60,6 +61,7 @@ def draw_scores(data):
             top = np.ones(infinite.sum())
             axes.plot(point[infinite], top, "^", ms=5, color=f"C{number}", transform=axes.get_xaxis_transform())
         axes.set_title(name.replace("_", " ") + ("" if unit == "1" else f" ({unit})"), fontsize=9)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.3)
     for axes in panels[len(names) :]:

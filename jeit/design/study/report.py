@@ -44,7 +44,10 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
         f"{'a layer' if study.points[0].layers else 'a sheet'}.</p>",
         *([_picture(draw_scatter(data), "Mean and least sensitivity of every point")] if len(study.points) > 1 else []),
         *([_picture(draw_scores(data), "Scores of every point; triangles are infinite")] if scores_of(data) else []),
-        _picture(draw_maps(study, data), f"Sensitivity maps of {len(shown(data))} points, electrodes as circles"),
+        _picture(
+            draw_maps(study, data),
+            f"Sensitivity maps of {len(shown(data))} points, electrodes as circles, axes in millimetres",
+        ),
         "<h2>Points</h2>",
         _table(study, data),
         "<h2>Configuration</h2>",
