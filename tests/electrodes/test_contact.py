@@ -16,12 +16,13 @@ from jeit.electrodes import (
     SheetDiscs,
     contact_impedance,
     electrodes_from_nodes,
+    grid,
     plates,
     ring,
     with_contact_impedance,
 )
 from jeit.forward import ForwardModel
-from jeit.mesh import Mesh, box, cylinder, disk, facet_measures, rectangle
+from jeit.mesh import Mesh, box, cylinder, disk, facet_measures, layer, rectangle
 from jeit.protocol import adjacent
 
 ROUNDING = 1e-12
@@ -197,3 +198,19 @@ def test_single_precision_is_enough_to_make_a_model():
     electrodes = BoundaryElectrodes(ring(0.05, 16), width=0.008, contact_impedance=0.1)
     double = ForwardModel(mesh, electrodes, adjacent(16, current=1e-3)).voltages(1e-3)
     np.testing.assert_allclose(single, double, rtol=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["sheet", "face"])
+def test_electrodes_that_share_a_cell_are_all_seen(kind):
+    """Twelve discs a fifth of a millimetre apart, on cells as large as they are: as each of them alone."""
+    mesh = rectangle(0.06, 0.06, cell_size=5e-3)
+    places = grid(3 * 6.2e-3, 2 * 6.2e-3, 4, 3)
+    if kind == "face":
+        mesh, places = layer(mesh, 5e-3, 1), np.column_stack([places, np.zeros(12)])
+    discs = SheetDiscs if kind == "sheet" else FaceDiscs
+    together = discs(places, 3e-3, 1e-3).contact(mesh)
+    alone = [discs(place[None], 3e-3, 1e-3).contact(mesh) for place in places]
+    np.testing.assert_allclose(together.load, np.hstack([one.load for one in alone]), atol=1e-12)
+    np.testing.assert_allclose(together.mass[0], sum(np.asarray(one.mass[0]) for one in alone), atol=1e-12)
+    cells = np.asarray(mesh.cells if kind == "sheet" else mesh.facets)
+    assert ((np.asarray(together.load) > 0)[cells].any(axis=1).sum(axis=1) > 1).any()
