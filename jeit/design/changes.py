@@ -8,31 +8,33 @@ currents into the electrodes and G = K⁻¹, both restricted to those nodes,
 (Sherman-Morrison-Woodbury), by conjugate gradients with G as the preconditioner: they need products with G and D only,
 never G⁻¹, in few steps, as touches of a bounded depth change the energy of any field by a bounded factor; nodes that a
 touch cuts off make the matrix singular, but nothing flows there. With the residual R of Y, (D F)ᵀ Y + Yᵀ R lacks
-Rᵀ (G⁻¹ + D)⁻¹ R, and Rᵀ G R is most of that.
+Rᵀ (G⁻¹ + D)⁻¹ R, and Rᵀ G R is most of that. G is needed only between nodes of one touch, which lie near each other.
 """
 
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jeit.design.press import Presses
+from jeit.design.touched_nodes import touched_nodes
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity, stiffness
 from jeit.forward.model import select_channels
 from jeit.forward.transfer import fields_and_inverse
-from jeit.mesh import Mesh
 from jeit_solvers import over_cores
 
-# Of Rᵀ G R, relative to the voltages, which are more exact than that.
-_TOLERANCE, _SMALLEST, _MOST_STEPS = 1e-9, 1e-12, 200
-# Touches worked on at once: their blocks of the inverse are to stay in the cache.
-_CHUNK = 8
-# Touches whose nodes are sought at once.
-_AT_ONCE = 64
+# Of the error's bound, relative to the voltages; steps to get there.
+_TOLERANCE, _MOST_STEPS = 1e-8, 200
+# Flow around what is cut off changes by a factor that its shape bounds, not the conductivity left. And where next to
+# nothing is left, the conductivity bounds too much.
+_CUT_OFF, _MOST_WEAKENED = 10.0, 1e6
+# Of the voltages, relative to the load's energy: below, they are rounding.
+_SMALLEST = 1e-12
+# Touches worked on at once: their blocks of the inverse are to stay in the cache, or of the Jacobian.
+_EXACT, _LINEAR = 2, 8
 
 
 def touch_changes(model: ForwardModel, conductivity, presses: Presses, *, linear: bool = False) -> Float[Array, "n M"]:
@@ -64,45 +66,17 @@ def _linear(model: ForwardModel, conductivity, presses: Presses):
         return jnp.einsum("bc,bcm->bm", changed[index], jacobian[presses.cells[index]])
 
     number = len(changed)
-    index = jnp.minimum(jnp.arange(-(-number // _CHUNK) * _CHUNK), number - 1).reshape(-1, _CHUNK)
+    index = jnp.minimum(jnp.arange(-(-number // _LINEAR) * _LINEAR), number - 1).reshape(-1, _LINEAR)
     return _joined(jax.lax.map(some, index))[:number]
 
 
-class _Touched(eqx.Module):
-    """Nodes of touches: `union` (u,) of all; `nodes` (n, k) of each, as places in the union, repeated to be as many;
-    `corners` (n, c, d + 1), the nodes of cells, as places among those k."""
-
-    union: Int[np.ndarray, " u"]
-    nodes: Int[np.ndarray, "n k"]
-    corners: Int[np.ndarray, "n c q"]
-
-
-def _nodes(mesh: Mesh, presses: Presses) -> _Touched:
-    cells, real = np.asarray(presses.cells), np.asarray(presses.change) != 0
-    corners = np.asarray(mesh.cells)[cells]  # (n, c, q)
-    union = np.unique(corners[real])
-    place = np.full(mesh.num_points, -1)
-    place[union] = np.arange(len(union))
-    own = np.where(real[..., None], place[corners], len(union))  # all that is not touched is one node more
-    local, each = np.zeros(corners.shape, np.int32), []
-    for some in np.array_split(np.arange(len(own)), -(-len(own) // _AT_ONCE)):
-        row = np.arange(len(some))[:, None, None]
-        reached = np.zeros((len(some), len(union) + 1), bool)
-        reached[row, own[some]] = True
-        local[some] = (np.cumsum(reached, axis=1, dtype=np.int32) - 1)[row, own[some]]
-        each += [np.flatnonzero(one) for one in reached[:, :-1]]
-    local[~real] = 0
-    most = -(-max(map(len, each)) // 8) * 8
-    padded = np.stack([np.pad(one, (0, most - len(one)), mode="edge") for one in each])
-    return _Touched(union, padded.astype(np.int32), local)
-
-
 def _exact(model: ForwardModel, conductivity, presses: Presses):
-    touched = _nodes(model.mesh, presses)
-    known = fields_and_inverse(model.mesh, conductivity, model.electrodes, model.system, jnp.asarray(touched.union))
+    touched = touched_nodes(model, presses)
+    reach = touched.strips.reach(touched.nodes)
+    known = fields_and_inverse(model.mesh, conductivity, model.electrodes, model.system, touched.strips, reach)
     touches = jax.tree.map(jnp.asarray, (presses.cells, presses.change, touched.nodes, touched.corners))
     number = len(presses.cells)
-    found = over_cores(partial(_changes, model, conductivity, known, touches), number, _CHUNK)[:number]
+    found = over_cores(partial(_changes, model, conductivity, known, touches), number, _EXACT)[:number]
     lost = np.flatnonzero(~np.isfinite(np.asarray(found)).all(axis=1))
     if lost.size:
         x, y = np.asarray(presses.places)[lost[0]]
@@ -123,7 +97,7 @@ def _changes(model: ForwardModel, conductivity, known, touches, index):
     def some(index):
         cells, change, nodes, corners = (array[index] for array in touches)
         blocks = element[cells] * change[..., None, None]
-        return select(_impedance_changes(blocks, corners, inverse[nodes[:, :, None], nodes[:, None]], fields[nodes]))
+        return select(_impedance_changes(blocks, corners, inverse.blocks(nodes), fields[nodes], _weakened(change)))
 
     return _joined(jax.lax.map(some, index))
 
@@ -132,7 +106,13 @@ def _joined(chunks: Float[Array, "c s *m"]) -> Float[Array, "cs *m"]:
     return chunks.reshape(-1, *chunks.shape[2:])
 
 
-def _impedance_changes(blocks, corners, inverse, fields):
+def _weakened(change: Float[Array, "b c"]) -> Float[Array, " b"]:
+    """By what factor touches lower the energy of a field, at most."""
+    left = 1 + change
+    return jnp.clip(jnp.where(left > 0, 1 / jnp.where(left > 0, left, 1.0), _CUT_OFF).max(axis=1), 1, _MOST_WEAKENED)
+
+
+def _impedance_changes(blocks, corners, inverse, fields, weakened):
     """ΔZ (b, L, L) of b touches, from D as `blocks` (b, c, q, q) of cells at `corners` (b, c, q), G (b, k, k) and F
     (b, k, L). The steps are those of all touches together, until the last has converged."""
     touch = jnp.arange(len(fields))[:, None, None]
@@ -148,7 +128,7 @@ def _impedance_changes(blocks, corners, inverse, fields):
         product = scaled + added @ direction
         curvature = jnp.sum(direction * product, axis=1, keepdims=True)
         # What has converged stays: nothing but rounding is left of it, and of its curvature.
-        going = (energy > _TOLERANCE * scale) & (curvature > 0)
+        going = (energy > enough) & (curvature > 0)
         length = jnp.where(going, energy / jnp.where(going, curvature, 1.0), 0.0)
         solution, residual = solution + length * direction, residual - length * product
         scaled_residual = inverse @ residual
@@ -158,18 +138,20 @@ def _impedance_changes(blocks, corners, inverse, fields):
 
     def unfinished(state):
         *_, energy, _, number = state
-        return (number < _MOST_STEPS) & jnp.any(energy > _TOLERANCE * scale)
+        return (number < _MOST_STEPS) & jnp.any(energy > enough)
 
     scaled_load, blank = inverse @ load, jnp.zeros_like(load)
     first = jnp.sum(load * scaled_load, axis=1, keepdims=True)
-    # Of what is to be found: conductors make the load large, and not the voltages.
-    small = jnp.sum(fields * load, axis=1, keepdims=True) ** 2 / jnp.where(first > 0, first, 1.0)
-    scale = jnp.clip(small, _SMALLEST * first, first)
+    # What is left of the error is at most Rᵀ G R, the energy, times what weakens it. Insulators change the voltages by
+    # Fᵀ D F and more, conductors by its square over the load's energy at least.
+    linear = jnp.abs(jnp.sum(fields * load, axis=1, keepdims=True))
+    voltages = jnp.minimum(linear, linear**2 / jnp.where(first > 0, first, 1.0))
+    enough = _TOLERANCE * jnp.maximum(voltages, _SMALLEST * first) / weakened[:, None, None]
     start = blank, load, scaled_load, blank, blank, first, jnp.zeros_like(first), jnp.zeros((), int)
     solution, residual, scaled_residual, *_, energy, _, _ = jax.lax.while_loop(unfinished, step, start)
     change = _transposed(solution) @ (load + residual) + _transposed(residual) @ scaled_residual
     change -= _transposed(fields) @ load
-    converged = jnp.all(energy <= _TOLERANCE * scale, axis=(1, 2))
+    converged = jnp.all(energy <= enough, axis=(1, 2))
     return jnp.where(converged[:, None, None], (change + _transposed(change)) / 2, jnp.nan)
 
 

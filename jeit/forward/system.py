@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jaxtyping import Array, Inexact, Int
+from jaxtyping import Array, Inexact
 
 from jeit.electrodes import AbstractElectrodes, Contact
 from jeit.forward.assembly import stiffness
@@ -77,17 +77,6 @@ class System(eqx.Module):
                 return operator.pattern.multiply(operator.values, columns)
 
             return jax.lax.custom_linear_solve(multiply, load, solve_columns, symmetric=True)
-
-        def column(vector):
-            return lx.linear_solve(operator, vector, self.solver, state=state, throw=False).value
-
-        return jax.vmap(column, in_axes=1, out_axes=1)(load)
-
-    def inverse_columns(self, operator: SparseSymmetric, state, columns: Int[Array, " s"]) -> Inexact[Array, "n s"]:
-        """Columns of A⁻¹; `state`: what the solver's `init` made of A."""
-        load = jnp.zeros((self.pattern.size, len(columns))).at[columns, jnp.arange(len(columns))].set(1.0)
-        if isinstance(self.solver, SparseCholesky):
-            return solve(self.solver.plan, state, load)
 
         def column(vector):
             return lx.linear_solve(operator, vector, self.solver, state=state, throw=False).value

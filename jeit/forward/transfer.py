@@ -11,10 +11,7 @@ point electrodes the load depends on their position, and 2 ∂_θ⟨load, F⟩ d
 SIAM Review 41 (1999) 85-101; Polydorides and Lionheart, Meas. Sci. Technol. 13 (2002) 1871-1883.
 """
 
-from functools import partial
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
@@ -22,10 +19,7 @@ from jeit.electrodes import AbstractElectrodes, Contact
 from jeit.forward.assembly import cell_conductivity, field_gradients
 from jeit.forward.system import System
 from jeit.mesh import Mesh
-from jeit_solvers import over_cores, symmetric_inverse
-
-# Rows of an inverse that are solved for at once.
-_ROWS = 64
+from jeit_solvers import NearInverse, Strips, near_inverse, symmetric_inverse
 
 
 @eqx.filter_custom_jvp
@@ -66,37 +60,23 @@ def electrode_fields(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, s
     return fields - (contact.load.T @ fields).mean(axis=0), impedance
 
 
-def fields_and_inverse(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System, nodes):
-    """F (u, L) at some nodes (u,), and the block of K⁻¹ among them (u, u), ohms, but for a constant in each.
+@eqx.filter_jit
+def fields_and_inverse(
+    mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System, strips: Strips, reach: int
+) -> tuple[Inexact[Array, "p L"], NearInverse]:
+    """F at places of strips of the nodes, and K⁻¹ between them, up to `reach` strips apart, ohms, but for a constant.
 
     K is the matrix of the electrode model with all electrodes floating: the potential at one node for a unit current
-    into another. What it leaves open, a constant, no change of conductivity sees. The last row may come repeatedly.
+    into another. What it leaves open, a constant, no change of conductivity sees.
     """
-    known = _before_inverse(mesh, conductivity, electrodes, system, nodes)
-    inverse = over_cores(partial(_rows_of_inverse, system, known, nodes), len(nodes), _ROWS)
-    return known[0], inverse
-
-
-@eqx.filter_jit
-def _before_inverse(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System, nodes):
-    """F at nodes; what is to be added to A⁻¹ there, X (u, L) of X Fᵀ, or None; A, and what the solver made of it."""
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
     fields, _ = electrode_fields(mesh, conductivity, electrodes, system)
+    fields, inverse = strips.spread(fields), near_inverse(strips, operator, reach)
+    if electrodes.is_point:
+        return fields, inverse
     # Electrodes carry what enters at the nodes back out: with X = A⁻¹ load, K⁻¹ = A⁻¹ + X Z Xᵀ, and X Z = F.
-    loads = None if electrodes.is_point else system.solve(operator, contact.load)[nodes]
-    return fields[nodes], loads, operator, system.solver.init(operator, {})
-
-
-@eqx.filter_jit
-def _rows_of_inverse(system: System, known, nodes, rows):
-    fields, loads, operator, state = known
-
-    def some(rows):
-        inverse = system.inverse_columns(operator, state, nodes[rows])[nodes].T
-        return inverse if loads is None else inverse + loads[rows] @ fields.T
-
-    return jax.lax.map(some, rows).reshape(-1, len(nodes))
+    return fields, inverse.add(strips.spread(system.solve(operator, contact.load)), fields)
 
 
 def _impedance(electrodes: AbstractElectrodes, product: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:

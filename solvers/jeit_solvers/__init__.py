@@ -13,6 +13,7 @@ from .descent import Descent
 from .few_unknowns import Minimum, definite_few, hessian_few, inverse_few, minimise_few, solve_few, symmetric_few
 from .kmeans import KMeans, kmeans
 from .multifrontal import Factor, factorise, half_solve, quadratic_form, solve
+from .near_inverse import NearInverse, Strips, near_inverse
 from .operator import SparseSymmetric
 from .over_cores import over_cores
 from .pattern import SparsityPattern
@@ -28,9 +29,11 @@ __all__ = [
     "KMeans",
     "Minimum",
     "Model",
+    "NearInverse",
     "SparseCholesky",
     "SparseSymmetric",
     "SparsityPattern",
+    "Strips",
     "analyse",
     "choose_solver",
     "definite_few",
@@ -41,6 +44,7 @@ __all__ = [
     "inverse_few",
     "kmeans",
     "minimise_few",
+    "near_inverse",
     "over_cores",
     "quadratic_form",
     "ridge_model",

@@ -68,18 +68,44 @@ def test_exact_changes_are_those_of_solving_anew(kind, options, models):
 
 
 def test_a_touch_that_is_found_at_once_waits_for_a_slow_one(models):
-    """One changes a single cell; the other's conductivities are seven orders of magnitude apart."""
+    """Some change or cut off few cells; the others' conductivities are seven orders of magnitude apart."""
     model, draw = models["sheet"], np.random.default_rng(0)
     middles = np.asarray(model.mesh.points)[np.asarray(model.mesh.cells)].mean(axis=1)
-    cells = np.argsort(np.linalg.norm(middles, axis=1))[:60]
-    change = np.zeros((8, 60))
-    change[:7, 0] = -np.linspace(0.1, 1, 7)
-    change[7] = 10 ** draw.uniform(-3, 4, 60) - 1
+    cells = np.argsort(np.linalg.norm(middles - 0.015, axis=1))[:60]
+    change = 10 ** draw.uniform(-3, 4, (8, 60)) - 1
+    change[::2] = 0
+    change[0, 0], change[2, 0], change[4, :5], change[6, :12] = -0.1, -1.0, -1.0, -1.0
     presses = Presses(jnp.zeros((8, 2)), jnp.asarray(np.tile(cells, (8, 1))), jnp.asarray(change), model.mesh.num_cells)
     conductivity = np.full(model.mesh.num_cells, 0.5)
     expected = anew(model, conductivity, presses)
     found = touch_changes(model, conductivity, presses)
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.slow
+def test_nearly_cut_off_layers_are_exact(models):
+    """A smooth edge leaves cells any fraction of their conductivity, down to millionths."""
+    model = models["layer"]
+    conductivity = np.full(model.mesh.num_cells, 0.5)
+    for indentation in (Bell(), Bell(depth=5e-3), Hemisphere(depth=3e-3, diameter=20e-3)):
+        presses = press(model.mesh, indentation, PLACES, edge=1e-3)
+        expected = anew(model, conductivity, presses)
+        found = touch_changes(model, conductivity, presses)
+        np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_touches_that_are_not_found_are_an_error(models, monkeypatch):
+    monkeypatch.setattr("jeit.design.changes._MOST_STEPS", 1)
+    model = models["sheet"]
+    presses = press(model.mesh, Bell(), np.array([[0.01, 0.02], [0.0, 0.0], [0.02, 0.0]]), **SHEET)
+    with pytest.raises(RuntimeError, match=r"3 of 3 touches were not found in 1 steps, the first at \(10, 20\) mm"):
+        touch_changes(model, 0.5, presses)
+
+
+def test_touches_that_change_nothing_change_no_voltage(models):
+    model = models["sheet"]
+    nothing = Presses(jnp.zeros((2, 2)), jnp.zeros((2, 3), int), jnp.zeros((2, 3)), model.mesh.num_cells)
+    np.testing.assert_array_equal(touch_changes(model, 0.5, nothing), 0.0)
 
 
 def test_touches_of_another_mesh_are_refused(models):

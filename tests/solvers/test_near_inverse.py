@@ -1,0 +1,90 @@
+"""Entries of the inverse near its diagonal, beside the dense inverse."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sparse_problems import box_cells, disk_cells, element_matrices, from_cells
+
+from jeit_solvers import SparseSymmetric, SparsityPattern, Strips, near_inverse
+
+
+def three_disks():
+    """Three parts that are not coupled, side by side and beyond each other."""
+    points, cells = disk_cells(60)
+    moves = np.array([[0.0, 0.0], [1.5, 3.0], [9.0, 0.0]])
+    everywhere = (points + moves[:, None]).reshape(-1, 2)
+    return from_cells(everywhere, np.vstack([cells, cells + 60, cells + 120]))
+
+
+def one_row():
+    cells = np.stack([np.arange(20), np.arange(1, 21)], axis=1)
+    pattern = SparsityPattern.from_elements([cells], 21)
+    return pattern, pattern.assemble(jnp.asarray(element_matrices(20, 2))), np.arange(21.0)[:, None]
+
+
+PROBLEMS = {
+    "disk": lambda: from_cells(*disk_cells(90)),
+    "box": lambda: from_cells(*box_cells(5)),
+    "three disks": three_disks,
+    "one row": one_row,
+}
+
+
+def all_pairs(strips, inverse, wanted, reach):
+    """Pairs of wanted unknowns that lie near enough, and G between them."""
+    place = strips.place[wanted]
+    strip = place // strips.wanted
+    first, second = np.nonzero(np.abs(strip[:, None] - strip) <= reach)
+    found = inverse.blocks(jnp.asarray(np.stack([place[first], place[second]], axis=1)))
+    return wanted[first], wanted[second], np.asarray(found)[:, 0, 1]
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+@pytest.mark.parametrize("reach", [1, 3, 50])
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_entries_are_those_of_the_dense_inverse(name, reach, share):
+    pattern, values, coordinates = PROBLEMS[name]()
+    chosen = np.random.default_rng(0).random(pattern.size) < share
+    strips = Strips.create(pattern, coordinates, chosen)
+    found = near_inverse(strips, SparseSymmetric(values, pattern), reach)
+    expected = np.linalg.inv(np.asarray(pattern.to_dense(values)))
+    rows, columns, entries = all_pairs(strips, found, np.flatnonzero(chosen), reach)
+    assert len(rows) > chosen.sum()
+    np.testing.assert_allclose(entries, expected[rows, columns], rtol=0, atol=1e-13 * np.abs(expected).max())
+
+
+def test_strips_are_coupled_to_the_next_only_and_hold_all():
+    for problem in PROBLEMS.values():
+        pattern, _, coordinates = problem()
+        strips = Strips.create(pattern, coordinates, np.ones(pattern.size, bool))
+        assert len(np.unique(strips.position)) == pattern.size
+        strip = strips.position // strips.size
+        assert np.abs(strip[np.asarray(pattern.rows)] - strip[np.asarray(pattern.columns)]).max() <= 1
+        assert len(np.unique(strip)) == strips.number
+
+
+def test_products_are_added():
+    pattern, values, coordinates = PROBLEMS["disk"]()
+    chosen = np.arange(pattern.size) % 3 > 0
+    strips = Strips.create(pattern, coordinates, chosen)
+    left = np.random.default_rng(1).normal(size=(pattern.size, 4))
+    weights = np.diag([1.0, 2.0, 3.0, 4.0])
+    inverse = near_inverse(strips, SparseSymmetric(values, pattern), 2)
+    more = inverse.add(strips.spread(jnp.asarray(left)), strips.spread(jnp.asarray(left @ weights)))
+    expected = np.linalg.inv(np.asarray(pattern.to_dense(values))) + left @ weights @ left.T
+    rows, columns, entries = all_pairs(strips, more, np.flatnonzero(chosen), 2)
+    np.testing.assert_allclose(entries, expected[rows, columns], rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_what_is_not_positive_definite_is_not_a_number():
+    pattern, values, coordinates = PROBLEMS["disk"]()
+    strips = Strips.create(pattern, coordinates, np.ones(pattern.size, bool))
+    found = near_inverse(strips, SparseSymmetric(values.at[3].set(-1.0), pattern), 2)
+    assert np.isnan(np.asarray(found.band)).any()
+
+
+def test_groups_reach_from_their_first_strip_to_their_last():
+    pattern, _, coordinates = one_row()
+    strips = Strips.create(pattern, coordinates, np.ones(21, bool))
+    assert strips.reach(strips.place[np.array([[0, 0, 1], [4, 9, 6]])]) == 5
+    assert strips.reach(strips.place[np.array([[7, 7]])]) == 1
