@@ -6,21 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from jeit.cli import skins
 from jeit.cli.layout_optimise import optimise
-from jeit.cli.options import (
-    Conductivity,
-    Height,
-    LayoutName,
-    Quiet,
-    Thickness,
-    Width,
-    check_layer,
-    check_positive,
-    check_within,
-    make_folder,
-    naming_options,
-    read_skin,
-)
+from jeit.cli.options import Quiet, check_at_least, check_positive, check_within, make_folder, naming_options
 
 if TYPE_CHECKING:
     from jeit.design import Felt
@@ -48,13 +36,13 @@ def _top(context: typer.Context) -> None:
 
 @layout.command()
 def compare(
-    first: LayoutName,
-    second: LayoutName,
+    first: skins.LayoutName,
+    second: skins.LayoutName,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for report.json and comparison.png.", show_default=False)
     ],
-    thickness: Thickness = 10.0,
-    conductivity: Conductivity = 1.0,
+    thickness: skins.Thickness = 10.0,
+    conductivity: skins.Conductivity = 1.0,
     pairs: Annotated[
         int | None,
         typer.Option(
@@ -68,10 +56,14 @@ def compare(
         float, typer.Option("--margin-mm", help="Touch no nearer to the edge, where a touch is partly off the skin.")
     ] = 10.0,
     places: Annotated[int, typer.Option(help="Places touched along a side.")] = 48,
+    contrast: Annotated[
+        float,
+        typer.Option(help="Of the touched part's conductivity: 0 for an insulator, above 1 for a conductor."),
+    ] = 0.0,
     cell: Annotated[float, typer.Option("--cell-mm", help="Size of the mesh's cells, millimetres.")] = 4.5,
     seed: Annotated[int, typer.Option(help="Of the taxels' k-means.")] = 0,
-    width: Width = 200.0,
-    height: Height = 200.0,
+    width: skins.Width = 200.0,
+    height: skins.Height = 200.0,
     quiet: Quiet = False,
 ) -> None:
     """Touch two layouts all over, and say what each feels: sensitivity, blind spots, virtual taxels."""
@@ -79,18 +71,16 @@ def compare(
     from rich.console import Console
 
     from jeit.cli.console import Steps
-    from jeit.design import comparison, feel, touches_away_from_the_edge
+    from jeit.design import TouchedSkin, comparison, touches_away_from_the_edge
 
-    check_layer(thickness, conductivity)
+    skins.check_layer(thickness, conductivity)
     check_positive({"--cell-mm": cell})
     check_within("--places", places, 2, _MOST_PLACES)
-    for name, value, least in (("--pairs", pairs, 0), ("--taxels", taxels, 1), ("--seed", seed, 0)):
-        if value is not None and value < least:
-            raise ValueError(f"{name} must be at least {least}; it is {value}.")
+    check_at_least({"--pairs": (pairs, 0), "--taxels": (taxels, 1), "--seed": (seed, 0)})
     if not 0 <= margin < float("inf"):
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
-    skins = [read_skin(name, width, height) for name in (first, second)]
-    _check_same(*skins)
+    both = [skins.read(name, width, height) for name in (first, second)]
+    _check_same(*both)
     make_folder(output, _FILES)
     arguments = {
         "thickness": "--thickness-mm",
@@ -98,26 +88,32 @@ def compare(
         "num_pairs": "--pairs",
         "num_taxels": "--taxels",
         "margin": "--margin-mm",
+        "contrast": "--contrast",
     }
     console = Console(highlight=False)
-    felt: list[Felt] = []
     with naming_options(arguments), Steps(console, quiet=quiet) as step:
-        for one, outline in skins:
-            step(f"touch {one.name}")
+        step("mesh")
+        # Both, before either is touched: what is wrong with one is said at once.
+        touched = []
+        for one, outline in both:
             grid = touches_away_from_the_edge(outline, 1e-3 * margin, places, places)
             every = one.num_electrodes * (one.num_electrodes - 1) // 2
-            felt.append(
-                feel(
+            touched.append(
+                TouchedSkin.create(
                     one,
                     grid,
-                    key=jax.random.key(seed),
                     thickness=1e-3 * thickness,
                     conductivity=conductivity,
                     cell_size=1e-3 * cell,
                     num_pairs=min(_PAIRS, every) if pairs is None else pairs or None,
+                    contrast=contrast,
                     num_taxels=min(_TAXELS, len(grid.places)) if taxels is None else taxels,
                 )
             )
+        felt = []
+        for skin in touched:
+            step(f"touch {skin.layout.name}")
+            felt.append(skin.feel(jax.random.key(seed)))
         step("write")
         told = comparison(felt[0], felt[1])
         report = {
@@ -127,6 +123,7 @@ def compare(
                 "conductivity_S_per_m": conductivity,
                 "pairs": pairs,
                 "taxels": taxels,
+                "contrast": contrast,
                 "margin_mm": margin,
                 "places": places,
                 "cell_mm": cell,

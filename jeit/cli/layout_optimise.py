@@ -7,25 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from jeit.cli.options import (
-    Conductivity,
-    Height,
-    LayoutName,
-    Quiet,
-    Thickness,
-    Width,
-    check_layer,
-    check_positive,
-    make_folder,
-    naming_options,
-    read_skin,
-)
+from jeit.cli import skins
+from jeit.cli.options import Quiet, check_at_least, check_positive, check_within, make_folder, naming_options
 
 if TYPE_CHECKING:
     from jeit.design import Optimisation, Scores
     from jeit.mesh import Disk, Domain, Rectangle
 
 RESULTS = ("layout.csv", "layout.svg", "travel.png", "report.json")
+# Nodes to optimise on: fewest that make cells at all, and as many as there can be four times of.
+_LEAST_NODES, _MOST_NODES = 4, 250_000
 # Of the mesh that results are confirmed on, times those of the one optimised on; and of places along a side.
 _FINER, _PLACES, _MORE_PLACES = 4, 16, 24
 # Correlation length of the amplitudes of touches before any is felt, in metres: two deviations of the bell.
@@ -51,7 +42,7 @@ _TOLD = (
 
 
 def optimise(
-    layout: LayoutName,
+    layout: skins.LayoutName,
     output: Annotated[
         Path, typer.Option("--output", "-o", help=f"Folder for {', '.join(RESULTS)}.", show_default=False)
     ],
@@ -73,13 +64,13 @@ def optimise(
     starts: Annotated[int, typer.Option(help="The layout, and random ones.")] = 1,
     steps: Annotated[int, typer.Option(help="At most.")] = 60,
     seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
-    thickness: Thickness = 10.0,
-    conductivity: Conductivity = 1.0,
+    thickness: skins.Thickness = 10.0,
+    conductivity: skins.Conductivity = 1.0,
     contact_impedance: Annotated[float | None, typer.Option(help="ohm·m² (the layout's, or 1e-4).")] = None,
     noise: Annotated[float, typer.Option(help="Standard deviation of a voltage at 1 mA, volts.")] = 2e-5,
     num_points: Annotated[int, typer.Option(help="Nodes of the mesh to optimise on, about.")] = 1300,
-    width: Width = 200.0,
-    height: Height = 200.0,
+    width: skins.Width = 200.0,
+    height: skins.Height = 200.0,
     quiet: Quiet = False,
 ) -> None:
     """Move the electrodes of LAYOUT until its worst sensitivity and mean variance are as good as they get.
@@ -96,16 +87,15 @@ def optimise(
     from jeit.forward import ForwardModel
     from jeit.protocol import two_terminal
 
-    check_layer(thickness, conductivity)
+    skins.check_layer(thickness, conductivity)
     check_positive({"--noise": noise})
     if contact_impedance is not None:
         check_positive({"--contact-impedance": contact_impedance})
-    for name, value, least in (("--starts", starts, 1), ("--steps", steps, 1), ("--seed", seed, 0)):
-        if value < least:
-            raise ValueError(f"{name} must be at least {least}; it is {value}.")
+    check_at_least({"--starts": (starts, 1), "--steps": (steps, 1), "--seed": (seed, 0)})
     if not 0 <= minimum_spacing < float("inf"):
         raise ValueError(f"--minimum-spacing-mm must not be negative; it is {minimum_spacing:g}.")
-    start, outline = read_skin(layout, width, height)
+    check_within("--num-points", num_points, _LEAST_NODES, _MOST_NODES)
+    start, outline = skins.read(layout, width, height)
     free = [_region(text, outline) for text in keep_out or ()]
     known = start.contact_impedance is not None
     contact = contact_impedance if contact_impedance is not None else None if known else 1e-4

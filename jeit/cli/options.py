@@ -4,13 +4,9 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
-
-if TYPE_CHECKING:
-    from jeit.electrodes import Layout
-    from jeit.mesh import Domain
 
 Data = Annotated[Path, typer.Argument(help="Measured file to image.", show_default=False)]
 Reference = Annotated[
@@ -45,51 +41,6 @@ Hop = Annotated[
     float | None, typer.Option(help="From one window to the next, seconds (default 0.0125, or the calibration's).")
 ]
 
-LayoutName = Annotated[
-    str,
-    typer.Argument(
-        help="Built-in layout (park-inner, park-boundary, grid-CxR), or a file: CSV in millimetres, DXF or SVG.",
-        show_default=False,
-    ),
-]
-Width = Annotated[float, typer.Option("--width-mm", help="Of the skin, centred at 0, if a file does not say it.")]
-Height = Annotated[float, typer.Option("--height-mm", help="Of the skin, centred at 0, if a file does not say it.")]
-Thickness = Annotated[float, typer.Option("--thickness-mm", help="Of the skin, millimetres.")]
-Conductivity = Annotated[float, typer.Option("--conductivity", help="Of the skin, siemens per metre.")]
-# Of conductivities in S/m: deionised water and silver, with room to spare.
-_LEAST_CONDUCTIVITY, _MOST_CONDUCTIVITY = 1e-9, 1e9
-
-
-def read_skin(name: str, width: float, height: float) -> "tuple[Layout, Domain]":
-    """A layout, by name or from a file, and its skin's outline: width × height (mm) where a file does not say it.
-
-    Raises `ValueError` for fewer than three electrodes.
-    """
-    from jeit.electrodes import named_layout, read_layout
-    from jeit.electrodes.layout import LARGEST, SMALLEST
-    from jeit.mesh import Rectangle
-
-    found = read_layout(name) if Path(name).suffix else named_layout(name)
-    if found.outline is None:
-        for option, side in (("--width-mm", width), ("--height-mm", height)):
-            check_within(option, side, 1e3 * SMALLEST, 1e3 * LARGEST, "mm")
-        found = read_layout(name, outline=Rectangle(1e-3 * width, 1e-3 * height))
-    if found.num_electrodes < 3:
-        raise ValueError(f"'{found.name}' has {found.num_electrodes} electrodes; give a layout of three or more.")
-    return found, _plain(found.skin)
-
-
-def check_layer(thickness: float, conductivity: float) -> None:
-    """Raise `ValueError` unless --thickness-mm is more than a touch is deep and --conductivity one that a skin has."""
-    from jeit.design import Bell
-
-    deepest = 1e3 * Bell().depth
-    if not deepest < thickness < float("inf"):
-        raise ValueError(
-            f"--thickness-mm must be more than the {deepest:g} mm that a touch is deep; it is {thickness:g}."
-        )
-    check_within("--conductivity", conductivity, _LEAST_CONDUCTIVITY, _MOST_CONDUCTIVITY, "S/m")
-
 
 @contextmanager
 def naming_options(options: dict[str, str]) -> Iterator[None]:
@@ -104,24 +55,18 @@ def naming_options(options: dict[str, str]) -> Iterator[None]:
         raise
 
 
-def _plain(outline: "Domain") -> "Domain":
-    """A drawing's four corners are a rectangle if they are one: it is then meshed as one."""
-    from jeit.mesh import Disk, Rectangle
-
-    if isinstance(outline, Disk | Rectangle) or getattr(outline, "holes", ()) or len(outline.vertices) != 4:
-        return outline
-    low_x, high_x, low_y, high_y = outline.extent
-    width, height = high_x - low_x, high_y - low_y
-    if abs(width * height - outline.area) > 1e-6 * width * height:
-        return outline
-    return Rectangle(width, height, ((low_x + high_x) / 2, (low_y + high_y) / 2))
-
-
 def check_positive(options: dict[str, float]) -> None:
     """Raise `ValueError` for options that are not positive and finite."""
     for name, value in options.items():
         if not 0 < value < float("inf"):
             raise ValueError(f"{name} must be positive; it is {value:g}.")
+
+
+def check_at_least(options: dict[str, tuple[int | None, int]]) -> None:
+    """Raise `ValueError` for options, if given, that are less than the least that goes with each."""
+    for name, (value, least) in options.items():
+        if value is not None and value < least:
+            raise ValueError(f"{name} must be at least {least}; it is {value}.")
 
 
 def check_within(name: str, value: float, least: float, most: float, unit: str = "") -> None:

@@ -47,9 +47,12 @@ def resume(
     file: File, output: Output = None, page: Page = None, scheduler: Scheduler = None, quiet: Quiet = False
 ) -> None:
     """Go on with a study that was stopped; finished chunks are not computed again."""
+    from jeit.design.study.store import Store
+
     sweep, store = _read(file, output)
     if not store.exists():
         raise ValueError(f"there is no {store} to go on with: begin with 'jeit study run {file}'.")
+    Store(sweep, store, create=False)  # is it one, and this study's?
     _run(sweep, file, store, page, scheduler, quiet)
 
 

@@ -7,11 +7,12 @@ Studies of many layouts, which survive a crash.
 
 from jeit.design.candidates import Candidates as Candidates
 from jeit.design.changes import touch_changes as touch_changes
-from jeit.design.compare import Felt as Felt
 from jeit.design.compare import comparison as comparison
-from jeit.design.compare import feel as feel
-from jeit.design.compare import touches_away_from_the_edge as touches_away_from_the_edge
 from jeit.design.constraints import Constraints as Constraints
+from jeit.design.feel import Felt as Felt
+from jeit.design.feel import TouchedSkin as TouchedSkin
+from jeit.design.feel import feel as feel
+from jeit.design.feel import touches_away_from_the_edge as touches_away_from_the_edge
 from jeit.design.indentation import AbstractIndentation as AbstractIndentation
 from jeit.design.indentation import Bell as Bell
 from jeit.design.indentation import Hemisphere as Hemisphere

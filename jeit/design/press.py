@@ -79,9 +79,9 @@ def press(
     changed = there & (share > 0)
     empty = np.flatnonzero(~changed.any(axis=1))
     if empty.size:
-        x, y = places[empty[0]]
+        x, y = 1e3 * places[empty[0]]
         raise ValueError(
-            f"{empty.size} of {len(places)} touches change no cell, the first at ({x:.4g}, {y:.4g}) m: they lie off "
+            f"{empty.size} of {len(places)} touches change no cell, the first at ({x:.4g}, {y:.4g}) mm: they lie off "
             "the skin, or its cells are too coarse for so shallow an indentation; refine the mesh, in a layer upwards."
         )
     kept, there = _padded([one[used] for one, used in zip(cells, changed, strict=True)])

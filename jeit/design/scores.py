@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 
 from jeit.design.indentation import AbstractIndentation
 from jeit.design.press import Presses, press
+from jeit.design.sensitivity import uniformity
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity
 from jeit.mesh import Mesh, centroids
@@ -145,7 +146,7 @@ class Scores(eqx.Module):
     @property
     def uniformity(self) -> Float[Array, "*layouts"]:
         """Mean Θ over its root mean square, as in `SensitivityMap`."""
-        return self.mean / jnp.sqrt(jnp.mean(self.sensitivity**2, axis=-1))
+        return uniformity(self.sensitivity)
 
     @property
     def mean_variance(self) -> Float[Array, "*layouts"]:

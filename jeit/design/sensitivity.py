@@ -56,6 +56,11 @@ def touch_grid(outline: Domain, columns: int = 48, rows: int = 48) -> TouchGrid:
     return TouchGrid(places[inside], row, column, (rows, columns), (float(width), float(height)))
 
 
+def uniformity(sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
+    """Mean Θ of n places over its root mean square: 1 where all are alike, less the more they differ."""
+    return jnp.mean(sensitivity, axis=-1) / jnp.sqrt(jnp.mean(sensitivity**2, axis=-1))
+
+
 class SensitivityMap(eqx.Module):
     """Sensitivity Θ of a skin at n places: ‖Δv‖₂ of the voltages' changes Δv by a touch there (Park et al. 2022).
 
@@ -83,7 +88,7 @@ class SensitivityMap(eqx.Module):
     @property
     def uniformity(self) -> Float[Array, ""]:
         """Mean Θ over its root mean square: 1 where all places are alike, less the more they differ."""
-        return self.mean / jnp.sqrt(jnp.mean(self.values**2, axis=-1))
+        return uniformity(self.values)
 
     def blind_spot(self, level) -> Float[Array, ""]:
         """Share of the area that is less sensitive than `level` (volts), such as another layout's minimum.

@@ -18,7 +18,8 @@ from jeit.mesh._delaunay import Front, doubled_areas, triangulate
 from jeit.mesh.refine import Refinement, SizeField
 
 DEFAULT_NUM_POINTS = 1200
-_MOST_POINTS = 1_000_000
+# Nodes of a mesh.
+MOST_POINTS = 1_000_000
 # Nodes that must be there, closer than this relative to the outline's length, are refused.
 _CLOSEST = 1e-6
 # How well the number of nodes is met before smoothing and repair, which may add or drop a few.
@@ -54,9 +55,9 @@ def check_count(name: str, value: int, least: int) -> int:
 
 def check_total(number: float, name: str) -> None:
     """Raise `ValueError` if the mesh would not fit a machine."""
-    if number > _MOST_POINTS:
+    if number > MOST_POINTS:
         raise ValueError(
-            f"{name}: this would make about {number:.2g} nodes; the limit is {_MOST_POINTS:.0e}. Lengths are in "
+            f"{name}: this would make about {number:.2g} nodes; the limit is {MOST_POINTS:.0e}. Lengths are in "
             "metres: check the units, or ask for larger cells."
         )
 

@@ -2,12 +2,11 @@
 
 import csv
 import json
-import re
-from pathlib import Path
 
 import matplotlib
 import numpy as np
 import pytest
+from pages import run_page
 from scipy.io import wavfile
 
 from jeit.acoustic import Calibration, measure, read_recording, write_recording
@@ -183,10 +182,7 @@ def test_the_documentation_runs(tmp_path, monkeypatch):
     """Every block of Python of the page, one after the other."""
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
-    page = (Path(__file__).resolve().parents[2] / "docs" / "hearing.md").read_text("utf-8")
-    names: dict = {}
-    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
-        exec(compile(block, "hearing.md", "exec"), names)
+    names = run_page("hearing.md")
     assert len(names["path"].touches) == 3
     assert names["jacobian"].shape == names["power"].shape[:1] + names["fit"].calibration.listeners.microphones.shape
     assert (tmp_path / "track.png").stat().st_size > 10_000

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from jeit.design import TouchedSkin
 from jeit.electrodes import Layout, grid, write_layout
 from jeit.mesh import Rectangle
 
@@ -41,6 +42,34 @@ def test_two_files_side_by_side(layouts, run, tmp_path):
     assert report["options"]["pairs"] == 6
 
 
+def test_the_second_layout_is_checked_before_the_first_is_touched(layouts, run, tmp_path, monkeypatch):
+    touched = []
+    monkeypatch.setattr(TouchedSkin, "feel", lambda skin, key: touched.append(skin.layout.name))
+    write_layout(Layout(grid(0.04, 0.03, 3, 2), 3e-3, outline=SKIN), tmp_path / "small.svg")
+    write_layout(Layout(grid(0.04, 0.0, 3, 1), 8e-3, outline=SKIN), tmp_path / "three.svg")
+    for second, said in (
+        ("none.svg", "none.svg"),
+        ("small.svg", "--cell-mm is 5 mm; give no more than 4.5 mm, as electrodes of 'small' are 3 mm across"),
+        ("three.svg", "--pairs is 6; 'three' has 3 electrodes, and they make 3 pairs"),
+    ):
+        command = ["layout", "compare", layouts[0], tmp_path / second, "--output", tmp_path / "out", *OPTIONS]
+        status, _, error = run(*command)
+        assert status == 1
+        assert said in error
+        assert "metres" not in error
+    assert touched == []
+
+
+def test_touches_that_conduct(layouts, run, tmp_path):
+    for contrast in (0, 5):
+        options = ["--output", tmp_path / f"out-{contrast}", *OPTIONS, "--contrast", contrast, "--quiet"]
+        assert run("layout", "compare", layouts[0], layouts[0], *options)[0] == 0
+    reports = [json.loads((tmp_path / f"out-{contrast}" / "report.json").read_text("utf-8")) for contrast in (0, 5)]
+    assert [report["options"]["contrast"] for report in reports] == [0, 5]
+    insulating, conducting = (report["layouts"][0]["sensitivity_mean_V"] for report in reports)
+    assert conducting != pytest.approx(insulating, rel=0.1)
+
+
 @pytest.mark.parametrize(("option", "value"), [("--width-mm", 0), ("--height-mm", 1e6)])
 def test_the_side_of_a_skin_is_a_length(option, value, layouts, run, tmp_path):
     status, _, error = run("layout", "compare", *layouts, "--output", tmp_path / "out", *OPTIONS, option, value)
@@ -66,7 +95,8 @@ def test_layouts_on_different_skins_are_not_compared(layouts, run, tmp_path):
         ([None, "--thickness-mm", 500], "--thickness-mm is 500 mm; give more than the 2.5 mm"),
         ([None, "--conductivity", -1], "--conductivity must be from 1e-09 to 1e+09 S/m"),
         ([None, "--cell-mm", 500], "--cell-mm is 500 mm; give no more than 12 mm"),
-        ([None, "--cell-mm", 0.001], "--cell-mm: this would make about"),
+        ([None, "--cell-mm", 0.001], "--cell-mm is 0.001 mm, which makes about 2.2e+10 nodes; give 0.15 mm or more"),
+        ([None, "--contrast", 1], "--contrast must be a factor for the conductivity"),
         ([None, "--places", 100_000], "--places must be from 2 to 256"),
         ([None, "--taxels", 0], "--taxels must be at least 1"),
         ([None, "--taxels", 101], "--taxels is 101; give from 1 to the"),

@@ -5,31 +5,18 @@ import os
 import sys
 
 import pytest
+from studies import SMALL
 
+from jeit.design.study import read_study
 from jeit.design.study.store import Store
 
 pytest.importorskip("xarray")
-
-TEXT = """
-chunk_points = 1
-[skin]
-width_mm = 100
-height_mm = 80
-[electrodes]
-layouts = ["grid-4x2", "perimeter-8"]
-diameter_mm = 10
-[touch]
-columns = 6
-rows = 5
-[mesh]
-cell_mm = 8
-"""
 
 
 @pytest.fixture
 def file(tmp_path):
     path = tmp_path / "sweep.toml"
-    path.write_text(TEXT, "utf-8")
+    path.write_text(SMALL, "utf-8")
     return path
 
 
@@ -72,13 +59,36 @@ def test_run_stop_resume_and_report(file, run, monkeypatch):
     assert "that is the study itself" in error
     assert "[electrodes]" in file.read_text()
     assert "something else already" in failed(run("study", "run", file, "--output", file))
-    file.write_text(TEXT.replace("rows = 5", "rows = 6"), "utf-8")
+    file.write_text(SMALL.replace("rows = 5", "rows = 6"), "utf-8")
     assert "another study, or of this one before it was changed" in failed(run("study", "resume", file))
+
+
+@pytest.mark.parametrize("command", ["resume", "status", "report"])
+def test_a_folder_that_holds_no_study(file, run, command):
+    folder = file.parent / "letters"
+    folder.mkdir()
+    (folder / "letter.txt").write_text("dear")
+    status, out, error = run("study", command, file, "-o", folder)
+    assert (status, out) == (1, "")
+    assert error == (
+        f"jeit: {folder} holds no study: name the store that 'jeit study run' wrote, or, for a new one, a place where "
+        "nothing is.\n"
+    )
+    assert [path.name for path in folder.iterdir()] == ["letter.txt"]
+
+
+@pytest.mark.parametrize("command", ["resume", "status", "report"])
+def test_a_damaged_store(file, run, command):
+    store = Store(read_study(file), file.with_suffix(".zarr"))
+    (store.path / "zarr.json").write_text('{"zarr_format": 3, "node', "utf-8")
+    error = failed(run("study", command, file))
+    assert f"{store.path / 'zarr.json'} cannot be read" in error
+    assert "Put that file back from a copy; or move the store away and run the study again." in error
 
 
 @pytest.mark.parametrize("command", ["run", "resume", "status", "report"])
 def test_bad_studies_are_refused_in_one_line(file, run, command):
-    file.write_text(TEXT + "cel_mm = 5\n", "utf-8")
+    file.write_text(SMALL + "cel_mm = 5\n", "utf-8")
     assert "sweep.toml: mesh.cel_mm is no key of a study (did you mean 'cell_mm'?)" in failed(
         run("study", command, file)
     )

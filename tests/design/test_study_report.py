@@ -6,28 +6,17 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from studies import SMALL
 
 from jeit.design.study import open_results, pictures, read_study, run_study, write_study_report
 from jeit.design.study.store import Store
 
 pytest.importorskip("xarray")
 
-TEXT = """
+TEXT = f"""
 # <script>alert("&")</script>
 name = "inside <b>or</b> around"
-chunk_points = 1
-[skin]
-width_mm = 100
-height_mm = 80
-[electrodes]
-layouts = ["grid-4x2", "perimeter-8"]
-diameter_mm = 10
-[touch]
-columns = 6
-rows = 5
-[mesh]
-cell_mm = 8
-"""
+{SMALL}"""
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +34,7 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.tags, self.links, self.text, self.cells = [], [], "", []
+        self.tags, self.links, self.text, self.cells, self.heads = [], [], "", [], []
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
@@ -56,6 +45,8 @@ class Page(HTMLParser):
         self.text += data
         if self.tags and self.tags[-1] == "td" and data.strip():
             self.cells.append(data)
+        if self.tags and self.tags[-1] == "th" and data.strip():
+            self.heads.append(data)
 
 
 def test_the_page_needs_nothing_else_and_escapes_all(folder):
@@ -78,11 +69,20 @@ def test_the_table_holds_what_was_found(folder):
     study = read_study(folder / "study.toml")
     page, data = Page((folder / "study.html").read_text("utf-8")), open_results(study, folder / "study.zarr")
     assert page.tags.count("tr") == 3
-    for value in [*data.minimum.values, *data.uniformity.values]:
+    for value in [*1e3 * data.minimum.values, *1e3 * data["mean"].values, *data.uniformity.values]:
         assert f"{value:.4g}" in page.cells
+    assert {"minimum / mV", "mean / mV", "uniformity"} <= set(page.heads)
     assert study.fingerprint in page.text
     assert re.search(r"Computed with jeit [\d.]+, jax [\d.]+", page.text)
     assert "2 of 2 points finished" in page.text
+
+
+def test_the_panels_of_scores_are_in_the_unit_of_the_maps(folder):
+    data = open_results(read_study(folder / "study.toml"), folder / "study.zarr")
+    panels = {axes.get_title(): axes for axes in pictures.draw_scores(data).axes}
+    assert set(panels) == {"minimum (mV)", "mean (mV)", "uniformity"}
+    drawn = np.concatenate([line.get_ydata() for line in panels["minimum (mV)"].lines])
+    np.testing.assert_allclose(drawn, 1e3 * data.minimum.values)
 
 
 def test_a_half_finished_study_is_reported_without_what_is_missing(folder, tmp_path):
@@ -115,7 +115,9 @@ def test_what_is_infinite_stands_in_table_and_picture(folder, tmp_path):
 
 def test_titles_tell_what_differs(tmp_path):
     varied = TEXT.replace("diameter_mm = 10", "diameter_mm = [8, 10]").replace(
-        "[touch]", '[measurement]\nprotocol = "two-terminal"\npairs = [0, 9]\nnoise_V = [1e-6, 2e-6]\n[touch]'
+        "[touch]",
+        '[measurement]\nprotocol = "two-terminal"\npairs = [0, 9]\nnoise_V = [1e-6, 2e-6]\n'
+        '[scores]\nwanted = "blind_spot"\n[touch]',
     )
     (tmp_path / "study.toml").write_text(varied, "utf-8")
     titles = pictures.titles_of(read_study(tmp_path / "study.toml"))

@@ -1,6 +1,7 @@
 """Study files: what a sweep is, and everything that is refused before anything runs."""
 
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,8 @@ def test_a_sweep_is_the_product_of_its_lists(read):
     study = read(
         'name = "all"\nchunk_points = 4\n[skin]\nthickness_mm = [5, 10]\nconductivity_S_per_m = [0.5, 1, 2]\n'
         '[electrodes]\nlayouts = ["grid-4x4", "perimeter-16", "inner-12"]\ndiameter_mm = [6, 8]\n'
-        '[measurement]\nprotocol = ["adjacent", "two-terminal"]\nnoise_V = [1e-6, 1e-5]\n[mesh]\ncell_mm = [5, 6]'
+        '[measurement]\nprotocol = ["adjacent", "two-terminal"]\nnoise_V = [1e-6, 1e-5]\n[mesh]\ncell_mm = [5, 6]\n'
+        '[scores]\nwanted = "blind_spot"'
     )
     assert len(study.points) == 3 * 2 * 2 * 3 * 2 * 2 * 2
     values = [tuple(point.coordinates.values()) for point in study.points]
@@ -98,6 +100,7 @@ def test_a_fingerprint_tells_what_decides_the_results(read, tmp_path):
     base = read(one())
     assert base == read("# a remark\nname = 'other'\n" + one())
     assert pickle.loads(pickle.dumps(base)) == base
+    wanted = "[scores]\nwanted = ['minimum'"
     texts = [
         one("grid-5x4"),
         one(electrodes="diameter_mm = 7"),
@@ -107,8 +110,12 @@ def test_a_fingerprint_tells_what_decides_the_results(read, tmp_path):
         one(rest='[touch]\nindentation = "hemisphere"'),
         one(rest="[touch]\ndeviation_mm = 8"),
         one(rest='[scores]\nwanted = "minimum"'),
-        one(rest="[scores]\nseed = 1"),
-        one(rest="[scores]\ncorrelation_mm = 20"),
+        *(
+            one(rest=f"{wanted}, 'taxels']{more}")
+            for more in ("", "\nseed = 1", "\nthreshold = 0.8", "\nnum_taxels = 80")
+        ),
+        *(one(rest=f"{wanted}, 'information']{more}") for more in ("", "\ncorrelation_mm = 20")),
+        *(one(rest=f"{wanted}, 'blind_spot']\n[measurement]\nnoise_V = {noise}") for noise in (1e-4, 1e-5)),
         one(rest="[touch]\ncontrast = 5"),
         one(rest="[touch]\nexact = true"),
         one(rest='[skin]\nmodel = "layer"'),
@@ -168,7 +175,7 @@ REFUSED = {
     ),
     "opposite": (one("grid-5x3", rest='[measurement]\nprotocol = "opposite"'), r"has 15 electrodes.*even number"),
     "pairs, other protocol": (
-        one(rest="[measurement]\npairs = 30"),
+        one(rest='[measurement]\nprotocol = ["adjacent", "two-terminal"]\npairs = 30'),
         r"measurement\.pairs is 30, and measurement\.protocol 'adjacent': only 'two-terminal'",
     ),
     "pairs, too many": (
@@ -196,6 +203,18 @@ REFUSED = {
         r"correlation_mm is 0\.015.*metres\? Then write 15\.",
     ),
     "deep": (one(rest="[skin]\nthickness_mm = 2"), r"touch\.depth_mm is 2\.5, and the skin 2 mm thick; press less"),
+    "deep, hemisphere": (
+        one(rest='[touch]\nindentation = "hemisphere"\ndiameter_mm = 4'),
+        r"touch\.depth_mm is 2\.5, and a hemisphere 4 mm across goes in no deeper than 2; press less",
+    ),
+    "fine": (
+        one(rest="[mesh]\ncell_mm = 0.1"),
+        r"mesh\.cell_mm is 0\.1 mm, which makes about 4\.8e\+06 nodes; give 0\.23 mm or more",
+    ),
+    "fine, layers": (
+        one(rest='[skin]\nmodel = "layer"\n[mesh]\ncell_mm = 0.4\nlayers = 4'),
+        r"mesh\.cell_mm is 0\.4 mm, which makes about 1\.5e\+06 nodes; give 0\.51 mm or more",
+    ),
     "coarse": (
         one(rest="[mesh]\ncell_mm = 30"),
         r"mesh\.cell_mm is 30, too coarse for electrodes 6 mm across; 3 would",
@@ -213,6 +232,32 @@ REFUSED = {
 def test_refused_naming_the_key_and_what_to_do(read, text, message):
     with pytest.raises(ValueError, match=message):
         read(text)
+
+
+@pytest.mark.parametrize(
+    ("key", "line", "other", "words"),
+    [
+        ("mesh.layers", "layers = 3", "skin.model", ["layer"]),
+        ("touch.diameter_mm", "diameter_mm = 20", "touch.indentation", ["hemisphere"]),
+        ("touch.deviation_mm", "indentation = 'hemisphere'\ndeviation_mm = 8", "touch.indentation", ["bell"]),
+        ("measurement.pairs", "pairs = 30", "measurement.protocol", ["two-terminal"]),
+        ("measurement.noise_V", "noise_V = [1e-5, 1e-6]", "scores.wanted", ["blind_spot", "localisation_error"]),
+        ("scores.num_taxels", "num_taxels = 80", "scores.wanted", ["taxels"]),
+        ("scores.threshold", "threshold = 0.8", "scores.wanted", ["taxels"]),
+        ("scores.seed", "wanted = 'information'\nseed = 1", "scores.wanted", ["taxels"]),
+        (
+            "scores.correlation_mm",
+            "wanted = 'localisation_error'\ncorrelation_mm = 20",
+            "scores.wanted",
+            ["information"],
+        ),
+    ],
+)
+def test_a_key_without_effect_is_refused(read, key, line, other, words):
+    with pytest.raises(ValueError, match=re.escape(f"{key} has no effect: it applies where {other} is")) as caught:
+        read(one(rest=f"[{key.split('.')[0]}]\n{line}"))
+    assert all(repr(word) in str(caught.value) for word in words)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(

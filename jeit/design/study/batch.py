@@ -8,7 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh as Devices
+from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float
 
 from jeit.design.changes import touch_changes
@@ -21,7 +22,7 @@ from jeit.design.study.spec import Point, Shape, Study
 from jeit.design.taxels import find_taxels
 from jeit.electrodes import FaceDiscs, SheetDiscs
 from jeit.forward import ForwardModel
-from jeit.mesh import layer, rectangle
+from jeit.mesh import Mesh, layer, rectangle
 from jeit.protocol import Protocol, adjacent, opposite, two_terminal
 
 
@@ -58,11 +59,19 @@ def check_points(study: Study) -> None:
         if key in seen:
             continue
         seen.add(key)
+        layers = f" and mesh.layers = {point.layers}" if point.layers else ""
+        where = f"mesh.cell_mm = {1e3 * point.cell_size:g}{layers}"
         try:
-            point.electrodes.check(_shared(study, point.shape).model.mesh)
+            point.electrodes.check(_mesh(study, point.shape))
+        except ValueError:
+            smallest = 1e3 * float(np.min(point.layout.diameters))
+            raise ValueError(
+                f"{where}: too coarse for electrodes of {point.layout.name!r}, {smallest:.3g} mm across; make cells "
+                "smaller."
+            ) from None
+        try:
+            _shared(study, point.shape)
         except ValueError as error:
-            layers = f" and mesh.layers = {point.layers}" if point.layers else ""
-            where = f"mesh.cell_mm = {1e3 * point.cell_size:g}{layers} with layout {point.layout.name!r}"
             raise ValueError(f"{where}: {error}") from None
 
 
@@ -94,11 +103,16 @@ def study_grid(study: Study) -> TouchGrid:
 
 
 @lru_cache(maxsize=4)
+def _mesh(study: Study, shape: Shape) -> Mesh:
+    """Of the sheet, or the layer."""
+    plane = rectangle(study.skin.width, study.skin.height, cell_size=shape.cell_size)
+    return layer(plane, shape.thickness, shape.layers) if shape.layers else plane
+
+
+@lru_cache(maxsize=4)
 def _shared(study: Study, shape: Shape) -> _Shared:
     point = next(point for point in study.points if point.shape == shape)
-    mesh = rectangle(study.skin.width, study.skin.height, cell_size=shape.cell_size)
-    if shape.layers:
-        mesh = layer(mesh, shape.thickness, shape.layers)
+    mesh = _mesh(study, shape)
     model = ForwardModel(mesh, point.electrodes, _protocol(point, study.current))
     grid, touches, prior = study_grid(study), None, None
     thickness = None if shape.layers else point.thickness
@@ -149,7 +163,7 @@ def _batch(
     batch = jax.vmap(one, in_axes=(None, 0))
     if num_devices == 1:
         return batch(shared, skins)
-    devices = Mesh(np.array(jax.devices()), ("point",))
+    devices = Devices(np.array(jax.devices()), ("point",))
     split = PartitionSpec("point")
     return jax.shard_map(batch, mesh=devices, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False)(
         shared, skins

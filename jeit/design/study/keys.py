@@ -126,12 +126,25 @@ _SECTIONS: dict[str, dict[str, _Key]] = {
         "seed": Quantity(0, 2**31 - 1, 0, whole=True),
     },
 }
+# Keys without effect unless another has one of these words.
+_NEEDS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "mesh.layers": ("skin.model", ("layer",)),
+    "touch.deviation_mm": ("touch.indentation", ("bell",)),
+    "touch.diameter_mm": ("touch.indentation", ("hemisphere",)),
+    "measurement.pairs": ("measurement.protocol", ("two-terminal",)),
+    "measurement.noise_V": ("scores.wanted", ("blind_spot", *OPTIMALITY)),
+    "scores.num_taxels": ("scores.wanted", ("taxels",)),
+    "scores.threshold": ("scores.wanted", ("taxels",)),
+    "scores.seed": ("scores.wanted", ("taxels",)),
+    "scores.correlation_mm": ("scores.wanted", ("information", "mean_variance", "largest_variance")),
+}
 
 
 def read_keys(table: dict[str, Any]) -> dict[str, Any]:
     """Every key's value, by its dotted name: lists where the key may be swept, defaults where it is missing.
 
-    A default of NaN is for the layout to say. Raises `ValueError` naming the key and what to do.
+    A default of NaN is for the layout to say. Raises `ValueError` naming the key and what to do, also for a key that
+    has no effect beside the others.
     """
     _refuse_unknown("", table, [*_TOP, *_SECTIONS])
     values = _section("", table, _TOP)
@@ -144,6 +157,7 @@ def read_keys(table: dict[str, Any]) -> dict[str, Any]:
     one_side = {"width_mm", "height_mm"} & set(table.get("skin", {}))
     if len(one_side) == 1:
         raise ValueError(f"skin.{one_side.pop()} is given alone; give both skin.width_mm and skin.height_mm.")
+    _refuse_idle(table, values)
     return values
 
 
@@ -165,6 +179,17 @@ def _refuse_unknown(prefix: str, table: dict[str, Any], known: Iterable[str]) ->
     for name in table:
         if name not in known:
             raise ValueError(f"{prefix}{name} is no key of a study{_meant(name, known)}; there are {', '.join(known)}.")
+
+
+def _refuse_idle(table: dict[str, Any], values: dict[str, Any]) -> None:
+    for where, (other, words) in _NEEDS.items():
+        section, name = where.split(".")
+        there = values[other] if isinstance(values[other], list) else [values[other]]
+        if name in table.get(section, {}) and not set(words) & set(there):
+            raise ValueError(
+                f"{where} has no effect: it applies where {other} is {' or '.join(map(repr, words))}, and that is "
+                f"{', '.join(map(repr, there))}; leave it out, or change the other."
+            )
 
 
 def _items(where: str, value: Any, swept: bool) -> list:

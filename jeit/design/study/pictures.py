@@ -41,6 +41,12 @@ def scores_of(data) -> list[str]:
     return [name for name in data.data_vars if data[name].dims == ("point",)]
 
 
+def told(data, name: str) -> tuple[np.ndarray, str]:
+    """Values of a score at every point, and their unit: as in the store, but millivolts for volts."""
+    values, unit = data[name].values, data[name].attrs.get("units", "1")
+    return (1e3 * values, "mV") if unit == "V" else (values, unit)
+
+
 def draw_scores(data):
     """Every score, point by point, a colour for each layout."""
     from matplotlib.figure import Figure
@@ -53,7 +59,7 @@ def draw_scores(data):
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     point = np.arange(data.sizes["point"])
     for axes, name in zip(panels, names, strict=False):
-        values, unit = data[name].values, data[name].attrs.get("units", "1")
+        values, unit = told(data, name)
         for number, layout in enumerate(dict.fromkeys(data.layout.values.tolist())):
             these = data.layout.values == layout
             finite, infinite = these & np.isfinite(values), these & np.isinf(values)

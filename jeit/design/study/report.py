@@ -10,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from jeit.design.study.pictures import draw_maps, draw_scatter, draw_scores, scores_of, shown
+from jeit.design.study.pictures import draw_maps, draw_scatter, draw_scores, scores_of, shown, told
 from jeit.design.study.run import study_progress
 from jeit.design.study.spec import Study
 from jeit.design.study.store import Store, open_results
@@ -85,11 +85,10 @@ def _picture(figure: Any, caption: str) -> str:
 def _table(study: Study, data) -> str:
     """A line for every point: what was swept, then what was found."""
     swept = list(study.points[0].coordinates)
-    scores = scores_of(data)
-    units = {name: data[name].attrs.get("units", "1") for name in scores}
-    heads = ["point", *swept, *(name if units[name] == "1" else f"{name} / {units[name]}" for name in scores)]
+    found = {name: told(data, name) for name in scores_of(data)}
+    heads = ["point", *swept, *(name if unit == "1" else f"{name} / {unit}" for name, (_, unit) in found.items())]
     lines = ["".join(f'<th class="{"text" if head in _TEXT else "number"}">{escape(head)}</th>' for head in heads)]
-    columns = [data[name].values.tolist() for name in (*swept, *scores)]
+    columns = [data[name].values.tolist() for name in swept] + [values.tolist() for values, _ in found.values()]
     for number, row in enumerate(zip(*columns, strict=True)):
         lines.append("".join(_cell(value) for value in (number, *row)))
     return '<div class="wide"><table>' + "\n".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jeit.design.fineness import check_fineness
 from jeit.design.indentation import AbstractIndentation, Bell, Hemisphere
 from jeit.design.study.keys import OPTIMALITY, read_keys
 from jeit.design.study.layouts import is_file, study_layout
@@ -176,9 +177,9 @@ def read_study(path: str | Path) -> Study:
         # of sheets also "information", "mean_variance", "largest_variance", "localisation_error": correlation_mm
 
     Only `electrodes.layouts` must be there. Files are looked for beside the study's. Raises `FileNotFoundError` if
-    there is no such file and `ValueError`, naming the key and what to do, for keys that are not known, values out of
-    range (such as metres for millimetres), electrodes that overlap, impossible spacings, and layouts that do not
-    have the electrodes that a protocol needs.
+    there is no such file and `ValueError`, naming the key and what to do, for keys that are not known or have no effect
+    beside the others, values out of range (such as metres for millimetres), electrodes that overlap, impossible
+    spacings, and layouts that do not have the electrodes that a protocol needs.
     """
     path = Path(path)
     if not path.is_file():
@@ -202,7 +203,13 @@ def _study(text: str, values: dict, folder: Path) -> Study:
     if values["touch.indentation"] == "bell":
         indentation = Bell(1e-3 * depth, 1e-3 * values["touch.deviation_mm"])
     else:
-        indentation = Hemisphere(1e-3 * depth, 1e-3 * values["touch.diameter_mm"])
+        across = values["touch.diameter_mm"]
+        if depth > across / 2:
+            raise ValueError(
+                f"touch.depth_mm is {depth:g}, and a hemisphere {across:g} mm across goes in no deeper than "
+                f"{across / 2:g}; press less, or give a larger touch.diameter_mm."
+            )
+        indentation = Hemisphere(1e-3 * depth, 1e-3 * across)
     if values["touch.contrast"] == 1:
         raise ValueError(
             "touch.contrast is 1, which changes nothing; take 0 for an insulator, above 1 for a conductor."
@@ -264,6 +271,7 @@ def _check(study: Study) -> None:
                 f"mesh.cell_mm is {1e3 * point.cell_size:g}, too coarse for electrodes {1e3 * smallest:.3g} mm across; "
                 f"{1e3 * smallest / 2:.3g} would do."
             )
+        check_fineness("mesh.cell_mm", point.cell_size, study.skin.area, point.layers)
 
 
 def _check_measurement(point: Point) -> None:

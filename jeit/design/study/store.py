@@ -46,8 +46,8 @@ class Store:
     """The store of `study` at `path`; made empty if there is none."""
 
     def __init__(self, study: Study, path: str | Path, *, create: bool = True):
-        """Raises `FileNotFoundError` if there is no store and none is to be made, `ValueError` if there is another
-        study's or something else, or if it is damaged, `ImportError` without the extra `cluster`, and `OSError` if it
+        """Raises `FileNotFoundError` if there is no store and none is to be made, `ValueError` if there is something
+        else, or another study's, or if it is damaged, `ImportError` without the extra `cluster`, and `OSError` if it
         cannot be written."""
         zarr = require("zarr")
         self.study, self.path = study, Path(path)
@@ -58,12 +58,21 @@ class Store:
                 _create(zarr, study, self.path)
             except OSError as error:
                 raise OSError(error.errno, f"the study's store cannot be made ({error.strerror})", str(path)) from error
-        if self._attributes().get("fingerprint") != study.fingerprint:
+        attributes = self._attributes()
+        if not attributes:
+            raise ValueError(
+                f"{self.path} holds no study: name the store that 'jeit study run' wrote, or, for a new one, a place "
+                "where nothing is."
+            )
+        if attributes.get("fingerprint") != study.fingerprint:
             raise ValueError(
                 f"{self.path} holds the results of another study, or of this one before it was changed; move it away "
                 "or choose another --output."
             )
-        self._group = zarr.open_group(str(self.path), mode="r+")
+        try:
+            self._group = zarr.open_group(str(self.path), mode="r+")
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise self._damaged(error) from None
 
     @property
     def versions(self) -> dict[str, str]:
@@ -129,12 +138,20 @@ class Store:
         except (FileNotFoundError, NotADirectoryError):
             return {}
         except (OSError, ValueError) as error:
-            raise ValueError(
-                f"{self.path / 'zarr.json'} cannot be read ({error}): the store is damaged, and does not say what is "
-                "finished. Put that file back from a copy; or move the store away and run the study again."
-            ) from None
-        attributes = content.get("attributes", {}) if isinstance(content, dict) else {}
-        return attributes if "finished" in attributes else {}
+            raise self._damaged(error) from None
+        attributes = content.get("attributes") if isinstance(content, dict) else None
+        if not isinstance(attributes, dict) or "finished" not in attributes:
+            return {}
+        if not all(isinstance(attributes.get(name), dict) for name in ("finished", "versions")):
+            raise self._damaged("what it says of finished chunks makes no sense")
+        return attributes
+
+    def _damaged(self, reason: object) -> ValueError:
+        said = " ".join(str(reason).split()).rstrip(".")
+        return ValueError(
+            f"{self.path / 'zarr.json'} cannot be read ({said}): the store is damaged, and does not say what is "
+            "finished. Put that file back from a copy; or move the store away and run the study again."
+        )
 
 
 def open_results(study: Study, path: str | Path):

@@ -1,0 +1,158 @@
+"""Studies against kill -9, full disks, damaged files and lost workers: nothing is lost, nothing solved twice."""
+
+import errno
+import os
+import re
+import shutil
+import signal
+
+import numpy as np
+import pytest
+from studies import ARRAYS, contents, in_another_process
+
+from jeit.design.study import open_results, run_study, study_progress
+from jeit.design.study import store as store_module
+from jeit.design.study.store import Store
+
+pytest.importorskip("xarray")
+pytest.importorskip("zarr")
+
+
+KILLED = """
+import os, signal, sys
+from jeit.design.study import read_study, run_study
+from jeit.design.study.store import Store
+
+write, calls = Store.write_array, []
+
+def dying(self, name, points, values):
+    calls.append(name)
+    if len(calls) == {calls}:
+        write(self, name, points[:1], values[:1])
+        os.kill(os.getpid(), signal.SIGKILL)
+    write(self, name, points, values)
+
+Store.write_array = dying
+run_study(read_study(sys.argv[1]), sys.argv[2])
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+def test_killed_in_the_middle_of_a_chunk_and_resumed_the_store_is_the_same(
+    study, study_file, whole_store, store_path, watch_chunks
+):
+    # The second chunk, half of its last array.
+    ended = in_another_process(KILLED.format(calls=2 * ARRAYS), study_file, store_path)
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    assert study_progress(study, store_path).chunks == 1
+    torn = contents(store_path)
+    assert len([name for name in torn if name.startswith("sensitivity/c/")]) > 2
+    data = open_results(study, store_path)
+    assert data.finished.values.sum() == 2
+    assert np.isnan(data.sensitivity.values[~data.finished.values]).all()  # what is torn is not read
+    solved = watch_chunks()
+    run_study(study, store_path)
+    assert solved == [1, 2]
+    assert contents(store_path) == contents(whole_store)
+
+
+@pytest.mark.parametrize("where", ["before the mark", "in the mark"])
+def test_stopped_about_the_mark(study, whole_store, store_path, monkeypatch, where):
+    """Interrupted between a chunk's arrays and its mark, or before the mark takes the place of the old one."""
+
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        if where == "before the mark":
+            patch.setattr(Store, "_mark", stop)
+        else:
+            patch.setattr(store_module.os, "fsync", stop)
+        with pytest.raises(KeyboardInterrupt):
+            run_study(study, store_path)
+    assert not [name for name in os.listdir(store_path.parent) if name.endswith(".tmp")]
+    if store_path.exists():
+        assert study_progress(study, store_path).chunks == 0
+    run_study(study, store_path)
+    assert contents(store_path) == contents(whole_store)
+
+
+def test_a_full_disk_keeps_finished_chunks(study, whole_store, store_path, monkeypatch, watch_chunks):
+    write = Store.write_array
+
+    def full(self, name, points, values):
+        if 2 in points and name == "mean":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        write(self, name, points, values)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Store, "write_array", full)
+        with pytest.raises(OSError, match="No space left on device: a chunk could not be written; 1 of 3 chunks are"):
+            run_study(study, store_path)
+    assert study_progress(study, store_path).chunks == 1
+    solved = watch_chunks()
+    run_study(study, store_path)
+    assert solved == [1, 2]
+    assert contents(store_path) == contents(whole_store)
+
+
+@pytest.mark.parametrize("damage", ["cut short", "changed", "lost"])
+def test_a_damaged_chunk_is_solved_again(study, whole_store, store_path, watch_chunks, damage):
+    shutil.copytree(whole_store, store_path)
+    victim, other = store_path / "sensitivity/c/3/0", store_path / "sensitivity/c/0/0"
+    if damage == "cut short":
+        victim.write_bytes(victim.read_bytes()[:10])
+    elif damage == "changed":
+        victim.write_bytes(other.read_bytes())
+    else:
+        victim.unlink()
+    assert open_results(study, store_path).finished.values.tolist() == [True, True, False, False, True, True]
+    assert study_progress(study, store_path).points == 4
+    solved = watch_chunks()
+    run_study(study, store_path)
+    assert solved == [1]
+    assert contents(store_path) == contents(whole_store)
+
+
+DAMAGED = {
+    "cut short": lambda content: content[:500],
+    "empty": lambda content: b"",
+    "no text": lambda content: b"\xff\xfe",
+    "no marks": lambda content: re.sub(rb'"finished": {[^}]*}', b'"finished": 5', content),
+    "no format": lambda content: content.replace(b'"zarr_format": 3', b'"zarr_format": 7'),
+    "no arrays": lambda content: re.sub(rb'"sensitivity": {', b'"sensitivity": {"node_type": 1}, "other": {', content),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED.values(), ids=DAMAGED)
+def test_a_damaged_store_is_not_called_another_study(study, whole_store, store_path, damage):
+    shutil.copytree(whole_store, store_path)
+    file = store_path / "zarr.json"
+    file.write_bytes(damage(file.read_bytes()))
+    for use in (run_study, open_results, study_progress):
+        with pytest.raises(
+            ValueError, match=r"^\S+zarr\.json cannot be read .*the store is damaged.*run the study again"
+        ):
+            use(study, store_path)
+
+
+@pytest.mark.slow
+def test_a_lost_worker_loses_nothing(study, whole_store, store_path):
+    distributed = pytest.importorskip("distributed")
+    told = []
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+
+        def kill_one(now):
+            told.append(now.chunks)
+            if now.chunks == 1:
+                busy = max(client.processing().items(), key=lambda item: len(item[1]))[0]
+                pids = client.run(os.getpid, workers=[busy])
+                os.kill(pids[busy], signal.SIGKILL)
+
+        data = run_study(study, store_path, client=client, progress=kill_one)
+    assert told == [0, 1, 2, 3]
+    assert data.finished.all()
+    assert contents(store_path) == contents(whole_store)

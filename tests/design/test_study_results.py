@@ -1,0 +1,167 @@
+"""What a study finds is what maps and scores find one at a time, in batches, on layers, and on two devices."""
+
+import os
+
+import jax
+import numpy as np
+import pytest
+from studies import changed, in_another_process
+
+from jeit.design import (
+    Bell,
+    TouchPrior,
+    feel,
+    find_taxels,
+    layout_scores,
+    nearest_pairs,
+    sensitivity_map,
+    sheet_touches,
+    touch_grid,
+)
+from jeit.design.study import batch, open_results, read_study, run_study
+from jeit.electrodes import FaceDiscs, SheetDiscs
+from jeit.forward import ForwardModel
+from jeit.mesh import Rectangle, layer, rectangle
+from jeit.protocol import adjacent, two_terminal
+
+pytest.importorskip("xarray")
+pytest.importorskip("zarr")
+
+MESH, GRID = rectangle(0.1, 0.08, cell_size=8e-3), touch_grid(Rectangle(0.1, 0.08), 6, 5)
+
+
+def test_results_are_those_of_one_map_at_a_time(study, whole_store):
+    data = open_results(study, whole_store)
+    prior = TouchPrior.create(GRID.places, correlation=20e-3)
+    for number, point in enumerate(study.points):
+        electrodes = SheetDiscs(point.layout.centres, 5e-3, 1e-3)
+        model = ForwardModel(MESH, electrodes, adjacent(8, current=1e-3))
+        found = sensitivity_map(model, 0.5 * point.thickness, GRID, thickness=point.thickness, linear=True)
+        taxels = find_taxels(found.changes, GRID.places, GRID.cell_area, num_taxels=5, key=jax.random.key(0))
+        touches = sheet_touches(MESH, Bell(), GRID.places, thickness=point.thickness)
+        scores = layout_scores(model, 0.5 * point.thickness, touches, prior=prior, noise=1e-3)
+        expected = {
+            "sensitivity": found.values,
+            "minimum": found.minimum,
+            "mean": found.mean,
+            "uniformity": found.uniformity,
+            "blind_spot": found.blind_spot(1e-3 * np.sqrt(found.changes.shape[1])),
+            "taxel_count": np.sum(taxels.areas > 0),
+            "taxel_area_mean": 1e4 * taxels.mean_area,
+            "taxel_area_std": 1e4 * taxels.std_area,
+            "taxel_area_max": 1e4 * taxels.max_area,
+            "information": scores.log_information,
+            "mean_variance": scores.mean_variance,
+            "largest_variance": scores.largest_variance,
+            "localisation_error_mean": 1e3 * scores.localisation_error.mean(),
+            "localisation_error_max": 1e3 * scores.localisation_error.max(),
+            "localisation_lost": 0.0,
+        }
+        assert set(data.data_vars) == set(expected)
+        for name, value in expected.items():
+            np.testing.assert_allclose(data[name][number], value, rtol=1e-8, err_msg=name)  # the solves' rounding
+
+
+@pytest.fixture
+def results(tmp_path):
+    """The points of a changed study, each with its sensitivities."""
+
+    def call(**lines):
+        (tmp_path / "other.toml").write_text(changed(**lines), "utf-8")
+        study = read_study(tmp_path / "other.toml")
+        return list(zip(study.points, run_study(study, tmp_path / "other.zarr").sensitivity.values, strict=True))
+
+    return call
+
+
+def model_of(point, *, number=None) -> ForwardModel:
+    """Of a skin as a sheet, or a layer, and its nearest `number` pairs."""
+    centres = point.layout.centres
+    protocol = adjacent(8) if number is None else two_terminal(8).subset(np.sort(nearest_pairs(centres, number)))
+    if not point.layers:
+        return ForwardModel(MESH, SheetDiscs(centres, 5e-3, 1e-3), protocol)
+    bottom = np.column_stack([centres, np.zeros(8)])
+    return ForwardModel(layer(MESH, point.thickness, point.layers), FaceDiscs(bottom, 5e-3, 1e-3), protocol)
+
+
+def test_the_nearest_pairs_of_each_layout_are_measured(results):
+    found = results(measurement='protocol = "two-terminal"\npairs = [10, 28]')
+    assert len(found) == 8
+    for point, values in found:
+        model = model_of(point, number=point.pairs)
+        theta = sensitivity_map(model, 0.5 * point.thickness, GRID, thickness=point.thickness, linear=True)
+        np.testing.assert_allclose(values, theta.values, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_layer_is_touched_on_its_top(results):
+    found = results(skin='model = "layer"', mesh="layers = 3")
+    for point, values in found:
+        theta = sensitivity_map(model_of(point), 0.5, GRID, linear=True)
+        np.testing.assert_allclose(values, theta.values, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_exact_maps_of_layers_are_those_of_a_comparison(results):
+    lines = {"skin": 'model = "layer"', "mesh": "layers = 3", "touch": "exact = true"}
+    for point, values in results(measurement='protocol = "two-terminal"\npairs = 10', **lines):
+        felt = feel(
+            point.layout,
+            GRID,
+            key=jax.random.key(0),
+            thickness=point.thickness,
+            conductivity=0.5,
+            cell_size=8e-3,
+            num_layers=3,
+            num_pairs=10,
+            num_taxels=3,
+        )
+        np.testing.assert_allclose(values, felt.sensitivity.values, rtol=1e-8)
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_conducting_touches_of_a_sheet(results, exact):
+    for point, values in results(touch=f"contrast = 5\nexact = {str(exact).lower()}"):
+        conductance, thickness = 0.5 * point.thickness, point.thickness
+        options = {"thickness": thickness, "contrast": 5.0, "linear": not exact}
+        theta = sensitivity_map(model_of(point), conductance, GRID, **options)
+        np.testing.assert_allclose(values, theta.values, rtol=1e-8)
+
+
+def test_a_place_that_cannot_be_told_is_infinite_and_counted(tmp_path, store_path):
+    lines = {"measurement": 'protocol = "two-terminal"\npairs = 2'}  # two voltages for a place and an amplitude
+    (tmp_path / "two.toml").write_text(changed(**lines) + '[scores]\nwanted = "localisation_error"', "utf-8")
+    data = run_study(read_study(tmp_path / "two.toml"), store_path)
+    assert np.isposinf(data.localisation_error_mean).all()
+    assert np.isposinf(data.localisation_error_max).all()
+    assert (data.localisation_lost == 1).all()
+
+
+def test_a_batch_factorises_once_and_calls_no_library(study):
+    shared, skin = batch._shared(study, study.points[0].shape), batch._skin(study.points[0], study.current)
+    skins, options = batch._stacked([skin] * 2), {"num_taxels": 5, "threshold": 0.7, "num_devices": 1}
+
+    def compiled(*scores):
+        return batch._batch.lower(shared, skins, scores=scores, **options).compile().as_text() or ""
+
+    maps, both = compiled("taxels"), compiled("taxels", "information")
+    assert "lapack" not in both
+    assert maps.count(" while(") < both.count(" while(") < 2 * maps.count(" while(")
+
+
+TWO_DEVICES = """
+import sys, jax
+from jeit.design.study import read_study, run_study
+assert len(jax.devices()) == 2
+run_study(read_study(sys.argv[1]), sys.argv[2])
+"""
+
+
+@pytest.mark.slow
+def test_two_devices_give_the_same(study, study_file, whole_store, store_path):
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
+    ended = in_another_process(TWO_DEVICES, study_file, store_path, XLA_FLAGS=flags, JAX_PLATFORMS="cpu")
+    assert ended.returncode == 0, ended.stderr
+    here, there = open_results(study, whole_store), open_results(study, store_path)
+    for name in here.data_vars:
+        np.testing.assert_allclose(there[name], here[name], rtol=1e-9, err_msg=name)

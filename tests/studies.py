@@ -1,0 +1,72 @@
+"""Small studies, and what is looked at when they run."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+
+# Two points in two chunks.
+SMALL = """
+chunk_points = 1
+[skin]
+width_mm = 100
+height_mm = 80
+[electrodes]
+layouts = ["grid-4x2", "perimeter-8"]
+diameter_mm = 10
+[touch]
+columns = 6
+rows = 5
+[mesh]
+cell_mm = 8
+"""
+# Six points, and every score.
+SWEEP = """
+chunk_points = 2
+[skin]
+width_mm = 100
+height_mm = 80
+thickness_mm = [5, 8]
+conductivity_S_per_m = 0.5
+[electrodes]
+layouts = ["grid-4x2", "perimeter-8", "inner-8"]
+diameter_mm = 10
+[measurement]
+noise_V = 1e-3
+[touch]
+columns = 6
+rows = 5
+[mesh]
+cell_mm = 8
+[scores]
+wanted = ["minimum", "mean", "uniformity", "blind_spot", "taxels", "information", "mean_variance", "largest_variance",
+    "localisation_error"]
+num_taxels = 5
+correlation_mm = 20
+"""
+# Chunks of the sweep, all of one shape, and arrays of each.
+CHUNKS, ARRAYS = 3, 15
+
+
+def changed(**lines: str) -> str:
+    """The sweep with two of its layouts and no scores, and with other lines at the beginnings of sections."""
+    text = SWEEP.replace('"grid-4x2", "perimeter-8", "inner-8"', '"grid-4x2", "perimeter-8"')
+    text = text[: text.index("[scores]")].replace("noise_V = 1e-3\n", "")
+    for section, more in lines.items():
+        text = text.replace(f"[{section}]\n", f"[{section}]\n{more}\n")
+    return text
+
+
+def contents(store: Path) -> dict[str, bytes]:
+    """Every file of a store, by its name in it."""
+    return {str(file.relative_to(store)): file.read_bytes() for file in store.rglob("*") if file.is_file()}
+
+
+def in_another_process(code: str, *arguments, **environment: str) -> subprocess.CompletedProcess:
+    """Run Python `code` with these arguments and variables of the environment, until it ends."""
+    variables = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir)} | environment
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)], env=variables, capture_output=True, text=True, timeout=120
+    )
