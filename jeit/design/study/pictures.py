@@ -18,11 +18,16 @@ _LABELS = {
     "noise_V": "noise {:g} V",
     "cell_mm": "cells {:g} mm",
 }
+# Names of scores in the store that need a word more above a picture.
+_TITLES = {"mean": "mean sensitivity", "minimum": "least sensitivity"}
+# Where ticks of a logarithmic scale stand, times powers of ten, and how they are written.
+_TICKS, _PLAIN_NUMBER = (1.0, 2.0, 5.0), "{x:g}"
 
 
 def draw_scatter(data):
     """Mean against least sensitivity, a colour for each layout."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     figure = Figure(figsize=(7.5, 4.2), layout="constrained")
     axes = figure.subplots()
@@ -31,6 +36,10 @@ def draw_scatter(data):
         these = data.layout.values == layout
         axes.plot(1e3 * least[these], 1e3 * mean[these], "o", label=_plain(layout), alpha=0.8)
     axes.set(xlabel="Least sensitivity (mV)", ylabel="Mean sensitivity (mV)", xscale="log", yscale="log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=_TICKS))
+        axis.set_major_formatter(_PLAIN_NUMBER)
+        axis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.3, which="both")
     figure.legend(loc="outside right upper", frameon=False)
     return figure
@@ -66,7 +75,7 @@ def draw_scores(data):
             axes.plot(point[finite], values[finite], "o", ms=4, color=f"C{number}", label=_plain(layout))
             top = np.ones(infinite.sum())
             axes.plot(point[infinite], top, "^", ms=5, color=f"C{number}", transform=axes.get_xaxis_transform())
-        axes.set_title(name.replace("_", " ") + ("" if unit == "1" else f" ({unit})"), fontsize=9)
+        axes.set_title(_TITLES.get(name, name.replace("_", " ")) + ("" if unit == "1" else f" ({unit})"), fontsize=9)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.tick_params(labelsize=7)
         axes.grid(alpha=0.3)
@@ -90,6 +99,7 @@ def draw_maps(study: Study, data):
     from matplotlib.collections import EllipseCollection
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     grid = study_grid(study)
     numbers = shown(data)
@@ -126,7 +136,9 @@ def draw_maps(study: Study, data):
     for axes in panels[len(numbers) :]:
         axes.set_axis_off()
     assert image is not None
-    figure.colorbar(image, ax=panels.tolist(), label="Sensitivity (mV)", shrink=min(1.0, 1.5 / rows))
+    bar = figure.colorbar(image, ax=panels.tolist(), label="Sensitivity (mV)", shrink=min(1.0, 1.5 / rows))
+    bar.set_ticks(LogLocator(subs=_TICKS), minor=False)
+    bar.formatter = _PLAIN_NUMBER
     return figure
 
 
