@@ -80,8 +80,8 @@ def test_the_table_holds_what_was_found(folder):
 def test_the_panels_of_scores_are_in_the_unit_of_the_maps(folder):
     data = open_results(read_study(folder / "study.toml"), folder / "study.zarr")
     panels = {axes.get_title(): axes for axes in pictures.draw_scores(data).axes}
-    assert set(panels) == {"minimum (mV)", "mean (mV)", "uniformity"}
-    drawn = np.concatenate([line.get_ydata() for line in panels["minimum (mV)"].lines])
+    assert set(panels) == {"least sensitivity (mV)", "mean sensitivity (mV)", "uniformity"}
+    drawn = np.concatenate([line.get_ydata() for line in panels["least sensitivity (mV)"].lines])
     np.testing.assert_allclose(drawn, 1e3 * data.minimum.values)
 
 

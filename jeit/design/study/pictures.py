@@ -136,9 +136,14 @@ def draw_maps(study: Study, data):
     for axes in panels[len(numbers) :]:
         axes.set_axis_off()
     assert image is not None
-    bar = figure.colorbar(image, ax=panels.tolist(), label="Sensitivity (mV)", shrink=min(1.0, 1.5 / rows))
-    bar.set_ticks(LogLocator(subs=_TICKS), minor=False)
-    bar.formatter = _PLAIN_NUMBER
+    figure.colorbar(
+        image,
+        ax=panels.tolist(),
+        label="Sensitivity (mV)",
+        ticks=LogLocator(subs=_TICKS),
+        format=_PLAIN_NUMBER,
+        shrink=min(1.0, 1.5 / rows),
+    )
     return figure
 
 
