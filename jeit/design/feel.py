@@ -1,5 +1,7 @@
 """What a skin of one layout feels, as in text S4 of Park et al. 2022: sensitivity and virtual taxels."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -66,7 +68,16 @@ class TouchedSkin(eqx.Module):
         num_taxels: int = 90,
         threshold: float = 0.7,
     ) -> "TouchedSkin":
-        """Arguments and errors are those of `feel`, all of whose checks are made here."""
+        """Check and mesh a layer with `layout` on its bottom.
+
+        `thickness` and `cell_size` in metres, `conductivity` in S/m, `current` in amperes. `contrast`: of the indented
+        part's conductivity, as in `press`: 0 for an insulator, above 1 for a conductor. `num_pairs`: two-terminal
+        measurements, of the electrodes nearest to each other; None for all pairs.
+
+        Raises `ValueError` for a layout without an outline, more pairs or taxels than there are pairs or places, a
+        layer that is thinner than touches are deep or so thick that they change no cell, a contrast that changes
+        nothing, cells too small for any mesh, and electrodes too small for them.
+        """
         outline = layout.skin
         indentation = Bell() if indentation is None else indentation
         number = _number_of_pairs(layout, num_pairs)
@@ -94,7 +105,7 @@ class TouchedSkin(eqx.Module):
         return cls(layout, grid, model, check_conductivity(mesh, conductivity), presses, num_taxels, threshold)
 
     def feel(self, key: Array) -> Felt:
-        """Touch it, one place at a time; `key` as in `feel`."""
+        """Touch it, one place at a time; `key`: for the taxels' k-means."""
         sensitivity = SensitivityMap(self.grid, touch_changes(self.model, self.conductivity, self.presses))
         taxels = find_taxels(
             sensitivity.changes,
@@ -117,47 +128,12 @@ def touches_away_from_the_edge(outline: Domain, margin: float, columns: int = 48
     return TouchGrid(grid.places[kept], grid.rows[kept], grid.columns[kept], grid.shape, grid.pitch)
 
 
-def feel(
-    layout: Layout,
-    grid: TouchGrid,
-    *,
-    key: Array,
-    thickness: float = 10e-3,
-    conductivity: float = 1.0,
-    cell_size: float = 4.5e-3,
-    num_layers: int = 5,
-    num_pairs: int | None = 94,
-    current: float = 1e-3,
-    indentation: AbstractIndentation | None = None,
-    contrast: float = 0.0,
-    num_taxels: int = 90,
-    threshold: float = 0.7,
-) -> Felt:
+def feel(layout: Layout, grid: TouchGrid, *, key: Array, **options: Any) -> Felt:
     """Touch a layer with `layout` on its bottom, at every place of `grid`, one at a time.
 
-    `thickness` and `cell_size` in metres, `conductivity` in S/m, `current` in amperes. `contrast`: of the indented
-    part's conductivity, as in `press`: 0 for an insulator, above 1 for a conductor. `num_pairs`: two-terminal
-    measurements, of the electrodes nearest to each other; None for all pairs. `key`: for the taxels' k-means.
-
-    Raises `ValueError` for a layout without an outline, more pairs or taxels than there are pairs or places, a layer
-    that is thinner than touches are deep or so thick that they change no cell, a contrast that changes nothing, cells
-    too small for any mesh, and electrodes too small for them. `TouchedSkin` does all but the touching.
+    `key`: for the taxels' k-means. `options`, with their units and errors: those of `TouchedSkin.create`.
     """
-    skin = TouchedSkin.create(
-        layout,
-        grid,
-        thickness=thickness,
-        conductivity=conductivity,
-        cell_size=cell_size,
-        num_layers=num_layers,
-        num_pairs=num_pairs,
-        current=current,
-        indentation=indentation,
-        contrast=contrast,
-        num_taxels=num_taxels,
-        threshold=threshold,
-    )
-    return skin.feel(key)
+    return TouchedSkin.create(layout, grid, **options).feel(key)
 
 
 def _number_of_pairs(layout: Layout, num_pairs: int | None) -> int:
