@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.mesh import Disk, Domain
+from jeit.mesh import Disk, Domain, Polygon, Rectangle
 
 
 class Constraints(eqx.Module):
@@ -56,11 +56,27 @@ def signed_room(points: Float[Array, "p 2"], domain: Domain) -> Float[Array, " p
     """Distance (p,) of points from the edge of a domain, metres; negative outside."""
     if isinstance(domain, Disk):
         return domain.radius - jnp.sqrt(jnp.sum((points - jnp.asarray(domain.centre)) ** 2, axis=1) + 1e-24)
+    nearest = jnp.sum((points - _nearest_on_edge(points, domain)) ** 2, axis=1)
+    inside = jax.lax.stop_gradient(domain.contains(points))
+    return jnp.where(inside, 1.0, -1.0) * jnp.sqrt(nearest + 1e-24)
+
+
+def pulled_inside(points: Float[Array, "p 2"], domain: Domain) -> Float[Array, "p 2"]:
+    """Points (p, 2) of a domain as they are, others moved to the nearest of its edge."""
+    if isinstance(domain, Disk):
+        offset = points - jnp.asarray(domain.centre)
+        distance = jnp.sqrt(jnp.sum(offset**2, axis=1, keepdims=True) + 1e-24)
+        return jnp.asarray(domain.centre) + offset * jnp.minimum(1, domain.radius / distance)
+    inside = jax.lax.stop_gradient(domain.contains(points))
+    return jnp.where(inside[:, None], points, _nearest_on_edge(points, domain))
+
+
+def _nearest_on_edge(points: Float[Array, "p 2"], domain: Rectangle | Polygon) -> Float[Array, "p 2"]:
     loops: Sequence = (domain.vertices, *getattr(domain, "holes", ()))
     start = jnp.concatenate([jnp.asarray(loop) for loop in loops])
     along = jnp.concatenate([jnp.roll(jnp.asarray(loop), -1, axis=0) for loop in loops]) - start
     offset = points[:, None] - start
     fraction = jnp.clip(jnp.sum(offset * along, axis=-1) / jnp.sum(along**2, axis=-1), 0, 1)
-    nearest = jnp.min(jnp.sum((offset - fraction[..., None] * along) ** 2, axis=-1), axis=1)
-    inside = jax.lax.stop_gradient(domain.contains(points))
-    return jnp.where(inside, 1.0, -1.0) * jnp.sqrt(nearest + 1e-24)
+    on_edges = start + fraction[..., None] * along  # (p, e, 2)
+    nearest = jnp.argmin(jnp.sum((points[:, None] - on_edges) ** 2, axis=-1), axis=1)
+    return jnp.take_along_axis(on_edges, nearest[:, None, None], axis=1)[:, 0]

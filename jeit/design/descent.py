@@ -28,7 +28,8 @@ class Record:
 
 
 def descend(cost, variables: Float[Array, "S v"], steps: int, record: Record, *, tolerance: float = _TOLERANCE):
-    """Minimise the sum of the starts' costs between 0 and 1 by L-BFGS; where it ends, and whether it settled.
+    """Minimise the sum of the starts' costs between 0 and 1 by L-BFGS; where it ends, and how: "converged",
+    "step limit", or "stalled" where no step along the gradient lowers it.
 
     `cost`: of variables (S, v) to costs (S,), scores (S,) for the record, and the gradient (S, v) of the costs.
     """
@@ -57,4 +58,4 @@ def descend(cost, variables: Float[Array, "S v"], steps: int, record: Record, *,
     )
     bounds = (jnp.zeros_like(variables), jnp.ones_like(variables))
     found, info = solver.run(variables, bounds)
-    return found, bool(info.success)
+    return found, "converged" if info.success else "step limit" if int(info.status) == 1 else "stalled"

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.design.constraints import Constraints
+from jeit.design.constraints import Constraints, pulled_inside
 from jeit.design.descent import Record, descend
 from jeit.design.scores import Score, Scores, SheetTouches, TouchPrior, layout_scores
 from jeit.design.variables import Design, Skin, Symmetry
@@ -26,6 +26,10 @@ from jeit.mesh import Domain
 _STAGES = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
 # Constraints are met with so much to spare, metres, that rounding a layout to whole nanometres breaks none.
 _SPARE = 2e-7
+# Of a skin's size, that its mesh may lack.
+_OFF = 0.01
+# Of a score: less is no improvement.
+_ROUNDING = 1e-9
 # Random places from which those inside the outline are taken.
 _DRAWS = 20_000
 
@@ -43,7 +47,7 @@ class Optimisation(eqx.Module):
     - `history` (S, T): score of each start after each step, without penalties; `snapshots` (S, T, L, 2), metres, and
       the first is the start itself.
     - `best`: the start that `layout` comes from; None if it is the one given.
-    - `status`: "converged", "step limit" or "infeasible", and the `reason`.
+    - `status`: "converged", "step limit", "stalled" (no shorter step improved) or "infeasible", and the `reason`.
     """
 
     layout: Layout
@@ -142,19 +146,19 @@ def optimise_layout(
         return _cost(variables, jnp.asarray(weight), design, constraints, task, score)
 
     record = Record(callback)
-    variables, settled = jnp.asarray(begin), False
+    variables, status = jnp.asarray(begin), "step limit"
     record.add(variables, cost(variables, _STAGES[0][0])[1])
     done = 0
     for weight, share in _STAGES:
         budget = round(share * steps) - done
         done += budget
         if budget:
-            variables, settled = descend(partial(cost, weight=weight), variables, budget, record)
+            variables, status = descend(partial(cost, weight=weight), variables, budget, record)
     variables = _feasible(design, constraints, variables)
     ends = jax.tree.map(np.asarray, _skins(design, variables))
     values = np.asarray(cost(variables, 0.0)[1])
     lacking = np.array([_lacking(constraints, *one) for one in zip(ends.centres, ends.radii, strict=True)])
-    best, status, reason = _judge(design.holds(skin), layout, constraints, ends, values, lacking, start_value, settled)
+    best, status, reason = _judge(design.holds(skin), layout, constraints, ends, values, lacking, start_value, status)
     found, scores = layout, given
     if best is not None:
         end = Skin(*(part[best] for part in ends))
@@ -242,7 +246,9 @@ def _cost(variables, weight, design: Design, constraints: Constraints, task: _Ta
     """Penalised cost of each start (S,), its score (S,) and the gradient of the cost (S, v)."""
 
     def one(own):
-        value = score(task.scores(design.skin(own)))
+        skin = design.skin(own)
+        # An electrode off the skin has no score: a step that goes too far is judged by how it is at the edge.
+        value = score(task.scores(skin._replace(centres=pulled_inside(skin.centres, constraints.outline))))
         return weight * _penalty(design, constraints, own) - value, value
 
     # One start after the other: the Jacobian of one fills the cache.
@@ -255,7 +261,7 @@ def _skins(design: Design, variables) -> Skin:
     return jax.vmap(design.skin)(variables)
 
 
-def _judge(holds, layout, constraints, ends, values, lacking, start_value, settled) -> tuple[int | None, str, str]:
+def _judge(holds, layout, constraints, ends, values, lacking, start_value, status) -> tuple[int | None, str, str]:
     """Which start is best, None if not one improves on the layout given, and what to say of it."""
     good = (lacking <= 0) & np.isfinite(values)
     fits = holds and _lacking(constraints, layout.centres, layout.diameters / 2) <= 1e-9
@@ -268,8 +274,7 @@ def _judge(holds, layout, constraints, ends, values, lacking, start_value, settl
         )
         return None, "infeasible", reason
     best = int(np.where(good, values, -np.inf).argmax())
-    status = "converged" if settled else "step limit"
-    if fits and values[best] <= start_value:
+    if fits and values[best] <= start_value + _ROUNDING * abs(start_value):
         return None, status, "no start is better than the layout given."
     reason = f"start {best + 1} of {len(values)} is best; {good.sum()} satisfy the constraints."
     if not fits:
@@ -321,7 +326,8 @@ def _check_outline(outline: Domain, model: ForwardModel) -> None:
     low_x, high_x, low_y, high_y = outline.extent
     points = np.asarray(model.mesh.points)
     off = max(*(points.min(axis=0) - (low_x, low_y)), *((high_x, high_y) - points.max(axis=0)))
-    if off > 1e-6:
+    # The mesh of a disk is a polygon inside it.
+    if off > _OFF * max(high_x - low_x, high_y - low_y):
         raise ValueError(f"outline: it reaches {1e3 * off:.3g} mm beyond the model's mesh; give the skin's own.")
 
 

@@ -82,7 +82,8 @@ def press(
         x, y = 1e3 * places[empty[0]]
         raise ValueError(
             f"{empty.size} of {len(places)} touches change no cell, the first at ({x:.4g}, {y:.4g}) mm: they lie off "
-            "the skin, or its cells are too coarse for so shallow an indentation; refine the mesh, in a layer upwards."
+            "the skin (places are in metres), or its cells are too coarse for so shallow an indentation; refine the "
+            "mesh, in a layer upwards."
         )
     kept, there = _padded([one[used] for one, used in zip(cells, changed, strict=True)])
     change = np.zeros(kept.shape)
@@ -101,8 +102,11 @@ def _padded(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 def _check_places(places) -> np.ndarray:
     places = np.asarray(places, float)
-    if places.ndim != 2 or places.shape[1] != 2 or not len(places) or not np.isfinite(places).all():
-        raise ValueError(f"places must be (n, 2), finite, in metres; they have shape {places.shape}.")
+    if places.ndim != 2 or places.shape[1] != 2 or not len(places):
+        raise ValueError(f"places must be (n, 2), one or more, in metres; they have shape {places.shape}.")
+    lost = np.flatnonzero(~np.isfinite(places).all(axis=1))
+    if lost.size:
+        raise ValueError(f"places: {lost.size} of {len(places)} are not finite, the first is number {lost[0]}.")
     return places
 
 

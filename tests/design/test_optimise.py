@@ -17,7 +17,9 @@ from jeit.design import (
     sensitivity_map,
     sheet_touches,
     touch_grid,
+    touches_away_from_the_edge,
 )
+from jeit.design.constraints import pulled_inside
 from jeit.design.variables import Design, Skin
 from jeit.electrodes import Layout, PointElectrodes, named_layout, perimeter
 from jeit.forward import ForwardModel
@@ -142,6 +144,37 @@ def test_shortfall_is_what_lacks():
     )
     nearest = np.min(np.linalg.norm(points[:, None] - edge, axis=-1), axis=1)
     np.testing.assert_allclose(np.abs(lacking), nearest, atol=5e-6)
+
+
+L_SHAPE = Polygon(((0.0, 0.0), (0.1, 0.0), (0.1, 0.04), (0.04, 0.04), (0.04, 0.1), (0.0, 0.1)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("outline", [L_SHAPE, Disk(0.05)], ids=["L", "disk"])
+def test_skins_that_leave_room_in_their_box(outline):
+    """A step may put an electrode beside the skin, where it has no score."""
+    mesh = outline.mesh(num_points=250)
+    middle = np.mean(outline.extent[:2]), np.mean(outline.extent[2:])
+    inside = touches_away_from_the_edge(outline, 4e-3, 9, 9).places
+    rim = inside[np.argsort(-np.linalg.norm(inside - middle, axis=1), kind="stable")]
+    layout = Layout(rim[: 2 * NUMBER : 2], 6e-3, outline=outline)
+    places = touch_grid(outline, 7, 7).places
+    setting = {"prior": TouchPrior.create(places, correlation=0.02), "noise": 1e-4}
+    model = ForwardModel(mesh, layout.sheet_discs(1e-4), two_terminal(NUMBER))
+    touches = sheet_touches(mesh, Bell(), places, thickness=0.01)
+    found = optimise_layout(layout, model, 2e-3, touches, **setting, steps=10, starts=2, key=jax.random.key(0))
+    assert found.status != "stalled"
+    assert found.history.shape[1] > 5
+    assert found.value > found.start_value + 0.5
+    assert found.shortfall.max() == 0
+
+
+def test_points_beside_a_skin_are_pulled_to_its_edge():
+    points = np.array([[0.02, 0.05], [0.07, 0.05], [0.05, 0.09], [0.045, 0.05], [-0.01, -0.02]])
+    expected = np.array([[0.02, 0.05], [0.07, 0.04], [0.04, 0.09], [0.04, 0.05], [0.0, 0.0]])
+    np.testing.assert_allclose(pulled_inside(points, L_SHAPE), expected, atol=1e-15)
+    expected = np.array([[0.02, 0.01], [0.03, 0.04], [0.0, -0.05]])
+    np.testing.assert_allclose(pulled_inside(expected * [[1], [1.7], [1.1]], Disk(0.05)), expected, atol=1e-15)
 
 
 @pytest.mark.slow

@@ -102,6 +102,21 @@ def test_touches_that_are_not_found_are_an_error(models, monkeypatch):
         touch_changes(model, 0.5, presses)
 
 
+def test_conductors_that_drown_the_voltages_in_rounding_are_an_error(models):
+    model = models["sheet"]
+    changes = [touch_changes(model, 0.5, press(model.mesh, Bell(), PLACES, contrast=c, **SHEET)) for c in (1e5, 1e6)]
+    np.testing.assert_allclose(*changes, atol=1e-2 * np.abs(changes[0]).max())
+    with pytest.raises(RuntimeError, match="5 of 5 touches were not found"):
+        touch_changes(model, 0.5, press(model.mesh, Bell(), PLACES, contrast=1e9, **SHEET))
+
+
+def test_exact_changes_are_not_traced(models):
+    model = models["sheet"]
+    presses = press(model.mesh, Bell(), PLACES, **SHEET)
+    with pytest.raises(ValueError, match="cannot be traced"):
+        jax.jit(lambda conductivity: touch_changes(model, conductivity, presses))(0.5)
+
+
 def test_touches_that_change_nothing_change_no_voltage(models):
     model = models["sheet"]
     nothing = Presses(jnp.zeros((2, 2)), jnp.zeros((2, 3), int), jnp.zeros((2, 3)), model.mesh.num_cells)
@@ -159,6 +174,7 @@ def test_touches_weaken_and_do_not_depend_on_their_order(models):
     [
         ({"places": [[0.3, 0.0]]}, "1 of 1 touches change no cell"),
         ({"places": [0.0, 0.0]}, r"places must be \(n, 2\)"),
+        ({"places": [[0.0, 0.0], [np.nan, 0.0]]}, "places: 1 of 2 are not finite, the first is number 1"),
         ({"thickness": None}, "thickness must be given"),
         ({"thickness": 2e-3}, "press less"),
         ({"contrast": 1}, "contrast"),
