@@ -86,7 +86,7 @@ class TouchedSkin(eqx.Module):
         _check_thickness(thickness, num_layers, indentation)
         smallest = 1e3 * float(np.min(layout.diameters))
         across = f"electrodes of '{layout.name}' are {smallest:.3g} mm across"
-        if not 0 < 1e3 * cell_size <= _COARSEST * smallest:
+        if not 0 < 1e3 * cell_size <= (1 + 1e-9) * _COARSEST * smallest:
             raise ValueError(
                 f"cell_size is {1e3 * cell_size:g} mm; give no more than {_COARSEST * smallest:.3g} mm, as {across}."
             )
