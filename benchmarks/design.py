@@ -148,11 +148,11 @@ def main() -> int:
     if options.quick:
         cases, places, sample, rounds, numbers = [("sheet", 7e-3)], 12, 3, 1, (2, 4)
     else:
-        cases, places, sample, rounds = [("sheet", 3.07e-3), ("layer", 4.34e-3)], 48, 6, 3
+        cases, places, sample, rounds = [("sheet", 3.07e-3), ("layer", 4.34e-3)], 48, 12, 3
         numbers = (16, 64, 256)
     rows, checks, agree, cost = [], [], True, {}
     for kind, cell_size in cases:
-        row, faster, same, nodes, spent = exact_map(kind, cell_size, places, sample, rounds)
+        row, faster, same, nodes, spent = exact_map(kind, cell_size, places, sample, 3 * rounds)
         rows.append(row)
         agree &= same
         cost[kind] = [(nodes, spent)]
