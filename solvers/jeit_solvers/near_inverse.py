@@ -80,6 +80,8 @@ class NearInverse(eqx.Module):
     def blocks(self, places: Int[Array, "g k"]) -> Inexact[Array, "g k k"]:
         """G between the places of each group."""
         _, wanted, width = self.band.shape
+        if self.band.size >= 2**31:  # places are 32-bit integers, and so are their products
+            places = places.astype(jnp.int64)
         strip = places // wanted
         row = places * width - (strip - width // wanted // 2) * wanted
         return self.band.reshape(-1).at[row[:, :, None] + places[:, None]].get(mode="promise_in_bounds")

@@ -214,3 +214,10 @@ def test_electrodes_that_share_a_cell_are_all_seen(kind):
     np.testing.assert_allclose(together.mass[0], sum(np.asarray(one.mass[0]) for one in alone), atol=1e-12)
     cells = np.asarray(mesh.cells if kind == "sheet" else mesh.facets)
     assert ((np.asarray(together.load) > 0)[cells].any(axis=1).sum(axis=1) > 1).any()
+
+
+@pytest.mark.parametrize("number", [2, 9])
+def test_discs_that_lie_over_each_other_are_named(number):
+    """Also where so many share an area that one seems to lie off the mesh."""
+    with pytest.raises(ValueError, match=r"Electrodes 1 and 2 overlap by 0\.006 m"):
+        SheetDiscs(np.zeros((number, 2)), 3e-3, 1e-3).check(rectangle(0.06, 0.06, cell_size=2e-3))
