@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-
 import numpy as np
 
 from benchmarks import problem as problems
-from benchmarks.contest import ROOT
+from jeit.forward.exact import ConductingDisk, arc_transfer_impedance, point_transfer_impedance
 
 
 def difference(result: np.ndarray, reference: np.ndarray) -> float:
@@ -21,19 +18,14 @@ def exact_voltages(problem: dict[str, np.ndarray]) -> np.ndarray:
 
     The solutions are those the tests hold the forward model to.
     """
-    sys.path.insert(0, str(ROOT / "tests"))
-    try:
-        arcs, disks = importlib.import_module("analytic.arcs"), importlib.import_module("analytic.disk")
-    finally:
-        sys.path.pop(0)
-    disk = disks.ConductingDisk(radius=problems.RADIUS, conductivity=float(problem["background"]))
+    disk = ConductingDisk(radius=problems.RADIUS, conductivity=float(problem["background"]))
     if "nodes" in problem:
         x, y = problem["points"][problem["nodes"]].T
-        impedance = disks.point_transfer_impedance(disk, np.arctan2(y, x))
+        impedance = point_transfer_impedance(disk, np.arctan2(y, x))
     else:
         num = len(problem["width"])
         width = np.full(num, problems.COVERED * 2 * np.pi * problems.RADIUS / num)
         angles = 2 * np.pi * (np.arange(num) + problems.FIRST) / num
-        impedance = arcs.arc_transfer_impedance(disk, angles, width, problem["contact_impedance"])
+        impedance = arc_transfer_impedance(disk, angles, width, problem["contact_impedance"])
     table = problem["measurement"] @ impedance @ problem["drive"].T
     return table[problem["measurement_index"], problem["drive_index"]]

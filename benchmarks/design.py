@@ -25,9 +25,10 @@ SIDE, THICKNESS = 0.2, 0.01
 
 
 def skin(kind: str, cell_size: float):
-    """A model of the paper's inner layout, its conductivity (m,), and what `press` needs to know."""
-    from jeit.electrodes import FaceDiscs, named_layout
+    """A model of the paper's inner layout, its conductivity (m,), and what `touched_cells` needs to know."""
+    from jeit.electrodes import FaceDiscs
     from jeit.forward import ForwardModel
+    from jeit.layout import named_layout
     from jeit.mesh import layer, rectangle
     from jeit.protocol import two_terminal
 
@@ -55,12 +56,12 @@ def exact_map(kind: str, cell_size: float, places: int, sample: int, rounds: int
     """A row of the table, times faster than SciPy, whether both agree, nodes, and seconds."""
     import jax
 
-    from jeit.design import Bell, press, touch_changes, touch_grid
+    from jeit.design import Bell, touch_changes, touch_grid, touched_cells
     from jeit.mesh import Rectangle
 
     model, conductivity, options = skin(kind, cell_size)
     grid = touch_grid(Rectangle(SIDE, SIDE), places, places)
-    presses = press(model.mesh, Bell(), grid.places, **options)
+    presses = touched_cells(model.mesh, Bell(), grid.places, **options)
     spent, compiling = seconds(lambda: jax.block_until_ready(touch_changes(model, conductivity, presses)), rounds)
     nodes, name = model.mesh.num_points, f"exact map, {kind}, {len(grid.places)} touches"
     if not sample:
@@ -85,11 +86,11 @@ def many_layouts(numbers: tuple[int, ...], rounds: int):
     import jax
     import jax.numpy as jnp
 
-    from jeit.design import Bell, press, touch_changes, touch_grid
+    from jeit.design import Bell, touch_changes, touch_grid, touched_cells
     from jeit.mesh import Rectangle
 
     model, conductivity, options = skin("sheet", 6.3e-3)
-    presses = press(model.mesh, Bell(), touch_grid(Rectangle(SIDE, SIDE), 24, 24).places, **options)
+    presses = touched_cells(model.mesh, Bell(), touch_grid(Rectangle(SIDE, SIDE), 24, 24).places, **options)
     sigma = jnp.asarray(conductivity)
 
     def theta(move):
@@ -119,13 +120,13 @@ def clusters(rounds: int):
     from sklearn.cluster import KMeans
     from threadpoolctl import threadpool_limits
 
-    from jeit.design import Bell, nearest_pairs, press, touch_changes, touch_grid
-    from jeit.electrodes import named_layout
+    from jeit.design import Bell, nearest_pairs, touch_changes, touch_grid, touched_cells
+    from jeit.layout import named_layout
     from jeit.mesh import Rectangle
     from jeit_solvers import kmeans
 
     model, conductivity, options = skin("sheet", 5e-3)
-    presses = press(model.mesh, Bell(), touch_grid(Rectangle(SIDE, SIDE)).places, **options)
+    presses = touched_cells(model.mesh, Bell(), touch_grid(Rectangle(SIDE, SIDE)).places, **options)
     chosen = np.sort(nearest_pairs(named_layout("park-inner").centres, 94))
     vectors = np.asarray(touch_changes(model, conductivity, presses, linear=True))[:, chosen]
     spent, compiling = seconds(lambda: jax.block_until_ready(kmeans(vectors, 90, jax.random.key(0))), rounds)

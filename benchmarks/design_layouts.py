@@ -14,8 +14,8 @@ def optimised(nodes: tuple[int, int], columns: tuple[int, int], starts: int, ste
     import jax
 
     from jeit.design import Bell, TouchPrior, layout_scores, optimise_layout, sensitivity_map, sheet_touches, touch_grid
-    from jeit.electrodes import Layout, named_layout
     from jeit.forward import ForwardModel
+    from jeit.layout import Layout, named_layout
     from jeit.mesh import Rectangle, rectangle
     from jeit.protocol import two_terminal
 
@@ -69,9 +69,9 @@ def selected(name: str, number: int, cell_sizes: tuple[float, float], correlatio
         random_selections,
         select_measurements,
     )
-    from jeit.electrodes import named_layout
     from jeit.forward import ForwardModel
     from jeit.inverse import Gaussian
+    from jeit.layout import named_layout
     from jeit.mesh import Refine, rectangle
     from jeit.protocol import two_terminal
 

@@ -14,7 +14,7 @@ from benchmarks.report import markdown
 if TYPE_CHECKING:
     from jaxtyping import Array
 
-    from jeit.design import AbstractIndentation, Felt
+    from jeit.design import AbstractIndentation, SkinResponse
 
 LAYOUTS = ("park-inner", "park-boundary")
 MARGIN, PAIRS, THICKNESS = 10e-3, 94, 10e-3
@@ -49,8 +49,9 @@ def changes(
 ) -> Array:
     """Changes (n, 496) of the voltages of all pairs at 1 mA, by touches of the whole skin of 1 S/m, as `feel` does."""
     from jeit.design import sensitivity_map, touch_grid
-    from jeit.electrodes import FaceDiscs, named_layout
+    from jeit.electrodes import FaceDiscs
     from jeit.forward import ForwardModel
+    from jeit.layout import named_layout
     from jeit.mesh import Rectangle, layer, rectangle
     from jeit.protocol import two_terminal
 
@@ -62,12 +63,12 @@ def changes(
     return sensitivity_map(model, 1.0, grid, indentation=indentation, contrast=contrast).changes
 
 
-def felt(name: str, setting: Setting, changed: Array, margin: float = MARGIN, pairs: int = PAIRS) -> Felt:
+def felt(name: str, setting: Setting, changed: Array, margin: float = MARGIN, pairs: int = PAIRS) -> SkinResponse:
     """What the layout feels farther than `margin` from the edge with the nearest `pairs`, given all changes."""
     import jax
 
-    from jeit.design import Felt, SensitivityMap, find_taxels, nearest_pairs, touches_away_from_the_edge
-    from jeit.electrodes import named_layout
+    from jeit.design import SensitivityMap, SkinResponse, find_taxels, nearest_pairs, touches_away_from_the_edge
+    from jeit.layout import named_layout
     from jeit.mesh import Rectangle
 
     layout = named_layout(name)
@@ -77,7 +78,7 @@ def felt(name: str, setting: Setting, changed: Array, margin: float = MARGIN, pa
     theta = SensitivityMap(grid, changed[there][:, channels])
     key = jax.random.key(0)
     taxels = find_taxels(theta.changes, grid.places, grid.cell_area, num_taxels=setting.taxels, key=key)
-    return Felt(layout, theta, taxels)
+    return SkinResponse(layout, theta, taxels)
 
 
 def area(told: dict) -> str:
@@ -112,7 +113,7 @@ def comparison_table(setting: Setting, changed: dict[str, Array]) -> str:
     return markdown(header, rows)
 
 
-def thickness_table(setting: Setting, step) -> tuple[str, dict[float, list[Felt]]]:
+def thickness_table(setting: Setting, step) -> tuple[str, dict[float, list[SkinResponse]]]:
     """Both layouts on layers of several thicknesses, and what they feel."""
     from jeit.design import comparison
 
@@ -156,7 +157,7 @@ def kinds_table(setting: Setting, changed: dict[str, Array], step) -> str:
     return markdown(header, rows)
 
 
-def draw_thickness(studied: dict[float, list[Felt]], path) -> None:
+def draw_thickness(studied: dict[float, list[SkinResponse]], path) -> None:
     """Distributions of sensitivity and of the taxels' areas for each thickness, metres, as in Fig. S12."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch

@@ -26,13 +26,13 @@ SAME_MAP, SAME_PLACE = 1e-10, 1e-6
 
 
 def frames(number: int):
-    """Listeners, and intensities (F, M) of as many touches with the noise that the listeners expect; floor and ν."""
+    """MicrophoneArray, and intensities (F, M) of as many touches with the noise that they expect; floor and ν."""
     import jax
     import jax.numpy as jnp
 
-    from jeit.acoustic import IntensityNoise, InverseSquare, Listeners, make_surface
-    from jeit.data.sounding_skin import SoundingSkin, expected_power, microphone_grid, noise_power
+    from jeit.acoustic import IntensityNoise, InverseSquare, MicrophoneArray, make_surface
     from jeit.mesh import Rectangle
+    from jeit.simulate.sounding_skin import SoundingSkin, expected_power, microphone_grid, noise_power
 
     skin = SoundingSkin(jax.random.key(0))
     microphones = np.asarray(skin.microphones)
@@ -49,7 +49,7 @@ def frames(number: int):
     a = np.exp(np.mean(np.log(response * (squared + b)), axis=0))
     noise = IntensityNoise.create(len(microphones), floor=floor, freedom=freedom, relative=0.2)
     decay = InverseSquare(jnp.asarray(a), jnp.asarray(b))
-    return Listeners(jnp.asarray(microphones), make_surface(Rectangle(0.2, 0.2)), decay, noise), power
+    return MicrophoneArray(jnp.asarray(microphones), make_surface(Rectangle(0.2, 0.2)), decay, noise), power
 
 
 def seconds(function, rounds: int) -> tuple[float, float]:
@@ -71,15 +71,19 @@ def play(number: int, rounds: int):
 
     from jeit.acoustic import Localiser
 
-    listeners, power = frames(max(number, 4096))
+    microphone_array, power = frames(max(number, 4096))
     few, many = power[:number], power[: 8 * number]
     plain = PlainLocaliser(
-        np.asarray(listeners.microphones), np.asarray(listeners.decay.a), np.asarray(listeners.decay.b), 0.1, 200
+        np.asarray(microphone_array.microphones),
+        np.asarray(microphone_array.decay.a),
+        np.asarray(microphone_array.decay.b),
+        0.1,
+        200,
     )
-    with_pixels = Localiser.create(listeners, method="consistency", map_shape=(200, 200))
-    coarse = Localiser.create(listeners, method="consistency")
-    likelihood = Localiser.create(listeners)
-    likely_maps = Localiser.create(listeners, map_shape=(200, 200))
+    with_pixels = Localiser.create(microphone_array, method="consistency", map_shape=(200, 200))
+    coarse = Localiser.create(microphone_array, method="consistency")
+    likelihood = Localiser.create(microphone_array)
+    likely_maps = Localiser.create(microphone_array, map_shape=(200, 200))
     maps, estimate = np.asarray(with_pixels.maps(few)), with_pixels(few)
     theirs = np.stack([plain.locate(frame) for frame in few])
     inside = np.abs(theirs).max(axis=1) < 0.1 - 1e-9
@@ -142,8 +146,8 @@ def recording(rounds: int) -> tuple[float, float, int]:
     import jax
 
     from jeit.acoustic import Recording, Taps, calibrate_microphones, locate, track
-    from jeit.data.sounding_skin import SoundingSkin, microphone_grid
-    from jeit.data.touches import calibration_taps, stroke
+    from jeit.simulate.sounding_skin import SoundingSkin, microphone_grid
+    from jeit.simulate.touch_sounds import calibration_taps, stroke
 
     skin = SoundingSkin(jax.random.key(0), multiplexed=False)
     taps = calibration_taps(skin, jax.random.key(1), microphone_grid(9), repeats=1)

@@ -27,8 +27,8 @@ def calibrated(skin):
     import jax
 
     from jeit.acoustic import Taps, calibrate_microphones
-    from jeit.data.touches import calibration_taps
-    from jeit.electrodes import grid
+    from jeit.layout import grid
+    from jeit.simulate.touch_sounds import calibration_taps
 
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.1
     sound = calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 13, 13))
@@ -42,7 +42,7 @@ def heard(skin, places, bursts: int):
     import jax
 
     from jeit.acoustic import Taps, tap_intensities
-    from jeit.data.touches import calibration_taps
+    from jeit.simulate.touch_sounds import calibration_taps
 
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.1
     sound = calibration_taps(skin, jax.random.key(2), places, repeats=bursts)
@@ -57,18 +57,18 @@ def errors(calibration, skin, places, bursts: int, pad: int):
     """Distances (P,) in metres of what each method finds, the share of 95 % ellipses of the likelihood that hold the
     truth, and the root mean square error that the Cramér-Rao bound allows."""
     from jeit.acoustic import Intensities, Localiser, cramer_rao
-    from jeit.acoustic.locate import prepare
+    from jeit.acoustic.localisation.locate import prepare
 
     power, floor, freedom, usable = heard(skin, places, bursts)
     order = np.arange(pad) % len(places)  # one shape for all: compiled once
     measured = Intensities(np.arange(pad), power[order], floor=floor, freedom=freedom, usable=usable[order])
-    listeners, use, _ = prepare(measured, calibration)
-    found = {name: Localiser.create(listeners, method=name)(measured.power, use) for name in METHODS}
+    microphone_array, use, _ = prepare(measured, calibration)
+    found = {name: Localiser.create(microphone_array, method=name)(measured.power, use) for name in METHODS}
     off = {name: np.asarray(one.position)[: len(places)] - places for name, one in found.items()}
     best = found["likelihood"]
     covariance = np.asarray(best.covariance)[: len(places)]
     square = np.einsum("fi,fij,fj->f", off["likelihood"], np.linalg.inv(covariance), off["likelihood"])
-    bound = np.asarray(cramer_rao(listeners, places, np.asarray(best.strength)[: len(places)]))
+    bound = np.asarray(cramer_rao(microphone_array, places, np.asarray(best.strength)[: len(places)]))
     least = np.sqrt(np.mean(np.trace(bound, axis1=1, axis2=2)))
     return (
         {name: np.linalg.norm(one, axis=1) for name, one in off.items()},
@@ -92,9 +92,9 @@ def main() -> int:
     import jax
     from matplotlib.figure import Figure
 
-    from jeit.data.sounding_skin import SoundingSkin, expected_power, microphone_grid, noise_power
-    from jeit.electrodes import grid
+    from jeit.layout import grid
     from jeit.plot import plot_error_curve
+    from jeit.simulate.sounding_skin import SoundingSkin, expected_power, microphone_grid, noise_power
 
     places = grid(0.15, 0.15, 13, 13)
     key = jax.random.key(0)

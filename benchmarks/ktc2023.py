@@ -14,8 +14,8 @@ import scipy.io
 
 from jeit.data import read
 from jeit.image import Raster, challenge_score, segment
+from jeit.imaging.preparation import prepare_difference
 from jeit.inverse import TotalVariation, reconstruct
-from jeit.preparation import prepare_difference
 
 from .machine import heading
 

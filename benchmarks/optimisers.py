@@ -52,7 +52,7 @@ def solvers():
     import jax.numpy as jnp
     import optimistix as optx
 
-    from jeit.inverse.bounded import minimise_between
+    from jeit.inverse.nonlinear.bounded import minimise_between
     from jeit_solvers import Descent
 
     with warnings.catch_warnings():

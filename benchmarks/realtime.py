@@ -21,8 +21,9 @@ def bodies():
     """Name: function that makes the model for about so many nodes."""
     import numpy as np
 
-    from jeit.electrodes import BoundaryElectrodes, CombinedElectrodes, SheetDiscs, perimeter, ring
+    from jeit.electrodes import BoundaryElectrodes, CombinedElectrodes, SheetDiscs
     from jeit.forward import ForwardModel
+    from jeit.layout import perimeter, ring
     from jeit.mesh import Disk, Rectangle, Refine
     from jeit.protocol import adjacent, reference_electrode
 

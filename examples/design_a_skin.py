@@ -4,7 +4,7 @@ import jax
 from matplotlib.figure import Figure
 
 from jeit.design import comparison, feel, touches_away_from_the_edge
-from jeit.electrodes import named_layout
+from jeit.layout import named_layout
 from jeit.plot import plot_sensitivity_map, plot_taxels
 
 

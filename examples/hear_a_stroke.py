@@ -6,10 +6,9 @@ from matplotlib.figure import Figure
 
 from jeit.acoustic import Localiser, Recording, Taps, brightness, calibrate_microphones, intensities, locate, overlay
 from jeit.acoustic import track as follow
-from jeit.data.sounding_skin import SoundingSkin
-from jeit.data.touches import calibration_taps, pat, stroke, tickle
-from jeit.electrodes import grid
+from jeit.layout import grid
 from jeit.plot import plot_track
+from jeit.simulate import SoundingSkin, calibration_taps, pat, stroke, tickle
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
 KEYS = jax.random.split(jax.random.key(1), 4)
@@ -30,7 +29,7 @@ def main() -> float:
     samples = np.concatenate([touch.samples for touch in touches.values()], axis=1)
     heard = intensities(Recording(samples, skin.rate))
     found = locate(heard, calibration)
-    localiser = Localiser.create(calibration.listeners, method="consistency", map_shape=(100, 100))
+    localiser = Localiser.create(calibration.microphone_array, method="consistency", map_shape=(100, 100))
     images = brightness(localiser.maps(heard.power), method="consistency") * found.located[:, None, None]
 
     figure = Figure(figsize=(13.5, 4.8), layout="compressed")

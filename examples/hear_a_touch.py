@@ -5,10 +5,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jeit.acoustic import Localiser, Recording, Taps, calibrate_microphones, intensities
-from jeit.data.sounding_skin import SoundingSkin
-from jeit.data.touches import calibration_taps, tap
-from jeit.electrodes import grid
+from jeit.layout import grid
 from jeit.plot import plot_loss_map
+from jeit.simulate import SoundingSkin, calibration_taps, tap
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
 TITLES = {"consistency": "Intensity consistency (Park 2022)", "likelihood": "Likelihood"}
@@ -18,7 +17,7 @@ def main() -> float:
     skin = SoundingSkin(jax.random.key(0))
     taps = calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 10, 10), repeats=2)
     known = Taps(skin.microphones, OUTLINE, taps.positions, samples=taps.samples, rate=taps.rate)
-    listeners = calibrate_microphones(known).calibration.listeners
+    microphone_array = calibrate_microphones(known).calibration.microphone_array
 
     truth = np.array([0.031, -0.022])
     light = tap(skin, jax.random.key(2), truth, strength=0.7, duration=0.5)
@@ -28,13 +27,13 @@ def main() -> float:
     figure = Figure(figsize=(11.2, 5.2), layout="compressed")
     error = {}
     for ax, (method, title) in zip(figure.subplots(1, 2), TITLES.items(), strict=True):
-        localiser = Localiser.create(listeners, method=method, map_shape=(200, 200))
+        localiser = Localiser.create(microphone_array, method=method, map_shape=(200, 200))
         found, maps = localiser.with_maps(loudest)
         place, spread = np.asarray(found.position[0]), found.covariance[0]
         error[method] = float(np.hypot(*(place - truth)))
         marks = {"received": loudest[0], "truth": truth, "estimate": place, "covariance": spread}
         title = f"{title}: {1e3 * error[method]:.1f} mm off"
-        plot_loss_map(maps[0], listeners, **marks, method=method, title=title, ax=ax)
+        plot_loss_map(maps[0], microphone_array, **marks, method=method, title=title, ax=ax)
     figure.savefig("hear_a_touch.png", dpi=120)
     return error["likelihood"]
 

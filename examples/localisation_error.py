@@ -5,10 +5,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jeit.acoustic import Intensities, Taps, calibrate_microphones, locate, tap_intensities
-from jeit.data.sounding_skin import SoundingSkin
-from jeit.data.touches import calibration_taps
-from jeit.electrodes import grid
+from jeit.layout import grid
 from jeit.plot import plot_pairs
+from jeit.simulate import SoundingSkin, calibration_taps
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
 TITLES = {"consistency": "Intensity consistency (Park 2022)", "likelihood": "Likelihood"}

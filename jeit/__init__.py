@@ -5,7 +5,7 @@ The names used most, and where the rest is:
 - `read`, `Measurement`: measured files (`jeit.data`);
 - `image_difference`, `ImagingSettings`: from two frames to a picture, in one call (`jeit.imaging`, `jeit.report`);
 - `Disk`, `Rectangle`, `Polygon`, `Mesh`: outlines and their meshes (`jeit.mesh`);
-- `BoundaryElectrodes`, `ring`: electrodes and where to put them (`jeit.electrodes`);
+- `BoundaryElectrodes`, `ring`: electrodes (`jeit.electrodes`) and where to put them (`jeit.layout`);
 - `adjacent`: what is driven and measured (`jeit.protocol`);
 - `ForwardModel`: conductivity to voltages and Jacobian (`jeit.forward`);
 - `calibrate`, `one_step`, `reconstruct`: linear and nonlinear imaging (`jeit.inverse`);
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from jeit.data import Measurement as Measurement
     from jeit.data import read as read
     from jeit.electrodes import BoundaryElectrodes as BoundaryElectrodes
-    from jeit.electrodes import ring as ring
     from jeit.forward import ForwardModel as ForwardModel
     from jeit.image import Raster as Raster
     from jeit.image import find_inclusions as find_inclusions
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from jeit.inverse import calibrate as calibrate
     from jeit.inverse import one_step as one_step
     from jeit.inverse import reconstruct as reconstruct
+    from jeit.layout import ring as ring
     from jeit.mesh import Disk as Disk
     from jeit.mesh import Mesh as Mesh
     from jeit.mesh import Polygon as Polygon
@@ -56,10 +56,12 @@ _ROOMS = (
     "image",
     "imaging",
     "inverse",
+    "layout",
     "mesh",
     "plot",
     "protocol",
     "report",
+    "simulate",
 )
 _HOMES = {
     "BoundaryElectrodes": "electrodes",
@@ -79,7 +81,7 @@ _HOMES = {
     "plot_image": "plot",
     "read": "data",
     "reconstruct": "inverse",
-    "ring": "electrodes",
+    "ring": "layout",
 }
 
 

@@ -1,48 +1,110 @@
-"""Imports run downwards only: what each layer may know of the others."""
+"""The house: every module in a room, rooms that look down only, no circles, and nobody in another's private rooms."""
 
 import ast
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# Each layer with the layers of jeit it may import. jeit_solvers knows none of them.
-ALLOWED = {
-    "mesh": set(),
-    "electrodes": {"mesh"},
-    "protocol": set(),
-    "forward": {"mesh", "electrodes", "protocol"},
-    "inverse": {"mesh", "electrodes", "protocol", "forward"},
-    "image": {"mesh"},
-    "acoustic": {"mesh"},
-    "design": {"mesh", "electrodes", "protocol", "forward", "inverse"},
-    "data": {"mesh", "electrodes", "protocol", "forward"},
-    "plot": {"mesh", "electrodes", "protocol", "forward", "inverse", "image", "acoustic", "data", "design"},
-}
-LAYERS = sorted(ALLOWED)
+# The rooms, each with those beneath it that it may import. All may import jeit_solvers, which knows none of them.
+ROOMS: dict[str, set[str]] = {}
+ROOMS["mesh"] = set()
+ROOMS["electrodes"] = {"mesh"}
+ROOMS["layout"] = {"mesh", "electrodes"}
+ROOMS["protocol"] = set()
+ROOMS["forward"] = {"mesh", "electrodes", "protocol"}
+ROOMS["inverse"] = {*ROOMS["forward"], "forward"}
+ROOMS["image"] = {"mesh"}
+ROOMS["acoustic"] = {"mesh"}
+ROOMS["design"] = {*ROOMS["inverse"], "layout", "inverse"}
+ROOMS["data"] = {*ROOMS["forward"], "layout", "forward"}
+ROOMS["simulate"] = {*ROOMS["design"], "design", "data", "acoustic"}
+ROOMS["imaging"] = {*ROOMS["inverse"], "inverse", "data", "image"}
+ROOMS["plot"] = {*ROOMS["simulate"], *ROOMS["imaging"], "simulate", "imaging"}
+ROOMS["report"] = {*ROOMS["plot"], "plot"}
+ROOMS["cli"] = {*ROOMS["report"], "report"}
+
+
+def modules(top: Path) -> dict[str, Path]:
+    """Every module under `top`, by its dotted name; a room's `__init__` has the room's name."""
+    named = {}
+    for path in top.rglob("*.py"):
+        parts = path.relative_to(top.parent).with_suffix("").parts
+        named[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return named
 
 
 def imported(path: Path) -> set[str]:
+    """Dotted names that a file imports, wherever in it: modules, and what is taken from them."""
     names = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
-            names.add(node.module)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: a relative import"
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
     return names
 
 
-@pytest.mark.parametrize("layer", LAYERS)
-def test_layers_look_down(layer):
-    files = list((ROOT / "jeit" / layer).rglob("*.py"))
-    assert files
-    for path in files:
-        for name in imported(path):
-            parts = name.split(".")
-            if parts[0] == "jeit" and len(parts) > 1:
-                assert parts[1] in ALLOWED[layer] | {layer}, f"{path.relative_to(ROOT)} imports {name}"
+def on_import(path: Path) -> set[str]:
+    """The same of what is imported when the file is: not within functions, nor for type checkers alone."""
+    names, left = set(), list(ast.parse(path.read_text("utf-8")).body)
+    while left:
+        node = left.pop()
+        if isinstance(node, ast.ImportFrom):
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            left += node.orelse
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            left += [child for child in ast.iter_child_nodes(node) if isinstance(child, ast.stmt)]
+    return names
+
+
+def rooms_of(house: dict[str, Path]) -> list[str]:
+    """What is wrong with where modules stand and what they import of other rooms."""
+    faults = []
+    for name, path in house.items():
+        parts = name.split(".")
+        if name in ("jeit", "jeit.__main__"):
+            continue
+        if parts[1] not in ROOMS or path.parent.name == "jeit":
+            faults.append(f"{name} is in no room")
+            continue
+        for other in imported(path):
+            steps = other.split(".")
+            if steps[0] != "jeit" or len(steps) < 2 or steps[1] == parts[1]:
+                continue
+            if steps[1] not in ROOMS[parts[1]]:
+                faults.append(f"{name} looks up: it imports {other}")
+            elif any(step.startswith("_") for step in steps[1:]):
+                faults.append(f"{name} imports {other}, which is private")
+    return faults
+
+
+def circle(house: dict[str, Path]) -> list[str]:
+    """Modules that import each other round in a circle, if any do; rooms' contents pages are not counted."""
+    graph = {}
+    for name, path in house.items():
+        if path.name == "__init__.py":
+            continue
+        taken = {part for other in on_import(path) for part in (other, other.rpartition(".")[0])}
+        graph[name] = {other for other in taken & house.keys() if house[other].name != "__init__.py"} - {name}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_every_module_is_in_a_room_and_looks_down():
+    assert rooms_of(modules(ROOT / "jeit")) == []
+
+
+@pytest.mark.parametrize("top", ["jeit", "solvers/jeit_solvers"])
+def test_no_circles(top):
+    assert circle(modules(ROOT / top)) == []
 
 
 def test_solvers_know_no_physics():
@@ -50,12 +112,32 @@ def test_solvers_know_no_physics():
         assert not {name for name in imported(path) if name.split(".")[0] == "jeit"}, path
 
 
+@pytest.mark.parametrize(
+    ("files", "fault"),
+    [
+        ({"lonely.py": ""}, "is in no room"),
+        ({"attic/box.py": ""}, "is in no room"),
+        ({"mesh/up.py": "from jeit.forward import ForwardModel"}, "looks up"),
+        ({"mesh/up.py": "def f():\n    from jeit.forward.model import ForwardModel"}, "looks up"),
+        ({"forward/sly.py": "from jeit.mesh._checks import check_points"}, "is private"),
+        ({"forward/sly.py": "from jeit.mesh import _checks"}, "is private"),
+    ],
+)
+def test_a_fault_is_found(tmp_path, files, fault):
+    for name, text in files.items():
+        (tmp_path / "jeit" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "jeit" / name).write_text(text, "utf-8")
+    assert [fault in one for one in rooms_of(modules(tmp_path / "jeit"))] == [True]
+
+
+def test_a_circle_is_found(tmp_path):
+    (tmp_path / "jeit" / "mesh").mkdir(parents=True)
+    (tmp_path / "jeit" / "mesh" / "hen.py").write_text("from jeit.mesh.egg import shell", "utf-8")
+    (tmp_path / "jeit" / "mesh" / "egg.py").write_text("from jeit.mesh import hen", "utf-8")
+    assert {"jeit.mesh.hen", "jeit.mesh.egg"} <= set(circle(modules(tmp_path / "jeit")))
+
+
 def test_no_two_test_files_have_one_name():
     """pytest imports them by name, and can collect only one of the two."""
     names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
     assert len(names) == len(set(names))
-
-
-def test_every_module_belongs_to_a_known_layer():
-    folders = {path.name for path in (ROOT / "jeit").iterdir() if path.is_dir() and path.name != "__pycache__"}
-    assert folders <= set(ALLOWED) | {"cli"}

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.stats import chi2
 
-from jeit.acoustic.locate import Locations
-from jeit_solvers import solve_few
+from jeit.acoustic.localisation.locate import Locations
+from jeit_solvers import solve_small
 
 # Densities tried: from a finger that rests to one that is flung about (m²/s³).
 _DENSITIES = np.geomspace(1e-5, 10.0, 13)
@@ -161,4 +161,4 @@ def _noise(step, d: int) -> Float[Array, "s s"]:
 
 
 def _solve(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    return solve_few(matrix[:, :, None] * jnp.ones(right.shape[1]), right)
+    return solve_small(matrix[:, :, None] * jnp.ones(right.shape[1]), right)

@@ -10,15 +10,15 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.calibrate_microphones import calibrate_microphones
-from jeit.cli.choose import choose
-from jeit.cli.demo import demo
-from jeit.cli.info import info
-from jeit.cli.layout import layout
-from jeit.cli.locate import locate
-from jeit.cli.reconstruct import reconstruct
-from jeit.cli.stream import stream
-from jeit.cli.study import study
+from jeit.cli.commands.calibrate_microphones import calibrate_microphones
+from jeit.cli.commands.choose import choose
+from jeit.cli.commands.demo import demo
+from jeit.cli.commands.info import info
+from jeit.cli.commands.layout import layout
+from jeit.cli.commands.locate import locate
+from jeit.cli.commands.reconstruct import reconstruct
+from jeit.cli.commands.stream import stream
+from jeit.cli.commands.study import study
 
 app = typer.Typer(
     name="jeit",

@@ -8,7 +8,7 @@ import typer
 from jeit.cli.options import check_within
 
 if TYPE_CHECKING:
-    from jeit.electrodes import Layout
+    from jeit.layout import Layout
     from jeit.mesh import Domain
 
 LayoutName = Annotated[
@@ -31,8 +31,8 @@ def read(name: str, width: float, height: float) -> "tuple[Layout, Domain]":
 
     Raises `ValueError` for fewer than three electrodes.
     """
-    from jeit.electrodes import named_layout, read_layout
-    from jeit.electrodes.layout import LARGEST, SMALLEST
+    from jeit.layout import named_layout, read_layout
+    from jeit.layout.layout import LARGEST, SMALLEST
     from jeit.mesh import Rectangle
 
     found = read_layout(name) if Path(name).suffix else named_layout(name)

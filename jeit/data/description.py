@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 
 from jeit import protocol as protocols
-from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs, perimeter, ring
+from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
+from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Domain, Polygon, Rectangle
 from jeit.protocol import Protocol
 
@@ -75,7 +76,7 @@ _PROTOCOL_OPTIONS = {
 
 
 @dataclass(frozen=True)
-class DataLayout:
+class TableLayout:
     """How numbers lie in a file (section `[data]`)."""
 
     frames_in: str = "rows"
@@ -97,7 +98,7 @@ class Description:
     title: str
     domain: Domain | None
     electrodes: Any
-    layout: DataLayout
+    layout: TableLayout
     notes: tuple[str, ...]
     protocol_section: dict[str, Any] = field(repr=False)
 
@@ -225,7 +226,7 @@ def _positions(section: dict, domain: Domain | None, origin: str) -> np.ndarray:
     )
 
 
-def _layout(section: dict, origin: str) -> DataLayout:
+def _layout(section: dict, origin: str) -> TableLayout:
     where = "[data]"
     unit = _choice(section.get("unit", "V"), VOLTAGE_UNITS, origin, f"{where} unit")
     gain = section.get("gain", 1.0)
@@ -236,7 +237,7 @@ def _layout(section: dict, origin: str) -> DataLayout:
     components = ("real", "imaginary", "magnitude", "complex")
     scale = VOLTAGE_UNITS[unit] / gain * (-1 if polarity == "reversed" else 1)
     saturation = section.get("saturation")
-    return DataLayout(
+    return TableLayout(
         frames_in=frames_in,
         delimiter=section.get("delimiter", ","),
         skip_rows=int(section.get("skip_rows", 0)),

@@ -7,7 +7,8 @@ import numpy as np
 from jeit.data import _matlab
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
-from jeit.electrodes import BoundaryElectrodes, ring
+from jeit.electrodes import BoundaryElectrodes
+from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import from_matrices
 

@@ -6,7 +6,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from jeit.data.description import DataLayout, Description, load_description
+from jeit.data.description import Description, TableLayout, load_description
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.protocol import Protocol
@@ -82,7 +82,7 @@ def measurement_from(
     )
 
 
-def frames_from(table: np.ndarray, layout: DataLayout, name: str) -> np.ndarray:
+def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:
     """Frames (F, M), in file units, of a table laid out as described."""
     frames = table.T if table.ndim == 2 and layout.frames_in == "columns" else np.atleast_2d(table)
     if layout.complex_pairs:
@@ -102,7 +102,7 @@ def frames_from(table: np.ndarray, layout: DataLayout, name: str) -> np.ndarray:
     return frames if layout.component == "complex" else np.real(frames)
 
 
-def _from_text(path: Path, layout: DataLayout) -> np.ndarray:
+def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
     delimiter = None if layout.delimiter.strip() == "" and layout.delimiter != "\t" else layout.delimiter
     try:
         lines = path.read_text("utf-8").splitlines()

@@ -22,13 +22,13 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jeit.design.indentation import AbstractIndentation
-from jeit.design.press import Presses, press
 from jeit.design.sensitivity import uniformity
+from jeit.design.skin.indentation import AbstractIndentation
+from jeit.design.skin.touched_cells import TouchedCells, touched_cells
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity
 from jeit.mesh import Mesh, centroids
-from jeit_solvers.dense_cholesky import inverse_cholesky
+from jeit_solvers.dense.cholesky import inverse_cholesky
 
 # The largest eigenvalue to ln(r) / 2^k, relative, however close the next.
 _SQUARINGS = 10
@@ -41,7 +41,7 @@ class SheetTouches(eqx.Module):
     the layer that the sheet stands for and `depth` of the touches, metres.
     """
 
-    presses: Presses
+    presses: TouchedCells
     slope: Float[Array, "n c 2"]
     thickness: Float[Array, ""]
     depth: float
@@ -66,14 +66,14 @@ class SheetTouches(eqx.Module):
 def sheet_touches(
     mesh: Mesh, indentation: AbstractIndentation, places, *, thickness: float, contrast: float = 0.0
 ) -> SheetTouches:
-    """Indent a sheet (2-D mesh) of a layer of `thickness` metres at `places` (n, 2), metres; the rest as in `press`.
+    """Indent a sheet (2-D mesh) of a layer of `thickness` metres at `places` (n, 2), metres.
 
-    The derivative is of the indentation's depth at the middles of the cells. Raises `ValueError` as `press` does, and
-    for a mesh that is no sheet.
+    The rest as in `touched_cells`. The derivative is of the indentation's depth at the middles of the cells. Raises
+    `ValueError` as `touched_cells` does, and for a mesh that is no sheet.
     """
     if mesh.dimension != 2:
         raise ValueError(f"mesh is {mesh.dimension}-D; scores are of the equivalent sheet, with a 2-D mesh.")
-    presses = press(mesh, indentation, places, thickness=thickness, contrast=contrast)
+    presses = touched_cells(mesh, indentation, places, thickness=thickness, contrast=contrast)
 
     def change(place, middle):
         # The root has no derivative at 0; a thousandth of a micrometre is nothing to a depth.

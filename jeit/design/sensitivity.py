@@ -6,9 +6,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jeit.design.changes import touch_changes
-from jeit.design.indentation import AbstractIndentation, Bell
-from jeit.design.press import press
+from jeit.design.skin.indentation import AbstractIndentation, Bell
+from jeit.design.skin.touched_cells import touched_cells
+from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
 from jeit.mesh import Domain
 
@@ -122,7 +122,7 @@ def sensitivity_map(
     """Touch a skin at every place of `grid` and see how its voltages change.
 
     `indentation`: the unit deformation of Park et al. 2022 unless given. `thickness` (a sheet's) and `contrast` as in
-    `press`; `linear` as in `touch_changes`. Raises `ValueError` as they do.
+    `touched_cells`; `linear` as in `touch_changes`. Raises `ValueError` as they do.
     """
-    presses = press(model.mesh, indentation or Bell(), grid.places, thickness=thickness, contrast=contrast)
+    presses = touched_cells(model.mesh, indentation or Bell(), grid.places, thickness=thickness, contrast=contrast)
     return SensitivityMap(grid, touch_changes(model, conductivity, presses, linear=linear))

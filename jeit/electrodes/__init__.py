@@ -1,4 +1,4 @@
-"""Electrodes (position, size, contact impedance), and layouts that say where to put them.
+"""Electrodes: position, size, contact impedance, and their contact integrals.
 
 | where | complete electrodes | point electrodes |
 |---|---|---|
@@ -8,8 +8,7 @@
 | whole facets of a mesh, nodes of a mesh | `FacetElectrodes`, `plates`, `electrodes_from_nodes` | `NodeElectrodes` |
 | several of these at once | `CombinedElectrodes` | |
 
-Layouts as arrays of positions: `ring`, `perimeter`, `grid`, `quasi_uniform`, …. As a design, with sizes, labels and the
-skin's outline: `Layout`, from `named_layout` or a CSV, DXF or SVG file (`read_layout`, `write_layout`).
+Where to put them: `jeit.layout`.
 """
 
 from jeit.electrodes.boundary import BoundaryElectrodes as BoundaryElectrodes
@@ -25,16 +24,6 @@ from jeit.electrodes.facets import FacetElectrodes as FacetElectrodes
 from jeit.electrodes.facets import electrodes_from_nodes as electrodes_from_nodes
 from jeit.electrodes.facets import plates as plates
 from jeit.electrodes.integrated import IntegratedElectrodes as IntegratedElectrodes
-from jeit.electrodes.layout import BUILT_IN as BUILT_IN
-from jeit.electrodes.layout import Layout as Layout
-from jeit.electrodes.layout import named_layout as named_layout
-from jeit.electrodes.layout_files import read_layout as read_layout
-from jeit.electrodes.layout_files import write_layout as write_layout
-from jeit.electrodes.layouts import grid as grid
-from jeit.electrodes.layouts import perimeter as perimeter
-from jeit.electrodes.layouts import quasi_uniform as quasi_uniform
-from jeit.electrodes.layouts import ring as ring
-from jeit.electrodes.layouts import ring_and_centre as ring_and_centre
 from jeit.electrodes.patches import FacePatches as FacePatches
 from jeit.electrodes.point import NodeElectrodes as NodeElectrodes
 from jeit.electrodes.point import PointElectrodes as PointElectrodes

@@ -8,7 +8,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit.forward import ForwardModel
-from jeit.inverse.priors import AbstractPrior, Noser
+from jeit.inverse.prior.priors import AbstractPrior, Noser
 from jeit.inverse.spectrum import Spectrum
 
 

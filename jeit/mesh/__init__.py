@@ -6,6 +6,8 @@ where a `Refine` asks. Solids: `layer`, `box`, `cylinder`. From elsewhere: `Mesh
 
 from jeit.mesh.domain import Disk, Domain, Polygon, Rectangle
 from jeit.mesh.files import read, write
+from jeit.mesh.generate._unstructured import MOST_POINTS
+from jeit.mesh.generate.refine import Refine
 from jeit.mesh.geometry import (
     boundary_loops,
     centroids,
@@ -18,11 +20,11 @@ from jeit.mesh.gmsh import from_gmsh
 from jeit.mesh.interior import interior_facets
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.quality import Quality, quality
-from jeit.mesh.refine import Refine
 from jeit.mesh.shapes import disk, polygon, rectangle
 from jeit.mesh.solids import box, cylinder, layer
 
 __all__ = [
+    "MOST_POINTS",
     "Disk",
     "Domain",
     "Mesh",

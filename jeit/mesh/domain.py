@@ -16,9 +16,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jeit.mesh import _outline
+from jeit.mesh import loops
 from jeit.mesh._checks import warn_large
-from jeit.mesh._meshing import mesh_disk, mesh_polygon, mesh_rectangle
+from jeit.mesh.generate._outlines import mesh_disk, mesh_polygon, mesh_rectangle
 from jeit.mesh.mesh import Mesh
 
 
@@ -158,9 +158,9 @@ class Polygon(eqx.Module):
             self.vertices = jnp.asarray(vertices)
             self.holes = tuple(jnp.asarray(hole) for hole in holes)
             return
-        outer = _outline.check_loop(vertices, "vertices", clockwise=False)
-        inner = [_outline.check_loop(hole, f"holes[{k}]", clockwise=True) for k, hole in enumerate(holes)]
-        _outline.check_apart(outer, inner)
+        outer = loops.check_loop(vertices, "vertices", clockwise=False)
+        inner = [loops.check_loop(hole, f"holes[{k}]", clockwise=True) for k, hole in enumerate(holes)]
+        loops.check_apart(outer, inner)
         warn_large(float(np.ptp(outer, axis=0).max()), "vertices")
         self.vertices = jnp.asarray(outer)
         self.holes = tuple(jnp.asarray(hole) for hole in inner)

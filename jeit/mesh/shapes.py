@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from numpy.typing import ArrayLike
 
-from jeit.mesh._meshing import mesh_disk, mesh_polygon, mesh_rectangle
 from jeit.mesh.domain import Disk, Polygon, Rectangle
+from jeit.mesh.generate._outlines import mesh_disk, mesh_polygon, mesh_rectangle
+from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
-from jeit.mesh.refine import Refinement
 
 
 def disk(

@@ -5,21 +5,29 @@ A direct solver (nested dissection, multifrontal Cholesky in batches of dense fr
 counts. See `analyse`, `factorise` and `solve`.
 """
 
-from .batching import in_turn
-from .choose import choose_solver
-from .conjugate_gradient import ConjugateGradient
-from .dense_cholesky import symmetric_inverse
-from .descent import Descent
-from .few_unknowns import Minimum, definite_few, hessian_few, inverse_few, minimise_few, solve_few, symmetric_few
-from .kmeans import KMeans, kmeans
-from .multifrontal import Factor, factorise, half_solve, quadratic_form, solve
-from .near_inverse import NearInverse, Strips, near_inverse
-from .operator import SparseSymmetric
-from .over_cores import over_cores
-from .pattern import SparsityPattern
-from .plan import FactorisationPlan, analyse
-from .ridge import Model, ridge_model, ridge_step, solve_definite
-from .sparse_cholesky import SparseCholesky
+from jeit_solvers.batching import in_turn
+from jeit_solvers.dense.cholesky import symmetric_inverse
+from jeit_solvers.dense.ridge import QuadraticModel, ridge_model, ridge_step, solve_definite
+from jeit_solvers.kmeans import KMeans, kmeans
+from jeit_solvers.optimise.descent import Descent
+from jeit_solvers.optimise.small_problems import (
+    Minimum,
+    definite_small,
+    hessian_small,
+    inverse_small,
+    minimise_small,
+    solve_small,
+    symmetric_small,
+)
+from jeit_solvers.over_cores import over_cores
+from jeit_solvers.sparse.choose import choose_solver
+from jeit_solvers.sparse.conjugate_gradient import ConjugateGradient
+from jeit_solvers.sparse.multifrontal import Factor, factorise, half_solve, quadratic_form, solve
+from jeit_solvers.sparse.near_inverse import NearInverse, Strips, near_inverse
+from jeit_solvers.sparse.operator import SparseSymmetric
+from jeit_solvers.sparse.pattern import SparsityPattern
+from jeit_solvers.sparse.plan import FactorisationPlan, analyse
+from jeit_solvers.sparse.sparse_cholesky import SparseCholesky
 
 __all__ = [
     "ConjugateGradient",
@@ -28,22 +36,22 @@ __all__ = [
     "FactorisationPlan",
     "KMeans",
     "Minimum",
-    "Model",
     "NearInverse",
+    "QuadraticModel",
     "SparseCholesky",
     "SparseSymmetric",
     "SparsityPattern",
     "Strips",
     "analyse",
     "choose_solver",
-    "definite_few",
+    "definite_small",
     "factorise",
     "half_solve",
-    "hessian_few",
+    "hessian_small",
     "in_turn",
-    "inverse_few",
+    "inverse_small",
     "kmeans",
-    "minimise_few",
+    "minimise_small",
     "near_inverse",
     "over_cores",
     "quadratic_form",
@@ -51,7 +59,7 @@ __all__ = [
     "ridge_step",
     "solve",
     "solve_definite",
-    "solve_few",
-    "symmetric_few",
+    "solve_small",
     "symmetric_inverse",
+    "symmetric_small",
 ]

@@ -15,7 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
-from .batching import in_turn
+from jeit_solvers.batching import in_turn
 
 
 class KMeans(eqx.Module):

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.acoustic import IntensityNoise, InverseSquare, Listeners, Localiser, make_surface
-from jeit.acoustic.localiser import METHODS
-from jeit.electrodes import grid
+from jeit.acoustic import IntensityNoise, InverseSquare, Localiser, MicrophoneArray, make_surface
+from jeit.acoustic.localisation.localiser import METHODS
+from jeit.layout import grid
 
 both = pytest.mark.parametrize("method", METHODS)
 # Programs take long to compile: of some, only the likelihood's is for the quick suite.
@@ -37,17 +37,17 @@ def listen(microphones, a, b, places, strength=1.0):
 
 
 def array(count, *, outline=OUTLINE, microphones=None, points=None, seed=0, **noise):
-    """Listeners with such models; `noise` as of `IntensityNoise.create`."""
+    """MicrophoneArray with such models; `noise` as of `IntensityNoise.create`."""
     place = MICROPHONES[count] if microphones is None else microphones
     a, b = models(count, seed)
     decay = InverseSquare(jnp.asarray(a), jnp.asarray(b))
     surface = make_surface(outline, points)
-    return Listeners(jnp.asarray(place), surface, decay, IntensityNoise.create(count, **noise))
+    return MicrophoneArray(jnp.asarray(place), surface, decay, IntensityNoise.create(count, **noise))
 
 
-def hear(listeners, places, strength=1.0):
-    """What the microphones of `listeners`, which are InverseSquare, receive without noise, (F, M)."""
-    return listen(listeners.microphones, listeners.decay.a, listeners.decay.b, places, strength)
+def hear(microphone_array, places, strength=1.0):
+    """What the microphones of `microphone_array`, which are InverseSquare, receive without noise, (F, M)."""
+    return listen(microphone_array.microphones, microphone_array.decay.a, microphone_array.decay.b, places, strength)
 
 
 def variance(noise, received):
@@ -83,9 +83,9 @@ def same_shape(localiser, power, number=1024, **options):
     return {key: np.asarray(getattr(found, key))[: len(power)] for key in found.__dataclass_fields__}
 
 
-def localise(listeners, power, method="likelihood", **options):
+def localise(microphone_array, power, method="likelihood", **options):
     """The same, of a localiser made for it."""
-    return same_shape(Localiser.create(listeners, method=method), power, **options)
+    return same_shape(Localiser.create(microphone_array, method=method), power, **options)
 
 
 def distance(found, places):

@@ -6,18 +6,18 @@ import pytest
 from microphone_arrays import MICROPHONES, array, hear, inside, variance
 
 from jeit.acoustic import cramer_rao, make_surface
-from jeit.acoustic.likelihood import Listeners
+from jeit.acoustic.microphones import MicrophoneArray
 
 PLACES, STRENGTH = inside(6), np.array([0.05, 0.3, 1.0, 3.0, 10.0, 100.0])
 
 
-def fisher(listeners, place, strength):
+def fisher(microphone_array, place, strength):
     """Σ ∇m ∇mᵀ / v + ½ ∇log v ∇log vᵀ in (x, y, log strength), by central differences."""
 
     def terms(x):
-        received = hear(listeners, [x[:2]], np.exp(x[2]))[0]
-        total = received + np.asarray(listeners.noise.floor)
-        return np.stack([np.log(total), np.log(np.asarray(variance(listeners.noise, received)) / total**2)])
+        received = hear(microphone_array, [x[:2]], np.exp(x[2]))[0]
+        total = received + np.asarray(microphone_array.noise.floor)
+        return np.stack([np.log(total), np.log(np.asarray(variance(microphone_array.noise, received)) / total**2)])
 
     at, step = np.array([*place, np.log(strength)]), 1e-6
     slopes = np.stack([(terms(at + step * e) - terms(at - step * e)) / (2 * step) for e in np.eye(3)], axis=-1)
@@ -26,10 +26,10 @@ def fisher(listeners, place, strength):
 
 
 def test_it_is_the_inverse_of_fishers_matrix():
-    listeners = array(9, relative=0.1, floor=0.05, freedom=30.0)
-    bound = cramer_rao(listeners, jnp.asarray(PLACES), jnp.asarray(STRENGTH))
+    microphone_array = array(9, relative=0.1, floor=0.05, freedom=30.0)
+    bound = cramer_rao(microphone_array, jnp.asarray(PLACES), jnp.asarray(STRENGTH))
     for place, strength, mine in zip(PLACES, STRENGTH, bound, strict=True):
-        expected = np.linalg.inv(fisher(listeners, place, strength))[:2, :2]
+        expected = np.linalg.inv(fisher(microphone_array, place, strength))[:2, :2]
         np.testing.assert_allclose(mine, expected, rtol=1e-6, atol=1e-7 * np.trace(expected))
 
 
@@ -38,7 +38,7 @@ def test_microphones_left_out_tell_nothing():
     whole = array(9, relative=0.1)
     use = np.ones(9, bool)
     use[[2, 3]] = False
-    part = Listeners(
+    part = MicrophoneArray(
         whole.microphones[use],
         whole.surface,
         type(whole.decay)(whole.decay.a[use], whole.decay.b[use]),
@@ -59,9 +59,9 @@ def test_relative_noise_knows_no_scale():
 
 
 def test_louder_is_better_until_the_relative_error_is_left():
-    listeners = array(9, relative=0.05, floor=0.1, freedom=20.0)
+    microphone_array = array(9, relative=0.05, floor=0.1, freedom=20.0)
     place = jnp.asarray(np.repeat(PLACES[:1], 6, axis=0))
-    spread = np.trace(cramer_rao(listeners, place, jnp.asarray(10.0 ** np.arange(-1, 5))), axis1=1, axis2=2)
+    spread = np.trace(cramer_rao(microphone_array, place, jnp.asarray(10.0 ** np.arange(-1, 5))), axis1=1, axis2=2)
     assert (np.diff(spread) < 0).all()
     assert spread[-1] == pytest.approx(np.trace(cramer_rao(array(9, relative=0.05), place)[0]), rel=0.01)
 
@@ -71,14 +71,17 @@ def test_on_a_skin_in_space():
     flat = array(9, relative=0.1)
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0][:, :2]
     corners = flat.surface.outline.vertices @ turn.T
-    curved = Listeners(jnp.asarray(MICROPHONES[9] @ turn.T), make_surface(np.asarray(corners)), flat.decay, flat.noise)
+    curved = MicrophoneArray(
+        jnp.asarray(MICROPHONES[9] @ turn.T), make_surface(np.asarray(corners)), flat.decay, flat.noise
+    )
     expected = turn @ np.asarray(cramer_rao(flat, jnp.asarray(PLACES))) @ turn.T
     found = np.asarray(cramer_rao(curved, jnp.asarray(PLACES @ turn.T)))
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
 
 
 def test_one_strength_for_all():
-    listeners = array(9, relative=0.1, floor=0.05, freedom=30.0)
+    microphone_array = array(9, relative=0.1, floor=0.05, freedom=30.0)
     np.testing.assert_allclose(
-        cramer_rao(listeners, jnp.asarray(PLACES), 2.0), cramer_rao(listeners, jnp.asarray(PLACES), jnp.full(6, 2.0))
+        cramer_rao(microphone_array, jnp.asarray(PLACES), 2.0),
+        cramer_rao(microphone_array, jnp.asarray(PLACES), jnp.full(6, 2.0)),
     )

@@ -6,7 +6,7 @@ from microphone_arrays import MICROPHONES, OUTLINE, listen
 
 from jeit.acoustic import InverseSquare, Taps, calibrate_microphones
 from jeit.acoustic.decay import DECAYS
-from jeit.electrodes import grid
+from jeit.layout import grid
 
 PLACES = grid(0.18, 0.18, 13, 13)
 MICROPHONE = MICROPHONES[25]
@@ -50,7 +50,7 @@ def calibrated(power, places=PLACES, **options):
 
 
 def logarithms_of(fit):
-    return np.asarray(fit.calibration.listeners.decay.logarithms())
+    return np.asarray(fit.calibration.microphone_array.decay.logarithms())
 
 
 @pytest.fixture(scope="module")
@@ -77,11 +77,11 @@ def test_exact_data_give_the_parameters(decay, seed):
     assert set(fit.calibration.reasons) == {""}
     np.testing.assert_allclose(fit.explained, 1, atol=1e-9)
     np.testing.assert_allclose(fit.distance, np.sqrt(SQUARED), rtol=1e-14)
-    assert float(np.log(fit.calibration.listeners.decay.gain).mean()) == pytest.approx(0, abs=1e-12)
-    assert isinstance(fit.calibration.listeners.decay, DECAYS[decay])
+    assert float(np.log(fit.calibration.microphone_array.decay.gain).mean()) == pytest.approx(0, abs=1e-12)
+    assert isinstance(fit.calibration.microphone_array.decay, DECAYS[decay])
     # Nothing is known better than to a thousandth.
-    np.testing.assert_allclose(fit.calibration.listeners.noise.relative, 1e-3)
-    np.testing.assert_array_equal(fit.calibration.listeners.noise.deviation, 0)
+    np.testing.assert_allclose(fit.calibration.microphone_array.noise.relative, 1e-3)
+    np.testing.assert_array_equal(fit.calibration.microphone_array.noise.deviation, 0)
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1e12])
@@ -139,7 +139,7 @@ def test_a_dead_and_a_deaf_microphone_are_named_with_reason(spoilt):
 
 def test_the_scale_is_that_of_the_usable_microphones(spoilt):
     calibration = spoilt[2].calibration
-    gain = np.asarray(calibration.listeners.decay.gain)[calibration.usable]
+    gain = np.asarray(calibration.microphone_array.decay.gain)[calibration.usable]
     assert float(np.log(gain).mean()) == pytest.approx(0, abs=1e-12)
     assert np.isnan(calibration.standard_errors[:, 3]).all()
     assert np.isfinite(calibration.standard_errors[:, calibration.usable]).all()
@@ -171,11 +171,11 @@ def test_relative_noise_is_found(drawn, exact):
     """And hardly any additive noise where there is none: in few microphones, and little."""
     additive = []
     for fit in drawn[2]:
-        relative = np.asarray(fit.calibration.listeners.noise.relative)
+        relative = np.asarray(fit.calibration.microphone_array.noise.relative)
         # Of 169 taps: good to 5.5 % each.
         assert np.mean(relative) == pytest.approx(0.05, rel=0.05)
         assert ((relative > 0.035) & (relative < 0.065)).all()
-        additive.append(np.asarray(fit.calibration.listeners.noise.deviation))
+        additive.append(np.asarray(fit.calibration.microphone_array.noise.deviation))
         assert not fit.outlier.any()
     assert np.mean(np.array(additive) > 0) < 0.05
     assert np.max(additive) < 0.05 * np.median(exact[2])
@@ -197,7 +197,7 @@ def test_additive_noise_is_found(exact):
     deviation = 0.1 * np.median(power)
     rng = np.random.default_rng(5)
     fit = calibrated(power * np.exp(0.05 * rng.normal(size=power.shape)) + deviation * rng.normal(size=power.shape))
-    noise = fit.calibration.listeners.noise
+    noise = fit.calibration.microphone_array.noise
     assert np.median(noise.deviation) == pytest.approx(deviation, rel=0.25)
     assert np.mean(noise.relative) == pytest.approx(0.05, rel=0.25)
     z = (logarithms_of(fit) - scaled("inverse-square", values)[0]) / fit.calibration.standard_errors
@@ -309,7 +309,7 @@ def test_on_a_curved_skin():
     place, taps = on(MICROPHONE, 0.01), on(PLACES)
     fit = calibrate_microphones(Taps(place, on(OUTLINE), taps, power=listen(place, *values, taps, strengths())))
     np.testing.assert_allclose(logarithms_of(fit), scaled("inverse-square", values)[0], atol=1e-6)
-    assert fit.calibration.listeners.surface.dimension == 3
+    assert fit.calibration.microphone_array.surface.dimension == 3
 
 
 def test_too_few_microphones(exact):
@@ -354,7 +354,7 @@ def test_microphones_at_each_others_places_are_said_to_be_off(exact):
     fit = calibrate_microphones(Taps(microphones, OUTLINE, PLACES, power=power))
     assert set(np.flatnonzero(~fit.calibration.usable)) == {11, 12}
     assert all("is it where it is said to be" in fit.calibration.reasons[k] for k in (11, 12))
-    relative = np.asarray(fit.calibration.listeners.noise.relative)
+    relative = np.asarray(fit.calibration.microphone_array.noise.relative)
     np.testing.assert_allclose(np.delete(relative, [11, 12]), 0.1, atol=0.04)
 
 
@@ -365,7 +365,7 @@ def test_few_microphones_share_the_noise():
     rng = np.random.default_rng(8)
     power = 1e-3 / (squared + 4e-4) * np.exp(0.2 * rng.normal(size=squared.shape) + rng.normal(size=(len(places), 1)))
     fit = calibrate_microphones(Taps(array, OUTLINE, places, power=power))
-    relative = np.asarray(fit.calibration.listeners.noise.relative)
+    relative = np.asarray(fit.calibration.microphone_array.noise.relative)
     assert ((relative > 0.1) & (relative < 0.4)).all(), relative
     np.testing.assert_allclose(logarithms_of(fit)[1], np.log(4e-4), atol=0.8)
 

@@ -8,20 +8,27 @@ import numpy as np
 import pytest
 from microphone_arrays import MICROPHONES, OUTLINE, array
 
-from jeit.acoustic import AttenuatedInverseSquare, Calibration, Exponential, IntensitySettings, Listeners, make_surface
+from jeit.acoustic import (
+    AttenuatedInverseSquare,
+    Calibration,
+    Exponential,
+    IntensitySettings,
+    MicrophoneArray,
+    make_surface,
+)
 from jeit.acoustic.noise import IntensityNoise
 from jeit.mesh import Polygon
 
 HOLE = [[0.01, 0.01], [0.01, 0.03], [0.03, 0.03], [0.03, 0.01]]
 
 
-def calibration(listeners, intensity=None):
-    count = len(listeners.microphones)
-    errors = np.abs(np.random.default_rng(0).normal(size=(len(listeners.decay.parameters), count)))
+def calibration(microphone_array, intensity=None):
+    count = len(microphone_array.microphones)
+    errors = np.abs(np.random.default_rng(0).normal(size=(len(microphone_array.decay.parameters), count)))
     errors[:, 2] = np.nan
     usable = np.arange(count) != 2
     reasons = tuple("" if good else "dead: every intensity is 0" for good in usable)
-    return Calibration(listeners, usable, reasons, errors, intensity, "taps of Friday – Ü", (0.25, 8.0))
+    return Calibration(microphone_array, usable, reasons, errors, intensity, "taps of Friday – Ü", (0.25, 8.0))
 
 
 def curved():
@@ -31,12 +38,12 @@ def curved():
     surface = make_surface(np.hstack([OUTLINE, height]), points)
     flat = array(9)
     place = np.column_stack([MICROPHONES[9], np.full(9, -0.01)])
-    return Listeners(jnp.asarray(place), surface, flat.decay, flat.noise)
+    return MicrophoneArray(jnp.asarray(place), surface, flat.decay, flat.noise)
 
 
 def other_decay(kind, *values):
     flat = array(9, relative=0.05, floor=0.3, freedom=12.0)
-    return Listeners(flat.microphones, flat.surface, kind(*(jnp.asarray(value) for value in values)), flat.noise)
+    return MicrophoneArray(flat.microphones, flat.surface, kind(*(jnp.asarray(value) for value in values)), flat.noise)
 
 
 RNG = np.random.default_rng(3)
@@ -58,9 +65,9 @@ def test_there_and_back(name, tmp_path):
     one = CASES[name]()
     one.save(tmp_path / "array.json")
     again = Calibration.load(tmp_path / "array.json")
-    assert eqx.tree_equal(one.listeners, again.listeners)
-    assert type(again.listeners.surface) is type(one.listeners.surface)
-    assert type(again.listeners.decay) is type(one.listeners.decay)
+    assert eqx.tree_equal(one.microphone_array, again.microphone_array)
+    assert type(again.microphone_array.surface) is type(one.microphone_array.surface)
+    assert type(again.microphone_array.decay) is type(one.microphone_array.decay)
     np.testing.assert_array_equal(again.usable, one.usable)
     np.testing.assert_array_equal(again.standard_errors, one.standard_errors)
     assert (again.reasons, again.name, again.num_microphones) == (one.reasons, one.name, 9)
@@ -90,7 +97,7 @@ def test_values_that_no_file_can_hold_are_not_written(tmp_path):
         flat.noise.floor.at[0].set(jnp.nan), flat.noise.deviation, flat.noise.cross, flat.noise.relative
     )
     with pytest.raises(ValueError, match="JSON"):
-        calibration(Listeners(flat.microphones, flat.surface, flat.decay, noise)).save(tmp_path / "array.json")
+        calibration(MicrophoneArray(flat.microphones, flat.surface, flat.decay, noise)).save(tmp_path / "array.json")
 
 
 @pytest.fixture(scope="module")

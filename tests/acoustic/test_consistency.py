@@ -7,23 +7,23 @@ import pytest
 from microphone_arrays import array, hear, inside, noisy, same_shape
 from scipy.optimize import minimize
 
-from jeit.acoustic import AttenuatedInverseSquare, Exponential, Listeners, Localiser, make_surface
-from jeit.acoustic.consistency import Consistency
+from jeit.acoustic import AttenuatedInverseSquare, Exponential, Localiser, MicrophoneArray, make_surface
+from jeit.acoustic.localisation.consistency import Consistency
 
 FRAMES = 12
 
 
 @pytest.fixture(scope="module")
-def listeners():
+def microphone_array():
     return array(9, relative=0.1)
 
 
 @pytest.fixture(scope="module")
-def frames(listeners):
+def frames(microphone_array):
     """Power (F, M) with 10 % noise, strengths over a factor of 30, and which are used: two of them not, in some."""
     places = inside(FRAMES, reach=0.8)
     strength = np.exp(np.linspace(-2, 1.5, FRAMES))
-    power = noisy(listeners.noise, hear(listeners, places, strength), np.random.default_rng(0))
+    power = noisy(microphone_array.noise, hear(microphone_array, places, strength), np.random.default_rng(0))
     use = np.ones(power.shape, bool)
     use[3, [1, 4]] = use[5, [7, 8]] = False
     # What is not used may be anything, the loudest included.
@@ -31,9 +31,11 @@ def frames(listeners):
     return power, use
 
 
-def loss(listeners, power, use, place):
+def loss(microphone_array, power, use, place):
     """L = Σ_{i≠k} (I_k (|x − x_k|² + b_k) / a_k − I_i (|x − x_i|² + b_i) / a_i)², k the loudest of those used."""
-    microphones, a, b = (np.asarray(x) for x in (listeners.microphones, listeners.decay.a, listeners.decay.b))
+    microphones, a, b = (
+        np.asarray(x) for x in (microphone_array.microphones, microphone_array.decay.a, microphone_array.decay.b)
+    )
     used = [i for i in range(len(power)) if use[i]]
     k = max(used, key=lambda i: power[i])
 
@@ -43,41 +45,43 @@ def loss(listeners, power, use, place):
     return sum((told(k) - told(i)) ** 2 for i in used if i != k)
 
 
-def objective(listeners, frames):
+def objective(microphone_array, frames):
     power, use = frames
-    return Consistency.create(jnp.asarray(power.T), jnp.asarray(use.T), listeners)
+    return Consistency.create(jnp.asarray(power.T), jnp.asarray(use.T), microphone_array)
 
 
-def test_cost_is_the_papers(listeners, frames):
+def test_cost_is_the_papers(microphone_array, frames):
     """Relative to the square of the loudest intensity."""
     power, use = frames
     places = inside(FRAMES, seed=1)
-    cost = objective(listeners, frames).cost(jnp.asarray(places.T))
+    cost = objective(microphone_array, frames).cost(jnp.asarray(places.T))
     for frame in range(FRAMES):
         loudest = power[frame, use[frame]].max()
-        expected = loss(listeners, power[frame], use[frame], places[frame]) / loudest**2
+        expected = loss(microphone_array, power[frame], use[frame], places[frame]) / loudest**2
         assert float(cost[frame]) == pytest.approx(expected, rel=1e-10)
 
 
-def test_screen_is_the_same_at_many_places(listeners, frames):
+def test_screen_is_the_same_at_many_places(microphone_array, frames):
     power, use = frames
     places = inside(20, seed=2)
-    one = objective(listeners, frames)
-    screened = np.asarray(one.screen(one.features(listeners, jnp.asarray(places.T))))
+    one = objective(microphone_array, frames)
+    screened = np.asarray(one.screen(one.features(microphone_array, jnp.asarray(places.T))))
     assert screened.shape == (FRAMES, 20)
     for frame in range(FRAMES):
         loudest = power[frame, use[frame]].max()
         for number, place in enumerate(places):
-            expected = loss(listeners, power[frame], use[frame], place) / loudest**2
+            expected = loss(microphone_array, power[frame], use[frame], place) / loudest**2
             assert screened[frame, number] == pytest.approx(expected, rel=1e-10)
 
 
 @pytest.mark.parametrize("decay", [Exponential, AttenuatedInverseSquare])
-def test_other_models_have_the_same_loss(decay, listeners, frames):
+def test_other_models_have_the_same_loss(decay, microphone_array, frames):
     """Cost, screen and formula, with g = 1 / f of another model, in the plane."""
     rng = np.random.default_rng(6)
     values = [jnp.asarray(one) for one in 0.03 * np.exp(0.3 * rng.normal(size=(len(decay.parameters), 9)))]
-    other = Listeners(listeners.microphones, listeners.surface, decay(*values), listeners.noise)
+    other = MicrophoneArray(
+        microphone_array.microphones, microphone_array.surface, decay(*values), microphone_array.noise
+    )
     power, use = frames
     places = inside(FRAMES, seed=7)
     one = objective(other, frames)
@@ -93,23 +97,25 @@ def test_other_models_have_the_same_loss(decay, listeners, frames):
         assert screened[frame, frame] == pytest.approx(expected, rel=1e-10)
 
 
-def test_on_a_skin_in_space(listeners, frames):
+def test_on_a_skin_in_space(microphone_array, frames):
     """A plane in space, tilted: the loss of the plane."""
     turn = np.linalg.qr(np.random.default_rng(8).normal(size=(3, 3)))[0][:, :2]
-    surface = make_surface(np.asarray(listeners.surface.outline.vertices) @ turn.T)
-    tilted = Listeners(jnp.asarray(listeners.microphones @ turn.T), surface, listeners.decay, listeners.noise)
+    surface = make_surface(np.asarray(microphone_array.surface.outline.vertices) @ turn.T)
+    tilted = MicrophoneArray(
+        jnp.asarray(microphone_array.microphones @ turn.T), surface, microphone_array.decay, microphone_array.noise
+    )
     places = inside(FRAMES, seed=1)
     chart = surface.project(jnp.asarray(turn @ places.T))
-    one, flat = objective(tilted, frames), objective(listeners, frames)
+    one, flat = objective(tilted, frames), objective(microphone_array, frames)
     plain = flat.cost(jnp.asarray(places.T))
     np.testing.assert_allclose(one.cost(chart), plain, rtol=1e-9)
     screened = one.screen(one.features(tilted, chart))
     np.testing.assert_allclose(np.diag(screened), plain, rtol=1e-9)
 
 
-def test_expansion(listeners, frames):
+def test_expansion(microphone_array, frames):
     """The gradient against JAX's own of the cost; the matrix against that of the differences, written out."""
-    one = objective(listeners, frames)
+    one = objective(microphone_array, frames)
     chart = jnp.asarray(inside(FRAMES, seed=3).T)
     value, gradient, matrix = one.expand(chart)
     np.testing.assert_allclose(value, one.cost(chart), rtol=1e-13)
@@ -126,10 +132,10 @@ def test_expansion(listeners, frames):
 
 
 @pytest.mark.slow
-def test_minimum_is_scipys(listeners, frames):
+def test_minimum_is_scipys(microphone_array, frames):
     """From four starts each: the localiser's is as low as the lowest of them."""
     power, use = frames
-    found = same_shape(Localiser.create(listeners, method="consistency"), np.where(use, power, np.nan))
+    found = same_shape(Localiser.create(microphone_array, method="consistency"), np.where(use, power, np.nan))
     # Gauss and Newton's steps are small where residuals curve the loss: a frame may need more, and is said to.
     assert found["converged"].mean() > 0.9
     starts = inside(4, seed=4)
@@ -139,7 +145,9 @@ def test_minimum_is_scipys(listeners, frames):
         best = min(
             (
                 minimize(
-                    lambda x, frame=frame, level=level: 1e3 * loss(listeners, power[frame], use[frame], x) / level**2,
+                    lambda x, frame=frame, level=level: (
+                        1e3 * loss(microphone_array, power[frame], use[frame], x) / level**2
+                    ),
                     start,
                     method="Nelder-Mead",
                     options={"xatol": 1e-9, "fatol": 1e-15, "maxiter": 400},
@@ -151,15 +159,15 @@ def test_minimum_is_scipys(listeners, frames):
         np.testing.assert_allclose(found["position"][frame], best.x, atol=1e-6)
 
 
-def test_scale_of_intensities_does_not_matter(listeners, frames):
+def test_scale_of_intensities_does_not_matter(microphone_array, frames):
     power, use = frames
     chart = jnp.asarray(inside(FRAMES, seed=1).T)
-    plain = objective(listeners, frames).cost(chart)
+    plain = objective(microphone_array, frames).cost(chart)
     for scale in (1e-12, 1e12):
-        np.testing.assert_allclose(objective(listeners, (scale * power, use)).cost(chart), plain, rtol=1e-10)
+        np.testing.assert_allclose(objective(microphone_array, (scale * power, use)).cost(chart), plain, rtol=1e-10)
 
 
-def test_covariance_is_that_of_draws(listeners):
+def test_covariance_is_that_of_draws(microphone_array):
     """Of the minimum of noisy frames, at 1 % noise, where its formula is exact but for a few per cent."""
     quiet = array(9, relative=0.01)
     rng = np.random.default_rng(5)

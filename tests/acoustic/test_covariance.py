@@ -6,7 +6,7 @@ import pytest
 from microphone_arrays import array, distance, hear, inside, localise, noisy, same_shape
 
 from jeit.acoustic import Localiser, cramer_rao
-from jeit.acoustic.localiser import METHODS
+from jeit.acoustic.localisation.localiser import METHODS
 
 # Honesty of the covariance.
 NOISES = {
@@ -20,11 +20,11 @@ SOURCES = [([0.01, 0.02], 1.0), ([0.05, -0.04], 5.0), ([-0.06, 0.0], 2.0), ([0.0
 @pytest.mark.parametrize("noise", NOISES)
 def test_the_covariance_is_honest(noise):
     """1,000 draws a place: the 95 % ellipse holds the truth in 92 to 98 %."""
-    listeners = array(9, **NOISES[noise])
-    localiser, rng = Localiser.create(listeners), np.random.default_rng(3)
+    microphone_array = array(9, **NOISES[noise])
+    localiser, rng = Localiser.create(microphone_array), np.random.default_rng(3)
     for place, strength in SOURCES:
-        received = np.repeat(hear(listeners, [place], strength), 1000, axis=0)
-        found = same_shape(localiser, noisy(listeners.noise, received, rng))
+        received = np.repeat(hear(microphone_array, [place], strength), 1000, axis=0)
+        found = same_shape(localiser, noisy(microphone_array.noise, received, rng))
         error = found["position"] - place
         square = np.einsum("fi,fij,fj->f", error, np.linalg.inv(found["covariance"]), error)
         assert 0.92 <= np.mean(square < 5.991) <= 0.98, (place, np.mean(square < 5.991))
@@ -37,10 +37,10 @@ def test_noise_of_windows_with_a_floor():
     """Not drawn from the model: powers of signal and noise in 100 degrees of freedom, noncentral chi-square, and gains
     off by 5 %."""
     floor, freedom = 0.05, 100.0
-    listeners = array(9, relative=0.05, floor=floor, freedom=freedom)
-    localiser, rng = Localiser.create(listeners), np.random.default_rng(4)
+    microphone_array = array(9, relative=0.05, floor=floor, freedom=freedom)
+    localiser, rng = Localiser.create(microphone_array), np.random.default_rng(4)
     for place, strength in SOURCES:
-        received = np.repeat(hear(listeners, [place], strength), 1000, axis=0)
+        received = np.repeat(hear(microphone_array, [place], strength), 1000, axis=0)
         received = received * np.exp(0.05 * rng.normal(size=received.shape))
         power = floor / freedom * rng.noncentral_chisquare(freedom, freedom * received / floor) - floor
         found = same_shape(localiser, power)
@@ -51,13 +51,14 @@ def test_noise_of_windows_with_a_floor():
 
 def test_the_error_is_the_cramer_rao_bound():
     """Where noise is low: 2 % in gain. Mean squares of 1,024 draws are good to 4.4 % a direction, 3.1 % in all."""
-    listeners = array(9, relative=0.02)
-    localiser, rng = Localiser.create(listeners), np.random.default_rng(5)
-    bound = cramer_rao(listeners, jnp.asarray([place for place, _ in SOURCES]))
+    microphone_array = array(9, relative=0.02)
+    localiser, rng = Localiser.create(microphone_array), np.random.default_rng(5)
+    bound = cramer_rao(microphone_array, jnp.asarray([place for place, _ in SOURCES]))
     ratio = []
     for (place, strength), least in zip(SOURCES, bound, strict=True):
         found = same_shape(
-            localiser, noisy(listeners.noise, np.repeat(hear(listeners, [place], strength), 1024, axis=0), rng)
+            localiser,
+            noisy(microphone_array.noise, np.repeat(hear(microphone_array, [place], strength), 1024, axis=0), rng),
         )
         error = found["position"] - place
         assert np.linalg.norm(error.mean(axis=0)) < 0.1 * np.sqrt(np.trace(least))
@@ -69,10 +70,10 @@ def test_the_error_is_the_cramer_rao_bound():
 
 def test_the_likelihood_beats_the_papers_loss():
     """Where far microphones hear little but noise, which the loss multiplies by the distance."""
-    listeners = array(9, relative=0.05, floor=0.05, freedom=30.0)
+    microphone_array = array(9, relative=0.05, floor=0.05, freedom=30.0)
     places, rng = inside(1000, reach=0.5), np.random.default_rng(6)
-    power = noisy(listeners.noise, hear(listeners, places), rng)
-    errors = [np.mean(distance(localise(listeners, power, method), places)) for method in METHODS]
+    power = noisy(microphone_array.noise, hear(microphone_array, places), rng)
+    errors = [np.mean(distance(localise(microphone_array, power, method), places)) for method in METHODS]
     assert errors[0] < 0.9 * errors[1]
 
 

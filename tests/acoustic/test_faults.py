@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from jeit.acoustic.faults import CLIPPING, NOT_FINITE, STUCK, intensity_faults, sample_faults, tell, window_faults
+from jeit.acoustic.signal.faults import (
+    CLIPPING,
+    NOT_FINITE,
+    STUCK,
+    describe_faults,
+    intensity_faults,
+    sample_faults,
+    window_faults,
+)
 
 RATE = 40e3
 TIME = np.arange(40_000) / RATE
@@ -226,4 +234,4 @@ def test_intensities_without_samples():
     ],
 )
 def test_one_reason_is_told_once(reasons, said):
-    assert tell(reasons) == said
+    assert describe_faults(reasons) == said

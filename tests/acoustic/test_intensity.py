@@ -4,9 +4,15 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jeit.acoustic import _band_power
-from jeit.acoustic.intensity import IntensitySettings, degrees_of_freedom, intensities, noise_floor, tap_intensities
-from jeit.acoustic.recording import Intensities, Recording, Taps
+from jeit.acoustic.signal import _band_power
+from jeit.acoustic.signal.intensity import (
+    IntensitySettings,
+    degrees_of_freedom,
+    intensities,
+    noise_floor,
+    tap_intensities,
+)
+from jeit.acoustic.signal.recording import Intensities, Recording, Taps
 
 RATE = 20e3
 OUTLINE = [[0, 0], [0.2, 0], [0.2, 0.2], [0, 0.2]]

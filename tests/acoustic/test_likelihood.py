@@ -6,29 +6,29 @@ import numpy as np
 import pytest
 from microphone_arrays import array, hear, inside, listen, noisy, variance
 
-from jeit.acoustic.likelihood import Likelihood
+from jeit.acoustic.localisation.likelihood import Likelihood
 
 FRAMES = 12
 
 
 @pytest.fixture(scope="module")
-def listeners():
+def microphone_array():
     return array(9, relative=0.1, floor=0.05, freedom=30.0)
 
 
 @pytest.fixture(scope="module")
-def frames(listeners):
+def frames(microphone_array):
     places = inside(FRAMES)
     strength = np.exp(np.linspace(-2, 3, FRAMES))
-    power = noisy(listeners.noise, hear(listeners, places, strength), np.random.default_rng(0))
+    power = noisy(microphone_array.noise, hear(microphone_array, places, strength), np.random.default_rng(0))
     use = np.ones(power.shape, bool)
     use[3, [1, 4]] = use[5, 7] = False
     power[3, 1], power[5, 7] = np.inf, np.nan
     return power, use
 
 
-def likelihood(listeners, frames):
-    return Likelihood.create(jnp.asarray(frames[0].T), jnp.asarray(frames[1].T), listeners)
+def likelihood(microphone_array, frames):
+    return Likelihood.create(jnp.asarray(frames[0].T), jnp.asarray(frames[1].T), microphone_array)
 
 
 def unknowns(number, seed=1):
@@ -36,11 +36,11 @@ def unknowns(number, seed=1):
     return np.concatenate([places.T, rng.normal(size=(1, number))])
 
 
-def terms_of(listeners, power, use, x):
+def terms_of(microphone_array, power, use, x):
     """(y − m)² / v and log v for sources x = (u, s, u', s', …), one frame, of the microphones used, in NumPy."""
-    a, b, noise = listeners.decay.a, listeners.decay.b, listeners.noise
+    a, b, noise = microphone_array.decay.a, microphone_array.decay.b, microphone_array.noise
     received = sum(
-        listen(listeners.microphones, a, b, [x[k : k + 2]], np.exp(x[k + 2]))[0] for k in range(0, len(x), 3)
+        listen(microphone_array.microphones, a, b, [x[k : k + 2]], np.exp(x[k + 2]))[0] for k in range(0, len(x), 3)
     )
     floor = np.asarray(noise.floor)
     deviation2 = np.asarray(variance(noise, received)) / (received + floor) ** 2
@@ -50,28 +50,29 @@ def terms_of(listeners, power, use, x):
 
 
 @pytest.mark.parametrize("sources", [1, 2])
-def test_cost_is_the_formula(sources, listeners, frames):
+def test_cost_is_the_formula(sources, microphone_array, frames):
     """Σ ½ (y − m)² / v + ½ log v; the misfit is twice its first part."""
     x = np.concatenate([unknowns(FRAMES, seed=k) for k in range(sources)])
     cost, misfit = (
-        f(jnp.asarray(x)) for f in (likelihood(listeners, frames).cost, likelihood(listeners, frames).misfit)
+        f(jnp.asarray(x))
+        for f in (likelihood(microphone_array, frames).cost, likelihood(microphone_array, frames).misfit)
     )
     for frame in range(FRAMES):
-        squares, logarithms = terms_of(listeners, frames[0][frame], frames[1][frame], x[:, frame])
+        squares, logarithms = terms_of(microphone_array, frames[0][frame], frames[1][frame], x[:, frame])
         assert float(cost[frame]) == pytest.approx(0.5 * (squares + logarithms).sum(), rel=1e-11)
         assert float(misfit[frame]) == pytest.approx(squares.sum(), rel=1e-11)
 
 
-def test_a_level_far_below_the_floor_is_finite(listeners):
+def test_a_level_far_below_the_floor_is_finite(microphone_array):
     """Power that is minus the floor has no logarithm: the level stops at a twentieth of the floor."""
     power = np.full((1, 9), -0.06)
-    one = Likelihood.create(jnp.asarray(power.T), jnp.ones((9, 1), bool), listeners)
-    np.testing.assert_allclose(one.level[:, 0], np.log(0.05 * np.asarray(listeners.noise.floor)), rtol=1e-12)
+    one = Likelihood.create(jnp.asarray(power.T), jnp.ones((9, 1), bool), microphone_array)
+    np.testing.assert_allclose(one.level[:, 0], np.log(0.05 * np.asarray(microphone_array.noise.floor)), rtol=1e-12)
 
 
 @pytest.mark.parametrize("sources", [1, 2])
-def test_gradient(sources, listeners, frames):
-    one = likelihood(listeners, frames)
+def test_gradient(sources, microphone_array, frames):
+    one = likelihood(microphone_array, frames)
     x = jnp.asarray(np.concatenate([unknowns(FRAMES, seed=k) for k in range(sources)]))
     value, gradient, matrix = one.expand(x)
     np.testing.assert_allclose(value, one.cost(x), rtol=1e-12)
@@ -81,15 +82,17 @@ def test_gradient(sources, listeners, frames):
     assert (np.linalg.eigvalsh(np.moveaxis(np.asarray(matrix), -1, 0)) > 0).all()
 
 
-def test_matrix_is_the_covariance_of_scores(listeners):
+def test_matrix_is_the_covariance_of_scores(microphone_array):
     """Fisher's: E[∇cost ∇costᵀ] over draws at the truth, where the mean of ∇cost is nothing. 20,000 draws: 2 %."""
     number = 20_000
     place, strength = np.array([0.02, -0.03]), 0.3
     power = noisy(
-        listeners.noise, np.repeat(hear(listeners, [place], strength), number, axis=0), np.random.default_rng(2)
+        microphone_array.noise,
+        np.repeat(hear(microphone_array, [place], strength), number, axis=0),
+        np.random.default_rng(2),
     )
     truth = jnp.asarray(np.repeat([[*place, np.log(strength)]], number, axis=0).T)
-    one = Likelihood.create(jnp.asarray(power.T), jnp.ones((9, number), bool), listeners)
+    one = Likelihood.create(jnp.asarray(power.T), jnp.ones((9, number), bool), microphone_array)
     _, gradient, matrix = jax.jit(lambda x: one.expand(x))(truth)
     score, fisher = np.asarray(gradient), np.asarray(matrix)[:, :, 0]
     scale = np.sqrt(np.diag(fisher))
@@ -100,14 +103,16 @@ def test_matrix_is_the_covariance_of_scores(listeners):
 
 
 @pytest.mark.slow
-def test_matrix_is_the_expected_hessian(listeners):
+def test_matrix_is_the_expected_hessian(microphone_array):
     """E[∇²cost] over draws, by JAX's Hessian of the cost, at the truth."""
     number = 2000
     place, strength = np.array([-0.05, 0.04]), 3.0
     power = noisy(
-        listeners.noise, np.repeat(hear(listeners, [place], strength), number, axis=0), np.random.default_rng(3)
+        microphone_array.noise,
+        np.repeat(hear(microphone_array, [place], strength), number, axis=0),
+        np.random.default_rng(3),
     )
-    one = Likelihood.create(jnp.asarray(power.T), jnp.ones((9, number), bool), listeners)
+    one = Likelihood.create(jnp.asarray(power.T), jnp.ones((9, number), bool), microphone_array)
     truth = jnp.asarray([*place, np.log(strength)])
     hessian = jax.jit(jax.hessian(lambda x: jnp.mean(one.cost(x[:, None] * jnp.ones(number)))))(truth)
     fisher = one.expand(truth[:, None] * jnp.ones(number))[2][:, :, 0]
@@ -115,7 +120,7 @@ def test_matrix_is_the_expected_hessian(listeners):
     np.testing.assert_allclose(hessian / np.outer(scale, scale), fisher / np.outer(scale, scale), atol=0.05)
 
 
-def test_strength_at_a_known_place(listeners):
+def test_strength_at_a_known_place(microphone_array):
     """Exact data: the strength itself, whatever the unit; and then the cost cannot be lower at another."""
     exact = array(9)
     places, strength = inside(5), np.array([1e-12, 0.1, 1.0, 10.0, 1e12])
@@ -126,7 +131,7 @@ def test_strength_at_a_known_place(listeners):
     np.testing.assert_allclose(one.misfit(start), 0, atol=1e-15)
 
 
-def test_screen_leaves_least_at_the_place(listeners):
+def test_screen_leaves_least_at_the_place(microphone_array):
     """½ Σ w (p − s f)² at the best s, written out; and nothing at the place of exact data."""
     exact = array(9)
     places, candidates = inside(6), np.concatenate([inside(6), inside(20, seed=5)])

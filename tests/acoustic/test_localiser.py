@@ -23,10 +23,10 @@ from microphone_arrays import (
 )
 def test_exact_data_to_a_micrometre(count, method):
     """All over the skin, of four microphones between them; whatever the strength and the unit of intensity."""
-    listeners, places = array(count), inside(600, reach=0.6 if count == 4 else 1.0)
+    microphone_array, places = array(count), inside(600, reach=0.6 if count == 4 else 1.0)
     strength = np.exp(np.random.default_rng(1).normal(size=len(places)))
     for scale in (1.0, 1e-12, 1e12):
-        found = localise(listeners, hear(listeners, places, scale * strength), method)
+        found = localise(microphone_array, hear(microphone_array, places, scale * strength), method)
         assert distance(found, places).max() < 1e-6
         np.testing.assert_allclose(found["strength"], scale * strength, rtol=1e-6)
         # A few stop at rounding, a step before they are told converged.
@@ -36,11 +36,14 @@ def test_exact_data_to_a_micrometre(count, method):
         assert (found["excess"] == 0).all()
 
 
-def explained(listeners, power, places, method):
+def explained(microphone_array, power, places, method):
     """Of one frame at many places in NumPy: the likelihood's misfit at the best strength, or the loss."""
-    told = np.log(power) - np.log(hear(listeners, places))  # log strength, as each microphone tells it
+    told = np.log(power) - np.log(hear(microphone_array, places))  # log strength, as each microphone tells it
     if method == "likelihood":  # all gains are known equally well: their mean is the best
-        return np.sum((told - told.mean(axis=1, keepdims=True)) ** 2, axis=1) / float(listeners.noise.relative[0]) ** 2
+        return (
+            np.sum((told - told.mean(axis=1, keepdims=True)) ** 2, axis=1)
+            / float(microphone_array.noise.relative[0]) ** 2
+        )
     told = np.exp(told)
     return np.sum((told - told[:, [power.argmax()]]) ** 2, axis=1)
 
@@ -53,13 +56,13 @@ RASTER = np.stack(np.meshgrid(*2 * [np.linspace(-0.1, 0.1, 101)]), axis=-1).resh
 @pytest.mark.parametrize("count", [pytest.param(3, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow), 9])
 def test_no_place_on_the_skin_is_better(count, noise, method):
     """A search of the whole skin, its outline too, every 2 mm: nothing is lower than what is found."""
-    listeners, places = array(count, relative=max(noise, 1e-3)), inside(150)
-    power = hear(listeners, places)
+    microphone_array, places = array(count, relative=max(noise, 1e-3)), inside(150)
+    power = hear(microphone_array, places)
     power = power * np.exp(noise * np.random.default_rng(11).normal(size=power.shape))
-    found = localise(listeners, power, method)
+    found = localise(microphone_array, power, method)
     missed = []
     for frame, mine in enumerate(found["position"]):
-        cost = explained(listeners, power[frame], np.concatenate([[mine], RASTER]), method)
+        cost = explained(microphone_array, power[frame], np.concatenate([[mine], RASTER]), method)
         if not cost[0] <= cost[1:].min() * (1 + 1e-6) + 1e-9:
             missed.append((places[frame], mine, cost[0], RASTER[cost[1:].argmin()], cost[1:].min()))
     # Noise makes valleys that are narrower than the coarse grid: a few frames may miss the deeper of two.
@@ -92,9 +95,9 @@ def both_places(place, power, a, b, microphones):
 @both
 def test_three_microphones(method):
     """Three are enough where the other place that they allow is off the skin; else that one is as good."""
-    listeners, places = array(3), inside(300)
-    power = hear(listeners, places)
-    found = localise(listeners, power, method)
+    microphone_array, places = array(3), inside(300)
+    power = hear(microphone_array, places)
+    found = localise(microphone_array, power, method)
     a, b = models(3)
     pairs = [both_places(*args, a, b, MICROPHONES[3]) for args in zip(places, power, strict=True)]
     np.testing.assert_allclose([pair[0] for pair in pairs], places, atol=1e-9)
@@ -113,9 +116,9 @@ def test_three_microphones(method):
 @both
 def test_an_outline_that_is_no_rectangle(method):
     """Inside an L to a micrometre; what sounds from its notch is held on its edge."""
-    listeners, places = array(9, outline=L_SHAPE), inside(300, outline=L_SHAPE)
+    microphone_array, places = array(9, outline=L_SHAPE), inside(300, outline=L_SHAPE)
     notch = np.array([[0.05, 0.06], [0.03, 0.09], [0.08, 0.03]])
-    found = localise(listeners, hear(listeners, np.concatenate([places, notch])), method)
+    found = localise(microphone_array, hear(microphone_array, np.concatenate([places, notch])), method)
     assert distance(found, np.concatenate([places, notch]))[:300].max() < 1e-6
     x, y = found["position"][300:].T
     on_edge = (np.abs(x) < 1e-9) & (y >= 0.01 - 1e-9) | (np.abs(y - 0.01) < 1e-9) & (x >= -1e-9)
@@ -152,10 +155,10 @@ def test_on_a_curved_skin(cylinder, method):
 @both
 def test_what_lies_beyond_is_held_on_the_skin(method):
     """At the best place on the outline, or at one inside that is better: none of a thousand along it is lower."""
-    listeners = array(9, relative=0.05)
+    microphone_array = array(9, relative=0.05)
     beyond = np.array([[0.13, 0.02], [-0.12, 0.05], [0.03, -0.15], [0.115, 0.12]])
-    power = hear(listeners, beyond)
-    found = localise(listeners, power, method)
+    power = hear(microphone_array, beyond)
+    found = localise(microphone_array, power, method)
     assert np.abs(found["position"]).max() <= 0.1 + 1e-12
     on_outline = np.abs(np.abs(found["position"]).max(axis=1) - 0.1) < 1e-9
     # The loss may have another valley inside.
@@ -164,7 +167,7 @@ def test_what_lies_beyond_is_held_on_the_skin(method):
     along = np.linspace(0, 1, 250, endpoint=False)[:, None]
     edge = np.concatenate([OUTLINE[k] + along * (OUTLINE[(k + 1) % 4] - OUTLINE[k]) for k in range(4)])
     for frame in range(4):
-        cost = explained(listeners, power[frame], np.concatenate([found["position"][[frame]], edge]), method)
+        cost = explained(microphone_array, power[frame], np.concatenate([found["position"][[frame]], edge]), method)
         assert cost[0] <= cost[1:].min() * (1 + 1e-9)
 
 

@@ -11,20 +11,20 @@ from jeit.acoustic import Localiser
 @pytest.fixture(scope="module")
 def mixed():
     """Noisy frames inside and beyond, some with readings missing."""
-    listeners = array(9, relative=0.1)
+    microphone_array = array(9, relative=0.1)
     rng = np.random.default_rng(7)
     places = np.concatenate([inside(40), inside(10, seed=1) + np.array([0.2, 0.0])])
-    power = noisy(listeners.noise, hear(listeners, places), rng)
+    power = noisy(microphone_array.noise, hear(microphone_array, places), rng)
     power[rng.random(power.shape) < 0.1] = np.nan
-    return listeners, power
+    return microphone_array, power
 
 
 @pytest.mark.slow
 @both
 def test_frames_do_not_see_each_other(method, mixed):
     """One by one, in another order, or padded with others: the same to rounding."""
-    listeners, power = mixed
-    localiser = Localiser.create(listeners, method=method)
+    microphone_array, power = mixed
+    localiser = Localiser.create(microphone_array, method=method)
     together = same_shape(localiser, power)
     for frame in range(0, 50, 7):
         alone = localiser(power[frame : frame + 1])
@@ -39,8 +39,8 @@ def test_frames_do_not_see_each_other(method, mixed):
 @pytest.mark.slow
 @both
 def test_many_frames_are_worked_on_in_chunks(method, mixed):
-    listeners, power = mixed
-    localiser = Localiser.create(listeners, method=method)
+    microphone_array, power = mixed
+    localiser = Localiser.create(microphone_array, method=method)
     many = localiser(power[np.arange(2500) % 50])
     np.testing.assert_allclose(many.position, localiser(power).position[np.arange(2500) % 50], rtol=1e-7, atol=1e-10)
 
@@ -48,8 +48,8 @@ def test_many_frames_are_worked_on_in_chunks(method, mixed):
 @pytest.mark.slow
 @both
 def test_compiled_or_not(method, mixed):
-    listeners, power = mixed
-    localiser = Localiser.create(listeners, method=method)
+    microphone_array, power = mixed
+    localiser = Localiser.create(microphone_array, method=method)
     with jax.disable_jit():
         eager = localiser(power[:3])
     for key, values in same_shape(localiser, power[:3]).items():
@@ -81,12 +81,12 @@ def test_missing_readings(method):
 
 @both
 def test_too_few_readings_give_nan(method, mixed):
-    listeners, power = mixed
+    microphone_array, power = mixed
     power = np.where(np.isnan(power), 1.0, power)
     power[0, 2:] = np.nan
     power[1] = np.nan
     power[2, 3:] = np.nan
-    found = localise(listeners, power, method)
+    found = localise(microphone_array, power, method)
     for key in ("position", "covariance", "strength", "misfit"):
         assert np.isnan(found[key][:2]).all()
         assert np.isfinite(found[key][2:]).all()
@@ -98,9 +98,9 @@ def test_too_few_readings_give_nan(method, mixed):
 @both
 def test_maps(method):
     """Least where the source is found, to a pixel; blank beyond the outline; bottom row first."""
-    listeners, places = array(9, outline=L_SHAPE, relative=0.02), inside(20, outline=L_SHAPE, reach=0.9)
-    localiser = Localiser.create(listeners, method=method, map_shape=(40, 30))
-    power = noisy(listeners.noise, hear(listeners, places), np.random.default_rng(10))
+    microphone_array, places = array(9, outline=L_SHAPE, relative=0.02), inside(20, outline=L_SHAPE, reach=0.9)
+    localiser = Localiser.create(microphone_array, method=method, map_shape=(40, 30))
+    power = noisy(microphone_array.noise, hear(microphone_array, places), np.random.default_rng(10))
     found, maps = localiser.with_maps(power[np.arange(32) % 20])
     assert maps.shape == (32, 40, 30)
     x, y = -0.1 + 0.2 * (np.arange(30) + 0.5) / 30, -0.1 + 0.2 * (np.arange(40) + 0.5) / 40
@@ -108,7 +108,7 @@ def test_maps(method):
     for one, place in zip(np.asarray(maps), np.asarray(found.position), strict=True):
         row, column = np.unravel_index(np.nanargmin(one), one.shape)
         assert np.hypot(x[column] - place[0], y[row] - place[1]) < 0.009
-    coarse = same_shape(Localiser.create(listeners, method=method), power)
+    coarse = same_shape(Localiser.create(microphone_array, method=method), power)
     np.testing.assert_allclose(found.position[:20], coarse["position"], atol=1e-8)
 
 
@@ -116,9 +116,9 @@ def test_maps(method):
 @both
 def test_the_papers_raster(method):
     """200 × 200 pixels of a millimetre: the map of the loss is the formula's, and its minimum the place."""
-    listeners, places = array(9, relative=0.02), inside(5, reach=0.9)
-    power = hear(listeners, places)
-    found, maps = Localiser.create(listeners, method=method, map_shape=(200, 200)).with_maps(power)
+    microphone_array, places = array(9, relative=0.02), inside(5, reach=0.9)
+    power = hear(microphone_array, places)
+    found, maps = Localiser.create(microphone_array, method=method, map_shape=(200, 200)).with_maps(power)
     np.testing.assert_allclose(found.position, places, atol=1e-6)
     for one, place in zip(np.asarray(maps), places, strict=True):
         row, column = np.unravel_index(np.nanargmin(one), one.shape)

@@ -8,18 +8,23 @@ import pytest
 from microphone_arrays import array, both, hear, inside, noisy, quick_likelihood
 
 from jeit.acoustic import Localiser
-from jeit.acoustic.localiser import METHODS
+from jeit.acoustic.localisation.localiser import METHODS
 
 
 @pytest.fixture(scope="module")
 def moving():
-    """Listeners, power, a direction in which all of them are moved, and what is found as a function of them."""
-    listeners = array(9, relative=0.1, floor=1e-4, freedom=100.0)
+    """MicrophoneArray, power, a direction in which all of them are moved, and what is found as a function of them."""
+    microphone_array = array(9, relative=0.1, floor=1e-4, freedom=100.0)
     beyond = [[0.14, 0.02], [0.15, -0.05], [-0.14, 0.03], [0.01, 0.15], [-0.04, -0.14], [0.05, 0.16]]
     places = np.concatenate([inside(20, reach=0.8), beyond, [[0.16, 0.16], [-0.17, 0.15]]])
     rng = np.random.default_rng(0)
-    power = noisy(listeners.noise, hear(listeners, places, np.exp(rng.normal(size=len(places)))), rng)
-    point = (listeners.microphones, jnp.log(listeners.decay.a), jnp.log(listeners.decay.b), jnp.asarray(power))
+    power = noisy(microphone_array.noise, hear(microphone_array, places, np.exp(rng.normal(size=len(places)))), rng)
+    point = (
+        microphone_array.microphones,
+        jnp.log(microphone_array.decay.a),
+        jnp.log(microphone_array.decay.b),
+        jnp.asarray(power),
+    )
     direction = (
         0.01 * rng.normal(size=(9, 2)),
         rng.normal(size=9),
@@ -27,11 +32,11 @@ def moving():
         power * rng.normal(size=power.shape),
     )
 
-    made = {method: Localiser.create(listeners, method=method) for method in METHODS}
+    made = {method: Localiser.create(microphone_array, method=method) for method in METHODS}
 
     def located(method, microphones, log_a, log_b, power):
         moved = eqx.tree_at(
-            lambda one: (one.listeners.microphones, one.listeners.decay.a, one.listeners.decay.b),
+            lambda one: (one.microphone_array.microphones, one.microphone_array.decay.a, one.microphone_array.decay.b),
             made[method],
             (microphones, jnp.exp(log_a), jnp.exp(log_b)),
         )
@@ -84,13 +89,13 @@ def test_gradients(method, moving):
 @both
 def test_the_gradient_of_exact_data_is_the_place_itself(method):
     """Moved together with all microphones, the source moves along: the Jacobian in them adds up to the identity."""
-    listeners = array(9)
-    power = jnp.asarray(hear(listeners, inside(28, reach=0.8)))
-    localiser = Localiser.create(listeners, method=method)
+    microphone_array = array(9)
+    power = jnp.asarray(hear(microphone_array, inside(28, reach=0.8)))
+    localiser = Localiser.create(microphone_array, method=method)
 
     def positions(shift):
-        moved = listeners.microphones + shift
-        return eqx.tree_at(lambda one: one.listeners.microphones, localiser, moved)(power).position
+        moved = microphone_array.microphones + shift
+        return eqx.tree_at(lambda one: one.microphone_array.microphones, localiser, moved)(power).position
 
     jacobian = jax.jacfwd(positions)(jnp.zeros(2))
     np.testing.assert_allclose(jacobian, np.broadcast_to(np.eye(2), (28, 2, 2)), atol=1e-6)

@@ -13,26 +13,26 @@ from jeit.acoustic import (
     cramer_rao,
     locate,
 )
-from jeit.acoustic.locate import STATUSES
+from jeit.acoustic.localisation.locate import STATUSES
 
 FRAMES = 64
 FLOOR, FREEDOM = 0.01, 50.0
 
 
-def calibration(listeners, usable=None, reasons=None):
-    count = len(listeners.microphones)
+def calibration(microphone_array, usable=None, reasons=None):
+    count = len(microphone_array.microphones)
     good = np.ones(count, bool) if usable is None else usable
-    return Calibration(listeners, good, reasons or ("",) * count, np.zeros((2, count)), None, "array")
+    return Calibration(microphone_array, good, reasons or ("",) * count, np.zeros((2, count)), None, "array")
 
 
 @pytest.fixture(scope="module")
-def listeners():
+def microphone_array():
     return array(9, relative=0.05, floor=FLOOR, freedom=FREEDOM)
 
 
 @pytest.fixture(scope="module")
-def known(listeners):
-    return calibration(listeners)
+def known(microphone_array):
+    return calibration(microphone_array)
 
 
 def heard(power, *, floor=FLOOR, freedom=FREEDOM, **options):
@@ -50,11 +50,13 @@ def silence(number, count=9, seed=0):
 
 
 @pytest.fixture(scope="module")
-def touches(listeners):
+def touches(microphone_array):
     """64 touches all over the skin, strengths over a factor of ten."""
     places = inside(FRAMES, reach=0.7)
     rng = np.random.default_rng(1)
-    return places, noisy(listeners.noise, hear(listeners, places, np.exp(rng.uniform(0, 2.3, FRAMES))), rng)
+    return places, noisy(
+        microphone_array.noise, hear(microphone_array, places, np.exp(rng.uniform(0, 2.3, FRAMES))), rng
+    )
 
 
 def coverage(found, places, frames=slice(None)):
@@ -131,13 +133,13 @@ def test_nothing_but_zeros(known):
         locate(heard(np.zeros((10, 9)), floor=0), known)
 
 
-def test_outside(known, listeners):
+def test_outside(known, microphone_array):
     """Two to five centimetres beyond: flagged, and held on the outline, on the near side."""
     along = np.linspace(-0.08, 0.08, 16)
     beyond = np.concatenate(
         [np.stack([along, np.full(16, sign * 0.14)], axis=1)[:, ::step] for sign in (1, -1) for step in (1, -1)]
     )
-    power = noisy(listeners.noise, hear(listeners, beyond, 10.0), np.random.default_rng(2))
+    power = noisy(microphone_array.noise, hear(microphone_array, beyond, 10.0), np.random.default_rng(2))
     found = locate(heard(power), known)
     assert np.mean(found.status == "outside") > 0.95
     assert np.mean(np.abs(np.abs(found.position).max(axis=1) - 0.1) < 1e-9) > 0.95
@@ -154,12 +156,12 @@ def pair_of_places():
     return inside(FRAMES, seed=4, reach=0.3) - aside, inside(FRAMES, seed=5, reach=0.3) + aside
 
 
-def test_two_touches(known, listeners):
+def test_two_touches(known, microphone_array):
     """Both are found within millimetres, the stronger first."""
     rng = np.random.default_rng(3)
     first, second = pair_of_places()
-    power = hear(listeners, first, 8.0) + hear(listeners, second, 5.0)
-    found = locate(heard(noisy(listeners.noise, power, rng)), known)
+    power = hear(microphone_array, first, 8.0) + hear(microphone_array, second, 5.0)
+    found = locate(heard(noisy(microphone_array.noise, power, rng)), known)
     both = found.status == "two touches"
     assert both.sum() > 0.7 * FRAMES
     error = np.stack([found.position - first, found.second - second], axis=1)[both]
@@ -173,10 +175,10 @@ def test_two_touches(known, listeners):
 
 def test_exact_two_touches(known):
     """Without noise: to a micrometre."""
-    listeners = array(9, relative=0.01)
+    microphone_array = array(9, relative=0.01)
     first, second = pair_of_places()
-    power = hear(listeners, first, 8.0) + hear(listeners, second, 5.0)
-    found = locate(heard(power, floor=0), calibration(listeners))
+    power = hear(microphone_array, first, 8.0) + hear(microphone_array, second, 5.0)
+    found = locate(heard(power, floor=0), calibration(microphone_array))
     both = found.status == "two touches"
     # One in ten looks, to one source, as if from beyond the outline, and is said to be outside.
     assert both.mean() > 0.8
@@ -188,11 +190,11 @@ def test_exact_two_touches(known):
 def test_ambiguous():
     """Four microphones on a line cannot tell the two sides of it apart: one of the mirror images, and said so."""
     line = np.array([[-0.07, 0.0], [-0.02, 0.0], [0.03, 0.0], [0.08, 0.0]])
-    listeners = array(4, microphones=line, relative=0.05, floor=FLOOR, freedom=FREEDOM)
+    microphone_array = array(4, microphones=line, relative=0.05, floor=FLOOR, freedom=FREEDOM)
     places = inside(FRAMES, seed=6, reach=0.7)
     places = places[np.abs(places[:, 1]) > 0.025]
-    power = noisy(listeners.noise, hear(listeners, places, 10.0), np.random.default_rng(7))
-    found = locate(heard(power), calibration(listeners))
+    power = noisy(microphone_array.noise, hear(microphone_array, places, 10.0), np.random.default_rng(7))
+    found = locate(heard(power), calibration(microphone_array))
     inside_ones = found.status != "outside"
     assert np.mean(found.status[inside_ones] == "ambiguous") > 0.9
     folded = np.stack([found.position[:, 0], np.abs(found.position[:, 1])], axis=1)
@@ -207,7 +209,7 @@ def test_misfit(known):
     assert np.isin(found.status, ["misfit", "outside", "two touches"]).all()
     wrong = found.status == "misfit"
     assert wrong.mean() > 0.5
-    bound = cramer_rao(known.listeners, jnp.asarray(found.position[wrong]), jnp.asarray(found.strength[wrong]))
+    bound = cramer_rao(known.microphone_array, jnp.asarray(found.position[wrong]), jnp.asarray(found.strength[wrong]))
     wider = np.trace(found.covariance[wrong], axis1=1, axis2=2) / np.trace(bound, axis1=1, axis2=2)
     np.testing.assert_allclose(wider, found.misfit[wrong] / found.freedom[wrong], rtol=1e-6)
     assert (wider > 4).all()  # chi-square of 6 degrees of freedom is beyond 27.9 with a chance of 1e-4
@@ -247,7 +249,7 @@ def test_another_number_of_microphones(known):
 
 
 @pytest.mark.parametrize("dead", range(1, 6))
-def test_dead_microphones(dead, listeners):
+def test_dead_microphones(dead, microphone_array):
     """Exact data stay exact, noisy ones near the bound of what is left; the faults are told."""
     places = inside(FRAMES, seed=9, reach=0.6)
     gone = np.array([4, 0, 7, 2, 5])[:dead]
@@ -265,24 +267,26 @@ def test_dead_microphones(dead, listeners):
         expected = "" if k not in gone else "dead: every intensity is " + ("0" if k in gone[::2] else "NaN or infinite")
         assert found.faults[k] == expected
 
-    received = hear(listeners, places, 10.0)
+    received = hear(microphone_array, places, 10.0)
     received[:, gone] = np.nan
-    found = locate(heard(noisy(listeners.noise, received, np.random.default_rng(10))), calibration(listeners))
+    found = locate(
+        heard(noisy(microphone_array.noise, received, np.random.default_rng(10))), calibration(microphone_array)
+    )
     error = np.linalg.norm(found.position - places, axis=1)
-    bound = cramer_rao(listeners, jnp.asarray(places), 10.0, use=~np.isin(np.arange(9), gone))
+    bound = cramer_rao(microphone_array, jnp.asarray(places), 10.0, use=~np.isin(np.arange(9), gone))
     typical = np.median(error / np.sqrt(np.trace(bound, axis1=1, axis2=2)))
     # The median of the length of a plane normal error is 0.83 of its root mean square if round, 0.67 if a line.
     assert 0.5 < typical < 1.1
     assert np.median(error) < 0.01
 
 
-def test_a_microphone_that_was_not_calibrated_is_not_used(listeners, touches):
+def test_a_microphone_that_was_not_calibrated_is_not_used(microphone_array, touches):
     usable = np.arange(9) != 3
     reasons = tuple("" if good else "what it hears does not fall with distance" for good in usable)
     power = touches[1].copy()
     power[:, 3] = 1e6
     power[0, 3] = np.nan
-    found = locate(heard(power), calibration(listeners, usable, reasons))
+    found = locate(heard(power), calibration(microphone_array, usable, reasons))
     assert not found.used[:, 3].any()
     assert found.used[:, usable].all()
     assert found.faults[3] == (
@@ -304,8 +308,8 @@ def test_swapped_microphones_are_named(known, touches):
 @pytest.mark.parametrize("method", ["likelihood", "consistency"])
 def test_exact_data(method):
     """Both methods, all over the skin, judged alike."""
-    listeners, places = array(9), inside(FRAMES, seed=11)
-    found = locate(heard(hear(listeners, places), floor=0), calibration(listeners), method=method)
+    microphone_array, places = array(9), inside(FRAMES, seed=11)
+    found = locate(heard(hear(microphone_array, places), floor=0), calibration(microphone_array), method=method)
     np.testing.assert_allclose(found.position, places, atol=1e-6)
     np.testing.assert_allclose(found.strength, 1.0, rtol=1e-6)
     assert (found.status == "touch").all()
@@ -333,11 +337,11 @@ def test_a_fine_raster_finds_the_same(known, touches):
 
 def test_noise_that_only_negative_intensities_betray():
     """No floor is known, and silence scatters about zero: still no touch, and touches are found."""
-    listeners = array(9, relative=0.05)
+    microphone_array = array(9, relative=0.05)
     places = inside(32, seed=12, reach=0.7)
     rng = np.random.default_rng(13)
-    power = np.concatenate([hear(listeners, places), np.zeros((32, 9))]) + 0.01 * rng.normal(size=(64, 9))
-    found = locate(heard(power, floor=0), calibration(listeners))
+    power = np.concatenate([hear(microphone_array, places), np.zeros((32, 9))]) + 0.01 * rng.normal(size=(64, 9))
+    found = locate(heard(power, floor=0), calibration(microphone_array))
     assert (found.status[32:] == "no touch").all()
     assert found.located[:32].all()
     assert np.median(np.linalg.norm(found.position[:32] - places, axis=1)) < 0.004
@@ -368,7 +372,7 @@ def test_bad_options(options, message, known, touches):
 
 def test_a_place_known_to_nothing_is_ambiguous():
     """Covariances wider than the skin, or none at all, are bounded, and such places are not called touches."""
-    from jeit.acoustic.locate import _bound
+    from jeit.acoustic.localisation.locate import _bound
 
     status = np.array(["touch", "touch", "touch", "outside"], object)
     covariance = np.stack([1e-6 * np.eye(2), np.full((2, 2), np.nan), 4e10 * np.ones((2, 2)), np.full((2, 2), np.nan)])
@@ -399,12 +403,12 @@ def test_another_unit_is_noted(scale, said, known, touches):
 
 def test_another_unit_is_noted_though_all_is_lost_in_the_noise():
     """Intensities whose floor nobody knows, a billionth of the calibration's: less than its silence was."""
-    listeners = array(9, relative=0.05, deviation=0.01)
+    microphone_array = array(9, relative=0.05, deviation=0.01)
     rng = np.random.default_rng(14)
-    power = hear(listeners, inside(32, seed=12)) + 0.01 * rng.normal(size=(32, 9))
-    found = locate(heard(1e-9 * power, floor=0), calibration(listeners))
+    power = hear(microphone_array, inside(32, seed=12)) + 0.01 * rng.normal(size=(32, 9))
+    found = locate(heard(1e-9 * power, floor=0), calibration(microphone_array))
     assert found.counts() == {"no touch": 32}
     assert "times as loud as the calibration's noise: do the recording" in found.notes[0]
-    silent = locate(heard(0.01 * rng.normal(size=(32, 9)), floor=0), calibration(listeners))
+    silent = locate(heard(0.01 * rng.normal(size=(32, 9)), floor=0), calibration(microphone_array))
     assert silent.counts() == {"no touch": 32}
     assert silent.notes == ()

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from jeit.acoustic import Intensities, Taps, calibrate_microphones, locate, tap_intensities
-from jeit.data.sounding_skin import SoundingSkin
-from jeit.data.touches import calibration_taps
-from jeit.electrodes import grid
+from jeit.layout import grid
+from jeit.simulate.sounding_skin import SoundingSkin
+from jeit.simulate.touch_sounds import calibration_taps
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
 BURSTS = 10
@@ -52,7 +52,7 @@ def errors(found, places):
 def test_every_microphone_is_calibrated(trial):
     calibration, _, _ = trial
     assert calibration.usable.all()
-    assert (np.asarray(calibration.listeners.noise.relative) < 0.5).all()
+    assert (np.asarray(calibration.microphone_array.noise.relative) < 0.5).all()
 
 
 def test_the_papers_loss_is_as_good_as_the_paper(trial, found):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.io.wavfile
 
-from jeit.acoustic.recording import (
+from jeit.acoustic.signal.recording import (
     Intensities,
     Recording,
     Taps,

@@ -12,16 +12,16 @@ from jeit.acoustic import (
     IntensityNoise,
     IntensitySettings,
     InverseSquare,
-    Listeners,
+    MicrophoneArray,
     Recording,
     intensities,
     locate,
     make_surface,
     measure,
 )
-from jeit.data.sounding_skin import SoundingSkin, expected_power, transfer
-from jeit.data.touches import quiet
-from jeit.electrodes import grid
+from jeit.layout import grid
+from jeit.simulate.sounding_skin import SoundingSkin, expected_power, transfer
+from jeit.simulate.touch_sounds import quiet
 
 PLACE = np.array([0.02, -0.03])
 
@@ -48,12 +48,12 @@ def heard_before(skin):
     a, b = np.transpose(models)
     silent = intensities(recorded(skin, quiet(skin, jax.random.key(1)).samples))
     noise = IntensityNoise.create(9, floor=silent.floor, freedom=silent.freedom, relative=0.3)
-    listeners = Listeners(
+    microphone_array = MicrophoneArray(
         jnp.asarray(MICROPHONES[9]), make_surface(OUTLINE), InverseSquare(jnp.asarray(a), jnp.asarray(b)), noise
     )
     return eqx.tree_at(
         lambda one: one.intensity,
-        Calibration(listeners, np.ones(9, bool), ("",) * 9, np.zeros((2, 9)), None, "array"),
+        Calibration(microphone_array, np.ones(9, bool), ("",) * 9, np.zeros((2, 9)), None, "array"),
         IntensitySettings(),
         is_leaf=lambda one: one is None,
     )

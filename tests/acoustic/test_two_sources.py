@@ -20,22 +20,22 @@ def pairs(number=40, apart=0.07, seed=0):
     return places, np.stack([weaker * rng.uniform(1.2, 3, len(places)), weaker], axis=1)
 
 
-def both(listeners, places, strengths):
-    return sum(hear(listeners, places[:, k], strengths[:, k]) for k in range(2))
+def both(microphone_array, places, strengths):
+    return sum(hear(microphone_array, places[:, k], strengths[:, k]) for k in range(2))
 
 
-def find(listeners, power, use=None):
+def find(microphone_array, power, use=None):
     """By a program of 64 frames."""
     index = np.arange(FRAMES) % len(power)
-    found = locate_two(listeners, np.asarray(power)[index], None if use is None else use[index])
+    found = locate_two(microphone_array, np.asarray(power)[index], None if use is None else use[index])
     return {key: np.asarray(getattr(found, key))[: len(power)] for key in FIELDS}
 
 
 def test_exact_data():
     """Nine microphones, six unknowns; the stronger comes first, whatever the unit."""
-    listeners, (places, strengths) = array(9), pairs()
+    microphone_array, (places, strengths) = array(9), pairs()
     for scale in (1.0, 1e-12, 1e12):
-        found = find(listeners, both(listeners, places, scale * strengths))
+        found = find(microphone_array, both(microphone_array, places, scale * strengths))
         error = np.linalg.norm(found["position"] - places, axis=-1).max(axis=1)
         # Of pairs beyond the outer microphones a few are missed: the coarse grid puts both into other valleys.
         assert np.mean(error < 1e-6) >= 0.9
@@ -49,19 +49,19 @@ def test_exact_data():
 
 @pytest.mark.slow
 def test_exact_data_of_many_microphones():
-    listeners, (places, strengths) = array(25), pairs()
-    found = find(listeners, both(listeners, places, strengths))
+    microphone_array, (places, strengths) = array(25), pairs()
+    found = find(microphone_array, both(microphone_array, places, strengths))
     np.testing.assert_allclose(found["position"], places, atol=1e-6)
     np.testing.assert_allclose(found["strength"], strengths, rtol=1e-6)
 
 
-def fisher(listeners, places, strengths):
+def fisher(microphone_array, places, strengths):
     """In (x, y, log strength) of both, by differences of the formulas."""
 
     def terms(x):
-        received = sum(hear(listeners, [x[k : k + 2]], np.exp(x[k + 2]))[0] for k in (0, 3))
-        total = received + np.asarray(listeners.noise.floor)
-        return np.stack([np.log(total), np.log(np.asarray(variance(listeners.noise, received)) / total**2)])
+        received = sum(hear(microphone_array, [x[k : k + 2]], np.exp(x[k + 2]))[0] for k in (0, 3))
+        total = received + np.asarray(microphone_array.noise.floor)
+        return np.stack([np.log(total), np.log(np.asarray(variance(microphone_array.noise, received)) / total**2)])
 
     at = np.array([*places[0], np.log(strengths[0]), *places[1], np.log(strengths[1])])
     step = 1e-6
@@ -71,12 +71,12 @@ def fisher(listeners, places, strengths):
 
 def test_covariance_is_the_inverse_of_fishers_matrix():
     """At the places found, of noisy frames."""
-    listeners, (places, strengths) = array(9, relative=0.02, floor=1e-3, freedom=50.0), pairs()
-    power = noisy(listeners.noise, both(listeners, places, strengths), np.random.default_rng(2))
-    found = find(listeners, power)
+    microphone_array, (places, strengths) = array(9, relative=0.02, floor=1e-3, freedom=50.0), pairs()
+    power = noisy(microphone_array.noise, both(microphone_array, places, strengths), np.random.default_rng(2))
+    found = find(microphone_array, power)
     assert np.mean(found["converged"]) > 0.9
     for frame in range(0, 40, 5):
-        spread = np.linalg.inv(fisher(listeners, found["position"][frame], found["strength"][frame]))
+        spread = np.linalg.inv(fisher(microphone_array, found["position"][frame], found["strength"][frame]))
         expected = np.stack([spread[:2, :2], spread[3:5, 3:5]])
         np.testing.assert_allclose(found["covariance"][frame], expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
@@ -84,10 +84,10 @@ def test_covariance_is_the_inverse_of_fishers_matrix():
 @pytest.mark.slow
 def test_errors_are_as_said():
     """95 % ellipses of either source, over 2,000 draws of one pair well apart."""
-    listeners = array(9, relative=0.03)
+    microphone_array = array(9, relative=0.03)
     places, strengths = np.array([[[-0.05, -0.04], [0.05, 0.045]]]), np.array([[2.0, 1.0]])
-    exact = np.repeat(both(listeners, places, strengths), 2048, axis=0)
-    found = locate_two(listeners, noisy(listeners.noise, exact, np.random.default_rng(3)))
+    exact = np.repeat(both(microphone_array, places, strengths), 2048, axis=0)
+    found = locate_two(microphone_array, noisy(microphone_array.noise, exact, np.random.default_rng(3)))
     error = np.asarray(found.position) - places
     square = np.einsum("fsi,fsij,fsj->fs", error, np.linalg.inv(found.covariance), error)
     assert ((np.mean(square < 5.991, axis=0) > 0.92) & (np.mean(square < 5.991, axis=0) < 0.98)).all()
@@ -96,22 +96,22 @@ def test_errors_are_as_said():
 
 def test_one_touch_is_explained_too():
     """Two where there is one: what is left unexplained is no more than one source leaves."""
-    listeners = array(9, relative=0.05)
-    power = noisy(listeners.noise, hear(listeners, inside(40)), np.random.default_rng(4))
-    found = find(listeners, power)
+    microphone_array = array(9, relative=0.05)
+    power = noisy(microphone_array.noise, hear(microphone_array, inside(40)), np.random.default_rng(4))
+    found = find(microphone_array, power)
     assert np.median(found["misfit"]) < 6
     assert (found["strength"][:, 0] >= found["strength"][:, 1]).all()
 
 
 def test_too_few_microphones_give_nan():
     """Six are needed for six unknowns."""
-    listeners, (places, strengths) = array(9), pairs()
-    power = both(listeners, places, strengths)
+    microphone_array, (places, strengths) = array(9), pairs()
+    power = both(microphone_array, places, strengths)
     use = np.ones(power.shape, bool)
     use[0, :4] = False
     use[1, :3] = False
     power[2, [0, 1, 5, 6]] = np.nan
-    found = find(listeners, power, use)
+    found = find(microphone_array, power, use)
     for frame in (0, 2):
         assert np.isnan(found["position"][frame]).all()
         assert np.isnan(found["covariance"][frame]).all()
@@ -123,10 +123,10 @@ def test_too_few_microphones_give_nan():
 
 @pytest.mark.slow
 def test_order_of_frames_does_not_matter():
-    listeners, (places, strengths) = array(9, relative=0.05), pairs()
-    power = noisy(listeners.noise, both(listeners, places, strengths), np.random.default_rng(5))
+    microphone_array, (places, strengths) = array(9, relative=0.05), pairs()
+    power = noisy(microphone_array.noise, both(microphone_array, places, strengths), np.random.default_rng(5))
     order = np.random.default_rng(6).permutation(len(power))
-    plain, mixed = find(listeners, power), find(listeners, power[order])
+    plain, mixed = find(microphone_array, power), find(microphone_array, power[order])
     np.testing.assert_allclose(mixed["position"], plain["position"][order], rtol=1e-6, atol=1e-9)
-    alone = locate_two(listeners, jnp.asarray(power[3:4]))
+    alone = locate_two(microphone_array, jnp.asarray(power[3:4]))
     np.testing.assert_allclose(alone.position[0], plain["position"][3], rtol=1e-6, atol=1e-9)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.cli import main
-from jeit.electrodes import ring
+from jeit.layout import ring
 from jeit.protocol import adjacent
 
 DESCRIPTION = """

@@ -9,15 +9,16 @@ import pytest
 import scipy.io
 
 from jeit import electrodes as el
+from jeit import layout as ly
 from jeit import protocol as pr
 from jeit.data import read
-from jeit.data.simulated import RoundSkin, simulate_press
 from jeit.forward import ForwardModel
 from jeit.image import Raster, find_inclusions
 from jeit.imaging import ImagingSettings, image_difference
 from jeit.inverse import Gaussian, back_projection, calibrate, one_step
 from jeit.mesh import Disk, Mesh, Polygon, Rectangle, Refine, box, disk
 from jeit.plot import plot_image, plot_raster, plot_voltages
+from jeit.simulate.round_skin import RoundSkin, simulate_press
 
 SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 CELLS = np.array([[0, 1, 2], [0, 2, 3]])
@@ -34,7 +35,7 @@ def model(mesh):
 
 
 def arcs(number=8, radius=0.1, width=0.01, contact_impedance=0.01):
-    return el.BoundaryElectrodes(el.ring(radius, number), width, contact_impedance)
+    return el.BoundaryElectrodes(ly.ring(radius, number), width, contact_impedance)
 
 
 GEOMETRY = {
@@ -78,11 +79,11 @@ ELECTRODES = {
     "disc off the sheet": (lambda mesh: el.SheetDiscs([[0.5, 0]], 0.01, 0.01).check(mesh), "off the mesh"),
     "discs overlap": (lambda mesh: el.SheetDiscs([[0, 0], [0.01, 0]], 0.03, 0.01).check(mesh), "overlap by"),
     "point outside": (lambda mesh: el.PointElectrodes([[0.2, 0], [0, 0]]).check(mesh), "outside the mesh"),
-    "ring of one": (lambda mesh: el.ring(0.1, 1), "2"),
+    "ring of one": (lambda mesh: ly.ring(0.1, 1), "2"),
     "faces on a plane mesh": (lambda mesh: el.FaceDiscs([[0, 0, 0]], 0.01, 0.01).check(mesh), "3-D mesh"),
     "number against protocol": (lambda mesh: ForwardModel(mesh, arcs(), pr.adjacent(16)), "8 electrodes"),
     "positions as electrodes": (
-        lambda mesh: ForwardModel(mesh, el.ring(0.1, 8), pr.adjacent(8)),  # pyright: ignore[reportArgumentType]
+        lambda mesh: ForwardModel(mesh, ly.ring(0.1, 8), pr.adjacent(8)),  # pyright: ignore[reportArgumentType]
         "become electrodes",
     ),
     "protocol by name": (lambda mesh: ForwardModel(mesh, arcs(), "adjacent"), "jeit.protocol"),  # pyright: ignore[reportArgumentType]
@@ -296,7 +297,7 @@ COMMANDS = {
     "info on nothing": (lambda t: ["info", "absent.csv"], "There is no file"),
     "info on a folder": (lambda t: ["info", t.folder], "is a folder"),
 }
-POINTS = "[" + ", ".join(f"[{x}, {y}]" for x, y in el.ring(0.05, 8).tolist()) + "]"
+POINTS = "[" + ", ".join(f"[{x}, {y}]" for x, y in ly.ring(0.05, 8).tolist()) + "]"
 SIXTEEN = """
 [geometry]
 shape = "disk"

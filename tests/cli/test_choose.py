@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jeit.choosing import compare_on_data, report
-from jeit.cli.choose import show
+from jeit.cli.commands.choose import show
 from jeit.data import read
-from jeit.imaging import ImagingSettings
+from jeit.imaging import ImagingSettings, compare_on_data
 from jeit.inverse import RULES
+from jeit.report import report_choice
 
 SMALL = ("--num-points", 300, "--contact", "fixed")
 
@@ -82,7 +82,7 @@ def test_a_rule_that_cannot_choose_is_refused_and_the_others_are_not(tank, capsy
     result = compare_on_data(touched, rest, settings, rules=["discrepancy", "gcv"])
     assert list(result.outcomes) == ["gcv"]
     assert "needs to know the noise" in result.refused["discrepancy"]
-    assert report(result)["refused"] == result.refused
+    assert report_choice(result)["refused"] == result.refused
     show(Console(width=200), result)
     assert "needs to know the noise" in capsys.readouterr().out
     with pytest.raises(ValueError, match="needs to know the noise"):

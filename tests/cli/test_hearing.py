@@ -11,7 +11,7 @@ from scipy.io import wavfile
 
 from jeit.acoustic import Calibration, measure, read_recording, write_recording
 from jeit.cli import main
-from jeit.electrodes import grid
+from jeit.layout import grid
 
 OUTLINE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
 MICROPHONES = grid(0.14, 0.14, 3, 3)
@@ -184,7 +184,10 @@ def test_the_documentation_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run_page("hearing.md")
     assert len(names["path"].touches) == 3
-    assert names["jacobian"].shape == names["power"].shape[:1] + names["fit"].calibration.listeners.microphones.shape
+    assert (
+        names["jacobian"].shape
+        == names["power"].shape[:1] + names["fit"].calibration.microphone_array.microphones.shape
+    )
     assert (tmp_path / "track.png").stat().st_size > 10_000
 
 

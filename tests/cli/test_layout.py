@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jeit.design import TouchedSkin
-from jeit.electrodes import Layout, grid, write_layout
+from jeit.layout import Layout, grid, write_layout
 from jeit.mesh import Rectangle
 
 SKIN = Rectangle(0.06, 0.05)

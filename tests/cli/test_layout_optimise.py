@@ -9,9 +9,9 @@ import pytest
 import typer
 from rich.console import Console
 
+from jeit.cli.commands.layout_optimise import RESULTS, _region, optimise
 from jeit.cli.console import Steps
-from jeit.cli.layout_optimise import RESULTS, _region, optimise
-from jeit.electrodes import Layout, read_layout, write_layout
+from jeit.layout import Layout, read_layout, write_layout
 from jeit.mesh import Disk, Rectangle
 
 APP = typer.Typer()

@@ -10,8 +10,8 @@ import pytest
 from jeit.data import read
 from jeit.image import Raster, find_inclusions
 from jeit.imaging import image_difference
+from jeit.imaging.preparation import prepare_difference
 from jeit.inverse import Gaussian, reconstruct
-from jeit.preparation import prepare_difference
 
 PITCH = 22.5  # degrees between electrodes of the 6 cm tank
 

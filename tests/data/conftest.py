@@ -5,7 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, ring
+from jeit.electrodes import BoundaryElectrodes
+from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import Protocol
 

@@ -19,10 +19,11 @@ from jeit.design import (
     touch_grid,
     touches_away_from_the_edge,
 )
-from jeit.design.constraints import pulled_inside
-from jeit.design.variables import Design, Skin
-from jeit.electrodes import Layout, PointElectrodes, named_layout, perimeter
+from jeit.design.optimisation.constraints import pulled_inside
+from jeit.design.optimisation.variables import Design, Skin
+from jeit.electrodes import PointElectrodes
 from jeit.forward import ForwardModel
+from jeit.layout import Layout, named_layout, perimeter
 from jeit.mesh import Disk, Polygon, Rectangle, rectangle
 from jeit.protocol import two_terminal
 

@@ -10,10 +10,10 @@ from jeit.design import (
     Bell,
     TouchPrior,
     layout_scores,
-    press,
     sheet_touches,
     touch_changes,
     touch_grid,
+    touched_cells,
 )
 from jeit.electrodes import SheetDiscs
 from jeit.forward import ForwardModel
@@ -91,7 +91,7 @@ def test_slopes_are_those_of_shifted_presses():
         shift = step * np.eye(2)[axis]
         blank = np.zeros((2, len(PLACES), MESH.num_cells))
         for one, sign in zip(blank, (1, -1), strict=True):
-            moved = press(MESH, BELL, PLACES + sign * shift, thickness=THICKNESS)
+            moved = touched_cells(MESH, BELL, PLACES + sign * shift, thickness=THICKNESS)
             np.add.at(one, (np.arange(len(PLACES))[:, None], np.asarray(moved.cells)), np.asarray(moved.change))
         wanted = (blank[0] - blank[1]) / (2 * step)
         slope = np.asarray(TOUCHES.weights(jnp.ones(MESH.num_cells))[1][axis])

@@ -17,9 +17,9 @@ from jeit.design import (
     random_selections,
     select_measurements,
 )
-from jeit.electrodes import named_layout
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian
+from jeit.layout import named_layout
 from jeit.mesh import Refine, rectangle
 from jeit.protocol import two_terminal
 

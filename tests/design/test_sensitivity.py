@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from jeit.design import Bell, Hemisphere, sensitivity_map, touch_grid
-from jeit.electrodes import SheetDiscs, grid
+from jeit.electrodes import SheetDiscs
 from jeit.forward import ForwardModel
+from jeit.layout import grid
 from jeit.mesh import Disk, Polygon, Rectangle, rectangle
 from jeit.protocol import adjacent
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from studies import SMALL
 
-from jeit.design.study import open_results, pictures, read_study, run_study, write_study_report
+from jeit.design.study import open_results, read_study, run_study
 from jeit.design.study.store import Store
+from jeit.report.study import pictures, write_study_report
 
 pytest.importorskip("xarray")
 

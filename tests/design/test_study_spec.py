@@ -9,7 +9,8 @@ import pytest
 
 from jeit.design import Bell, Hemisphere
 from jeit.design.study import read_study
-from jeit.electrodes import FaceDiscs, Layout, grid, write_layout
+from jeit.electrodes import FaceDiscs
+from jeit.layout import Layout, grid, write_layout
 from jeit.mesh import Rectangle
 
 

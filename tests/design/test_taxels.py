@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jeit.design import find_taxels
-from jeit.electrodes import grid
+from jeit.layout import grid
 
 SIDE = 0.2
 PLACES = grid(SIDE * 15 / 16, SIDE * 15 / 16, 16, 16)

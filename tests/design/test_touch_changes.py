@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.design import Bell, Hemisphere, Presses, press, touch_changes
-from jeit.electrodes import FaceDiscs, PointElectrodes, SheetDiscs, grid
+from jeit.design import Bell, Hemisphere, TouchedCells, touch_changes, touched_cells
+from jeit.electrodes import FaceDiscs, PointElectrodes, SheetDiscs
 from jeit.forward import ForwardModel
+from jeit.layout import grid
 from jeit.mesh import layer, rectangle
 from jeit.protocol import adjacent
 
@@ -61,7 +62,7 @@ def test_exact_changes_are_those_of_solving_anew(kind, options, models):
     model = models[kind]
     conductivity = 0.5 + 0.4 * np.random.default_rng(0).random(model.mesh.num_cells)
     for indentation in (Bell(), Hemisphere(depth=3e-3, diameter=20e-3)):
-        presses = press(model.mesh, indentation, PLACES, **options)
+        presses = touched_cells(model.mesh, indentation, PLACES, **options)
         expected = anew(model, conductivity, presses)
         found = touch_changes(model, conductivity, presses)
         np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
@@ -75,7 +76,9 @@ def test_a_touch_that_is_found_at_once_waits_for_a_slow_one(models):
     change = 10 ** draw.uniform(-3, 4, (8, 60)) - 1
     change[::2] = 0
     change[0, 0], change[2, 0], change[4, :5], change[6, :12] = -0.1, -1.0, -1.0, -1.0
-    presses = Presses(jnp.zeros((8, 2)), jnp.asarray(np.tile(cells, (8, 1))), jnp.asarray(change), model.mesh.num_cells)
+    presses = TouchedCells(
+        jnp.zeros((8, 2)), jnp.asarray(np.tile(cells, (8, 1))), jnp.asarray(change), model.mesh.num_cells
+    )
     conductivity = np.full(model.mesh.num_cells, 0.5)
     expected = anew(model, conductivity, presses)
     found = touch_changes(model, conductivity, presses)
@@ -88,43 +91,45 @@ def test_nearly_cut_off_layers_are_exact(models):
     model = models["layer"]
     conductivity = np.full(model.mesh.num_cells, 0.5)
     for indentation in (Bell(), Bell(depth=5e-3), Hemisphere(depth=3e-3, diameter=20e-3)):
-        presses = press(model.mesh, indentation, PLACES, edge=1e-3)
+        presses = touched_cells(model.mesh, indentation, PLACES, edge=1e-3)
         expected = anew(model, conductivity, presses)
         found = touch_changes(model, conductivity, presses)
         np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
 def test_touches_that_are_not_found_are_an_error(models, monkeypatch):
-    monkeypatch.setattr("jeit.design.changes._MOST_STEPS", 1)
+    monkeypatch.setattr("jeit.design.skin.voltage_changes._MOST_STEPS", 1)
     model = models["sheet"]
-    presses = press(model.mesh, Bell(), np.array([[0.01, 0.02], [0.0, 0.0], [0.02, 0.0]]), **SHEET)
+    presses = touched_cells(model.mesh, Bell(), np.array([[0.01, 0.02], [0.0, 0.0], [0.02, 0.0]]), **SHEET)
     with pytest.raises(RuntimeError, match=r"3 of 3 touches were not found in 1 steps, the first at \(10, 20\) mm"):
         touch_changes(model, 0.5, presses)
 
 
 def test_conductors_that_drown_the_voltages_in_rounding_are_an_error(models):
     model = models["sheet"]
-    changes = [touch_changes(model, 0.5, press(model.mesh, Bell(), PLACES, contrast=c, **SHEET)) for c in (1e5, 1e6)]
+    changes = [
+        touch_changes(model, 0.5, touched_cells(model.mesh, Bell(), PLACES, contrast=c, **SHEET)) for c in (1e5, 1e6)
+    ]
     np.testing.assert_allclose(*changes, atol=1e-2 * np.abs(changes[0]).max())
     with pytest.raises(RuntimeError, match="5 of 5 touches were not found"):
-        touch_changes(model, 0.5, press(model.mesh, Bell(), PLACES, contrast=1e9, **SHEET))
+        touch_changes(model, 0.5, touched_cells(model.mesh, Bell(), PLACES, contrast=1e9, **SHEET))
 
 
 def test_exact_changes_are_not_traced(models):
     model = models["sheet"]
-    presses = press(model.mesh, Bell(), PLACES, **SHEET)
+    presses = touched_cells(model.mesh, Bell(), PLACES, **SHEET)
     with pytest.raises(ValueError, match="cannot be traced"):
         jax.jit(lambda conductivity: touch_changes(model, conductivity, presses))(0.5)
 
 
 def test_touches_that_change_nothing_change_no_voltage(models):
     model = models["sheet"]
-    nothing = Presses(jnp.zeros((2, 2)), jnp.zeros((2, 3), int), jnp.zeros((2, 3)), model.mesh.num_cells)
+    nothing = TouchedCells(jnp.zeros((2, 2)), jnp.zeros((2, 3), int), jnp.zeros((2, 3)), model.mesh.num_cells)
     np.testing.assert_array_equal(touch_changes(model, 0.5, nothing), 0.0)
 
 
 def test_touches_of_another_mesh_are_refused(models):
-    presses = press(models["layer"].mesh, Bell(), PLACES)
+    presses = touched_cells(models["layer"].mesh, Bell(), PLACES)
     with pytest.raises(ValueError, match="the touches are of a mesh of"):
         touch_changes(models["sheet"], 0.5, presses)
 
@@ -134,7 +139,7 @@ def test_small_touches_are_linear(models):
     model = models["sheet"]
     left = []
     for depth in (1e-4, 2e-4):
-        presses = press(model.mesh, Bell(depth=depth), PLACES, **SHEET)
+        presses = touched_cells(model.mesh, Bell(depth=depth), PLACES, **SHEET)
         exact, linear = (touch_changes(model, 0.5, presses, linear=linear) for linear in (False, True))
         left.append(np.abs(exact - linear).max())
     assert left[1] / left[0] == pytest.approx(4, rel=0.05)
@@ -143,7 +148,7 @@ def test_small_touches_are_linear(models):
 
 def test_linear_changes_have_derivatives_in_electrode_positions_and_batch(models):
     model = models["sheet"]
-    presses = press(model.mesh, Bell(), PLACES, **SHEET)
+    presses = touched_cells(model.mesh, Bell(), PLACES, **SHEET)
     direction = np.random.default_rng(1).normal(size=CENTRES.shape)
 
     def changes(move):
@@ -163,8 +168,8 @@ def test_linear_changes_have_derivatives_in_electrode_positions_and_batch(models
 def test_touches_weaken_and_do_not_depend_on_their_order(models):
     """An insulating touch raises every self-impedance; touches do not see each other."""
     model = models["layer"]
-    presses = press(model.mesh, Bell(), PLACES)
-    turned = press(model.mesh, Bell(), PLACES[::-1])
+    presses = touched_cells(model.mesh, Bell(), PLACES)
+    turned = touched_cells(model.mesh, Bell(), PLACES[::-1])
     found = touch_changes(model, 1.0, presses)
     np.testing.assert_allclose(found[::-1], touch_changes(model, 1.0, turned), rtol=1e-9, atol=1e-18)
 
@@ -185,7 +190,7 @@ def test_touches_weaken_and_do_not_depend_on_their_order(models):
 def test_bad_touches(change, said, models):
     arguments = {"places": PLACES, **SHEET, **change}
     with pytest.raises(ValueError, match=said):
-        press(models["sheet"].mesh, Bell(), arguments.pop("places"), **arguments)
+        touched_cells(models["sheet"].mesh, Bell(), arguments.pop("places"), **arguments)
 
 
 def test_bad_indentations(models):
@@ -194,6 +199,6 @@ def test_bad_indentations(models):
     with pytest.raises(ValueError, match="depth"):
         Bell(depth=-1e-3)
     with pytest.raises(ValueError, match="that of a layer is in its mesh"):
-        press(models["layer"].mesh, Bell(), PLACES, thickness=0.01)
+        touched_cells(models["layer"].mesh, Bell(), PLACES, thickness=0.01)
     with pytest.raises(ValueError, match="real, scalar"):
-        touch_changes(models["sheet"], 1.0 + 0.1j, press(models["sheet"].mesh, Bell(), PLACES, **SHEET))
+        touch_changes(models["sheet"], 1.0 + 0.1j, touched_cells(models["sheet"].mesh, Bell(), PLACES, **SHEET))

@@ -16,12 +16,11 @@ from jeit.electrodes import (
     SheetDiscs,
     contact_impedance,
     electrodes_from_nodes,
-    grid,
     plates,
-    ring,
     with_contact_impedance,
 )
 from jeit.forward import ForwardModel
+from jeit.layout import grid, ring
 from jeit.mesh import Mesh, box, cylinder, disk, facet_measures, layer, rectangle
 from jeit.protocol import adjacent
 

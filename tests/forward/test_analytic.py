@@ -16,10 +16,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from analytic.arcs import arc_transfer_impedance
-from analytic.box import plate_resistance
-from analytic.disk import ConductingDisk, point_inclusion_effect, point_potentials, point_transfer_impedance
-from analytic.sheet_discs import centre_to_rim_resistance, disc_transfer_impedance
 
 from jeit.electrodes import (
     BoundaryElectrodes,
@@ -31,6 +27,16 @@ from jeit.electrodes import (
     plates,
 )
 from jeit.forward import ForwardModel
+from jeit.forward.exact import (
+    ConductingDisk,
+    arc_transfer_impedance,
+    centre_to_rim_resistance,
+    disc_transfer_impedance,
+    plate_resistance,
+    point_inclusion_effect,
+    point_potentials,
+    point_transfer_impedance,
+)
 from jeit.mesh import Refine, box, centroids, disk, rectangle
 from jeit.protocol import adjacent, from_matrices
 

@@ -15,10 +15,9 @@ from jeit.electrodes import (
     NodeElectrodes,
     PointElectrodes,
     SheetDiscs,
-    ring,
-    ring_and_centre,
 )
 from jeit.forward import ForwardModel, electrode_fields
+from jeit.layout import ring, ring_and_centre
 from jeit.mesh import cylinder, disk, layer, rectangle
 from jeit.protocol import adjacent, trigonometric
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import scipy.io
 import scipy.sparse
-from analytic.disk import ConductingDisk, point_transfer_impedance
 
 from jeit.electrodes import BoundaryElectrodes, NodeElectrodes, electrodes_from_nodes
 from jeit.forward import ForwardModel
+from jeit.forward.exact import ConductingDisk, point_transfer_impedance
 from jeit.inverse import Laplace, Noser, Tikhonov, one_step
 from jeit.mesh import Mesh, interior_facets
 from jeit.protocol import from_channels

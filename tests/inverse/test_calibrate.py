@@ -4,9 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, PointElectrodes, ring, with_contact_impedance
+from jeit.electrodes import BoundaryElectrodes, PointElectrodes, with_contact_impedance
 from jeit.forward import ForwardModel
 from jeit.inverse import calibrate
+from jeit.layout import ring
 from jeit.mesh import disk
 from jeit.protocol import skip
 

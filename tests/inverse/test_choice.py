@@ -6,13 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, ring
+from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import RULES, Choice, Laplace, Noser, choose_hyperparameter, compare_rules, one_step
-from jeit.inverse.hyperparameter import choose, discrepancy
+from jeit.inverse.hyperparameter.point_spread import best_resolution, blur_radius, spread_cells
+from jeit.inverse.hyperparameter.rules import choose, discrepancy
 from jeit.inverse.linearisation import Linearisation
-from jeit.inverse.point_spread import best_resolution, blur_radius, spread_cells
 from jeit.inverse.spectrum import Spectrum
+from jeit.layout import ring
 from jeit.mesh import Mesh, box, centroids, disk, measures
 from jeit.protocol import adjacent
 
@@ -268,9 +269,8 @@ def test_bad_input_is_refused(call, words, model, frame):
 @pytest.mark.slow
 def test_rules_on_a_measured_tank(data_folder):
     """A metal rod beside electrode 1: discrepancy, told of the noise but not of the model's error, ends at the edge."""
-    from jeit.choosing import compare_on_data
     from jeit.data import read
-    from jeit.imaging import ImagingSettings
+    from jeit.imaging import ImagingSettings, compare_on_data
 
     (file,) = (data_folder / "tank6cm" / "electrode01_metal").glob("*.csv")
     result = compare_on_data(read(file), settings=ImagingSettings(num_points=500))

@@ -4,11 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, PointElectrodes, perimeter, ring
+from jeit.electrodes import BoundaryElectrodes, PointElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Raster, figures_of_merit
 from jeit.inverse import greit, one_step
-from jeit.inverse.greit import _desired_images, _targets
+from jeit.inverse.linear.greit import _desired_images, _targets
+from jeit.layout import perimeter, ring
 from jeit.mesh import Rectangle, Refine, box, centroids, disk, measures
 from jeit.protocol import adjacent
 

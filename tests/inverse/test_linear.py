@@ -4,10 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, ring
+from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import find_inclusions
 from jeit.inverse import RULES, Gaussian, Laplace, Noser, Tikhonov, back_projection, one_step
+from jeit.layout import ring
 from jeit.mesh import centroids, disk
 from jeit.protocol import adjacent
 

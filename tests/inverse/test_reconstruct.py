@@ -6,7 +6,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, ring
+from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import (
     Background,
@@ -23,7 +23,8 @@ from jeit.inverse import (
     posterior,
     reconstruct,
 )
-from jeit.inverse.hyperparameter import noise_figure
+from jeit.inverse.hyperparameter.rules import noise_figure
+from jeit.layout import ring
 from jeit.mesh import Disk, Refine, centroids, measures
 from jeit.protocol import adjacent
 

@@ -8,9 +8,10 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, SheetDiscs, perimeter, ring, ring_and_centre
+from jeit.electrodes import BoundaryElectrodes, SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.inverse import Laplace, reconstruct
+from jeit.layout import perimeter, ring, ring_and_centre
 from jeit.mesh import Disk, Rectangle, centroids
 from jeit.protocol import adjacent, opposite, reference_electrode
 

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, ring
+from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, Imager, TotalVariation, reconstruct, stream
+from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
 

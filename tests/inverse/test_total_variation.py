@@ -6,10 +6,11 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, perimeter
+from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, Laplace, Noser, Tikhonov, TotalVariation, posterior, reconstruct
 from jeit.inverse.channels import IndependentChannels
+from jeit.layout import perimeter
 from jeit.mesh import Rectangle, box, centroids, measures
 from jeit.protocol import adjacent
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs, grid, ring
+from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.inverse import (
     Background,
@@ -17,6 +17,7 @@ from jeit.inverse import (
     posterior,
     reconstruct,
 )
+from jeit.layout import grid, ring
 from jeit.mesh import Disk, Rectangle, centroids
 from jeit.protocol import adjacent
 

@@ -6,17 +6,10 @@ import pytest
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
 
-from jeit.electrodes import (
-    BoundaryElectrodes,
-    CombinedElectrodes,
-    FaceDiscs,
-    PointElectrodes,
-    SheetDiscs,
-    plates,
-    ring,
-)
+from jeit.electrodes import BoundaryElectrodes, CombinedElectrodes, FaceDiscs, PointElectrodes, SheetDiscs, plates
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion
+from jeit.layout import ring
 from jeit.mesh import Polygon, centroids, disk, layer, rectangle
 from jeit.plot import draw_electrodes, plot_image, plot_mesh, plot_raster, plot_sensitivity, plot_voltages
 from jeit.protocol import adjacent

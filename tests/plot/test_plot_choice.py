@@ -10,7 +10,7 @@ from jeit.inverse import RULES, Choice
 from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import disk
 from jeit.plot import plot_choice
-from jeit.plot.choice import COLOURS
+from jeit.plot.imaging.choice import COLOURS
 
 
 @pytest.fixture(scope="module")

@@ -13,15 +13,15 @@ from jeit.acoustic import (
     CalibrationFit,
     IntensityNoise,
     InverseSquare,
-    Listeners,
     Locations,
+    MicrophoneArray,
     Touch,
     Track,
     make_surface,
 )
-from jeit.electrodes import grid
+from jeit.layout import grid
 from jeit.plot import plot_error_curve, plot_loss_map, plot_pairs, plot_receptive_fields, plot_track
-from jeit.plot._skin import FOUND
+from jeit.plot.acoustic.surface_view import FOUND
 
 OUTLINE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
 DEAD = "dead: every sample is 0"
@@ -34,9 +34,9 @@ def calibration(number=9, reasons=(), outline=OUTLINE, points=None, microphones=
     why = tuple(dict(reasons).get(k, "") for k in range(number))
     decay = InverseSquare(jnp.full(number, 1e-4), jnp.full(number, 1e-4))
     noise = IntensityNoise.create(number, floor=1e-2, freedom=100.0)
-    listeners = Listeners(jnp.asarray(places), make_surface(outline, points), decay, noise)
+    microphone_array = MicrophoneArray(jnp.asarray(places), make_surface(outline, points), decay, noise)
     return Calibration(
-        listeners, np.array([not reason for reason in why]), why, np.full((2, number), 0.1), None, "made"
+        microphone_array, np.array([not reason for reason in why]), why, np.full((2, number), 0.1), None, "made"
     )
 
 
@@ -50,7 +50,7 @@ def fitted(number=9, reasons=(), outliers=()):
     known = calibration(number, reasons)
     rng = np.random.default_rng(0)
     places = rng.uniform(-0.1, 0.1, (30, 2))
-    distance = np.linalg.norm(places[:, None] - np.asarray(known.listeners.microphones), axis=2)
+    distance = np.linalg.norm(places[:, None] - np.asarray(known.microphone_array.microphones), axis=2)
     strength, outlier = np.linspace(1, 2, 30), np.isin(np.arange(30), outliers)
     power = strength[:, None] * 1e-4 / (distance**2 + 1e-4) * np.where(outlier, 10, 1)[:, None]
     usable = np.ones_like(power, bool)
@@ -176,7 +176,7 @@ def test_a_loss_map_lies_bottom_row_first_and_is_least_at_the_source(ax):
     values[0, 0], values[5, 30] = np.nan, 2.0
     place, spread = np.array([0.05, -0.04]), np.diag([4e-6, 1e-6])
     marks = {"truth": [0.052, -0.041], "estimate": place, "covariance": spread}
-    assert plot_loss_map(values, known.listeners, received=np.linspace(0, 1, 9), **marks, ax=ax) is ax
+    assert plot_loss_map(values, known.microphone_array, received=np.linspace(0, 1, 9), **marks, ax=ax) is ax
     (drawn,) = ax.images
     assert list(drawn.get_extent()) == pytest.approx([-0.1, 0.1, -0.1, 0.1])
     assert drawn.origin == "lower"
@@ -224,7 +224,7 @@ def test_the_papers_loss_is_in_decibels(ax):
     ],
 )
 def test_loss_maps_refuse_what_makes_no_sense(match, change, ax):
-    arguments = {"values": np.ones((3, 3)), "skin": calibration().listeners, "ax": ax} | change
+    arguments = {"values": np.ones((3, 3)), "skin": calibration().microphone_array, "ax": ax} | change
     with pytest.raises(ValueError, match=match):
         plot_loss_map(**arguments)
 
@@ -304,7 +304,7 @@ def test_microphones_of_no_use_are_crossed(ax):
     used[3, 7] = False
     known = calibration(reasons={1: DEAD})
     plot_track(*recorded(stroke(), used=used), known, ax=ax)
-    np.testing.assert_allclose(dots(ax, "not usable"), np.asarray(known.listeners.microphones)[[1, 5]])
+    np.testing.assert_allclose(dots(ax, "not usable"), np.asarray(known.microphone_array.microphones)[[1, 5]])
     assert len(dots(ax, "microphone")) == 7
     assert named(ax)[:2] == ["microphone", "not usable"]
 
@@ -332,10 +332,12 @@ def test_a_curved_skin_is_drawn_in_its_chart(ax):
     over = {"points": dome(grid(0.18, 0.18, 5, 5)), "microphones": dome(grid(0.15, 0.15, 3, 3))}
     known = calibration(outline=dome(OUTLINE), **over)
     plot_track(*recorded(dome(stroke())), known, overlay=np.ones((4, 4)), ax=ax)
-    surface = known.listeners.surface
+    surface = known.microphone_array.surface
     places = np.asarray(surface.project(jnp.asarray(dome(stroke()).T))).T
     np.testing.assert_allclose(dots(ax, "onset"), places[:1])
-    np.testing.assert_allclose(dots(ax, "microphone"), np.asarray(surface.project(known.listeners.microphones.T)).T)
+    np.testing.assert_allclose(
+        dots(ax, "microphone"), np.asarray(surface.project(known.microphone_array.microphones.T)).T
+    )
 
 
 def test_the_ellipse_lies_in_the_plane_of_the_skin(ax):

@@ -10,7 +10,7 @@ from matplotlib.patches import StepPatch
 from matplotlib.tri import TriContourSet
 
 from jeit.design import Taxels
-from jeit.electrodes import grid
+from jeit.layout import grid
 from jeit.plot import plot_similarity, plot_taxel_areas, plot_taxels
 from jeit_solvers import KMeans
 
@@ -166,7 +166,7 @@ def test_histograms_share_their_bins(ax):
     ],
 )
 def test_refuses_what_makes_no_sense(match, draw, monkeypatch, ax):
-    monkeypatch.setattr("jeit.plot.taxels.axes_or_new", lambda *_: ax)
+    monkeypatch.setattr("jeit.plot.design.taxels.axes_or_new", lambda *_: ax)
     with pytest.raises(ValueError, match=match):
         draw(four())
 

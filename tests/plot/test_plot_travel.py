@@ -7,7 +7,7 @@ from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
 
 from jeit.design import Optimisation, Scores
-from jeit.electrodes import Layout, grid
+from jeit.layout import Layout, grid
 from jeit.mesh import Disk, Rectangle
 from jeit.plot import plot_travel
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit_solvers.dense_cholesky import inverse_cholesky
+from jeit_solvers.dense.cholesky import inverse_cholesky
 
 
 # Row by row; unrolled; unrolled halves; block rows with padding; block rows in block rows, with padding.

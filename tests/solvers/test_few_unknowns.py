@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from jeit_solvers import inverse_few, minimise_few, solve_few
+from jeit_solvers import inverse_small, minimise_small, solve_small
 
 
 def definite(number, batch, seed=0, spread=3.0):
@@ -22,9 +22,9 @@ def test_systems_are_solved(number):
     right = np.random.default_rng(1).normal(size=(20, number))
     expected = np.linalg.solve(matrices, right[..., None])[..., 0]
     # Rounding times the condition number.
-    solved = solve_few(jnp.asarray(matrices.transpose(1, 2, 0)), jnp.asarray(right.T))
+    solved = solve_small(jnp.asarray(matrices.transpose(1, 2, 0)), jnp.asarray(right.T))
     np.testing.assert_allclose(solved.T, expected, rtol=1e-10, atol=1e-10)
-    inverse = inverse_few(jnp.asarray(matrices.transpose(1, 2, 0)))
+    inverse = inverse_small(jnp.asarray(matrices.transpose(1, 2, 0)))
     np.testing.assert_allclose(np.moveaxis(np.asarray(inverse), -1, 0), np.linalg.inv(matrices), rtol=1e-9, atol=1e-10)
 
 
@@ -32,14 +32,14 @@ def test_scales_do_not_matter_to_systems():
     """Unknowns of units as unlike as metres and logarithms: the matrix is scaled by D on both sides."""
     matrix, right = definite(4, 1)[0], np.arange(1.0, 5.0)
     scale = np.array([1e-9, 1.0, 1e6, 1e12])
-    solved = solve_few(jnp.asarray(matrix * np.outer(scale, scale))[:, :, None], jnp.asarray(right * scale)[:, None])
+    solved = solve_small(jnp.asarray(matrix * np.outer(scale, scale))[:, :, None], jnp.asarray(right * scale)[:, None])
     np.testing.assert_allclose(solved[:, 0] * scale, np.linalg.solve(matrix, right), rtol=1e-10)
 
 
 def test_only_the_broken_system_of_a_batch_is_nan():
     matrices = np.array(definite(3, 4))
     matrices[2] = -matrices[2]
-    solved = np.asarray(solve_few(jnp.asarray(matrices.transpose(1, 2, 0)), jnp.ones((3, 4))))
+    solved = np.asarray(solve_small(jnp.asarray(matrices.transpose(1, 2, 0)), jnp.ones((3, 4))))
     assert np.isnan(solved[:, 2]).all()
     np.testing.assert_allclose(solved[:, [0, 1, 3]].T, np.linalg.solve(matrices[[0, 1, 3]], np.ones((3, 3, 1)))[..., 0])
 
@@ -52,7 +52,7 @@ def test_systems_can_be_differentiated():
     expected = np.linalg.solve(matrix, shift - change @ solved)
 
     def solve(matrix, right):
-        return solve_few(matrix[:, :, None], right[:, None])[:, 0]
+        return solve_small(matrix[:, :, None], right[:, None])[:, 0]
 
     _, slope = jax.jvp(solve, (jnp.asarray(matrix), jnp.asarray(right)), (jnp.asarray(change), jnp.asarray(shift)))
     np.testing.assert_allclose(slope, expected, rtol=1e-10)
@@ -87,7 +87,7 @@ def expand(x, data):
 
 @jax.jit
 def descend(start, problems, skip=None):
-    return minimise_few(
+    return minimise_small(
         expand,
         start,
         problems,
@@ -183,7 +183,7 @@ def test_none_takes_more_steps_than_allowed(problems, found):
     """Nor of those that are gathered after the first steps: then some are not converged, and none lies about it."""
     limits = [jnp.asarray(bound)[:, None] for bound in (LOW, HIGH)]
     options = {"lower": limits[0], "upper": limits[1], "largest_step": jnp.full((NUMBER, 1), 0.5), "tolerance": 1e-14}
-    some = minimise_few(expand, jnp.asarray(found[0]), problems, max_steps=8, **options)
+    some = minimise_small(expand, jnp.asarray(found[0]), problems, max_steps=8, **options)
     assert int(some.steps) == 8
     assert 0 < int(some.converged.sum()) < BATCH
     done = np.asarray(some.converged)
@@ -199,7 +199,7 @@ def test_a_step_cut_off_at_a_bound_is_still_a_descent():
         return 0.5 * jnp.sum(off * (matrix @ off), axis=0), matrix @ off, matrix[:, :, None]
 
     limit = jnp.ones((2, 1))
-    result = minimise_few(expand, jnp.zeros((2, 1)), lower=-limit, upper=limit, largest_step=jnp.inf * limit)
+    result = minimise_small(expand, jnp.zeros((2, 1)), lower=-limit, upper=limit, largest_step=jnp.inf * limit)
     # At y = 1 the least is where the first slope is nothing: 8.55 (x - 0.5) = 2.94 (1 - 2.3).
     np.testing.assert_allclose(result.x[:, 0], [0.5 - 2.94 * 1.3 / 8.55, 1.0], atol=1e-6)
     assert result.converged.all()
@@ -214,7 +214,7 @@ def test_a_quadratic_takes_few_steps():
         return 0.5 * jnp.einsum("if,ij,jf->f", off, matrix, off), matrix @ off, matrix[:, :, None]
 
     limit = jnp.full((2, 1), jnp.inf)
-    result = minimise_few(expand, jnp.zeros((2, 1)), lower=-limit, upper=limit, largest_step=limit)
+    result = minimise_small(expand, jnp.zeros((2, 1)), lower=-limit, upper=limit, largest_step=limit)
     assert result.converged.all()
     assert int(result.steps) <= 6
     np.testing.assert_allclose(result.x[:, 0], target, atol=1e-7)
@@ -228,7 +228,7 @@ def test_steps_are_no_longer_than_asked():
         return -x[0], slope, jnp.full((1, 1, x.shape[1]), 1e-3)
 
     limit = jnp.full((1, 1), jnp.inf)
-    result = minimise_few(
+    result = minimise_small(
         expand, jnp.zeros((1, 3)), lower=-limit, upper=limit, largest_step=jnp.full((1, 1), 0.25), max_steps=4
     )
     np.testing.assert_allclose(result.x, 1.0, rtol=1e-12)
@@ -253,7 +253,7 @@ def test_never_higher_than_the_start():
     limit = jnp.full((2, 1), jnp.inf)
     costs = []
     for steps in (1, 2, 4, 8, 100):
-        result = minimise_few(
+        result = minimise_small(
             expand, start, lower=-limit, upper=limit, largest_step=limit, max_steps=steps, tolerance=1e-16
         )
         costs.append(np.asarray(result.value))

@@ -4,7 +4,6 @@
 `write_study_report` makes one page of it. Needs the extra `cluster`: zarr, xarray and dask.distributed.
 """
 
-from jeit.design.study.report import write_study_report as write_study_report
 from jeit.design.study.run import Progress as Progress
 from jeit.design.study.run import run_study as run_study
 from jeit.design.study.run import study_progress as study_progress

@@ -12,11 +12,11 @@ from jax.sharding import Mesh as Devices
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float
 
-from jeit.design.changes import touch_changes
-from jeit.design.press import Presses, press
+from jeit.design.measurements.selection import nearest_pairs
 from jeit.design.scores import SheetTouches, TouchPrior, layout_scores, sheet_touches
-from jeit.design.selection import nearest_pairs
 from jeit.design.sensitivity import SensitivityMap, TouchGrid, touch_grid
+from jeit.design.skin.touched_cells import TouchedCells, touched_cells
+from jeit.design.skin.voltage_changes import touch_changes
 from jeit.design.study.keys import OPTIMALITY
 from jeit.design.study.spec import Point, Shape, Study
 from jeit.design.taxels import find_taxels
@@ -31,7 +31,7 @@ class _Shared(eqx.Module):
     are None, as the `prior` is, unless a score needs them."""
 
     model: ForwardModel
-    presses: Presses
+    presses: TouchedCells
     touches: SheetTouches | None
     prior: TouchPrior | None
     grid: TouchGrid
@@ -122,7 +122,7 @@ def _shared(study: Study, shape: Shape) -> _Shared:
         presses = touches.presses
         prior = TouchPrior.create(grid.places, correlation=study.correlation)
     else:
-        presses = press(mesh, study.indentation, grid.places, thickness=thickness, contrast=study.contrast)
+        presses = touched_cells(mesh, study.indentation, grid.places, thickness=thickness, contrast=study.contrast)
     return _Shared(model, presses, touches, prior, grid, point.thickness, jax.random.key(study.seed))
 
 
@@ -181,7 +181,7 @@ def _exact(
             solved(number)
 
 
-def _touched(shared: _Shared, skin: _Skin) -> tuple[ForwardModel, Presses]:
+def _touched(shared: _Shared, skin: _Skin) -> tuple[ForwardModel, TouchedCells]:
     """The model of a skin, and its touches."""
     model = shared.model.with_electrodes(skin.electrodes).with_protocol(skin.protocol)
     presses = eqx.tree_at(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.electrodes import Layout, grid, named_layout, perimeter, quasi_uniform, read_layout
+from jeit.layout import Layout, grid, named_layout, perimeter, quasi_uniform, read_layout
 from jeit.mesh import Rectangle
 
 _DIAMETER, _CONTACT_IMPEDANCE = 6e-3, 1e-3  # m, ohm·m²: where neither study nor file says

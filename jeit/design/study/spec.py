@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jeit.design.fineness import check_fineness
-from jeit.design.indentation import AbstractIndentation, Bell, Hemisphere
+from jeit.design.skin.cell_size import check_cell_size
+from jeit.design.skin.indentation import AbstractIndentation, Bell, Hemisphere
 from jeit.design.study.keys import OPTIMALITY, read_keys
 from jeit.design.study.layouts import is_file, study_layout
-from jeit.electrodes import FaceDiscs, Layout, SheetDiscs
+from jeit.electrodes import FaceDiscs, SheetDiscs
+from jeit.layout import Layout
 from jeit.mesh import Rectangle
 
 # Bump when the same study would give other numbers.
@@ -89,8 +90,8 @@ class Study:
     """A sweep: every combination of the lists in a study file. Make it with `read_study`.
 
     - `points`: the skins, in the order of the lists, the last list fastest.
-    - `skin`: their outline; `indentation`, `contrast`: the touch, as in `press`; `exact`: whether its changes are, or
-      linear; `columns`, `rows`: of the grid of touches.
+    - `skin`: their outline; `indentation`, `contrast`: the touch, as in `touched_cells`; `exact`: whether its changes
+      are, or linear; `columns`, `rows`: of the grid of touches.
     - `current`: amperes. `scores`: those wanted; `num_taxels`, `threshold`, `seed`: of `find_taxels`; `correlation`: of
       `TouchPrior`, metres.
     - `chunk_points`: most points in a chunk. `text`: the study file.
@@ -271,7 +272,7 @@ def _check(study: Study) -> None:
                 f"mesh.cell_mm is {1e3 * point.cell_size:g}, too coarse for electrodes {1e3 * smallest:.3g} mm across; "
                 f"{1e3 * smallest / 2:.3g} would do."
             )
-        check_fineness("mesh.cell_mm", point.cell_size, study.skin.area, point.layers)
+        check_cell_size("mesh.cell_mm", point.cell_size, study.skin.area, point.layers)
 
 
 def _check_measurement(point: Point) -> None:

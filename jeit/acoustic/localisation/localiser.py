@@ -1,0 +1,216 @@
+"""The localiser: intensities of many frames to positions, by maximum likelihood or by intensity consistency.
+
+Each frame is screened on a coarse grid, its best two valleys are descended, and a minimum beyond the outline gives way
+to the best place on the outline. All of it is one compiled program, differentiable by the implicit function theorem in
+the intensities, the microphones' positions and the decay models.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from jeit.acoustic.localisation.consistency import Consistency
+from jeit.acoustic.localisation.likelihood import Likelihood
+from jeit.acoustic.localisation.minimise import descend, differentiable
+from jeit.acoustic.localisation.raster import Pixels, valleys
+from jeit.acoustic.microphones import MicrophoneArray
+from jeit.acoustic.surface import box, in_space, size
+from jeit_solvers import inverse_small
+
+METHODS = {"likelihood": Likelihood, "consistency": Consistency}
+# Places screened, in the outline's box.
+_COARSE = 400
+# Frames worked on together: all their arrays stay in the cache.
+_CHUNK, _CHUNK_OF_MAPS = 1024, 32
+# Relative error of the decay models with which frames are screened, at least.
+_SCREENED_AT = 0.2
+
+
+class SourceEstimate(eqx.Module):
+    """What is found of F frames.
+
+    `position` (F, d) in metres, on the surface and inside its outline; its `covariance` (F, d, d) in m²; `strength`
+    (F,), in units of intensity; `misfit` (F,), chi-square of what one source at this place does not explain, with
+    `freedom` (F,) degrees; `excess` (F,), by how much a place beyond the outline would lower −2 log-likelihood (0 for
+    places inside); `rival` (F,), by how much the second best valley is worse (∞ if there is none); `converged` (F,).
+    """
+
+    position: Float[Array, "F d"]
+    covariance: Float[Array, "F d d"]
+    strength: Float[Array, " F"]
+    misfit: Float[Array, " F"]
+    freedom: Int[Array, " F"]
+    excess: Float[Array, " F"]
+    rival: Float[Array, " F"]
+    converged: Bool[Array, " F"]
+
+
+class Localiser(eqx.Module):
+    """Finds sources from intensities; make one with `Localiser.create` and call it."""
+
+    microphone_array: MicrophoneArray
+    coarse: Pixels
+    pixels: Pixels | None
+    features: Float[Array, "N P"] | None
+    method: str = eqx.field(static=True)
+
+    @classmethod
+    def create(
+        cls,
+        microphone_array: MicrophoneArray,
+        *,
+        method: str = "likelihood",
+        map_shape: tuple[int, int] | None = None,
+    ) -> "Localiser":
+        """`method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster on
+        which every frame's whole map is worked out and where the descent starts, (200, 200) in the paper; a coarse grid
+        of 400 places and no maps unless given. Raises `ValueError` for another method, or a shape that makes no sense.
+        """
+        if method not in METHODS:
+            raise ValueError(f"method must be one of {', '.join(METHODS)}; it is {method!r}.")
+        low, high = box(microphone_array.surface)
+        sides_of_box = np.asarray(high - low)
+        spacing = np.sqrt(np.prod(sides_of_box) / _COARSE)
+        counts = [max(3, round(side / spacing)) for side in sides_of_box]
+        coarse = Pixels.create(microphone_array.surface, *counts)
+        if map_shape is None:
+            return cls(microphone_array, coarse, None, None, method)
+        if len(map_shape) != 2 or min(map_shape) < 2:
+            raise ValueError(f"map_shape must be (rows, columns) of at least two each; it is {map_shape!r}.")
+        pixels = Pixels.create(microphone_array.surface, int(map_shape[1]), int(map_shape[0]))
+        return cls(microphone_array, coarse, pixels, METHODS[method].features(microphone_array, pixels.chart), method)
+
+    def __call__(self, power: ArrayLike, use: ArrayLike | None = None) -> SourceEstimate:
+        """Locate the source of each frame. `power` (F, M): intensities above the floor; `use`: which to look at, all
+        that are finite unless given. Frames with fewer than three usable microphones give NaN."""
+        return _locate(self, *self._checked(power, use))
+
+    def maps(self, power: ArrayLike, use: ArrayLike | None = None) -> Float[Array, "F rows columns"]:
+        """The map of each frame: the paper's loss, relative to the square of the loudest intensity, or minus the
+        log-likelihood at the best strength; bottom row first, NaN outside the outline. Raises `ValueError` where the
+        localiser was made without `map_shape`."""
+        if self.pixels is None:
+            raise ValueError("maps were not asked for: make the Localiser with map_shape=(rows, columns).")
+        return _maps(self, *self._checked(power, use))
+
+    def with_maps(
+        self, power: ArrayLike, use: ArrayLike | None = None
+    ) -> tuple[SourceEstimate, Float[Array, "F rows columns"]]:
+        """Both: what is found of each frame, and its map."""
+        return self(power, use), self.maps(power, use)
+
+    def _checked(self, power, use) -> tuple[Array, Array]:
+        """Intensities as an array, and which are to be looked at."""
+        power = jnp.asarray(power, float)
+        finite = jnp.isfinite(power)
+        use = finite if use is None else finite & jnp.asarray(use, bool)
+        if power.ndim != 2 or power.shape != use.shape or power.shape[1] != len(self.microphone_array.microphones):
+            raise ValueError(
+                f"power has shape {power.shape} and use {use.shape}; give (frames, microphones) with "
+                f"{len(self.microphone_array.microphones)} microphones."
+            )
+        return power, use
+
+
+def _in_chunks(function, most: int, *arrays):
+    """`function` of a few frames at a time: `arrays` (F, M) are cut, padded, turned to (M, F); results lead with F."""
+    number = arrays[0].shape[0]
+    size_of_chunk = min(most, max(number, 1))
+    chunks = -(-number // size_of_chunk)
+    pad = ((0, chunks * size_of_chunk - number), (0, 0))
+
+    def cut(array):
+        return jnp.pad(array, pad).reshape(chunks, size_of_chunk, -1).transpose(0, 2, 1)
+
+    found = jax.lax.map(lambda chunk: function(*chunk), tuple(cut(array) for array in arrays))
+    return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:number], found)
+
+
+def _raster(localiser: Localiser, microphone_array: MicrophoneArray) -> tuple[Pixels, Array]:
+    """The paper's raster where maps were asked for, the coarse one otherwise, and the features of its pixels."""
+    if localiser.pixels is not None and localiser.features is not None:
+        return localiser.pixels, localiser.features
+    return localiser.coarse, METHODS[localiser.method].features(microphone_array, localiser.coarse.chart)
+
+
+@eqx.filter_jit
+def _maps(localiser: Localiser, power, use) -> Array:
+    """Of all frames at once: one product, with nothing to copy."""
+    pixels, features = _raster(localiser, localiser.microphone_array)
+    use = _usable(localiser, power, use)
+    maps = METHODS[localiser.method].create(power.T, use.T, localiser.microphone_array).screen(features)
+    return (maps if pixels.full else jnp.where(pixels.inside, maps, jnp.nan)).reshape(-1, *pixels.shape)
+
+
+def _starts(localiser: Localiser, power, use):
+    """Where the descents of each frame start: first (F, 2), second (F, 2), and whether that is worth it (F,)."""
+    still = jax.lax.stop_gradient(localiser.microphone_array)
+    pixels, features = _raster(localiser, still)
+    # Valleys of a model known to be exact are narrower than pixels are apart: screened as if it were not.
+    still = eqx.tree_at(lambda one: one.noise.relative, still, jnp.maximum(still.noise.relative, _SCREENED_AT))
+
+    def screen(power, use):
+        maps = METHODS[localiser.method].create(power, use, still).screen(features)
+        first, second, worth = valleys(maps, pixels)
+        return first.T, second.T, worth
+
+    most = _CHUNK if localiser.pixels is None else _CHUNK_OF_MAPS
+    return _in_chunks(screen, most, jax.lax.stop_gradient(power), use)
+
+
+def _usable(localiser: Localiser, power, use):
+    """Without a floor, what is not positive has no logarithm: nothing is known of such a reading."""
+    return use & (power + localiser.microphone_array.noise.floor > 0)
+
+
+@eqx.filter_jit
+def _locate(localiser: Localiser, power, use) -> SourceEstimate:
+    use = _usable(localiser, power, use)
+    first, second, worth = _starts(localiser, power, use)
+
+    def refine(power, use, first, second, worth):
+        return _refine(localiser, power, use, first, second, worth[0])
+
+    return _in_chunks(refine, _CHUNK, power, use, first, second, worth[:, None])
+
+
+def _refine(localiser: Localiser, power, use, first, second, worth) -> SourceEstimate:
+    """From the starts (2, F) of each frame; `power` and `use` (M, F)."""
+    microphone_array = localiser.microphone_array
+    fixed = jax.lax.stop_gradient(microphone_array)
+    still = METHODS[localiser.method].create(jax.lax.stop_gradient(power), use, fixed)
+    # Where one pixel of many was the start there is no second valley to try.
+    unknowns, excess, rival, converged, side = descend(
+        still, first, second, worth if localiser.pixels is None else None
+    )
+    likelihood = Likelihood.create(power, use, microphone_array)
+    objective = likelihood if localiser.method == "likelihood" else Consistency.create(power, use, microphone_array)
+    unknowns = differentiable(objective, unknowns, side, size(fixed.surface))
+    return _describe(objective, likelihood, unknowns, excess, rival, converged)
+
+
+def _describe(objective, likelihood: Likelihood, unknowns, excess, rival, converged) -> SourceEstimate:
+    surface, chart = likelihood.microphone_array.surface, unknowns[:2]
+    if isinstance(objective, Likelihood):
+        strength = jnp.exp(unknowns[2])
+        spread = inverse_small(likelihood.expand(unknowns)[2])[:2, :2]
+    else:
+        strength = likelihood.strength(likelihood.microphone_array.response(chart))
+        spread = objective.covariance(chart, strength)
+    misfit = likelihood.misfit(jnp.concatenate([chart, jnp.log(strength)[None]]))
+    place, covariance = in_space(surface, chart, spread)
+    number = jnp.sum(likelihood.use, axis=0)
+    known = (number >= 3) & jnp.all(jnp.isfinite(unknowns), axis=0)
+    return SourceEstimate(
+        position=jnp.where(known[:, None], place, jnp.nan),
+        covariance=jnp.where(known[:, None, None], covariance, jnp.nan),
+        strength=jnp.where(known, strength, jnp.nan),
+        misfit=jnp.where(known, misfit, jnp.nan),
+        freedom=jnp.maximum(number - 3, 0),
+        excess=jnp.where(known, 2 * excess, jnp.nan),
+        rival=jnp.where(known, 2 * rival, jnp.nan),
+        converged=converged & known,
+    )

@@ -1,0 +1,287 @@
+"""From a recording to places: which frames hold a touch, where it is, and what is wrong with the others."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.stats import chi2
+
+from jeit.acoustic.calibration.calibration import Calibration
+from jeit.acoustic.localisation.localiser import Localiser, SourceEstimate
+from jeit.acoustic.localisation.measure import measure
+from jeit.acoustic.localisation.setup_changes import find_setup_changes
+from jeit.acoustic.localisation.two_sources import locate_two
+from jeit.acoustic.microphones import MicrophoneArray
+from jeit.acoustic.noise import IntensityNoise, below_nothing
+from jeit.acoustic.signal.faults import describe_faults
+from jeit.acoustic.signal.intensity import IntensitySettings
+from jeit.acoustic.signal.recording import Intensities, Recording
+from jeit.acoustic.surface import size
+
+STATUSES = ("touch", "no touch", "outside", "two touches", "ambiguous", "misfit", "unusable")
+# Chance that a silent frame is taken for a touch; that a frame one source explains is said not to be.
+_FALSE_ALARM, _FALSE_MISFIT = 1e-6, 1e-4
+# Standard deviations of unknown distribution that a false alarm needs.
+_HEARD_DEVIATIONS = 6.0
+# −2 log-likelihood by which a place beyond the outline must be better to be said outside, and a rival valley worse not
+# to make a frame ambiguous: three standard deviations, and two.
+_OUTSIDE, _RIVAL = 9.0, 4.0
+# Two sources are believed that leave this part of what one leaves, and not too much per degree of freedom, even where
+# they do not explain everything; but not one so much weaker than the other: errors of a model look like that.
+_BOTH, _STILL_FAIR, _WEAKEST = 0.2, 10.0, 0.05
+# Share of touches that no source on the skin explains, from which something is wrong with the array.
+_ODD = 0.25
+# Intensities this much below the loudest frame's are no touch, where no floor is known (60 dB).
+_DYNAMIC_RANGE = 1e-6
+# No touch is so much stronger or weaker than the calibration's taps (40 dB).
+_SAME_UNIT = 1e4
+
+
+class Locations(eqx.Module):
+    """What was found of F frames of M microphones.
+
+    - `times`: (F,) seconds; `status`: (F,) one of `STATUSES`.
+    - `position`: (F, d) metres; `covariance`: (F, d, d) m²; `strength`: (F,). NaN where there is no touch.
+    - `misfit`: (F,) chi-square of what one source leaves unexplained, with `freedom`: (F,) degrees.
+    - `used`: (F, M) which microphones were looked at. `faults`: M strings, what is wrong with one ("" if nothing).
+    - `second`: (F, d) and `second_strength`: (F,), of the weaker of two touches, NaN elsewhere.
+    - `overlap`: windows that share a sample, whose errors are alike.
+    - `notes`: what to know of all of it.
+
+    Status: "touch"; "no touch", nothing is above the floor; "outside", the intensities say a place beyond the outline,
+    and the place given is the best on it; "two touches", one source does not explain the frame but two do; "misfit",
+    neither does, and the covariance is widened accordingly; "ambiguous", two places explain the frame about as well;
+    "unusable", fewer than three microphones could be used.
+    """
+
+    times: Float[np.ndarray, " F"]
+    position: Float[np.ndarray, "F d"]
+    covariance: Float[np.ndarray, "F d d"]
+    strength: Float[np.ndarray, " F"]
+    status: np.ndarray
+    misfit: Float[np.ndarray, " F"]
+    freedom: Int[np.ndarray, " F"]
+    used: Bool[np.ndarray, "F M"]
+    second: Float[np.ndarray, "F d"]
+    second_strength: Float[np.ndarray, " F"]
+    overlap: float = eqx.field(static=True)
+    faults: tuple[str, ...] = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    @property
+    def located(self) -> Bool[np.ndarray, " F"]:
+        """Frames that have a position."""
+        return np.asarray(np.isfinite(self.position).all(axis=1))
+
+    def counts(self) -> dict[str, int]:
+        """How many frames there are of each status."""
+        return {status: int((self.status == status).sum()) for status in STATUSES if (self.status == status).any()}
+
+
+def locate(
+    recording: Recording | Intensities,
+    calibration: Calibration,
+    *,
+    method: str = "likelihood",
+    map_shape: tuple[int, int] | None = None,
+    intensity: IntensitySettings | None = None,
+    silence: Recording | None = None,
+) -> Locations:
+    """Locate the touch in every frame of a recording.
+
+    `method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster that is
+    searched, (200, 200) in the paper; a coarse grid unless given (both are refined). `intensity`: band and window for
+    samples, those of the calibration unless given; `silence`: the array untouched, as of `measure`. Raises
+    `ValueError` for a recording of another number of microphones, and where fewer than three can be used.
+    """
+    heard = measure(recording, calibration, intensity, silence=silence)
+    microphone_array, use, faults = prepare(heard, calibration)
+    touched = use.any(axis=1) & _above_floor(heard, microphone_array.noise, use)
+    enough = use.sum(axis=1) >= 3
+    solve = touched & enough
+    localiser = Localiser.create(microphone_array, method=method, map_shape=map_shape)
+    frames, d = len(heard.times), calibration.microphone_array.microphones.shape[1]
+    status = np.where(touched, "touch", "no touch").astype(object)
+    status[~enough] = "unusable"
+    result = {
+        "position": np.full((frames, d), np.nan),
+        "covariance": np.full((frames, d, d), np.nan),
+        "strength": np.full(frames, np.nan),
+        "misfit": np.full(frames, np.nan),
+        "freedom": np.zeros(frames, int),
+        "second": np.full((frames, d), np.nan),
+        "second_strength": np.full(frames, np.nan),
+    }
+    notes = list(heard.notes)
+    if solve.any():
+        power, used = _padded(heard.power[solve], use[solve])
+        found = localiser(power, used)
+        # The likelihood judges frames, whichever loss has placed them.
+        judge = found if method == "likelihood" else Localiser.create(microphone_array)(power, used)
+        number = int(solve.sum())
+        for key in ("position", "covariance", "strength"):
+            result[key][solve] = getattr(found, key)[:number]
+        for key in ("misfit", "freedom"):
+            result[key][solve] = getattr(judge, key)[:number]
+        status[solve] = _judge(judge, found)[:number]
+        _explain(status, result, heard.power, use, microphone_array)
+        excess = np.zeros(frames)
+        excess[solve] = np.asarray(judge.excess)[:number]
+        status[(status == "misfit") & (excess > _OUTSIDE)] = "outside"
+        _bound(status, result, float(size(microphone_array.surface)))
+        notes += _notes(status, heard, use, microphone_array)
+    return Locations(
+        np.asarray(heard.times),
+        **result,
+        status=status.astype(str),
+        used=use,
+        overlap=heard.overlap,
+        faults=faults,
+        notes=(*notes, *_unit(result["strength"], heard, use, calibration)),
+        name=heard.name,
+    )
+
+
+def _judge(judge: SourceEstimate, found: SourceEstimate) -> np.ndarray:
+    """The status of frames with a touch, but for two touches."""
+    misfit, freedom = np.asarray(judge.misfit), np.asarray(judge.freedom)
+    excess = np.asarray(judge.excess)
+    status = np.where(np.asarray(judge.rival) < _RIVAL, "ambiguous", "touch").astype(object)
+    status[_unexplained(misfit, freedom)] = "misfit"
+    # A source beyond the outline explains what none on it does, but for two sources, which nothing explains.
+    status[(excess > _OUTSIDE) & ~_unexplained(misfit - excess, freedom)] = "outside"
+    status[~np.isfinite(np.asarray(found.position)).all(axis=1)] = "unusable"
+    return status
+
+
+def _unexplained(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+    """Whether a misfit is too great for chance."""
+    return (freedom > 0) & (chi2.sf(misfit, np.maximum(freedom, 1)) < _FALSE_MISFIT)
+
+
+def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, microphone_array: MicrophoneArray) -> None:
+    """Try two sources where one does not explain the frame; widen the covariance where neither does."""
+    tried = np.flatnonzero((status == "misfit") & (use.sum(axis=1) > 6))
+    if tried.size:
+        two = locate_two(microphone_array, *_padded(power[tried], use[tried]))
+        misfit, freedom = np.asarray(two.misfit)[: tried.size], np.asarray(two.freedom)[: tried.size]
+        stronger, weaker = np.asarray(two.strength)[: tried.size].T
+        much_better = (misfit < _BOTH * result["misfit"][tried]) & (misfit < _STILL_FAIR * freedom)
+        both = (~_unexplained(misfit, freedom) | much_better) & (weaker > _WEAKEST * stronger)
+        chosen, index = tried[both], np.flatnonzero(both)
+        status[chosen] = "two touches"
+        result["misfit"][chosen], result["freedom"][chosen] = misfit[both], freedom[both]
+        position, strength = np.asarray(two.position)[index], np.asarray(two.strength)[index]
+        result["position"][chosen], result["second"][chosen] = position[:, 0], position[:, 1]
+        result["strength"][chosen], result["second_strength"][chosen] = strength.T
+        result["covariance"][chosen] = np.asarray(two.covariance)[index, 0]
+    left = np.flatnonzero(status == "misfit")
+    wide = result["misfit"][left] / np.maximum(result["freedom"][left], 1)
+    result["covariance"][left] *= np.maximum(wide, 1.0)[:, None, None]
+
+
+def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> None:
+    """A touch not known to a fourth of the skin's size is ambiguous; no covariance is wider than the skin."""
+    located = np.isfinite(result["position"]).all(axis=1)
+    finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
+    width = np.zeros(len(status))
+    width[finite] = np.sqrt(np.abs(np.linalg.eigvalsh(result["covariance"][finite])).max(axis=1))
+    status[located & (status == "touch") & (~finite | (width > reach / 4))] = "ambiguous"
+    boundless = located & (~finite | (width > reach))
+    result["covariance"][boundless] = (reach / 2) ** 2 * np.eye(result["covariance"].shape[1])
+
+
+def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, microphone_array: MicrophoneArray) -> list[str]:
+    """What the user should know beyond the status of frames."""
+    notes = []
+    placed = ~np.isin(status, ["no touch", "unusable"])
+    odd = np.isin(status, ["misfit", "outside", "two touches"])
+    if odd.sum() > _ODD * placed.sum():
+        exchanged, altered = find_setup_changes(microphone_array, heard.power[placed], use[placed])
+        notes += [
+            f"microphones {one} and {other} look exchanged since the calibration: exchanged back, their intensities "
+            "fit one source. The places are not corrected: exchange the channels and locate again."
+            for one, other in exchanged
+        ]
+        notes += [
+            f"microphone {one} does not hear as when it was calibrated: without it, one source explains the others. "
+            "The places are not corrected: make its channel NaN and locate again, or calibrate anew."
+            for one in altered
+        ]
+        if not exchanged and not altered and (status == "misfit").sum() > 2 * _ODD * placed.sum():
+            notes.append("most touches fit no single source: is this the calibration of this array?")
+    return notes
+
+
+def _unit(strength: np.ndarray, heard: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
+    """A note where what was heard is of another order than what the calibration's taps were."""
+    asked = "do the recording and the taps have the same gain and unit?"
+    if np.isfinite(strength).any():
+        typical = float(np.nanmedian(strength))
+        ratio = typical / np.clip(typical, *(calibration.strengths or (typical, typical)))
+        if max(ratio, 1 / ratio) > _SAME_UNIT:
+            return [f"touches are {ratio:.3g} times as strong as the calibration's taps: {asked}"]
+        return []
+    # Silence whose floor nobody knows scatters as it did in the calibration.
+    deviation = np.asarray(calibration.microphone_array.noise.deviation)
+    known = use.any(axis=0) & (deviation > 0)
+    if heard.floor.any() or not known.any():
+        return []
+    ratio = float(np.median(np.where(use, np.abs(heard.power), 0.0).max(axis=0)[known] / deviation[known]))
+    low = ratio < 1 / _SAME_UNIT
+    return [f"what is heard is {ratio:.3g} times as loud as the calibration's noise: {asked}"] if low else []
+
+
+def prepare(heard: Intensities, calibration: Calibration) -> tuple[MicrophoneArray, np.ndarray, tuple[str, ...]]:
+    """The microphones with the noise of these intensities, which are to be used (F, M), and what is wrong with others.
+
+    Raises `ValueError` if fewer than three microphones are left.
+    """
+    use = np.asarray(heard.usable) & calibration.usable
+    faults = tuple(
+        "; ".join(part for part in (fault, reason and f"not calibrated: {reason}") if part)
+        for fault, reason in zip(heard.faults, calibration.reasons, strict=True)
+    )
+    if use.any(axis=0).sum() < 3:
+        raise ValueError(
+            f"'{heard.name}': {use.any(axis=0).sum()} of {len(faults)} microphones can be used, and three are needed "
+            f"to locate a touch. {describe_faults(faults)}."
+        )
+    known = calibration.microphone_array.noise
+    if np.any(heard.floor > 0):
+        noise = IntensityNoise.create(
+            len(faults), floor=heard.floor, freedom=heard.freedom, relative=np.asarray(known.relative)
+        )
+    else:
+        # What is negative betrays noise that the calibration may not have had.
+        wider = np.maximum(below_nothing(heard.power, use), np.asarray(known.deviation))
+        noise = eqx.tree_at(
+            lambda n: (n.deviation, n.floor),
+            known,
+            (jnp.asarray(wider), jnp.maximum(known.floor, IntensityNoise.create(len(wider), deviation=wider).floor)),
+        )
+    return (
+        eqx.tree_at(lambda microphone_array: microphone_array.noise, calibration.microphone_array, noise),
+        use,
+        faults,
+    )
+
+
+def _above_floor(heard: Intensities, noise: IntensityNoise, use: np.ndarray) -> np.ndarray:
+    """Frames in which a microphone hears what silence would not make it hear."""
+    power = np.where(use, heard.power, -np.inf)
+    if np.any(heard.floor > 0) and np.isfinite(heard.freedom):
+        least = heard.floor * (chi2.isf(_FALSE_ALARM / use.shape[1], heard.freedom) / heard.freedom - 1)
+    else:
+        loudest = power.max(initial=0.0)
+        least = np.maximum(_HEARD_DEVIATIONS * np.asarray(noise.deviation), _DYNAMIC_RANGE * loudest)
+    return np.asarray((power > least).any(axis=1))
+
+
+def _padded(power: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Frames repeated up to a round number of them, so that few sizes are ever compiled."""
+    number = len(power)
+    round_number = max(64, 1 << (number - 1).bit_length()) if number <= 1024 else -(-number // 1024) * 1024
+    index = np.minimum(np.arange(round_number), number - 1)
+    return power[index], use[index]

@@ -1,0 +1,81 @@
+"""Intensities of a recording as its calibration took the taps', above its own noise floor or that of silence."""
+
+import dataclasses
+
+import numpy as np
+
+from jeit.acoustic.calibration.calibration import Calibration
+from jeit.acoustic.signal.faults import describe_faults
+from jeit.acoustic.signal.intensity import IntensitySettings, intensities
+from jeit.acoustic.signal.recording import Intensities, Recording
+
+# A noise floor so many times as high is another one.
+_SAME_FLOOR = 4.0
+
+
+def measure(
+    recording: Recording | Intensities,
+    calibration: Calibration,
+    intensity: IntensitySettings | None = None,
+    *,
+    silence: Recording | None = None,
+) -> Intensities:
+    """Intensities of a recording, as the calibration took them.
+
+    `silence`: samples of the same array at the same gain, untouched. The noise floor is theirs then, which a recording
+    without pauses needs; otherwise it comes from the quietest windows of the recording itself. Raises `ValueError` for
+    another number of microphones, and for a silence that is louder than the recording's quietest windows.
+    """
+    for one in (recording, silence):
+        if one is None:
+            continue
+        number = one.samples.shape[0] if isinstance(one, Recording) else one.power.shape[1]
+        if number != calibration.num_microphones:
+            raise ValueError(
+                f"'{one.name}' has {number} microphones and the calibration '{calibration.name}' "
+                f"{calibration.num_microphones}; give the calibration of this array."
+            )
+    if silence is not None and not (isinstance(recording, Recording) and isinstance(silence, Recording)):
+        raise ValueError("silence is for a recording of samples, and must be one itself; intensities have their floor.")
+    if isinstance(recording, Intensities):
+        return recording
+    settings = intensity or calibration.intensity or IntensitySettings()
+    heard = intensities(recording, settings)
+    if silence is not None:
+        return _above_silence(heard, intensities(silence, settings))
+    # Only a floor measured in the same way can be compared.
+    if settings != calibration.intensity:
+        if calibration.intensity is None:
+            return heard
+        note = "band or window are not the calibration's: its decay models may not hold; calibrate with the same."
+        return dataclasses.replace(heard, notes=(note,))
+    usual = np.asarray(calibration.microphone_array.noise.floor)
+    ratio = np.where(calibration.usable, heard.floor / np.where(usual > 0, usual, np.inf), 0.0)
+    higher = f"the noise floor, taken from the quietest windows, is up to {ratio.max():.3g} times the calibration's"
+    told = describe_faults([higher if one > _SAME_FLOOR else "" for one in ratio])
+    note = (
+        f"{told}. If the recording never pauses, touches count as silence: give a recording of the array untouched "
+        "(silence=, --silence FILE). If gain, unit, surroundings or microphones have changed, calibrate again."
+    )
+    return dataclasses.replace(heard, notes=(note,)) if told else heard
+
+
+def _above_silence(heard: Intensities, quiet: Intensities) -> Intensities:
+    """Intensities above the floor of silence; what has none there cannot be used."""
+    known = np.asarray(quiet.usable.any(axis=0))
+    both = (quiet.floor > 0) & (heard.floor > 0)
+    ratio = float(np.median(quiet.floor[both] / heard.floor[both])) if both.any() else 1.0
+    if ratio > _SAME_FLOOR:
+        raise ValueError(
+            f"silence '{quiet.name}' is {ratio:.3g} times as loud as the quietest windows of '{heard.name}': record "
+            "the array untouched, at the same gain."
+        )
+    spoilt = [("" if good else f"in the silence: {fault}") for good, fault in zip(known, quiet.faults, strict=True)]
+    faults = ["; ".join(filter(None, pair)) for pair in zip(heard.faults, spoilt, strict=True)]
+    return dataclasses.replace(
+        heard,
+        power=heard.power + heard.floor - quiet.floor,
+        floor=quiet.floor,
+        usable=heard.usable & known,
+        faults=faults,
+    )

@@ -1,0 +1,32 @@
+"""An array of microphones: where they are, what each receives of a source, and how well that is known."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jeit.acoustic.decay import AbstractDecay
+from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.surface import AbstractSurface
+
+
+class MicrophoneArray(eqx.Module):
+    """All that a source's intensities depend on: microphones (M, d) in metres, surface, decay models, noise."""
+
+    microphones: Float[Array, "M d"]
+    surface: AbstractSurface
+    decay: AbstractDecay
+    noise: IntensityNoise
+
+    def response(self, chart: Float[Array, "2 ..."]) -> Float[Array, "M ..."]:
+        """f_i of sources at chart coordinates."""
+        place = self.surface.place(chart)
+        mine = self.microphones.reshape(self.microphones.shape + (1,) * (place.ndim - 1))
+        squares = [(place[k] - mine[:, k]) ** 2 for k in range(place.shape[0])]
+        return self.decay.response(sum(squares[1:], squares[0]))
+
+    def expected(self, unknowns: Float[Array, "n F"]) -> tuple[Float[Array, "M F"], Float[Array, "M F"]]:
+        """Expected levels m and their variances v."""
+        each = [unknowns[k : k + 3] for k in range(0, len(unknowns), 3)]
+        sent = [jnp.exp(one[2]) * self.response(one[:2]) for one in each]
+        received = sum(sent[1:], sent[0])
+        return jnp.log(received + self.noise.floor[:, None]), self.noise.level_variance(received)

@@ -1,0 +1,164 @@
+"""Checks of what recordings and taps are made of, and the arrays of an NPZ file."""
+
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from jeit.mesh.loops import distance, inside
+
+# Below this no vibration of a touch would be left in a recording.
+LOWEST_RATE = 100.0  # Hz
+# No skin is known that is longer: its coordinates would be in millimetres.
+LARGEST_EXTENT = 5.0  # m
+# Taps may miss the outline by so much of the skin's length; microphones nearer than this are at one place.
+_BESIDE, _SAME = 0.05, 1e-6  # of the length; m
+
+
+def npz_arrays(path: Path, start: bytes, *keys: str) -> dict[str, np.ndarray]:
+    """The arrays named, as far as an NPZ file has them, and under "" the names of all that it holds.
+
+    `start` is the file's first four bytes. Raises `ValueError` for other files, broken ones, and arrays of objects.
+    """
+    if start == b"\x93NUM":
+        raise ValueError("it holds a single array without names; save it with numpy.savez and the names of its arrays.")
+    if start != b"PK\x03\x04":
+        raise ValueError("neither an NPZ nor a WAV file; save the arrays with numpy.savez.")
+    arrays: dict[str, np.ndarray] = {}
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
+            for key in keys:
+                if key in content.files:
+                    arrays[key] = content[key]
+                    if not isinstance(arrays[key], np.ndarray):
+                        raise ValueError(f"'{key}' in it is a file of another kind")
+            arrays[""] = np.array(content.files)
+    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
+        message = " ".join(str(error).split())
+        raise ValueError(f"not a readable NPZ file of plain arrays ({message}); write it again.") from None
+    return arrays
+
+
+def need(arrays: dict[str, np.ndarray], *keys: str) -> None:
+    """Raise `ValueError` where an array is missing, with the names of those that are there."""
+    missing = [key for key in keys if key not in arrays]
+    if missing:
+        held = ", ".join(str(name) for name in arrays[""][:12]) or "nothing"
+        raise ValueError(f"there is no array '{missing[0]}'; the file holds {held}.")
+
+
+def either(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
+    """Which of two arrays the file has: raises `ValueError` for both, and for neither."""
+    if first in arrays and second in arrays:
+        raise ValueError(f"it holds both '{first}' and '{second}'; keep the one to use.")
+    if second not in arrays and first not in arrays:
+        held = ", ".join(str(name) for name in arrays[""][:12]) or "nothing"
+        raise ValueError(f"there is neither '{second}' nor '{first}'; the file holds {held}.")
+    return first if first in arrays else second
+
+
+def short(values: np.ndarray) -> str:
+    """A few numbers, else their shape."""
+    return f"of shape {values.shape}" if values.size > 4 else str(values.tolist())
+
+
+def real(value, label: str, axes: str) -> np.ndarray:
+    """Real numbers with the axes named: float32 as it is, all else as float64."""
+    try:
+        array = np.asarray(value)
+    except ValueError:
+        raise ValueError(f"{label}: rows differ in length; give one array ({axes}).") from None
+    if array.dtype.kind not in "fiu":
+        raise ValueError(f"{label} is {array.dtype}; give real numbers.")
+    if array.ndim != axes.count(",") + 1:
+        raise ValueError(f"{label} has shape {array.shape}; give ({axes}).")
+    if array.size == 0:
+        raise ValueError(f"{label} is empty: its shape is {array.shape}.")
+    return array if array.dtype == np.float32 else array.astype(float, copy=False)
+
+
+def number(value, label: str) -> float:
+    """One real number, also when it is an array of one."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu" or array.size != 1:
+        raise ValueError(f"{label} must be one real number; it is {array.dtype} of shape {array.shape}.")
+    return float(array.reshape(()))
+
+
+def sampling_rate(value) -> float:
+    """A rate in Hz that touch could be heard at."""
+    rate = number(value, "rate")
+    if not np.isfinite(rate) or rate < LOWEST_RATE:
+        raise ValueError(
+            f"rate is {rate:g}; give the samples a second of each microphone in Hz (40000, not 40 kHz or 25 µs): "
+            f"finite and at least {LOWEST_RATE:g}."
+        )
+    return rate
+
+
+def check_full_scale(value) -> float | None:
+    """The largest |sample| possible, or None."""
+    full_scale = None if value is None else number(value, "full_scale")
+    if full_scale is not None and not 0 < full_scale < np.inf:
+        raise ValueError(f"full_scale must be the largest sample possible, positive and finite; it is {full_scale:g}.")
+    return full_scale
+
+
+def coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
+    """Points (n, 2) or (n, 3), with as many coordinates as `dimension` = (2,) or (3,) says."""
+    points = real(value, label, "points, 2 or 3").astype(float)
+    if points.shape[1] not in (2, 3) or points.shape[1:] != dimension:
+        raise ValueError(
+            f"{label} has shape {points.shape}; give one row of 2 or 3 coordinates each, as many for microphones, "
+            "outline and positions."
+        )
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if bad.size:
+        raise ValueError(f"{label}: row {bad[0]} is {points[bad[0]].tolist()}; every coordinate must be finite.")
+    return points
+
+
+def check_extent(points: np.ndarray, label: str) -> None:
+    """Raise `ValueError` where points (n, d) are farther apart than a skin is long."""
+    extent = np.ptp(points, axis=0).max()
+    if extent > LARGEST_EXTENT:
+        raise ValueError(
+            f"{label} spread over {extent:.4g}: are these metres? Divide millimetres by 1000; no side may be longer "
+            f"than {LARGEST_EXTENT:g} m."
+        )
+
+
+def check_microphones(places: np.ndarray, skin: np.ndarray) -> None:
+    """Raise `ValueError` for microphones (M, d) farther from the box of points of the skin (n, d) than it is long, and
+    for two at one place."""
+    low, high = skin.min(axis=0), skin.max(axis=0)
+    extent = (high - low).max()
+    beyond = np.linalg.norm(places - np.clip(places, low, high), axis=1)
+    far = int(beyond.argmax())
+    if beyond[far] > extent:
+        raise ValueError(
+            f"microphones: number {far} at {places[far].tolist()} is {beyond[far]:.3g} m away from a skin that is only "
+            f"{extent:.3g} m long: are these metres, in the outline's coordinates? Divide millimetres by 1000."
+        )
+    pairs = sorted(KDTree(places).query_pairs(_SAME))
+    if pairs:
+        one, other = pairs[0]
+        raise ValueError(
+            f"microphones: numbers {one} and {other} are at the same place, {places[one].tolist()}; give each its own."
+        )
+
+
+def check_taps(places: np.ndarray, outline: np.ndarray) -> None:
+    """Raise `ValueError` for taps (T, 2) well outside the outline (K, 2)."""
+    extent = np.ptp(outline, axis=0).max()
+    outside = np.flatnonzero(~inside(places, [outline]))
+    beyond = distance(places[outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)
+    if outside.size and beyond.max() > _BESIDE * extent:
+        row = int(outside[beyond.argmax()])
+        raise ValueError(
+            f"positions: row {row}, {places[row].tolist()}, is {1e3 * beyond.max():.3g} mm outside the outline; taps "
+            f"must be on the skin, or within {1e3 * _BESIDE * extent:.3g} mm of it. Correct the place, or leave the "
+            "tap out."
+        )

@@ -1,0 +1,209 @@
+"""From sound to intensity: the power of each microphone in a band, in sliding windows, above its noise floor.
+
+A sine of amplitude A within the band has the intensity A²/2, white noise of variance σ² the part of σ² that the band
+is of 0 to half the rate. How that is done, and how noise scatters, is in `jeit.acoustic.signal._band_power`.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.special import gammainc, gammaincinv
+
+from jeit.acoustic.signal._band_power import band_power, make_grid, shared_noise, white_freedom
+from jeit.acoustic.signal.faults import intensity_faults, sample_faults, window_faults
+from jeit.acoustic.signal.recording import Intensities, Recording, Taps
+
+# A tap is heard in the windows that reach this part of its loudest.
+_HEARD = 0.5
+
+
+class IntensitySettings(eqx.Module):
+    """How intensity is measured: in the band `low` to `high`, Hz, over windows of `window` s that begin every `hop` s.
+
+    The touch of a soft skin sounds below 1 kHz; below 50 Hz the skin and the arm that wears it move.
+    Raises `ValueError` for what is no band, and for times that are not in seconds.
+    """
+
+    low: float = 50.0
+    high: float = 1000.0
+    window: float = 0.05
+    hop: float = 0.0125
+
+    def __check_init__(self):
+        for name in ("low", "high", "window", "hop"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not np.isfinite(value):
+                raise ValueError(f"{name} must be a finite number; it is {value!r}.")
+        if not 0 <= self.low < self.high:
+            raise ValueError(f"low and high must be a band in Hz, 0 ≤ low < high; they are {self.low} and {self.high}.")
+        if not 0 < self.hop <= self.window:
+            raise ValueError(
+                f"hop must be positive and no longer than window, or sound between windows is lost; they are "
+                f"{self.hop} and {self.window} s."
+            )
+        if self.window > 10:
+            raise ValueError(f"window is {self.window} s, longer than any touch; give seconds (0.05, not 50 ms).")
+
+
+class TapIntensities(NamedTuple):
+    """What `tap_intensities` found: intensities of T taps at M microphones.
+
+    - `power`: (T, M) mean band power above the noise floor while the tap is heard; may be negative.
+    - `floor`: (M,) noise power that was subtracted.
+    - `freedom`: (T,) degrees of freedom ν of each mean, so that noise alone has the variance 2 floor² / ν.
+    - `usable`: (T, M), `faults`: M strings, as in `Intensities`.
+    """
+
+    power: Float[np.ndarray, "T M"]
+    floor: Float[np.ndarray, " M"]
+    freedom: Float[np.ndarray, " T"]
+    usable: Bool[np.ndarray, "T M"]
+    faults: tuple[str, ...]
+
+
+def intensities(
+    recording: Recording, settings: IntensitySettings | None = None, floor: Float[np.ndarray, " M"] | None = None
+) -> Intensities:
+    """Intensities of a recording, window by window, with the windows that faults spoil marked.
+
+    The noise floor (M,), in the square of the samples' unit, is estimated from the quietest windows, a fifth of which
+    at least must be free of touch; give `floor` where it is known, from a recording of silence, or where the touch
+    never pauses. Raises `ValueError` where band, window and recording do not fit each other.
+    """
+    if not isinstance(recording, Recording):
+        raise ValueError(f"recording must be a Recording of samples; it is {type(recording).__name__}.")
+    samples, rate = recording.samples, recording.rate
+    grid = make_grid(settings or IntensitySettings(), rate, samples.shape[-1], recording.name)
+    found = [
+        window_faults(*sample_faults(channel, rate, recording.full_scale), grid.length, grid.hop) for channel in samples
+    ]
+    usable = np.stack([good for good, _ in found], axis=1)
+    power = band_power(samples, grid)
+    freedom = white_freedom(grid)
+    noise = noise_floor(power, usable, freedom) if floor is None else _check_floor(floor, samples.shape[0])
+    times = (grid.hop * np.arange(len(power)) + grid.length / 2) / rate
+    faults = tuple(reason for _, reason in found)
+    return Intensities(
+        times,
+        power - noise,
+        floor=noise,
+        freedom=freedom,
+        overlap=grid.length / grid.hop,
+        usable=usable,
+        faults=faults,
+        name=recording.name,
+    )
+
+
+def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> TapIntensities:
+    """One intensity for each tap and microphone, for calibration.
+
+    A tap's power is the mean over the windows in which it is heard, the same for all microphones: those in which the
+    sum over microphones of power / floor, less that of noise, is at least half its maximum. A microphone that has a
+    fault in one of them is not usable for that tap: its mean over other windows would be of another loudness. The
+    floor comes from the quietest windows of all taps, so that the taps should hold some silence, before or after. The
+    windows overlap; `freedom` counts what they share exactly, for white noise. It does not know that the windows were
+    chosen: of a tap that is not heard at all, the loudest windows of noise are taken, somewhat above the floor.
+
+    Taps that already hold intensities are returned as they are, with a floor of zero and infinite freedom.
+    """
+    if not isinstance(taps, Taps):
+        raise ValueError(f"taps must be Taps, as read_taps gives; they are {type(taps).__name__}.")
+    if taps.samples is None or taps.rate is None:
+        assert taps.power is not None
+        usable, faults = intensity_faults(taps.power)
+        count, microphones = taps.power.shape
+        return TapIntensities(taps.power, np.zeros(microphones), np.full(count, np.inf), usable, faults)
+    samples, rate = taps.samples, taps.rate
+    grid = make_grid(settings or IntensitySettings(), rate, samples.shape[-1], taps.name)
+    good, faults = [], []
+    for m in range(samples.shape[1]):
+        # All taps of a microphone together: its range, its steps and its silence are the same throughout.
+        kind, dead = sample_faults(samples[:, m].ravel(), rate, taps.full_scale)
+        one, reason = window_faults(kind.reshape(-1, samples.shape[-1]), dead, grid.length, grid.hop)
+        good.append(one)
+        faults.append(reason)
+    usable = np.stack(good, axis=-1)
+    power = np.stack([band_power(tap, grid) for tap in samples])
+    count, windows, microphones = power.shape
+    freedom = white_freedom(grid)
+    floor = noise_floor(power.reshape(-1, microphones), usable.reshape(-1, microphones), freedom)
+    # A channel without noise, of a simulation, would otherwise decide alone; a dead one has nothing to say.
+    alive = usable.any(axis=(0, 1))
+    least = np.maximum(floor, max(1e-9 * power.max(), np.finfo(float).tiny))
+    loudness = np.where(alive, power / least - floor / least, 0).sum(axis=-1)
+    heard = loudness >= _HEARD * loudness.max(axis=1, keepdims=True)
+    # Where no window is above the floor the rule chooses too few or too many: take the loudest.
+    heard |= loudness == loudness.max(axis=1, keepdims=True)
+    mean = np.einsum("tf,tfm->tm", heard, power) / heard.sum(axis=1)[:, None]
+    shared = shared_noise(grid, windows)
+    each = np.array([freedom * one.sum() ** 2 / shared[np.ix_(one, one)].sum() for one in heard])
+    whole = (usable | ~heard[..., None]).all(axis=1)
+    return TapIntensities(mean - floor, floor, each, whole, tuple(faults))
+
+
+def noise_floor(
+    power: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, "F M"], freedom: float, share: float = 0.2
+) -> Float[np.ndarray, " M"]:
+    """(M,) mean band power of noise alone, though touches are heard in some of the F windows.
+
+    At least the part `share` of the windows must be quiet. The start is a low quantile of the powers over that of
+    χ²_ν / ν, as in minimum statistics (R. Martin, IEEE Trans. Speech Audio Process. 9, 504-512, 2001). That start is
+    up to a few tenths too high when most windows are loud, since the share that is quiet is not known. So it is
+    improved: the mean of the powers below c times the floor, over what that mean is for χ²_ν / ν cut off at c,
+    repeated until it stands. `freedom` is ν; with ν infinite the low quantile is returned as it is. A channel without
+    usable windows has the floor 0.
+
+    Noise that is much louder at one end of the band scatters more than ν of white noise says, and its floor comes out
+    low: for power as 1/f from 50 to 1000 Hz by 8 %, as 1/f² by a third.
+    """
+    power, usable = np.asarray(power, float), np.asarray(usable)
+    if power.ndim != 2 or usable.shape != power.shape or usable.dtype != bool:
+        raise ValueError(
+            f"power and usable must both be (windows, microphones), usable of booleans; they are {power.shape} and "
+            f"{usable.shape} of {usable.dtype}."
+        )
+    if not 0 < share <= 1:
+        raise ValueError(f"share must be a part of the windows, above 0 and up to 1; it is {share!r}.")
+    if not freedom > 0:
+        raise ValueError(f"freedom must be positive; it is {freedom!r}.")
+    if not (np.isfinite(power) | ~usable).all():
+        raise ValueError("power is NaN or infinite in windows that usable calls usable; mark those False.")
+    number = usable.sum(axis=0)
+    ordered = np.sort(np.where(usable, power, np.inf), axis=0)
+    # The middle of the windows that are quiet for certain.
+    rank = np.clip(np.floor(0.5 * share * number).astype(int), 0, max(len(power) - 1, 0))
+    floor = np.take_along_axis(ordered, rank[None], axis=0)[0] if len(power) else np.zeros(power.shape[1])
+    floor = np.where(number > 0, floor, 0.0)
+    if np.isinf(freedom):
+        return floor
+    half = freedom / 2
+    # Quantiles of χ²_ν / ν, and its mean below the cut-off: ∫ y p(y) dy is the distribution function of ν + 2.
+    floor = floor / (gammaincinv(half, 0.5 * share) / half)
+    cut = gammaincinv(half, 0.9) / half
+    below = gammainc(half + 1, half * cut) / 0.9
+    for _ in range(50):
+        quiet = usable & (power <= cut * floor)
+        mean = np.where(quiet, power, 0).sum(axis=0) / np.maximum(quiet.sum(axis=0), 1) / below
+        new = np.where(quiet.any(axis=0), mean, floor)
+        if np.allclose(new, floor, rtol=1e-6, atol=0):
+            break
+        floor = new
+    return floor
+
+
+def degrees_of_freedom(settings: IntensitySettings, rate: float) -> float:
+    """ν of one window's power of white noise sampled at `rate` Hz: its variance is 2 mean² / ν. Exact."""
+    return white_freedom(make_grid(settings, rate, None, "settings"))
+
+
+def _check_floor(floor, microphones: int) -> Float[np.ndarray, " M"]:
+    given = np.asarray(floor)
+    if given.dtype.kind not in "fiu" or given.shape != (microphones,) or not (np.isfinite(given) & (given >= 0)).all():
+        raise ValueError(
+            f"floor must be finite and not negative, one for each of the {microphones} microphones; it is "
+            f"{given.dtype} of shape {given.shape}."
+        )
+    return given.astype(float)

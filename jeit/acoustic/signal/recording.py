@@ -1,0 +1,296 @@
+"""What a skin with M microphones hears: recordings, intensities and calibration taps, and the files they come from.
+
+Everything is checked on the way in, so that what comes later need not look again: real numbers, the right shapes,
+metres and hertz. What a broken microphone writes (NaN, zeros, flat tops) is let in: `jeit.acoustic.signal.faults` finds
+it.
+"""
+
+import warnings
+from pathlib import Path
+from struct import error as StructError
+
+import equinox as eqx
+import numpy as np
+import scipy.io.wavfile
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+
+from jeit.acoustic.signal._arrays import (
+    check_extent,
+    check_full_scale,
+    check_microphones,
+    check_taps,
+    coordinates,
+    either,
+    need,
+    npz_arrays,
+    number,
+    real,
+    sampling_rate,
+    short,
+)
+from jeit.acoustic.signal.faults import intensity_faults
+from jeit.mesh.loops import check_loop
+
+
+class Recording(eqx.Module):
+    """Sound of M microphones, sampled together.
+
+    - `samples`: (M, S) in any unit (volts, counts, parts of full scale); NaN or infinite where the device said so.
+    - `rate`: samples a second of each microphone, Hz.
+    - `full_scale`: the largest |sample| that the device can give, or None when that is not known.
+    - `name`: where it comes from.
+    """
+
+    samples: Float[np.ndarray, "M S"]
+    rate: float
+    full_scale: float | None
+    name: str = eqx.field(static=True)
+
+    def __init__(self, samples, rate, *, full_scale=None, name: str = "recording"):
+        """Raises `ValueError` for what is not real, not (M, S), transposed, or sampled at no plausible rate."""
+        self.samples = real(samples, "samples", "microphones, samples")
+        count, length = self.samples.shape
+        if count > length:
+            raise ValueError(
+                f"samples has shape {self.samples.shape}: {count} microphones with {length} samples each. It looks "
+                "transposed: give (microphones, samples)."
+            )
+        self.rate, self.full_scale, self.name = sampling_rate(rate), check_full_scale(full_scale), name
+
+
+class Intensities(eqx.Module):
+    """Band power of M microphones in F time windows.
+
+    - `times`: (F,) seconds, the middle of each window.
+    - `power`: (F, M) band power above the noise floor, in the square of the samples' unit; may be negative. NaN only
+      where it is not usable.
+    - `floor`: (M,) noise power that was subtracted; zeros when unknown.
+    - `freedom`: degrees of freedom ν of one window's power of white noise, so that its variance is 2 floor² / ν;
+      infinite when unknown.
+    - `overlap`: windows that share a sample, window / hop; 1 where none do.
+    - `usable`: (F, M) False where a fault spoils the window.
+    - `faults`: M strings, what is wrong with a channel in words; "" for a sound one.
+    - `name`: where they come from. `notes`: what to know of how they were measured.
+    """
+
+    times: Float[np.ndarray, " F"]
+    power: Float[np.ndarray, "F M"]
+    floor: Float[np.ndarray, " M"]
+    freedom: float
+    overlap: float
+    usable: Bool[np.ndarray, "F M"]
+    faults: tuple[str, ...] = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        times,
+        power,
+        *,
+        floor=None,
+        freedom: ArrayLike = np.inf,
+        overlap: ArrayLike = 1.0,
+        usable=None,
+        faults=None,
+        name="intensities",
+        notes=(),
+    ):
+        """`usable` and `faults` are worked out from NaN and dead channels when not given.
+
+        Raises `ValueError` for what is not real, for shapes that disagree, and for times that do not increase.
+        """
+        self.times, self.power = real(times, "times", "windows"), real(power, "intensity", "windows, microphones")
+        shape, length = self.power.shape, len(self.times)
+        if shape[0] != length:
+            hint = " It looks transposed: give (windows, microphones)." if shape[1] == length else ""
+            raise ValueError(f"intensity has shape {shape}, but there are {length} times, one a window.{hint}")
+        if not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
+            raise ValueError("times must be finite and increasing, in seconds: the middle of each window.")
+        self.floor = np.zeros(shape[1]) if floor is None else real(floor, "floor", "microphones")
+        if self.floor.shape != shape[1:] or not (np.isfinite(self.floor) & (self.floor >= 0)).all():
+            raise ValueError(
+                f"floor must be finite and not negative, one for each of the {shape[1]} microphones; it is "
+                f"{short(self.floor)}. Leave it out when it is not known."
+            )
+        self.freedom = number(freedom, "freedom")
+        if not self.freedom > 0:
+            raise ValueError(f"freedom must be positive (infinite when unknown); it is {self.freedom}.")
+        self.overlap = number(overlap, "overlap")
+        if not 1 <= self.overlap <= max(length, 1):
+            raise ValueError(
+                f"overlap must be at least 1 and no more than the {length} windows: how many of them share a sample "
+                f"(window / hop); it is {self.overlap:g}."
+            )
+        found, reasons = intensity_faults(self.power)
+        given = found if usable is None else np.asarray(usable)
+        self.faults = reasons if faults is None else tuple(str(reason) for reason in faults)
+        if given.shape != shape or given.dtype != bool or len(self.faults) != shape[1]:
+            raise ValueError(
+                f"usable is {given.dtype} of shape {given.shape} with {len(self.faults)} faults; give booleans of "
+                f"shape {shape}, and one string a microphone."
+            )
+        self.usable, self.name, self.notes = given & np.isfinite(self.power), name, tuple(notes)
+
+
+class Taps(eqx.Module):
+    """T touches at known places, as calibration needs them; d = 2 or 3.
+
+    - `microphones`: (M, d), `positions`: (T, d), `outline`: (K, d) corners of the skin in order; metres. A plane
+      outline is turned counter-clockwise.
+    - `power`: (T, M) intensity of each tap above the noise floor, or None;
+    - `samples`: (T, M, S) what was heard of each tap, or None, and `rate` in Hz.
+    - `name`, `full_scale`: as in `Recording`.
+    """
+
+    microphones: Float[np.ndarray, "M d"]
+    outline: Float[np.ndarray, "K d"]
+    positions: Float[np.ndarray, "T d"]
+    power: Float[np.ndarray, "T M"] | None
+    samples: Float[np.ndarray, "T M S"] | None
+    rate: float | None
+    full_scale: float | None
+    name: str = eqx.field(static=True)
+
+    def __init__(
+        self, microphones, outline, positions, *, power=None, samples=None, rate=None, full_scale=None, name="taps"
+    ):
+        """Give either `power`, or `samples` and `rate`.
+
+        Raises `ValueError` for what is no such thing: also for microphones farther from the skin than it is long, two
+        at one place, and in the plane taps farther outside the outline than 5 % of its length.
+        """
+        self.outline = coordinates(outline, "outline", np.shape(microphones)[-1:])
+        self.microphones = coordinates(microphones, "microphones", self.outline.shape[1:])
+        self.positions = coordinates(positions, "positions", self.outline.shape[1:])
+        if self.outline.shape[1] == 2:
+            self.outline = check_loop(self.outline, "outline", clockwise=False)
+        elif len(self.outline) < 3:
+            raise ValueError(f"outline: expected at least three vertices, got {len(self.outline)}.")
+        for label, points in (
+            ("outline", self.outline),
+            ("microphones", self.microphones),
+            ("positions", self.positions),
+        ):
+            check_extent(np.concatenate([self.outline, points]), label)
+        flat = self.outline.shape[1] == 2
+        check_microphones(self.microphones, self.outline if flat else np.vstack([self.outline, self.positions]))
+        if flat:
+            check_taps(self.positions, self.outline)
+        if (power is None) == (samples is None):
+            both = "neither" if power is None else "both"
+            raise ValueError(f"taps need either intensity or samples with their rate; {both} were given.")
+        expected = (len(self.positions), len(self.microphones))
+        self.power = None if power is None else real(power, "intensity", "taps, microphones")
+        self.samples = None if samples is None else real(samples, "samples", "taps, microphones, samples")
+        label, given = ("intensity", self.power) if self.samples is None else ("samples", self.samples)
+        assert given is not None
+        if given.shape[:2] != expected:
+            transposed = given.shape == expected[::-1] or (given.ndim == 3 and given.shape[::2] == expected)
+            hint = " It looks transposed." if transposed else ""
+            raise ValueError(
+                f"{label} has shape {given.shape}, but there are {expected[0]} positions and {expected[1]} "
+                f"microphones: give (taps, microphones{', samples' if given.ndim == 3 else ''}).{hint}"
+            )
+        if self.samples is not None and rate is None:
+            raise ValueError("rate is missing: samples need the samples a second of each microphone, in Hz.")
+        self.rate = None if self.samples is None else sampling_rate(rate)
+        self.full_scale, self.name = check_full_scale(full_scale), name
+
+
+def read_recording(path: str | Path) -> Recording | Intensities:
+    """Read what a skin heard: a multichannel WAV file, or an NPZ file.
+
+    An NPZ file holds `samples` (M, S) and `rate` in Hz, optionally `full_scale`; or `intensity` (F, M) and `times` (F,)
+    in seconds, optionally `floor` (M,), `freedom` and `overlap`. A WAV file's integers become parts of full scale, -1
+    to 1. Raises `ValueError` for any other content, and `OSError` where there is no such file.
+    """
+    path = Path(path)
+    with path.open("rb") as file:
+        start = file.read(4)
+    try:
+        if start in (b"RIFF", b"RIFX", b"RF64"):
+            return _read_wav(path)
+        optional = ("floor", "freedom", "overlap")
+        arrays = npz_arrays(path, start, "samples", "rate", "full_scale", "intensity", "times", *optional)
+        kind = either(arrays, "intensity", "samples")
+        if kind == "samples":
+            if arrays["samples"].ndim == 3:
+                raise ValueError("samples has three axes, as a file of taps has: read that with read_taps.")
+            need(arrays, "rate")
+            return Recording(arrays["samples"], arrays["rate"], full_scale=arrays.get("full_scale"), name=path.stem)
+        need(arrays, "times")
+        known = {key: arrays[key] for key in optional if key in arrays}
+        return Intensities(arrays["times"], arrays["intensity"], **known, name=path.stem)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from None
+
+
+def read_taps(path: str | Path) -> Taps:
+    """Read calibration taps from an NPZ file.
+
+    It holds `microphones` (M, d), `outline` (K, d), `positions` (T, d), and `intensity` (T, M), or `samples` (T, M, S)
+    with `rate`; optionally `full_scale`. Raises `ValueError` for other content, `OSError` where there is no such file.
+    """
+    path = Path(path)
+    with path.open("rb") as file:
+        start = file.read(4)
+    geometry = ("microphones", "outline", "positions")
+    try:
+        arrays = npz_arrays(path, start, *geometry, "intensity", "samples", "rate", "full_scale")
+        need(arrays, *geometry)
+        kind = either(arrays, "intensity", "samples")
+        values = {"power" if kind == "intensity" else "samples": arrays[kind]}
+        if kind == "samples":
+            need(arrays, "rate")
+            values |= {"rate": arrays["rate"]}
+        full_scale = arrays.get("full_scale")
+        return Taps(*(arrays[key] for key in geometry), **values, full_scale=full_scale, name=path.stem)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from None
+
+
+def write_recording(path: str | Path, recording: Recording | Intensities) -> None:
+    """Write an NPZ file that `read_recording` reads; windows that are not usable become NaN."""
+    if isinstance(recording, Recording):
+        _write(path, samples=recording.samples, rate=recording.rate, full_scale=recording.full_scale)
+    else:
+        known = {key: getattr(recording, key) for key in ("times", "floor", "freedom", "overlap")}
+        _write(path, intensity=np.where(recording.usable, recording.power, np.nan), **known)
+
+
+def write_taps(path: str | Path, taps: Taps) -> None:
+    """Write an NPZ file that `read_taps` reads."""
+    geometry = {"microphones": taps.microphones, "outline": taps.outline, "positions": taps.positions}
+    _write(path, **geometry, intensity=taps.power, samples=taps.samples, rate=taps.rate, full_scale=taps.full_scale)
+
+
+def _write(path: str | Path, **arrays) -> None:
+    # Through an open file: given a name, NumPy would add a suffix of its own.
+    with Path(path).open("wb") as file:
+        np.savez(file, allow_pickle=False, **{key: value for key, value in arrays.items() if value is not None})
+
+
+def _read_wav(path: Path) -> Recording:
+    problem, rate, data = None, 0, np.zeros(0)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            rate, data = scipy.io.wavfile.read(path)
+        except (ValueError, EOFError, StructError, UnboundLocalError, ZeroDivisionError, TypeError) as error:
+            problem = error
+    # The reader only warns of these, or stumbles later; its other warnings are of chunks that hold no sound.
+    if any("prematurely" in str(one.message) for one in said):
+        raise ValueError("the WAV file is cut off: it holds fewer samples than its header says. Copy it again.")
+    if problem is not None:
+        raise ValueError(f"not a readable WAV file, or cut off ({problem}); write it as plain PCM or float.")
+    samples = data.T if data.ndim == 2 else data[None]
+    if data.dtype == np.uint8:
+        return Recording((samples - 128.0) / 128.0, rate, full_scale=1.0, name=path.stem)
+    if data.dtype.kind == "i":
+        # 24 bits come as the upper bits of 32, so that this holds for them too.
+        return Recording(samples / -float(np.iinfo(data.dtype.name).min), rate, full_scale=1.0, name=path.stem)
+    # Floats beyond 1 are in some other unit: then full scale is not known.
+    beyond = (np.abs(samples[np.isfinite(samples)]) > 1.0).any()
+    return Recording(samples, rate, full_scale=None if beyond else 1.0, name=path.stem)

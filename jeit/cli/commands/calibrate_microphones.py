@@ -1,0 +1,130 @@
+"""`jeit calibrate-microphones`: taps at known places in, the decay model of every microphone out."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jeit.cli.options import BandHigh, BandLow, Hop, Quiet, Window, intensity_settings, make_folder
+
+if TYPE_CHECKING:
+    from jeit.acoustic import CalibrationFit
+
+# A relative error of the models that taps at places slightly wrong give.
+_MUCH = 0.3
+
+
+def calibrate_microphones(
+    taps: Annotated[
+        Path,
+        typer.Argument(
+            help="NPZ file: microphones (M, d) and outline (K, d) in metres, positions (T, d) of the taps in metres, "
+            "and intensity (T, M), or samples (T, M, S) with rate in hertz.",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", help="Calibration file to write (JSON); a picture goes beside it.", show_default=False
+        ),
+    ],
+    decay: Annotated[
+        str, typer.Option(help="inverse-square, a/(r²+b); exponential; or attenuated, the product of both.")
+    ] = "inverse-square",
+    low: BandLow = None,
+    high: BandHigh = None,
+    window: Window = None,
+    hop: Hop = None,
+    quiet: Quiet = False,
+) -> None:
+    """Calibrate an array of microphones from taps at known places; writes the calibration and a picture of it."""
+    from matplotlib.figure import Figure
+    from rich.console import Console
+
+    from jeit.acoustic import calibrate_microphones as calibrate
+    from jeit.acoustic import read_taps
+    from jeit.acoustic.decay import find_decay
+    from jeit.cli.console import Steps
+    from jeit.plot import plot_receptive_fields
+
+    find_decay(decay)
+    settings = intensity_settings(low, high, window, hop)
+    if output.is_dir():
+        raise ValueError(f"--output {output} is a folder; give a file, such as {output / 'calibration.json'}.")
+    picture = output.with_suffix(".png")
+    if picture == output:
+        raise ValueError(f"--output {output}: the calibration is JSON; give another name, such as {output.stem}.json.")
+    make_folder(output.parent, (output.name, picture.name))
+    console = Console(highlight=False)
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        touched = read_taps(taps)
+        if settings is not None and touched.samples is None:
+            raise ValueError(
+                "--low, --high, --window and --hop are for taps that come as samples; these are intensities."
+            )
+        step("fit")
+        fit = calibrate(touched, decay=decay, intensity=settings)
+        step("write")
+        fit.calibration.save(output)
+        figure = Figure(figsize=(9.6, 8.4), layout="constrained")
+        plot_receptive_fields(fit, title=touched.name, ax=figure.subplots())
+        figure.savefig(picture, dpi=130)
+    if not quiet:
+        _show(console, fit)
+        console.print(f"[dim]Written:[/dim] {output}, {picture.name}", soft_wrap=True)
+
+
+def _show(console, fit: "CalibrationFit") -> None:
+    import numpy as np
+    from rich.table import Table
+
+    from jeit.cli.console import pairs
+
+    calibration = fit.calibration
+    decay, noise = calibration.microphone_array.decay, calibration.microphone_array.noise
+    usable = calibration.usable
+    typical = float(np.median(np.asarray(noise.relative)[usable]))
+    rows = [
+        ("microphones", f"{int(usable.sum())} of {len(usable)} usable"),
+        ("taps", f"{len(fit.outlier)}, {int(fit.outlier.sum())} left out as outliers"),
+        ("decay model", decay.name),
+        (
+            "error of the model",
+            f"{100 * typical:.1f} % of an intensity, median"
+            + (": much; are all taps where they are said to be?" if typical > _MUCH else ""),
+        ),
+        ("scale", "strength 1 reads 1 at a typical microphone right under the source"),
+    ]
+    if fit.shared.any():
+        which = ", ".join(str(k) for k in np.flatnonzero(fit.shared))
+        rows.append(("tap nearer to", f"{which}: no tap says how their response falls off; it is that of the others"))
+    console.print()
+    console.print(pairs(calibration.name, rows))
+    console.print()
+    factors, units = {"a": 1.0, "b": 1e6, "length": 1e3}, {"a": "m²", "b": "mm²", "length": "mm"}
+    if decay.name == "exponential":
+        units["a"] = "1"
+    columns = [text for name in decay.parameters for text in (f"{name} / {units[name]}", "± %")]
+    table = Table("", *columns, "error %", "explained %", box=None, padding=(0, 1))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    refused = []
+    for k, reason in enumerate(calibration.reasons):
+        if reason:
+            refused.append((f"microphone {k}", f"not usable: {reason}"))
+            continue
+        cells = []
+        for i, name in enumerate(decay.parameters):
+            error = 100 * calibration.standard_errors[i, k]
+            cells += [
+                f"{factors[name] * float(getattr(decay, name)[k]):.3g}",
+                f"{error:.1f}" if error == error else "–",
+            ]
+        cells += [f"{100 * float(noise.relative[k]):.1f}", f"{100 * float(fit.explained[k]):.1f}"]
+        table.add_row(str(k), *cells)
+    console.print(table)
+    if refused:
+        console.print()
+        console.print(pairs("Left out", refused))

@@ -1,0 +1,95 @@
+"""`jeit choose`: what every rule for the hyperparameter chooses on a measured file, and what comes of it."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jeit.cli.options import (
+    Contact,
+    Data,
+    Description,
+    Format,
+    Frame,
+    Nodes,
+    Quiet,
+    Reference,
+    make_folder,
+    number_or_name,
+)
+
+if TYPE_CHECKING:
+    from jeit.imaging import ComparedRules
+
+
+def choose(
+    data: Data,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for choice.png and choice.json.", show_default=False)
+    ],
+    reference: Reference = None,
+    rule: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Only this rule: gcv, l-curve, discrepancy, noise-figure or best-resolution; may be given repeatedly."
+        ),
+    ] = None,
+    format: Format = None,
+    description: Description = None,
+    prior: Annotated[str | None, typer.Option(help="tikhonov, laplace, noser or gaussian (default).")] = None,
+    contact: Contact = None,
+    num_points: Nodes = None,
+    frame: Frame = None,
+    quiet: Quiet = False,
+) -> None:
+    """Compare the rules that choose the hyperparameter of DATA's image; writes choice.png and choice.json."""
+    from rich.console import Console
+
+    from jeit.cli.console import Steps
+    from jeit.data import read
+    from jeit.imaging import ImagingSettings, compare_on_data
+    from jeit.report import write_choice
+
+    given = {"prior": prior, "contact": contact, "num_points": num_points}
+    settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})
+    make_folder(output, ("choice.png", "choice.json"))
+    console = Console(highlight=False)
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        measurement = read(data, format, description)
+        base = None if reference is None else read(reference, format, description)
+        chosen = None if frame is None else number_or_name(frame, int)
+        result = compare_on_data(measurement, base, settings, rules=rule or None, frame=chosen, progress=step)
+        step("write")
+        write_choice(result, output)
+    if not quiet:
+        show(console, result)
+        console.print(f"[dim]Written:[/dim] {output / 'choice.png'}, choice.json", soft_wrap=True)
+
+
+def show(console, result: "ComparedRules") -> None:
+    """Print a row for every rule, and what speaks against its choice."""
+    from rich.table import Table
+
+    from jeit.cli.console import percent
+
+    table = Table("rule", "λ", "residual", "noise figure", "inclusions", box=None, padding=(0, 2))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, outcome in result.outcomes.items():
+        table.add_row(
+            f"{name} *" if outcome.choice.edge else name,
+            f"{float(outcome.choice.hyperparameter):.3g}",
+            percent(outcome.residual),
+            f"{outcome.noise_figure:.3g}",
+            str(len(outcome.inclusions)),
+        )
+    console.print()
+    console.print(f"[bold]{result.prepared.measurement.name}[/bold]")
+    console.print(table)
+    for outcome in result.outcomes.values():
+        if outcome.choice.edge:
+            console.print(f"  * {outcome.choice.note}", soft_wrap=True)
+    for reason in result.refused.values():
+        console.print(f"  {reason}", soft_wrap=True)
+    console.print()

@@ -1,0 +1,54 @@
+"""`jeit demo`: a press on a simulated skin, imaged; needs no data."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jeit.cli.options import Quiet, make_folder
+
+
+def demo(
+    x: Annotated[float, typer.Option(help="Where to press, metres from the middle.")] = 0.02,
+    y: Annotated[float, typer.Option(help="Where to press, metres from the middle.")] = 0.012,
+    noise: Annotated[float, typer.Option(help="Noise, relative to the voltages.")] = 1e-4,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the picture and the report.")] = Path(
+        "jeit-demo"
+    ),
+    quiet: Quiet = False,
+) -> None:
+    """Press a simulated skin (100 mm across, 16 electrodes), image it, and compare. Needs no data."""
+    import jax
+    import numpy as np
+    from rich.console import Console
+
+    from jeit.cli.console import Steps, pairs
+    from jeit.imaging import image_difference
+    from jeit.report import write_image
+    from jeit.simulate.round_skin import RoundSkin, simulate_press
+
+    make_folder(output)
+    console = Console(highlight=False)
+    skin = RoundSkin()
+    with Steps(console, quiet=quiet) as step:
+        step("simulate a press")
+        pressed, rest = simulate_press(skin, jax.random.key(seed), (x, y), noise=noise)
+        result = image_difference(pressed, rest, progress=step)
+        step("write")
+        write_image(result, output, truth=(x, y))
+    if not result.inclusions:
+        raise ValueError("the press was not found in the image; try less --noise.")
+    if quiet:
+        return
+    found = result.inclusions[0].centroid
+    error = float(np.hypot(found[0] - x, found[1] - y))
+    rows = [
+        ("pressed at", f"({1e3 * x:6.1f}, {1e3 * y:6.1f}) mm"),
+        ("found at", f"({1e3 * found[0]:6.1f}, {1e3 * found[1]:6.1f}) mm"),
+        ("error", f"{1e3 * error:.1f} mm, {100 * error / (2 * skin.radius):.1f} % of the diameter"),
+    ]
+    console.print()
+    console.print(pairs("A simulated press", rows))
+    console.print()
+    console.print(f"[dim]Written:[/dim] {output / 'image.png'}, image.npz, report.json", soft_wrap=True)

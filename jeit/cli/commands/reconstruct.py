@@ -1,0 +1,143 @@
+"""`jeit reconstruct`: a measured file in; a picture, arrays and a report out."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jeit.cli.options import (
+    Contact,
+    Data,
+    Description,
+    Format,
+    Frame,
+    Nodes,
+    Quiet,
+    Reference,
+    make_folder,
+    number_or_name,
+)
+
+if TYPE_CHECKING:
+    from jeit.imaging import ImagedDifference
+
+
+def reconstruct(
+    data: Data,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for image.png, image.npz, report.json.", show_default=False)
+    ],
+    reference: Reference = None,
+    format: Format = None,
+    description: Description = None,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help="one-step (default), back-projection, filtered-back-projection; gauss-newton, levenberg-marquardt, "
+            "total-variation (default with --segment)."
+        ),
+    ] = None,
+    prior: Annotated[
+        str | None,
+        typer.Option(
+            help="tikhonov, laplace, noser or gaussian (default); not for back-projection and total-variation."
+        ),
+    ] = None,
+    hyperparameter: Annotated[
+        str | None,
+        typer.Option(
+            help="A number, or the rule that chooses it: noise-figure (default), l-curve, gcv, discrepancy, "
+            "best-resolution, see jeit choose; unless given 5 for gauss-newton and levenberg-marquardt, 300 for "
+            "total-variation.",
+            metavar="VALUE|RULE",
+        ),
+    ] = None,
+    contact: Contact = None,
+    segment: Annotated[
+        bool, typer.Option("--segment", help="Add labels to image.npz: 0 background, 1 resistive, 2 conductive.")
+    ] = False,
+    num_points: Nodes = None,
+    frame: Frame = None,
+    quiet: Quiet = False,
+) -> None:
+    """Image what changed between REFERENCE and DATA; writes image.png, image.npz and report.json."""
+    from rich.console import Console
+
+    from jeit.cli.console import Steps
+    from jeit.data import read
+    from jeit.imaging import ImagingSettings, image_difference
+    from jeit.report import write_image
+
+    if segment and method is None:
+        method = "total-variation"
+    given = {
+        "segment": segment,
+        "method": method,
+        "prior": prior,
+        "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
+        "contact": contact,
+        "num_points": num_points,
+    }
+    if method in ("back-projection", "filtered-back-projection", "total-variation") and prior is not None:
+        raise ValueError(f"--prior does not go with --method {method}; leave it out, or choose another method.")
+    if method == "back-projection" and hyperparameter is not None:
+        raise ValueError("--hyperparameter: plain back-projection has none; leave it out.")
+    settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})
+    make_folder(output)
+    console = Console(highlight=False)
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        measurement = read(data, format, description)
+        base = None if reference is None else read(reference, format, description)
+        chosen = None if frame is None else number_or_name(frame, int)
+        result = image_difference(measurement, base, settings, frame=chosen, progress=step)
+        step("write")
+        write_image(result, output)
+    if not quiet:
+        show(console, result)
+        console.print(f"[dim]Written:[/dim] {output / 'image.png'}, image.npz, report.json", soft_wrap=True)
+
+
+def show(console, result: "ImagedDifference") -> None:
+    """Print what was found."""
+    from rich.table import Table
+
+    from jeit.cli.console import pairs, percent, scaled
+    from jeit.inverse import Reconstruction
+
+    calibration, reconstruction = result.calibration, result.reconstruction
+    unit = "S" if result.mesh.dimension == 2 else "S/m"
+    noise = result.quality.difference_noise
+    hyperparameter = float(reconstruction.hyperparameter)
+    chosen = "none" if reconstruction.rule == "none" else f"{hyperparameter:.3g} ({reconstruction.rule})"
+    rows = [
+        ("background", f"{scaled(float(calibration.conductivity), unit)}, misfit {percent(float(calibration.misfit))}"),
+        ("difference", f"{percent(result.quality.difference)} of the reference"),
+        ("noise in it", "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"),
+        ("method", f"{result.settings.method}, hyperparameter {chosen}"),
+        ("mesh", f"{result.mesh.num_points:,} nodes, {result.mesh.num_cells:,} cells"),
+    ]
+    if calibration.status != "converged":
+        rows.insert(1, ("calibration", calibration.status))
+    if reconstruction.choice is not None and reconstruction.choice.note:
+        rows.append(("hyperparameter", reconstruction.choice.note))
+    if isinstance(reconstruction, Reconstruction):
+        misfit = f"misfit {float(reconstruction.misfit):.2g} standard deviations"
+        rows.append(("iteration", f"{reconstruction.status}, {reconstruction.iterations} steps, {misfit}"))
+        if reconstruction.status != "converged":
+            rows.append(("", reconstruction.reason))
+    elif result.lowest < -1:
+        fall = f"falls to {percent(result.lowest)} of the background: of changes so large only place and sign are right"
+        rows.append(("linear image", fall))
+    console.print()
+    console.print(pairs(result.measurement.name, rows))
+    console.print()
+    table = Table("inclusion", "x / mm", "y / mm", "area / mm²", f"peak / {unit}", box=None, padding=(0, 2))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for inclusion in result.inclusions:
+        x, y = inclusion.centroid[:2]
+        numbers = (f"{1e3 * x:.1f}", f"{1e3 * y:.1f}", f"{1e6 * inclusion.area:.0f}", f"{inclusion.peak:.3g}")
+        table.add_row(inclusion.kind, *numbers)
+    console.print(table if result.inclusions else "  no inclusion found")
+    console.print()

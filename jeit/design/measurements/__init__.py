@@ -1,0 +1,1 @@
+"""Which measurements are worth making: candidates, and the choice among them."""

@@ -1,0 +1,274 @@
+"""Measurement selection: of all measurements that could be made, the few that tell most of the conductivity.
+
+With f_i as in `Candidates`, the coefficients of the conductivity have covariance C = (I + Σ_{i∈T} f_i f_iᵀ)⁻¹ after the
+measurements of a set T, and the set is as good as its
+
+- "D": log det C⁻¹, twice the mutual information between measurements and conductivity, in nats;
+- "A": tr V - tr VC with V = SᵀWS, the variance of the conductivity that the set removes, summed with weights W.
+
+Atkinson, Donev and Tobias, Optimum Experimental Designs (Oxford, 2007), chapters 10-12; Krause, Singh and Guestrin,
+J. Mach. Learn. Res. 9 (2008) 235-284.
+"""
+
+from functools import partial
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+
+from jeit.design.measurements.candidates import Candidates
+from jeit_solvers.dense.cholesky import inverse_cholesky
+
+Criterion = Literal["D", "A"]
+# A swap must be worth more than this share of what the set tells, or rounding could swap for ever.
+_WORTH = 1e-9
+
+
+class Selection(eqx.Module):
+    """The measurements chosen, and what they keep of what all would tell.
+
+    **Fields**
+
+    - `chosen`: (N,) numbers of the candidates, the most telling first; `protocol.subset(chosen)` measures them.
+    - `gains`: (N,) what each of the greedy choices added, before any exchange; in "D" they never grow.
+    - `information`: of the chosen ("D": nats, "A": variance removed), and `total`, of all candidates.
+    - `swaps`: how many the exchange made, and `settled`, whether no further swap would help.
+    """
+
+    chosen: Int[Array, " N"]
+    gains: Float[Array, " N"]
+    information: Float[Array, ""]
+    total: Float[Array, ""]
+    swaps: Int[Array, ""]
+    settled: Bool[Array, ""]
+
+    @property
+    def share(self) -> Float[Array, ""]:
+        """Information of the chosen over that of all candidates."""
+        return self.information / self.total
+
+
+def select_measurements(
+    candidates: Candidates,
+    number: int,
+    *,
+    criterion: Criterion = "D",
+    exchange: bool = True,
+    max_swaps: int | None = None,
+) -> Selection:
+    """Choose `number` of the candidates that lose least information.
+
+    Greedily, each time the one that adds most to those chosen before; then, with `exchange`, by the best swap of one
+    chosen for one not chosen, again and again until none helps (Fedorov's exchange) or `max_swaps`, `number` unless
+    given, are made. Deterministic. The greedy set has at least 1 - 1/e of the best possible "D" (the criterion is
+    submodular); `information_bound` tells how much better any other could be. A greedy choice costs O(M r) operations,
+    a swap O(N M r). Works under `jit` and `vmap`: one call for many layouts.
+
+    Raises `ValueError` for a number that is not from 1 to M, and another criterion.
+    """
+    _check_number(candidates, number, criterion)
+    limit = 0 if not exchange else number if max_swaps is None else max_swaps
+    if not isinstance(limit, int) or limit < 0:
+        raise ValueError(f"max_swaps must be a whole number from 0; it is {max_swaps!r}.")
+    return _select(candidates, number, criterion, limit)
+
+
+def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -> Float[Array, "..."]:
+    """What sets of candidates tell: (...,) for sets `chosen` (..., N), of N different candidates each.
+
+    Raises `ValueError` for numbers that are no candidates.
+    """
+    chosen = jnp.asarray(chosen)
+    if chosen.ndim == 0 or not jnp.issubdtype(chosen.dtype, jnp.integer):
+        raise ValueError(f"chosen has shape {chosen.shape} of {chosen.dtype}; give integers (..., N).")
+    _check_number(candidates, chosen.shape[-1], criterion)
+    if not isinstance(chosen, Tracer) and not ((chosen >= 0) & (chosen < candidates.num_candidates)).all():
+        raise ValueError(f"chosen must be from 0 to {candidates.num_candidates - 1}.")
+    return _of_sets(candidates, chosen.reshape(-1, chosen.shape[-1]), criterion).reshape(chosen.shape[:-1])
+
+
+def information_bound(
+    candidates: Candidates, number: int, *, criterion: Criterion = "D", iterations: int = 50
+) -> Float[Array, ""]:
+    """What no choice of `number` candidates can exceed.
+
+    If every candidate may be measured in part, 0 ≤ w_i ≤ 1 with Σw_i = N, the information is a concave function of w,
+    and each of its tangents bounds it. The least bound met on the way of Frank and Wolfe's method to the maximum is
+    returned; more `iterations` tighten it. Close where many candidates tell much the same; loose where noise is so low
+    that each tells something new, for then parts of all of them would tell more than any few.
+
+    Boyd and Vandenberghe, Convex Optimization (2004), section 7.5.
+    """
+    _check_number(candidates, number, criterion)
+    return _bound(candidates, number, criterion, iterations)
+
+
+def random_selections(key: Array, num_candidates: int, number: int, count: int) -> Int[Array, "count N"]:
+    """`count` sets of `number` different candidates each, all equally likely: (count, number)."""
+    if not 1 <= number <= num_candidates:
+        raise ValueError(f"number must be from 1 to the {num_candidates} candidates; it is {number}.")
+    orders = jax.vmap(lambda one: jax.random.permutation(one, num_candidates))(jax.random.split(key, count))
+    return orders[:, :number]
+
+
+def nearest_pairs(centres, number: int) -> Int[np.ndarray, " N"]:
+    """The `number` shortest of all pairs of electrodes at `centres` (L, d): channels of `two_terminal(L)`.
+
+    The obvious pattern that measures every place from close by. Of pairs of the same length the first are taken.
+    Raises `ValueError` for a number that is not from 1 to L(L - 1)/2.
+    """
+    return _by_length(centres, number, 1)
+
+
+def farthest_pairs(centres, number: int) -> Int[np.ndarray, " N"]:
+    """The `number` longest pairs, as in `nearest_pairs`: a pattern that drives current through the whole skin."""
+    return _by_length(centres, number, -1)
+
+
+def _by_length(centres, number: int, sign: int) -> np.ndarray:
+    centres = np.asarray(centres, float)
+    first, second = np.triu_indices(len(centres), 1)
+    if not 1 <= number <= len(first):
+        raise ValueError(
+            f"number must be from 1 to the {len(first)} pairs of {len(centres)} electrodes; it is {number}."
+        )
+    # Rounded to a nanometre, so that pairs as long as each other are taken in their order.
+    length = np.linalg.norm(centres[first] - centres[second], axis=1).round(9)
+    return np.argsort(sign * length, kind="stable")[:number]
+
+
+def _check_number(candidates: Candidates, number: int, criterion: Criterion) -> None:
+    if criterion not in ("D", "A"):
+        raise ValueError(f"criterion must be 'D' or 'A'; it is {criterion!r}.")
+    if not isinstance(number, int) or not 1 <= number <= candidates.num_candidates:
+        raise ValueError(f"number must be a whole number from 1 to {candidates.num_candidates}; it is {number!r}.")
+
+
+@partial(jax.jit, static_argnames=("number", "criterion", "limit"))
+def _select(candidates: Candidates, number: int, criterion: Criterion, limit: int) -> Selection:
+    chosen, gains = _greedy(candidates, number, criterion)
+    total, _ = _tangent(candidates, jnp.ones(candidates.num_candidates), criterion)
+
+    def helps(state):
+        _, swaps, settled = state
+        return (swaps < limit) & ~settled
+
+    def swap(state):
+        chosen, swaps, _ = state
+        gain = _swap_gains(candidates, chosen, criterion)
+        leaves, enters = jnp.unravel_index(jnp.argmax(gain), gain.shape)
+        worth = gain[leaves, enters] > _WORTH * total
+        return jnp.where(worth, chosen.at[leaves].set(enters), chosen), swaps + worth, ~worth
+
+    chosen, swaps, settled = jax.lax.while_loop(helps, swap, (chosen, jnp.array(0), jnp.array(False)))
+    kept = _of_sets(candidates, chosen[None], criterion)[0]
+    return Selection(chosen, gains, kept, total, swaps, settled)
+
+
+def _greedy(candidates: Candidates, number: int, criterion: Criterion):
+    """The chosen (N,) and what each added: a Cholesky factorisation of I + FFᵀ with the best as the next pivot.
+
+    Choosing p turns C into C - uuᵀ with u = C f_p / √(1 + f_pᵀC f_p); the u found so far are the rows of `known`.
+    """
+    rows, weight = candidates.rows, candidates.weight
+
+    def covariance(known, vector):
+        return vector - known.T @ (known @ vector)
+
+    def step(state, turn):
+        known, left, removable, free = state
+        gain = jnp.log1p(left) if criterion == "D" else removable / (1 + left)
+        best = jnp.argmax(jnp.where(free, gain, -jnp.inf))
+        direction = covariance(known, rows[best]) / jnp.sqrt(1 + left[best])
+        seen = rows @ direction
+        if criterion == "A":
+            # f_jᵀCVC f_j with the new C; VC f_j and Cf_j change by multiples of `seen`.
+            pulled = weight @ direction
+            change = rows @ covariance(known, pulled)
+            removable = jnp.maximum(removable - 2 * seen * change + (direction @ pulled) * seen**2, 0)
+        state = known.at[turn].set(direction), jnp.maximum(left - seen**2, 0), removable, free.at[best].set(False)
+        return state, (best, gain[best])
+
+    left = jnp.sum(rows**2, axis=1)  # f_jᵀC f_j: the variance of reading j that is not known yet
+    removable = jnp.sum((rows @ weight) * rows, axis=1)  # f_jᵀCVC f_j
+    known = jnp.zeros((number, rows.shape[1]))
+    start = (known, left, removable, jnp.ones(len(rows), bool))
+    return jax.lax.scan(step, start, jnp.arange(number))[1]
+
+
+def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[Array, "N M"]:
+    """What the set gains where its i-th is swapped for candidate j, (N, M); -inf where j is in it.
+
+    With c_ij = f_iᵀC f_j and b_ij = f_iᵀCVC f_j, C of the present set, a swap multiplies det C⁻¹ by
+    q = (1 + c_jj)(1 - c_ii) + c_ij² and lowers tr VC by ((1 - c_ii) b_jj + 2 c_ij b_ij - (1 + c_jj) b_ii) / q.
+    """
+    rows, weight = candidates.rows, candidates.weight
+    picked = rows[chosen]
+    cross = picked @ rows.T
+    # C F_Tᵀ = F_Tᵀ (I + F_T F_Tᵀ)⁻¹: c_ij and 1 - c_ii come without a difference of large numbers.
+    root = _inverse_root(cross[:, chosen])
+    half = root @ cross
+    c_j = jnp.maximum(jnp.sum(rows**2, axis=1) - jnp.sum(half**2, axis=0), 0)
+    c_ij = root.T @ half
+    rest_i = jnp.sum(root**2, axis=0)[:, None]  # 1 - c_ii
+    ratio = (1 + c_j) * rest_i + c_ij**2
+    if criterion == "D":
+        gain = jnp.log(ratio)
+    else:
+        smoothed = rows - c_ij.T @ picked  # rows f_jᵀC
+        kept = root.T @ (root @ picked) @ weight  # rows f_iᵀCV
+        b_ij = kept @ smoothed.T
+        b_j = jnp.sum((smoothed @ weight) * smoothed, axis=1)
+        gain = (rest_i * b_j + 2 * c_ij * b_ij - (1 + c_j) * b_j[chosen][:, None]) / ratio
+    return gain.at[:, chosen].set(-jnp.inf)
+
+
+def _of_set(candidates: Candidates, weighted: Float[Array, "M r"], chosen, criterion: Criterion):
+    """Information of one set, from the N × N system I + F_T F_Tᵀ; `weighted` are the rows times V."""
+    picked = candidates.rows[chosen]
+    root = _inverse_root(picked @ picked.T)
+    if criterion == "D":
+        return -2 * jnp.sum(jnp.log(jnp.diag(root)))
+    return jnp.sum((root @ weighted[chosen]) * (root @ picked))
+
+
+@partial(jax.jit, static_argnames="criterion")
+def _of_sets(candidates: Candidates, sets, criterion: Criterion):
+    weighted = candidates.rows @ candidates.weight
+    return jax.lax.map(lambda chosen: _of_set(candidates, weighted, chosen, criterion), sets, batch_size=64)
+
+
+def _tangent(candidates: Candidates, parts: Float[Array, " M"], criterion: Criterion):
+    """Information where candidate i counts `parts[i]` times, and its derivative (M,), from the r × r system C⁻¹."""
+    rows, weight = candidates.rows, candidates.weight
+    root = _inverse_root(rows.T @ (parts[:, None] * rows))
+    half = root @ rows.T
+    if criterion == "D":
+        return -2 * jnp.sum(jnp.log(jnp.diag(root))), jnp.sum(half**2, axis=0)  # f_jᵀC f_j
+    smoothed = root.T @ half
+    value = jnp.trace(weight) - jnp.sum((root @ weight) * root)
+    return value, jnp.sum(smoothed * (weight @ smoothed), axis=0)  # f_jᵀCVC f_j
+
+
+def _inverse_root(matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
+    """L⁻¹ of the Cholesky factor of I + `matrix`: matrix products alone, which batch where LAPACK's solves may not."""
+    return inverse_cholesky(jnp.eye(len(matrix)) + matrix[None])[0]
+
+
+@partial(jax.jit, static_argnames=("number", "criterion", "iterations"))
+def _bound(candidates: Candidates, number: int, criterion: Criterion, iterations: int):
+    def step(turn, state):
+        parts, bound = state
+        value, slope = _tangent(candidates, parts, criterion)
+        _, best = jax.lax.top_k(slope, number)
+        target = jnp.zeros_like(parts).at[best].set(1.0)
+        bound = jnp.minimum(bound, value + slope @ (target - parts))
+        return parts + 2 / (turn + 2) * (target - parts), bound
+
+    start = jnp.full(candidates.num_candidates, number / candidates.num_candidates)
+    # From turn 2, half a step: the whole one of turn 0 would forget where it began.
+    return jax.lax.fori_loop(2, iterations + 2, step, (start, jnp.array(jnp.inf)))[1]

@@ -1,0 +1,1 @@
+"""Better layouts: electrodes moved by gradients within constraints."""

@@ -1,0 +1,120 @@
+"""What touches do to a mesh: the few cells that each of them changes, and by how much."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.spatial import KDTree
+
+from jeit.design.skin.indentation import AbstractIndentation
+from jeit.electrodes.window import smooth_step
+from jeit.mesh import Mesh, centroids
+
+
+class TouchedCells(eqx.Module):
+    """n touches, each of which makes the conductivity of up to c cells σ (1 + change).
+
+    **Fields**
+
+    - `places`: (n, 2) metres, middles of the touches.
+    - `cells`: (n, c), and `change`: (n, c), −1 for a cell that conducts no more; 0 where a touch has fewer cells.
+    - `num_cells`: of the mesh they are of.
+    """
+
+    places: Float[Array, "n 2"]
+    cells: Int[Array, "n c"]
+    change: Float[Array, "n c"]
+    num_cells: int = eqx.field(static=True)
+
+
+def touched_cells(
+    mesh: Mesh,
+    indentation: AbstractIndentation,
+    places,
+    *,
+    thickness: float | None = None,
+    contrast: float = 0.0,
+    edge: float = 0.0,
+) -> TouchedCells:
+    """Indent the top of a layer, or a sheet, at `places` (n, 2) in metres, one at a time.
+
+    **Layer** (3-D mesh, top at its greatest z): cells in the indented part, by their centroids, get `contrast` times
+    their conductivity: 0, the default, for an insulating indenter (Park et al. 2022, text S4). With an `edge` in metres
+    the change rises smoothly over twice that depth, and so has derivatives in depth and place.
+
+    **Sheet** (2-D mesh) of a layer of `thickness` metres: a part depth / thickness of the current's way gets `contrast`
+    times its conductivity.
+
+    A `contrast` above 1 is that of a conductor. Raises `ValueError` for places where no cell is touched, for an
+    indentation as deep as the skin, and where `thickness` is missing or superfluous.
+    """
+    middle = np.asarray(centroids(mesh))
+    places = _check_places(places)
+    _check_values(contrast, edge)
+    layer = mesh.dimension == 3
+    deepest = float(np.max(indentation.depth_at(jnp.zeros(()))))
+    below = np.zeros(len(middle))
+    if layer:
+        if thickness is not None:
+            raise ValueError("thickness is for sheets; that of a layer is in its mesh.")
+        height = np.asarray(mesh.points)[:, 2]
+        below = height.max() - middle[:, 2]
+        thickness = float(np.ptp(height))
+    elif thickness is None or not 0 < thickness < np.inf:
+        raise ValueError(f"thickness must be given for a sheet, in metres, positive; it is {thickness!r}.")
+    if deepest >= thickness:
+        raise ValueError(
+            f"the indentation is {1e3 * deepest:.3g} mm deep, and the skin {1e3 * thickness:.3g} mm thick; press less."
+        )
+    candidates = np.flatnonzero(below < deepest + edge)
+    near = KDTree(middle[candidates, :2]).query_ball_point(places, indentation.reach, return_sorted=True)
+    cells, there = _padded([candidates[np.asarray(index, int)] for index in near])
+    depth = np.asarray(indentation.depth_at(np.linalg.norm(middle[cells, :2] - places[:, None], axis=-1)))
+    if not layer:
+        share = depth / thickness
+    elif edge:
+        share = np.asarray(smooth_step(jnp.asarray((depth - below[cells]) / edge)))
+    else:
+        share = (depth > below[cells]).astype(float)
+    changed = there & (share > 0)
+    empty = np.flatnonzero(~changed.any(axis=1))
+    if empty.size:
+        x, y = 1e3 * places[empty[0]]
+        raise ValueError(
+            f"{empty.size} of {len(places)} touches change no cell, the first at ({x:.4g}, {y:.4g}) mm: they lie off "
+            "the skin (places are in metres), or its cells are too coarse for so shallow an indentation; refine the "
+            "mesh, in a layer upwards."
+        )
+    kept, there = _padded([one[used] for one, used in zip(cells, changed, strict=True)])
+    change = np.zeros(kept.shape)
+    change[there] = (contrast - 1) * share[changed]
+    return TouchedCells(jnp.asarray(places), jnp.asarray(kept), jnp.asarray(change), mesh.num_cells)
+
+
+def _padded(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of whole numbers as one array, with zeros at their ends, and where they are."""
+    length = np.array([len(row) for row in rows])
+    there = np.arange(max(length.max(), 1)) < length[:, None]
+    padded = np.zeros(there.shape, np.int32)
+    padded[there] = np.concatenate(rows)
+    return padded, there
+
+
+def _check_places(places) -> np.ndarray:
+    places = np.asarray(places, float)
+    if places.ndim != 2 or places.shape[1] != 2 or not len(places):
+        raise ValueError(f"places must be (n, 2), one or more, in metres; they have shape {places.shape}.")
+    lost = np.flatnonzero(~np.isfinite(places).all(axis=1))
+    if lost.size:
+        raise ValueError(f"places: {lost.size} of {len(places)} are not finite, the first is number {lost[0]}.")
+    return places
+
+
+def _check_values(contrast: float, edge: float) -> None:
+    if not 0 <= contrast < np.inf or contrast == 1:
+        raise ValueError(
+            f"contrast must be a factor for the conductivity, 0 for an insulator, above 1 for a conductor; it is "
+            f"{contrast!r}."
+        )
+    if not 0 <= edge < np.inf:
+        raise ValueError(f"edge must be a depth in metres, not negative; it is {edge!r}.")

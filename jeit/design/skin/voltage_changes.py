@@ -1,0 +1,176 @@
+"""Changes of voltages by touches, one touch at a time: exact by low-rank updates of one factorisation, or linear.
+
+A touch adds D to the system matrix K of the electrode model, nonzero only among its k nodes. With the fields F for unit
+currents into the electrodes and G = K⁻¹, both restricted to those nodes,
+
+    ΔZ = −Fᵀ D F + (D F)ᵀ Y,    (G⁻¹ + D) Y = D F,
+
+(Sherman-Morrison-Woodbury), by conjugate gradients with G as the preconditioner: they need products with G and D only,
+never G⁻¹, in few steps, as touches of a bounded depth change the energy of any field by a bounded factor; nodes that a
+touch cuts off make the matrix singular, but nothing flows there. With the residual R of Y, (D F)ᵀ Y + Yᵀ R lacks
+Rᵀ (G⁻¹ + D)⁻¹ R, and Rᵀ G R is most of that. G is needed only between nodes of one touch, which lie near each other.
+"""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jeit.design.skin.touched_cells import TouchedCells
+from jeit.design.skin.touched_nodes import touched_nodes
+from jeit.forward import ForwardModel
+from jeit.forward.assembly import cell_conductivity, check_conductivity, stiffness
+from jeit.forward.model import select_channels
+from jeit.forward.transfer import fields_and_inverse
+from jeit_solvers import over_cores
+
+# Of the error's bound, relative to the voltages; steps to get there.
+_TOLERANCE, _MOST_STEPS = 1e-8, 200
+# Flow around what is cut off changes by a factor that its shape bounds, not the conductivity left. And where next to
+# nothing is left, the conductivity bounds too much.
+_CUT_OFF, _MOST_WEAKENED = 10.0, 1e6
+# Of the voltages, relative to the load's energy: below, they are rounding.
+_SMALLEST = 1e-12
+# Touches worked on at once: their blocks of the inverse are to stay in the cache, or of the Jacobian.
+_EXACT, _LINEAR = 2, 8
+
+
+def touch_changes(
+    model: ForwardModel, conductivity, presses: TouchedCells, *, linear: bool = False
+) -> Float[Array, "n M"]:
+    """Changes (n, M) of the protocol's M voltages by n touches, one at a time, in volts.
+
+    `linear`: J δσ, the Jacobian's, differentiable in everything and batched with `vmap`; else exact, as if the model
+    had been solved anew for every touch, to 1e-8 of the largest. Raises `ValueError` for touches of another mesh and
+    for exact changes under `jit`, `grad` or `vmap`, and `RuntimeError` where exact changes are not found: by conductors
+    of contrast above some 1e6, whose limit is reached long before, and where a touch cuts an electrode off.
+    """
+    conductivity = check_conductivity(model.mesh, conductivity)
+    if conductivity.ndim == 3 or jnp.iscomplexobj(conductivity):
+        raise ValueError("touches need a real, scalar conductivity.")
+    if presses.num_cells != model.mesh.num_cells:
+        raise ValueError(
+            f"the touches are of a mesh of {presses.num_cells} cells, and the model's has {model.mesh.num_cells}; "
+            "press on the model's own, press(model.mesh, …)."
+        )
+    if not linear and any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((model, conductivity, presses))):
+        raise ValueError("exact changes cannot be traced by jit, grad or vmap; take linear=True there.")
+    if linear:
+        return _linear(model, cell_conductivity(model.mesh, conductivity), presses)
+    return _exact(model, cell_conductivity(model.mesh, conductivity), presses)
+
+
+@jax.jit
+def _linear(model: ForwardModel, conductivity, presses: TouchedCells):
+    jacobian = model.jacobian(conductivity).T  # (m, M)
+    changed = presses.change * conductivity[presses.cells]
+
+    def some(index):
+        return jnp.einsum("bc,bcm->bm", changed[index], jacobian[presses.cells[index]])
+
+    number = len(changed)
+    index = jnp.minimum(jnp.arange(-(-number // _LINEAR) * _LINEAR), number - 1).reshape(-1, _LINEAR)
+    return _joined(jax.lax.map(some, index))[:number]
+
+
+def _exact(model: ForwardModel, conductivity, presses: TouchedCells):
+    touched = touched_nodes(model, presses)
+    reach = touched.strips.reach(touched.nodes)
+    known = fields_and_inverse(model.mesh, conductivity, model.electrodes, model.system, touched.strips, reach)
+    touches = jax.tree.map(jnp.asarray, (presses.cells, presses.change, touched.nodes, touched.corners))
+    number = len(presses.cells)
+    found = over_cores(partial(_changes, model, conductivity, known, touches), number, _EXACT)[:number]
+    lost = np.flatnonzero(~np.isfinite(np.asarray(found)).all(axis=1))
+    if lost.size:
+        x, y = np.asarray(presses.places)[lost[0]]
+        raise RuntimeError(
+            f"the changes by {lost.size} of {number} touches were not found in {_MOST_STEPS} steps, the first at "
+            f"({1e3 * x:.4g}, {1e3 * y:.4g}) mm; does it cut an electrode off, or are conductivities many orders of "
+            "magnitude apart?"
+        )
+    return found
+
+
+@jax.jit
+def _changes(model: ForwardModel, conductivity, known, touches, index):
+    """Changes of the voltages by the touches with these numbers (c, s), s of them at a time."""
+    fields, inverse = known
+    element = _symmetric(stiffness(model.mesh, conductivity), model.mesh.dimension + 1)  # (m, q, q)
+    select = jax.vmap(lambda change: select_channels(model.protocol, change))
+
+    def some(index):
+        cells, change, nodes, corners = (array[index] for array in touches)
+        blocks = element[cells] * change[..., None, None]
+        return select(_impedance_changes(blocks, corners, inverse.blocks(nodes), fields[nodes], _weakened(change)))
+
+    return _joined(jax.lax.map(some, index))
+
+
+def _joined(chunks: Float[Array, "c s *m"]) -> Float[Array, "cs *m"]:
+    return chunks.reshape(-1, *chunks.shape[2:])
+
+
+def _weakened(change: Float[Array, "b c"]) -> Float[Array, " b"]:
+    """By what factor touches lower the energy of a field, at most."""
+    left = 1 + change
+    return jnp.clip(jnp.where(left > 0, 1 / jnp.where(left > 0, left, 1.0), _CUT_OFF).max(axis=1), 1, _MOST_WEAKENED)
+
+
+def _impedance_changes(blocks, corners, inverse, fields, weakened):
+    """ΔZ (b, L, L) of b touches, from D as `blocks` (b, c, q, q) of cells at `corners` (b, c, q), G (b, k, k) and F
+    (b, k, L). The steps are those of all touches together, until the last has converged."""
+    touch = jnp.arange(len(fields))[:, None, None]
+    size = fields.shape[1]
+    added = jnp.zeros((len(fields), size, size))
+    added = added.at[touch[..., None], corners[..., :, None], corners[..., None, :]].add(blocks)
+    load = added @ fields
+
+    def step(state):
+        solution, residual, scaled_residual, direction, scaled, energy, ratio, number = state
+        direction = scaled_residual + ratio * direction
+        scaled = residual + ratio * scaled  # G⁻¹ of the direction, which is a combination of what G was applied to
+        product = scaled + added @ direction
+        curvature = jnp.sum(direction * product, axis=1, keepdims=True)
+        # What has converged stays: nothing but rounding is left of it, and of its curvature.
+        going = (energy > enough) & (curvature > 0)
+        length = jnp.where(going, energy / jnp.where(going, curvature, 1.0), 0.0)
+        solution, residual = solution + length * direction, residual - length * product
+        scaled_residual = inverse @ residual
+        new = jnp.sum(residual * scaled_residual, axis=1, keepdims=True)
+        ratio = jnp.where(going, new / jnp.where(going, energy, 1.0), 0.0)
+        return solution, residual, scaled_residual, direction, scaled, new, ratio, number + 1
+
+    def unfinished(state):
+        *_, energy, _, number = state
+        return (number < _MOST_STEPS) & jnp.any(energy > enough)
+
+    scaled_load, blank = inverse @ load, jnp.zeros_like(load)
+    first = jnp.sum(load * scaled_load, axis=1, keepdims=True)
+    # What is left of the error is at most Rᵀ G R, the energy, times what weakens it. Insulators change the voltages by
+    # Fᵀ D F and more, conductors by its square over the load's energy at least.
+    linear = jnp.abs(jnp.sum(fields * load, axis=1, keepdims=True))
+    voltages = jnp.minimum(linear, linear**2 / jnp.where(first > 0, first, 1.0))
+    enough = _TOLERANCE * jnp.maximum(voltages, _SMALLEST * first) / weakened[:, None, None]
+    start = blank, load, scaled_load, blank, blank, first, jnp.zeros_like(first), jnp.zeros((), int)
+    solution, residual, scaled_residual, *_, energy, _, _ = jax.lax.while_loop(unfinished, step, start)
+    change = _transposed(solution) @ (load + residual) + _transposed(residual) @ scaled_residual
+    change -= _transposed(fields) @ load
+    # Rounding of the load is all that is left of voltages that are so small beside it.
+    drowned = jnp.sum(voltages, axis=(1, 2)) < _SMALLEST * jnp.sum(first, axis=(1, 2))
+    converged = jnp.all(energy <= enough, axis=(1, 2)) & ~drowned
+    return jnp.where(converged[:, None, None], (change + _transposed(change)) / 2, jnp.nan)
+
+
+def _transposed(matrices):
+    return jnp.swapaxes(matrices, -1, -2)
+
+
+def _symmetric(packed: Float[Array, "p m"], size: int) -> Float[Array, "m q q"]:
+    """Full matrices from lower triangles."""
+    rows, columns = np.tril_indices(size)
+    place = np.zeros((size, size), int)
+    place[rows, columns] = place[columns, rows] = np.arange(len(rows))
+    return jnp.moveaxis(packed[place], -1, 0)

@@ -1,0 +1,18 @@
+"""From two frames to a picture in one call, `image_difference`, and what every rule for λ would choose on the way.
+
+`settings` says how to image, `preparation` checks, meshes and calibrates, `difference` images and looks for inclusions.
+"""
+
+from jeit.imaging.choice import ComparedRules as ComparedRules
+from jeit.imaging.choice import RuleOutcome as RuleOutcome
+from jeit.imaging.choice import compare_on_data as compare_on_data
+from jeit.imaging.difference import ImagedDifference as ImagedDifference
+from jeit.imaging.difference import image_difference as image_difference
+from jeit.imaging.preparation import PreparedDifference as PreparedDifference
+from jeit.imaging.preparation import calibrated_model as calibrated_model
+from jeit.imaging.preparation import imaging_mesh as imaging_mesh
+from jeit.imaging.preparation import prepare_difference as prepare_difference
+from jeit.imaging.preparation import select_frames as select_frames
+from jeit.imaging.settings import CONTACTS as CONTACTS
+from jeit.imaging.settings import METHODS as METHODS
+from jeit.imaging.settings import ImagingSettings as ImagingSettings

@@ -1,0 +1,147 @@
+"""From two frames to a picture: check, mesh, calibrate, image, and say what is in it.
+
+This is what `jeit reconstruct` runs, as one function. Its steps are the public functions of `jeit.data`,
+`jeit.imaging.preparation`, `jeit.inverse` and `jeit.image`; take them from there for anything out of the ordinary.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from jeit.data import FrameQuality, Measurement
+from jeit.image import Inclusion, Raster, find_inclusions, segment
+from jeit.imaging.method import iterative_reconstruction, linear_reconstruction
+from jeit.imaging.preparation import Clock, prepare_difference
+from jeit.imaging.settings import LINEAR_METHODS, ImagingSettings
+from jeit.inverse import (
+    Calibration,
+    LinearReconstruction,
+    Reconstruction,
+)
+from jeit.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class ImagedDifference:
+    """What `image_difference` found.
+
+    - `measurement`, `reference`: the two frames compared, one frame each.
+    - `quality`: what was found about the data before imaging.
+    - `settings`: how it was imaged, with what was decided on the way filled in.
+    - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
+    - `reconstruction`: the reconstruction matrix, or what the iteration found; with the hyperparameter used and the
+      rule that chose it.
+    - `change`: change of conductivity in every cell (m,), S/m (2-D: S); against `calibration.conductivity`.
+    - `raster`: `change` on a grid, NaN outside the mesh; `extent` (x_min, x_max, y_min, y_max) in metres.
+    - `inclusions`: regions of changed conductivity, strongest first; iterative images are looked at on the scale of the
+      logarithm, which weighs both signs alike.
+    - `labels`: 0 background, 1 resistive, 2 conductive for every pixel of the raster, if asked for.
+    - `timings`: seconds of each step.
+    """
+
+    measurement: Measurement
+    reference: Measurement
+    quality: FrameQuality
+    settings: ImagingSettings
+    calibration: Calibration
+    reconstruction: LinearReconstruction | Reconstruction
+    change: Float[Array, " m"]
+    raster: Float[Array, "rows columns"]
+    extent: tuple[float, float, float, float]
+    inclusions: tuple[Inclusion, ...]
+    labels: UInt8[np.ndarray, "rows columns"] | None = None
+    timings: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def lowest(self) -> float:
+        """Least change relative to the background; below -1 the linear image claims a negative conductivity."""
+        return float(jnp.min(self.change) / self.calibration.conductivity)
+
+    @property
+    def mesh(self) -> Mesh:
+        """The mesh imaged on."""
+        return self.calibration.model.mesh
+
+    @property
+    def iterative(self) -> bool:
+        """Whether the image solves for conductivity itself."""
+        return isinstance(self.reconstruction, Reconstruction)
+
+    @property
+    def departure(self) -> Float[Array, " m"]:
+        """What stands out, per cell: the change of conductivity, or of its logarithm in iterative images."""
+        if not self.iterative:
+            return self.change
+        return jnp.log1p(self.change / self.calibration.conductivity)
+
+
+def image_difference(
+    measurement: Measurement,
+    reference: Measurement | None = None,
+    settings: ImagingSettings | None = None,
+    *,
+    frame: int | str | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> ImagedDifference:
+    """Image what changed between a reference frame and a frame of `measurement`.
+
+    `reference`: the undisturbed body (the mean of its frames is used); None if `measurement` carries its own, a
+    frame named "reference". `frame`: which frame to image, by number from 0 or by name; the first unless given.
+    `progress` is called with the name of each step as it begins. Raises `ValueError` for data that cannot be
+    imaged (see `jeit.data.check_imageable`), that do not say where the electrodes are, or that are complex.
+    """
+    settings = ImagingSettings() if settings is None else settings
+    clock = Clock(progress)
+    prepared = prepare_difference(
+        measurement,
+        reference,
+        frame=frame,
+        contact=settings.contact,
+        num_points=settings.num_points,
+        clock=clock,
+    )
+    calibration, mesh = prepared.calibration, prepared.mesh
+    with clock("image"):
+        if settings.method in LINEAR_METHODS:
+            reconstruction = linear_reconstruction(prepared, settings)
+            change = reconstruction.image(prepared.difference)
+        else:
+            reconstruction = iterative_reconstruction(prepared, settings)
+            change = reconstruction.conductivity - calibration.conductivity
+        largest = float(jnp.abs(change).max())
+        if not largest > 1e-9 * float(calibration.conductivity):
+            raise ValueError(
+                f"'{prepared.measurement.name}': the image is empty, no change reaches a billionth of the background. "
+                f"The hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give a "
+                "smaller one, or a rule."
+            )
+    with clock("raster and inclusions"):
+        grid = Raster.create(mesh, shape=settings.raster_shape)
+        found = ImagedDifference(
+            measurement=prepared.measurement,
+            reference=prepared.reference,
+            quality=prepared.quality,
+            settings=replace(settings, contact=prepared.contact),
+            calibration=calibration,
+            reconstruction=reconstruction,
+            change=change,
+            raster=grid.sample(change),
+            extent=grid.extent,
+            inclusions=(),
+            timings=clock.seconds,
+        )
+        departure = found.departure
+        inclusions = find_inclusions(mesh, departure, level=settings.level, least_peak=settings.least_peak)
+        if found.iterative:
+            inclusions = [_with_change(one, calibration.conductivity) for one in inclusions]
+        labels = segment(np.asarray(grid.sample(departure))) if settings.segment else None
+    return replace(found, inclusions=tuple(inclusions), labels=labels)
+
+
+def _with_change(inclusion: Inclusion, background) -> Inclusion:
+    """An inclusion found in the logarithm of conductivity over `background`, its peak turned into a change."""
+    peak = float(background * np.expm1(inclusion.peak))
+    return Inclusion(inclusion.sign, inclusion.centroid, inclusion.area, peak)

@@ -1,0 +1,55 @@
+"""Which hyperparameter for these data: what one rule chooses, or what all of them do."""
+
+from collections.abc import Mapping
+
+from jaxtyping import Array, Bool, Float
+
+from jeit.forward import ForwardModel
+from jeit.inverse.hyperparameter.choice import Choice
+from jeit.inverse.hyperparameter.rules import RULES, Rule, choose
+from jeit.inverse.linearisation import Linearisation
+from jeit.inverse.prior.priors import AbstractPrior
+
+
+def choose_hyperparameter(
+    model: ForwardModel,
+    conductivity,
+    *,
+    rule: str | Rule = "noise-figure",
+    prior: AbstractPrior | None = None,
+    difference: Float[Array, " M"] | None = None,
+    noise: Float[Array, " M"] | float = 1.0,
+    mask: Bool[Array, " M"] | None = None,
+) -> Choice:
+    """The λ that `one_step` would use with the same arguments, and what it was chosen by, without the image.
+
+    `rule`: a name in `jeit.inverse.RULES`, or a rule: one of `jeit.inverse.hyperparameter` with a setting of its own,
+    `functools.partial(noise_figure, target=0.5)`, or your own, a function of (spectrum, data, mesh) to a `Choice`.
+    The choice can be given to `one_step` as its hyperparameter. Raises `ValueError` for arguments that do not fit.
+    """
+    if not (isinstance(rule, str) or callable(rule)):
+        raise ValueError(f"rule: give one of {', '.join(RULES)}, not {rule!r}; a number needs no choosing.")
+    linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
+    data = None if difference is None else linear.whiten(difference)
+    return choose(linear.spectrum, rule, data, model.mesh)
+
+
+def compare_rules(
+    model: ForwardModel,
+    conductivity,
+    *,
+    difference: Float[Array, " M"],
+    prior: AbstractPrior | None = None,
+    noise: Float[Array, " M"] | float = 1.0,
+    mask: Bool[Array, " M"] | None = None,
+    rules: Mapping[str, Rule] | None = None,
+) -> dict[str, Choice]:
+    """What every rule chooses for the same data, by name; the problem is decomposed once for all of them.
+
+    `rules`: those to compare, `jeit.inverse.RULES` unless given; other arguments as in `one_step`.
+    `jeit.plot.plot_choice` draws the result. Raises `ValueError` for arguments that do not fit.
+    """
+    rules = RULES if rules is None else rules
+    linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
+    data = linear.whiten(difference)
+    return {name: choose(linear.spectrum, rule, data, model.mesh) for name, rule in rules.items()}

@@ -1,0 +1,151 @@
+"""The hyperparameter λ of a linear reconstruction, and rules that choose it when none is given.
+
+A rule takes the `Spectrum` of the problem, the whitened data (None if there are none) and the mesh, and returns a
+`Choice`. All share the one eigendecomposition: with c = UᵀQᵀv the data components, f = λ²/(Λ + λ²) the filter, the
+residual is ‖r‖² = Σ f²c² and the penalty xᵀQx = Σ Λc²/(Λ + λ²)².
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.optimize
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jeit.inverse.hyperparameter.choice import Choice
+from jeit.inverse.hyperparameter.point_spread import best_resolution
+from jeit.inverse.spectrum import Spectrum as Spectrum
+from jeit.mesh import Mesh
+
+Rule = Callable[[Spectrum, Float[Array, " M"] | None, Mesh | None], Choice]
+
+
+def generalised_cross_validation(spectrum: Spectrum, data, mesh: Mesh | None = None) -> Choice:
+    """λ that predicts each channel best from the others: least M‖r‖²/(tr(I - H))². Golub, Heath and Wahba 1979.
+
+    Criterion: that score, the mean squared error of prediction in units of the noise's variance.
+    """
+    candidates, data = spectrum.candidates(), _needed(data, "gcv")
+    residual, penalty = spectrum.curves(data, candidates)
+    score = len(data) * residual**2 / _filters(spectrum, candidates).sum(axis=1) ** 2
+    return Choice.among("gcv", candidates, int(np.argmin(score)), score, (residual, penalty))
+
+
+def discrepancy(spectrum: Spectrum, data, mesh: Mesh | None = None, *, noise: float = 1.0) -> Choice:
+    """Largest λ whose residual is no more than the noise: ‖r‖² = r noise², r being the number of components.
+
+    Criterion: ‖r‖/√r, the residual in standard deviations. `noise`: the standard deviation that the whitened data
+    really have, 1 where the channels' noise was given as it is. Morozov, Soviet Math. Dokl. 7 (1966) 414-417.
+    """
+    candidates, data = spectrum.candidates(), _needed(data, "discrepancy")
+    components = np.asarray(spectrum.basis).T @ data
+    residual, penalty = spectrum.curves(data, candidates)
+    criterion = residual / np.sqrt(len(components))
+    inside = np.flatnonzero(criterion <= noise)
+    index = inside[-1] if inside.size else 0
+    between = None
+    if inside.size and index + 1 < len(candidates):
+
+        def excess(log_value) -> float:
+            return float(np.sqrt(np.mean((_filters(spectrum, np.exp(log_value)) * components) ** 2)) - noise)
+
+        between = np.exp(scipy.optimize.root_scalar(excess, bracket=np.log(candidates[index : index + 2])).root)
+    return Choice.among(
+        "discrepancy", candidates, index, criterion, (residual, penalty), target=float(noise), between=between
+    )
+
+
+def l_curve(spectrum: Spectrum, data, mesh: Mesh | None = None) -> Choice:
+    """λ at the corner of greatest curvature of log ‖r‖ against log √(xᵀQx). Hansen, SIAM Review 34 (1992) 561-580.
+
+    Criterion: that curvature, positive where the curve bends towards the origin.
+    """
+    candidates, data = spectrum.candidates(), _needed(data, "l-curve")
+    residual, penalty = spectrum.curves(data, candidates)
+    bend = _curvature(spectrum, data, candidates)
+    bend = np.where(np.isfinite(bend), bend, np.min(bend[np.isfinite(bend)], initial=0))
+    return Choice.among("l-curve", candidates, int(np.argmax(bend)), bend, (residual, penalty))
+
+
+def noise_figure(spectrum: Spectrum, data=None, mesh: Mesh | None = None, *, target: float = 1.25) -> Choice:
+    """λ at which the signal-to-noise ratio of the image is 1 / `target` times that of the data; looks at no data.
+
+    Signals are drawn from the prior and the noise is white: the ratio of the data is trΛ / r, that of the image
+    tr(RJΓJᵀRᵀ) / tr(RRᵀ). Adler and Guardo 1996, with the prior in place of their one central object.
+    Criterion: the noise figure.
+    """
+    candidates = spectrum.candidates()
+    eigenvalues = np.asarray(spectrum.eigenvalues)
+    gain = np.sum(np.asarray(spectrum.modes()) ** 2, axis=0)
+    passed = gain / (eigenvalues + candidates[:, None] ** 2) ** 2
+    image = passed @ eigenvalues / passed.sum(axis=1)
+    figure = np.sqrt(eigenvalues.mean() / image)
+    return Choice.among(
+        "noise-figure",
+        candidates,
+        int(np.argmin(np.abs(np.log(figure / target)))),
+        figure,
+        spectrum.curves(data, candidates),
+        target=target,
+    )
+
+
+RULES: dict[str, Rule] = {
+    "gcv": generalised_cross_validation,
+    "l-curve": l_curve,
+    "discrepancy": discrepancy,
+    "noise-figure": noise_figure,
+    "best-resolution": best_resolution,
+}
+"""Rules by name: each takes a `Spectrum`, the whitened data and the mesh, and returns a `Choice`."""
+
+
+def choose(spectrum: Spectrum, hyperparameter: float | str | Rule | Choice, data, mesh: Mesh | None = None) -> Choice:
+    """λ and how it came about, from a number, the name of a rule, a rule, or a choice made before."""
+    if isinstance(hyperparameter, Choice):
+        return hyperparameter
+    if isinstance(hyperparameter, str):
+        if hyperparameter not in RULES:
+            raise ValueError(f"hyperparameter: no rule '{hyperparameter}'; give a number or one of {', '.join(RULES)}.")
+        return RULES[hyperparameter](spectrum, data, mesh)
+    if callable(hyperparameter):
+        return hyperparameter(spectrum, data, mesh)
+    if not isinstance(hyperparameter, Tracer):
+        value = np.asarray(hyperparameter)
+        if value.shape != () or value.dtype.kind not in "iuf" or not (np.isfinite(value) and value > 0):
+            raise ValueError(f"hyperparameter must be positive and finite; it is {hyperparameter}.")
+    return Choice.given(hyperparameter)
+
+
+def _filters(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
+    squared = np.atleast_1d(candidates)[:, None] ** 2
+    return squared / (np.asarray(spectrum.eigenvalues) + squared)
+
+
+def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
+    """Of the L-curve in its parameter t = log λ, from df/dt = 2f(1 - f) for the filter f."""
+    left, eigenvalues = _filters(spectrum, candidates), np.asarray(spectrum.eigenvalues)
+    squared = (np.asarray(spectrum.basis).T @ data) ** 2
+    image = squared * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2  # its sum is the penalty
+    rest = squared * left**2  # its sum is ‖r‖²
+    # d/dt of rest is 4 rest (1 - f), of image -4 image f.
+    first = _log_derivatives(rest, 4 * (1 - left), 8 * (1 - left) * (2 - 3 * left))
+    second = _log_derivatives(image, -4 * left, -8 * left * (1 - 3 * left))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (first[0] * second[1] - second[0] * first[1]) / (first[0] ** 2 + second[0] ** 2) ** 1.5
+
+
+def _log_derivatives(terms, once, twice):
+    """First and second derivative of ½ log Σ terms, whose own are terms · once and terms · twice."""
+    total = terms.sum(axis=1)
+    slope = (terms * once).sum(axis=1) / total
+    return slope / 2, ((terms * twice).sum(axis=1) / total - slope**2) / 2
+
+
+def _needed(data, rule: str) -> Float[np.ndarray, " M"]:
+    if data is None:
+        raise ValueError(f"The rule '{rule}' looks at the data: give difference, the change of voltages to be imaged.")
+    values = np.asarray(data)
+    if not (np.isfinite(values).all() and values.any()):
+        raise ValueError(f"The rule '{rule}' looks at the data, and they are all zero, NaN or infinite: give others.")
+    return values

@@ -1,0 +1,1 @@
+"""Linear difference images: a reconstruction matrix, computed once, times a difference of frames."""

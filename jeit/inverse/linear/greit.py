@@ -1,0 +1,192 @@
+"""GREIT: a reconstruction matrix trained on small targets, so that each is imaged as a smooth disc of one size.
+
+Adler et al., "GREIT: a unified approach to 2D linear EIT reconstruction of lung images", Physiol. Meas. 30 (2009)
+S35-S55. There the body is a disk; here the targets and their images follow the mesh, whatever its outline.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+import scipy.sparse
+from jaxtyping import Array, Bool, Float
+from scipy.spatial import KDTree
+
+from jeit.forward import ForwardModel
+from jeit.inverse.linear.one_step import LinearReconstruction
+from jeit.inverse.linearisation import used_channels
+from jeit.mesh import Mesh, centroids, measures
+
+# Desired images fall from their height to zero over this much of their radius to either side of it.
+_EDGE = 0.25
+# A training target counts if this share of it lies in the body.
+_INSIDE = 0.9
+# Smaller targets are alike in a linear model, and cost points to sample them with.
+_LEAST = 0.01
+
+
+def greit(
+    model: ForwardModel,
+    conductivity,
+    *,
+    radius: float | None = None,
+    hyperparameter: float | str = "noise-figure",
+    noise_figure: float = 0.5,
+    noise: Float[Array, " M"] | float = 1.0,
+    mask: Bool[Array, " M"] | None = None,
+    target_radius: float = 0.05,
+    num_targets: int = 1000,
+) -> LinearReconstruction:
+    """GREIT reconstruction matrix R = XYᵀ(YYᵀ + λ²W⁻¹)⁻¹ of a plane body of any outline, at a background conductivity.
+
+    Trained on about `num_targets` small discs spread evenly over the body, on a hexagonal grid. Y holds their responses
+    to a change of one siemens, taken **from the Jacobian**: exact for small changes; the contrast of large ones is
+    underestimated, as in any linear image. X holds the images desired: discs of one radius with a smooth edge, cut
+    off at the outline, each with as much change (its integral) as its target. Both are divided by √(number of targets).
+
+    `radius` of the desired images and `target_radius` of the targets: fractions of the body's radius, that of the disc
+    with its area. `radius` is 1/√L unless given, 0.25 for 16 electrodes; smaller buys resolution with ringing and
+    noise. `hyperparameter`: λ itself, or "noise-figure": the λ at which the signal-to-noise ratio of the data is
+    `noise_figure` times that of the image, for a target in the middle of the body; 0.5 is what GREIT's authors agreed
+    on. Signal is the mean absolute value, over channels in units of their noise and over the body; noise is the root
+    mean square standard deviation. `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in
+    volts (or relative to each other). `mask`: True for the channels to use.
+
+    Raises `ValueError` for solids, for arguments that do not fit, and for a noise figure that no λ reaches.
+    """
+    mesh = model.mesh
+    if mesh.dimension != 2:
+        raise ValueError("GREIT is for plane bodies, and this mesh is 3-D; use one_step, which takes either.")
+    radius = model.electrodes.num_electrodes**-0.5 if radius is None else radius
+    _check(radius, target_radius, num_targets, hyperparameter, noise_figure)
+    channels, root_weight = used_channels(model, noise, mask)
+    if jnp.iscomplexobj(conductivity):
+        raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
+    if np.shape(conductivity) not in ((), (mesh.num_cells,)):
+        raise ValueError("conductivity: give one number, or one value per cell: the image has a value per cell.")
+    measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
+    body_radius, middle = np.sqrt(measure.sum() / np.pi), measure @ centre / measure.sum()
+    position, covered = _targets(mesh, middle, target_radius * body_radius, num_targets)
+    desired = _desired_images(mesh, position, covered.T @ measure, radius * body_radius)
+    jacobian = root_weight[:, None] * np.asarray(model.jacobian(conductivity))[channels]
+    response = jacobian @ covered / np.sqrt(len(position))
+    eigenvalues, vectors = np.linalg.eigh(response @ response.T)
+    eigenvalues = np.maximum(eigenvalues, 0)
+    painted = desired @ (response.T @ vectors) / np.sqrt(len(position))
+    if isinstance(hyperparameter, str):
+        central = response[:, np.argmin(np.linalg.norm(position - middle, axis=1))]
+        level = float(np.abs(central).mean())
+        chosen = _of_noise_figure(noise_figure, eigenvalues, vectors.T @ central, level, painted, measure)
+    else:
+        chosen = float(hyperparameter)
+    matrix = np.zeros((mesh.num_cells, model.protocol.num_measurements))
+    matrix[:, channels] = (painted / (eigenvalues + chosen**2)) @ vectors.T * root_weight
+    rule = "noise-figure" if isinstance(hyperparameter, str) else "given"
+    return LinearReconstruction.create(model, matrix, chosen, rule, "GREIT")
+
+
+def _targets(mesh: Mesh, middle, radius: float, number: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
+    """Centres (K, 2) of the targets that lie in the body, and the share of every cell that each covers (m, K)."""
+    measure, points = np.asarray(measures(mesh)), np.asarray(mesh.points)
+    spacing = np.sqrt(2 / np.sqrt(3) * measure.sum() / number)
+    grid = _hexagonal(points.min(axis=0), points.max(axis=0), middle, spacing)
+    samples, cell, share = _samples(mesh, radius / 4)
+    pairs = KDTree(grid).sparse_distance_matrix(KDTree(samples), radius, output_type="ndarray")
+    covered = scipy.sparse.coo_array(
+        (share[pairs["j"]], (cell[pairs["j"]], pairs["i"])), shape=(mesh.num_cells, len(grid))
+    ).tocsc()
+    inside = np.flatnonzero(covered.T @ measure > _INSIDE * np.pi * radius**2)
+    if inside.size == 0:
+        raise ValueError(
+            f"target_radius: no disc of {1e3 * radius:.3g} mm radius fits into this body; give a smaller one, or more "
+            "targets."
+        )
+    return grid[inside], covered[:, inside]
+
+
+def _hexagonal(low, high, middle, spacing: float) -> np.ndarray:
+    """Points (k, 2) of a hexagonal grid about `middle` that covers the box from `low` to `high`."""
+    step = spacing * np.array([1, np.sqrt(0.75)])
+    (first, bottom), (last, top) = np.floor((low - middle) / step) - 1, np.ceil((high - middle) / step) + 1
+    row, column = np.meshgrid(np.arange(bottom, top + 1), np.arange(first, last + 1), indexing="ij")
+    return middle + step * np.stack([column + row % 2 / 2, row], axis=-1).reshape(-1, 2)
+
+
+def _samples(mesh: Mesh, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (q, 2) spread evenly over every cell, about `spacing` apart, with their cells and their shares of these.
+
+    The centres of the upright triangles that n cuts along each side leave: barycentric (i + 1/3, j + 1/3, k + 1/3) / n
+    with i + j + k = n - 1.
+    """
+    corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
+    cuts = np.maximum(np.ceil(longest / spacing), 1).astype(int)
+    points, owner, share = [], [], []
+    for number in np.unique(cuts):
+        cells = np.flatnonzero(cuts == number)
+        first, second = np.meshgrid(np.arange(number), np.arange(number))
+        first, second = (index[first + second < number] for index in (first, second))
+        barycentric = (np.stack([first, second, number - 1 - first - second], axis=1) + 1 / 3) / number
+        points.append((barycentric @ corners[cells]).reshape(-1, 2))
+        owner.append(np.repeat(cells, len(barycentric)))
+        share.append(np.full(len(owner[-1]), 1 / len(barycentric)))
+    return np.concatenate(points), np.concatenate(owner), np.concatenate(share)
+
+
+def _desired_images(mesh: Mesh, position, area, radius: float) -> scipy.sparse.csc_array:
+    """X (m, K): a disc about each position whose integral over the body is `area` (K,); half as high at `radius`."""
+    measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
+    pairs = KDTree(centre).sparse_distance_matrix(KDTree(position), (1 + _EDGE) * radius, output_type="ndarray")
+    ramp = np.clip((pairs["v"] / radius - 1) / _EDGE, -1, 1)
+    height = (1 - np.sin(0.5 * np.pi * ramp)) / 2
+    disc = scipy.sparse.coo_array((height, (pairs["i"], pairs["j"])), shape=(len(centre), len(position))).tocsc()
+    total = disc.T @ measure
+    if not (total > 0.01 * np.pi * radius**2).all():
+        raise ValueError(
+            f"radius: a desired image of {1e3 * radius:.3g} mm radius is lost between the cells of this mesh; give a "
+            "larger radius, or a finer mesh."
+        )
+    return disc @ scipy.sparse.diags_array(area / total)
+
+
+def _of_noise_figure(target: float, eigenvalues, signal, level: float, painted, measure) -> float:
+    """The least λ whose noise figure is `target`.
+
+    With YYᵀ = VΛVᵀ the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy: `signal` is Vᵀy, `painted` XYᵀV, `level` the signal of
+    the data. White noise of unit variance in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
+    """
+    weight = measure / measure.sum()
+    gain = weight @ painted**2
+
+    def excess(log_hyperparameter) -> float:
+        filtered = 1 / (eigenvalues + np.exp(2 * log_hyperparameter))
+        noise, image = np.sqrt(gain @ filtered**2), weight @ np.abs(painted @ (signal * filtered))
+        return float(np.log(level * noise / image / target))
+
+    grid = np.log(np.sqrt(eigenvalues.max()) * np.logspace(-6, 1, 71))
+    values = np.array([excess(value) for value in grid])
+    below = np.flatnonzero(values <= 0)
+    if below.size == 0 or below[0] == 0:
+        low, high = target * np.exp([values.min(), values.max()])
+        raise ValueError(
+            f"noise_figure: no hyperparameter gives {target:g}; here it lies between {low:.3g} and {high:.3g}. A "
+            "larger radius brings it down; a larger noise_figure takes a noisier image."
+        )
+    bracket = (grid[below[0] - 1], grid[below[0]])
+    return float(np.exp(scipy.optimize.root_scalar(excess, bracket=bracket, rtol=1e-10).root))
+
+
+def _check(radius, target_radius, num_targets, hyperparameter, noise_figure) -> None:
+    if not _LEAST <= target_radius <= radius < 1:
+        raise ValueError(
+            "radius and target_radius are fractions of the body's radius, and targets no larger than their images: "
+            f"give {_LEAST} ≤ target_radius ≤ radius < 1; they are {target_radius} and {radius}."
+        )
+    if int(num_targets) != num_targets or num_targets < 1:
+        raise ValueError(f"num_targets: give a whole number of training targets, such as 1000; it is {num_targets}.")
+    if isinstance(hyperparameter, str):
+        if hyperparameter != "noise-figure":
+            raise ValueError(f"hyperparameter: GREIT takes a number or 'noise-figure', not '{hyperparameter}'.")
+        if not (np.isfinite(noise_figure) and noise_figure > 0):
+            raise ValueError(f"noise_figure must be positive and finite; it is {noise_figure}.")
+    elif not (np.isfinite(hyperparameter) and hyperparameter > 0):
+        raise ValueError(f"hyperparameter must be positive and finite; it is {hyperparameter}.")

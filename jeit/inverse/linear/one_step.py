@@ -1,0 +1,140 @@
+"""One-step (linear) difference imaging: a reconstruction matrix, computed once, times a difference of frames."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
+
+from jeit.forward import ForwardModel
+from jeit.inverse.hyperparameter.choice import Choice
+from jeit.inverse.hyperparameter.rules import Rule, choose
+from jeit.inverse.linearisation import Linearisation
+from jeit.inverse.prior.priors import AbstractPrior
+from jeit.mesh import Mesh
+
+
+class LinearReconstruction(eqx.Module):
+    """A linear image reconstruction: change of conductivity = matrix · change of voltages.
+
+    Two channels that reciprocity ties together (v_b = r v_a) have proportional columns in the matrix, so they are
+    added first and multiplied once: half the arithmetic, the same image.
+
+    **Fields**: `mesh`; `first`, `second` (K,) the channels added to make each combined channel, and `ratio` (K,) the
+    weight of the second; `weights` (K, m), siemens per metre (2-D: siemens) per volt of combined channel;
+    `hyperparameter` λ, and `rule`, how it was chosen; `method`, the name of the reconstruction; `choice`, all that was
+    looked at in choosing λ and whether to trust it (`choice.note`), where λ came from `jeit.inverse.RULES` or a number.
+    """
+
+    mesh: Mesh
+    first: Int[Array, " K"]
+    second: Int[Array, " K"]
+    ratio: Float[Array, " K"]
+    weights: Float[Array, "K m"]
+    hyperparameter: Float[Array, ""]
+    num_measurements: int = eqx.field(static=True)
+    rule: str = eqx.field(static=True)
+    method: str = eqx.field(static=True)
+    choice: Choice | None = None
+
+    @classmethod
+    def create(cls, model: ForwardModel, matrix, hyperparameter, rule: str, method: str, choice: Choice | None = None):
+        """From a full reconstruction matrix (m, M)."""
+        matrix = np.asarray(matrix)
+        first, second, ratio = _combine(model, matrix)
+        # Of two tied columns the mean, not either: their rounding errors are large where λ is small, and opposite.
+        tied = matrix.T[first] + ratio[:, None] * matrix.T[second]
+        weights = tied / (1 + ratio**2)[:, None]
+        return cls(
+            model.mesh,
+            jnp.asarray(first),
+            jnp.asarray(second),
+            jnp.asarray(ratio),
+            jnp.asarray(weights),
+            jnp.asarray(hyperparameter, float),
+            matrix.shape[1],
+            rule,
+            method,
+            choice,
+        )
+
+    @property
+    def matrix(self) -> Float[Array, "m M"]:
+        """The full reconstruction matrix (m, M), zero in the columns of masked channels."""
+        full = jnp.zeros((self.num_measurements, self.weights.shape[1]))
+        full = full.at[self.second].add(self.ratio[:, None] * self.weights)
+        return full.at[self.first].add(self.weights).T
+
+    def image(self, difference: Float[Array, "*frames M"]) -> Float[Array, "*frames m"]:
+        """Change of conductivity in every cell, for one difference of frames (M,) in volts or many (F, M).
+
+        Raises `ValueError` for another number of channels.
+        """
+        shape = np.shape(difference)
+        if len(shape) not in (1, 2) or shape[-1] != self.num_measurements:
+            raise ValueError(
+                f"difference has shape {shape}; this reconstruction takes ({self.num_measurements},) volts, or "
+                f"(frames, {self.num_measurements})."
+            )
+        image = _apply(self.first, self.second, self.ratio, self.weights, difference)
+        # JAX works on the image meanwhile: looked at before, the check would cost as much as the product.
+        if not isinstance(image, Tracer) and not np.isfinite(difference).all():
+            raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
+        return image
+
+
+@jax.jit
+def _apply(first, second, ratio, weights, difference):
+    # Bare arrays across the jit boundary: flattening a Module costs as much as the product itself.
+    get = jnp.asarray(difference).at
+    combined = get[..., first].get(mode="promise_in_bounds") + ratio * get[..., second].get(mode="promise_in_bounds")
+    return combined @ weights
+
+
+def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Channels to add before the product: pairs tied by reciprocity whose columns are proportional, others alone."""
+    size = np.linalg.norm(matrix, axis=0)
+    alone = size > 0
+    pairs, _ = model.protocol.reciprocal_pairs()
+    pairs = np.asarray(pairs).reshape(-1, 2)
+    first, second = pairs[(size[pairs] > 0).all(axis=1)].T
+    ratio = np.einsum("ij,ij->j", matrix[:, first], matrix[:, second]) / size[first] ** 2
+    tied = np.abs(matrix[:, second] - ratio * matrix[:, first]).max(axis=0) < 1e-9 * np.abs(matrix).max()
+    first, second, ratio = first[tied], second[tied], ratio[tied]
+    alone[first] = alone[second] = False
+    single = np.flatnonzero(alone)
+    return (
+        np.concatenate([first, single]),
+        np.concatenate([second, single]),
+        np.concatenate([ratio, np.zeros(len(single))]),
+    )
+
+
+def one_step(
+    model: ForwardModel,
+    conductivity,
+    *,
+    prior: AbstractPrior | None = None,
+    hyperparameter: float | str | Rule | Choice = "noise-figure",
+    difference: Float[Array, " M"] | None = None,
+    noise: Float[Array, " M"] | float = 1.0,
+    mask: Bool[Array, " M"] | None = None,
+) -> LinearReconstruction:
+    """Reconstruction matrix of the linearised problem, R = (JᵀWJ + λ²Q)⁻¹JᵀW, at a background conductivity.
+
+    `prior`: `Noser()` unless given. `hyperparameter`: λ itself, or the rule that chooses it, one of
+    `jeit.inverse.RULES`, or a `Choice`; rules that look at data need `difference`, the change of voltages (M,) to be
+    imaged.
+    `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
+    other). `mask`: True for the channels to use. Raises `ValueError` for arguments that do not fit.
+
+    Computed in data space: R = ΓJᵀ(JΓJᵀ + λ²W⁻¹)⁻¹ with Γ = Q⁻¹; see `jeit.inverse.prior.priors` for a Q with a null
+    space. Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179.
+    """
+    linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
+    data = None if difference is None else linear.whiten(difference)
+    choice = choose(linear.spectrum, hyperparameter, data, model.mesh)
+    matrix = linear.matrix(choice.hyperparameter)
+    method = f"one-step, {type(linear.prior).__name__} prior"
+    return LinearReconstruction.create(model, matrix, choice.hyperparameter, choice.rule, method, choice)

@@ -1,0 +1,106 @@
+"""What is asked of the arguments of reconstructions, before anything is compiled: errors that say what to give."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jeit.forward import ForwardModel
+from jeit.inverse.noise import relative_noise
+from jeit.inverse.nonlinear.links import AbstractLink
+from jeit.inverse.nonlinear.unknowns import AbstractUnknown
+from jeit.inverse.prior.priors import AbstractPrior
+from jeit.inverse.prior.total_variation import TotalVariation
+
+
+def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
+    """Voltages as an array with zeros for what is left out, and which channels are used; raises `ValueError`."""
+    if jnp.iscomplexobj(voltages):
+        raise ValueError("voltages are complex; reconstruct from their real part or magnitude.")
+    shape = (model.protocol.num_measurements,)
+    measured = jnp.asarray(voltages, float)
+    used = np.ones(shape, bool) if mask is None else np.asarray(mask)
+    if measured.shape != shape or used.shape != shape or used.dtype != bool:
+        raise ValueError(
+            f"voltages has shape {measured.shape} and mask {used.shape} of {used.dtype}; protocol "
+            f"'{model.protocol.name}' has {shape[0]} channels, and the mask must be booleans."
+        )
+    if not used.any():
+        raise ValueError("mask: every channel is left out, so there is nothing to reconstruct from.")
+    values = np.asarray(measured)[used]
+    if not np.isfinite(values).all():
+        raise ValueError(f"voltages: {(~np.isfinite(values)).sum()} channels in use are NaN or infinite; mask them.")
+    if not values.any():
+        raise ValueError("voltages: all channels in use read zero; was the current source on?")
+    return jnp.where(used, measured, 0), used
+
+
+def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
+    """The background per cell; raises `ValueError` for what is not one real number or one for each cell."""
+    if jnp.iscomplexobj(background) or jnp.shape(background) not in ((), (model.mesh.num_cells,)):
+        raise ValueError(
+            f"background must be one real conductivity, or one for each of the {model.mesh.num_cells} cells; it is "
+            f"{jnp.asarray(background).dtype} of shape {jnp.shape(background)}."
+        )
+    return jnp.broadcast_to(jnp.asarray(background, float), (model.mesh.num_cells,))
+
+
+def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[Array, " M"]:
+    """Standard deviation of every channel, volts (1 where left out); raises `ValueError`."""
+    given = np.zeros(()) if noise is None else np.asarray(noise)
+    if given.shape not in ((), measured.shape) or given.dtype.kind not in "iuf":
+        raise ValueError(
+            f"noise is {given.dtype} of shape {given.shape}; give one real number, or one for each channel."
+        )
+    deviation = relative_noise(measured, used) if noise is None else np.broadcast_to(np.asarray(noise), measured.shape)
+    if not (np.isfinite(deviation)[used] & (np.asarray(deviation)[used] > 0)).all():
+        raise ValueError("noise must be positive and finite for every channel in use.")
+    return jnp.where(used, deviation, 1)
+
+
+def check_prior(prior) -> None:
+    """That it is one of jeit's, or made like them."""
+    if not isinstance(prior, (AbstractPrior, TotalVariation)):
+        raise ValueError(f"prior must be one of those in jeit.inverse, such as Noser(), not {prior!r}.")
+
+
+def check_link(link) -> None:
+    """That it is one of jeit's, or made like them."""
+    if not isinstance(link, AbstractLink):
+        raise ValueError(f"link must be one of those in jeit.inverse, such as Log(), not {link!r}.")
+
+
+def check_steps(name: str, steps) -> int:
+    """A whole number from 1."""
+    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
+        raise ValueError(f"{name} must be a whole number from 1; it is {steps!r}.")
+    return int(steps)
+
+
+def check_tolerance(rtol) -> float:
+    """A number from 0 up to, but not including, 1."""
+    if not isinstance(rtol, (int, float, np.number)) or not 0 <= rtol < 1:
+        raise ValueError(f"rtol must be a number from 0 and less than 1; it is {rtol!r}.")
+    return float(rtol)
+
+
+def check_unknowns(unknowns, model: ForwardModel) -> tuple[AbstractUnknown, ...]:
+    """One of each kind at most, made for a model like this one."""
+    if not isinstance(unknowns, Sequence) or not all(isinstance(one, AbstractUnknown) for one in unknowns):
+        raise ValueError(f"unknowns must be a list of those in jeit.inverse, such as [Scale()]; it is {unknowns!r}.")
+    names = [type(one).__name__ for one in unknowns]
+    for one, name in zip(unknowns, names, strict=True):
+        if names.count(name) > 1:
+            raise ValueError(f"unknowns: {name} is there more than once.")
+        if not one.fits(model):
+            raise ValueError(f"unknowns: this {name} was made for another model; make it with the one given here.")
+    return tuple(unknowns)
+
+
+def check_bounds(bounds) -> tuple[float, float]:
+    """0 ≤ lower < upper."""
+    values = np.asarray((0.0, np.inf) if bounds is None else bounds)
+    if values.shape != (2,) or values.dtype.kind not in "iuf" or not 0 <= values[0] < values[1]:
+        raise ValueError(f"bounds: give two numbers, 0 ≤ lower < upper, S/m (2-D: S); they are {bounds!r}.")
+    return float(values[0]), float(values[1])

@@ -1,0 +1,159 @@
+"""Priors: what is thought of an image before the data are seen, as a precision Q with energy xᵀQx.
+
+A linear image minimises ‖W^½ (J x - v)‖² + λ² xᵀQx. With M measurements and m ≫ M cells it is found in data space,
+from products of the prior covariance Γ = Q⁻¹ with Jᵀ alone; where Q has a null space (Laplace: the constant), Γ is
+any generalised inverse and the null space is estimated from the data without penalty.
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
+import scipy.sparse
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, pivoted_cholesky
+from jeit.mesh import Mesh, centroids, interior_facets
+from jeit_solvers import SparsityPattern, analyse, factorise, solve
+
+# Precision given to the constant image where it would have none, relative to a step between neighbouring cells.
+_FREEDOM = 1e-6
+
+
+class AbstractPrior(eqx.Module):
+    """Base of all priors on an image of one value per cell."""
+
+    @abc.abstractmethod
+    def covariance_product(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> Float[Array, "m M"]:
+        """Γ Jᵀ, one column per measurement."""
+
+    @abc.abstractmethod
+    def precision(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> scipy.sparse.sparray:
+        """Q (m, m), sparse."""
+
+    @abc.abstractmethod
+    def basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
+        """S with Γ = S Sᵀ, for nonlinear reconstructions; where Q has a null space, a wide prior stands for none."""
+
+    def null_space(self, mesh: Mesh) -> Float[Array, "m p"]:
+        """Basis of the images that cost nothing; none unless a prior says otherwise."""
+        return jnp.zeros((mesh.num_cells, 0))
+
+
+class Tikhonov(AbstractPrior):
+    """Zeroth-order Tikhonov: Q = I. Every cell on its own, pulled to the background."""
+
+    def covariance_product(self, mesh, jacobian):
+        """Jᵀ."""
+        return jacobian.T
+
+    def precision(self, mesh, jacobian) -> scipy.sparse.sparray:
+        """The identity."""
+        return scipy.sparse.csr_array(scipy.sparse.eye_array(mesh.num_cells))
+
+    def basis(self, mesh, jacobian):
+        """Every cell on its own."""
+        return DiagonalBasis(jnp.ones(mesh.num_cells))
+
+
+class Noser(AbstractPrior):
+    """NOSER: Q = diag(JᵀJ)^exponent, which evens out the sensitivity between the edge and the centre.
+
+    Cheney, Isaacson, Newell, Simske and Goble, Int. J. Imaging Syst. Technol. 2 (1990) 66-75. `exponent`: 0.5 by
+    default; 1 penalises relative to full sensitivity, 0 is `Tikhonov`.
+    """
+
+    exponent: float = 0.5
+
+    def covariance_product(self, mesh, jacobian):
+        """Jᵀ, its rows divided by the diagonal of Q."""
+        return jacobian.T / jnp.sum(jacobian**2, axis=0)[:, None] ** self.exponent
+
+    def precision(self, mesh, jacobian):
+        """The diagonal matrix Q."""
+        return scipy.sparse.diags_array(np.sum(np.asarray(jacobian) ** 2, axis=0) ** self.exponent).tocsr()
+
+    def basis(self, mesh, jacobian):
+        """Every cell on its own."""
+        return DiagonalBasis(jnp.sum(jacobian**2, axis=0) ** (-self.exponent / 2))
+
+
+class Laplace(AbstractPrior):
+    """Laplace smoothness: Q = 2 × graph Laplacian of face-neighbouring cells, xᵀQx = 2 Σ (x_i - x_j)².
+
+    Unweighted by geometry, as the field has it; a constant image costs nothing.
+    """
+
+    def covariance_product(self, mesh, jacobian):
+        """Γ Jᵀ with the generalised inverse that grounds cell 0."""
+        pairs, _ = interior_facets(mesh)
+        pattern = SparsityPattern.from_elements([pairs, np.zeros((1, 1), int)], size=mesh.num_cells)
+        link = 2 * jnp.broadcast_to(jnp.array([[1.0, -1.0], [-1.0, 1.0]]), (len(pairs), 2, 2))
+        plan = analyse(pattern, coordinates=np.asarray(centroids(mesh)))
+        factor = factorise(plan, pattern.assemble(link, jnp.full((1, 1, 1), 2.0)))
+        return solve(plan, factor, jacobian.T)
+
+    def precision(self, mesh, jacobian):
+        """The Laplacian matrix Q."""
+        pairs, _ = interior_facets(mesh)
+        size = mesh.num_cells
+        links = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(size, size))
+        adjacency = (links + links.T).tocsr()
+        return 2 * (scipy.sparse.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
+
+    def basis(self, mesh, jacobian):
+        """All of Q's inverse, dense, the constant image nearly free."""
+        precision = self.precision(mesh, jacobian).toarray()
+        precision[np.diag_indices_from(precision)] += _FREEDOM
+        lower = scipy.linalg.cholesky(precision, lower=True)
+        return DenseBasis(jnp.asarray(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T))
+
+    def null_space(self, mesh):
+        """The constant image."""
+        return jnp.ones((mesh.num_cells, 1))
+
+
+class Gaussian(AbstractPrior):
+    """Gaussian smoothness: a random field with covariance Γ = exp(-|x_i - x_j|² / 2 length²) between cell centres.
+
+    Does not depend on the mesh. `length`: correlation length in metres.
+    """
+
+    length: float
+
+    def __check_init__(self):
+        if not isinstance(self.length, Tracer) and not self.length > 0:
+            raise ValueError(f"length must be positive, in metres; it is {self.length}.")
+
+    def covariance_product(self, mesh, jacobian):
+        """Γ Jᵀ, a block of rows at a time: Γ is dense and is not kept."""
+        return _gaussian_product(centroids(mesh), jacobian, self.length)
+
+    def basis(self, mesh, jacobian):
+        """The shapes that hold all but a thousandth of the variance: fewer than cells where `length` spans many."""
+        centres = np.asarray(centroids(mesh))
+
+        def column(cell):
+            return np.exp(-np.sum((centres - centres[cell]) ** 2, axis=1) / (2 * self.length**2))
+
+        return DenseBasis(jnp.asarray(pivoted_cholesky(np.ones(len(centres)), column, tolerance=1e-3, max_rank=2000)))
+
+    def precision(self, mesh, jacobian):
+        """Not to be had: the inverse of a Gaussian covariance is dense and ill-conditioned. Raises `ValueError`."""
+        raise ValueError(
+            "prior: Gaussian has no usable precision matrix, which bounds need; take Noser, Tikhonov, Laplace or "
+            "TotalVariation, or link=Bounded(lower, upper) in place of bounds."
+        )
+
+
+@jax.jit
+def _gaussian_product(centres, jacobian, length):
+    def row(centre):
+        covariance = jnp.exp(-jnp.sum((centres - centre) ** 2, axis=1) / (2 * length**2))
+        return jacobian @ covariance
+
+    return jax.lax.map(row, centres, batch_size=256)

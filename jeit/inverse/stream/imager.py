@@ -1,0 +1,293 @@
+"""`Imager`: frame after frame to images, linear or by Gauss-Newton from the last image, in a bounded time.
+
+All that does not depend on the frame is worked out once: which channels are independent, the prior's basis, the
+hyperparameter, the electrodes' integrals, the linear image's matrix; and which combinations of the prior's shapes the
+data can tell of at all, some dozens, kept in single precision, which alters an image by a millionth. Array shapes never
+change, so nothing is compiled again: a channel that is masked keeps its place, and gets a variance so large that it
+does not count.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from jeit.electrodes import IntegratedElectrodes
+from jeit.forward import ForwardModel
+from jeit.inverse.channels import IndependentChannels, Weighing
+from jeit.inverse.nonlinear.checks import (
+    check_background,
+    check_frame,
+    check_link,
+    check_noise,
+    check_prior,
+    check_steps,
+    check_tolerance,
+)
+from jeit.inverse.nonlinear.links import AbstractLink, Log
+from jeit.inverse.nonlinear.problem import Inversion, Ridge
+from jeit.inverse.nonlinear.reconstruct import pose
+from jeit.inverse.prior.bases import DenseBasis
+from jeit.inverse.prior.priors import AbstractPrior, Gaussian
+from jeit.inverse.prior.total_variation import TotalVariation
+from jeit_solvers import Descent
+
+METHODS = ("linear", "gauss-newton", "levenberg-marquardt")
+# Standard deviation of a masked channel over the largest noise.
+_BLIND = 1e5
+
+
+def check_settings(method: str, steps, memory) -> None:
+    """Raises `ValueError` for what `Imager.create` would refuse, before there is a model."""
+    if method not in METHODS:
+        raise ValueError(f"method: there is no '{method}'; give one of {', '.join(METHODS)}.")
+    check_steps("steps", steps)
+    if not (np.isfinite(memory) and memory >= 0):
+        raise ValueError(f"memory must be a number of frames, or 0 for none; it is {memory}.")
+
+
+class FrameEstimate(eqx.Module):
+    """What an `Imager` makes of one frame by iteration.
+
+    **Fields**: `conductivity` (m,), S/m (2-D: S); `coefficients`, where the next frame may start; `misfit`, root mean
+    square in standard deviations of the channels used; `iterations`; `converged`, whether one more step would have
+    changed the objective by less than the tolerance.
+    """
+
+    conductivity: Float[Array, " m"]
+    coefficients: Float[Array, " n"]
+    misfit: Float[Array, ""]
+    iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+class LinearMap(eqx.Module):
+    """The linear image: σ = `level` (m,) + `matrix` (m, k) · `estimator` (k, M) · voltages (M,), S/m (2-D: S).
+
+    k is the number of independent channels or of the prior's shapes, whichever is smaller. With a memory, the weights
+    of the last image's shapes (k,), less those of an undisturbed frame, come in times `carry` (k, k).
+    """
+
+    matrix: Float[Array, "m k"]
+    estimator: Float[Array, "k M"]
+    level: Float[Array, " m"]
+    carry: Float[Array, "k k"]
+
+
+class Imager(eqx.Module):
+    """Images frames of one sensor. Made by `Imager.create`; `stream` feeds it, and looks after bad frames.
+
+    **Fields**: `channels`, which of them are independent; `inversion`, the problem, whose data are exchanged for every
+    frame's; `noise` (M,), volts; `mask` (M,), the channels used at all; `expected` (M,) volts, an undisturbed frame;
+    `offset` (M,) volts, added to frames: what the model's voltages have and the sensor's have not; `touching` (L, M),
+    channels that drive or read each electrode; `method`; `steps`, the most iterations a frame is given; `rtol`, the
+    relative change of the objective that ends them sooner; `persistence`, the share of the last image that the next one
+    is expected to keep, 0 without a memory.
+    """
+
+    channels: IndependentChannels
+    inversion: Inversion
+    noise: Float[Array, " M"]
+    mask: Bool[Array, " M"]
+    expected: Float[Array, " M"]
+    offset: Float[Array, " M"]
+    touching: Bool[Array, "L M"]
+    method: str = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    rtol: float = eqx.field(static=True)
+    persistence: float = eqx.field(static=True)
+
+    @classmethod
+    def create(
+        cls,
+        model: ForwardModel,
+        background,
+        *,
+        reference: Float[Array, " M"] | None = None,
+        method: str = "gauss-newton",
+        prior: AbstractPrior | TotalVariation | None = None,
+        link: AbstractLink | None = None,
+        hyperparameter: float | str | None = None,
+        noise: Float[Array, " M"] | float | None = None,
+        mask: Bool[Array, " M"] | None = None,
+        steps: int = 4,
+        rtol: float = 1e-3,
+        informative: float = 0.03,
+        memory: float = 0.0,
+    ) -> "Imager":
+        """`background`: conductivity of the undisturbed body, S/m (2-D: S). `reference` (M,): a measured frame of it,
+        volts; frames are then imaged by their difference to it, which frees images from what the model gets wrong.
+        `prior`: `Gaussian` of a twelfth of the body's width unless given. `informative`: images are built of shapes
+        that the data of the undisturbed body tell more of than this, in standard deviations of the noise for one of the
+        prior, the rest staying as the prior has it; 0 takes all shapes. `memory`: frames over which an image changes;
+        the last image then tells of the next (a Kalman filter in its steady state, of coefficients with covariance
+        exp(-|t - t'| / memory) in time), which takes noise out and lags by a part of it; 0 takes every frame alone. The
+        rest as in `reconstruct`. Raises `ValueError` for arguments that do not fit.
+
+        Kaipio, Karjalainen, Somersalo and Vauhkonen, Ann. N. Y. Acad. Sci. 873 (1999) 430-439.
+        """
+        check_settings(method, steps, memory)
+        rtol = check_tolerance(rtol)
+        if not 0 <= informative < 1:
+            raise ValueError(f"informative must lie between 0 and 1; it is {informative}.")
+        width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
+        prior = Gaussian(0.085 * width) if prior is None else prior
+        link = Log() if link is None else link
+        check_prior(prior)
+        check_link(link)
+        if memory > 0 and isinstance(prior, TotalVariation):
+            raise ValueError("memory: total variation has no covariance to carry on; take another prior, or memory 0.")
+        if method == "linear" and isinstance(prior, TotalVariation):
+            raise ValueError("prior: total variation is not linear; take method 'gauss-newton', or another prior.")
+        background = check_background(model, background)
+        predicted = model.voltages(background)
+        frame, used = check_frame(model, predicted if reference is None else reference, mask)
+        _check_reference(np.asarray(frame)[used], np.asarray(predicted)[used])
+        deviation = check_noise(noise, frame, used)
+        channels = IndependentChannels.create(model.protocol)
+        weighing = channels.weigh(_blinded(deviation, used))
+        small = model.with_protocol(model.protocol.subset(np.asarray(channels.index)))
+        inversion, _ = pose(
+            eqx.tree_at(lambda m: m.electrodes, small, IntegratedElectrodes(model.electrodes, model.mesh)),
+            weighing.combine(predicted),
+            link,
+            background,
+            prior,
+            hyperparameter,
+        )
+        persistence = float(np.exp(-1 / memory)) if memory > 0 else 0.0
+        if (informative > 0 or memory > 0) and isinstance(inversion.penalty, Ridge):
+            shapes = _informed_shapes(inversion, _singular_values(inversion), informative, persistence)
+            inversion = eqx.tree_at(lambda i: i.basis, inversion, DenseBasis(shapes))
+        return cls(
+            channels=channels,
+            inversion=inversion,
+            noise=deviation,
+            mask=jnp.asarray(used),
+            expected=jnp.where(used, frame, predicted),
+            offset=jnp.where(used, predicted - frame, 0),
+            touching=jnp.asarray([model.protocol.channels_touching(k) for k in range(model.protocol.num_electrodes)]),
+            method=method,
+            steps=int(steps),
+            rtol=float(rtol),
+            persistence=persistence,
+        )
+
+    @property
+    def start(self) -> Float[Array, " n"]:
+        """Coefficients of the background: where the first frame starts."""
+        return jnp.zeros(self.inversion.num_coefficients)
+
+    def weighing(self, usable: Bool[Array, " M"]) -> Weighing:
+        """How to combine frames of which only the `usable` channels count."""
+        return self.channels.weigh(_blinded(self.noise, self.mask & usable))
+
+    def linear_map(self, weighing: Weighing) -> LinearMap:
+        """The linear image for frames combined in this way: one Gauss-Newton step from the background."""
+        return _linear_map(self.inversion, weighing, self.offset, self.persistence)
+
+    def estimate(self, frame: Float[Array, " M"], weighing: Weighing, start: Float[Array, " n"]) -> FrameEstimate:
+        """The image of a frame (M,) in volts, by at most `steps` iterations from coefficients `start`.
+
+        With a memory, `start` is also what the prior expects: `persistence` times the last image's coefficients.
+        Channels that do not count must hold some finite voltage, best that of the last frame.
+        """
+        return _estimate(self, frame, weighing, start)
+
+
+@jax.jit
+def _singular_values(inversion: Inversion):
+    """Of the whitened Jacobian at the background: squared singular values, and right vectors times their roots."""
+    start = jnp.zeros(inversion.num_coefficients)
+    rows = inversion.data.whiten(inversion.linearise(start)[1])
+    squares, left = jnp.linalg.eigh(rows @ rows.T)
+    return squares, left.T @ rows
+
+
+def _informed_shapes(inversion: Inversion, decomposition, least: float, persistence: float) -> Float[Array, "m k"]:
+    """The shapes that the data tell more of than `least`, as large as expected of a frame; in single precision."""
+    squares, rows = (np.asarray(values) for values in decomposition)
+    kept = squares > max(least**2, 1e-12 * squares[-1])
+    size = np.sqrt(_expected_variance(squares[kept], persistence) / squares[kept])
+    return jax.vmap(inversion.basis.expand)(jnp.asarray(size[:, None] * rows[kept])).T.astype(jnp.float32)
+
+
+def _expected_variance(strength, persistence: float):
+    """Variance of a coefficient before its frame comes, p = a² p / (1 + s p) + 1 - a², for data of `strength` s."""
+    fresh = 1 - persistence**2
+    half = fresh * (1 - strength) / 2
+    root = np.sqrt(half**2 + strength * fresh)
+    return np.where(half > 0, fresh / (half + root), (root - half) / strength)
+
+
+def _check_reference(measured, predicted) -> None:
+    """Units and polarity: what is wrong by ten times, or in sign, is not the model's error."""
+    ratio = measured @ predicted / (predicted @ predicted)
+    if not 0.1 < ratio < 10:
+        raise ValueError(
+            f"reference: it is {ratio:.2g} times what the model predicts for the background; are both in SI units, and "
+            "the signs right? See calibrate."
+        )
+
+
+def _blinded(noise, used) -> Float[Array, " M"]:
+    return jnp.where(used, noise, _BLIND * jnp.max(jnp.where(used, noise, 0)))
+
+
+@functools.partial(jax.jit, static_argnames="persistence")
+def _linear_map(inversion: Inversion, weighing: Weighing, offset, persistence: float) -> LinearMap:
+    start = jnp.zeros(inversion.num_coefficients)
+    posed = eqx.tree_at(lambda i: i.data, inversion, weighing.combine(offset))
+    residual, jacobian = posed.linearise(start)
+    lower = jnp.linalg.cholesky(jacobian @ jacobian.T + posed.data.covariance)
+    gain = jax.scipy.linalg.cho_solve((lower, True), jacobian).T
+    if inversion.num_coefficients <= len(residual):
+        shapes = jnp.eye(inversion.num_coefficients)
+        carry = persistence * (shapes - gain @ jacobian)
+    else:  # never with a memory, whose shapes are no more than the data
+        shapes, gain = gain.T, jnp.eye(len(residual))
+        carry = jnp.zeros_like(gain)
+    matrix = jax.vmap(inversion.basis.expand)(shapes).T * inversion.link.slope(inversion.reference)[:, None]
+    level = inversion.link.conductivity(inversion.reference) - matrix @ (gain @ residual)
+    return LinearMap(matrix, gain @ (weighing.weight[:, None] * weighing.estimator), level, carry)
+
+
+def _residual(coefficients, inversion: Inversion):
+    return inversion.residual(coefficients), coefficients
+
+
+def _expand(coefficients, inversion: Inversion):
+    return inversion.quadratic_model(coefficients)
+
+
+@jax.jit
+def _estimate(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate:
+    data = weighing.combine(frame + imager.offset)
+    inversion = eqx.tree_at(lambda i: i.data, imager.inversion, data)
+    expected = jnp.zeros_like(start)
+    if imager.persistence > 0:  # the prior's centre moves, and the coefficients count from there
+        expected, start = start, expected
+        inversion = eqx.tree_at(lambda i: i.reference, inversion, inversion.estimate(expected))
+    damping = 1.0 if imager.method == "levenberg-marquardt" else 0.0
+    solver = Descent(rtol=imager.rtol, damping=damping, history=imager.steps)
+    solution = optx.least_squares(
+        _residual, solver, start, inversion, options={"expand": _expand}, max_steps=imager.steps, throw=False
+    )
+    # The last step leads to a point not looked at yet. It takes voltages, but no Jacobian, to see if it is better.
+    state = solution.state
+    cost = inversion.cost(state.trial)
+    better = cost < state.cost
+    coefficients = jnp.where(better, state.trial, solution.value)
+    penalty = inversion.penalty.cost(coefficients)
+    squares = 2 * (jnp.where(better, cost, state.cost) - penalty) + data.rest
+    return FrameEstimate(
+        conductivity=inversion.conductivity(coefficients),
+        coefficients=expected + coefficients,
+        misfit=jnp.sqrt(squares / jnp.sum(weighing.noise <= jnp.max(imager.noise))),
+        iterations=state.num_accepted - 1 + better,
+        converged=state.converged,
+    )

@@ -1,0 +1,171 @@
+"""`stream`: frames one by one, from anywhere, to images; a bad frame is said to be bad, and the stream goes on."""
+
+import time
+from collections.abc import Iterable, Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jeit.inverse.stream.imager import Imager
+
+# A frame that differs by more than this, relative to an undisturbed one, is another sensor's, or a fault.
+_LARGEST_DIFFERENCE = 0.5
+# Beyond this, an electrode is taken for dead whose channels have changed by half or more, and hold most of the change.
+_SUSPICIOUS, _EXPLAINED, _LOST = 0.15, 0.5, 0.5
+_LEAST_CHANNELS = 0.5
+
+
+class FrameImage(eqx.Module):
+    """One frame of a stream.
+
+    **Fields**: `number`, from 0; `conductivity` (m,), S/m (2-D: S), NumPy, None for a frame that is refused; `status`:
+    "imaged"; "partial", some channels were left out; "not converged", within the steps a frame is given; "refused";
+    `reason`, in a sentence, empty where all is well; `usable` (M,), the channels used; `misfit`, root mean square in
+    standard deviations (NaN for linear images, which solve no forward problem, and refused frames); `iterations`;
+    `latency`, seconds from the frame to its image.
+    """
+
+    number: int
+    conductivity: Float[np.ndarray, " m"] | None
+    status: str
+    reason: str
+    usable: Bool[np.ndarray, " M"]
+    misfit: float
+    iterations: int
+    latency: float
+
+    @property
+    def imaged(self) -> bool:
+        """Whether there is an image."""
+        return self.conductivity is not None
+
+
+def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
+    """Images of frames (M,) in volts, each as soon as its frame has come. NaN marks channels without a reading.
+
+    Iterative methods start from the last image, and an imager with a memory expects the next one near it. Everything is
+    compiled before the first frame is asked for. A frame is refused, and the stream goes on, when it has another number
+    of channels or is not real, when fewer than half of the channels can be used, when all read zero (the current source
+    has failed), or when it differs from an undisturbed frame by more than half of it. A dead electrode's channels are
+    left out, and named.
+    """
+    if isinstance(frames, (np.ndarray, jax.Array)) and frames.ndim != 2:
+        raise ValueError(f"frames has shape {frames.shape}; give (frames, channels), or for one frame [frame].")
+    session = _Session(imager)
+    for number, frame in enumerate(frames):
+        yield session.image(number, frame)
+
+
+class _Session:
+    """What a stream keeps from one frame to the next, in NumPy where JAX's dispatch would cost more than the work."""
+
+    def __init__(self, imager: Imager):
+        self.imager = imager
+        self.mask = np.asarray(imager.mask)
+        self.unmasked = bool(self.mask.all())
+        self.expected = np.asarray(imager.expected)
+        self.touching = np.asarray(imager.touching)
+        self.size = np.linalg.norm(self.expected[self.mask])
+        self.ordinary = (_SUSPICIOUS * self.size) ** 2
+        self.coefficients = np.asarray(imager.start)
+        self.last = self.expected
+        self._weigh(self.mask)
+        self._estimate(self.expected)  # compiles
+        self.coefficients = np.asarray(imager.start)
+
+    def image(self, number: int, frame) -> FrameImage:
+        """The image of one frame, or why there is none."""
+        begin = time.perf_counter()
+        values, usable, status, reason = self._inspect(frame)
+        if status == "refused":
+            return FrameImage(number, None, status, reason, usable, np.nan, 0, time.perf_counter() - begin)
+        if usable is not self.usable and not np.array_equal(usable, self.usable):
+            self._weigh(usable)
+        filled = values if usable is self.mask and self.unmasked else np.where(usable, values, self.last)
+        conductivity, misfit, iterations, converged = self._estimate(filled)
+        if not np.isfinite(conductivity).all():
+            reason = "The image became NaN; the next frame starts from the background again."
+            self.coefficients = np.asarray(self.imager.start)
+            return FrameImage(number, None, "refused", reason, usable, np.nan, iterations, time.perf_counter() - begin)
+        self.last = filled
+        if not converged and status == "imaged":
+            status, reason = "not converged", f"More than {self.imager.steps} iterations are needed for this frame."
+        return FrameImage(number, conductivity, status, reason, usable, misfit, iterations, time.perf_counter() - begin)
+
+    def _weigh(self, usable) -> None:
+        self.usable = usable
+        self.weighing = self.imager.weighing(jnp.asarray(usable))
+        if self.imager.method == "linear":
+            linear = self.imager.linear_map(self.weighing)
+            # Reading the matrix takes most of a linear image's time; it multiplies differences, so single will do, and
+            # BLAS reads it column by column in half the time.
+            self.matrix = np.asfortranarray(linear.matrix, np.float32)
+            self.estimator = np.asarray(linear.estimator)
+            self.resting = self.estimator @ self.expected
+            self.carry = np.asarray(linear.carry)
+            self.level = np.asarray(linear.level) + np.asarray(linear.matrix) @ self.resting
+
+    def _estimate(self, frame):
+        """Conductivity, misfit, iterations, and whether they converged."""
+        if self.imager.method == "linear":
+            weights = self.estimator @ frame - self.resting
+            if self.imager.persistence > 0:
+                weights = self.coefficients = weights + self.carry @ self.coefficients
+            return self.level + self.matrix @ weights.astype(np.float32), np.nan, 1, True
+        found = self.imager.estimate(frame, self.weighing, jnp.asarray(self.coefficients))
+        self.coefficients = found.coefficients * (self.imager.persistence or 1.0)
+        return np.asarray(found.conductivity), float(found.misfit), int(found.iterations), bool(found.converged)
+
+    @np.errstate(over="ignore")  # a square that overflows is not an ordinary one
+    def _inspect(self, frame):
+        """Values, usable channels, status and reason of a frame as it came."""
+        none = np.zeros_like(self.mask)
+        if np.ma.isMaskedArray(frame):
+            frame = np.ma.filled(frame.astype(float), np.nan)
+        try:
+            values = np.asarray(frame)
+        except ValueError:
+            return none, none, "refused", f"The frame is ragged, not {self.mask.size} real voltages."
+        if values.dtype.kind in "US":
+            return values, none, "refused", f"The frame is text, not {self.mask.size} real voltages."
+        if values.shape != self.mask.shape or values.dtype.kind not in "iuf":
+            reason = f"The frame is {values.dtype} of shape {values.shape}, not {self.mask.size} real voltages."
+            return values, none, "refused", reason
+        change = (values - self.expected)[self.mask]
+        if change @ change < self.ordinary:  # which NaN is not, nor a frame of zeros
+            return values, self.mask, "imaged", ""
+        finite = np.isfinite(values)
+        usable = self.mask if finite.all() else self.mask & finite
+        count = np.count_nonzero(usable)
+        if count < _LEAST_CHANNELS * np.count_nonzero(self.mask):
+            return values, usable, "refused", f"Only {count} of {np.count_nonzero(self.mask)} channels can be used."
+        if not values[usable].any():
+            return values, none, "refused", "All channels read zero; the current source has failed."
+        difference = np.where(usable, values - self.expected, 0)
+        relative = np.linalg.norm(difference) / self.size
+        if relative > _SUSPICIOUS:
+            usable, reason = self._without_dead_electrode(difference, usable)
+            if reason:
+                return values, usable, "partial", reason
+            if relative > _LARGEST_DIFFERENCE:
+                reason = f"It differs by {relative:.0%} from an undisturbed frame: another sensor's, or a fault."
+                return values, none, "refused", reason
+        if count < np.count_nonzero(self.mask):
+            missing = np.count_nonzero(self.mask) - count
+            return values, usable, "partial", f"{missing} channels have no reading and are left out."
+        return values, usable, "imaged", ""
+
+    def _without_dead_electrode(self, difference, usable):
+        """The usable channels less those of an electrode that explains most of a large difference, and a sentence."""
+        total = np.linalg.norm(difference)
+        left = [np.linalg.norm(difference[usable & ~touching]) for touching in self.touching]
+        electrode = int(np.argmin(left))
+        own, rest = usable & self.touching[electrode], usable & ~self.touching[electrode]
+        lost = np.median(np.abs(difference[own]) / np.abs(self.expected[own])) > _LOST
+        explained = left[electrode] <= min(_EXPLAINED * total, _LARGEST_DIFFERENCE * self.size)
+        if not (lost and explained) or rest.sum() < _LEAST_CHANNELS * self.mask.sum():
+            return usable, ""
+        return rest, f"Electrode {electrode + 1} seems to be dead; its channels are left out."

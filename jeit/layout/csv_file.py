@@ -1,0 +1,136 @@
+"""Layouts as CSV: one electrode a line, the unit in the name of the column."""
+
+import csv
+import math
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from jeit.layout.layout import LARGEST, SMALLEST, Layout, bounds, check_discs_fit
+from jeit.mesh import Domain
+
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_LENGTHS = ("x", "y", "diameter")
+# "x_mm", "x [mm]", "x (mm)", "xmm"
+_LENGTH = re.compile(rf"({'|'.join(_LENGTHS)})[ _]*[\[(]?({'|'.join(_UNITS)})[\])]?")
+_LABEL, _IMPEDANCE = "label", "contact_impedance_ohm_m2"
+_TEMPLATE = f"x_mm, y_mm, diameter_mm and, if wanted, {_LABEL} and {_IMPEDANCE}"
+
+
+def millimetres(metres: float) -> float:
+    """A length as the decimal millimetres of a text file: 12.5, not 12.500000000000002 or -0.0."""
+    return round(1e3 * float(metres), 9) + 0.0
+
+
+def write_csv(layout: Layout, path: Path) -> None:
+    """Write the electrodes; the outline has no place in a table."""
+    lengths = np.column_stack([layout.centres, layout.diameters])
+    header = [*(f"{name}_mm" for name in _LENGTHS), _LABEL]
+    columns: list[Iterable] = [*(map(millimetres, column) for column in lengths.T), layout.labels]
+    if layout.contact_impedance is not None:
+        header.append(_IMPEDANCE)
+        columns.append(np.asarray(layout.contact_impedance).tolist())
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(header)
+        writer.writerows(zip(*columns, strict=True))
+
+
+def read_csv(path: Path, outline: Domain | None) -> Layout:
+    """Read what `write_csv` wrote, or a table made by hand. Raises `ValueError`, naming the line."""
+    lines = _lines(path)
+    delimiter = next((mark for mark in ";\t" if mark in lines[0][1]), ",")
+    (_, header), *rows = [(number, _cells(line, delimiter)) for number, line in lines]
+    columns = _columns(header)
+    if not rows:
+        raise ValueError("there is no electrode below the names of the columns.")
+    for number, row in rows:
+        if len(row) != len(header):
+            hint = " Write decimals with a point, or separate columns by semicolons." if delimiter == "," else ""
+            raise ValueError(f"line {number} has {len(row)} values for {len(header)} columns.{hint}")
+
+    def numbers(name: str) -> np.ndarray:
+        place, unit = columns[name]
+        return unit * np.array([_number(row[place], delimiter, f"line {at}: {header[place]}") for at, row in rows])
+
+    centres, diameters = np.column_stack([numbers("x"), numbers("y")]), numbers("diameter")
+    contact_impedance = numbers(_IMPEDANCE) if _IMPEDANCE in columns else None
+    for name, values in (("diameter", diameters), (_IMPEDANCE, contact_impedance)):
+        if values is not None and values.min() <= 0:
+            raise ValueError(f"line {rows[int(values.argmin())][0]}: {name} is not positive.")
+    labels = (
+        [row[columns[_LABEL][0]] or str(index + 1) for index, (_, row) in enumerate(rows)]
+        if _LABEL in columns
+        else None
+    )
+    _check_unit(centres, diameters, [header[columns[name][0]] for name in _LENGTHS])
+    check_discs_fit(centres, diameters, outline, [f"the electrode of line {number}" for number, _ in rows])
+    return Layout(
+        centres, diameters, contact_impedance=contact_impedance, outline=outline, labels=labels, name=path.stem
+    )
+
+
+def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -> None:
+    """Raise `ValueError` for lengths that must be of another unit than the columns' titles say."""
+    x_min, x_max, y_min, y_max = bounds(centres, diameters)
+    size = max(x_max - x_min, y_max - y_min)
+    if size < SMALLEST:
+        raise ValueError(
+            f"the electrodes would span {1e3 * size:.3g} mm under the columns {', '.join(titles)}; if the values are "
+            "in metres, multiply them by 1000 and call the columns x_mm, y_mm, diameter_mm."
+        )
+    if size > LARGEST:
+        raise ValueError(
+            f"the electrodes would span {size:.3g} m under the columns {', '.join(titles)}; if the values are in "
+            "millimetres, call the columns x_mm, y_mm, diameter_mm."
+        )
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Lines that hold something, with their numbers from 1."""
+    try:
+        text = path.read_text("utf-8-sig")
+    except UnicodeDecodeError:
+        raise ValueError("this is not a text file in UTF-8; in the spreadsheet, save it as 'CSV UTF-8'.") from None
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]
+    lines = [(number, line) for number, line in lines if line.strip(" \t,;") and not line.lstrip().startswith("#")]
+    if not lines:
+        raise ValueError(f"the file is empty; the first line names the columns: {_TEMPLATE}.")
+    return lines
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
+
+
+def _columns(header: list[str]) -> dict[str, tuple[int, float]]:
+    """Place and unit of every column. Raises `ValueError` for names that say no unit, are missing or not known."""
+    columns: dict[str, tuple[int, float]] = {}
+    for place, title in enumerate(header):
+        length = _LENGTH.fullmatch(title.lower())
+        name = length[1] if length else title.lower()
+        if name in _LENGTHS and not length:
+            raise ValueError(f"the column {title!r} does not say its unit; call it {name}_mm (or {name}_cm, {name}_m).")
+        if name not in (*_LENGTHS, _LABEL, _IMPEDANCE):
+            raise ValueError(
+                f"there is no column {title!r} in a layout; the first line names the columns: {_TEMPLATE}."
+            )
+        if name in columns:
+            raise ValueError(f"there are two columns for {name}; keep one.")
+        columns[name] = (place, _UNITS[length[2]] if length else 1.0)
+    missing = [name for name in _LENGTHS if name not in columns]
+    if missing:
+        raise ValueError(f"there is no column {missing[0]}_mm; the first line names the columns: {_TEMPLATE}.")
+    return columns
+
+
+def _number(cell: str, delimiter: str, where: str) -> float:
+    try:
+        value = float(cell if delimiter == "," else cell.replace(",", "."))
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{where} is {cell!r}; give a finite number, such as 12.5.")
+    return value

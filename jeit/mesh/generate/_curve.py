@@ -1,0 +1,111 @@
+"""Closed curves by arc length, as the mesh generator walks them (NumPy)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from jeit.mesh import loops
+
+Size = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A closed curve of `length` metres.
+
+    `at` gives points (p, 2) at arc lengths (p,); `corners` are the arc lengths of its corners, all of them
+    nodes; `inside` tells which points it encloses and `distance` how far from it they are; `angles` are the
+    angles of the domain at the corners in radians.
+    """
+
+    length: float
+    at: Callable[[np.ndarray], np.ndarray]
+    inside: Callable[[np.ndarray], np.ndarray]
+    distance: Callable[[np.ndarray], np.ndarray]
+    corners: np.ndarray
+    angles: np.ndarray
+
+
+def circle(radius: float, centre: np.ndarray) -> Curve:
+    """A circle, arc length counter-clockwise from angle 0."""
+
+    def at(arc_length: np.ndarray) -> np.ndarray:
+        angle = np.asarray(arc_length) / radius
+        return centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+    def from_centre(points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(points - centre, axis=1)
+
+    return Curve(
+        length=2 * np.pi * radius,
+        at=at,
+        inside=lambda points: from_centre(points) < radius,
+        distance=lambda points: np.abs(radius - from_centre(points)),
+        corners=np.zeros(0),
+        angles=np.zeros(0),
+    )
+
+
+def closed_line(vertices: np.ndarray) -> Curve:
+    """A closed polygon, arc length from its first vertex; the domain is on its left."""
+    closed = np.concatenate([vertices, vertices[:1]])
+    stops = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+
+    def at(arc_length: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(arc_length, stops, closed[:, axis]) for axis in range(2)], axis=-1)
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        result = np.full(len(points), np.inf)
+        for start, end in pairwise(closed):
+            result = np.minimum(result, loops.distance(points, start[None], end[None])[:, 0])
+        return result
+
+    forward = np.roll(vertices, -1, axis=0) - vertices
+    backward = np.roll(vertices, 1, axis=0) - vertices
+    angles = np.arctan2(
+        forward[:, 0] * backward[:, 1] - forward[:, 1] * backward[:, 0], (forward * backward).sum(axis=1)
+    )
+    return Curve(
+        length=float(stops[-1]),
+        at=at,
+        inside=lambda points: loops.inside(points, [vertices]),
+        distance=distance,
+        corners=stops[:-1],
+        angles=np.mod(angles, 2 * np.pi),
+    )
+
+
+def inside(curves: list[Curve], points: np.ndarray) -> np.ndarray:
+    """True for points inside the first curve and outside the others (holes)."""
+    result = np.zeros(len(points), bool)
+    for curve in curves:
+        result ^= curve.inside(points)
+    return result
+
+
+def divide(curve: Curve, stops: np.ndarray, size: Size) -> np.ndarray:
+    """Arc lengths of nodes along a curve, `stops` among them, one node per wanted cell size."""
+    stops = np.unique(stops)
+    if not len(stops):
+        stops = np.zeros(1)
+    fine = np.append(stops, stops[0] + curve.length)
+    while True:
+        middle, width = 0.5 * (fine[1:] + fine[:-1]), np.diff(fine)
+        long = width > 0.5 * size(curve.at(middle % curve.length))
+        if not long.any():
+            break
+        fine = np.sort(np.concatenate([fine, middle[long]]))
+    density = 1.0 / size(curve.at(0.5 * (fine[1:] + fine[:-1]) % curve.length))
+    count = np.concatenate([[0.0], np.cumsum(np.diff(fine) * density)])
+    at_ends = np.interp(np.append(stops, stops[0] + curve.length), fine, count)
+    fewest = max(1, -(-3 // len(stops)))
+    pieces = []
+    for start, low, high in zip(stops, at_ends[:-1], at_ends[1:], strict=True):
+        number = max(fewest, round(high - low))
+        inner = np.interp(low + (high - low) * np.arange(1, number) / number, count, fine)
+        pieces.append(np.append(start, inner))
+    return np.sort(np.concatenate(pieces) % curve.length)

@@ -1,0 +1,244 @@
+"""From what the user asks (a number of nodes or a cell size, refinement, nodes that must be there) to a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from numbers import Integral, Real
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+from jeit.mesh import loops
+from jeit.mesh.generate import _curve, _triangulate
+from jeit.mesh.generate._curve import Curve, Size
+from jeit.mesh.generate._delaunay import Front, doubled_areas, triangulate
+from jeit.mesh.generate.refine import Refinement, SizeField
+
+DEFAULT_NUM_POINTS = 1200
+# Nodes of a mesh.
+MOST_POINTS = 1_000_000
+# Nodes that must be there, closer than this relative to the outline's length, are refused.
+_CLOSEST = 1e-6
+# How well the number of nodes is met before smoothing and repair, which may add or drop a few.
+_MISS = 0.02
+
+
+@dataclass(frozen=True)
+class Target:
+    """How fine the mesh shall be: a number of nodes, or a cell size in metres (the other is None or a default)."""
+
+    num_points: int
+    cell_size: float | None
+    asked: bool
+
+    @staticmethod
+    def create(num_points: int | None, cell_size: float | None) -> Target:
+        """Check the two arguments of a shape; raises `ValueError` if both are given or one is out of range."""
+        if num_points is not None and cell_size is not None:
+            raise ValueError("num_points, cell_size: give one of the two, not both.")
+        if cell_size is not None and not (isinstance(cell_size, Real) and 0 < cell_size < np.inf):
+            raise ValueError(f"cell_size: expected a positive length in metres, got {cell_size!r}.")
+        number = DEFAULT_NUM_POINTS if num_points is None else check_count("num_points", num_points, 4)
+        check_total(number, "num_points")
+        return Target(number, cell_size, num_points is not None)
+
+
+def check_count(name: str, value: int, least: int) -> int:
+    """A whole number of at least `least`, or `ValueError`."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name}: expected a whole number of at least {least}, got {value!r}.")
+    return int(value)
+
+
+def check_total(number: float, name: str) -> None:
+    """Raise `ValueError` if the mesh would not fit a machine."""
+    if number > MOST_POINTS:
+        raise ValueError(
+            f"{name}: this would make about {number:.2g} nodes; the limit is {MOST_POINTS:.0e}. Lengths are in "
+            "metres: check the units, or ask for larger cells."
+        )
+
+
+def check_positions(name: str, positions: ArrayLike) -> np.ndarray:
+    """Finite numbers (k,), or `ValueError`."""
+    array = np.asarray(positions, dtype=float)
+    if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
+        raise ValueError(
+            f"{name}: expected finite positions along the outline, shape (k,), got {positions!r}. A disk takes angles "
+            "in radians, other outlines arc lengths in metres."
+        )
+    return array
+
+
+def mesh(
+    curves: list[Curve],
+    stops: list[np.ndarray],
+    interior_points: ArrayLike | None,
+    refine: Refinement,
+    target: Target,
+    area: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points and cells inside `curves`, with nodes at `stops` (arc lengths on each) and at `interior_points`."""
+    stops = [_merge(curve, own) for curve, own in zip(curves, stops, strict=True)]
+    fixed = _check_interior(interior_points, curves)
+    field = SizeField(curves, refine, *_room(curves, stops, fixed))
+    front = None
+    if target.cell_size is not None:
+        size = partial(_capped if field.is_own else _sized, field, target.cell_size)
+        check_total(_estimate(curves, size, area), "cell_size")
+    elif field.is_own and not target.asked:
+        size = partial(_sized, field, 1.0)
+        check_total(_estimate(curves, size, area), "refine")
+    else:
+        size, front = _fit(curves, stops, fixed, field, target.num_points, area)
+    return _triangulate.generate(curves, stops, fixed, size, front)
+
+
+def _sized(field: SizeField, background: float, points: np.ndarray) -> np.ndarray:
+    return field.at(points)(background)
+
+
+def _capped(field: SizeField, cap: float, points: np.ndarray) -> np.ndarray:
+    return np.minimum(field.at(points)(1.0), cap)
+
+
+def _merge(curve: Curve, own: np.ndarray) -> np.ndarray:
+    """Wanted positions on a curve together with its corners, coinciding ones once; `ValueError` if too close."""
+    stops = np.sort(np.concatenate([curve.corners, np.mod(own, curve.length)]))
+    if len(stops) < 2:
+        return stops
+    gaps = np.diff(np.append(stops, stops[0] + curve.length)) / curve.length
+    close = (gaps > 1e-9) & (gaps < _CLOSEST)
+    if close.any():
+        first = int(np.flatnonzero(close)[0])
+        raise ValueError(
+            f"boundary_points: two nodes at arc lengths {stops[first]:g} and {stops[(first + 1) % len(stops)]:g} m are "
+            "closer than a millionth of the outline (a corner counts). Make them equal or move one."
+        )
+    keep = gaps > 1e-9
+    # Of coinciding stops keep the corner, so that corners stay exactly where they are.
+    kept = stops[keep]
+    if len(curve.corners):
+        apart = np.abs(kept[:, None] - curve.corners)
+        apart = np.minimum(apart, curve.length - apart)
+        nearest = apart.argmin(axis=1)
+        kept = np.where(apart.min(axis=1) < 2e-9 * curve.length, curve.corners[nearest], kept)
+    return np.unique(kept)
+
+
+def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> np.ndarray:
+    if interior_points is None:
+        return np.zeros((0, 2))
+    fixed = np.atleast_2d(np.asarray(interior_points, dtype=float))
+    if fixed.ndim != 2 or fixed.shape[1] != 2 or not np.isfinite(fixed).all():
+        raise ValueError(f"interior_points: expected finite coordinates of shape (k, 2), got shape {fixed.shape}.")
+    apart = np.min([curve.distance(fixed) for curve in curves], axis=0)
+    bad = np.flatnonzero(~_curve.inside(curves, fixed) | (apart < _CLOSEST * curves[0].length))
+    if bad.size:
+        raise ValueError(
+            f"interior_points: point {bad[0]} at {fixed[bad[0]].tolist()} does not lie inside the outline. Use "
+            "boundary_points for nodes on it."
+        )
+    if len(fixed) > 1 and KDTree(fixed).query(fixed, k=2)[0][:, 1].min() < _CLOSEST * curves[0].length:
+        raise ValueError("interior_points: two points coincide or nearly so. Keep one of them.")
+    return fixed
+
+
+def _room(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes that must be there (k, 2), and how far each is from the next one or from a side it is not on (k,)."""
+    chains = [curve.at(stop) for curve, stop in zip(curves, stops, strict=True)]
+    held = np.concatenate([*chains, fixed])
+    if len(held) < 2:
+        apart = np.array([curves[0].distance(point[None])[0] for point in fixed])
+        return (held, apart) if len(fixed) else (np.zeros((0, 2)), np.zeros(0))
+    spacing = KDTree(held).query(held, k=2)[0][:, 1]
+    offset = 0
+    for chain in chains:
+        count = len(chain)
+        for k, (start, end) in enumerate(pairwise(np.concatenate([chain, chain[:1]]))):
+            if count < 2 or (start == end).all():
+                continue
+            apart = loops.distance(held, start[None], end[None])[:, 0]
+            apart[[offset + k, offset + (k + 1) % count]] = np.inf
+            spacing = np.minimum(spacing, np.where(apart > 0, apart, np.inf))
+        offset += count
+    for curve in curves:
+        if len(fixed):
+            spacing[offset:] = np.minimum(spacing[offset:], curve.distance(fixed))
+    return held, spacing
+
+
+def _sample(curves: list[Curve]) -> np.ndarray:
+    """Points of a regular grid that lie inside."""
+    outline = curves[0].at(np.linspace(0, curves[0].length, 400))
+    axes = [np.linspace(outline[:, k].min(), outline[:, k].max(), 60) for k in (0, 1)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    return grid[_curve.inside(curves, grid)]
+
+
+def _estimate(curves: list[Curve], size: Size, area: float) -> float:
+    """About how many nodes a mesh of this size has, from samples inside and along the outline."""
+    total = area * float(np.mean(1.0 / size(_sample(curves)) ** 2))
+    for curve in curves:
+        total += curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400)))))
+    return total
+
+
+def _fit(
+    curves: list[Curve],
+    stops: list[np.ndarray],
+    fixed: np.ndarray,
+    field: SizeField,
+    num_points: int,
+    area: float,
+) -> tuple[Size, Front]:
+    """The size function that makes `num_points` nodes, by its background size or factor, and a filled outline.
+
+    The number of nodes is about ∫ c/h² over the domain: a coarser mesh gives the constant c and the sample
+    points, the next ones correct the rest.
+    """
+    first = num_points / 4 if num_points > 4000 else num_points
+    value = float(np.sqrt(1.1 * area / first))
+    if field.is_own:
+        value *= float(np.sqrt(np.mean(1.0 / field.at(_sample(curves))(1.0) ** 2)))
+    best: tuple[float, Size, Front] | None = None
+    for _ in range(6):
+        size = partial(_sized, field, value)
+        front = _triangulate.outline_nodes(curves, stops, fixed, size, 1.0)
+        _triangulate.fill(front, size)
+        points = front.points()
+        miss = len(points) / num_points - 1.0
+        if best is None or abs(miss) < best[0]:
+            best = (abs(miss), size, front)
+        if abs(miss) < _MISS:
+            break
+        cells = triangulate(front, points)
+        value = _corrected(field.at(points[cells].mean(axis=1)), doubled_areas(points, cells), value, miss, num_points)
+    assert best is not None
+    return best[1], best[2]
+
+
+def _corrected(
+    size: Callable[[float], np.ndarray], weight: np.ndarray, value: float, miss: float, num_points: int
+) -> float:
+    """The background size at which ∫ 1/h² is what it was at `value`, less the relative surplus of nodes `miss`."""
+
+    def total(trial: float) -> float:
+        return float(np.sum(weight / size(trial) ** 2))
+
+    wanted = total(value) / (1.0 + miss)
+    if total(1e3 * value) > 1.1 * wanted:
+        least = round(num_points * total(1e3 * value) / wanted)
+        raise ValueError(
+            f"num_points: the outline and refinement alone need about {least} nodes, more than the {num_points} asked. "
+            "Ask for more nodes, less refinement (larger cell_size, smaller factor) or faster growth."
+        )
+    low, high = np.log(value / 1e3), np.log(value * 1e3)
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if total(float(np.exp(middle))) > wanted else (low, middle)
+    return float(np.exp(0.5 * (low + high)))

@@ -1,0 +1,207 @@
+"""Where cells shall be small: `Refine`, and the wanted cell size as a function of position."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import RegularGridInterpolator
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import KDTree
+
+from jeit.mesh.generate import _curve
+from jeit.mesh.generate._curve import Curve, Size
+
+# How fast cells may grow away from nodes that lie close together and from a user's own size function.
+_OWN_GROWTH = 0.45
+
+
+class Refine(eqx.Module):
+    """Smaller cells near given points, or along the whole outline.
+
+    At a distance r from the nearest of `points`, cells have edges of at most h + growth · max(r − distance, 0), with
+    h the cell size there: either `cell_size`, or the background cell size divided by `factor`.
+
+    The potential is singular at the edges of electrodes. For 16 electrodes that cover half the rim of a disk,
+    `disk(radius, num_points=1200, refine=Refine(edges, factor=5, growth=0.3), boundary_points=angles)`, with `edges`
+    the electrodes' end points and `angles` theirs, brings the largest error of a voltage between undriven electrodes
+    from 2.2 % (uniform rings) to 0.5 %; 10,000 nodes with `factor=8, growth=0.4` bring it below 0.1 %
+    (contact impedance times conductivity between 0.01 and 0.1 radii).
+
+    **Fields**: `points` (k, 2) in metres, or None for the whole outline; `cell_size` in metres; `factor` > 1;
+    `growth` of the edge length per length, 0.35 unless told, at most 1 (above 0.7 the cells are visibly
+    stretched); `distance` in metres over which cells stay at their smallest.
+    """
+
+    points: np.ndarray | None
+    cell_size: float | None
+    factor: float | None
+    growth: float
+    distance: float
+
+    def __init__(
+        self,
+        points: ArrayLike | None = None,
+        *,
+        cell_size: float | None = None,
+        factor: float | None = None,
+        growth: float = 0.35,
+        distance: float = 0.0,
+    ):
+        """Give exactly one of `cell_size` and `factor`. Raises `ValueError` on values out of range."""
+        if points is not None:
+            points = np.atleast_2d(np.asarray(points, dtype=float))
+            if points.ndim != 2 or points.shape[1] != 2 or not len(points) or not np.isfinite(points).all():
+                raise ValueError(
+                    f"points: expected finite coordinates of shape (k, 2) in metres, got shape {points.shape}."
+                )
+        if (cell_size is None) == (factor is None):
+            raise ValueError("Refine: give exactly one of cell_size (metres) and factor (times smaller).")
+        if cell_size is not None and not (np.isfinite(cell_size) and cell_size > 0):
+            raise ValueError(f"cell_size: expected a positive length in metres, got {cell_size!r}.")
+        if factor is not None and not (np.isfinite(factor) and factor >= 1):
+            raise ValueError(f"factor: cells become `factor` times smaller, so it must be >= 1, got {factor!r}.")
+        if not 0 < growth <= 1:
+            raise ValueError(
+                f"growth: must lie in (0, 1], got {growth!r}; cells that grow faster cannot be well shaped."
+            )
+        if not (np.isfinite(distance) and distance >= 0):
+            raise ValueError(f"distance: expected a length in metres >= 0, got {distance!r}.")
+        self.points = points
+        self.cell_size = cell_size
+        self.factor = factor
+        self.growth = float(growth)
+        self.distance = float(distance)
+
+    def smallest(self, background: float) -> float:
+        """Edge length in metres at the points themselves, for a background cell size in metres."""
+        if self.cell_size is not None:
+            return self.cell_size
+        assert self.factor is not None
+        return background / self.factor
+
+
+Refinement = Refine | Sequence[Refine] | Callable[[np.ndarray], np.ndarray] | None
+
+
+class SizeField:
+    """Wanted edge length at any point for a given background cell size."""
+
+    def __init__(self, curves: list[Curve], refine: Refinement, held: np.ndarray, spacing: np.ndarray):
+        """`held` (k, 2) are nodes that must be there and `spacing` (k,) the room each has."""
+        self._terms: list[tuple[Callable[[np.ndarray], np.ndarray], Refine]] = []
+        self._own: Size | None = None
+        if callable(refine):
+            self._own = limited(curves, refine)
+        elif refine is not None:
+            for term in (refine,) if isinstance(refine, Refine) else tuple(refine):
+                if not isinstance(term, Refine):
+                    raise ValueError(
+                        f"refine: expected a Refine, several of them, or a function of points, got {term!r}."
+                    )
+                self._terms.append((_distance_from(curves, term.points), term))
+        self._held = _close_nodes(held, spacing)
+        self._least_room = float(spacing.min()) if len(spacing) else np.inf
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the user gave the sizes as a function."""
+        return self._own is not None
+
+    def at(self, points: np.ndarray) -> Callable[[float], np.ndarray]:
+        """Edge length (p,) at points (p, 2) as a function of the background: of the cell size in metres wanted away
+        from refinement, or, where the user gave a function, of the factor it is multiplied by."""
+        if self._own is not None:
+            own, held = self._own(points), self._held(points)
+            return lambda factor: np.minimum(factor * own, held)
+        apart = [np.maximum(distance(points) - term.distance, 0.0) for distance, term in self._terms]
+
+        def size(background: float) -> np.ndarray:
+            result = np.full(len(points), background)
+            for beyond, (_, term) in zip(apart, self._terms, strict=True):
+                result = np.minimum(result, term.smallest(background) + term.growth * beyond)
+            # Nodes with room enough for the background cells need no thought.
+            return result if background <= self._least_room else np.minimum(result, self._held(points))
+
+        return size
+
+
+def _distance_from(curves: list[Curve], points: np.ndarray | None) -> Callable[[np.ndarray], np.ndarray]:
+    if points is None:
+        return lambda where: np.min([curve.distance(where) for curve in curves], axis=0)
+    tree = KDTree(points)
+    return lambda where: tree.query(where)[0]
+
+
+def _close_nodes(held: np.ndarray, spacing: np.ndarray) -> Size:
+    """Cells no larger than the room that nodes which must be there have, growing away from them."""
+    if not len(held):
+        return lambda points: np.full(len(points), np.inf)
+    tree = KDTree(held)
+    count = min(8, len(held))
+    if count > 1:
+        # Let every node know of tighter ones farther off, so that the nearest few decide.
+        for _ in range(4):
+            apart, other = tree.query(held, k=count)
+            spacing = np.min(spacing[other] + _OWN_GROWTH * apart, axis=1)
+
+    def size(points: np.ndarray) -> np.ndarray:
+        apart, other = tree.query(points, k=count)
+        apart, other = apart.reshape(len(points), count), other.reshape(len(points), count)
+        return np.min(spacing[other] + _OWN_GROWTH * apart, axis=1)
+
+    return size
+
+
+def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resolution: int = 128) -> Size:
+    """A user's size function with its growth limited: min over y of f(y) + growth |x − y|.
+
+    The minimum is found on a grid by Dijkstra's algorithm; the function itself still counts wherever it
+    is smaller. Raises `ValueError` if the function does not give one positive size per point.
+    """
+    outline = curves[0].at(np.linspace(0, curves[0].length, 721))
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    step = float((high - low).max()) / resolution
+    axes = [np.arange(low[k] - step, high[k] + 2 * step, step) for k in (0, 1)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    shape, flat = grid.shape[:2], grid.reshape(-1, 2)
+    inside = np.flatnonzero(_curve.inside(curves, flat))
+    values = np.asarray(function(flat[inside]), dtype=float)
+    if values.shape != (len(inside),):
+        raise ValueError(
+            f"refine: the size function must return one size per point: for points of shape ({len(inside)}, 2) it "
+            f"returned shape {values.shape}."
+        )
+    if not (np.isfinite(values).all() and (values > 0).all()):
+        bad = inside[int(np.flatnonzero(~(np.isfinite(values) & (values > 0)))[0])]
+        raise ValueError(
+            f"refine: the size function must be positive and finite inside the domain; "
+            f"at {flat[bad].tolist()} it is not."
+        )
+    number = np.arange(len(flat)).reshape(shape)
+    links = [
+        (number[1:], number[:-1], step),
+        (number[:, 1:], number[:, :-1], step),
+        (number[1:, 1:], number[:-1, :-1], step * np.sqrt(2)),
+        (number[1:, :-1], number[:-1, 1:], step * np.sqrt(2)),
+    ]
+    start = np.concatenate([a.ravel() for a, _, _ in links] + [np.full(len(inside), len(flat))])
+    end = np.concatenate([b.ravel() for _, b, _ in links] + [inside])
+    weight = np.concatenate([np.full(a.size, _OWN_GROWTH * length) for a, _, length in links] + [values])
+    graph = coo_array((weight, (start, end)), shape=(len(flat) + 1,) * 2).tocsr()
+    field = dijkstra(graph, directed=False, indices=len(flat))[:-1].reshape(shape)
+    interpolate = RegularGridInterpolator(axes, field)
+    first, last = grid[0, 0], grid[-1, -1]
+
+    def size(points: np.ndarray) -> np.ndarray:
+        # Trial nodes may lie outside the domain, where the user's function need not make sense.
+        with np.errstate(all="ignore"):
+            own = np.asarray(function(points), dtype=float)
+        own = np.where(np.isfinite(own) & (own > 0), own, np.inf)
+        return np.minimum(own, interpolate(np.clip(points, first, last)))
+
+    return size

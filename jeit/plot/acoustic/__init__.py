@@ -1,0 +1,1 @@
+"""Pictures of what microphones hear: receptive fields, maps, tracks, errors."""

@@ -1,0 +1,155 @@
+"""What pictures of touches share: the skin seen from above, its microphones, where a touch is and how surely."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse, PathPatch
+from matplotlib.path import Path
+from matplotlib.patheffects import withStroke
+from numpy.typing import ArrayLike
+from scipy.stats import chi2
+
+from jeit.acoustic import Calibration, MicrophoneArray, make_surface
+from jeit.acoustic.surface import AbstractSurface, box
+from jeit.mesh import Domain
+from jeit.plot.axes import INK, SOFT, bare, draw_scale_bar, extent_of
+
+MICROPHONE, FOUND = "#1f6fb4", "#c8102e"
+HALO = (withStroke(linewidth=2.5, foreground="white"),)
+# Radius, in standard deviations, of the ellipse that holds 95 % of a normal distribution in the plane.
+_REACH = float(np.sqrt(chi2.ppf(0.95, 2)))
+
+Skin = Calibration | MicrophoneArray | AbstractSurface | Domain | ArrayLike
+
+
+class View(NamedTuple):
+    """A skin seen along the normal of its chart: `surface`, `microphones` (M, 2) in the chart, which are `usable`."""
+
+    surface: AbstractSurface
+    microphones: np.ndarray
+    usable: np.ndarray
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """(x_min, x_max, y_min, y_max) of the outline, metres."""
+        (left, bottom), (right, top) = (np.asarray(corner) for corner in box(self.surface))
+        return float(left), float(right), float(bottom), float(top)
+
+    def chart(self, points: ArrayLike, name: str) -> np.ndarray:
+        """Chart coordinates (n, 2) of `points` (n, d); raises `ValueError` that names the argument."""
+        return chart_of(self.surface, points, name)
+
+    def chart_point(self, point: ArrayLike, name: str) -> np.ndarray:
+        """The same of one point (d,)."""
+        place = np.asarray(point, float)
+        if place.shape != (self.surface.dimension,):
+            raise ValueError(f"{name} has shape {place.shape}; give one place ({self.surface.dimension},) in metres.")
+        return self.chart(place[None], name)[0]
+
+    def chart_covariance(self, covariance: ArrayLike, point: ArrayLike, name: str = "covariance") -> np.ndarray:
+        """Covariance (2, 2) in the chart of a `covariance` (d, d) at `point` (d,)."""
+        spread, d = np.asarray(covariance, float), self.surface.dimension
+        if spread.shape != (d, d):
+            raise ValueError(f"{name} has shape {spread.shape}; give ({d}, {d}) in m².")
+        slopes = jax.jacfwd(lambda x: self.surface.project(x[:, None])[:, 0])(jnp.asarray(point, float))
+        return np.asarray(slopes @ spread @ slopes.T)
+
+
+def view_of(skin: Skin, microphones: ArrayLike | None = None, usable: ArrayLike | None = None) -> View:
+    """The view of a calibration, an array, a surface or an outline; `microphones` (M, d) where it does not know them.
+
+    Raises `ValueError` for shapes that disagree.
+    """
+    if isinstance(skin, Calibration):
+        usable = skin.usable if usable is None else usable
+        skin = skin.microphone_array
+    if isinstance(skin, MicrophoneArray):
+        microphones = skin.microphones if microphones is None else microphones
+        skin = skin.surface
+    surface = skin if isinstance(skin, AbstractSurface) else make_surface(skin)
+    place = np.zeros((0, 2)) if microphones is None else chart_of(surface, microphones, "microphones")
+    good = np.ones(len(place), bool) if usable is None else np.asarray(usable, bool)
+    if good.shape != (len(place),):
+        raise ValueError(f"usable has shape {good.shape}; give one for each of the {len(place)} microphones.")
+    return View(surface, place, good)
+
+
+def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarray:
+    """Chart coordinates (n, 2) of `points` (n, d)."""
+    place = np.asarray(points, float)
+    if place.ndim != 2 or place.shape[1] != surface.dimension:
+        raise ValueError(f"{name} has shape {place.shape}; give (n, {surface.dimension}) in metres.")
+    return np.asarray(surface.project(jnp.asarray(place.T))).T
+
+
+def outline_of(view: View) -> Path:
+    """The outline and its holes, in the chart."""
+    outline = view.surface.outline
+    loops = [np.asarray(loop) for loop in (outline.vertices, *outline.holes)]
+    return Path.make_compound_path(*(Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in loops))
+
+
+def draw_skin(ax: Axes, view: View, *, microphones: bool = True, faint: bool = False) -> list[Line2D]:
+    """Outline and scale bar, and the microphones, those of no use crossed; what of it a legend should name."""
+    ax.add_patch(
+        PathPatch(outline_of(view), facecolor="none", edgecolor=INK, linewidth=0.9, joinstyle="round", zorder=2)
+    )
+    # Microphones may stand beside the skin.
+    shown = np.concatenate([np.reshape(view.extent, (2, 2)).T, view.microphones])
+    x_min, x_max, y_min, y_max = extent_of(shown)
+    room = 0.06 * max(x_max - x_min, y_max - y_min)
+    bare(ax, (x_min, x_max, y_min, y_max))
+    # Nothing stands outside but the scale bar, which can be nearer than where numbers of electrodes are.
+    draw_scale_bar(ax, (x_min + room, x_max, y_min + room, y_max))
+    ax.set_xlim(x_min - 0.5 * room, x_max + 0.5 * room)
+    ax.set_ylim(y_min - 2 * room, y_max + 0.5 * room)
+    if not microphones:
+        return []
+    named = []
+    style = {"marker": "o", "linestyle": "none", "markersize": 6.5, "zorder": 2.5, "label": "microphone"}
+    style |= {"markerfacecolor": "none", "markeredgewidth": 1.0} if faint else {"markeredgewidth": 0.8}
+    style |= {"markeredgecolor": SOFT} if faint else {"markerfacecolor": MICROPHONE, "markeredgecolor": "white"}
+    dead = {"marker": "x", "linestyle": "none", "markersize": 7, "markeredgewidth": 1.6, "color": INK, "zorder": 2.6}
+    if view.usable.any():
+        named += ax.plot(*view.microphones[view.usable].T, **style)
+    if not view.usable.all():
+        named += ax.plot(*view.microphones[~view.usable].T, **dead, label="not usable")
+    return named
+
+
+def draw_ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray, *, colour: str = FOUND) -> None:
+    """The ellipse that holds a normal variable with 95 % probability: `middle` (2,), `covariance` (2, 2), metres."""
+    variances, axes = np.linalg.eigh(covariance)
+    long, short = 2 * _REACH * np.sqrt(np.maximum(variances[::-1], 0))
+    angle = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
+    x, y = middle
+    ellipse = Ellipse((x, y), long, short, angle=angle, fill=False, edgecolor=colour, linewidth=1.4, zorder=4)
+    ellipse.set_path_effects([*HALO])
+    ax.add_patch(ellipse)
+
+
+def draw_legend(ax: Axes, handles: list) -> None:
+    """A legend under the picture, of as many columns as there is room for; none where there is nothing to name."""
+    if not handles:
+        return
+    # Widths in inches: of a marker with its gaps, and of a letter.
+    widths = [0.45 + 0.065 * len(str(handle.get_label())) for handle in handles]
+    room = ax.bbox.width / ax.figure.dpi
+    columns = len(handles) if sum(widths) <= room else max(1, int(room / max(widths)))
+    ax.legend(
+        handles=handles,
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0.0),
+        ncols=columns,
+        frameon=False,
+        borderpad=0,
+        borderaxespad=0,
+        handletextpad=0.5,
+        columnspacing=1.4,
+        fontsize=9,
+        labelcolor=INK,
+    )

@@ -1,0 +1,1 @@
+"""Pictures of designs: sensitivity maps, virtual taxels, electrodes on the move."""

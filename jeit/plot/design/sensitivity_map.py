@@ -1,0 +1,61 @@
+"""Sensitivity maps of a skin, and the histograms of several."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from numpy.typing import ArrayLike
+
+from jeit.design import SensitivityMap
+from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar
+
+_COLOURS = (INK, "#c8102e", "#1f6fb4", "#2a9d6f")
+
+
+def plot_sensitivity_map(
+    theta: SensitivityMap,
+    *,
+    electrodes: ArrayLike | None = None,
+    limit: float | None = None,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw Θ in millivolts over the skin. `electrodes`: positions (L, 2), metres; `limit`: volts at the bar's end."""
+    ax = axes_or_new(ax)
+    grid = theta.grid
+    rows, columns = grid.shape
+    corner = np.asarray(grid.places[0]) - np.array([grid.columns[0], grid.rows[0]]) * np.array(grid.pitch)
+    corner = corner - np.array(grid.pitch) / 2
+    extent = (corner[0], corner[0] + columns * grid.pitch[0], corner[1], corner[1] + rows * grid.pitch[1])
+    top = float(np.max(np.asarray(theta.values))) if limit is None else limit
+    image = ax.imshow(
+        1e3 * theta.image(), origin="lower", extent=extent, cmap=SEQUENTIAL, vmin=0, vmax=1e3 * top, aspect="equal"
+    )
+    draw_colour_bar(ax, image, "Sensitivity (mV)")
+    if electrodes is not None:
+        x, y = np.asarray(electrodes).T[:2]
+        ax.plot(x, y, "o", markersize=4, markerfacecolor="white", markeredgecolor=INK, markeredgewidth=0.8)
+    bare(ax, extent)
+    draw_scale_bar(ax, extent)
+    if title:
+        ax.set_title(title)
+    return ax
+
+
+def plot_sensitivity_histograms(
+    maps: Mapping[str, SensitivityMap], *, bins: int = 40, title: str | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw the share of the area at each sensitivity, of maps {name: map}; the first one's minimum is marked."""
+    ax = axes_or_new(ax)
+    top = max(float(np.max(np.asarray(theta.values))) for theta in maps.values())
+    edges = np.linspace(0, top, bins + 1)
+    for colour, (name, theta) in zip(_COLOURS, maps.items(), strict=False):
+        ax.stairs(100 * theta.histogram(edges)[0], 1e3 * edges, color=colour, label=name, linewidth=1.4)
+    least = float(next(iter(maps.values())).minimum)
+    ax.axvline(1e3 * least, color=SOFT, linewidth=1, linestyle="--")
+    ax.set_xlabel("Sensitivity (mV)")
+    ax.set_ylabel("Share of the area (%)")
+    ax.legend(frameon=False)
+    if title:
+        ax.set_title(title)
+    return ax

@@ -1,0 +1,179 @@
+"""Virtual taxels: where they are and how large, their areas' histogram, and what each is sensitive to."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.tri import Triangulation
+from numpy.typing import ArrayLike
+
+from jeit.design import Taxels
+from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar, extent_of
+
+_COLOURS = (INK, "#c8102e", "#1f6fb4", "#2a9d6f", "#8a5cb8", "#d98a1c")
+_PALETTE = "Set3"
+_QUANTITIES = {"area": "Taxel area (cm²)", "coverage": "Taxels over a point", "label": ""}
+
+
+def plot_taxels(
+    taxels: Taxels,
+    *,
+    colour: str = "area",
+    outlines: bool = False,
+    electrodes: ArrayLike | None = None,
+    limit: float | None = None,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the map of the taxels of one layout, place by place.
+
+    `colour`: "area", of the taxel whose cluster the place is in; "coverage", how many taxels cover the place; "label",
+    a colour for each cluster. `outlines`: draw where the similarity to each taxel falls below the threshold.
+    `electrodes`: positions (L, 2) or (L, 3), metres. `limit`: value at the end of the colour bar, in m² for "area".
+    Raises `ValueError` for other colours, and batches.
+    """
+    if colour not in _QUANTITIES:
+        raise ValueError(f"colour must be one of {', '.join(_QUANTITIES)}; it is {colour!r}.")
+    _check_single(taxels)
+    labels = np.asarray(taxels.labels)
+    ax = axes_or_new(ax)
+    if colour == "label":
+        cells = _draw_cells(ax, taxels, _map_colours(taxels)[labels], colour_map=_PALETTE)
+        cells.set_clim(0, colormaps[_PALETTE].N - 1)
+    else:
+        values = 1e4 * np.asarray(taxels.areas)[labels] if colour == "area" else np.asarray(taxels.coverage)
+        cells = _draw_cells(ax, taxels, values, colour_map=SEQUENTIAL)
+        cells.set_clim(0, float(values.max()) if limit is None else limit * (1e4 if colour == "area" else 1))
+        draw_colour_bar(ax, cells, _QUANTITIES[colour])
+    if outlines:
+        style = {"colour": INK if colour == "label" else "white", "width": 0.7}
+        _draw_outlines(ax, taxels, range(len(taxels.similarity)), **style)
+    _dress(ax, taxels, electrodes, title)
+    return ax
+
+
+def plot_taxel_areas(
+    taxels: Taxels | Mapping[str, Taxels], *, bins: int = 20, title: str | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw the histogram of the taxels' areas of one layout, or of several: {name: taxels}.
+
+    `bins`: as many, of the same width for all, from 0 to the largest area. The legend gives mean ± standard deviation.
+    Raises `ValueError` for batches, no layouts and more than six.
+    """
+    layouts = {"taxels": taxels} if isinstance(taxels, Taxels) else dict(taxels)
+    if not 1 <= len(layouts) <= len(_COLOURS):
+        raise ValueError(f"taxels are of {len(layouts)} layouts; give 1 to {len(_COLOURS)}, {{name: taxels}}.")
+    for one in layouts.values():
+        _check_single(one)
+    areas = {name: 1e4 * np.asarray(one.areas) for name, one in layouts.items()}
+    edges = np.linspace(0, max(area.max() for area in areas.values()) or 1.0, bins + 1)
+    ax = axes_or_new(ax, (5.8, 3.8))
+    for (name, area), colour in zip(areas.items(), _COLOURS, strict=False):
+        label = f"{name}: {area.mean():.1f} ± {area.std():.1f} cm²"
+        counts = np.histogram(area, edges)[0]
+        ax.stairs(counts, edges, fill=True, color=colour, alpha=0.25)
+        ax.stairs(counts, edges, color=colour, linewidth=1.6, label=label)
+    ax.set_xlabel("Taxel area (cm²)", color=INK)
+    ax.set_ylabel("Taxels", color=INK)
+    ax.set_title(title or "")
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color(SOFT)
+    ax.tick_params(color=SOFT, labelcolor=INK)
+    ax.legend(frameon=False)
+    return ax
+
+
+def plot_similarity(
+    taxels: Taxels,
+    index: int,
+    *,
+    electrodes: ArrayLike | None = None,
+    title: str | None = None,
+    colour_bar: bool = True,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw how like the mean change of taxel `index` the change of each place is, and the outline of the taxel.
+
+    `electrodes`: positions (L, 2) or (L, 3), metres. Raises `ValueError` for a taxel that is not there, and batches.
+    """
+    _check_single(taxels)
+    number = len(taxels.similarity)
+    if not isinstance(index, (int, np.integer)) or not 0 <= index < number:
+        raise ValueError(f"index must be from 0 to {number - 1}, of one of the {number} taxels; it is {index!r}.")
+    ax = axes_or_new(ax)
+    cells = _draw_cells(ax, taxels, np.asarray(taxels.similarity[index]), colour_map="magma")
+    # What is opposite is no more alike than what has nothing in common.
+    cells.set_clim(0, 1)
+    _draw_outlines(ax, taxels, [index], colour="white", width=1.6)
+    _dress(ax, taxels, electrodes, f"{1e4 * float(taxels.areas[index]):.1f} cm²" if title is None else title)
+    if colour_bar:
+        draw_colour_bar(ax, cells, "Cosine similarity")
+    return ax
+
+
+def _check_single(taxels: Taxels) -> None:
+    if taxels.similarity.ndim != 2:
+        raise ValueError(
+            f"taxels are of a batch of {taxels.similarity.shape[0]} layouts; draw one of them, "
+            "jax.tree.map(lambda array: array[0], taxels)."
+        )
+
+
+def _sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
+    """Width and height (n,) of the cells: of a grid its spacings, otherwise of squares of their area."""
+    gaps = [np.diff(np.unique(axis.round(9))) for axis in np.asarray(taxels.places).T]
+    square = np.sqrt(np.asarray(taxels.cell_area))
+    if all(len(gap) and np.allclose(gap, gap[0], rtol=1e-3) for gap in gaps):
+        return np.full_like(square, gaps[0][0]), np.full_like(square, gaps[1][0])
+    return square, square
+
+
+def _draw_cells(ax: Axes, taxels: Taxels, values: np.ndarray, *, colour_map: str) -> PolyCollection:
+    half = np.stack(_sides(taxels), axis=1)[:, None] / 2
+    corners = np.asarray(taxels.places)[:, None] + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    # Edges in the cells' own colour: without them the background shines through the seams.
+    cells = PolyCollection(list(corners), array=values, cmap=colormaps[colour_map], edgecolors="face", linewidth=0.4)
+    ax.add_collection(cells)
+    return cells
+
+
+def _map_colours(taxels: Taxels) -> np.ndarray:
+    """A colour (k,) for each cluster, the first of the palette that none of its neighbours has."""
+    labels, count = np.asarray(taxels.labels), len(taxels.similarity)
+    first, second = labels[_triangles(taxels).edges].T
+    neighbours = np.zeros((count, count), bool)
+    neighbours[first, second] = neighbours[second, first] = True
+    np.fill_diagonal(neighbours, False)
+    chosen = np.full(count, -1)
+    for index in range(count):
+        free = np.setdiff1d(np.arange(count), chosen[neighbours[index]])
+        chosen[index] = free[0] % colormaps[_PALETTE].N
+    return chosen
+
+
+def _triangles(taxels: Taxels) -> Triangulation:
+    return Triangulation(*np.asarray(taxels.places).T)
+
+
+def _draw_outlines(ax: Axes, taxels: Taxels, indices: Iterable[int], *, colour: str, width: float) -> None:
+    triangles = _triangles(taxels)
+    for surface in np.asarray(taxels.similarity)[list(indices)]:
+        if surface.min() < taxels.threshold <= surface.max():
+            ax.tricontour(triangles, surface, levels=[taxels.threshold], colors=[colour], linewidths=width)
+
+
+def _dress(ax: Axes, taxels: Taxels, electrodes: ArrayLike | None, title: str | None) -> None:
+    if electrodes is not None:
+        position = np.asarray(electrodes, float)
+        if position.ndim != 2 or position.shape[1] not in (2, 3):
+            raise ValueError(f"electrodes has shape {position.shape}; give positions (L, 2) or (L, 3) in metres.")
+        style = {"markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK, "markeredgewidth": 0.8}
+        ax.plot(*position[:, :2].T, marker="o", linestyle="none", **style)
+    half = np.stack(_sides(taxels), axis=1) / 2
+    places = np.asarray(taxels.places)
+    extent = extent_of(np.concatenate([places - half, places + half]))
+    bare(ax, extent)
+    draw_scale_bar(ax, extent)
+    ax.set_title(title or "")

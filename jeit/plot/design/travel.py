@@ -1,0 +1,61 @@
+"""Where electrodes travelled while a layout was optimised, from start to end."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.patches import Circle, PathPatch
+from matplotlib.path import Path
+
+from jeit.design import Optimisation
+from jeit.mesh import Disk, Domain
+from jeit.plot.axes import INK, SOFT, axes_or_new, bare, draw_scale_bar
+from jeit.plot.imaging.electrodes import METAL
+
+# Corners that a round outline is drawn with.
+_CORNERS = 120
+_FREE = {"facecolor": "none", "edgecolor": SOFT, "hatch": "////", "linewidth": 0.5, "zorder": 1}
+
+
+def plot_travel(
+    optimisation: Optimisation,
+    start: int = 0,
+    *,
+    keep_out: tuple[Domain, ...] = (),
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the way of every electrode of one of the starts: hollow where it began, filled where it ended.
+
+    `start`: which, from 0; `keep_out`: regions to be hatched. The title gives the mean way in millimetres unless one is
+    given. Raises `ValueError` for a start that is not there.
+    """
+    number = len(optimisation.centres)
+    if not isinstance(start, (int, np.integer)) or not 0 <= start < number:
+        raise ValueError(f"start must be from 0 to {number - 1}, of one of the {number} starts; it is {start!r}.")
+    ends, radii = optimisation.centres[start], optimisation.radii[start]
+    ways = np.concatenate([optimisation.snapshots[start], ends[None]])
+    ax = axes_or_new(ax)
+    outline = optimisation.layout.outline
+    if outline is not None:
+        ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9, zorder=2))
+        extent = outline.extent
+        bare(ax, extent)
+        draw_scale_bar(ax, extent)
+    for domain in keep_out:
+        ax.add_patch(PathPatch(outline_path(domain), **_FREE))
+    began = [Circle((x, y), r) for (x, y), r in zip(ways[0], radii, strict=True)]
+    ended = [Circle((x, y), r) for (x, y), r in zip(ends, radii, strict=True)]
+    ax.add_collection(PatchCollection(began, facecolor="none", edgecolor=SOFT, linewidth=1.0, zorder=3))
+    ax.add_collection(LineCollection(list(ways.swapaxes(0, 1)), colors=SOFT, linewidths=1.2, zorder=3))
+    ax.add_collection(PatchCollection(ended, facecolor=METAL, edgecolor=INK, linewidth=0.6, zorder=4))
+    travelled = np.linalg.norm(ends - ways[0], axis=1)
+    ax.set_title(f"Moved {1e3 * travelled.mean():.0f} mm on average" if title is None else title, color=INK)
+    return ax
+
+
+def outline_path(domain: Domain) -> Path:
+    """The edge of a domain and of its holes, closed, in metres."""
+    if isinstance(domain, Disk):
+        return Path(np.asarray(domain.boundary(np.linspace(0, domain.perimeter, _CORNERS))), closed=True)
+    loops = [np.asarray(loop) for loop in (domain.vertices, *getattr(domain, "holes", ()))]
+    return Path.make_compound_path(*(Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in loops))

@@ -1,0 +1,1 @@
+"""Pictures of bodies and images: meshes, electrodes, conductivity, inclusions, voltages, choices of λ."""

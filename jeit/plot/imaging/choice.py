@@ -1,0 +1,154 @@
+"""Parameter choice: the curves that rules for the hyperparameter look at, and the points they choose."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
+
+from jeit.inverse import Choice
+from jeit.plot.axes import INK, SOFT, axes_or_new
+
+# A colour for each rule; numbers that were given, and rules not known here, are drawn in the colour of ink.
+COLOURS = {
+    "gcv": "#d1495b",
+    "l-curve": "#1f6fb4",
+    "discrepancy": "#c9820a",
+    "noise-figure": "#157f3b",
+    "best-resolution": "#7b4fa3",
+}
+# The criterion of each rule, the scale of its axis, and what is looked for.
+_CRITERIA = {
+    "gcv": ("prediction error (σ²)", "log", "least"),
+    "l-curve": ("curvature of the L-curve", "linear", "greatest"),
+    "discrepancy": ("residual (σ)", "log", "equal to the noise"),
+    "noise-figure": ("noise figure", "log", "at its target"),
+    "best-resolution": ("blur radius / body", "linear", "least"),
+}
+
+
+def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = None, ax: Axes | None = None) -> Axes:
+    """Draw what was looked at in choosing a hyperparameter, and the point chosen.
+
+    One `Choice`: for "l-curve" the L-curve, ‖residual‖ against ‖image‖ with the corner marked; for other rules their
+    criterion against λ. Several, by name, as from `jeit.inverse.compare_rules`: the L-curve with all of them marked,
+    where there were data, and the criterion of each; these plots are insets of the axes returned. A choice at the edge
+    of its grid is drawn hollow. Raises `ValueError` where there is nothing to draw: for numbers that were given.
+    """
+    if isinstance(choices, Choice):
+        if choices.criterion.size == 0:
+            raise ValueError("choices: a hyperparameter that was given has no curve; draw one that a rule chose.")
+        ax = axes_or_new(ax, (5.6, 4.2))
+        if choices.rule == "l-curve":
+            _draw_l_curve(ax, choices, [choices])
+            ax.set_title(title or "", loc="left")
+        else:
+            _draw_criterion(ax, choices)
+            ax.set_title(title or _headline(choices), color=_colour(choices), fontsize=11, loc="left")
+            ax.set_xlabel("Hyperparameter λ")
+        return ax
+    several = list(choices.values())
+    rules = [choice for choice in several if choice.criterion.size]
+    if not rules:
+        raise ValueError("choices: there is no choice of a rule among them, so there is no curve to draw.")
+    ax = axes_or_new(ax, (9.6, 5.4))
+    ax.set_axis_off()
+    ax.set_title(title or "", loc="left")
+    with_data = [choice for choice in rules if choice.residual.size]
+    left = 0.0
+    if with_data:
+        left = 0.54
+        # Any of them has the whole curve; the one with most candidates draws it best.
+        longest = max(with_data, key=lambda choice: choice.candidates.size)
+        _draw_l_curve(ax.inset_axes((0, 0, 0.46, 1)), longest, several)
+    height = 1 / len(rules)
+    panel = None
+    for row, choice in enumerate(rules):
+        place = (left, 1 - (row + 1) * height, 1 - left, (0.62 if len(rules) > 1 else 0.95) * height)
+        panel = ax.inset_axes(place, sharex=panel)
+        for other in several:
+            panel.axvline(float(other.hyperparameter), color=_colour(other), linewidth=0.6, alpha=0.45, zorder=0)
+        _draw_criterion(panel, choice, small=len(rules) > 2)
+        panel.tick_params(labelbottom=row == len(rules) - 1)
+    if panel is not None:
+        panel.set_xlabel("Hyperparameter λ")
+    return ax
+
+
+def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
+    """The L-curve, its points at whole decades of λ, and all choices, named in the free corner of the L."""
+    values, residual, penalty = (np.asarray(array) for array in (curve.candidates, curve.residual, curve.penalty))
+    ax.loglog(residual, penalty, color=SOFT, linewidth=1.8, zorder=1)
+    exponents = np.arange(np.ceil(np.log10(values[0])), np.floor(np.log10(values[-1])) + 1, dtype=int)
+    for exponent in exponents:
+        place = curve.read(residual, 10.0**exponent), curve.read(penalty, 10.0**exponent)
+        name = "λ = " if exponent == exponents[-1] else ""
+        label = {"textcoords": "offset points", "ha": "right", "va": "top", "color": SOFT, "fontsize": 7.5}
+        ax.plot(*place, "o", color=SOFT, markersize=3, zorder=1)
+        ax.annotate(f"{name}$10^{{{exponent}}}$", place, (-4, -3), **label)
+    ordered = sorted(choices, key=lambda choice: float(choice.hyperparameter))
+    for number, choice in enumerate(ordered):
+        place = curve.read(residual, choice.hyperparameter), curve.read(penalty, choice.hyperparameter)
+        ax.annotate(
+            _headline(choice),
+            place,
+            (0.36, 0.97 - 0.065 * number),
+            textcoords="axes fraction",
+            color=_colour(choice),
+            va="center",
+            fontsize=9,
+            arrowprops={"arrowstyle": "-", "color": _colour(choice), "linewidth": 0.7, "relpos": (0, 0.5)},
+        )
+        ax.plot(*place, zorder=3, **_marker(choice, 8))
+    ax.set_xlabel("Residual ‖w (v − Jx)‖ (standard deviations)")
+    ax.set_ylabel("Penalty √(xᵀQx)")
+    _tidy(ax)
+
+
+def _draw_criterion(ax: Axes, choice: Choice, *, small: bool = False) -> None:
+    label, scale, aim = _CRITERIA.get(choice.rule, ("criterion", "linear", ""))
+    value = float(choice.hyperparameter)
+    ax.set_xscale("log")
+    ax.set_yscale(scale)
+    ax.plot(np.asarray(choice.candidates), np.asarray(choice.criterion), color=_colour(choice), linewidth=1.6)
+    if choice.target is not None:
+        ax.axhline(choice.target, color=INK, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
+    ax.plot(value, choice.read(choice.criterion), clip_on=False, zorder=3, **_marker(choice, 6 if small else 8))
+    text = f"{label}, {aim}" if aim else label
+    if small:
+        ax.set_title(f"{choice.rule}: {text}", fontsize=8.5, loc="left", pad=3, color=_colour(choice))
+        ax.tick_params(labelsize=7.5)
+    else:
+        ax.axvline(value, color=_colour(choice), linewidth=0.6, alpha=0.45, zorder=0)
+        ax.set_ylabel(text[0].upper() + text[1:])
+    _tidy(ax, ticks=3 if small else 6)
+
+
+def _marker(choice: Choice, size: float) -> dict:
+    face = "white" if choice.edge else _colour(choice)
+    edge = _colour(choice) if choice.edge else "white"
+    style = {"marker": "o", "markersize": size, "linestyle": "none"}
+    return {**style, "markerfacecolor": face, "markeredgecolor": edge, "markeredgewidth": 1.6 if choice.edge else 0.8}
+
+
+def _headline(choice: Choice) -> str:
+    edge = " (edge of the grid)" if choice.edge else ""
+    return f"{choice.rule}: λ = {float(choice.hyperparameter):.3g}{edge}"
+
+
+def _colour(choice: Choice) -> str:
+    return COLOURS.get(choice.rule, INK)
+
+
+def _tidy(ax: Axes, ticks: int = 6) -> None:
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color(SOFT)
+    ax.tick_params(color=SOFT, labelcolor=INK)
+    for axis, number in ((ax.xaxis, 8), (ax.yaxis, ticks)):
+        if axis.get_scale() == "log":
+            axis.set_major_locator(LogLocator(numticks=number))
+            axis.set_minor_formatter(NullFormatter())
+            if number < 6:
+                axis.set_minor_locator(NullLocator())
+        else:
+            axis.set_major_locator(MaxNLocator(number))

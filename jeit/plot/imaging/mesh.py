@@ -1,0 +1,35 @@
+"""Meshes: their cells, their outline, their electrodes."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+
+from jeit.electrodes import AbstractElectrodes
+from jeit.mesh import Mesh
+from jeit.plot.axes import INK, SOFT, axes_or_new, bare, draw_scale_bar, extent_of
+from jeit.plot.imaging.electrodes import draw_electrodes
+
+
+def plot_mesh(
+    mesh: Mesh, electrodes: AbstractElectrodes | None = None, *, title: str | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw a 2-D mesh with its outline, and `electrodes` numbered; of a 3-D mesh its surface, seen from above."""
+    ax = axes_or_new(ax)
+    points = np.asarray(mesh.points)
+    triangles = np.asarray(mesh.cells if mesh.dimension == 2 else mesh.facets)
+    ax.triplot(points[:, 0], points[:, 1], triangles, color=SOFT, linewidth=0.7)
+    if mesh.dimension == 2:
+        draw_outline(mesh, ax)
+    if electrodes is not None:
+        draw_electrodes(mesh, electrodes, ax=ax)
+    extent = extent_of(points)
+    bare(ax, extent)
+    draw_scale_bar(ax, extent)
+    ax.set_title(f"{mesh.num_points:,} nodes, {mesh.num_cells:,} cells" if title is None else title)
+    return ax
+
+
+def draw_outline(mesh: Mesh, ax: Axes) -> None:
+    """The boundary of a 2-D mesh, holes included."""
+    edges = np.asarray(mesh.points)[np.asarray(mesh.facets)]
+    ax.add_collection(LineCollection(list(edges), colors=INK, linewidths=0.9, capstyle="round", zorder=2))

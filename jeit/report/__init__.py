@@ -1,0 +1,12 @@
+"""Everything that is written to a folder: images, tracks, choices of a hyperparameter, layouts, studies."""
+
+from jeit.report.choice import draw_choice as draw_choice
+from jeit.report.choice import report_choice as report_choice
+from jeit.report.choice import write_choice as write_choice
+from jeit.report.image import draw_image as draw_image
+from jeit.report.image import report_image as report_image
+from jeit.report.image import write_image as write_image
+from jeit.report.study import write_study_report as write_study_report
+from jeit.report.track import draw_track as draw_track
+from jeit.report.track import report_track as report_track
+from jeit.report.track import write_track as write_track

@@ -1,0 +1,176 @@
+"""What is left of an imaged difference on disk: a picture, arrays, and a report."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jeit.electrodes import contact_impedance
+from jeit.imaging.difference import ImagedDifference
+from jeit.inverse import LinearReconstruction
+from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain, version_of
+
+_PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix", "matplotlib")
+
+
+def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[float, float] | None = None) -> None:
+    """Write `image.png`, `image.npz` and `report.json` into `folder`, made if need be.
+
+    The NPZ holds `raster` (rows, columns), the change of conductivity (S; 3-D: S/m), NaN outside the body, row 0 at the
+    top, column 0 at the left; `extent` (x_min, x_max, y_min, y_max) in metres; `conductivity` (m,), the same change per
+    cell; `background`, the conductivity it is a change of; `points` (n, d) and `cells` (m, d + 1); and `labels` (rows,
+    columns), if the image was segmented: 0 background, 1 resistive, 2 conductive. `truth`: a known position (x, y) in
+    metres, marked in the picture.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    draw_image(result, truth=truth).savefig(folder / "image.png", dpi=150)
+    arrays: dict[str, Any] = {
+        "raster": np.asarray(result.raster),
+        "extent": np.asarray(result.extent),
+        "conductivity": np.asarray(result.change),
+        "background": np.asarray(result.calibration.conductivity),
+        "points": np.asarray(result.mesh.points),
+        "cells": np.asarray(result.mesh.cells),
+    }
+    if result.labels is not None:
+        arrays["labels"] = result.labels
+    np.savez_compressed(folder / "image.npz", **arrays)
+    text = json.dumps(report_image(result), indent=2, ensure_ascii=False, allow_nan=False)
+    (folder / "report.json").write_text(text + "\n", "utf-8")
+
+
+def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = None):
+    """The picture of a result, as a matplotlib `Figure` that needs no display."""
+    from matplotlib.figure import Figure
+
+    from jeit.plot import draw_labels, plot_image
+
+    figure = Figure(figsize=(6.4, 5.6), layout="constrained")
+    # Iterative images reach from a hundredth to a hundred times the background: on the logarithm's scale both show.
+    ax = plot_image(
+        result.mesh,
+        result.departure / (math.log(10) if result.iterative else 1),
+        result.calibration.model.electrodes,
+        inclusions=result.inclusions if result.labels is None else (),
+        title=result.measurement.name,
+        quantity="log₁₀ of conductivity over background" if result.iterative else None,
+        unit="" if result.iterative else None,
+        ax=figure.subplots(),
+    )
+    if truth is not None:
+        ring = {"marker": "o", "markersize": 15, "markerfacecolor": "none", "markeredgewidth": 2, "linestyle": "none"}
+        ax.plot(*truth, color="#157f3b", label="pressed here", **ring)
+    if result.labels is not None:
+        draw_labels(result.labels, result.extent, ax=ax)
+    elif result.inclusions:
+        ax.plot([], [], color="black", linewidth=1, linestyle=(0, (4, 3)), label="found: sign and area")
+    if ax.get_legend_handles_labels()[1]:
+        ax.legend(loc="upper left", bbox_to_anchor=(0, 0), frameon=False, borderaxespad=0)
+    return figure
+
+
+def report_image(result: ImagedDifference) -> dict[str, Any]:
+    """All that was found and decided, as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    calibration, reconstruction, quality = result.calibration, result.reconstruction, result.quality
+    electrodes, protocol = calibration.model.electrodes, result.measurement.protocol
+    unit = "S" if result.mesh.dimension == 2 else "S/m"
+    noise = quality.difference_noise
+    settings = result.settings
+    background = float(calibration.conductivity)
+    content = {
+        "data": describe_measurement(result.measurement),
+        "reference": describe_measurement(result.reference),
+        "geometry": {
+            **describe_domain(result.measurement.domain or result.reference.domain),
+            "electrodes": describe_electrodes(electrodes),
+            "mesh": {"points": result.mesh.num_points, "cells": result.mesh.num_cells},
+        },
+        "protocol": {
+            "name": protocol.name,
+            "electrodes": protocol.num_electrodes,
+            "drives": protocol.num_drives,
+            "measurements": protocol.num_measurements,
+            "largest_current": float(np.abs(np.asarray(protocol.drive)).max()),
+            "largest_current_unit": "A",
+        },
+        "calibration": {
+            "conductivity": background,
+            "conductivity_unit": unit,
+            "contact": settings.contact,
+            "contact_impedance": None if electrodes.is_point else contact_impedance(electrodes),
+            "contact_impedance_unit": "ohm·m" if result.mesh.dimension == 2 else "ohm·m²",
+            "relative_misfit": float(calibration.misfit),
+            "iterations": calibration.iterations,
+            "status": calibration.status,
+        },
+        "noise": None
+        if noise is None
+        else {
+            "standard_deviation": noise.standard_deviation,
+            "unit": "V",
+            "relative_to_difference": noise.relative,
+            "method": noise.method,
+        },
+        "quality": {
+            "relative_difference": quality.difference,
+            "difference_reciprocity_error": quality.difference_reciprocity_error,
+            "impossible_signs": quality.impossible_signs,
+            "usable_channels": quality.usable_channels,
+        },
+        "reconstruction": {
+            "quantity": f"change of conductivity against the reference, {unit}",
+            "method": settings.method,
+            "least_change_relative_to_background": result.lowest,
+            "prior": _prior(settings),
+            **_iteration(result),
+        },
+        "hyperparameter": {
+            "value": float(reconstruction.hyperparameter),
+            "chosen_by": reconstruction.rule,
+            "note": (reconstruction.choice.note or None) if reconstruction.choice is not None else None,
+        },
+        "inclusions": [
+            {
+                "sign": inclusion.sign,
+                "kind": inclusion.kind,
+                "centroid": list(inclusion.centroid),
+                "centroid_unit": "m",
+                "area": inclusion.area,
+                "area_unit": "m²" if result.mesh.dimension == 2 else "m³",
+                "peak": inclusion.peak,
+                "peak_unit": unit,
+                "peak_relative_to_background": inclusion.peak / background,
+            }
+            for inclusion in result.inclusions
+        ],
+        "inclusion_settings": {"level": settings.level, "least_peak": settings.least_peak},
+        "timings": {**result.timings, "unit": "s"},
+        "versions": {name: version_of(name) for name in _PACKAGES},
+    }
+    return plain(content)
+
+
+def _prior(settings) -> str | None:
+    if settings.method == "total-variation":
+        return "total variation"
+    if settings.method.endswith("back-projection"):
+        return None
+    return settings.prior if isinstance(settings.prior, str) else type(settings.prior).__name__
+
+
+def _iteration(result: ImagedDifference) -> dict[str, Any]:
+    """How the iteration went; nothing for linear images."""
+    found = result.reconstruction
+    if isinstance(found, LinearReconstruction):
+        return {}
+    return {
+        "status": found.status,
+        "reason": found.reason,
+        "iterations": found.iterations,
+        "misfit": float(found.misfit),
+        "misfit_unit": "standard deviations",
+        "objective_per_iteration": np.asarray(found.costs),
+    }

@@ -1,0 +1,3 @@
+"""A study as one HTML page, and its pictures."""
+
+from jeit.report.study.report import write_study_report as write_study_report

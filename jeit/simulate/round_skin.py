@@ -1,0 +1,111 @@
+"""Simulated skins: what a round piezoresistive skin would read while it is pressed.
+
+No openly licensed measurement of a tactile skin exists; this stands in where one is needed, and says so in its notes.
+It uses the forward model, which the readers do not, and is therefore not re-exported by `jeit.data`.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jeit.data.measurement import Measurement
+from jeit.data.screening import screen
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.layout import ring
+from jeit.mesh import Disk, centroids
+from jeit.protocol import adjacent
+
+
+class RoundSkin(eqx.Module):
+    """A round conductive sheet with electrodes along its edge, read by the neighbouring method.
+
+    The defaults are those of Chen et al. (2022): a film of 100 mm diameter, 16 electrodes, 208 voltages.
+
+    **Fields**: `radius` in metres; `num_electrodes`; `electrode_width` in metres; `contact_impedance` in ohm·m;
+    `conductivity`, sheet conductivity in siemens; `current` in amperes; `num_points`, nodes of the mesh that the
+    simulation runs on, to be chosen finer than that of the reconstruction.
+    """
+
+    radius: float = 0.05
+    num_electrodes: int = eqx.field(static=True, default=16)
+    electrode_width: float = 0.008
+    contact_impedance: float = 0.2
+    conductivity: float = 1e-3
+    current: float = 1e-3
+    num_points: int = eqx.field(static=True, default=4000)
+
+    def model(self) -> ForwardModel:
+        """The forward model that simulates the skin."""
+        electrodes = self.electrodes()
+        mesh = Disk(self.radius).mesh(num_points=self.num_points)
+        return ForwardModel(mesh, electrodes, adjacent(self.num_electrodes, current=self.current))
+
+    def electrodes(self) -> BoundaryElectrodes:
+        """The electrodes, the first at 12 o'clock, then clockwise."""
+        position = ring(self.radius, self.num_electrodes, clockwise=True)
+        return BoundaryElectrodes(position, self.electrode_width, self.contact_impedance)
+
+
+@jax.jit
+def pressed_conductivity(
+    points: Float[Array, "m 2"], background: float, position, radius: float, strength: float
+) -> Float[Array, " m"]:
+    """Conductivity (m,) at `points` of a sheet pressed by a sphere: σ₀ (1 + strength √(1 - (r / radius)²)).
+
+    The change follows Hertz's pressure under a sphere: `strength` (relative) in the middle of a contact of `radius`
+    metres round `position`, zero at its edge. More pressure, more contact, more conductivity.
+    """
+    squared = jnp.sum((points - jnp.asarray(position)) ** 2, axis=-1) / radius**2
+    return background * (1 + strength * jnp.sqrt(jnp.maximum(1 - squared, 0)))
+
+
+def simulate_press(
+    skin: RoundSkin,
+    key: Array,
+    position: tuple[float, float],
+    *,
+    radius: float = 0.008,
+    strength: float = 0.5,
+    noise: float = 1e-4,
+) -> tuple[Measurement, Measurement]:
+    """A frame of the pressed skin and one of the skin at rest, `(pressed, rest)`.
+
+    `key`: of the random noise (`jax.random.key`). `position` (x, y) of the press and `radius` of its contact, metres.
+    `strength`: greatest relative change of conductivity. `noise`: standard deviation of the noise in each voltage,
+    relative to their root mean square (1e-4: 80 dB). Raises `ValueError` for a press beyond the edge, or values that
+    are not positive.
+    """
+    where = np.asarray(position, float)
+    if where.shape != (2,) or not np.isfinite(where).all():
+        raise ValueError(f"position: give (x, y) in metres, not {position!r}.")
+    if not (np.isfinite(radius) and radius > 0):
+        raise ValueError(f"radius: the contact must be of positive size, in metres; it is {radius}.")
+    if np.hypot(*where) + radius > skin.radius:
+        raise ValueError(
+            f"position: a press at ({where[0]:g}, {where[1]:g}) m with a contact of radius {radius:g} m reaches beyond "
+            f"the skin, whose radius is {skin.radius:g} m. Positions are in metres from its centre."
+        )
+    if not (np.isfinite(strength) and strength > -1 and strength != 0):
+        raise ValueError(f"strength: the relative change must be above -1 and not zero; it is {strength}.")
+    if not (np.isfinite(noise) and noise >= 0):
+        raise ValueError(f"noise must be zero or positive, relative to the voltages; it is {noise}.")
+    model = skin.model()
+    points = centroids(model.mesh)
+    rest = jnp.full(model.mesh.num_cells, skin.conductivity)
+    pressed = pressed_conductivity(points, skin.conductivity, where, radius, strength)
+    frames = jnp.stack([model.voltages(pressed), model.voltages(rest)])
+    frames += noise * jnp.sqrt(jnp.mean(frames**2)) * jax.random.normal(key, frames.shape)
+    measured = screen(
+        np.asarray(frames),
+        model.protocol,
+        electrodes=model.electrodes,
+        domain=Disk(skin.radius),
+        name="simulated press",
+        source="simulated",
+        frame_names=("pressed", "reference"),
+        notes=(f"simulated on a mesh of {model.mesh.num_points} nodes, with {noise:g} relative noise; not measured.",),
+    )
+    return measured.frame("pressed"), measured.frame("reference")

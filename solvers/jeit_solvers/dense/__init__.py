@@ -1,0 +1,1 @@
+"""Small dense systems in elementwise operations and matrix products, which batch."""

@@ -1,0 +1,191 @@
+"""Many small minimisations at once: functions of a few unknowns, damped Newton steps between bounds.
+
+The batch is the last axis of every array, so that each operation runs along it; with two to six unknowns the linear
+systems are solved by formulas written out.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+# What a function must give at x (n, F), with data whose last axis is F: its value (F,), gradient (n, F), and a positive
+# definite model of its Hessian (n, n, F), the Gauss-Newton or Fisher matrix for instance.
+Expansion = Callable[[Array, Any], tuple[Array, Array, Array]]
+
+_MOST_DAMPING = 1e12
+# Gathering fewer than so many is not worth it.
+_LEAST_PART = 32
+
+
+class Minimum(eqx.Module):
+    """Where the batch ended: `x` (n, F), `value` (F,), `converged` (F,), and the `steps` that the slowest took."""
+
+    x: Float[Array, "n F"]
+    value: Float[Array, " F"]
+    converged: Bool[Array, " F"]
+    steps: Int[Array, ""]
+
+
+def solve_small(matrix: Float[Array, "n n F"], right: Float[Array, "n F"]) -> Float[Array, "n F"]:
+    """Solve F symmetric positive definite systems of n unknowns by Cholesky's method, written out."""
+    number, lower = matrix.shape[0], _cholesky(matrix)
+    forward: list[Array] = []
+    for i in range(number):
+        rest = right[i] - sum((lower[i, k] * forward[k] for k in range(i)), jnp.zeros(()))
+        forward.append(rest / lower[i, i])
+    solution: dict[int, Array] = {}
+    for i in reversed(range(number)):
+        rest = forward[i] - sum((lower[k, i] * solution[k] for k in range(i + 1, number)), jnp.zeros(()))
+        solution[i] = rest / lower[i, i]
+    return jnp.stack([solution[i] for i in range(number)])
+
+
+def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n n F"]:
+    """The Hessians at x of F functions, each of its own column: `value` (n, F) -> (F,)."""
+    slope = jax.grad(lambda at: jnp.sum(value(at)))
+    directions = jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)
+    return jnp.stack([jax.jvp(slope, (x,), (direction,))[1] for direction in directions])
+
+
+def definite_small(matrix: Float[Array, "n n F"]) -> Bool[Array, " F"]:
+    """Which of F symmetric matrices are positive definite."""
+    lower = _cholesky(matrix)
+    diagonal = jnp.stack([lower[i, i] for i in range(len(matrix))])
+    return jnp.all(jnp.isfinite(diagonal) & (diagonal > 0), axis=0)
+
+
+def _cholesky(matrix: Float[Array, "n n F"]) -> dict[tuple[int, int], Array]:
+    lower: dict[tuple[int, int], Array] = {}
+    for j in range(matrix.shape[0]):
+        for i in range(j, matrix.shape[0]):
+            rest = matrix[i, j] - sum((lower[i, k] * lower[j, k] for k in range(j)), jnp.zeros(()))
+            lower[i, j] = jnp.sqrt(rest) if i == j else rest / lower[j, j]
+    return lower
+
+
+def symmetric_small(rows: Sequence[Sequence[Array]]) -> Float[Array, "n n F"]:
+    """The symmetric matrices of which `rows` are the lower triangles, entries (F,)."""
+    number = len(rows)
+    return jnp.stack([jnp.stack([rows[max(i, j)][min(i, j)] for j in range(number)]) for i in range(number)])
+
+
+def inverse_small(matrix: Float[Array, "n n F"]) -> Float[Array, "n n F"]:
+    """The inverses of F symmetric positive definite matrices."""
+    identity = jnp.eye(len(matrix))[:, :, None] * jnp.ones_like(matrix[0])
+    return jnp.stack([solve_small(matrix, column) for column in identity])
+
+
+class _State(eqx.Module):
+    """Where each function of a batch stands."""
+
+    x: Array
+    value: Array
+    gradient: Array
+    matrix: Array
+    damping: Array
+    taken: Array
+    done: Array
+    converged: Array
+
+
+def minimise_small(
+    expand: Expansion,
+    start: Float[Array, "n F"],
+    data: Any = None,
+    *,
+    finish: Expansion | None = None,
+    lower: Float[Array, "n 1"],
+    upper: Float[Array, "n 1"],
+    largest_step: Float[Array, "n 1"],
+    max_steps: int = 30,
+    tolerance: float = 1e-10,
+    whole_steps: int = 8,
+    skip: Bool[Array, " F"] | None = None,
+) -> Minimum:
+    """Minimise F functions of n unknowns between bounds by projected, damped Newton steps (Bertsekas 1982).
+
+    `expand(x, data)`: see `Expansion`; `data`: arrays whose last axis is F. An unknown at its bound whose gradient
+    pushes outwards is held; the others step. Damping as in Levenberg and Marquardt, by the diagonal. Converged: the
+    next step promises to lower the value by less than `tolerance` · (1 + |value|). Functions that are not finite at
+    their start stay there, not converged, their value infinite; so do those to `skip`.
+
+    All take `whole_steps` steps together; those that need more, mostly few, are then gathered and go on, a quarter of
+    the batch at a time, with the expansion `finish` if there is one: a dearer one with the exact Hessian, say.
+    """
+    first = jnp.clip(start, lower, upper)
+    number = first.shape[1]
+
+    def step_from(state: _State):
+        x, gradient, matrix = state.x, state.gradient, state.matrix
+        held = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
+        diagonal = jnp.eye(x.shape[0], dtype=bool)[:, :, None]
+        damped = matrix + diagonal * (state.damping * matrix + 1e-300)
+        damped = jnp.where(held[:, None] | held[None], jnp.where(diagonal, 1.0, 0.0), damped)
+        step = -solve_small(damped, jnp.where(held, 0.0, gradient))
+        step = jnp.where(jnp.isfinite(step), step, 0.0)
+        step = step / jnp.maximum(1.0, jnp.max(jnp.abs(step) / largest_step, axis=0))
+        new = jnp.clip(x + step, lower, upper)
+        return new, -jnp.sum((new - x) * gradient, axis=0)
+
+    def advance(state: _State, data, steps: int, expand: Expansion) -> _State:
+        def body(loop):
+            count, state = loop
+            # The first turn only looks at the start: no step leads away from there yet.
+            fresh = jnp.isinf(state.value)
+            trial, promised = step_from(state)
+            value, gradient, matrix = expand(trial, data)
+            better = (value <= state.value) & ~state.done
+            # Cut off at a bound, a step may lead uphill: then a more damped one, closer to the gradient, is tried.
+            settled = (promised >= 0) & (promised <= tolerance * (1 + jnp.abs(state.value))) & ~fresh
+            damping = jnp.where(better, jnp.maximum(state.damping / 10, 1e-12), 8 * jnp.maximum(state.damping, 1e-4))
+            taken = state.taken + ~(state.done | fresh)
+            # A step too small to tell better from worse ends the search as well.
+            converged = state.converged | (~state.done & (settled | (damping > _MOST_DAMPING)))
+            broken = fresh & ~jnp.isfinite(value)
+            return count + 1, _State(
+                x=jnp.where(better, trial, state.x),
+                value=jnp.where(better, value, state.value),
+                gradient=jnp.where(better, gradient, state.gradient),
+                matrix=jnp.where(better, matrix, state.matrix),
+                damping=damping,
+                taken=taken,
+                done=state.done | converged | broken | (taken >= max_steps),
+                converged=converged,
+            )
+
+        def go_on(loop):
+            return (loop[0] < steps) & ~jnp.all(loop[1].done)
+
+        return jax.lax.while_loop(go_on, body, (jnp.zeros((), int), state))[1]
+
+    nothing = jnp.zeros(number, bool)
+    state = _State(
+        x=first,
+        value=jnp.full(number, jnp.inf),
+        gradient=jnp.zeros_like(first),
+        matrix=jnp.eye(len(first))[:, :, None] * jnp.ones_like(first),
+        damping=jnp.full(number, 1e-2),
+        taken=jnp.zeros(number, int),
+        done=nothing if skip is None else skip,
+        converged=nothing,
+    )
+    part = number // 4
+    if part < _LEAST_PART:
+        state = advance(state, data, max_steps + 1, finish or expand)
+    else:
+        if skip is None:
+            state = advance(state, data, whole_steps + 1, expand)
+
+        def go_on_with_some(state: _State) -> _State:
+            index = jnp.nonzero(~state.done, size=part, fill_value=number)[0]
+            gathered, mine = jax.tree.map(lambda array: jnp.take(array, index, axis=-1, mode="clip"), (state, data))
+            gathered = eqx.tree_at(lambda s: s.done, gathered, gathered.done | (index == number))
+            ended = advance(gathered, mine, max_steps + 1, finish or expand)
+            return jax.tree.map(lambda all, some: all.at[..., index].set(some, mode="drop"), state, ended)
+
+        state = jax.lax.while_loop(lambda state: ~jnp.all(state.done), go_on_with_some, state)
+    return Minimum(state.x, state.value, state.converged, jnp.max(state.taken))

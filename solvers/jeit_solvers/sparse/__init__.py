@@ -1,0 +1,1 @@
+"""Sparse symmetric systems: the multifrontal direct solver, conjugate gradients, and the choice between them."""

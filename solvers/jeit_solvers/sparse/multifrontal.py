@@ -1,0 +1,182 @@
+"""The numeric half of the direct solver, in pure JAX: factorise, solve, and products with the inverse."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Inexact, Int
+
+from jeit_solvers.batching import differentiable_batches, in_turn, one_by_one
+from jeit_solvers.dense.cholesky import inverse_cholesky
+from jeit_solvers.sparse.index_store import IndexLayout
+from jeit_solvers.sparse.plan import FactorisationPlan, Stage
+
+
+class Factor(eqx.Module):
+    """A factorised matrix A = L L^T: two arrays for every stage of its plan.
+
+    `inverses` (batch, pivots, pivots) of L's diagonal blocks, and `lowers` (batch, border, pivots), the blocks below
+    them: solving is nothing but matrix products. For a complex symmetric A, transposes are not conjugated.
+    """
+
+    inverses: tuple[Inexact[Array, "batch pivots pivots"], ...]
+    lowers: tuple[Inexact[Array, "batch border pivots"], ...]
+
+    @property
+    def positive_definite(self) -> Bool[Array, ""]:
+        """Whether the matrix was positive definite (complex: every pivot had a positive real part)."""
+        diagonals = [jnp.diagonal(inverse, axis1=-2, axis2=-1) for inverse in self.inverses]
+        return jnp.all(jnp.stack([jnp.all(jnp.isfinite(diagonal), axis=(-2, -1)) for diagonal in diagonals]), axis=0)
+
+    def require_positive_definite(self) -> None:
+        """Raise a ValueError if the matrix was not positive definite; does nothing while JAX traces."""
+        verdict = self.positive_definite
+        if not isinstance(verdict, Tracer) and not verdict.all():
+            raise ValueError(
+                "factorise: the matrix is not positive definite, so it has no Cholesky factor. In a finite-element "
+                "system the usual reasons are: a coefficient that is zero, negative or NaN somewhere; no boundary "
+                "condition that fixes the solution's constant part, which leaves the matrix singular; or a part of the "
+                "mesh that is not connected to the rest."
+            )
+
+
+def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor:
+    """Factorise the matrix with the given values (nnz,), in the order of the pattern that `plan` was made for.
+
+    Real values must make a positive definite matrix. Complex ones make a complex *symmetric* matrix, whose real part
+    must be positive definite (an admittivity). If they do not, the factor is NaN and `positive_definite` is false.
+    """
+    if values.shape != (plan.num_entries,):
+        raise ValueError(
+            f"factorise: `values` must have shape {(plan.num_entries,)}, the entries of the plan's pattern; "
+            f"got {values.shape}. Use jax.vmap for a batch of matrices."
+        )
+    numeric = in_turn(partial(_factorise, plan.layout))
+    return numeric(plan.indices, values)
+
+
+# Compiled functions of their own, so that a second program with the same plan need not trace them again.
+@partial(jax.jit, static_argnums=0)
+def _factorise(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Factor:
+    stages, _ = layout.content
+    dtype = values.dtype
+    extended = jnp.concatenate([values, jnp.ones(1, dtype)])
+    inverses, lowers, left = [], [], []
+    for stage in stages:
+        pivots, border = stage.pivots, stage.border
+        panel = stage.entries.apply(indices, extended)
+        corner = jnp.zeros(stage.batch * border * border, dtype)
+        for link in stage.links:
+            schur = left[link.source].reshape(-1)
+            panel = panel + link.panel.apply(indices, schur)
+            corner = corner + link.corner.apply(indices, schur)
+        panel = panel.reshape(stage.batch, pivots + border, pivots)
+        inverse = inverse_cholesky(panel[:, :pivots])
+        lower = panel[:, pivots:] @ _transposed(inverse)
+        inverses.append(inverse)
+        lowers.append(lower)
+        left.append(corner.reshape(stage.batch, border, border) - lower @ _transposed(lower))
+    return Factor(tuple(inverses), tuple(lowers))
+
+
+def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
+    """x with A x = b, for one right-hand side (n,) or several (n, k) at once."""
+    vectors = _columns(plan, right_hand_sides, "solve")
+    numeric = differentiable_batches(partial(_solve, plan.layout), _batch_of_solves)
+    return numeric(plan.indices, factor, vectors).reshape(right_hand_sides.shape)
+
+
+@partial(jax.jit, static_argnums=0)
+def _solve(
+    layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
+) -> Inexact[Array, "n k"]:
+    stages, solution = layout.content
+    reduced = _forward(layout, indices, factor, vectors)
+    return _backward(stages, indices, factor, reduced)[solution.read(indices)]
+
+
+def _batch_of_solves(batchable, plain, axis_size, batched, indices, factor, vectors):
+    """More right-hand sides for one factor are more columns; more factors are solved with one by one."""
+    if any(jax.tree.leaves(batched[:2])):
+        return one_by_one(batchable, plain, axis_size, batched, indices, factor, vectors)
+    size, count = vectors.shape[1:]
+    columns = jnp.moveaxis(vectors, 0, 1).reshape(size, axis_size * count)
+    return jnp.moveaxis(batchable(indices, factor, columns).reshape(size, axis_size, count), 1, 0)
+
+
+def half_solve(
+    plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n k"]
+) -> Inexact[Array, "rows k"]:
+    """Y = L^-1 P b, rows in the order of elimination and with rows of zeros for padding: Y^T Y = b^T A^-1 b.
+
+    Half the work of `solve`, if products with the inverse are all that is wanted.
+    """
+    reduced = _forward(plan.layout, plan.indices, factor, _columns(plan, right_hand_sides, "half_solve"))
+    return jnp.concatenate([rows.reshape(-1, rows.shape[-1]) for rows in reduced])
+
+
+def quadratic_form(
+    plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n k"]
+) -> Inexact[Array, "k k"]:
+    """b^T A^-1 b, symmetric (complex: not conjugated), by the forward half of a solve."""
+    half = half_solve(plan, factor, right_hand_sides)
+    return half.T @ half
+
+
+def _transposed(matrices: Inexact[Array, "batch a b"]) -> Inexact[Array, "batch b a"]:
+    return jnp.swapaxes(matrices, -1, -2)
+
+
+def _columns(plan: FactorisationPlan, right_hand_sides: Inexact[Array, "n *k"], where: str) -> Inexact[Array, "n k"]:
+    if right_hand_sides.ndim not in (1, 2) or right_hand_sides.shape[0] != plan.size:
+        raise ValueError(
+            f"{where}: right-hand sides must have shape (n,) or (n, k) with n = {plan.size}; "
+            f"got {right_hand_sides.shape}."
+        )
+    return right_hand_sides.reshape(plan.size, -1)
+
+
+@partial(jax.jit, static_argnums=0)
+def _forward(
+    layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
+) -> list[Inexact[Array, "batch pivots k"]]:
+    """L^-1 times the vectors, stage by stage. A front's pivot rows gather what its children have subtracted."""
+    stages, _ = layout.content
+    count = vectors.shape[1]
+    reduced, updates = [], []
+    for stage, inverse, lower in zip(stages, factor.inverses, factor.lowers, strict=True):
+        rows = vectors.at[stage.right_hand_side.read(indices)].get(mode="fill", fill_value=0)
+        passed_on = jnp.zeros((), vectors.dtype)
+        for link in stage.links:
+            received = link.rows.apply(indices, updates[link.source].reshape(-1, count))
+            received = received.reshape(stage.batch, -1, count)
+            rows = rows + received[:, : stage.pivots]
+            passed_on = passed_on + received[:, stage.pivots :]
+        reduced.append(inverse @ rows)
+        updates.append(passed_on - lower @ reduced[-1])
+    return reduced
+
+
+def _backward(
+    stages: tuple[Stage, ...],
+    indices: Int[Array, " total"],
+    factor: Factor,
+    reduced: list[Inexact[Array, "batch pivots k"]],
+) -> Inexact[Array, "rows k"]:
+    """L^-T times the vectors, from the root down: the pivots of all stages. A front finds its border's solution in its
+    parent."""
+    count = reduced[0].shape[-1]
+    fronts: dict[int, Inexact[Array, "rows k"]] = {}
+    solved = []
+    for number in reversed(range(len(stages))):
+        stage, local = stages[number], reduced[number]
+        above = jnp.zeros((stage.batch, 0, count), local.dtype)
+        if stage.border:
+            above = fronts[stage.parent].at[stage.above.read(indices)].get(mode="fill", fill_value=0)
+            local = local - _transposed(factor.lowers[number]) @ above
+        pivots = _transposed(factor.inverses[number]) @ local
+        solved.append(pivots.reshape(-1, count))
+        fronts[number] = jnp.concatenate([pivots, above], axis=1).reshape(-1, count)
+    return jnp.concatenate(solved[::-1])

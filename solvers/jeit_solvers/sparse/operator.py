@@ -1,0 +1,101 @@
+"""Sparse symmetric matrices as lineax operators."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax
+from jaxtyping import Array, Inexact
+
+from jeit_solvers.sparse.pattern import SparsityPattern
+
+
+class SparseSymmetric(lineax.AbstractLinearOperator):
+    """The symmetric (n, n) matrix with the given values (nnz,) in a sparsity pattern.
+
+    Real matrices are taken to be positive definite, as the solvers of this package need them. Complex ones are
+    symmetric, not Hermitian. Differentiable in `values`.
+    """
+
+    values: Inexact[Array, " nnz"]
+    pattern: SparsityPattern
+
+    def __init__(self, values: Inexact[Array, " nnz"], pattern: SparsityPattern):
+        values = jnp.asarray(values)
+        if values.shape != (pattern.num_entries,):
+            raise ValueError(
+                f"SparseSymmetric: `values` must have shape {(pattern.num_entries,)}, one for each entry of the "
+                f"pattern; got {values.shape}. Make them with `pattern.assemble`; use jax.vmap for batches."
+            )
+        if not jnp.issubdtype(values.dtype, jnp.inexact):
+            raise ValueError(f"SparseSymmetric: `values` must be floating point; got dtype {values.dtype}.")
+        self.values = values
+        self.pattern = pattern
+
+    def mv(self, vector: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+        return self.pattern.multiply(self.values, vector)
+
+    def as_matrix(self) -> Inexact[Array, "n n"]:
+        return self.pattern.to_dense(self.values)
+
+    def transpose(self) -> "SparseSymmetric":
+        return self
+
+    def in_structure(self) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((self.pattern.size,), self.values.dtype)
+
+    def out_structure(self) -> jax.ShapeDtypeStruct:
+        return self.in_structure()
+
+
+@lineax.linearise.register(SparseSymmetric)
+@lineax.materialise.register(SparseSymmetric)
+def _(operator: SparseSymmetric) -> SparseSymmetric:
+    return operator
+
+
+@lineax.conj.register(SparseSymmetric)
+def _(operator: SparseSymmetric) -> SparseSymmetric:
+    return eqx.tree_at(lambda op: op.values, operator, operator.values.conj())
+
+
+@lineax.diagonal.register(SparseSymmetric)
+def _(operator: SparseSymmetric) -> Inexact[Array, " n"]:
+    return operator.pattern.diagonal(operator.values)
+
+
+@lineax.tridiagonal.register(SparseSymmetric)
+def _(operator: SparseSymmetric):
+    matrix = operator.as_matrix()
+    return jnp.diagonal(matrix), jnp.diagonal(matrix, -1), jnp.diagonal(matrix, 1)
+
+
+@lineax.is_symmetric.register(SparseSymmetric)
+def _(operator: SparseSymmetric) -> bool:
+    return True
+
+
+@lineax.is_positive_semidefinite.register(SparseSymmetric)
+def _(operator: SparseSymmetric) -> bool:
+    return not jnp.issubdtype(operator.values.dtype, jnp.complexfloating)
+
+
+@lineax.is_negative_semidefinite.register(SparseSymmetric)
+@lineax.is_diagonal.register(SparseSymmetric)
+@lineax.is_tridiagonal.register(SparseSymmetric)
+@lineax.has_unit_diagonal.register(SparseSymmetric)
+@lineax.is_lower_triangular.register(SparseSymmetric)
+@lineax.is_upper_triangular.register(SparseSymmetric)
+def _(operator: SparseSymmetric) -> bool:
+    return False
+
+
+def require_sparse_symmetric(operator: lineax.AbstractLinearOperator, solver: str) -> SparseSymmetric:
+    """The operator, if it is a `SparseSymmetric`; otherwise a ValueError that says how to make one."""
+    if isinstance(operator, lineax.TaggedLinearOperator):
+        operator = operator.operator
+    if not isinstance(operator, SparseSymmetric):
+        raise ValueError(
+            f"{solver} solves systems with `SparseSymmetric` operators only; got a {type(operator).__name__}. Make one "
+            "with `pattern, values = SparsityPattern.from_matrix(matrix)` and `SparseSymmetric(values, pattern)`."
+        )
+    return operator

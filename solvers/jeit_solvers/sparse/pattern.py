@@ -1,0 +1,235 @@
+"""Sparsity patterns of symmetric matrices, and fast assembly of element matrices into them."""
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Inexact, Int
+from scipy.sparse import coo_array, csr_array, issparse
+
+from jeit_solvers.sparse.assembly import AssemblyMap
+from jeit_solvers.sparse.index_store import IndexLayout, IndexStore, Slot
+
+
+class SparsityPattern(eqx.Module):
+    """Which entries of a symmetric (n, n) matrix may be non-zero: its lower triangle, diagonal included.
+
+    A matrix with this pattern is its `values` (nnz,): `values[k]` stands at `(rows[k], columns[k])` and also at
+    `(columns[k], rows[k])`. The diagonal comes first, `values[:n]`, then the entries below it, row by row.
+
+    Build one with `from_elements`, `from_entries` or `from_matrix`. Its indices are one
+    leaf of the pytree: pass a pattern to a jitted function as an argument, and they are not baked into the executable.
+    """
+
+    indices: Int[Array, " total"]
+    layout: IndexLayout = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+
+    @property
+    def num_entries(self) -> int:
+        """Stored entries, nnz: the diagonal and what is below it."""
+        return self._slots.shape[1]
+
+    @property
+    def rows(self) -> Int[Array, " nnz"]:
+        """Row of every stored entry; not less than its column."""
+        return self._slots.read(self.indices)[0]
+
+    @property
+    def columns(self) -> Int[Array, " nnz"]:
+        """Column of every stored entry."""
+        return self._slots.read(self.indices)[1]
+
+    @property
+    def _slots(self) -> Slot:
+        return self.layout.content[0]
+
+    @property
+    def _assembly(self) -> tuple[AssemblyMap, ...]:
+        return self.layout.content[1]
+
+    @classmethod
+    def from_elements(cls, groups: Sequence[Any], size: int) -> Self:
+        """The pattern of a finite-element matrix: nodes of one element are coupled.
+
+        **Arguments:**
+
+        - `groups`: groups of elements, each an integer array (m, k) of node numbers: cells (m, 3), boundary
+          facets (b, 2) … A group may bring couplings that no other group has.
+        - `size`: number of nodes, n.
+
+        Raises a ValueError for node numbers out of range, for elements that name a node twice, and for nodes that
+        belong to no element (their row would be empty and the matrix singular).
+        """
+        size = _checked_size(size)
+        if len(groups) == 0:
+            raise ValueError("from_elements: `groups` is empty; give at least one (m, k) array of node numbers.")
+        row_lists, column_lists, shapes = [], [], []
+        for number, group in enumerate(groups):
+            elements = _checked_integers(group, f"from_elements: `groups[{number}]`")
+            if elements.ndim != 2:
+                raise ValueError(
+                    f"from_elements: `groups[{number}]` must have shape (m, k), one row of node numbers to an element; "
+                    f"got {elements.shape}."
+                )
+            _check_range(elements, size, f"from_elements: `groups[{number}]`")
+            in_order = np.sort(elements, axis=1)
+            twice = np.flatnonzero((in_order[:, 1:] == in_order[:, :-1]).any(axis=1))
+            if twice.size:
+                raise ValueError(
+                    f"from_elements: element {twice[0]} of `groups[{number}]` names a node twice: "
+                    f"{elements[twice[0]].tolist()}. Remove degenerate elements from the mesh."
+                )
+            first, second = np.tril_indices(elements.shape[1])
+            row_lists.append(elements[:, first].T.ravel())
+            column_lists.append(elements[:, second].T.ravel())
+            shapes.append(elements.shape)
+        return cls._from_contributions(row_lists, column_lists, shapes, size, "from_elements", "belong to no element")
+
+    @classmethod
+    def from_entries(cls, rows: Any, columns: Any, size: int) -> Self:
+        """The pattern with the given entries, each named once as (row, column) or as (column, row).
+
+        `assemble` then takes one array (entries,) in the order given here; entries named more than once add up.
+        Raises a ValueError for indices out of range and for rows without a diagonal entry.
+        """
+        size = _checked_size(size)
+        rows = _checked_integers(rows, "from_entries: `rows`")
+        columns = _checked_integers(columns, "from_entries: `columns`")
+        if rows.ndim != 1 or rows.shape != columns.shape:
+            raise ValueError(
+                "from_entries: `rows` and `columns` must be 1-D and equally long; "
+                f"got shapes {rows.shape} and {columns.shape}."
+            )
+        _check_range(rows, size, "from_entries: `rows`")
+        _check_range(columns, size, "from_entries: `columns`")
+        return cls._from_contributions([rows], [columns], [rows.shape], size, "from_entries", "have no diagonal entry")
+
+    @classmethod
+    def from_matrix(cls, matrix: Any) -> tuple[Self, Array]:
+        """Pattern and values (nnz,) of a symmetric SciPy sparse matrix or dense array, both triangles given.
+
+        Raises a ValueError unless the matrix is square, symmetric (not Hermitian: complex values are not conjugated),
+        finite and without missing diagonal entries.
+        """
+        if not issparse(matrix):
+            matrix = np.asarray(matrix)
+        if len(matrix.shape) != 2 or matrix.shape[0] != matrix.shape[1]:
+            raise ValueError(f"from_matrix: `matrix` must be square; got shape {matrix.shape}.")
+        full = csr_array(matrix)
+        full.sum_duplicates()
+        if not np.isfinite(full.data).all():
+            raise ValueError("from_matrix: `matrix` has entries that are NaN or infinite; remove them first.")
+        skew = abs(full - full.T)
+        largest = abs(full).max() if full.nnz else 0.0
+        if skew.nnz and skew.max() > 1e-12 * largest:
+            raise ValueError(
+                f"from_matrix: `matrix` is not symmetric: |A - A^T| is up to {skew.max():.3g}, "
+                f"and its largest entry is {largest:.3g}. Give both triangles, or (matrix + matrix.T) / 2 if the "
+                "difference is noise."
+            )
+        entries = coo_array(full)
+        rows, columns = entries.coords
+        lower = rows >= columns
+        pattern = cls.from_entries(rows[lower], columns[lower], matrix.shape[0])
+        return pattern, pattern.assemble(jnp.asarray(entries.data[lower]))
+
+    @classmethod
+    def _from_contributions(cls, row_lists, column_lists, shapes, size, where, what) -> Self:
+        """Unique entries of all groups in the pattern's order, and each group's map into them."""
+        keys = []
+        for rows, columns in zip(row_lists, column_lists, strict=True):
+            above, below = np.maximum(rows, columns), np.minimum(rows, columns)
+            # Negative keys put the diagonal first, in row order.
+            keys.append(np.where(above == below, above - size, above * size + below))
+        unique, entry = np.unique(np.concatenate(keys), return_inverse=True)
+        on_diagonal = np.zeros(size, dtype=bool)
+        on_diagonal[unique[unique < 0] + size] = True
+        if not on_diagonal.all():
+            missing = np.flatnonzero(~on_diagonal)
+            raise ValueError(
+                f"{where}: {missing.size} of {size} rows {what}, the first are {missing[:5].tolist()}. A matrix with "
+                "this pattern cannot be positive definite: leave these unknowns out, and number the rest 0..n-1."
+            )
+        below = unique[size:]
+        rows = np.concatenate([np.arange(size), below // size])
+        columns = np.concatenate([np.arange(size), below % size])
+        ends = np.cumsum([key.size for key in keys])
+        store = IndexStore()
+        entries = store.add(np.stack([rows, columns]))
+        maps = tuple(
+            AssemblyMap.create(store, part, size, unique.size, shape)
+            for part, shape in zip(np.split(entry, ends[:-1]), shapes, strict=True)
+        )
+        return cls(store.pack(), IndexLayout(entries, maps), size)
+
+    def assemble(self, *element_matrices: Inexact[Array, "..."] | None) -> Inexact[Array, " nnz"]:
+        """Add element matrices up into the matrix's values (nnz,).
+
+        One argument for each group the pattern was made from, in their order: symmetric matrices (m, k, k), of which
+        only the lower triangles are read; or just these, packed as (k (k + 1) / 2, m), rows in the order of
+        `numpy.tril_indices(k)`; or None, for a group that adds nothing this time. Real or complex.
+        """
+        if len(element_matrices) != len(self._assembly):
+            raise ValueError(
+                f"assemble: this pattern has {len(self._assembly)} groups of elements, "
+                f"and {len(element_matrices)} arrays were given; use None for a group that adds nothing."
+            )
+        parts = [
+            group.apply(self.indices, jnp.asarray(matrices), f"assemble: argument {number}")
+            for number, (group, matrices) in enumerate(zip(self._assembly, element_matrices, strict=True))
+            if matrices is not None
+        ]
+        if not parts:
+            raise ValueError("assemble: every group is None, so there is nothing to assemble.")
+        return sum(parts[1:], start=parts[0])
+
+    def diagonal(self, values: Inexact[Array, " nnz"]) -> Inexact[Array, " n"]:
+        """The matrix's diagonal (n,)."""
+        return values[: self.size]
+
+    def multiply(self, values: Inexact[Array, " nnz"], vectors: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
+        """The product A x for one vector (n,) or several (n, k)."""
+        expand = (...,) + (None,) * (vectors.ndim - 1)
+        below = values[self.size :][expand]
+        rows, columns = self.rows[self.size :], self.columns[self.size :]
+        result = values[: self.size][expand] * vectors
+        result = result.at[rows].add(below * vectors[columns])
+        return result.at[columns].add(below * vectors[rows])
+
+    def to_dense(self, values: Inexact[Array, " nnz"]) -> Inexact[Array, "n n"]:
+        """The matrix as a dense array (n, n)."""
+        dense = jnp.zeros((self.size, self.size), values.dtype)
+        return dense.at[self.rows, self.columns].set(values).at[self.columns, self.rows].set(values)
+
+    def to_scipy(self, values: Any) -> csr_array:
+        """The matrix as a SciPy sparse array (n, n), both triangles."""
+        values = np.asarray(values)
+        rows, columns = np.asarray(self.rows), np.asarray(self.columns)
+        below = slice(self.size, None)
+        coordinates = (np.concatenate([rows, columns[below]]), np.concatenate([columns, rows[below]]))
+        data = np.concatenate([values, values[below]])
+        return csr_array(coo_array((data, coordinates), shape=(self.size, self.size)))
+
+
+def _checked_size(size: Any) -> int:
+    if not isinstance(size, int | np.integer) or isinstance(size, bool) or size < 1:
+        raise ValueError(f"`size` must be a positive integer, the number of rows; got {size!r}.")
+    return int(size)
+
+
+def _checked_integers(array: Any, name: str) -> np.ndarray:
+    array = np.asarray(array)
+    if not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{name} must hold integers, counted from 0; got dtype {array.dtype}.")
+    return array.astype(np.int64)
+
+
+def _check_range(indices: np.ndarray, size: int, name: str) -> None:
+    if indices.size and (indices.min() < 0 or indices.max() >= size):
+        raise ValueError(
+            f"{name} holds indices from {indices.min()} to {indices.max()}, outside 0..{size - 1} "
+            f"for `size` = {size}. Are they counted from 1?"
+        )

@@ -1,0 +1,104 @@
+"""What has changed since the calibration: found and named, and not found where nothing has."""
+
+import numpy as np
+import pytest
+from microphone_arrays import array, hear, inside, noisy
+
+from jeit.acoustic import find_setup_changes
+
+# Large programs; test_locate has an exchange in the quick suite.
+pytestmark = pytest.mark.slow
+
+
+def frames(number=24, noise=0.05, seed=0):
+    microphone_array = array(9, relative=noise)
+    rng = np.random.default_rng(seed)
+    power = hear(microphone_array, inside(number, seed=seed), np.exp(rng.normal(size=number)))
+    return microphone_array, noisy(microphone_array.noise, power, rng)
+
+
+def swapped(power, *pairs):
+    order = np.arange(power.shape[1])
+    for one, other in pairs:
+        order[[one, other]] = order[[other, one]]
+    return power[:, order]
+
+
+def found(microphone_array, power):
+    """Exchanged pairs, where nothing is altered otherwise."""
+    exchanged, altered = find_setup_changes(microphone_array, power, np.isfinite(power))
+    assert altered == []
+    return exchanged
+
+
+@pytest.mark.parametrize("factor", [0.02, 30.0])
+def test_another_gain_is_no_exchange(factor):
+    """Deaf, or too loud: named as such."""
+    microphone_array, power = frames()
+    power[:, 4] *= factor
+    assert find_setup_changes(microphone_array, power, np.isfinite(power)) == ([], [4])
+
+
+def test_of_five_microphones_none_is_left_out():
+    """Four explain anything: what says nothing is not believed."""
+    microphone_array, power = frames()
+    power[:, 5:] = np.nan
+    power[:, 4] *= 0.02
+    assert find_setup_changes(microphone_array, power, np.isfinite(power)).altered == []
+
+
+@pytest.mark.parametrize("pair", [(0, 8), (3, 4), (1, 2)])
+def test_one_exchange(pair):
+    microphone_array, power = frames()
+    assert found(microphone_array, swapped(power, pair)) == [pair]
+
+
+def test_nothing_is_exchanged():
+    """Not in good data, nor in few frames, nor where microphones are missing."""
+    microphone_array, power = frames()
+    assert found(microphone_array, power) == []
+    power[3:9, 5] = np.nan
+    assert found(microphone_array, power) == []
+
+
+def test_another_array_is_no_exchange():
+    """Where nothing fits, no exchange makes it fit."""
+    microphone_array, power = frames()
+    rubbish = np.exp(np.random.default_rng(1).normal(size=power.shape))
+    assert found(microphone_array, rubbish) == []
+
+
+def test_three_frames_are_needed():
+    microphone_array, power = frames()
+    exchanged = swapped(power, (0, 8))
+    assert found(microphone_array, exchanged[:2]) == []
+    assert found(microphone_array, exchanged[:3]) == [(0, 8)]
+
+
+def test_the_loudest_frames_are_looked_at():
+    """Two dozen of many: silence, which fits anything or nothing, does not hide the exchange."""
+    microphone_array, power = frames()
+    silence = 1e-6 * np.abs(np.random.default_rng(2).normal(size=(200, 9)))
+    mixed = np.concatenate([silence, swapped(power, (2, 6))])
+    assert found(microphone_array, mixed) == [(2, 6)]
+
+
+def test_a_dead_microphone_is_not_named():
+    microphone_array, power = frames()
+    exchanged = swapped(power, (0, 8))
+    exchanged[:, 4] = np.nan
+    assert found(microphone_array, exchanged) == [(0, 8)]
+
+
+def test_two_exchanges():
+    """The one that explains most comes first."""
+    microphone_array, power = frames()
+    assert set(found(microphone_array, swapped(power, (0, 8), (1, 3)))) == {(0, 8), (1, 3)}
+
+
+def test_any_exchange_of_nine_and_seeds():
+    """Of 36 pairs, all are found that are; no other is ever named."""
+    for seed, pair in enumerate([(a, b) for a in range(9) for b in range(a + 1, 9)]):
+        microphone_array, power = frames(seed=seed)
+        assert found(microphone_array, swapped(power, pair)) == [pair]
+        assert found(microphone_array, power) == []

@@ -1,0 +1,57 @@
+"""Layouts: how many, how far apart, and inside what."""
+
+import numpy as np
+import pytest
+
+from jeit.layout import grid, perimeter, quasi_uniform, ring, ring_and_centre
+from jeit.mesh import Disk, Polygon, Rectangle
+
+
+def nearest_gap(position):
+    gap = np.linalg.norm(position[:, None] - position, axis=-1)
+    np.fill_diagonal(gap, np.inf)
+    return gap.min(axis=1)
+
+
+def test_ring_begins_at_noon_and_turns_as_told():
+    position = ring(2.0, 4)
+    np.testing.assert_allclose(position, [[0, 2], [-2, 0], [0, -2], [2, 0]], atol=1e-12)
+    np.testing.assert_allclose(ring(2.0, 4, clockwise=True)[1], [2, 0], atol=1e-12)
+    assert ring(2.0, 5, height=0.3).shape == (5, 3)
+
+
+def test_ring_and_centre_puts_the_centre_last():
+    position = ring_and_centre(1.0, 8, centre=(3.0, 1.0))
+    assert position.shape == (9, 2)
+    np.testing.assert_allclose(position[-1], [3, 1], atol=1e-12)
+
+
+def test_perimeter_is_even_along_the_edge():
+    position = perimeter(Rectangle(0.32, 0.2), 16, start=0.01)
+    inside = np.abs(position) <= np.array([0.16, 0.1]) + 1e-12
+    assert inside.all()
+    on_edge = np.isclose(np.abs(position[:, 0]), 0.16) | np.isclose(np.abs(position[:, 1]), 0.1)
+    assert on_edge.all()
+    assert len(np.unique(position.round(9), axis=0)) == 16
+
+
+def test_grid_spans_what_it_is_told():
+    position = grid(0.2, 0.1, 4, 3, centre=(1.0, 0.0))
+    assert position.shape == (12, 2)
+    np.testing.assert_allclose(np.ptp(position, axis=0), [0.2, 0.1])
+    np.testing.assert_allclose(position.mean(axis=0), [1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "domain",
+    [Disk(0.1), Rectangle(0.2, 0.2), Polygon([[0, 0], [0.3, 0], [0.3, 0.1], [0.1, 0.1], [0.1, 0.3], [0, 0.3]])],
+)
+def test_quasi_uniform_fills_any_outline_evenly(domain):
+    position = quasi_uniform(domain, 32, margin=0.005)
+    assert position.shape == (32, 2)
+    assert np.asarray(domain.contains(position)).all()
+    gap = nearest_gap(position)
+    ideal = np.sqrt(2 / np.sqrt(3) * domain.area / 32)
+    assert gap.min() > 0.6 * ideal
+    assert gap.max() < 1.3 * ideal
+    np.testing.assert_array_equal(position, quasi_uniform(domain, 32, margin=0.005))

@@ -1,0 +1,330 @@
+"""The simulated acoustic skin: its powers against closed forms and drawn touches, its clock and its truth."""
+
+import jax
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from jeit.simulate.sounding_skin import (
+    SoundingSkin,
+    expected_power,
+    microphone_grid,
+    noise_power,
+    nominal_power,
+    transfer,
+)
+from jeit.simulate.touch_sounds import calibration_taps, pat, quiet, stroke, superpose, tap, tickle
+
+KEY = jax.random.key(0)
+# No spread from microphone to microphone, and no coupling: what is left has closed forms.
+ALIKE = {"gain_spread_db": 0.0, "depth_spread": 0.0, "noise_spread_db": 0.0, "coupling_db": -np.inf}
+CENTRE = [(0.0, 0.0)]
+
+
+@pytest.fixture(scope="module")
+def skin() -> SoundingSkin:
+    return SoundingSkin(KEY)
+
+
+@pytest.fixture(scope="module")
+def small() -> SoundingSkin:
+    return SoundingSkin(KEY, microphone_grid(2))
+
+
+def test_microphones_lie_on_a_grid_of_40_mm(skin):
+    place = np.asarray(skin.microphones)
+    assert place.shape == (25, 2)
+    np.testing.assert_allclose(np.unique(place.round(12)), [-0.08, -0.04, 0, 0.04, 0.08])
+    np.testing.assert_allclose(place[1] - place[0], [0.04, 0], atol=1e-15)
+    assert skin.wave_speed == pytest.approx(10)
+    # 2 dB of spread in power; the standard deviation of 25 draws scatters by 14 %.
+    assert 20 * np.std(np.log10(np.asarray(skin.gain))) == pytest.approx(2, rel=0.45)
+
+
+def test_without_loss_and_echoes_power_is_the_spreading():
+    lossless = SoundingSkin(KEY, CENTRE, attenuation=0.0, reflection=0.0, **ALIKE)
+    distance = np.array([0.0, 0.01, 0.03, 0.09])
+    length, thickness = np.hypot(distance, 0.01), 0.01
+    expected = (0.01 / length) ** 2 * (1 + length / thickness) / 2
+    power = expected_power(lossless, np.stack([distance, 0 * distance], axis=-1))[:, 0]
+    # What is left is the quadrature of the source's density.
+    np.testing.assert_allclose(power, expected, rtol=5e-5)
+    np.testing.assert_allclose(nominal_power(lossless, distance), expected, rtol=5e-5)
+
+
+def test_edges_and_corners_answer_with_images_of_the_source():
+    # A microphone on an edge is as far from the image as from the source: amplitude 1 + reflection. In a corner there
+    # are three images, (1 + reflection)². The other edges are a metre and more away, where little is left.
+    edges = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
+    corners = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
+    for reflection in (1.0, 0.5, -1.0):
+        walled = {"width": 2.0, "height": 2.0, "reflection": reflection, "attenuation": 20.0}
+        large = SoundingSkin(KEY, np.concatenate([edges, corners]), **walled, **ALIKE)
+        power = np.diagonal(expected_power(large, 0.97 * np.concatenate([edges, corners])))
+        direct = nominal_power(large, np.repeat([0.03, 0.03 * np.sqrt(2)], 4))
+        expected = direct * np.repeat([(1 + reflection) ** 2, (1 + reflection) ** 4], 4)
+        np.testing.assert_allclose(power, expected, rtol=1e-3, atol=1e-9)
+
+
+def test_sound_is_delayed_as_its_loss_demands():
+    # For a loss ∝ f, α = α0 f / f0, Kramers and Kronig give the slowness 1 / speed - α0 ln(f / f0) / (π² f0).
+    dispersive = SoundingSkin(KEY, CENTRE, reflection=0.0, attenuation_exponent=1.0, multiplexed=False, **ALIKE)
+    frequencies, length = np.linspace(1, 900, 900), np.hypot(0.04, 0.01)
+    phase = np.unwrap(np.angle(transfer(dispersive, frequencies, np.array([0.04, 0.0]))[0]))
+    slowness = 1 / 10 - 4 * np.log(frequencies / 100) / (np.pi**2 * 100)
+    np.testing.assert_allclose(-phase / length / (2 * np.pi * frequencies), slowness, rtol=1e-4)
+
+
+def test_a_microphone_hears_as_far_as_its_reach():
+    alike = SoundingSkin(KEY, CENTRE, **ALIKE)
+    snr = expected_power(alike, [(0.055, 0.0), (0.0, -0.055)])[:, 0] / noise_power(alike)
+    # 0 dB, but for the edges' echoes, which are weak so far from them.
+    np.testing.assert_allclose(10 * np.log10(snr), 0, atol=0.4)
+    louder = SoundingSkin(KEY, CENTRE, snr_db=10.0, **ALIKE)
+    np.testing.assert_allclose(noise_power(alike) / noise_power(louder), 10, rtol=1e-12)
+
+
+def test_power_falls_with_distance():
+    alike = SoundingSkin(KEY, CENTRE, reflection=0.0, **ALIKE)
+    power = expected_power(alike, np.stack([np.linspace(0, 0.1, 40), np.zeros(40)], axis=-1))[:, 0]
+    assert (np.diff(power) < 0).all()
+    assert power[-1] < power[0] / 30
+    np.testing.assert_allclose(power, nominal_power(alike, np.linspace(0, 0.1, 40)), rtol=1e-4)
+
+
+def test_the_library_s_decay_model_does_not_fit_exactly(skin):
+    places = microphone_grid(13)
+    power = expected_power(skin, places)
+    scatter = []
+    for place, received in zip(np.asarray(skin.microphones), power.T, strict=True):
+        squared = ((places - place) ** 2).sum(axis=1)
+
+        def misfit(parameters, squared=squared, received=received):
+            return np.log(received) - parameters[0] + np.log(squared + np.exp(parameters[1]))
+
+        scatter.append(np.std(least_squares(misfit, np.log([1e-4, 1e-4])).fun))
+    assert min(scatter) > 0.05
+    assert 0.1 < np.mean(scatter) < 0.3
+    assert max(scatter) < 0.4
+
+
+def test_drawn_bursts_have_the_expected_power(small):
+    places, options = np.array([[0.01, 0.02], [0.06, -0.03], [0.095, 0.09]]), {"duration": 0.14, "noise": False}
+    taps = calibration_taps(small, KEY, places, repeats=200, strength_spread=0.0, **options)
+    assert taps.samples.shape == (600, 4, 1400)
+    np.testing.assert_array_equal(taps.positions[[0, 199, 200]], places[[0, 0, 1]])
+    # A strength of 1 over 60 ms is 600 samples' worth of energy at 10 kHz.
+    ratio = (taps.samples**2).sum(axis=-1).reshape(3, 200, 4) / 600 / expected_power(small, places)[:, None]
+    error = ratio.std(axis=1) / np.sqrt(200)
+    # Two to ten independent values make a burst, fewer where only low tones arrive: 200 tell the mean to 2 to 5 %.
+    assert error.max() < 0.06
+    assert (np.abs(ratio.mean(axis=1) - 1) < 3.5 * error).all()
+    # The mean over places is good to 2.5 %.
+    assert ratio.mean() == pytest.approx(1, abs=0.06)
+    np.testing.assert_array_equal(taps.strengths, 1)
+    # Strengths scale the taps, no more; 600 draws tell their standard deviation to 3 %.
+    spread = calibration_taps(small, KEY, places, repeats=200, strength_spread=0.5, **options)
+    assert np.std(np.log(spread.strengths)) == pytest.approx(0.5, rel=0.12)
+    np.testing.assert_allclose(spread.samples, taps.samples * spread.strengths[:, None, None], rtol=1e-9, atol=1e-12)
+
+
+def test_pieces_of_a_calibration_do_not_show(small, monkeypatch):
+    places = [(0.0, 0.01), (0.03, 0.02), (-0.08, 0.0)]
+    whole = calibration_taps(small, KEY, places, repeats=2, duration=0.1)
+    monkeypatch.setattr("jeit.simulate.touch_sounds.PIECE", 12_000)
+    # Two pieces of two places, the last one twice.
+    parts = calibration_taps(small, KEY, places, repeats=2, duration=0.1)
+    np.testing.assert_allclose(parts.samples, whole.samples, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("multiplexed", [True, False])
+def test_blocks_add_up_to_the_transfer_function(multiplexed):
+    # Whatever the source's spectrum was, two channels differ by the ratio of their transfer functions.
+    made = SoundingSkin(KEY, microphone_grid(2), multiplexed=multiplexed)
+    place = (0.03, -0.06)
+    recording = tap(made, KEY, place, repeats=2, duration=0.5, noise=False)
+    spectrum = np.fft.rfft(recording.samples)
+    frequencies = np.fft.rfftfreq(recording.samples.shape[1], 1 / recording.rate)
+    inside = (frequencies > 80) & (frequencies < 900)
+    ratio = np.asarray(transfer(made, frequencies[inside], np.asarray(place)))
+    left, right = spectrum[0, inside] * ratio[1], spectrum[1, inside] * ratio[0]
+    assert np.linalg.norm(left) > 0
+    # What rings before the recording begins, by the source's filter, is cut off: -50 dB.
+    assert np.linalg.norm(left - right) < 3e-3 * np.linalg.norm(left)
+
+
+def test_a_row_of_taps_is_as_loud_and_as_late_as_it_should_be():
+    near = SoundingSkin(KEY, CENTRE)
+    recording = tap(near, KEY, (0.01, 0.0), repeats=100, frequency=10.0, noise=False)
+    heard, made = (
+        (row[:100_000] ** 2).reshape(100, 1000).mean(axis=0) for row in (recording.samples[0], recording.active)
+    )
+    # Each burst's energy scatters by a third, its middle by 10 ms: 100 tell them to 4 % and 1 ms.
+    assert heard.sum() / made.sum() == pytest.approx(expected_power(near, [(0.01, 0.0)])[0, 0], rel=0.12)
+    middles = [np.average(np.arange(1000) / recording.rate, weights=row) for row in (heard, made)]
+    # The way is 14 mm, 1.4 ms.
+    assert middles[0] - middles[1] == pytest.approx(0.0014, abs=0.003)
+
+
+@pytest.mark.parametrize(("multiplexed", "step", "rate"), [(True, 25e-6, 10e3), (False, 0.0, 40e3)])
+def test_the_multiplexer_samples_one_after_another(multiplexed, step, rate):
+    # Six microphones in one place hear the same sound; later samples are earlier sound.
+    together = SoundingSkin(KEY, [(0.0, 0.02)] * 6, multiplexed=multiplexed, **ALIKE)
+    recording = tap(together, KEY, (0.01, 0.0), noise=False)
+    assert recording.rate == pytest.approx(rate)
+    spectrum = np.fft.rfft(recording.samples)
+    frequencies = np.fft.rfftfreq(recording.samples.shape[1], 1 / recording.rate)
+    cross = spectrum * spectrum[0].conj()
+    inside = (frequencies > 100) & (frequencies < 800)
+    delay = [
+        np.sum(np.angle(c) * f * np.abs(c)) / np.sum(f**2 * np.abs(c)) / 2 / np.pi
+        for c, f in ((row[inside], frequencies[inside]) for row in cross)
+    ]
+    np.testing.assert_allclose(delay, step * np.array([0, 1, 2, 3, 0, 1]), atol=1e-7)
+    np.testing.assert_allclose(together.stagger, step * np.array([0, 1, 2, 3, 0, 1]), atol=1e-12)
+
+
+def test_coupling_leaks_from_the_slot_before():
+    frequencies, place = np.array([100.0, 700.0]), np.array([0.05, 0.03])
+    grid = microphone_grid(3)[:6]
+    alone, coupled = (
+        np.asarray(transfer(SoundingSkin(KEY, grid, coupling_db=db), frequencies, place)) for db in (-np.inf, -20.0)
+    )
+    # The second multiplexer holds microphones 4 and 5 and two open slots, the last of which comes before 4.
+    before = np.array([3, 0, 1, 2, 4, 4])
+    expected = 0.1 * np.abs(alone[before])
+    expected[4] = 0
+    np.testing.assert_allclose(np.abs(coupled - alone), expected, rtol=1e-9, atol=1e-15)
+
+
+def test_noise_has_its_power_and_lies_in_the_band(small):
+    recording = quiet(small, KEY, duration=8.0)
+    # 860 Hz for 8 s are some 14,000 independent values: 1.2 %.
+    np.testing.assert_allclose((recording.samples**2).mean(axis=1), noise_power(small), rtol=0.05)
+    power = np.abs(np.fft.rfft(recording.samples * np.hanning(recording.samples.shape[1]))) ** 2
+    frequencies = np.fft.rfftfreq(recording.samples.shape[1], 1 / recording.rate)
+    assert power[:, frequencies > 1300].sum() < 1e-6 * power.sum()
+    low, high = (power[:, (frequencies > f) & (frequencies < f + 200)].mean() for f in (200, 400))
+    assert low == pytest.approx(high, rel=0.1)
+    assert recording.position.shape == (0, 2)
+    assert not recording.active.any()
+
+
+def test_keys_decide_everything(small):
+    line = [(-0.05, 0.0), (0.05, 0.0)]
+    for made in (
+        lambda key: pat(small, key, (0.01, 0.0)).samples,
+        lambda key: tickle(small, key, (0.01, 0.0)).samples,
+        lambda key: stroke(small, key, line).samples,
+        lambda key: quiet(small, key).samples,
+        lambda key: SoundingSkin(key).gain,
+    ):
+        np.testing.assert_array_equal(made(KEY), made(KEY))
+        assert np.abs(made(KEY) - made(jax.random.key(1))).max() > 0
+    # A draw does not depend on what else the skin is.
+    np.testing.assert_array_equal(SoundingSkin(KEY).gain, SoundingSkin(KEY, snr_db=20.0, reflection=0.0).gain)
+
+
+def test_touches_add_and_noise_is_added_once(small):
+    one, two = (pat(small, jax.random.key(k), at, noise=False) for k, at in ((1, (0.05, 0.05)), (2, (-0.06, 0.0))))
+    together = superpose(small, None, one, two)
+    np.testing.assert_allclose(together, one.samples + two.samples, rtol=1e-12)
+    noise = superpose(small, KEY, one, two) - together
+    # 860 Hz for a second: 2.4 %.
+    np.testing.assert_allclose((noise**2).mean(axis=1), noise_power(small), rtol=0.12)
+    louder = pat(small, jax.random.key(1), (0.05, 0.05), strength=4.0, noise=False)
+    np.testing.assert_allclose(louder.samples, 2 * one.samples, rtol=1e-9, atol=1e-12)
+    noisy = pat(small, jax.random.key(1), (0.05, 0.05))
+    assert np.corrcoef((noisy.samples - one.samples)[0], one.samples[0])[0, 1] < 0.1
+    with pytest.raises(ValueError, match="noise=False"):
+        superpose(small, KEY, one, noisy)
+    with pytest.raises(ValueError, match="equally long"):
+        superpose(small, KEY, one, tap(small, KEY, (0.0, 0.0), repeats=4, noise=False))
+
+
+def test_the_loudest_microphone_follows_a_stroke():
+    clear = SoundingSkin(KEY, snr_db=20.0, **ALIKE)
+    recording = stroke(clear, KEY, [(-0.09, -0.04), (0.0, -0.04), (0.0, 0.09)])
+    place, right = np.asarray(clear.microphones), 0
+    starts = np.arange(500, 9000, 500)
+    for start in starts:
+        loudest = place[np.argmax((recording.samples[:, start : start + 500] ** 2).mean(axis=1))]
+        middle = (start + 250) / recording.rate - 0.003  # sound takes 3 ms to a microphone near by
+        truth = [np.interp(middle, recording.position_times, axis) for axis in recording.position.T]
+        nearest = place[np.argmin(((place - truth) ** 2).sum(axis=1))]
+        right += np.allclose(loudest, nearest)
+    # Half way between two microphones chance decides.
+    assert right >= 0.8 * len(starts)
+
+
+def test_a_stroke_goes_where_the_path_says_and_faster_is_louder(small):
+    line = stroke(small, KEY, [(-0.05, 0.0), (0.05, 0.0)], noise=False)
+    np.testing.assert_allclose(line.position[:, 0], -0.05 + 0.1 * line.position_times, atol=2e-5)
+    # 0.1 m in a second: the nominal speed, but for the ends.
+    np.testing.assert_allclose(line.active[300:-300], 1, rtol=1e-9)
+    faster = stroke(small, KEY, lambda t: np.stack([-0.05 + 0.1 * t**2, 0 * t], axis=-1), noise=False)
+    np.testing.assert_allclose(faster.active[[2000, 8000]], np.sqrt([0.4, 1.6]), rtol=1e-3)
+    np.testing.assert_allclose(faster.position[50], [-0.025, 0], atol=1e-9)
+
+
+def test_pats_and_tickles_are_where_and_when_they_say(small):
+    patted = pat(small, KEY, (0.02, -0.01), taps=3, interval=0.3)
+    rises = np.flatnonzero(np.diff((patted.active > 1).astype(int)) == 1) / patted.rate
+    np.testing.assert_allclose(np.diff(rises), 0.3, atol=1e-9)
+    assert len(rises) == 3
+    np.testing.assert_array_equal(np.unique(patted.position, axis=0), [[0.02, -0.01]])
+    tickled = tickle(small, KEY, (0.095, 0.0), radius=0.01)
+    assert 8 <= len(np.unique(tickled.position, axis=0)) <= 15
+    assert (np.linalg.norm(tickled.position - [0.095, 0], axis=1) <= 0.01).all()
+    assert (tickled.position[:, 0] <= 0.1).all()
+    assert len(tickled.times) == tickled.samples.shape[1] == len(tickled.active) == 10_000
+    assert tap(small, KEY, (0, 0), repeats=4).samples.shape[1] == pytest.approx(4100, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"width": -0.2}, "width must be a positive"),
+        ({"depth": 0.0}, "depth must be a positive"),
+        ({"reach": np.nan}, "reach must be a positive"),
+        ({"attenuation": -1.0}, "attenuation must be zero or positive"),
+        ({"reflection": 1.5}, "reflection: an edge"),
+        ({"coupling_db": 3.0}, "coupling_db"),
+        ({"snr_db": np.inf}, "snr_db"),
+        ({"band": (900.0, 60.0)}, "band: give"),
+        ({"band": (60.0, 4000.0)}, "below 3536 Hz"),
+        ({"microphones": [(40.0, 0.0)]}, "microphones: row 0.*millimetres"),
+        ({"microphones": np.zeros((3, 3))}, r"microphones: give \(x, y\)"),
+    ],
+)
+def test_impossible_skins_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        SoundingSkin(KEY, **options)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda skin: tap(skin, KEY, (0.11, 0.0)), "position: row 0.*off the skin"),
+        (lambda skin: tap(skin, KEY, (np.nan, 0.0)), "position: row 0 is not finite"),
+        (lambda skin: tap(skin, KEY, (0.0, 0.0, 0.0)), "position: give"),
+        (lambda skin: tap(skin, KEY, (0.0, 0.0), strength=0.0), "strength must be"),
+        (lambda skin: tap(skin, KEY, (0.0, 0.0), repeats=0), "repeats"),
+        (lambda skin: tap(skin, KEY, (0.0, 0.0), length=0.2), "does not fit"),
+        (lambda skin: pat(skin, KEY, (0.0, 0.0), interval=-1.0), "interval must be"),
+        (lambda skin: tickle(skin, KEY, (0.0, 0.0), radius=0.0), "radius must be"),
+        (lambda skin: stroke(skin, KEY, [(0.0, 0.0), (0.2, 0.0)]), "path: row 1"),
+        (lambda skin: stroke(skin, KEY, [(0.0, 0.0)]), "stands still"),
+        (lambda skin: stroke(skin, KEY, lambda t: np.zeros((3, 2))), "one for each"),
+        (lambda skin: quiet(skin, KEY, duration=0.0), "duration must be"),
+        (lambda skin: calibration_taps(skin, KEY, [(0.0, 0.0)], repeats=0), "repeats"),
+        (lambda skin: calibration_taps(skin, KEY, [(0.0, 0.0)], strength_spread=-1.0), "strength_spread"),
+        (lambda skin: calibration_taps(skin, KEY, np.zeros((0, 2))), "positions: give"),
+        (lambda skin: expected_power(skin, [(0.0, np.inf)]), "positions: row 0 is not finite"),
+        (lambda skin: microphone_grid(0), "number"),
+        (lambda skin: superpose(skin, KEY), "at least one"),
+    ],
+)
+def test_impossible_touches_are_refused(skin, make, message):
+    with pytest.raises(ValueError, match=message):
+        make(skin)
