@@ -1,15 +1,23 @@
 """Shared by all tests: where measured data lie, and a cache that keeps compiled code between runs."""
 
+import gc
 import os
 from pathlib import Path
 
-# Most of a test's time is compilation: compile quickly, run a little slower. Before JAX starts, which reads it once.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+# Most of a test's time is compilation: compile quickly, run a little slower; XLA_FLAGS="" tests what users run. Before
+# JAX starts, which reads it once.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
+)
 
 import jax
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+
+# Programs being traced are many small objects, which Python would look through for rubbish again and again.
+gc.set_threshold(100_000, 20, 50)
 
 # The same shapes come back run after run.
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".jax_cache"))
