@@ -6,18 +6,18 @@ where a `Refine` asks. Solids: `layer`, `box`, `cylinder`. From elsewhere: `Mesh
 
 from jeit.mesh.domain import Disk, Domain, Polygon, Rectangle
 from jeit.mesh.files import read, write
-from jeit.mesh.generate._unstructured import MOST_POINTS
 from jeit.mesh.generate.refine import Refine
+from jeit.mesh.generate.unstructured import MOST_POINTS
 from jeit.mesh.geometry import (
     boundary_loops,
     centroids,
     facet_centroids,
     facet_measures,
     gradients,
+    interior_facets,
     measures,
 )
 from jeit.mesh.gmsh import from_gmsh
-from jeit.mesh.interior import interior_facets
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.quality import Quality, quality
 from jeit.mesh.shapes import disk, polygon, rectangle

@@ -79,7 +79,7 @@ def closed_line(vertices: np.ndarray) -> Curve:
     )
 
 
-def inside(curves: list[Curve], points: np.ndarray) -> np.ndarray:
+def within(curves: list[Curve], points: np.ndarray) -> np.ndarray:
     """True for points inside the first curve and outside the others (holes)."""
     result = np.zeros(len(points), bool)
     for curve in curves:

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jeit.mesh import loops
-from jeit.mesh.generate import _curve, _triangulate
-from jeit.mesh.generate._curve import Curve, Size
+from jeit.mesh.generate import _triangulate
 from jeit.mesh.generate._delaunay import Front, doubled_areas, triangulate
+from jeit.mesh.generate.curve import Curve, Size, within
 from jeit.mesh.generate.refine import Refinement, SizeField
 
 DEFAULT_NUM_POINTS = 1200
@@ -137,7 +137,7 @@ def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> n
     if fixed.ndim != 2 or fixed.shape[1] != 2 or not np.isfinite(fixed).all():
         raise ValueError(f"interior_points: expected finite coordinates of shape (k, 2), got shape {fixed.shape}.")
     apart = np.min([curve.distance(fixed) for curve in curves], axis=0)
-    bad = np.flatnonzero(~_curve.inside(curves, fixed) | (apart < _CLOSEST * curves[0].length))
+    bad = np.flatnonzero(~within(curves, fixed) | (apart < _CLOSEST * curves[0].length))
     if bad.size:
         raise ValueError(
             f"interior_points: point {bad[0]} at {fixed[bad[0]].tolist()} does not lie inside the outline. Use "
@@ -177,7 +177,7 @@ def _sample(curves: list[Curve]) -> np.ndarray:
     outline = curves[0].at(np.linspace(0, curves[0].length, 400))
     axes = [np.linspace(outline[:, k].min(), outline[:, k].max(), 60) for k in (0, 1)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    return grid[_curve.inside(curves, grid)]
+    return grid[within(curves, grid)]
 
 
 def _estimate(curves: list[Curve], size: Size, area: float) -> float:
