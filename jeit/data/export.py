@@ -7,7 +7,8 @@ import numpy as np
 
 from jeit.data.measurement import Measurement
 from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
-from jeit.mesh import Disk, Domain, Polygon, Rectangle
+from jeit.mesh import Domain
+from jeit.mesh.outline import OUTLINES
 
 
 def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]:
@@ -17,8 +18,8 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
     `measurement` (K, L), `drive_index` (M,), `measurement_index` (M,), `protocol_name`. The TOML holds
     geometry, electrodes, frame names and notes. `read` gives the same measurement back.
 
-    Raises `ValueError` for another suffix, and for electrodes or domains that a description cannot say (3-D,
-    holes).
+    Raises `ValueError` for another suffix, and for electrodes or domains that a description cannot say (3-D, an
+    outline of your own).
     """
     file = Path(path)
     if file.suffix.lower() != ".npz":
@@ -51,14 +52,13 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
 
 
 def _geometry(domain: Domain) -> dict:
-    if isinstance(domain, Disk):
-        return {"shape": "disk", "radius": domain.radius, "centre": list(domain.centre)}
-    if isinstance(domain, Rectangle):
-        size = {"width": domain.width, "height": domain.height}
-        return {"shape": "rectangle", **size, "centre": list(domain.centre)}
-    if isinstance(domain, Polygon) and not domain.holes:
-        return {"shape": "polygon", "vertices": np.asarray(domain.vertices).tolist()}
-    raise ValueError(f"write_table: a description cannot say {domain!r}. Set domain to None, or save the mesh instead.")
+    described = domain.describe()
+    if described["shape"] not in OUTLINES:
+        raise ValueError(
+            f"write_table: a description cannot say {domain!r}; it knows {', '.join(OUTLINES)}. Set domain to None, or "
+            "save the mesh instead."
+        )
+    return described
 
 
 def _electrodes(electrodes) -> dict:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jeit.mesh.domain import check_length
 from jeit.mesh.generate import unstructured
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
+from jeit.mesh.outline.domain import check_length
 from jeit.mesh.shapes import disk, rectangle
 
 # In a solid 'bottom' and 'top' are the faces across z, so the sides of a rectangle across y get new names.

@@ -17,6 +17,7 @@ from jeit.mesh.generate import _triangulate
 from jeit.mesh.generate._delaunay import Front, doubled_areas, triangulate
 from jeit.mesh.generate.curve import Curve, Size, within
 from jeit.mesh.generate.refine import Refinement, SizeField
+from jeit.mesh.mesh import Mesh
 
 DEFAULT_NUM_POINTS = 1200
 # Nodes of a mesh.
@@ -74,16 +75,20 @@ def check_positions(name: str, positions: ArrayLike) -> np.ndarray:
     return array
 
 
-def mesh(
+def mesh_within(
     curves: list[Curve],
-    stops: list[np.ndarray],
-    interior_points: ArrayLike | None,
-    refine: Refinement,
-    target: Target,
     area: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points and cells inside `curves`, with nodes at `stops` (arc lengths on each) and at `interior_points`."""
-    stops = [_merge(curve, own) for curve, own in zip(curves, stops, strict=True)]
+    target: Target,
+    refine: Refinement = None,
+    boundary_points: ArrayLike | None = None,
+    interior_points: ArrayLike | None = None,
+) -> Mesh:
+    """A mesh inside the first of `curves` and outside the others, of `area` m² in all.
+
+    There are nodes at `boundary_points`, arc lengths (k,) in metres on the first curve, and at `interior_points` (k, 2)
+    in metres. Raises `ValueError` on bad or contradicting arguments.
+    """
+    stops = [_merge(curve, own) for curve, own in zip(curves, _stops(curves, boundary_points), strict=True)]
     fixed = _check_interior(interior_points, curves)
     field = SizeField(curves, refine, *_room(curves, stops, fixed))
     front = None
@@ -95,7 +100,15 @@ def mesh(
         check_total(_estimate(curves, size, area), "refine")
     else:
         size, front = _fit(curves, stops, fixed, field, target.num_points, area)
-    return _triangulate.generate(curves, stops, fixed, size, front)
+    return Mesh.create(*_triangulate.generate(curves, stops, fixed, size, front))
+
+
+def _stops(curves: list[Curve], boundary_points: ArrayLike | None) -> list[np.ndarray]:
+    """Arc lengths on each curve where nodes are wanted besides its corners; one without corners begins with a node."""
+    stops = [np.zeros(0 if len(curve.corners) else 1) for curve in curves]
+    if boundary_points is not None:
+        stops[0] = np.mod(check_positions("boundary_points", boundary_points), curves[0].length)
+    return stops
 
 
 def _sized(field: SizeField, background: float, points: np.ndarray) -> np.ndarray:
