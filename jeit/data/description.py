@@ -34,6 +34,7 @@ from jeit.protocol import Protocol
 
 CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
 VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
+ELECTRODES = {"boundary": BoundaryElectrodes, "disc": SheetDiscs, "point": PointElectrodes}
 BUNDLED = ("tank6cm",)
 
 # What makes each outline, and whether it must be told.
@@ -197,15 +198,14 @@ def _domain(section: dict, origin: str) -> Domain:
 
 def _electrodes(section: dict, domain: Domain | None, origin: str):
     where = "[electrodes]"
-    kind = _choice(section.get("kind", "boundary"), ("boundary", "disc", "point"), origin, f"{where} kind")
+    kind = _choice(section.get("kind", "boundary"), ELECTRODES, origin, f"{where} kind")
     try:
         position = _positions(section, domain, origin)
         if kind == "point":
             return PointElectrodes(position)
         size = _need(section, "width" if kind == "boundary" else "radius", origin, where)
         contact_impedance = _need(section, "contact_impedance", origin, where)
-        build = BoundaryElectrodes if kind == "boundary" else SheetDiscs
-        return build(position, np.asarray(size, float), np.asarray(contact_impedance, float))
+        return ELECTRODES[kind](position, np.asarray(size, float), np.asarray(contact_impedance, float))
     except (ValueError, TypeError) as error:
         raise _located(error, origin, where) from None
 

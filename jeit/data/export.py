@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from jeit.data.description import ELECTRODES
 from jeit.data.measurement import Measurement
-from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
+from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Domain
 from jeit.mesh.outline import OUTLINES
 
@@ -61,20 +62,19 @@ def _geometry(domain: Domain) -> dict:
     return described
 
 
-def _electrodes(electrodes) -> dict:
-    positions = {"positions": np.asarray(getattr(electrodes, "position", np.zeros((0, 0)))).tolist()}
-    if isinstance(electrodes, BoundaryElectrodes):
-        size = {"kind": "boundary", "width": np.asarray(electrodes.width).tolist()}
-    elif isinstance(electrodes, SheetDiscs):
-        size = {"kind": "disc", "radius": np.asarray(electrodes.radius).tolist()}
-    elif isinstance(electrodes, PointElectrodes) and electrodes.position.shape[1] == 2:
-        return {"kind": "point", **positions}
-    else:
+def _electrodes(electrodes: AbstractElectrodes) -> dict:
+    kind = next((name for name, known in ELECTRODES.items() if type(electrodes) is known), None)
+    geometry = {name: np.asarray(values).tolist() for name, values in electrodes.geometry().items()} if kind else {}
+    positions = geometry.pop("position", None)
+    if positions is None or len(positions[0]) != 2:
         raise ValueError(
             f"write_table: a description cannot say {type(electrodes).__name__}; it knows 2-D boundary, disc "
             "and point electrodes. Set electrodes to None, or save the model instead."
         )
-    return {**size, **positions, "contact_impedance": np.asarray(electrodes.contact_impedance).tolist()}
+    described = {"kind": kind, **geometry, "positions": positions}
+    if electrodes.is_point:
+        return described
+    return {**described, "contact_impedance": np.asarray(electrodes.contact_impedance).tolist()}
 
 
 def _assignments(section: dict) -> list[str]:

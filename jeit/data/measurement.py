@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Inexact
 
-from jeit.electrodes import is_concrete
+from jeit.electrodes.electrodes import is_concrete
 from jeit.mesh import Domain
 from jeit.protocol import Protocol
 

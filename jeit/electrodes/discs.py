@@ -4,21 +4,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from jeit.electrodes.electrodes import (
-    AbstractElectrodes,
+    AbstractCompleteElectrodes,
+    AbstractMovableElectrodes,
     Contact,
+    Pen,
     as_electrode_values,
     as_positions,
     check_dimension,
     compiled_contact,
     is_concrete,
+    replace_contact_impedance,
 )
 from jeit.electrodes.window import EDGE, nearest_electrodes, smooth_step, triangle_quadrature, window_contact
-from jeit.mesh import Mesh, facet_measures, measures
+from jeit.mesh import Mesh, Refine, measures
+from jeit.mesh.geometry import facet_measures
 
 
-class SheetDiscs(AbstractElectrodes):
+class SheetDiscs(AbstractMovableElectrodes):
     """Complete electrodes that are discs inside a sheet (2-D mesh), free of its nodes.
 
     The disc's indicator function is replaced by a smooth window whose edge is half a cell wide, so integrals are
@@ -34,20 +39,32 @@ class SheetDiscs(AbstractElectrodes):
     def __init__(self, position, radius, contact_impedance):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position = as_positions(position, (2,))
-        self.radius = as_electrode_values("radius", radius, self.num_electrodes, unit="metres")
+        self.radius = as_electrode_values("radius", radius, len(self.position), unit="metres")
         self.contact_impedance = as_electrode_values(
-            "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²"
+            "contact_impedance", contact_impedance, len(self.position), unit="ohm·m²"
         )
 
-    @property
-    def is_point(self) -> bool:
-        """No."""
-        return False
+    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
+        """The same electrodes with other contact impedances, ohm·m². Raises `ValueError`."""
+        return replace_contact_impedance(self, contact_impedance)
 
-    @property
-    def num_electrodes(self) -> int:
-        """Number of electrodes L."""
-        return self.position.shape[0]
+    def geometry(self) -> dict[str, Array]:
+        """Positions and radii."""
+        return {"position": self.position, "radius": self.radius}
+
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """Discs."""
+        for place, radius in zip(np.asarray(self.position), np.asarray(self.radius), strict=True):
+            pen.disc(place, radius)
+
+    def refinement(self) -> tuple[Refine, ...]:
+        """Cells of 0.7 of the smallest radius on them."""
+        radius = np.asarray(self.radius)
+        return (Refine(np.asarray(self.position), cell_size=0.7 * radius.min(), distance=float(radius.max())),)
+
+    def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
+        """Along x and along y."""
+        return np.broadcast_to(np.eye(2), (self.num_electrodes, 2, 2))
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The cells of `mesh`."""
@@ -69,7 +86,7 @@ class SheetDiscs(AbstractElectrodes):
         check_discs(self, mesh, measures(mesh))
 
 
-class FaceDiscs(AbstractElectrodes):
+class FaceDiscs(AbstractCompleteElectrodes):
     """Complete electrodes that are discs on flat or gently curved faces of a 3-D mesh, free of its nodes.
 
     **Fields**: `position` (L, 3) metres, on the surface; `radius` (L,) metres; `contact_impedance` (L,) ohm·m².
@@ -82,20 +99,27 @@ class FaceDiscs(AbstractElectrodes):
     def __init__(self, position, radius, contact_impedance):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position = as_positions(position, (3,))
-        self.radius = as_electrode_values("radius", radius, self.num_electrodes, unit="metres")
+        self.radius = as_electrode_values("radius", radius, len(self.position), unit="metres")
         self.contact_impedance = as_electrode_values(
-            "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²"
+            "contact_impedance", contact_impedance, len(self.position), unit="ohm·m²"
         )
 
-    @property
-    def is_point(self) -> bool:
-        """No."""
-        return False
+    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
+        """The same electrodes with other contact impedances, ohm·m². Raises `ValueError`."""
+        return replace_contact_impedance(self, contact_impedance)
 
-    @property
-    def num_electrodes(self) -> int:
-        """Number of electrodes L."""
-        return self.position.shape[0]
+    def geometry(self) -> dict[str, Array]:
+        """Positions and radii."""
+        return {"position": self.position, "radius": self.radius}
+
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """Discs."""
+        for place, radius in zip(np.asarray(self.position), np.asarray(self.radius), strict=True):
+            pen.disc(place, radius)
+
+    def refinement(self) -> tuple[Refine, ...]:
+        """None: they are not of a plane mesh."""
+        return ()
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The boundary triangles of `mesh`."""

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from jeit.electrodes import is_concrete
+from jeit.electrodes.electrodes import is_concrete
 from jeit.mesh import Mesh, gradients, measures
 
 

@@ -7,7 +7,8 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from jeit.electrodes import AbstractElectrodes, Contact
+from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrodes import Contact
 from jeit.forward.assembly import stiffness
 from jeit.mesh import Mesh
 from jeit_solvers import (

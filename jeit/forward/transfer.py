@@ -15,7 +15,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
-from jeit.electrodes import AbstractElectrodes, Contact
+from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrodes import Contact
 from jeit.forward.assembly import cell_conductivity, field_gradients
 from jeit.forward.system import System
 from jeit.mesh import Mesh

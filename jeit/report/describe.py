@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jeit.data import Measurement
+from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Domain
 
 
@@ -28,16 +29,11 @@ def describe_domain(domain: Domain | None) -> dict[str, Any]:
     return {"shape": "not known"} if domain is None else {**domain.describe(), "unit": "m"}
 
 
-def describe_electrodes(electrodes) -> dict[str, Any]:
+def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]:
     """Kind, number, place and size in metres of electrodes."""
     if electrodes is None:
         return {"kind": "at places not known"}
-    known = {
-        name: getattr(electrodes, name)
-        for name in ("position", "width", "height", "radius")
-        if hasattr(electrodes, name)
-    }
-    return plain({"kind": type(electrodes).__name__, "number": electrodes.num_electrodes, **known, "unit": "m"})
+    return plain(electrodes.describe())
 
 
 def version_of(package: str) -> str | None:

@@ -297,7 +297,7 @@ def _named(layout: Layout, skin: Skin, outline: Domain, contacts: bool) -> Layou
 
 
 def _contacts(model: ForwardModel) -> Float[Array, " L"]:
-    return model.electrodes.contact_impedance  # pyright: ignore[reportAttributeAccessIssue]
+    return model.electrodes.contact_impedance
 
 
 def _check(layout: Layout, model: ForwardModel, steps: int, starts: int, key) -> None:
