@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 from jeit.data.measurement import Measurement
 from jeit.electrodes import BoundaryElectrodes
 from jeit.mesh.loops import along
-from jeit.protocol import Protocol, transfer_between_drives
+from jeit.protocol import Protocol
+from jeit.protocol.reciprocity import transfer_between_drives
 
 # Enough frames to judge a recording by; a long one is sampled evenly.
 _MOST_FRAMES = 32

@@ -68,12 +68,6 @@ def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
     return 0.5 * jnp.sqrt(jnp.sum(jnp.cross(edges[:, 0], edges[:, 1]) ** 2, axis=-1))
 
 
-@jax.jit
-def facet_centroids(mesh: Mesh) -> Float[Array, "b d"]:
-    """Centre in metres of every boundary facet, (b, d)."""
-    return jnp.mean(mesh.points[mesh.facets], axis=1)
-
-
 def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
     """For each boundary facet of a 2-D mesh: the number of its loop, and the arc length in metres where it starts.
 
