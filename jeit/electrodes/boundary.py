@@ -4,10 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from numpy.typing import ArrayLike
 
 from jeit.electrodes.electrodes import (
-    AbstractCompleteElectrodes,
     AbstractMovableElectrodes,
     Contact,
     Pen,
@@ -15,7 +13,6 @@ from jeit.electrodes.electrodes import (
     as_positions,
     check_dimension,
     is_concrete,
-    replace_contact_impedance,
 )
 from jeit.mesh import Mesh, Refine
 from jeit.mesh.geometry import boundary_loops, facet_measures
@@ -43,10 +40,6 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         self.contact_impedance = as_electrode_values(
             "contact_impedance", contact_impedance, len(self.position), unit="ohm·m"
         )
-
-    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """The same electrodes with other contact impedances, ohm·m. Raises `ValueError`."""
-        return replace_contact_impedance(self, contact_impedance)
 
     def geometry(self) -> dict[str, Array]:
         """Positions and widths."""

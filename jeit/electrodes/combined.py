@@ -71,6 +71,6 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         )
 
     def check(self, mesh: Mesh) -> None:
-        """Check every part on its own."""
+        """Check every part on its own; raises `ValueError` as they do."""
         for part in self.parts:
             part.check(mesh)

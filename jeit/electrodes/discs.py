@@ -1,14 +1,14 @@
 """Round electrodes: discs inside a sheet, and discs on the faces of a 3-D body."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from numpy.typing import ArrayLike
 
 from jeit.electrodes.electrodes import (
-    AbstractCompleteElectrodes,
     AbstractMovableElectrodes,
+    AbstractPlacedElectrodes,
     Contact,
     Pen,
     as_electrode_values,
@@ -16,14 +16,28 @@ from jeit.electrodes.electrodes import (
     check_dimension,
     compiled_contact,
     is_concrete,
-    replace_contact_impedance,
 )
 from jeit.electrodes.window import EDGE, nearest_electrodes, smooth_step, triangle_quadrature, window_contact
 from jeit.mesh import Mesh, Refine, measures
 from jeit.mesh.geometry import facet_measures
 
 
-class SheetDiscs(AbstractMovableElectrodes):
+class AbstractDiscs(AbstractPlacedElectrodes):
+    """Base of round electrodes."""
+
+    radius: eqx.AbstractVar[Float[Array, " L"]]
+
+    def geometry(self) -> dict[str, Array]:
+        """Positions and radii."""
+        return {"position": self.position, "radius": self.radius}
+
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """Discs."""
+        for place, radius in zip(np.asarray(self.position), np.asarray(self.radius), strict=True):
+            pen.disc(place, radius)
+
+
+class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
     """Complete electrodes that are discs inside a sheet (2-D mesh), free of its nodes.
 
     The disc's indicator function is replaced by a smooth window whose edge is half a cell wide, so integrals are
@@ -38,24 +52,7 @@ class SheetDiscs(AbstractMovableElectrodes):
 
     def __init__(self, position, radius, contact_impedance):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
-        self.position = as_positions(position, (2,))
-        self.radius = as_electrode_values("radius", radius, len(self.position), unit="metres")
-        self.contact_impedance = as_electrode_values(
-            "contact_impedance", contact_impedance, len(self.position), unit="ohm·m²"
-        )
-
-    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """The same electrodes with other contact impedances, ohm·m². Raises `ValueError`."""
-        return replace_contact_impedance(self, contact_impedance)
-
-    def geometry(self) -> dict[str, Array]:
-        """Positions and radii."""
-        return {"position": self.position, "radius": self.radius}
-
-    def draw(self, mesh: Mesh, pen: Pen) -> None:
-        """Discs."""
-        for place, radius in zip(np.asarray(self.position), np.asarray(self.radius), strict=True):
-            pen.disc(place, radius)
+        self.position, self.radius, self.contact_impedance = _as_discs(position, 2, radius, contact_impedance)
 
     def refinement(self) -> tuple[Refine, ...]:
         """Cells of 0.7 of the smallest radius on them."""
@@ -86,7 +83,7 @@ class SheetDiscs(AbstractMovableElectrodes):
         check_discs(self, mesh, measures(mesh))
 
 
-class FaceDiscs(AbstractCompleteElectrodes):
+class FaceDiscs(AbstractDiscs):
     """Complete electrodes that are discs on flat or gently curved faces of a 3-D mesh, free of its nodes.
 
     **Fields**: `position` (L, 3) metres, on the surface; `radius` (L,) metres; `contact_impedance` (L,) ohm·m².
@@ -98,24 +95,7 @@ class FaceDiscs(AbstractCompleteElectrodes):
 
     def __init__(self, position, radius, contact_impedance):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
-        self.position = as_positions(position, (3,))
-        self.radius = as_electrode_values("radius", radius, len(self.position), unit="metres")
-        self.contact_impedance = as_electrode_values(
-            "contact_impedance", contact_impedance, len(self.position), unit="ohm·m²"
-        )
-
-    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """The same electrodes with other contact impedances, ohm·m². Raises `ValueError`."""
-        return replace_contact_impedance(self, contact_impedance)
-
-    def geometry(self) -> dict[str, Array]:
-        """Positions and radii."""
-        return {"position": self.position, "radius": self.radius}
-
-    def draw(self, mesh: Mesh, pen: Pen) -> None:
-        """Discs."""
-        for place, radius in zip(np.asarray(self.position), np.asarray(self.radius), strict=True):
-            pen.disc(place, radius)
+        self.position, self.radius, self.contact_impedance = _as_discs(position, 3, radius, contact_impedance)
 
     def refinement(self) -> tuple[Refine, ...]:
         """None: they are not of a plane mesh."""
@@ -144,6 +124,13 @@ class FaceDiscs(AbstractCompleteElectrodes):
         check_discs(self, mesh, facet_measures(mesh))
 
 
+def _as_discs(position, dimension: int, radius, contact_impedance):
+    """Positions (L, d) and radii (L,) in metres and contact impedances (L,) in ohm·m², checked."""
+    position = as_positions(position, (dimension,))
+    radius = as_electrode_values("radius", radius, len(position), unit="metres")
+    return position, radius, as_electrode_values("contact_impedance", contact_impedance, len(position), unit="ohm·m²")
+
+
 def disc_window(points, position, radius, edge):
     """Share (q, k, p) that discs at `position` (q, k, d) with `radius` (q, k) cover of quadrature points (q, p, d);
     `edge` (q,) is the half-width of theirs."""
@@ -170,7 +157,7 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], tolerance: Float[Array,
     return jax.lax.stop_gradient(height < tolerance).astype(position.dtype)
 
 
-def check_discs(electrodes: SheetDiscs | FaceDiscs, mesh: Mesh, area) -> None:
+def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:
     """Raise `ValueError` unless every disc lies on the mesh, apart from the others, and spans enough cells."""
     position, radius = electrodes.position, electrodes.radius
     if not is_concrete(position, radius, electrodes.contact_impedance, mesh.points, mesh.cells):

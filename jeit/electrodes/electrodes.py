@@ -115,10 +115,18 @@ class AbstractCompleteElectrodes(AbstractElectrodes):
         return self.contact_impedance.shape[0]
 
 
-class AbstractMovableElectrodes(AbstractCompleteElectrodes):
-    """Base of complete electrodes that can slide on a plane mesh."""
+class AbstractPlacedElectrodes(AbstractCompleteElectrodes):
+    """Base of complete electrodes at positions of their own, whatever the nodes of the mesh."""
 
-    position: eqx.AbstractVar[Float[Array, "L 2"]]
+    position: eqx.AbstractVar[Float[Array, "L d"]]
+
+    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
+        """The same electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError`."""
+        return replace_contact_impedance(self, contact_impedance)
+
+
+class AbstractMovableElectrodes(AbstractPlacedElectrodes):
+    """Base of complete electrodes that can slide on a plane mesh."""
 
     @abc.abstractmethod
     def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
@@ -186,7 +194,7 @@ def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) ->
 
 
 def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
-    """Check and convert electrode positions (L, d) in metres, d one of `dimensions`."""
+    """Check and convert electrode positions (L, d) in metres, d one of `dimensions`; `ValueError`."""
     position = jnp.asarray(position, dtype=float)
     if position.ndim != 2 or position.shape[1] not in dimensions or position.shape[0] == 0:
         wanted = " or ".join(f"(L, {d})" for d in dimensions)

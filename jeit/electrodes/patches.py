@@ -4,11 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from numpy.typing import ArrayLike
 
 from jeit.electrodes.discs import facet_normals
 from jeit.electrodes.electrodes import (
-    AbstractCompleteElectrodes,
+    AbstractPlacedElectrodes,
     Contact,
     Pen,
     as_electrode_values,
@@ -16,14 +15,13 @@ from jeit.electrodes.electrodes import (
     check_dimension,
     compiled_contact,
     is_concrete,
-    replace_contact_impedance,
 )
 from jeit.electrodes.window import EDGE, smooth_step, triangle_quadrature, window_contact
 from jeit.mesh import Mesh, Refine
 from jeit.mesh.geometry import facet_measures
 
 
-class FacePatches(AbstractCompleteElectrodes):
+class FacePatches(AbstractPlacedElectrodes):
     """Complete electrodes that are rectangles on the surface of a 3-D mesh, free of its nodes.
 
     A patch lies in the tangent plane at its position: its width runs horizontally (perpendicular to z) and its
@@ -46,10 +44,6 @@ class FacePatches(AbstractCompleteElectrodes):
         self.contact_impedance = as_electrode_values(
             "contact_impedance", contact_impedance, len(self.position), unit="ohm·m²"
         )
-
-    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """The same electrodes with other contact impedances, ohm·m². Raises `ValueError`."""
-        return replace_contact_impedance(self, contact_impedance)
 
     def geometry(self) -> dict[str, Array]:
         """Positions, widths and heights."""
