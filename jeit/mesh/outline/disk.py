@@ -89,7 +89,7 @@ class Disk(Domain):
         boundary_points: ArrayLike | None = None,
         interior_points: ArrayLike | None = None,
     ) -> Mesh:
-        """A mesh of the disk; arguments and errors are those of `jeit.mesh.disk`."""
+        """A mesh of the disk; arguments are those of `jeit.mesh.disk`, which also says what it raises."""
         middle = np.asarray(self.centre)
         if num_boundary is not None:
             refine = self._finer_rim(num_boundary, refine)
