@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +15,7 @@ from jeit.mesh.generate.curve import circle
 from jeit.mesh.generate.refine import Refine, Refinement
 from jeit.mesh.generate.unstructured import Target, check_count, check_positions, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
-from jeit.mesh.outline.domain import Domain, Pen, check_length, check_position
+from jeit.mesh.outline.domain import Domain, Pen, check_length, check_position, numerics
 
 
 class Disk(Domain):
@@ -60,16 +61,19 @@ class Disk(Domain):
 
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
         """R less the distance (p,) of `points` (p, 2) from the centre, metres."""
-        return self.radius - self._from_centre(points)[1]
+        return jnp.asarray(self.radius - self._from_centre(points)[1])
 
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
         """`points` (p, 2) in metres, those outside moved to the circle along their radius."""
         offset, distance = self._from_centre(points)
-        return jnp.asarray(self.centre) + offset * jnp.minimum(1, self.radius / distance[:, None])
+        xp = numerics(self, points)
+        return jnp.asarray(xp.asarray(self.centre) + offset * xp.minimum(1, self.radius / distance[:, None]))
 
-    def _from_centre(self, points: ArrayLike) -> tuple[Float[Array, "p 2"], Float[Array, " p"]]:
-        offset = jnp.asarray(points) - jnp.asarray(self.centre)
-        return offset, jnp.sqrt(jnp.sum(offset**2, axis=1) + 1e-24)
+    def _from_centre(self, points: ArrayLike) -> tuple[Any, Any]:
+        """Offsets (p, 2) and distances (p,) from the centre, these with a derivative at zero too."""
+        xp = numerics(self, points)
+        offset = xp.asarray(points) - xp.asarray(self.centre)
+        return offset, xp.sqrt((offset**2).sum(axis=1) + 1e-24)
 
     def describe(self) -> dict:
         """Shape, radius and centre."""

@@ -102,6 +102,11 @@ def traced(*values: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
+def numerics(*values: Any) -> Any:
+    """JAX's numpy where any of `values` is being traced, NumPy where all are known."""
+    return jnp if traced(*values) else np
+
+
 def check_length(name: str, value: Any) -> Any:
     """Check a length in metres and make it a float (traced values pass); `ValueError` unless it is positive."""
     if traced(value):

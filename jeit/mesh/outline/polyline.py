@@ -1,17 +1,23 @@
-"""Closed loops of straight sides: what outlines made of them share (pure JAX).
+"""Closed loops of straight sides: what outlines made of them share.
 
 `loops` holds the vertices (k, 2) in metres of each, first not repeated: the outer one counter-clockwise, holes
-clockwise. For checks of loops see `jeit.mesh.loops`.
+clockwise. Distances are worked out by NumPy where all values are known, for JAX would compile anew for every number of
+points. For checks of loops see `jeit.mesh.loops`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
+
+from jeit.mesh.loops import inside as enclosed
+from jeit.mesh.outline.domain import numerics
 
 Loop = Float[Array, "k 2"]
 
@@ -44,35 +50,33 @@ def contains(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."]:
     return inside
 
 
-@jax.jit
 def signed_distance(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, " p"]:
     """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
-    points = jnp.asarray(points)
-    apart = _length_of(points - _nearest_on(loops, points))
-    return jnp.where(jax.lax.stop_gradient(contains(loops, points)), 1.0, -1.0) * apart
+    xp = numerics(loops, points)
+    at, inside, place = _nearest_on(xp, loops, points)
+    apart = xp.sqrt(((at - place) ** 2).sum(axis=1) + 1e-24)  # with a derivative at zero too
+    return jnp.asarray(xp.where(inside, apart, -apart))
 
 
-@jax.jit
 def nearest(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "p 2"]:
     """`points` (p, 2) inside as they are, others moved to the nearest place on a side."""
-    points = jnp.asarray(points)
-    inside = jax.lax.stop_gradient(contains(loops, points))
-    return jnp.where(inside[:, None], points, _nearest_on(loops, points))
+    xp = numerics(loops, points)
+    at, inside, place = _nearest_on(xp, loops, points)
+    return jnp.asarray(xp.where(inside[:, None], at, place))
 
 
-def _nearest_on(loops: Sequence[Loop], points: Float[Array, "p 2"]) -> Float[Array, "p 2"]:
-    start = jnp.concatenate([jnp.asarray(loop) for loop in loops])
-    sides = jnp.concatenate([jnp.roll(jnp.asarray(loop), -1, axis=0) for loop in loops]) - start
-    offset = points[:, None] - start
-    fraction = jnp.clip(jnp.sum(offset * sides, axis=-1) / jnp.sum(sides**2, axis=-1), 0, 1)
+def _nearest_on(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tuple[Any, Any, Any]:
+    """`points` (p, 2), which of them lie inside (p,), and the place on a side nearest to each, (p, 2)."""
+    chains, at = [xp.asarray(loop) for loop in loops], xp.asarray(points, float)
+    start = xp.concatenate(chains)
+    sides = xp.concatenate([xp.roll(loop, -1, axis=0) for loop in chains]) - start
+    offset = at[:, None] - start
+    fraction = xp.clip((offset * sides).sum(axis=-1) / (sides**2).sum(axis=-1), 0, 1)
     on_sides = start + fraction[..., None] * sides  # (p, s, 2)
-    closest = jnp.argmin(jnp.sum((points[:, None] - on_sides) ** 2, axis=-1), axis=1)
-    return jnp.take_along_axis(on_sides, closest[:, None, None], axis=1)[:, 0]
-
-
-def _length_of(vectors: Float[Array, "p 2"]) -> Float[Array, " p"]:
-    """Lengths (p,), with a derivative at zero too."""
-    return jnp.sqrt(jnp.sum(vectors**2, axis=1) + 1e-24)
+    closest = xp.argmin(((at[:, None] - on_sides) ** 2).sum(axis=-1), axis=1)
+    place = xp.take_along_axis(on_sides, closest[:, None, None], axis=1)[:, 0]
+    inside = enclosed(at, chains) if xp is np else jax.lax.stop_gradient(contains(chains, at))
+    return at, inside, place
 
 
 def _side_lengths(loop: Loop) -> Float[Array, " k"]:
