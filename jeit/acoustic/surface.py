@@ -13,12 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.mesh import Disk, Domain, Polygon, Rectangle
+from jeit.mesh import Domain, Polygon
 
 # Knots of the spline: more make every evaluation slower and the surface no smoother.
 _MOST_KNOTS = 300
-# Of the polygon that stands for a disk: it is nowhere more than 0.04 % of the radius inside it.
-_DISK_VERTICES = 120
 
 
 class AbstractSurface(eqx.Module):
@@ -90,17 +88,14 @@ class CurvedSurface(AbstractSurface):
 
 
 def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -> AbstractSurface:
-    """The surface within `outline`: vertices (K, 2), or a `Rectangle`, `Disk` or `Polygon`; or (K, 3) in space.
+    """The surface within `outline`: vertices (K, 2), or an outline such as `Disk`; or (K, 3) in space.
 
     In space the surface passes through the outline and `points` (T, 3), places of taps for instance. Raises
     `ValueError` for outlines that are none, and for surfaces that fold over their best plane.
     """
-    if isinstance(outline, Disk):
-        outline = Polygon(outline.boundary(np.linspace(0, outline.perimeter, _DISK_VERTICES, endpoint=False)))
-    if isinstance(outline, Rectangle):
-        outline = Polygon(outline.vertices)
-    if isinstance(outline, Polygon):
-        return Plane(outline)
+    if isinstance(outline, Domain):
+        edge, *holes = outline.loops()
+        return Plane(Polygon(edge, holes))
     vertices = np.asarray(outline, float)
     if vertices.ndim != 2 or vertices.shape[1] not in (2, 3) or len(vertices) < 3:
         raise ValueError(f"outline: give at least three vertices (K, 2) or (K, 3) in metres; got {vertices.shape}.")

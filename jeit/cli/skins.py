@@ -59,9 +59,9 @@ def check_layer(thickness: float, conductivity: float) -> None:
 
 def _plain(outline: "Domain") -> "Domain":
     """A drawing's four corners are a rectangle if they are one: it is then meshed as one."""
-    from jeit.mesh import Disk, Rectangle
+    from jeit.mesh import Rectangle
 
-    if isinstance(outline, Disk | Rectangle) or getattr(outline, "holes", ()) or len(outline.vertices) != 4:
+    if [len(loop) for loop in outline.loops()] != [4]:
         return outline
     low_x, high_x, low_y, high_y = outline.extent
     width, height = high_x - low_x, high_y - low_y

@@ -4,20 +4,12 @@
 whether a frame can be imaged against a reference.
 """
 
-from jeit.data.checks import FrameQuality as FrameQuality
-from jeit.data.checks import assess as assess
 from jeit.data.checks import check_imageable as check_imageable
-from jeit.data.checks import check_same_setup as check_same_setup
-from jeit.data.description import Description as Description
 from jeit.data.description import load_description as load_description
 from jeit.data.export import write_table as write_table
 from jeit.data.measurement import Measurement as Measurement
-from jeit.data.quality import NoiseEstimate as NoiseEstimate
-from jeit.data.quality import channel_reciprocity_error as channel_reciprocity_error
 from jeit.data.quality import estimate_noise as estimate_noise
-from jeit.data.quality import expected_signs as expected_signs
 from jeit.data.quality import impossible_signs as impossible_signs
 from jeit.data.quality import reciprocity_error as reciprocity_error
-from jeit.data.registry import FORMATS as FORMATS
 from jeit.data.registry import read as read
 from jeit.data.screening import screen as screen

@@ -2,8 +2,8 @@
 
 Sections (`tank6cm.toml` in this folder is an example; only `[protocol]` must be there):
 
-- `[geometry]`: `shape` = "disk" (`radius`), "rectangle" (`width`, `height`) or "polygon" (`vertices`);
-  `centre`. Metres.
+- `[geometry]`: `shape` = "disk" (`radius`, `centre`), "rectangle" (`width`, `height`, `centre`) or "polygon"
+  (`vertices`, `holes`). Metres.
 - `[electrodes]`: `kind` = "boundary" (`width`), "disc" (`radius`) or "point"; `contact_impedance`; and where
   they are: `layout` = "ring" (disk: `number`, `start_angle_degrees`, `clockwise`), "perimeter" (`number`,
   `start`) or `positions`.
@@ -15,6 +15,7 @@ Sections (`tank6cm.toml` in this folder is an example; only `[protocol]` must be
 - `[notes]`: `text`, a list of sentences to carry along.
 """
 
+import inspect
 import re
 import tomllib
 from dataclasses import dataclass, field
@@ -27,15 +28,22 @@ import numpy as np
 from jeit import protocol as protocols
 from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
 from jeit.layout import perimeter, ring
-from jeit.mesh import Disk, Domain, Polygon, Rectangle
+from jeit.mesh import Disk, Domain
+from jeit.mesh.outline import OUTLINES
 from jeit.protocol import Protocol
 
 CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
 VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
+ELECTRODES = {"boundary": BoundaryElectrodes, "disc": SheetDiscs, "point": PointElectrodes}
 BUNDLED = ("tank6cm",)
 
+# What makes each outline, and whether it must be told.
+_OUTLINE_ARGUMENTS = {
+    shape: {name: one.default is one.empty for name, one in inspect.signature(outline).parameters.items()}
+    for shape, outline in OUTLINES.items()
+}
 _KEYS = {
-    "geometry": {"shape", "radius", "width", "height", "vertices", "centre"},
+    "geometry": {"shape"}.union(*_OUTLINE_ARGUMENTS.values()),
     "electrodes": {
         "kind",
         "layout",
@@ -176,30 +184,28 @@ def _choice(value: Any, choices, origin: str, where: str) -> Any:
 
 def _domain(section: dict, origin: str) -> Domain:
     where = "[geometry]"
-    shape = _choice(_need(section, "shape", origin, where), ("disk", "rectangle", "polygon"), origin, f"{where} shape")
-    centre = section.get("centre", (0.0, 0.0))
+    shape = _choice(_need(section, "shape", origin, where), OUTLINES, origin, f"{where} shape")
+    arguments = {
+        name: _need(section, name, origin, where) if needed else section[name]
+        for name, needed in _OUTLINE_ARGUMENTS[shape].items()
+        if needed or name in section
+    }
     try:
-        if shape == "disk":
-            return Disk(_need(section, "radius", origin, where), centre)
-        if shape == "rectangle":
-            width, height = (_need(section, key, origin, where) for key in ("width", "height"))
-            return Rectangle(width, height, centre)
-        return Polygon(_need(section, "vertices", origin, where))
+        return OUTLINES[shape](**arguments)
     except ValueError as error:
         raise _located(error, origin, where) from None
 
 
 def _electrodes(section: dict, domain: Domain | None, origin: str):
     where = "[electrodes]"
-    kind = _choice(section.get("kind", "boundary"), ("boundary", "disc", "point"), origin, f"{where} kind")
+    kind = _choice(section.get("kind", "boundary"), ELECTRODES, origin, f"{where} kind")
     try:
         position = _positions(section, domain, origin)
         if kind == "point":
             return PointElectrodes(position)
         size = _need(section, "width" if kind == "boundary" else "radius", origin, where)
         contact_impedance = _need(section, "contact_impedance", origin, where)
-        build = BoundaryElectrodes if kind == "boundary" else SheetDiscs
-        return build(position, np.asarray(size, float), np.asarray(contact_impedance, float))
+        return ELECTRODES[kind](position, np.asarray(size, float), np.asarray(contact_impedance, float))
     except (ValueError, TypeError) as error:
         raise _located(error, origin, where) from None
 

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from jeit.data.description import ELECTRODES
 from jeit.data.measurement import Measurement
-from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
-from jeit.mesh import Disk, Domain, Polygon, Rectangle
+from jeit.electrodes import AbstractElectrodes
+from jeit.mesh import Domain
+from jeit.mesh.outline import OUTLINES
 
 
 def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]:
@@ -17,8 +19,8 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
     `measurement` (K, L), `drive_index` (M,), `measurement_index` (M,), `protocol_name`. The TOML holds
     geometry, electrodes, frame names and notes. `read` gives the same measurement back.
 
-    Raises `ValueError` for another suffix, and for electrodes or domains that a description cannot say (3-D,
-    holes).
+    Raises `ValueError` for another suffix, and for electrodes or domains that a description cannot say (3-D, an
+    outline of your own).
     """
     file = Path(path)
     if file.suffix.lower() != ".npz":
@@ -51,30 +53,28 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
 
 
 def _geometry(domain: Domain) -> dict:
-    if isinstance(domain, Disk):
-        return {"shape": "disk", "radius": domain.radius, "centre": list(domain.centre)}
-    if isinstance(domain, Rectangle):
-        size = {"width": domain.width, "height": domain.height}
-        return {"shape": "rectangle", **size, "centre": list(domain.centre)}
-    if isinstance(domain, Polygon) and not domain.holes:
-        return {"shape": "polygon", "vertices": np.asarray(domain.vertices).tolist()}
-    raise ValueError(f"write_table: a description cannot say {domain!r}. Set domain to None, or save the mesh instead.")
+    described = domain.describe()
+    if described["shape"] not in OUTLINES:
+        raise ValueError(
+            f"write_table: a description cannot say {domain!r}; it knows {', '.join(OUTLINES)}. Set domain to None, or "
+            "save the mesh instead."
+        )
+    return described
 
 
-def _electrodes(electrodes) -> dict:
-    positions = {"positions": np.asarray(getattr(electrodes, "position", np.zeros((0, 0)))).tolist()}
-    if isinstance(electrodes, BoundaryElectrodes):
-        size = {"kind": "boundary", "width": np.asarray(electrodes.width).tolist()}
-    elif isinstance(electrodes, SheetDiscs):
-        size = {"kind": "disc", "radius": np.asarray(electrodes.radius).tolist()}
-    elif isinstance(electrodes, PointElectrodes) and electrodes.position.shape[1] == 2:
-        return {"kind": "point", **positions}
-    else:
+def _electrodes(electrodes: AbstractElectrodes) -> dict:
+    kind = next((name for name, known in ELECTRODES.items() if type(electrodes) is known), None)
+    geometry = {name: np.asarray(values).tolist() for name, values in electrodes.geometry().items()} if kind else {}
+    positions = geometry.pop("position", None)
+    if positions is None or len(positions[0]) != 2:
         raise ValueError(
             f"write_table: a description cannot say {type(electrodes).__name__}; it knows 2-D boundary, disc "
             "and point electrodes. Set electrodes to None, or save the model instead."
         )
-    return {**size, **positions, "contact_impedance": np.asarray(electrodes.contact_impedance).tolist()}
+    described = {"kind": kind, **geometry, "positions": positions}
+    if electrodes.is_point:
+        return described
+    return {**described, "contact_impedance": np.asarray(electrodes.contact_impedance).tolist()}
 
 
 def _assignments(section: dict) -> list[str]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Inexact
 
-from jeit.electrodes import is_concrete
+from jeit.electrodes.electrodes import is_concrete
 from jeit.mesh import Domain
 from jeit.protocol import Protocol
 
@@ -134,7 +134,7 @@ class Measurement(eqx.Module):
     def masked(self, usable, reason: str) -> "Measurement":
         """The same measurement with fewer usable channels.
 
-        `usable` is boolean, (M,) or (F, M); `reason` goes into the notes.
+        `usable` is boolean, (M,) or (F, M); `reason` goes into the notes. Raises `ValueError` for another shape.
         """
         extra = jnp.asarray(usable)
         if extra.dtype != bool or extra.shape not in ((self.num_channels,), self.mask.shape):
@@ -149,7 +149,10 @@ class Measurement(eqx.Module):
         return self._replace(self.voltages, mask, notes=(*self.notes, note))
 
     def without_electrodes(self, electrodes) -> "Measurement":
-        """Mask channels that drive or measure any of `electrodes` (0-based): missing or broken ones."""
+        """Mask channels that drive or measure any of `electrodes` (0-based): missing or broken ones.
+
+        Raises `ValueError` for electrodes that are not there.
+        """
         numbers = ", ".join(str(k + 1) for k in np.atleast_1d(electrodes))
         return self.masked(self.protocol.mask_without(electrodes), f"electrodes {numbers} left out.")
 

@@ -10,8 +10,9 @@ from jaxtyping import Float, Int
 
 from jeit.data.measurement import Measurement
 from jeit.electrodes import BoundaryElectrodes
-from jeit.mesh import Disk, Rectangle
-from jeit.protocol import Protocol, transfer_between_drives
+from jeit.mesh.loops import along
+from jeit.protocol import Protocol
+from jeit.protocol.reciprocity import transfer_between_drives
 
 # Enough frames to judge a recording by; a long one is sampled evenly.
 _MOST_FRAMES = 32
@@ -117,8 +118,8 @@ def impossible_signs(measurement: Measurement) -> Float[np.ndarray, " F"] | None
     """(F,) fraction of the usable voltages whose sign no passive body gives (real part of complex voltages).
 
     Voltages that are nothing but noise have the wrong sign half the time: the fraction of such channels is
-    about twice the value returned. None when the electrodes are not known to lie around the boundary of a
-    disk or rectangle, or no channel has a known sign. See `expected_signs`.
+    about twice the value returned. None when the electrodes are not known to lie around the boundary of an
+    outline, or no channel has a known sign. See `expected_signs`.
     """
     order = _boundary_order(measurement)
     if order is None:
@@ -134,10 +135,9 @@ def impossible_signs(measurement: Measurement) -> Float[np.ndarray, " F"] | None
 
 def _boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
     electrodes, domain = measurement.electrodes, measurement.domain
-    if not isinstance(electrodes, BoundaryElectrodes) or not isinstance(domain, (Disk, Rectangle)):
+    if not isinstance(electrodes, BoundaryElectrodes) or domain is None:
         return None
-    x, y = np.asarray(electrodes.position).T - np.asarray(domain.centre)[:, None]
-    return np.argsort(np.arctan2(y, x), kind="stable")
+    return np.argsort(along(np.asarray(electrodes.position), np.asarray(domain.loops()[0])), kind="stable")
 
 
 def _asymmetry(measurement: Measurement) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

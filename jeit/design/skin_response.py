@@ -18,7 +18,7 @@ from jeit.electrodes import FaceDiscs
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import check_conductivity
 from jeit.layout import Layout
-from jeit.mesh import Disk, Domain, Mesh, Rectangle, disk, layer, polygon, rectangle
+from jeit.mesh import Domain, layer
 from jeit.protocol import two_terminal
 
 # Of a hydrogel's electrodes, ohm·m², where a layout does not say.
@@ -92,7 +92,7 @@ class TouchedSkin(eqx.Module):
                 f"cell_size is {1e3 * cell_size:g} mm; give no more than {_COARSEST * smallest:.3g} mm, as {across}."
             )
         check_cell_size("cell_size", cell_size, float(outline.area), num_layers)
-        mesh = layer(_plane(outline, cell_size), thickness, num_layers)
+        mesh = layer(outline.mesh(cell_size=cell_size), thickness, num_layers)
         centres = np.asarray(layout.centres)
         impedance = _CONTACT_IMPEDANCE if layout.contact_impedance is None else layout.contact_impedance
         electrodes = FaceDiscs(np.column_stack([centres, np.zeros(len(centres))]), layout.diameters / 2, impedance)
@@ -156,11 +156,3 @@ def _check_thickness(thickness: float, num_layers: int, indentation: AbstractInd
             f"thickness is {1e3 * thickness:g} mm; give more than the {1e3 * deepest:g} mm that a touch is deep, and "
             f"no more than {1e3 * most:g} mm, where {num_layers} layers of cells become too coarse for it."
         )
-
-
-def _plane(outline: Domain, cell_size: float) -> Mesh:
-    if isinstance(outline, Disk):
-        return disk(outline.radius, cell_size=cell_size, centre=outline.centre)
-    if isinstance(outline, Rectangle):
-        return rectangle(outline.width, outline.height, cell_size=cell_size, centre=outline.centre)
-    return polygon(outline.vertices, holes=getattr(outline, "holes", ()), cell_size=cell_size)

@@ -13,17 +13,12 @@ Where to put them: `jeit.layout`.
 
 from jeit.electrodes.boundary import BoundaryElectrodes as BoundaryElectrodes
 from jeit.electrodes.combined import CombinedElectrodes as CombinedElectrodes
-from jeit.electrodes.combined import contact_impedance as contact_impedance
-from jeit.electrodes.combined import with_contact_impedance as with_contact_impedance
 from jeit.electrodes.discs import FaceDiscs as FaceDiscs
 from jeit.electrodes.discs import SheetDiscs as SheetDiscs
 from jeit.electrodes.electrodes import AbstractElectrodes as AbstractElectrodes
-from jeit.electrodes.electrodes import Contact as Contact
-from jeit.electrodes.electrodes import is_concrete as is_concrete
 from jeit.electrodes.facets import FacetElectrodes as FacetElectrodes
 from jeit.electrodes.facets import electrodes_from_nodes as electrodes_from_nodes
 from jeit.electrodes.facets import plates as plates
-from jeit.electrodes.integrated import IntegratedElectrodes as IntegratedElectrodes
 from jeit.electrodes.patches import FacePatches as FacePatches
 from jeit.electrodes.point import NodeElectrodes as NodeElectrodes
 from jeit.electrodes.point import PointElectrodes as PointElectrodes

@@ -6,17 +6,19 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.electrodes.electrodes import (
-    AbstractElectrodes,
+    AbstractMovableElectrodes,
     Contact,
+    Pen,
     as_electrode_values,
     as_positions,
     check_dimension,
     is_concrete,
 )
-from jeit.mesh import Mesh, boundary_loops, facet_measures
+from jeit.mesh import Mesh, Refine
+from jeit.mesh.geometry import boundary_loops, facet_measures
 
 
-class BoundaryElectrodes(AbstractElectrodes):
+class BoundaryElectrodes(AbstractMovableElectrodes):
     """Complete electrodes that cover arcs of the boundary of a 2-D mesh, free of its nodes.
 
     Electrode l covers the points of the boundary within `width[l]` / 2 of `position[l]`, measured along the
@@ -34,20 +36,31 @@ class BoundaryElectrodes(AbstractElectrodes):
     def __init__(self, position, width, contact_impedance):
         """`width` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position = as_positions(position, (2,))
-        self.width = as_electrode_values("width", width, self.num_electrodes, unit="metres")
+        self.width = as_electrode_values("width", width, len(self.position), unit="metres")
         self.contact_impedance = as_electrode_values(
-            "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m"
+            "contact_impedance", contact_impedance, len(self.position), unit="ohm·m"
         )
 
-    @property
-    def is_point(self) -> bool:
-        """No."""
-        return False
+    def geometry(self) -> dict[str, Array]:
+        """Positions and widths."""
+        return {"position": self.position, "width": self.width}
 
-    @property
-    def num_electrodes(self) -> int:
-        """Number of electrodes L."""
-        return self.position.shape[0]
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """Arcs of the boundary of `mesh`."""
+        for place, width in zip(np.asarray(self.position), np.asarray(self.width), strict=True):
+            pen.lines([_arc(mesh, place, width)], place)
+
+    def refinement(self) -> tuple[Refine, ...]:
+        """Half the size of cells at their middles."""
+        return (Refine(np.asarray(self.position), factor=2.0),)
+
+    def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
+        """Along the boundary of `mesh`, counter-clockwise."""
+        start, end = np.asarray(mesh.points)[np.asarray(mesh.facets)].swapaxes(0, 1)
+        place = np.asarray(self.position)
+        nearest = np.argmin(np.linalg.norm(place[:, None] - (start + end) / 2, axis=-1), axis=1)
+        along = (end - start)[nearest]
+        return (along / np.linalg.norm(along, axis=1, keepdims=True))[:, None]
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The boundary edges of `mesh`."""
@@ -114,6 +127,27 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
             if common.max() > max(1e-9, 1e3 * np.finfo(end.dtype).eps) * end.max():
                 pairs.append((first, second))
     return pairs
+
+
+def _arc(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
+    """Points (k, 2) of the piece of outline of length `width` in metres round the point nearest to `centre`."""
+    points, facets = np.asarray(mesh.points), np.asarray(mesh.facets)
+    ends = points[facets]
+    along = ends[:, 1] - ends[:, 0]
+    squared = np.sum(along**2, axis=1)
+    fraction = np.clip(np.sum((centre - ends[:, 0]) * along, axis=1) / squared, 0, 1)
+    nearest = np.argmin(np.sum((ends[:, 0] + fraction[:, None] * along - centre) ** 2, axis=1))
+    # The loop that holds this edge, unrolled into vertices by arc length from its beginning.
+    loop = np.cumsum(np.concatenate([[0], facets[1:, 0] != facets[:-1, 1]]))
+    edges = np.flatnonzero(loop == loop[nearest])
+    length = np.sqrt(squared[edges])
+    arc = np.concatenate([[0], np.cumsum(length)])
+    middle = arc[nearest - edges[0]] + fraction[nearest] * np.sqrt(squared[nearest])
+    vertices = np.concatenate([ends[edges, 0], ends[edges[-1:], 1]])
+    stops = np.concatenate([arc - arc[-1], arc, arc + arc[-1]])
+    inside = stops[(stops > middle - width / 2) & (stops < middle + width / 2)]
+    where = np.mod(np.concatenate([[middle - width / 2], inside, [middle + width / 2]]), arc[-1])
+    return np.stack([np.interp(where, arc, vertices[:, axis]) for axis in range(2)], axis=1)
 
 
 @jax.jit

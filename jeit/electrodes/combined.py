@@ -1,15 +1,17 @@
 """Electrodes of several kinds on one mesh, such as arcs round the edge of a sheet and a disc in its centre."""
 
-import equinox as eqx
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
-from jeit.electrodes.electrodes import AbstractElectrodes, Contact, as_electrode_values
-from jeit.mesh import Mesh
+from jeit.electrodes.electrodes import AbstractCompleteElectrodes, AbstractElectrodes, Contact, Pen, as_electrode_values
+from jeit.mesh import Mesh, Refine
 
 
-class CombinedElectrodes(AbstractElectrodes):
+class CombinedElectrodes(AbstractCompleteElectrodes):
     """Complete electrodes of several kinds, numbered one kind after the other.
 
     **Fields**: `parts`, electrodes none of which is a point electrode.
@@ -30,14 +32,30 @@ class CombinedElectrodes(AbstractElectrodes):
         self.parts = parts
 
     @property
-    def is_point(self) -> bool:
-        """No."""
-        return False
+    def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Contact impedances (L,) of all parts, ohm·m² (ohm·m for arcs)."""
+        return jnp.concatenate([part.contact_impedance for part in self.parts])
 
-    @property
-    def num_electrodes(self) -> int:
-        """Number of electrodes L of all parts together."""
-        return sum(part.num_electrodes for part in self.parts)
+    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
+        """The same electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError`."""
+        values = as_electrode_values("contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²")
+        pieces = jnp.split(values, np.cumsum([part.num_electrodes for part in self.parts])[:-1])
+        return CombinedElectrodes(
+            *(part.with_contact_impedance(piece) for part, piece in zip(self.parts, pieces, strict=True))
+        )
+
+    def geometry(self) -> dict[str, Any]:
+        """Every part's own description."""
+        return {"parts": [part.describe() for part in self.parts]}
+
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """All parts, one after the other."""
+        for part in self.parts:
+            part.draw(mesh, pen)
+
+    def refinement(self) -> tuple[Refine, ...]:
+        """That of all parts."""
+        return tuple(refine for part in self.parts for refine in part.refinement())
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The facets and cells of all parts."""
@@ -53,30 +71,6 @@ class CombinedElectrodes(AbstractElectrodes):
         )
 
     def check(self, mesh: Mesh) -> None:
-        """Check every part on its own."""
+        """Check every part on its own; raises `ValueError` as they do."""
         for part in self.parts:
             part.check(mesh)
-
-
-def contact_impedance(electrodes: AbstractElectrodes) -> Float[Array, " L"]:
-    """Contact impedances (L,) of complete electrodes, ohm·m² (ohm·m for arcs). Raises `ValueError` for points."""
-    if isinstance(electrodes, CombinedElectrodes):
-        return jnp.concatenate([contact_impedance(part) for part in electrodes.parts])
-    _refuse_points(electrodes)
-    return vars(electrodes)["contact_impedance"]
-
-
-def with_contact_impedance(electrodes: AbstractElectrodes, contact_impedance) -> AbstractElectrodes:
-    """The same electrodes with other contact impedances: one number or (L,). Raises `ValueError` for points."""
-    _refuse_points(electrodes)
-    values = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
-    if isinstance(electrodes, CombinedElectrodes):
-        ends = np.cumsum([part.num_electrodes for part in electrodes.parts])[:-1]
-        pieces = jnp.split(values, ends)
-        return CombinedElectrodes(*map(with_contact_impedance, electrodes.parts, pieces))
-    return eqx.tree_at(lambda each: each.contact_impedance, electrodes, values)
-
-
-def _refuse_points(electrodes: AbstractElectrodes) -> None:
-    if electrodes.is_point:
-        raise ValueError(f"{type(electrodes).__name__} have no contact impedance.")

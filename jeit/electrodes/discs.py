@@ -1,13 +1,16 @@
 """Round electrodes: discs inside a sheet, and discs on the faces of a 3-D body."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.electrodes.electrodes import (
-    AbstractElectrodes,
+    AbstractMovableElectrodes,
+    AbstractPlacedElectrodes,
     Contact,
+    Pen,
     as_electrode_values,
     as_positions,
     check_dimension,
@@ -15,10 +18,26 @@ from jeit.electrodes.electrodes import (
     is_concrete,
 )
 from jeit.electrodes.window import EDGE, nearest_electrodes, smooth_step, triangle_quadrature, window_contact
-from jeit.mesh import Mesh, facet_measures, measures
+from jeit.mesh import Mesh, Refine, measures
+from jeit.mesh.geometry import facet_measures
 
 
-class SheetDiscs(AbstractElectrodes):
+class AbstractDiscs(AbstractPlacedElectrodes):
+    """Base of round electrodes."""
+
+    radius: eqx.AbstractVar[Float[Array, " L"]]
+
+    def geometry(self) -> dict[str, Array]:
+        """Positions and radii."""
+        return {"position": self.position, "radius": self.radius}
+
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """Discs."""
+        for place, radius in zip(np.asarray(self.position), np.asarray(self.radius), strict=True):
+            pen.disc(place, radius)
+
+
+class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
     """Complete electrodes that are discs inside a sheet (2-D mesh), free of its nodes.
 
     The disc's indicator function is replaced by a smooth window whose edge is half a cell wide, so integrals are
@@ -33,21 +52,16 @@ class SheetDiscs(AbstractElectrodes):
 
     def __init__(self, position, radius, contact_impedance):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
-        self.position = as_positions(position, (2,))
-        self.radius = as_electrode_values("radius", radius, self.num_electrodes, unit="metres")
-        self.contact_impedance = as_electrode_values(
-            "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²"
-        )
+        self.position, self.radius, self.contact_impedance = _as_discs(position, 2, radius, contact_impedance)
 
-    @property
-    def is_point(self) -> bool:
-        """No."""
-        return False
+    def refinement(self) -> tuple[Refine, ...]:
+        """Cells of 0.7 of the smallest radius on them."""
+        radius = np.asarray(self.radius)
+        return (Refine(np.asarray(self.position), cell_size=0.7 * radius.min(), distance=float(radius.max())),)
 
-    @property
-    def num_electrodes(self) -> int:
-        """Number of electrodes L."""
-        return self.position.shape[0]
+    def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
+        """Along x and along y."""
+        return np.broadcast_to(np.eye(2), (self.num_electrodes, 2, 2))
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The cells of `mesh`."""
@@ -69,7 +83,7 @@ class SheetDiscs(AbstractElectrodes):
         check_discs(self, mesh, measures(mesh))
 
 
-class FaceDiscs(AbstractElectrodes):
+class FaceDiscs(AbstractDiscs):
     """Complete electrodes that are discs on flat or gently curved faces of a 3-D mesh, free of its nodes.
 
     **Fields**: `position` (L, 3) metres, on the surface; `radius` (L,) metres; `contact_impedance` (L,) ohm·m².
@@ -81,21 +95,11 @@ class FaceDiscs(AbstractElectrodes):
 
     def __init__(self, position, radius, contact_impedance):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
-        self.position = as_positions(position, (3,))
-        self.radius = as_electrode_values("radius", radius, self.num_electrodes, unit="metres")
-        self.contact_impedance = as_electrode_values(
-            "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²"
-        )
+        self.position, self.radius, self.contact_impedance = _as_discs(position, 3, radius, contact_impedance)
 
-    @property
-    def is_point(self) -> bool:
-        """No."""
-        return False
-
-    @property
-    def num_electrodes(self) -> int:
-        """Number of electrodes L."""
-        return self.position.shape[0]
+    def refinement(self) -> tuple[Refine, ...]:
+        """None: they are not of a plane mesh."""
+        return ()
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The boundary triangles of `mesh`."""
@@ -118,6 +122,13 @@ class FaceDiscs(AbstractElectrodes):
         """Raise `ValueError` for discs off the surface, overlapping, or too small for the mesh."""
         check_dimension("FaceDiscs", mesh, 3)
         check_discs(self, mesh, facet_measures(mesh))
+
+
+def _as_discs(position, dimension: int, radius, contact_impedance):
+    """Positions (L, d) and radii (L,) in metres and contact impedances (L,) in ohm·m², checked."""
+    position = as_positions(position, (dimension,))
+    radius = as_electrode_values("radius", radius, len(position), unit="metres")
+    return position, radius, as_electrode_values("contact_impedance", contact_impedance, len(position), unit="ohm·m²")
 
 
 def disc_window(points, position, radius, edge):
@@ -146,7 +157,7 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], tolerance: Float[Array,
     return jax.lax.stop_gradient(height < tolerance).astype(position.dtype)
 
 
-def check_discs(electrodes: SheetDiscs | FaceDiscs, mesh: Mesh, area) -> None:
+def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:
     """Raise `ValueError` unless every disc lies on the mesh, apart from the others, and spans enough cells."""
     position, radius = electrodes.position, electrodes.radius
     if not is_concrete(position, radius, electrodes.contact_impedance, mesh.points, mesh.cells):

@@ -1,6 +1,7 @@
 """What every kind of electrode has in common, and the integrals the forward model asks of it."""
 
 import abc
+from typing import Any, Protocol
 
 import equinox as eqx
 import jax
@@ -8,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
-from jeit.mesh import Mesh
+from jeit.mesh import Mesh, Refine
 
 
 class Contact(eqx.Module):
@@ -31,8 +33,27 @@ class Contact(eqx.Module):
     load: Float[Array, "n L"]
 
 
+class Pen(Protocol):
+    """What electrodes are drawn with, as seen from above: one stroke each, round its middle (d,), all in metres."""
+
+    def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
+        """An electrode on the edge of a sheet, which covers these lines (k, 2) of it."""
+
+    def disc(self, middle: np.ndarray, radius: float) -> None:
+        """A disc."""
+
+    def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:
+        """A rectangle, its sides along x and y."""
+
+    def dot(self, middle: np.ndarray) -> None:
+        """An electrode without a size, or one whose shape is not seen from above."""
+
+
 class AbstractElectrodes(eqx.Module):
     """Base of all electrodes: something that turns itself and a mesh into contact integrals."""
+
+    contact_impedance: eqx.AbstractVar[Float[Array, " L"]]
+    """(L,) ohm·m² (ohm·m for arcs on the edge of a sheet). Point electrodes have none, and raise `ValueError`."""
 
     @property
     @abc.abstractmethod
@@ -55,6 +76,91 @@ class AbstractElectrodes(eqx.Module):
     @abc.abstractmethod
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` where these electrodes do not fit `mesh`. Does nothing on traced values."""
+
+    @abc.abstractmethod
+    def with_contact_impedance(self, contact_impedance: ArrayLike) -> "AbstractElectrodes":
+        """The same electrodes with other contact impedances, one number or (L,), ohm·m² (ohm·m for arcs).
+
+        Raises `ValueError` for point electrodes, which have none.
+        """
+
+    @abc.abstractmethod
+    def geometry(self) -> dict[str, Any]:
+        """Where they are and how large: names and values of the fields that say so, metres."""
+
+    @abc.abstractmethod
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """Draw every electrode on `mesh` in one stroke, in their order, as seen from above."""
+
+    @abc.abstractmethod
+    def refinement(self) -> tuple[Refine, ...]:
+        """Where a plane mesh made for them should be finer; nothing where that is not known."""
+
+    def describe(self) -> dict[str, Any]:
+        """Kind, number, places and sizes in metres."""
+        return {"kind": type(self).__name__, "number": self.num_electrodes, **self.geometry(), "unit": "m"}
+
+
+class AbstractCompleteElectrodes(AbstractElectrodes):
+    """Base of electrodes of the complete model: they have a size, and a contact impedance for each."""
+
+    @property
+    def is_point(self) -> bool:
+        """No."""
+        return False
+
+    @property
+    def num_electrodes(self) -> int:
+        """Number of electrodes L."""
+        return self.contact_impedance.shape[0]
+
+
+class AbstractPlacedElectrodes(AbstractCompleteElectrodes):
+    """Base of complete electrodes at positions of their own, whatever the nodes of the mesh."""
+
+    position: eqx.AbstractVar[Float[Array, "L d"]]
+
+    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
+        """The same electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError`."""
+        return replace_contact_impedance(self, contact_impedance)
+
+
+class AbstractMovableElectrodes(AbstractPlacedElectrodes):
+    """Base of complete electrodes that can slide on a plane mesh."""
+
+    @abc.abstractmethod
+    def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
+        """Unit vectors (L, a, 2) of the a ways in which each electrode can move on `mesh`."""
+
+
+class AbstractPointElectrodes(AbstractElectrodes):
+    """Base of point electrodes, which have no contact."""
+
+    @property
+    def is_point(self) -> bool:
+        """Yes."""
+        return True
+
+    @property
+    def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Raises `ValueError`: there is none."""
+        raise ValueError(f"{type(self).__name__} have no contact impedance.")
+
+    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractElectrodes:
+        """Raises `ValueError`: there is none."""
+        raise ValueError(f"{type(self).__name__} have no contact impedance.")
+
+    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
+        """Node 0, where the potential is grounded: point electrodes have no contact mass."""
+        return (jnp.zeros((1, 1), mesh.cells.dtype),)
+
+
+def replace_contact_impedance(
+    electrodes: AbstractCompleteElectrodes, contact_impedance: ArrayLike
+) -> AbstractCompleteElectrodes:
+    """Electrodes whose field `contact_impedance` (L,) is another, one number or (L,). Raises `ValueError`."""
+    values = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
+    return eqx.tree_at(lambda each: each.contact_impedance, electrodes, values)
 
 
 @jax.jit
@@ -88,7 +194,7 @@ def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) ->
 
 
 def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
-    """Check and convert electrode positions (L, d) in metres, d one of `dimensions`."""
+    """Check and convert electrode positions (L, d) in metres, d one of `dimensions`; `ValueError`."""
     position = jnp.asarray(position, dtype=float)
     if position.ndim != 2 or position.shape[1] not in dimensions or position.shape[0] == 0:
         wanted = " or ".join(f"(L, {d})" for d in dimensions)

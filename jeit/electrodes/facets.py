@@ -5,12 +5,21 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
-from jeit.electrodes.electrodes import AbstractElectrodes, Contact, as_electrode_values, is_concrete
-from jeit.mesh import Mesh, facet_measures
+from jeit.electrodes.electrodes import (
+    AbstractCompleteElectrodes,
+    Contact,
+    Pen,
+    as_electrode_values,
+    is_concrete,
+    replace_contact_impedance,
+)
+from jeit.mesh import Mesh, Refine
+from jeit.mesh.geometry import facet_measures
 
 
-class FacetElectrodes(AbstractElectrodes):
+class FacetElectrodes(AbstractCompleteElectrodes):
     """Complete electrodes that cover whole boundary facets of a mesh; exact.
 
     **Fields**: `covers` (b, L), 1 where electrode l covers boundary facet f and 0 elsewhere; `contact_impedance`
@@ -46,15 +55,27 @@ class FacetElectrodes(AbstractElectrodes):
             "contact_impedance", contact_impedance, len(facets), unit="ohm·m² (ohm·m in 2-D)"
         )
 
-    @property
-    def is_point(self) -> bool:
-        """No."""
-        return False
+    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
+        """The same electrodes with other contact impedances, ohm·m² (ohm·m in 2-D). Raises `ValueError`."""
+        return replace_contact_impedance(self, contact_impedance)
 
-    @property
-    def num_electrodes(self) -> int:
-        """Number of electrodes L."""
-        return self.covers.shape[1]
+    def geometry(self) -> dict[str, Array]:
+        """Nothing but in facets of a mesh."""
+        return {}
+
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """The facets of a plane mesh; dots in their middle on a solid one."""
+        ends, covers = np.asarray(mesh.points)[np.asarray(mesh.facets)], np.asarray(self.covers)
+        middles = covers.T @ ends.mean(axis=1) / covers.sum(axis=0)[:, None]
+        for covered, middle in zip(covers.T, middles, strict=True):
+            if mesh.dimension == 2:
+                pen.lines(list(ends[covered > 0]), middle)
+            else:
+                pen.dot(middle)
+
+    def refinement(self) -> tuple[Refine, ...]:
+        """None: they have a mesh."""
+        return ()
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The boundary facets of `mesh`."""

@@ -1,9 +1,13 @@
 """Electrodes whose contact integrals are worked out: for models that are evaluated again and again as they stand."""
 
-import equinox as eqx
+from typing import Any
 
-from jeit.electrodes.electrodes import AbstractElectrodes, Contact
-from jeit.mesh import Mesh
+import equinox as eqx
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from jeit.electrodes.electrodes import AbstractElectrodes, Contact, Pen
+from jeit.mesh import Mesh, Refine
 
 
 class IntegratedElectrodes(AbstractElectrodes):
@@ -28,6 +32,27 @@ class IntegratedElectrodes(AbstractElectrodes):
     def num_electrodes(self) -> int:
         """Number of electrodes L."""
         return self.integrals.load.shape[1]
+
+    @property
+    def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Raises `ValueError`: it is in the integrals."""
+        raise ValueError("IntegratedElectrodes hold integrals only; ask the electrodes that they were made of.")
+
+    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractElectrodes:
+        """Raises `ValueError`: it is in the integrals."""
+        raise ValueError("IntegratedElectrodes cannot be changed; change the electrodes and integrate them anew.")
+
+    def geometry(self) -> dict[str, Any]:
+        """Nothing is known any more."""
+        return {}
+
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """Raises `ValueError`: where they are is not known any more."""
+        raise ValueError("IntegratedElectrodes do not say where they are; draw the electrodes that they were made of.")
+
+    def refinement(self) -> tuple[Refine, ...]:
+        """None: they have a mesh."""
+        return ()
 
     def contact_nodes(self, mesh: Mesh):
         """As the electrodes they were made of."""

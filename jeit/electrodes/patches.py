@@ -7,8 +7,9 @@ from jaxtyping import Array, Float, Int
 
 from jeit.electrodes.discs import facet_normals
 from jeit.electrodes.electrodes import (
-    AbstractElectrodes,
+    AbstractPlacedElectrodes,
     Contact,
+    Pen,
     as_electrode_values,
     as_positions,
     check_dimension,
@@ -16,10 +17,11 @@ from jeit.electrodes.electrodes import (
     is_concrete,
 )
 from jeit.electrodes.window import EDGE, smooth_step, triangle_quadrature, window_contact
-from jeit.mesh import Mesh, facet_measures
+from jeit.mesh import Mesh, Refine
+from jeit.mesh.geometry import facet_measures
 
 
-class FacePatches(AbstractElectrodes):
+class FacePatches(AbstractPlacedElectrodes):
     """Complete electrodes that are rectangles on the surface of a 3-D mesh, free of its nodes.
 
     A patch lies in the tangent plane at its position: its width runs horizontally (perpendicular to z) and its
@@ -37,21 +39,29 @@ class FacePatches(AbstractElectrodes):
     def __init__(self, position, width, height, contact_impedance):
         """Sizes and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position = as_positions(position, (3,))
-        self.width = as_electrode_values("width", width, self.num_electrodes, unit="metres")
-        self.height = as_electrode_values("height", height, self.num_electrodes, unit="metres")
+        self.width = as_electrode_values("width", width, len(self.position), unit="metres")
+        self.height = as_electrode_values("height", height, len(self.position), unit="metres")
         self.contact_impedance = as_electrode_values(
-            "contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²"
+            "contact_impedance", contact_impedance, len(self.position), unit="ohm·m²"
         )
 
-    @property
-    def is_point(self) -> bool:
-        """No."""
-        return False
+    def geometry(self) -> dict[str, Array]:
+        """Positions, widths and heights."""
+        return {"position": self.position, "width": self.width, "height": self.height}
 
-    @property
-    def num_electrodes(self) -> int:
-        """Number of electrodes L."""
-        return self.position.shape[0]
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """Rectangles where all lie on one horizontal face, dots elsewhere."""
+        places = np.asarray(self.position)
+        flat = np.ptp(places[:, 2]) < 1e-9
+        for place, width, height in zip(places, np.asarray(self.width), np.asarray(self.height), strict=True):
+            if flat:
+                pen.rectangle(place, width, height)
+            else:
+                pen.dot(place)
+
+    def refinement(self) -> tuple[Refine, ...]:
+        """None: they are not of a plane mesh."""
+        return ()
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The boundary triangles of `mesh`."""

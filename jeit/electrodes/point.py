@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.electrodes.electrodes import AbstractElectrodes, Contact, as_positions, is_concrete
-from jeit.mesh import Mesh, gradients
+from jeit.electrodes.electrodes import AbstractPointElectrodes, Contact, Pen, as_positions, is_concrete
+from jeit.mesh import Mesh, Refine, gradients
 
 
-class PointElectrodes(AbstractElectrodes):
+class PointElectrodes(AbstractPointElectrodes):
     """Point electrodes at any position in or on the boundary of a mesh.
 
     Current enters and voltage is read by P1 interpolation in the cell that holds the position. The potential of
@@ -25,18 +25,22 @@ class PointElectrodes(AbstractElectrodes):
         self.position = as_positions(position, (2, 3))
 
     @property
-    def is_point(self) -> bool:
-        """Yes."""
-        return True
-
-    @property
     def num_electrodes(self) -> int:
         """Number of electrodes L."""
         return self.position.shape[0]
 
-    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """Node 0, where the potential is grounded: point electrodes have no contact mass."""
-        return (jnp.zeros((1, 1), mesh.cells.dtype),)
+    def geometry(self) -> dict[str, Array]:
+        """Positions."""
+        return {"position": self.position}
+
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """Dots."""
+        for place in np.asarray(self.position):
+            pen.dot(place)
+
+    def refinement(self) -> tuple[Refine, ...]:
+        """Half the size of cells at their places."""
+        return (Refine(np.asarray(self.position), factor=2.0),)
 
     def contact(self, mesh: Mesh) -> Contact:
         """`load` (n, L): values of the basis functions at the electrodes; no mass."""
@@ -66,7 +70,7 @@ class PointElectrodes(AbstractElectrodes):
             raise ValueError(f"Electrodes {first + 1} and {second + 1} are at the same position.")
 
 
-class NodeElectrodes(AbstractElectrodes):
+class NodeElectrodes(AbstractPointElectrodes):
     """Point electrodes at nodes of a mesh, as imported models have them; exact.
 
     **Fields**: `nodes` (L,) indices into `mesh.points`.
@@ -84,18 +88,22 @@ class NodeElectrodes(AbstractElectrodes):
         self.nodes = jnp.asarray(array, jnp.int32)
 
     @property
-    def is_point(self) -> bool:
-        """Yes."""
-        return True
-
-    @property
     def num_electrodes(self) -> int:
         """Number of electrodes L."""
         return self.nodes.shape[0]
 
-    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """Node 0, where the potential is grounded: point electrodes have no contact mass."""
-        return (jnp.zeros((1, 1), mesh.cells.dtype),)
+    def geometry(self) -> dict[str, Array]:
+        """Nothing but nodes of a mesh."""
+        return {}
+
+    def draw(self, mesh: Mesh, pen: Pen) -> None:
+        """Dots."""
+        for place in np.asarray(mesh.points)[np.asarray(self.nodes)]:
+            pen.dot(place)
+
+    def refinement(self) -> tuple[Refine, ...]:
+        """None: they have a mesh."""
+        return ()
 
     def contact(self, mesh: Mesh) -> Contact:
         """`load` (n, L): one at each electrode's node; no mass."""

@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from jeit.electrodes import is_concrete
+from jeit.electrodes.electrodes import is_concrete
 from jeit.mesh import Mesh, gradients, measures
 
 
 def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
-    """Conductivity per cell, (m,) or tensor (m, d, d), from a per-cell, per-node or tensor conductivity.
+    """Conductivity per cell, (m,) or tensor (m, d, d), from a per-cell, per-node or tensor one, S/m (2-D: S).
 
     A conductivity given per node is linear in each cell; as P1 gradients are constant there, its mean over the
     cell's nodes is exact.

@@ -19,9 +19,10 @@ class ForwardModel(eqx.Module):
     """Electrode voltages of a body of given conductivity: ∇·(σ∇u) = 0 with the complete (or point) electrode model.
 
     Every method takes a conductivity: a scalar, one value per cell (m,), one per node (n,), or symmetric tensors
-    (m, d, d), in siemens per metre (2-D: sheet conductivity in siemens); complex values are admittivities. All are
-    jit-compiled, differentiable in the conductivity and in every field of the model (`model.electrodes.position`,
-    `.contact_impedance`, `model.mesh.points`, …), and may be wrapped in `jax.vmap`.
+    (m, d, d), in siemens per metre (2-D: sheet conductivity in siemens); complex values are admittivities. One of
+    another shape, not positive or not finite raises `ValueError`. All are jit-compiled, differentiable in the
+    conductivity and in every field of the model (`model.electrodes.position`, `.contact_impedance`,
+    `model.mesh.points`, …), and may be wrapped in `jax.vmap`.
 
     **Fields**: `mesh`, `electrodes`, `protocol`, and `system`, the sparsity pattern and linear solver.
     """
@@ -49,7 +50,8 @@ class ForwardModel(eqx.Module):
         self.system = System.create(mesh, electrodes, solver)
 
     def with_electrodes(self, electrodes: AbstractElectrodes) -> "ForwardModel":
-        """The same model with other electrodes of the same kind; their number may not change. Works under jit."""
+        """The same model with other electrodes of the same kind, as many; works under jit. Raises `ValueError` for
+        others, and for electrodes that do not fit the mesh."""
         if type(electrodes) is not type(self.electrodes):
             raise ValueError(
                 f"with_electrodes needs {type(self.electrodes).__name__}, not {type(electrodes).__name__}; make a new "
@@ -59,31 +61,41 @@ class ForwardModel(eqx.Module):
         return eqx.tree_at(lambda model: model.electrodes, self, electrodes)
 
     def with_protocol(self, protocol: Protocol) -> "ForwardModel":
-        """The same model with another protocol for the same electrodes."""
+        """The same model with another protocol; `ValueError` unless it is for as many electrodes."""
         _check(self.mesh, self.electrodes, protocol)
         return eqx.tree_at(lambda model: model.protocol, self, protocol)
 
     def voltages(self, conductivity) -> Inexact[Array, " M"]:
-        """Voltages (M,) of the protocol's channels, in volts."""
+        """Voltages (M,) of the protocol's channels, in volts. `conductivity` in S/m (2-D: S); raises `ValueError`."""
         return _voltages(self, check_conductivity(self.mesh, conductivity))
 
     def transfer_impedance(self, conductivity) -> Inexact[Array, "L L"]:
-        """Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero."""
+        """Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero.
+
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
+        """
         return _transfer_impedance(self, check_conductivity(self.mesh, conductivity))
 
     def potentials(self, conductivity) -> Inexact[Array, "S n"]:
-        """Potential at the nodes for every drive pattern, in volts; the mean over the electrodes is zero."""
+        """Potential at the nodes for every drive pattern, in volts; the mean over the electrodes is zero.
+
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
+        """
         return _potentials(self, check_conductivity(self.mesh, conductivity))
 
     def jacobian(self, conductivity) -> Inexact[Array, "M m"]:
         """∂(voltage)/∂(conductivity), volts per siemens per metre (2-D: per siemens).
 
-        With respect to the cells (M, m); with respect to the nodes (M, n) if `conductivity` is given per node.
+        With respect to the cells (M, m); with respect to the nodes (M, n) if `conductivity` is given per node. Raises
+        `ValueError` for a bad conductivity, and for tensors.
         """
         return self.voltages_and_jacobian(conductivity)[1]
 
     def voltages_and_jacobian(self, conductivity) -> tuple[Inexact[Array, " M"], Inexact[Array, "M m"]]:
-        """`voltages` and `jacobian` from one factorisation and one solve per electrode."""
+        """`voltages` and `jacobian` from one factorisation and one solve per electrode.
+
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one, and for tensors.
+        """
         conductivity = check_conductivity(self.mesh, conductivity)
         if conductivity.ndim == 3:
             raise ValueError(

@@ -7,7 +7,8 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from jeit.electrodes import AbstractElectrodes, Contact
+from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrodes import Contact
 from jeit.forward.assembly import stiffness
 from jeit.mesh import Mesh
 from jeit_solvers import (
@@ -34,7 +35,10 @@ class System(eqx.Module):
 
     @classmethod
     def create(cls, mesh: Mesh, electrodes: AbstractElectrodes, solver: str | lx.AbstractLinearSolver = "auto"):
-        """`solver`: "auto" (by predicted work and memory), "cholesky", "cg", or any lineax solver."""
+        """`solver`: "auto" (by predicted work and memory), "cholesky", "cg", or any lineax solver.
+
+        Raises `ValueError` for another name.
+        """
         groups = [np.asarray(nodes) for nodes in (mesh.cells, *electrodes.contact_nodes(mesh))]
         pattern = SparsityPattern.from_elements(groups, size=mesh.num_points)
         if isinstance(solver, str):
@@ -52,6 +56,7 @@ class System(eqx.Module):
     def operator(self, mesh: Mesh, conductivity, electrodes: AbstractElectrodes, contact: Contact) -> SparseSymmetric:
         """The symmetric positive-definite matrix A of stiffness and contact mass, (n, n) in siemens.
 
+        `conductivity` per cell, S/m (2-D: S).
         Point electrodes leave the constant potential free; a conductance to ground at node 0 fixes it. Currents
         that sum to zero send nothing through it, so its size does not matter: it is of the order of the rest.
         """

@@ -15,7 +15,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Inexact
 
-from jeit.electrodes import AbstractElectrodes, Contact
+from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrodes import Contact
 from jeit.forward.assembly import cell_conductivity, field_gradients
 from jeit.forward.system import System
 from jeit.mesh import Mesh
@@ -26,7 +27,8 @@ from jeit_solvers import NearInverse, Strips, near_inverse, symmetric_inverse
 def transfer_impedance(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
     """Transfer impedance Z (L, L) in ohms: electrode potentials U = Z I for currents I that sum to zero.
 
-    Rows and columns of Z sum to zero, i.e. the mean electrode potential is the reference. Symmetric.
+    `conductivity` in S/m (2-D: S), (m,), (n,) or (m, d, d). Rows and columns of Z sum to zero, i.e. the mean electrode
+    potential is the reference. Symmetric. Checks nothing: `ForwardModel.transfer_impedance` does.
     """
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
@@ -48,7 +50,8 @@ def _transfer_impedance_jvp(primals, tangents):
 def electrode_fields(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
     """Potentials F (n, L) for a unit current into each electrode, leaving evenly through all; and Z (L, L).
 
-    Volts per ampere. Differentiable by the implicit rule of the linear solve (one more solve per direction).
+    Volts per ampere; `conductivity` in S/m (2-D: S). Differentiable by the implicit rule of the linear solve (one more
+    solve per direction).
     """
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
@@ -66,8 +69,8 @@ def fields_and_inverse(
 ) -> tuple[Inexact[Array, "p L"], NearInverse]:
     """F at places of strips of the nodes, and K⁻¹ between them, up to `reach` strips apart, ohms, but for a constant.
 
-    K is the matrix of the electrode model with all electrodes floating: the potential at one node for a unit current
-    into another. What it leaves open, a constant, no change of conductivity sees.
+    `conductivity` in S/m (2-D: S). K is the matrix of the electrode model with all electrodes floating: the potential
+    at one node for a unit current into another. What it leaves open, a constant, no change of conductivity sees.
     """
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)

@@ -4,7 +4,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.mesh import Mesh, centroids, interior_facets, measures
+from jeit.mesh import Mesh, centroids, measures
+from jeit.mesh.geometry import interior_facets
 
 
 class Inclusion(eqx.Module):

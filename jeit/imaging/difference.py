@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from jeit.data import FrameQuality, Measurement
+from jeit.data import Measurement
+from jeit.data.checks import FrameQuality
 from jeit.image import Inclusion, Raster, find_inclusions, segment
 from jeit.imaging.method import iterative_reconstruction, linear_reconstruction
 from jeit.imaging.preparation import Clock, prepare_difference

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jeit.data import FrameQuality, Measurement, check_imageable
-from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes, PointElectrodes, SheetDiscs
+from jeit.data import Measurement, check_imageable
+from jeit.data.checks import FrameQuality
+from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import Calibration, calibrate, relative_noise
-from jeit.mesh import Domain, Mesh, Refine
+from jeit.mesh import Domain, Mesh
 
 
 class Clock:
@@ -160,14 +161,7 @@ def select_frames(
 
 def imaging_mesh(domain: Domain, electrodes: AbstractElectrodes, num_points: int) -> Mesh:
     """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep."""
-    if isinstance(electrodes, SheetDiscs):
-        radius = np.asarray(electrodes.radius)
-        refine = Refine(np.asarray(electrodes.position), cell_size=0.7 * radius.min(), distance=float(radius.max()))
-    elif isinstance(electrodes, (BoundaryElectrodes, PointElectrodes)):
-        refine = Refine(np.asarray(electrodes.position), factor=2.0)
-    else:
-        refine = None
-    return domain.mesh(num_points=num_points, refine=refine)
+    return domain.mesh(num_points=num_points, refine=electrodes.refinement() or None)
 
 
 def default_contact(measurement: Measurement) -> str:

@@ -6,7 +6,6 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
-from jeit.electrodes import contact_impedance, with_contact_impedance
 from jeit.forward import ForwardModel
 
 
@@ -93,8 +92,8 @@ def _fitted(model: ForwardModel, parameters) -> tuple[ForwardModel, Float[Array,
     # Voltages at fixed z·σ are proportional to 1/σ, so these two are nearly independent of each other.
     factor = jnp.exp(parameters["contact"] - parameters["conductivity"])
     electrodes = model.electrodes
-    impedance = contact_impedance(electrodes) * factor
-    return model.with_electrodes(with_contact_impedance(electrodes, impedance)), conductivity
+    impedance = electrodes.contact_impedance * factor
+    return model.with_electrodes(electrodes.with_contact_impedance(impedance)), conductivity
 
 
 def _residual(parameters, arguments):

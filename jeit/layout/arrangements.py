@@ -30,7 +30,10 @@ def ring(
 
 
 def ring_and_centre(radius: float, num_electrodes: int, **options) -> np.ndarray:
-    """A `ring` of electrodes and one more in its centre, which comes last: (num_electrodes + 1, d) metres."""
+    """A `ring` of electrodes and one more in its centre, which comes last: (num_electrodes + 1, d) metres.
+
+    For `jeit.protocol.reference_electrode`. `options` and errors are those of `ring`.
+    """
     position = ring(radius, num_electrodes, **options)
     return np.vstack([position, position.mean(axis=0)])
 
@@ -40,6 +43,7 @@ def perimeter(domain: Domain, num_electrodes: int, *, start: float = 0.0) -> np.
 
     `start`: arc length of the first electrode in metres, counted as in `domain.boundary` (a rectangle begins at its
     lower left corner; half a pitch keeps electrodes off the corners when L is a multiple of four).
+    Raises `ValueError` for fewer than two.
     """
     _check_count(num_electrodes, 2)
     arc_length = start + domain.perimeter * np.arange(num_electrodes) / num_electrodes
@@ -49,7 +53,10 @@ def perimeter(domain: Domain, num_electrodes: int, *, start: float = 0.0) -> np.
 def grid(
     width: float, height: float, columns: int, rows: int, *, centre: tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
-    """A regular grid of rows × columns positions that spans width × height metres, row by row from the lower left."""
+    """A regular grid of rows × columns positions that spans width × height metres, row by row from the lower left.
+
+    (L, 2) metres. Raises `ValueError` for sides that are not positive and for no rows or columns.
+    """
     _check_count(columns, 1)
     _check_count(rows, 1)
     if not (width > 0 or columns == 1) or not (height > 0 or rows == 1):

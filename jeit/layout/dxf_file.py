@@ -24,21 +24,28 @@ def write_dxf(layout: Layout, path: Path) -> None:
         drawing.layers.add(name, color=colour)
     space = drawing.modelspace()
 
-    def circle(centre, diameter: float, layer: str) -> None:
-        space.add_circle(1e3 * np.asarray(centre), 1e3 * float(diameter) / 2, dxfattribs={"layer": layer})
-
-    outline = layout.outline
-    if isinstance(outline, Disk):
-        circle(outline.centre, 2 * outline.radius, _OUTLINE)
-    elif outline is not None:
-        for loop in (outline.vertices, *getattr(outline, "holes", ())):
-            space.add_lwpolyline(1e3 * np.asarray(loop), close=True, dxfattribs={"layer": _OUTLINE})
+    if layout.outline is not None:
+        layout.outline.draw(_Pen(space, _OUTLINE))
+    discs = _Pen(space, _ELECTRODES)
     centred = ezdxf.enums.TextEntityAlignment.MIDDLE_CENTER
     for centre, diameter, label in zip(layout.centres, layout.diameters, layout.labels, strict=True):
-        circle(centre, diameter, _ELECTRODES)
+        discs.circle(centre, float(diameter) / 2)
         text = space.add_text(label, height=1e3 * float(diameter) / 3, dxfattribs={"layer": _LABELS})
         text.set_placement(1e3 * np.asarray(centre), align=centred)
     drawing.saveas(path)
+
+
+class _Pen:
+    """Draws on one of a drawing's layers."""
+
+    def __init__(self, space: Any, layer: str):
+        self.space, self.on = space, {"layer": layer}
+
+    def circle(self, centre: Any, radius: float) -> None:
+        self.space.add_circle(1e3 * np.asarray(centre), 1e3 * radius, dxfattribs=self.on)
+
+    def loop(self, vertices: np.ndarray) -> None:
+        self.space.add_lwpolyline(1e3 * vertices, close=True, dxfattribs=self.on)
 
 
 def read_dxf(path: Path, outline: Domain | None) -> Layout:

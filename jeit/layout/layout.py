@@ -11,8 +11,7 @@ from jaxtyping import Array, Float
 from jeit.electrodes.discs import SheetDiscs
 from jeit.electrodes.electrodes import as_electrode_values, as_positions, is_concrete
 from jeit.layout.arrangements import grid, quasi_uniform
-from jeit.mesh import Disk, Domain, Rectangle
-from jeit.mesh.loops import distance, inside
+from jeit.mesh import Domain, Rectangle
 
 # A skin outside these is not known to exist: its lengths would be in millimetres, or have been divided by 1000 twice.
 SMALLEST, LARGEST = 1e-3, 5.0  # m
@@ -167,11 +166,11 @@ def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain 
         raise ValueError(f"centres: {called[first]} and {called[second]} {how}; remove one or move them apart.")
     if outline is None:
         return
-    room = _room(centres, outline) - diameters / 2
+    room = np.asarray(outline.signed_distance(centres)) - diameters / 2
     worst = int(room.argmin())
     if room[worst] < -_ROUNDING:
         hint = ""
-        if (np.abs(centres) > LARGEST).any() and (_room(centres / 1000, outline) > 0).all():
+        if (np.abs(centres) > LARGEST).any() and bool((outline.signed_distance(centres / 1000) > 0).all()):
             hint = " Are they in millimetres? Divide by 1000."
         elif diameters[worst] > size:
             hint = " Is its diameter in metres?"
@@ -192,15 +191,6 @@ def bounds(centres: np.ndarray, diameters: np.ndarray) -> tuple[float, float, fl
     low = (centres - diameters[:, None] / 2).min(axis=0)
     high = (centres + diameters[:, None] / 2).max(axis=0)
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])
-
-
-def _room(points: np.ndarray, outline: Domain) -> np.ndarray:
-    """Distance (p,) of points (p, 2) from the outline, in metres; negative outside."""
-    if isinstance(outline, Disk):
-        return outline.radius - np.linalg.norm(points - np.asarray(outline.centre), axis=1)
-    loops = [np.asarray(loop) for loop in (outline.vertices, *getattr(outline, "holes", ()))]
-    nearest = np.min([distance(points, loop, np.roll(loop, -1, axis=0)).min(axis=1) for loop in loops], axis=0)
-    return np.where(inside(points, loops), nearest, -nearest)
 
 
 def _check_labels(labels: Sequence[str] | None, number: int) -> tuple[str, ...]:

@@ -44,13 +44,9 @@ def write_svg(layout: Layout, path: Path) -> None:
     root = ElementTree.Element("svg", {"xmlns": _SPACE, **size})
     _add(root, "title").text = layout.name
     line = {"fill": "none", "stroke-width": "0.1"}
-    outline = layout.outline
     group = _add(root, "g", id="OUTLINE", stroke="#ff0000", **line)
-    if isinstance(outline, Disk):
-        _add(group, "circle", **_circle(outline.centre, 2 * outline.radius))
-    elif outline is not None:
-        for loop in (outline.vertices, *getattr(outline, "holes", ())):
-            _add(group, "polygon", points=" ".join(f"{millimetres(x)},{millimetres(-y)}" for x, y in np.asarray(loop)))
+    if layout.outline is not None:
+        layout.outline.draw(_Pen(group))
     group = _add(root, "g", id="ELECTRODES", stroke="#0000ff", **line)
     centred = {"text-anchor": "middle", "dominant-baseline": "central", "font-family": "sans-serif"}
     names = _add(root, "g", id="LABELS", fill="#808080", **centred)
@@ -92,6 +88,20 @@ def _add(parent: ElementTree.Element, tag: str, **attributes: str) -> ElementTre
 def _circle(centre, diameter) -> dict[str, str]:
     x, y = centre
     return {"cx": str(millimetres(x)), "cy": str(millimetres(-y)), "r": str(millimetres(diameter / 2))}
+
+
+class _Pen:
+    """Draws outlines into a group."""
+
+    def __init__(self, group: ElementTree.Element):
+        self.group = group
+
+    def circle(self, centre: tuple[float, float], radius: float) -> None:
+        _add(self.group, "circle", **_circle(centre, 2 * radius))
+
+    def loop(self, vertices: np.ndarray) -> None:
+        points = " ".join(f"{millimetres(x)},{millimetres(-y)}" for x, y in vertices)
+        _add(self.group, "polygon", points=points)
 
 
 class _Builder(ElementTree.TreeBuilder):

@@ -4,44 +4,29 @@ Outlines without a mesh: `Disk`, `Rectangle`, `Polygon`. Plane meshes: `disk`, `
 where a `Refine` asks. Solids: `layer`, `box`, `cylinder`. From elsewhere: `Mesh.create`, `read`, `from_gmsh`.
 """
 
-from jeit.mesh.domain import Disk, Domain, Polygon, Rectangle
 from jeit.mesh.files import read, write
-from jeit.mesh.generate._unstructured import MOST_POINTS
 from jeit.mesh.generate.refine import Refine
-from jeit.mesh.geometry import (
-    boundary_loops,
-    centroids,
-    facet_centroids,
-    facet_measures,
-    gradients,
-    measures,
-)
+from jeit.mesh.geometry import centroids, gradients, measures
 from jeit.mesh.gmsh import from_gmsh
-from jeit.mesh.interior import interior_facets
 from jeit.mesh.mesh import Mesh
-from jeit.mesh.quality import Quality, quality
+from jeit.mesh.outline import Disk, Domain, Polygon, Rectangle
+from jeit.mesh.quality import quality
 from jeit.mesh.shapes import disk, polygon, rectangle
 from jeit.mesh.solids import box, cylinder, layer
 
 __all__ = [
-    "MOST_POINTS",
     "Disk",
     "Domain",
     "Mesh",
     "Polygon",
-    "Quality",
     "Rectangle",
     "Refine",
-    "boundary_loops",
     "box",
     "centroids",
     "cylinder",
     "disk",
-    "facet_centroids",
-    "facet_measures",
     "from_gmsh",
     "gradients",
-    "interior_facets",
     "layer",
     "measures",
     "polygon",

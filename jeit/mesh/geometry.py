@@ -9,8 +9,11 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from jeit.mesh._topology import cell_facets, pair_facets
 from jeit.mesh.mesh import Mesh
 
 
@@ -65,12 +68,6 @@ def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
     return 0.5 * jnp.sqrt(jnp.sum(jnp.cross(edges[:, 0], edges[:, 1]) ** 2, axis=-1))
 
 
-@jax.jit
-def facet_centroids(mesh: Mesh) -> Float[Array, "b d"]:
-    """Centre in metres of every boundary facet, (b, d)."""
-    return jnp.mean(mesh.points[mesh.facets], axis=1)
-
-
 def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
     """For each boundary facet of a 2-D mesh: the number of its loop, and the arc length in metres where it starts.
 
@@ -85,6 +82,18 @@ def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
     loop = jnp.sum((order <= order[:, None]) & first, axis=1)
     earlier = (order < order[:, None]) & (loop == loop[:, None])
     return loop, jnp.sum(jnp.where(earlier, facet_measures(mesh), 0), axis=1)
+
+
+def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of cells that share a facet, (f, 2), and the nodes of that facet, (f, d). NumPy; once per mesh.
+
+    Raises `ValueError` for a mesh that is being traced.
+    """
+    if isinstance(mesh.cells, Tracer):
+        raise ValueError("interior_facets needs a mesh with values; call it outside jit and vmap.")
+    cells = np.asarray(mesh.cells)
+    first, second, _ = pair_facets(cells)
+    return np.stack([first, second], axis=1) // cells.shape[1], cell_facets(cells)[first]
 
 
 def _cross(a: Float[Array, "m 2"], b: Float[Array, "m 2"]) -> Float[Array, " m"]:

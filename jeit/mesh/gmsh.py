@@ -9,9 +9,9 @@ from types import ModuleType
 
 import numpy as np
 
-from jeit.mesh.domain import Disk, Domain, Polygon, Rectangle
 from jeit.mesh.files import read
 from jeit.mesh.mesh import Mesh
+from jeit.mesh.outline import Domain
 
 
 def from_gmsh(
@@ -23,7 +23,7 @@ def from_gmsh(
 ) -> Mesh:
     """Mesh a geometry with Gmsh.
 
-    **Arguments**: `source`, a geometry file (.geo, .step, .brep, …), a `Disk`, `Rectangle` or `Polygon`, or None
+    **Arguments**: `source`, a geometry file (.geo, .step, .brep, …), an outline such as `Disk`, or None
     for the model that is current in the `gmsh` module; `cell_size` in the geometry's own unit (metres for a domain),
     the largest edge; `dimension` 2 or 3 (by default the geometry's own); `scale`, the geometry's unit in metres.
     Physical groups of the boundary become tags.
@@ -98,20 +98,26 @@ def _write(
         raise ValueError(f"source: Gmsh could not mesh the geometry: {error}.") from error
 
 
+class _Kernel:
+    """Gmsh's geometry kernel as a pen: a curve loop for each stroke."""
+
+    def __init__(self, gmsh: ModuleType):
+        self.shape = gmsh.model.occ
+        self.loops: list[int] = []
+
+    def circle(self, centre: tuple[float, float], radius: float) -> None:
+        self.loops.append(self.shape.addCurveLoop([self.shape.addCircle(*centre, 0.0, radius)]))
+
+    def loop(self, vertices: np.ndarray) -> None:
+        corners = [self.shape.addPoint(float(x), float(y), 0.0) for x, y in vertices]
+        sides = [self.shape.addLine(a, b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]
+        self.loops.append(self.shape.addCurveLoop(sides))
+
+
 def _draw(gmsh: ModuleType, domain: Domain) -> None:
-    shape = gmsh.model.occ
-    if isinstance(domain, Disk):
-        shape.addDisk(*domain.centre, 0.0, domain.radius, domain.radius)
-    elif isinstance(domain, Rectangle):
-        left, _, bottom, _ = domain.extent
-        shape.addRectangle(left, bottom, 0.0, domain.width, domain.height)
-    elif isinstance(domain, Polygon):
-        loops = []
-        for vertices in (domain.vertices, *domain.holes):
-            corners = [shape.addPoint(float(x), float(y), 0.0) for x, y in np.asarray(vertices)]
-            sides = [shape.addLine(a, b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]
-            loops.append(shape.addCurveLoop(sides))
-        shape.addPlaneSurface(loops)
-    else:
+    if not isinstance(domain, Domain):
         raise ValueError(f"source: expected a file, an outline or None, got {type(domain).__name__}")
-    shape.synchronize()
+    kernel = _Kernel(gmsh)
+    domain.draw(kernel)
+    kernel.shape.addPlaneSurface(kernel.loops)
+    kernel.shape.synchronize()

@@ -60,6 +60,16 @@ def inside(points: np.ndarray, loops: Sequence[np.ndarray]) -> np.ndarray:
     return result
 
 
+def along(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
+    """Arc length (p,) from the first vertex of a loop to where it comes nearest to points (p, 2)."""
+    sides = np.roll(loop, -1, axis=0) - loop
+    offset = points[:, None] - loop
+    fraction = np.clip((offset * sides).sum(-1) / (sides**2).sum(-1), 0.0, 1.0)
+    nearest = np.argmin(np.linalg.norm(offset - fraction[..., None] * sides, axis=-1), axis=1)
+    length = np.linalg.norm(sides, axis=1)
+    return np.cumsum(length)[nearest] - (1 - fraction[np.arange(len(points)), nearest]) * length[nearest]
+
+
 def distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Distance (p, s) of points (p, 2) from segments given by `start` and `end` (s, 2)."""
     along = end - start

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 from numpy.typing import ArrayLike
 
-from jeit.mesh.domain import Disk, Polygon, Rectangle
-from jeit.mesh.generate._outlines import mesh_disk, mesh_polygon, mesh_rectangle
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
+from jeit.mesh.outline import Disk, Polygon, Rectangle
 
 
 def disk(
@@ -38,8 +37,7 @@ def disk(
     The mesh is the polygon inscribed in the circle: with N boundary nodes its area falls short by the fraction
     (2 π² / 3) / N². Every angle is at least 25°. Raises `ValueError` on bad or contradicting arguments.
     """
-    return mesh_disk(
-        Disk(radius, centre),
+    return Disk(radius, centre).mesh(
         num_points=num_points,
         cell_size=cell_size,
         refine=refine,
@@ -66,8 +64,7 @@ def rectangle(
     are tagged 'left', 'right', 'bottom', 'top'. `boundary_points` are arc lengths in metres, counter-clockwise from
     the lower left corner; the other arguments are those of `disk`, and so are the errors.
     """
-    return mesh_rectangle(
-        Rectangle(width, height, centre),
+    return Rectangle(width, height, centre).mesh(
         num_points=num_points,
         cell_size=cell_size,
         refine=refine,
@@ -94,8 +91,7 @@ def polygon(
 
     Raises `ValueError` on an outline that is not simple, and on bad or contradicting arguments.
     """
-    return mesh_polygon(
-        Polygon(vertices, holes),
+    return Polygon(vertices, holes).mesh(
         num_points=num_points,
         cell_size=cell_size,
         refine=refine,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jeit.mesh.domain import check_length
-from jeit.mesh.generate import _unstructured
+from jeit.mesh.generate import unstructured
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
+from jeit.mesh.outline.domain import check_length
 from jeit.mesh.shapes import disk, rectangle
 
 # In a solid 'bottom' and 'top' are the faces across z, so the sides of a rectangle across y get new names.
@@ -28,10 +28,10 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1) -> Mesh:
     if mesh.dimension != 2:
         raise ValueError("mesh: a layer is made from a plane (2-D) mesh, this one is 3-D.")
     thickness = check_length("thickness", thickness)
-    num_layers = _unstructured.check_count("num_layers", num_layers, 1)
+    num_layers = unstructured.check_count("num_layers", num_layers, 1)
     plane, cells, facets = np.asarray(mesh.points), np.asarray(mesh.cells), np.asarray(mesh.facets)
     count = len(plane)
-    _unstructured.check_total(count * (num_layers + 1), "num_layers")
+    unstructured.check_total(count * (num_layers + 1), "num_layers")
     heights = np.repeat(np.linspace(0.0, thickness, num_layers + 1), count)
     points = np.column_stack([np.tile(plane, (num_layers + 1, 1)), heights])
 
@@ -121,9 +121,9 @@ def _stack(
     area: float, height: float, num_points: int | None, cell_size: float | None, num_layers: int | None
 ) -> tuple[int | None, int]:
     """Nodes of the base (None if a cell size is given) and number of layers."""
-    target = _unstructured.Target.create(num_points, cell_size)
+    target = unstructured.Target.create(num_points, cell_size)
     if num_layers is not None:
-        num_layers = _unstructured.check_count("num_layers", num_layers, 1)
+        num_layers = unstructured.check_count("num_layers", num_layers, 1)
     if target.cell_size is not None:
         return None, num_layers or max(1, round(height / target.cell_size))
     number = target.num_points if target.asked else 4000

@@ -11,4 +11,3 @@ from jeit.protocol.patterns import skip as skip
 from jeit.protocol.patterns import trigonometric as trigonometric
 from jeit.protocol.patterns import two_terminal as two_terminal
 from jeit.protocol.protocol import Protocol as Protocol
-from jeit.protocol.reciprocity import transfer_between_drives as transfer_between_drives

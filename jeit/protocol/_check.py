@@ -116,3 +116,9 @@ def check_pairs(pairs, num_electrodes: int, what: str) -> np.ndarray:
             f"{what}: pair {same[0]} is electrode {values[same[0], 0]} with itself. Use two different electrodes."
         )
     return values
+
+
+def check_choice(value, choices: tuple[str, ...], where: str, name: str) -> None:
+    """Raise `ValueError` unless the argument `name` is one of `choices`."""
+    if value not in choices:
+        raise ValueError(f"{where}: {name} must be one of {', '.join(map(repr, choices))}; got {value!r}.")

@@ -7,17 +7,12 @@ second, and measure the first minus the second.
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.protocol._check import check_count, check_current, check_pairs, electrode_indices
+from jeit.protocol._check import check_choice, check_count, check_current, check_pairs, electrode_indices
 from jeit.protocol.matrices import from_matrices
-from jeit.protocol.protocol import Protocol, shares_electrode
-from jeit.protocol.reciprocity import reciprocal_channel_pairs
-
-Order = Literal["rotating", "fixed"]
-# Amperes; an array, possibly traced, when something is differentiated with respect to it.
-Current = float | Float[Array, ""]
+from jeit.protocol.pairs import CrossedPairs, Current, Order, Reciprocal, pair_patterns, ring_pairs
+from jeit.protocol.protocol import Protocol
 
 
 def adjacent(
@@ -25,7 +20,7 @@ def adjacent(
     *,
     current: Current = 1e-3,
     driven_electrodes: bool = False,
-    reciprocal: Literal["all", "half"] = "all",
+    reciprocal: Reciprocal = "all",
     order: Order = "rotating",
 ) -> Protocol:
     """Neighbouring electrodes drive, neighbouring electrodes measure: L(L - 3) channels.
@@ -58,7 +53,7 @@ def skip(
     measurement_skipped: int | None = None,
     current: Current = 1e-3,
     driven_electrodes: bool = False,
-    reciprocal: Literal["all", "half"] = "all",
+    reciprocal: Reciprocal = "all",
     order: Order = "rotating",
 ) -> Protocol:
     """Pairs that leave out `skipped` electrodes drive, pairs that leave out `measurement_skipped` measure.
@@ -78,12 +73,9 @@ def skip(
     kind = "adjacent" if skipped == 0 else f"skip-{skipped}"
     if measurement_skipped != skipped:
         kind += f", skip-{measurement_skipped} measurement"
-    return _finish(
-        count,
-        _ring_pairs(count, skipped + 1),
-        _ring_pairs(count, measurement_skipped + 1),
-        name=f"{kind}, {count} electrodes",
-        where=where,
+    drive, measurement = ring_pairs(count, skipped + 1), ring_pairs(count, measurement_skipped + 1)
+    return CrossedPairs(where, count, drive, measurement).protocol(
+        f"{kind}, {count} electrodes",
         current=current,
         driven_electrodes=driven_electrodes,
         reciprocal=reciprocal,
@@ -112,17 +104,13 @@ def opposite(
             f"opposite: {count} electrodes have no opposite pairs. Use an even number, or `skip(..., "
             f"{count // 2 - 1})`."
         )
-    _check_choice(drives, ("distinct", "all"), "opposite", "drives")
-    pairs = _ring_pairs(count, count // 2)
-    return _finish(
-        count,
-        pairs[: count // 2] if drives == "distinct" else pairs,
-        _ring_pairs(count, 1),
-        name=f"opposite, {count} electrodes",
-        where="opposite",
+    check_choice(drives, ("distinct", "all"), "opposite", "drives")
+    pairs = ring_pairs(count, count // 2)
+    drive = pairs[: count // 2] if drives == "distinct" else pairs
+    return CrossedPairs("opposite", count, drive, ring_pairs(count, 1)).protocol(
+        f"opposite, {count} electrodes",
         current=current,
         driven_electrodes=driven_electrodes,
-        reciprocal="all",
         order=order,
     )
 
@@ -134,7 +122,7 @@ def all_against_one(
     measurement: Literal["common", "adjacent"] = "common",
     current: Current = 1e-3,
     driven_electrodes: bool | None = None,
-    reciprocal: Literal["all", "half"] = "all",
+    reciprocal: Reciprocal = "all",
 ) -> Protocol:
     """Every electrode in turn drives against the electrode `common`: L - 1 drives.
 
@@ -147,21 +135,17 @@ def all_against_one(
     `driven_electrodes=False`, and as `adjacent`.
     """
     count = check_count(num_electrodes, "all_against_one", 3)
-    _check_choice(measurement, ("common", "adjacent"), "all_against_one", "measurement")
+    check_choice(measurement, ("common", "adjacent"), "all_against_one", "measurement")
     electrode_indices(common, count)
     pairs = np.array([(k, common) for k in range(count) if k != common])
     if driven_electrodes is None:
         driven_electrodes = measurement == "common"
-    return _finish(
-        count,
-        pairs,
-        pairs if measurement == "common" else _ring_pairs(count, 1),
-        name=f"all against electrode {common}, {measurement} measurement, {count} electrodes",
-        where="all_against_one",
+    read = pairs if measurement == "common" else ring_pairs(count, 1)
+    return CrossedPairs("all_against_one", count, pairs, read).protocol(
+        f"all against electrode {common}, {measurement} measurement, {count} electrodes",
         current=current,
         driven_electrodes=driven_electrodes,
         reciprocal=reciprocal,
-        order="fixed",
     )
 
 
@@ -193,15 +177,14 @@ def reference_electrode(
         raise ValueError(f"reference_electrode: skipped must be from 0 to {count - 2}; got {skipped!r}.")
     boundary = np.array([k for k in range(count + 1) if k != reference])
     drive_kind = "adjacent" if skipped == 0 else f"skip-{skipped}"
-    return _finish(
-        count + 1,
-        boundary[_ring_pairs(count, skipped + 1)],
+    drive, measurement = (
+        boundary[ring_pairs(count, skipped + 1)],
         np.stack([boundary, np.full(count, reference)], axis=1),
-        name=f"{drive_kind} drive against reference electrode, {count} + 1 electrodes",
-        where="reference_electrode",
+    )
+    return CrossedPairs("reference_electrode", count + 1, drive, measurement).protocol(
+        f"{drive_kind} drive against reference electrode, {count} + 1 electrodes",
         current=current,
         driven_electrodes=driven_electrodes,
-        reciprocal="all",
         order=order,
     )
 
@@ -214,7 +197,7 @@ def two_terminal(
 ) -> Protocol:
     """Current and voltage on the same two electrodes, pair by pair.
 
-    All L(L - 1)/2 pairs, unless `pairs` (P, 2) says which.     Each voltage contains the contact impedance of
+    All L(L - 1)/2 pairs, unless `pairs` (P, 2) says which. Each voltage contains the contact impedance of
     both electrodes.
 
     Raises `ValueError` for a pair of an electrode with itself, or with one that does not exist.
@@ -253,13 +236,13 @@ def trigonometric(
     """
     count = check_count(num_electrodes, "trigonometric", 3)
     check_current(current, "trigonometric")
-    _check_choice(measurement, ("adjacent", "mean"), "trigonometric", "measurement")
+    check_choice(measurement, ("adjacent", "mean"), "trigonometric", "measurement")
     angle = 2 * np.pi * np.arange(count) / count
     waves = [wave(k * angle) for k in range(1, count // 2 + 1) for wave in (np.cos, np.sin)]
     drive = np.array(waves[: count - 1])
     drive -= drive.mean(axis=1, keepdims=True)  # the last rounding errors of Kirchhoff's law
     if measurement == "adjacent":
-        rows = pair_patterns(_ring_pairs(count, 1), count)
+        rows = pair_patterns(ring_pairs(count, 1), count)
     else:
         rows = np.eye(count) - (1 - np.eye(count)) / (count - 1)
     return from_matrices(current * drive, rows, name=f"trigonometric, {measurement} measurement, {count} electrodes")
@@ -272,86 +255,22 @@ def bipolar(
     *,
     current: Current = 1e-3,
     driven_electrodes: bool = False,
-    reciprocal: Literal["all", "half"] = "all",
+    reciprocal: Reciprocal = "all",
     name: str = "bipolar",
 ) -> Protocol:
     """Any drive pairs (S, 2) crossed with any measurement pairs (K, 2), drive by drive.
 
-    Options as in `adjacent`.     Raises `ValueError` for a pair of an electrode with itself, or with one that
+    Options as in `adjacent`.
+
+    Raises `ValueError` for a pair of an electrode with itself, or with one that
     does not exist.
     """
     count = check_count(num_electrodes, "bipolar", 2)
-    return _finish(
-        count,
-        check_pairs(drive_pairs, count, "bipolar: drive_pairs"),
-        check_pairs(measurement_pairs, count, "bipolar: measurement_pairs"),
-        name=name,
-        where="bipolar",
+    drive = check_pairs(drive_pairs, count, "bipolar: drive_pairs")
+    measurement = check_pairs(measurement_pairs, count, "bipolar: measurement_pairs")
+    return CrossedPairs("bipolar", count, drive, measurement).protocol(
+        name,
         current=current,
         driven_electrodes=driven_electrodes,
         reciprocal=reciprocal,
-        order="fixed",
-    )
-
-
-def pair_patterns(pairs: np.ndarray, num_electrodes: int) -> np.ndarray:
-    """Pairs (P, 2) as patterns (P, L): +1 on the first electrode, -1 on the second."""
-    patterns = np.zeros((len(pairs), num_electrodes))
-    rows = np.arange(len(pairs))
-    patterns[rows, pairs[:, 0]] = 1.0
-    patterns[rows, pairs[:, 1]] = -1.0
-    return patterns
-
-
-def _ring_pairs(count: int, step: int) -> np.ndarray:
-    start = np.arange(count)
-    return np.stack([start, (start + step) % count], axis=1)
-
-
-def _check_choice(value, choices: tuple[str, ...], where: str, name: str) -> None:
-    if value not in choices:
-        raise ValueError(f"{where}: {name} must be one of {', '.join(map(repr, choices))}; got {value!r}.")
-
-
-def _finish(
-    count: int,
-    drive_pairs: np.ndarray,
-    measurement_pairs: np.ndarray,
-    *,
-    name: str,
-    where: str,
-    current: Current,
-    driven_electrodes: bool,
-    reciprocal: str,
-    order: str,
-) -> Protocol:
-    """Cross drive pairs with measurement pairs, in the order and with the channels asked for."""
-    check_current(current, where)
-    _check_choice(reciprocal, ("all", "half"), where, "reciprocal")
-    _check_choice(order, ("rotating", "fixed"), where, "order")
-    num_rows = len(measurement_pairs)
-    drive_index = np.repeat(np.arange(len(drive_pairs)), num_rows)
-    measurement_index = np.tile(np.arange(num_rows), len(drive_pairs))
-    if order == "rotating":
-        # Drive i begins with measurement pair i: pairs are in ring order, one per electrode.
-        measurement_index = (measurement_index + drive_index) % num_rows
-    # Channels are chosen with NumPy at unit current, so that the current itself may be traced.
-    drive, measurement = pair_patterns(drive_pairs, count), pair_patterns(measurement_pairs, count)
-    keep = np.ones(len(drive_index), dtype=bool)
-    if not driven_electrodes:
-        keep &= ~shares_electrode(drive, measurement)[drive_index, measurement_index]
-    if reciprocal == "half":
-        pairs, _ = reciprocal_channel_pairs(drive, measurement, drive_index, measurement_index)
-        keep[pairs[:, 1]] = False
-    if not keep.any():
-        raise ValueError(
-            f"{where}: every channel measures on a driven electrode, so none is left. Pass "
-            "driven_electrodes=True, or measure other pairs."
-        )
-    return Protocol(
-        drive=current * drive,
-        measurement=measurement,
-        drive_index=drive_index[keep],
-        measurement_index=measurement_index[keep],
-        name=name,
     )

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from jeit.data import Measurement
-from jeit.mesh import Disk, Domain, Polygon, Rectangle
+from jeit.electrodes import AbstractElectrodes
+from jeit.mesh import Domain
 
 
 def describe_measurement(measurement: Measurement) -> dict[str, Any]:
@@ -25,26 +26,14 @@ def describe_measurement(measurement: Measurement) -> dict[str, Any]:
 
 def describe_domain(domain: Domain | None) -> dict[str, Any]:
     """Shape and size in metres of an outline."""
-    if isinstance(domain, Disk):
-        return {"shape": "disk", "radius": float(domain.radius), "centre": list(domain.centre), "unit": "m"}
-    if isinstance(domain, Rectangle):
-        size = {"width": float(domain.width), "height": float(domain.height)}
-        return {"shape": "rectangle", **size, "centre": list(domain.centre), "unit": "m"}
-    if isinstance(domain, Polygon):
-        return {"shape": "polygon", "vertices": np.asarray(domain.vertices).tolist(), "unit": "m"}
-    return {"shape": "not known"}
+    return {"shape": "not known"} if domain is None else {**domain.describe(), "unit": "m"}
 
 
-def describe_electrodes(electrodes) -> dict[str, Any]:
+def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]:
     """Kind, number, place and size in metres of electrodes."""
     if electrodes is None:
         return {"kind": "at places not known"}
-    known = {
-        name: getattr(electrodes, name)
-        for name in ("position", "width", "height", "radius")
-        if hasattr(electrodes, name)
-    }
-    return plain({"kind": type(electrodes).__name__, "number": electrodes.num_electrodes, **known, "unit": "m"})
+    return plain(electrodes.describe())
 
 
 def version_of(package: str) -> str | None:

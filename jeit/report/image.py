@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from jeit.electrodes import contact_impedance
 from jeit.imaging.difference import ImagedDifference
 from jeit.inverse import LinearReconstruction
 from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain, version_of
@@ -100,7 +99,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "conductivity": background,
             "conductivity_unit": unit,
             "contact": settings.contact,
-            "contact_impedance": None if electrodes.is_point else contact_impedance(electrodes),
+            "contact_impedance": None if electrodes.is_point else electrodes.contact_impedance,
             "contact_impedance_unit": "ohm·m" if result.mesh.dimension == 2 else "ohm·m²",
             "relative_misfit": float(calibration.misfit),
             "iterations": calibration.iterations,

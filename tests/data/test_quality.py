@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from jeit import data, protocol
+from jeit.data.checks import assess
+from jeit.data.quality import channel_reciprocity_error, expected_signs
 
 
 def test_missing_saturated_and_dead_channels_are_masked_and_noted(tank, setup):
@@ -74,10 +76,10 @@ def test_channel_reciprocity_error_finds_the_channel(tank):
     chosen = protocol.adjacent(16)
     voltages = tank(chosen)
     voltages[17] *= 1.5
-    error = data.channel_reciprocity_error(data.screen(voltages, chosen))[0]
+    error = channel_reciprocity_error(data.screen(voltages, chosen))[0]
     assert np.argmax(np.abs(error)) in (17, *(p for pair in chosen.reciprocal_pairs()[0] if 17 in pair for p in pair))
     assert np.sum(np.abs(error) > 1e-10) == 2
-    assert np.isnan(data.channel_reciprocity_error(data.screen(tank(protocol.opposite(8)), protocol.opposite(8)))).all()
+    assert np.isnan(channel_reciprocity_error(data.screen(tank(protocol.opposite(8)), protocol.opposite(8)))).all()
 
 
 @pytest.mark.parametrize(
@@ -95,7 +97,7 @@ def test_channel_reciprocity_error_finds_the_channel(tank):
 def test_expected_signs(tank, chosen, all_known, clockwise):
     count = chosen.num_electrodes
     order = np.roll(np.arange(count)[:: 1 if clockwise else -1], 3)
-    signs = data.expected_signs(chosen, order)
+    signs = expected_signs(chosen, order)
     assert np.all(signs != 0) == all_known
     assert np.count_nonzero(signs) > 0.3 * len(signs)
     known = signs != 0
@@ -125,7 +127,7 @@ def test_noise_in_the_difference_is_refused(tank, setup):
     much = data.screen(other + 1.0 * size * rng.normal(size=208), chosen, **setup(16))
     with pytest.raises(ValueError, match="breaks reciprocity"):
         data.check_imageable(much, reference)
-    assert [q.imageable for q in data.assess(much, reference)] == [False]
+    assert [q.imageable for q in assess(much, reference)] == [False]
 
 
 def test_too_few_channels_are_refused(tank, setup):

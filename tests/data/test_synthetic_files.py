@@ -174,10 +174,11 @@ def test_round_trip(tmp_path, tank, setup):
     assert again.notes[0] == "ein „Test“."
 
 
-@pytest.mark.parametrize("shape", ["rectangle", "polygon"])
+@pytest.mark.parametrize("shape", ["rectangle", "polygon", "polygon with a hole"])
 def test_round_trip_of_other_shapes(tmp_path, tank, shape):
     chosen = protocol.adjacent(4)
-    domain = Rectangle(0.2, 0.1) if shape == "rectangle" else Polygon([[0, 0], [0.2, 0], [0.1, 0.1]])
+    holes = [[[0.09, 0.01], [0.1, 0.03], [0.11, 0.01]]] if shape == "polygon with a hole" else []
+    domain = Rectangle(0.2, 0.1) if shape == "rectangle" else Polygon([[0, 0], [0.2, 0], [0.1, 0.1]], holes)
     position = 0.02 * np.array([[1.0, 1], [2, 1], [2, 2], [1, 2]])
     electrodes = SheetDiscs(position, 0.001, 1e-4) if shape == "rectangle" else PointElectrodes(position)
     first = data.screen(tank(chosen) * (1 + 0.1j), chosen, electrodes=electrodes, domain=domain)
@@ -185,5 +186,7 @@ def test_round_trip_of_other_shapes(tmp_path, tank, shape):
     again = data.read(tmp_path / "out.npz")
     np.testing.assert_array_equal(again.voltages, first.voltages)
     assert type(again.domain) is type(domain)
+    for loop, wanted in zip(again.domain.loops(), domain.loops(), strict=True):
+        np.testing.assert_array_equal(loop, wanted)
     assert type(again.electrodes) is type(electrodes)
     np.testing.assert_array_equal(again.electrodes.position, position)

@@ -19,7 +19,6 @@ from jeit.design import (
     touch_grid,
     touches_away_from_the_edge,
 )
-from jeit.design.optimisation.constraints import pulled_inside
 from jeit.design.optimisation.variables import Design, Skin
 from jeit.electrodes import PointElectrodes
 from jeit.forward import ForwardModel
@@ -173,9 +172,9 @@ def test_skins_that_leave_room_in_their_box(outline):
 def test_points_beside_a_skin_are_pulled_to_its_edge():
     points = np.array([[0.02, 0.05], [0.07, 0.05], [0.05, 0.09], [0.045, 0.05], [-0.01, -0.02]])
     expected = np.array([[0.02, 0.05], [0.07, 0.04], [0.04, 0.09], [0.04, 0.05], [0.0, 0.0]])
-    np.testing.assert_allclose(pulled_inside(points, L_SHAPE), expected, atol=1e-15)
+    np.testing.assert_allclose(L_SHAPE.nearest(points), expected, atol=1e-15)
     expected = np.array([[0.02, 0.01], [0.03, 0.04], [0.0, -0.05]])
-    np.testing.assert_allclose(pulled_inside(expected * [[1], [1.7], [1.1]], Disk(0.05)), expected, atol=1e-15)
+    np.testing.assert_allclose(Disk(0.05).nearest(expected * [[1], [1.7], [1.1]]), expected, atol=1e-15)
 
 
 @pytest.mark.slow

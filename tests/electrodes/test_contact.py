@@ -14,14 +14,13 @@ from jeit.electrodes import (
     NodeElectrodes,
     PointElectrodes,
     SheetDiscs,
-    contact_impedance,
     electrodes_from_nodes,
     plates,
-    with_contact_impedance,
 )
 from jeit.forward import ForwardModel
 from jeit.layout import grid, ring
-from jeit.mesh import Mesh, box, cylinder, disk, facet_measures, layer, rectangle
+from jeit.mesh import Mesh, box, cylinder, disk, layer, rectangle
+from jeit.mesh.geometry import facet_measures
 from jeit.protocol import adjacent
 
 ROUNDING = 1e-12
@@ -164,8 +163,8 @@ def test_combined_electrodes_keep_their_order_and_impedances():
     load = both.contact(mesh).load
     np.testing.assert_allclose(load[:, :3], arcs.contact(mesh).load, atol=ROUNDING)
     np.testing.assert_allclose(load[:, 3:], disc.contact(mesh).load, atol=ROUNDING)
-    changed = with_contact_impedance(both, [1.0, 2.0, 3.0, 4.0])
-    np.testing.assert_allclose(contact_impedance(changed), [1, 2, 3, 4])
+    changed = both.with_contact_impedance([1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_allclose(changed.contact_impedance, [1, 2, 3, 4])
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.004, 0.011])

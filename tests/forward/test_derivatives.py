@@ -16,7 +16,8 @@ from jeit.electrodes import (
     PointElectrodes,
     SheetDiscs,
 )
-from jeit.forward import ForwardModel, electrode_fields
+from jeit.forward import ForwardModel
+from jeit.forward.transfer import electrode_fields
 from jeit.layout import ring, ring_and_centre
 from jeit.mesh import cylinder, disk, layer, rectangle
 from jeit.protocol import adjacent, trigonometric

@@ -18,7 +18,8 @@ from jeit.electrodes import BoundaryElectrodes, NodeElectrodes, electrodes_from_
 from jeit.forward import ForwardModel
 from jeit.forward.exact import ConductingDisk, point_transfer_impedance
 from jeit.inverse import Laplace, Noser, Tikhonov, one_step
-from jeit.mesh import Mesh, interior_facets
+from jeit.mesh import Mesh
+from jeit.mesh.geometry import interior_facets
 from jeit.protocol import from_channels
 
 QUICK = ["circ2d_cem_576", "cyl3d_pem_768"]  # both electrode models, both dimensions; the others run in CI

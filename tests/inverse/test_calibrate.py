@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.electrodes import BoundaryElectrodes, PointElectrodes, with_contact_impedance
+from jeit.electrodes import BoundaryElectrodes, PointElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import calibrate
 from jeit.layout import ring
@@ -21,7 +21,7 @@ def model():
 
 
 def test_recovers_conductivity_and_common_impedance(model):
-    truth = model.with_electrodes(with_contact_impedance(model.electrodes, 8e-3))
+    truth = model.with_electrodes(model.electrodes.with_contact_impedance(8e-3))
     result = calibrate(model, truth.voltages(0.27))
     assert result.status == "converged"
     assert float(result.conductivity) == pytest.approx(0.27, rel=1e-6)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jeit.mesh import Disk, Polygon, Rectangle, quality
+from jeit.mesh.outline import OUTLINES
 
 L_SHAPE = [[0, 0], [0.2, 0], [0.2, 0.1], [0.1, 0.1], [0.1, 0.2], [0, 0.2]]
 HOLE = [[0.02, 0.02], [0.06, 0.02], [0.06, 0.06], [0.02, 0.06]]
@@ -63,3 +64,37 @@ def test_domains_mesh_themselves(domain):
     assert mesh.num_points == pytest.approx(300, rel=0.06)
     assert quality(mesh).smallest_angle.min() >= 25
     assert np.asarray(domain.contains(np.asarray(mesh.points)[np.asarray(mesh.cells)].mean(axis=1))).all()
+
+
+def _sampled(loop, every=5e-4):
+    sides = np.roll(loop, -1, axis=0) - loop
+    counts = np.ceil(np.linalg.norm(sides, axis=1) / every).astype(int)
+    return np.concatenate(
+        [start + side * np.arange(n)[:, None] / n for start, side, n in zip(loop, sides, counts, strict=True)]
+    )
+
+
+@pytest.mark.parametrize("domain", DOMAINS, ids=NAMES)
+def test_distances_and_nearest_places_agree_with_the_edge(domain):
+    left, right, low, high = domain.extent
+    x, y = np.meshgrid(np.linspace(left - 0.05, right + 0.05, 23), np.linspace(low - 0.05, high + 0.05, 19))
+    points = np.stack([x, y], axis=-1).reshape(-1, 2)
+    edge = np.concatenate([_sampled(np.asarray(loop)) for loop in domain.loops()])
+    apart = np.linalg.norm(points[:, None] - edge, axis=-1).min(axis=1)
+    distance, inside = np.asarray(domain.signed_distance(points)), np.asarray(domain.contains(points))
+    # The edge is sampled every half a millimetre, which matters within a few of them.
+    np.testing.assert_allclose(np.abs(distance), apart, atol=6e-4)
+    clear = apart > 1e-3
+    np.testing.assert_array_equal(distance[clear] > 0, inside[clear])
+    nearest = np.asarray(domain.nearest(points))
+    np.testing.assert_allclose(nearest[inside], points[inside], atol=1e-15)
+    np.testing.assert_allclose(np.linalg.norm(nearest - points, axis=1)[~inside], -distance[~inside], atol=1e-9)
+
+
+@pytest.mark.parametrize("domain", DOMAINS, ids=NAMES)
+def test_what_it_is_described_by_makes_it_again(domain):
+    described = domain.describe()
+    again = OUTLINES[described.pop("shape")](**described)
+    assert type(again) is type(domain)
+    for loop, wanted in zip(again.loops(), domain.loops(), strict=True):
+        np.testing.assert_array_equal(loop, wanted)

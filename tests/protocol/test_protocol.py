@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jeit import protocol
+from jeit.protocol.reciprocity import transfer_between_drives
 
 
 def voltages(chosen, seed=0):
@@ -46,7 +47,7 @@ def test_reciprocity_knows_unequal_currents_and_reversed_pairs():
 def test_transfer_between_drives_is_symmetric_where_known():
     # Skip-1 drives are sums of two neighbours, so that adjacent measurement spans them all.
     chosen = protocol.skip(8, 1, measurement_skipped=0, driven_electrodes=True)
-    transfer, known, gain = protocol.transfer_between_drives(
+    transfer, known, gain = transfer_between_drives(
         np.asarray(chosen.drive),
         np.asarray(chosen.measurement),
         np.asarray(chosen.drive_index),

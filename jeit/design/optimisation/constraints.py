@@ -1,14 +1,11 @@
 """What a layout that can be made must satisfy: electrodes inside an outline, apart, and off regions kept free."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.mesh import Disk, Domain, Polygon, Rectangle
+from jeit.mesh import Domain
 
 
 class Constraints(eqx.Module):
@@ -44,39 +41,9 @@ class Constraints(eqx.Module):
         """The same by the names of the constraints: "minimum_spacing", "outline" and "keep_out"."""
         first, second = np.triu_indices(len(radii), 1)
         distance = jnp.sqrt(jnp.sum((centres[first] - centres[second]) ** 2, axis=1) + 1e-24)
-        outside = [radii + signed_room(centres, domain) for domain in self.keep_out]
+        outside = [radii + domain.signed_distance(centres) for domain in self.keep_out]
         return {
             "minimum_spacing": jnp.maximum(self.minimum_spacing, radii[first] + radii[second]) - distance,
-            "outline": radii - signed_room(centres, self.outline),
+            "outline": radii - self.outline.signed_distance(centres),
             "keep_out": jnp.concatenate(outside) if outside else jnp.zeros(0),
         }
-
-
-def signed_room(points: Float[Array, "p 2"], domain: Domain) -> Float[Array, " p"]:
-    """Distance (p,) of points from the edge of a domain, metres; negative outside."""
-    if isinstance(domain, Disk):
-        return domain.radius - jnp.sqrt(jnp.sum((points - jnp.asarray(domain.centre)) ** 2, axis=1) + 1e-24)
-    nearest = jnp.sum((points - _nearest_on_edge(points, domain)) ** 2, axis=1)
-    inside = jax.lax.stop_gradient(domain.contains(points))
-    return jnp.where(inside, 1.0, -1.0) * jnp.sqrt(nearest + 1e-24)
-
-
-def pulled_inside(points: Float[Array, "p 2"], domain: Domain) -> Float[Array, "p 2"]:
-    """Points (p, 2) of a domain as they are, others moved to the nearest of its edge."""
-    if isinstance(domain, Disk):
-        offset = points - jnp.asarray(domain.centre)
-        distance = jnp.sqrt(jnp.sum(offset**2, axis=1, keepdims=True) + 1e-24)
-        return jnp.asarray(domain.centre) + offset * jnp.minimum(1, domain.radius / distance)
-    inside = jax.lax.stop_gradient(domain.contains(points))
-    return jnp.where(inside[:, None], points, _nearest_on_edge(points, domain))
-
-
-def _nearest_on_edge(points: Float[Array, "p 2"], domain: Rectangle | Polygon) -> Float[Array, "p 2"]:
-    loops: Sequence = (domain.vertices, *getattr(domain, "holes", ()))
-    start = jnp.concatenate([jnp.asarray(loop) for loop in loops])
-    along = jnp.concatenate([jnp.roll(jnp.asarray(loop), -1, axis=0) for loop in loops]) - start
-    offset = points[:, None] - start
-    fraction = jnp.clip(jnp.sum(offset * along, axis=-1) / jnp.sum(along**2, axis=-1), 0, 1)
-    on_edges = start + fraction[..., None] * along  # (p, e, 2)
-    nearest = jnp.argmin(jnp.sum((points[:, None] - on_edges) ** 2, axis=-1), axis=1)
-    return jnp.take_along_axis(on_edges, nearest[:, None, None], axis=1)[:, 0]

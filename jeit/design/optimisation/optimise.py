@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.design.optimisation.constraints import Constraints, pulled_inside
+from jeit.design.optimisation.constraints import Constraints
 from jeit.design.optimisation.search import Record, descend
 from jeit.design.optimisation.variables import Design, Skin, Symmetry
 from jeit.design.scores import Score, Scores, SheetTouches, TouchPrior, layout_scores
@@ -249,7 +249,7 @@ def _cost(variables, weight, design: Design, constraints: Constraints, task: _Ta
     def one(own):
         skin = design.skin(own)
         # An electrode off the skin has no score: a step that goes too far is judged by how it is at the edge.
-        value = score(task.scores(skin._replace(centres=pulled_inside(skin.centres, constraints.outline))))
+        value = score(task.scores(skin._replace(centres=constraints.outline.nearest(skin.centres))))
         return weight * _penalty(design, constraints, own) - value, value
 
     # One start after the other: the Jacobian of one fills the cache.
@@ -297,7 +297,7 @@ def _named(layout: Layout, skin: Skin, outline: Domain, contacts: bool) -> Layou
 
 
 def _contacts(model: ForwardModel) -> Float[Array, " L"]:
-    return model.electrodes.contact_impedance  # pyright: ignore[reportAttributeAccessIssue]
+    return model.electrodes.contact_impedance
 
 
 def _check(layout: Layout, model: ForwardModel, steps: int, starts: int, key) -> None:

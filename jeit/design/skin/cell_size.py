@@ -2,7 +2,7 @@
 
 import math
 
-from jeit.mesh import MOST_POINTS
+from jeit.mesh.generate.unstructured import MOST_POINTS
 
 # Nodes of a plane mesh, times cell size squared over area: 1.155 for equilateral cells, and some for the edge.
 _NODES = 1.2

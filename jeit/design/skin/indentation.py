@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jeit.mesh.domain import check_length
+from jeit.mesh.outline.domain import check_length
 
 
 class AbstractIndentation(eqx.Module):

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.electrodes import BoundaryElectrodes, SheetDiscs, contact_impedance, with_contact_impedance
+from jeit.electrodes.electrodes import AbstractMovableElectrodes
 from jeit.forward import ForwardModel
-from jeit.mesh import Mesh
 
 
 class AbstractUnknown(eqx.Module):
@@ -55,8 +54,8 @@ class ContactImpedance(AbstractUnknown):
 
     def apply(self, model, estimate, values):
         """z exp(values)."""
-        impedance = contact_impedance(model.electrodes) * jnp.exp(values)
-        return model.with_electrodes(with_contact_impedance(model.electrodes, impedance)), estimate
+        impedance = model.electrodes.contact_impedance * jnp.exp(values)
+        return model.with_electrodes(model.electrodes.with_contact_impedance(impedance)), estimate
 
 
 class ElectrodePosition(AbstractUnknown):
@@ -71,20 +70,17 @@ class ElectrodePosition(AbstractUnknown):
     def __init__(self, model: ForwardModel, deviation: float):
         """`deviation`: metres. Raises `ValueError` for electrodes of other kinds."""
         electrodes = model.electrodes
-        if isinstance(electrodes, BoundaryElectrodes):
-            direction = _tangents(model.mesh, np.asarray(electrodes.position))[:, None]
-        elif isinstance(electrodes, SheetDiscs):
-            direction = np.broadcast_to(np.eye(2), (electrodes.num_electrodes, 2, 2))
-        else:
+        if not isinstance(electrodes, AbstractMovableElectrodes):
             raise ValueError(
                 f"ElectrodePosition is for BoundaryElectrodes and SheetDiscs; these are {type(electrodes).__name__}."
             )
+        direction = electrodes.directions(model.mesh)
         self.direction = jnp.asarray(direction)
         self.deviation = _deviation("ElectrodePosition", deviation, direction.shape[0] * direction.shape[1])
 
     def fits(self, model):
         """As many electrodes, of a kind that can move."""
-        movable = isinstance(model.electrodes, (BoundaryElectrodes, SheetDiscs))
+        movable = isinstance(model.electrodes, AbstractMovableElectrodes)
         return movable and self.direction.shape[0] == model.electrodes.num_electrodes
 
     def apply(self, model, estimate, values):
@@ -127,11 +123,3 @@ def _deviation(name: str, deviation, size: int) -> Float[Array, " k"]:
     if values.shape not in ((), (size,)) or not (np.isfinite(values) & (values > 0)).all():
         raise ValueError(f"{name}: deviation must be positive, one number or {size}; it is {deviation}.")
     return jnp.broadcast_to(jnp.asarray(values), (size,))
-
-
-def _tangents(mesh: Mesh, position: np.ndarray) -> np.ndarray:
-    """Direction of the boundary, counter-clockwise, (L, 2), where the electrodes lie."""
-    start, end = np.asarray(mesh.points)[np.asarray(mesh.facets)].swapaxes(0, 1)
-    nearest = np.argmin(np.linalg.norm(position[:, None] - (start + end) / 2, axis=-1), axis=1)
-    along = (end - start)[nearest]
-    return along / np.linalg.norm(along, axis=1, keepdims=True)

@@ -17,7 +17,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, pivoted_cholesky
-from jeit.mesh import Mesh, centroids, interior_facets
+from jeit.mesh import Mesh, centroids
+from jeit.mesh.geometry import interior_facets
 from jeit_solvers import SparsityPattern, analyse, factorise, solve
 
 # Precision given to the constant image where it would have none, relative to a step between neighbouring cells.

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.inverse.nonlinear.problem import AbstractPenalty
-from jeit.mesh import Mesh, centroids, interior_facets, measures
+from jeit.mesh import Mesh, centroids, measures
+from jeit.mesh.geometry import interior_facets
 from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, solve, solve_definite
 
 # Pull to the background, relative to the price of an edge: what fixes an image that the data do not.

@@ -16,7 +16,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jeit.electrodes import IntegratedElectrodes
+from jeit.electrodes.integrated import IntegratedElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import IndependentChannels, Weighing
 from jeit.inverse.nonlinear.checks import (

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import Delaunay, KDTree
 
-from jeit.mesh.generate import _curve
-from jeit.mesh.generate._curve import Curve
+from jeit.mesh.generate.curve import Curve, within
 
 
 @dataclass
@@ -75,7 +74,7 @@ def triangulate(front: Front, points: np.ndarray) -> np.ndarray:
     # A cell with a node inside the domain is inside; only those spanned by the outline need a test.
     doubtful = np.flatnonzero((cells < front.num_outline).all(axis=1))
     keep = np.ones(len(cells), bool)
-    keep[doubtful] = _curve.inside(front.curves, points[cells[doubtful]].mean(axis=1))
+    keep[doubtful] = within(front.curves, points[cells[doubtful]].mean(axis=1))
     cells = cells[keep]
     clockwise = doubled_areas(points, cells) < 0
     cells[clockwise] = cells[clockwise][:, [0, 2, 1]]
@@ -141,5 +140,5 @@ def clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: n
         fraction = np.clip((offset * along).sum(1) / (along**2).sum(1), 0.0, 1.0)
         apart = np.minimum(apart, np.linalg.norm(offset - fraction[:, None] * along, axis=1))
     clear = apart > gap
-    clear[clear] = _curve.inside(front.curves, points[clear])
+    clear[clear] = within(front.curves, points[clear])
     return clear

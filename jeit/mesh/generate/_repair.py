@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from jeit.mesh.generate import _curve
 from jeit.mesh.generate._delaunay import (
     Front,
     circumcircles,
@@ -14,6 +13,7 @@ from jeit.mesh.generate._delaunay import (
     smallest_angles,
     triangulate,
 )
+from jeit.mesh.generate.curve import within
 
 # Degrees. What is asked of the repair is a little more than what is promised.
 PROMISED_ANGLE = 25.0
@@ -145,7 +145,7 @@ def _refine(front: Front, points: np.ndarray, bad: np.ndarray, angle: np.ndarray
     spoilt = np.zeros(len(centre), bool)
     for index in np.flatnonzero(encroached):
         spoilt[near[index]] = True
-    outside = ~_curve.inside(front.curves, centre)
+    outside = ~within(front.curves, centre)
     lost = np.flatnonzero(outside & ~spoilt)
     if lost.size:
         encroached[KDTree(middle).query(centre[lost])[1]] = True

@@ -16,7 +16,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jeit.mesh.generate import _repair
-from jeit.mesh.generate._curve import Curve, Size, divide
 from jeit.mesh.generate._delaunay import (
     Front,
     circumcircles,
@@ -26,6 +25,7 @@ from jeit.mesh.generate._delaunay import (
     smallest_angles,
     triangulate,
 )
+from jeit.mesh.generate.curve import Curve, Size, divide
 
 # Largest circumradius per wanted cell size: makes the mean edge equal the size (an equilateral cell has 0.577).
 _FILLING = 0.74

@@ -13,8 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
-from jeit.mesh.generate import _curve
-from jeit.mesh.generate._curve import Curve, Size
+from jeit.mesh.generate.curve import Curve, Size, within
 
 # How fast cells may grow away from nodes that lie close together and from a user's own size function.
 _OWN_GROWTH = 0.45
@@ -169,7 +168,7 @@ def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resoluti
     axes = [np.arange(low[k] - step, high[k] + 2 * step, step) for k in (0, 1)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     shape, flat = grid.shape[:2], grid.reshape(-1, 2)
-    inside = np.flatnonzero(_curve.inside(curves, flat))
+    inside = np.flatnonzero(within(curves, flat))
     values = np.asarray(function(flat[inside]), dtype=float)
     if values.shape != (len(inside),):
         raise ValueError(

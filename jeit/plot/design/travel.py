@@ -7,12 +7,10 @@ from matplotlib.patches import Circle, PathPatch
 from matplotlib.path import Path
 
 from jeit.design import Optimisation
-from jeit.mesh import Disk, Domain
+from jeit.mesh import Domain
 from jeit.plot.axes import INK, SOFT, axes_or_new, bare, draw_scale_bar
 from jeit.plot.imaging.electrodes import METAL
 
-# Corners that a round outline is drawn with.
-_CORNERS = 120
 _FREE = {"facecolor": "none", "edgecolor": SOFT, "hatch": "////", "linewidth": 0.5, "zorder": 1}
 
 
@@ -55,7 +53,5 @@ def plot_travel(
 
 def outline_path(domain: Domain) -> Path:
     """The edge of a domain and of its holes, closed, in metres."""
-    if isinstance(domain, Disk):
-        return Path(np.asarray(domain.boundary(np.linspace(0, domain.perimeter, _CORNERS))), closed=True)
-    loops = [np.asarray(loop) for loop in (domain.vertices, *getattr(domain, "holes", ()))]
+    loops = [np.asarray(loop) for loop in domain.loops()]
     return Path.make_compound_path(*(Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in loops))

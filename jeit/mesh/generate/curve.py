@@ -50,6 +50,16 @@ def circle(radius: float, centre: np.ndarray) -> Curve:
     )
 
 
+def smooth(length: float, at: Callable[[np.ndarray], np.ndarray], num_chords: int = 720) -> Curve:
+    """A closed curve without corners, `at` giving points (p, 2) at arc lengths (p,); the domain is on its left.
+
+    What it encloses, and how far from it a point is, are those of `num_chords` chords.
+    """
+    chords = at(length * np.arange(num_chords) / num_chords)
+    inscribed = closed_line(chords)
+    return Curve(length, at, inscribed.inside, inscribed.distance, np.zeros(0), np.zeros(0))
+
+
 def closed_line(vertices: np.ndarray) -> Curve:
     """A closed polygon, arc length from its first vertex; the domain is on its left."""
     closed = np.concatenate([vertices, vertices[:1]])
@@ -79,7 +89,7 @@ def closed_line(vertices: np.ndarray) -> Curve:
     )
 
 
-def inside(curves: list[Curve], points: np.ndarray) -> np.ndarray:
+def within(curves: list[Curve], points: np.ndarray) -> np.ndarray:
     """True for points inside the first curve and outside the others (holes)."""
     result = np.zeros(len(points), bool)
     for curve in curves:

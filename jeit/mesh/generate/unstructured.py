@@ -13,10 +13,11 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jeit.mesh import loops
-from jeit.mesh.generate import _curve, _triangulate
-from jeit.mesh.generate._curve import Curve, Size
+from jeit.mesh.generate import _triangulate
 from jeit.mesh.generate._delaunay import Front, doubled_areas, triangulate
+from jeit.mesh.generate.curve import Curve, Size, within
 from jeit.mesh.generate.refine import Refinement, SizeField
+from jeit.mesh.mesh import Mesh
 
 DEFAULT_NUM_POINTS = 1200
 # Nodes of a mesh.
@@ -74,16 +75,20 @@ def check_positions(name: str, positions: ArrayLike) -> np.ndarray:
     return array
 
 
-def mesh(
+def mesh_within(
     curves: list[Curve],
-    stops: list[np.ndarray],
-    interior_points: ArrayLike | None,
-    refine: Refinement,
-    target: Target,
     area: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points and cells inside `curves`, with nodes at `stops` (arc lengths on each) and at `interior_points`."""
-    stops = [_merge(curve, own) for curve, own in zip(curves, stops, strict=True)]
+    target: Target,
+    refine: Refinement = None,
+    boundary_points: ArrayLike | None = None,
+    interior_points: ArrayLike | None = None,
+) -> Mesh:
+    """A mesh inside the first of `curves` and outside the others, of `area` m² in all.
+
+    There are nodes at `boundary_points`, arc lengths (k,) in metres on the first curve, and at `interior_points` (k, 2)
+    in metres. Raises `ValueError` on bad or contradicting arguments.
+    """
+    stops = [_merge(curve, own) for curve, own in zip(curves, _stops(curves, boundary_points), strict=True)]
     fixed = _check_interior(interior_points, curves)
     field = SizeField(curves, refine, *_room(curves, stops, fixed))
     front = None
@@ -95,7 +100,15 @@ def mesh(
         check_total(_estimate(curves, size, area), "refine")
     else:
         size, front = _fit(curves, stops, fixed, field, target.num_points, area)
-    return _triangulate.generate(curves, stops, fixed, size, front)
+    return Mesh.create(*_triangulate.generate(curves, stops, fixed, size, front))
+
+
+def _stops(curves: list[Curve], boundary_points: ArrayLike | None) -> list[np.ndarray]:
+    """Arc lengths on each curve where nodes are wanted besides its corners; one without corners begins with a node."""
+    stops = [np.zeros(0 if len(curve.corners) else 1) for curve in curves]
+    if boundary_points is not None:
+        stops[0] = np.mod(check_positions("boundary_points", boundary_points), curves[0].length)
+    return stops
 
 
 def _sized(field: SizeField, background: float, points: np.ndarray) -> np.ndarray:
@@ -137,7 +150,7 @@ def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> n
     if fixed.ndim != 2 or fixed.shape[1] != 2 or not np.isfinite(fixed).all():
         raise ValueError(f"interior_points: expected finite coordinates of shape (k, 2), got shape {fixed.shape}.")
     apart = np.min([curve.distance(fixed) for curve in curves], axis=0)
-    bad = np.flatnonzero(~_curve.inside(curves, fixed) | (apart < _CLOSEST * curves[0].length))
+    bad = np.flatnonzero(~within(curves, fixed) | (apart < _CLOSEST * curves[0].length))
     if bad.size:
         raise ValueError(
             f"interior_points: point {bad[0]} at {fixed[bad[0]].tolist()} does not lie inside the outline. Use "
@@ -177,7 +190,7 @@ def _sample(curves: list[Curve]) -> np.ndarray:
     outline = curves[0].at(np.linspace(0, curves[0].length, 400))
     axes = [np.linspace(outline[:, k].min(), outline[:, k].max(), 60) for k in (0, 1)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    return grid[_curve.inside(curves, grid)]
+    return grid[within(curves, grid)]
 
 
 def _estimate(curves: list[Curve], size: Size, area: float) -> float:

@@ -1,0 +1,132 @@
+"""`Disk`: a circle, meshed in rings where nothing else is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
+
+from jeit.mesh.generate import structured
+from jeit.mesh.generate.curve import circle
+from jeit.mesh.generate.refine import Refine, Refinement
+from jeit.mesh.generate.unstructured import Target, check_count, check_positions, check_total, mesh_within
+from jeit.mesh.mesh import Mesh
+from jeit.mesh.outline.domain import Domain, Pen, check_length, check_position, numerics
+
+
+class Disk(Domain):
+    """A disk of given radius and centre, in metres; arc length starts at angle 0."""
+
+    radius: float
+    centre: tuple[float, float]
+
+    def __init__(self, radius: float, centre: Sequence[float] = (0.0, 0.0)):
+        """`radius` > 0 and `centre` (x, y) in metres; raises `ValueError` otherwise."""
+        self.radius = check_length("radius", radius)
+        self.centre = check_position("centre", centre)
+
+    @property
+    def area(self) -> float:
+        """π R² in m²."""
+        return np.pi * self.radius**2
+
+    @property
+    def perimeter(self) -> float:
+        """2 π R in m."""
+        return 2.0 * np.pi * self.radius
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Bounding box (x_min, x_max, y_min, y_max) in metres."""
+        x, y = self.centre
+        return (x - self.radius, x + self.radius, y - self.radius, y + self.radius)
+
+    def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
+        """Points (…, 2) on the circle at `arc_length` (…) in metres, counter-clockwise from angle 0."""
+        angle = jnp.asarray(arc_length) / self.radius
+        return jnp.asarray(self.centre) + self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+
+    def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
+        """The circle as the polygon inscribed in it."""
+        return (self.boundary(jnp.linspace(0, self.perimeter, num_chords, endpoint=False)),)
+
+    def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
+        """True for each of `points` (…, 2) in metres that lies in the disk or on its edge."""
+        offset = jnp.asarray(points) - jnp.asarray(self.centre)
+        return jnp.sum(offset**2, axis=-1) <= self.radius**2 * (1 + 1e-12)
+
+    def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
+        """R less the distance (p,) of `points` (p, 2) from the centre, metres."""
+        return jnp.asarray(self.radius - self._from_centre(points)[1])
+
+    def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
+        """`points` (p, 2) in metres, those outside moved to the circle along their radius."""
+        offset, distance = self._from_centre(points)
+        xp = numerics(self, points)
+        return jnp.asarray(xp.asarray(self.centre) + offset * xp.minimum(1, self.radius / distance[:, None]))
+
+    def _from_centre(self, points: ArrayLike) -> tuple[Any, Any]:
+        """Offsets (p, 2) and distances (p,) from the centre, these with a derivative at zero too."""
+        xp = numerics(self, points)
+        offset = xp.asarray(points) - xp.asarray(self.centre)
+        return offset, xp.sqrt((offset**2).sum(axis=1) + 1e-24)
+
+    def describe(self) -> dict:
+        """Shape, radius and centre."""
+        return {"shape": "disk", "radius": float(self.radius), "centre": [float(x) for x in self.centre]}
+
+    def draw(self, pen: Pen) -> None:
+        """One circle."""
+        pen.circle(self.centre, self.radius)
+
+    def mesh(
+        self,
+        num_points: int | None = None,
+        cell_size: float | None = None,
+        refine: Refinement = None,
+        *,
+        num_boundary: int | None = None,
+        boundary_points: ArrayLike | None = None,
+        interior_points: ArrayLike | None = None,
+    ) -> Mesh:
+        """A mesh of the disk; arguments are those of `jeit.mesh.disk`, which also says what it raises."""
+        middle = np.asarray(self.centre)
+        if num_boundary is not None:
+            refine = self._finer_rim(num_boundary, refine)
+        if refine is None and boundary_points is None and interior_points is None:
+            points, cells = structured.ring_disk(*self._rings(num_points, cell_size))
+            return Mesh.create(middle + self.radius * points, cells)
+        arcs = None
+        if boundary_points is not None:
+            arcs = self.radius * np.mod(check_positions("boundary_points", boundary_points), 2 * np.pi)
+        target = Target.create(num_points, cell_size)
+        mesh = mesh_within([circle(self.radius, middle)], self.area, target, refine, arcs, interior_points)
+        most = 0 if num_boundary is None else 0.1 * num_boundary + (1 if arcs is None else len(arcs))
+        if num_boundary is not None and abs(mesh.num_facets - num_boundary) > most:
+            raise ValueError(
+                f"num_boundary: cells of the size asked give {mesh.num_facets} nodes on the circle, not "
+                f"{num_boundary}. Ask for fewer nodes inside (num_points), larger cells, or more nodes on the circle."
+            )
+        return mesh
+
+    def _finer_rim(self, num_boundary: int, refine: Refinement) -> Refinement:
+        num_boundary = check_count("num_boundary", num_boundary, 3)
+        if callable(refine):
+            raise ValueError("num_boundary: cannot be combined with a size function; let the function give the size.")
+        along = Refine(cell_size=self.perimeter / num_boundary)
+        return (along, *(() if refine is None else (refine,) if isinstance(refine, Refine) else tuple(refine)))
+
+    def _rings(self, num_points: int | None, cell_size: float | None) -> tuple[int, int]:
+        target = Target.create(num_points, cell_size)
+        if target.cell_size is None:
+            rings = structured.choose_rings(target.num_points)
+        else:
+            # Six nodes a ring: cells with legs t and π/3 t have the area of equilateral ones with edge 1.1 t.
+            num_rings = max(1, round(1.1 * self.radius / target.cell_size))
+            rings = (num_rings, 6 * num_rings)
+        check_total(rings[0] * rings[1] // 2, "cell_size")
+        return rings

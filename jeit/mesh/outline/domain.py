@@ -1,0 +1,131 @@
+"""`Domain`, the base of all outlines in metres, and what all of them check."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
+
+from jeit.mesh._checks import warn_large
+from jeit.mesh.generate.refine import Refinement
+from jeit.mesh.mesh import Mesh
+
+
+class Pen(Protocol):
+    """What outlines are drawn with: a drawing's file, or a geometry kernel. The first stroke encloses the others."""
+
+    def circle(self, centre: tuple[float, float], radius: float) -> None:
+        """A circle, in metres."""
+
+    def loop(self, vertices: np.ndarray) -> None:
+        """A closed loop of straight sides with these `vertices` (k, 2) in metres, the first not repeated."""
+
+
+class Domain(eqx.Module):
+    """An outline in metres, without a mesh: `Disk`, `Rectangle`, `Polygon`, or one of your own.
+
+    Readers, layouts, rasters and mesh builders ask for nothing but what stands here, so that a new outline is one
+    class. Arc length runs counter-clockwise along the outer edge. For edges of straight sides, or drawn as chords, each
+    method is a line that calls `jeit.mesh.outline.polyline`; see `Polygon`.
+    """
+
+    @property
+    @abc.abstractmethod
+    def area(self) -> float | Float[Array, ""]:
+        """Enclosed area without holes, m²."""
+
+    @property
+    @abc.abstractmethod
+    def perimeter(self) -> float | Float[Array, ""]:
+        """Length of the outer edge, m."""
+
+    @property
+    @abc.abstractmethod
+    def extent(self) -> tuple[float, float, float, float]:
+        """Bounding box (x_min, x_max, y_min, y_max) in metres."""
+
+    @abc.abstractmethod
+    def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
+        """Points (…, 2) on the outer edge at `arc_length` (…) in metres; it wraps round."""
+
+    @abc.abstractmethod
+    def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
+        """Vertices (k, 2) in metres of the outer edge, counter-clockwise, and of every hole, clockwise.
+
+        The first vertex is not repeated. A curved edge becomes `num_chords` chords: a circle,
+        with 120, a polygon that is nowhere more than 0.04 % of the radius inside it.
+        """
+
+    @abc.abstractmethod
+    def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
+        """True for each of `points` (…, 2) in metres that lies inside."""
+
+    @abc.abstractmethod
+    def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
+        """Distance (p,) of `points` (p, 2) from the edge in metres, negative outside.
+
+        To be differentiated almost everywhere; within 1e-12 m of the edge it is smoothed.
+        """
+
+    @abc.abstractmethod
+    def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
+        """`points` (p, 2) in metres, those outside moved to the nearest place on the edge."""
+
+    @abc.abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """The name of the "shape" and what it is made from, lengths in metres, in words that JSON and TOML have.
+
+        All but "shape" are the arguments that make the outline again.
+        """
+
+    @abc.abstractmethod
+    def draw(self, pen: Pen) -> None:
+        """Draw the edge and then the holes: circles as circles, everything else as loops of straight sides."""
+
+    @abc.abstractmethod
+    def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
+        """A mesh of triangles with `num_points` nodes or of `cell_size` metres; see `jeit.mesh.disk`.
+
+        Raises `ValueError` on bad or contradicting arguments.
+        """
+
+
+def traced(*values: Any) -> bool:
+    """Whether any array in `values` is being traced by JAX, so that it cannot be looked at."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+
+
+def numerics(*values: Any) -> Any:
+    """JAX's numpy where any of `values` is being traced, NumPy where all are known."""
+    return jnp if traced(*values) else np
+
+
+def check_length(name: str, value: Any) -> Any:
+    """Check a length in metres and make it a float (traced values pass); `ValueError` unless it is positive."""
+    if traced(value):
+        return value
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: expected one length in metres, got {value!r}.") from None
+    if not np.isfinite(number) or number <= 0:
+        raise ValueError(f"{name}: expected a positive length in metres, got {number:g}.")
+    warn_large(number, name)
+    return number
+
+
+def check_position(name: str, value: Any) -> Any:
+    """Check a place (x, y) in metres and make it two floats (traced values pass); `ValueError` if it is none."""
+    if traced(value):
+        return jnp.asarray(value)
+    array = np.asarray(value, dtype=float)
+    if array.shape != (2,) or not np.isfinite(array).all():
+        raise ValueError(f"{name}: expected two finite coordinates (x, y) in metres, got {value!r}.")
+    return (float(array[0]), float(array[1]))

@@ -1,0 +1,104 @@
+"""`Polygon`: straight sides, holes if there are any."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
+
+from jeit.mesh import loops
+from jeit.mesh._checks import warn_large
+from jeit.mesh.generate.curve import closed_line
+from jeit.mesh.generate.refine import Refinement
+from jeit.mesh.generate.unstructured import Target, mesh_within
+from jeit.mesh.mesh import Mesh
+from jeit.mesh.outline import polyline
+from jeit.mesh.outline.domain import Domain, Pen, traced
+
+
+class Polygon(Domain):
+    """A simple polygon, possibly with holes, in metres; arc length starts at the first vertex."""
+
+    vertices: Float[Array, "k 2"]
+    holes: tuple[Float[Array, "h 2"], ...]
+
+    def __init__(self, vertices: ArrayLike, holes: Sequence[ArrayLike] = ()):
+        """`vertices` (k, 2) of the outline and of each of `holes`, in order, in metres, first not repeated.
+
+        Either orientation is taken; the outline is kept counter-clockwise, holes clockwise. Raises
+        `ValueError` on fewer than three or repeated vertices, an outline that crosses or touches itself, and holes that
+        are not inside.
+        """
+        if traced(vertices, holes):
+            self.vertices = jnp.asarray(vertices)
+            self.holes = tuple(jnp.asarray(hole) for hole in holes)
+            return
+        outer = loops.check_loop(vertices, "vertices", clockwise=False)
+        inner = [loops.check_loop(hole, f"holes[{k}]", clockwise=True) for k, hole in enumerate(holes)]
+        loops.check_apart(outer, inner)
+        warn_large(float(np.ptp(outer, axis=0).max()), "vertices")
+        self.vertices = jnp.asarray(outer)
+        self.holes = tuple(jnp.asarray(hole) for hole in inner)
+
+    @property
+    def area(self) -> Float[Array, ""]:
+        """Enclosed area without the holes, in m² (shoelace formula)."""
+        return polyline.area(self.loops())
+
+    @property
+    def perimeter(self) -> Float[Array, ""]:
+        """Length of the outer outline in m."""
+        return polyline.length(self.vertices)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Bounding box (x_min, x_max, y_min, y_max) in metres."""
+        low, high = np.min(np.asarray(self.vertices), axis=0), np.max(np.asarray(self.vertices), axis=0)
+        return (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
+
+    def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
+        """Points (…, 2) on the outer outline at `arc_length` (…) in metres from the first vertex."""
+        return polyline.along(self.vertices, arc_length)
+
+    def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
+        """The vertices, and those of every hole."""
+        return (self.vertices, *self.holes)
+
+    def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
+        """True for each of `points` (…, 2) in metres inside the outline and outside the holes (even-odd rule)."""
+        return polyline.contains(self.loops(), points)
+
+    def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
+        """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside and in holes."""
+        return polyline.signed_distance(self.loops(), points)
+
+    def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
+        """`points` (p, 2) in metres, those outside and in holes moved to the nearest place on a side."""
+        return polyline.nearest(self.loops(), points)
+
+    def describe(self) -> dict:
+        """Shape and vertices, and those of the holes if there are any."""
+        holes = {"holes": [np.asarray(hole).tolist() for hole in self.holes]} if self.holes else {}
+        return {"shape": "polygon", "vertices": np.asarray(self.vertices).tolist(), **holes}
+
+    def draw(self, pen: Pen) -> None:
+        """A loop for the outline and one for each hole."""
+        for loop in self.loops():
+            pen.loop(np.asarray(loop))
+
+    def mesh(
+        self,
+        num_points: int | None = None,
+        cell_size: float | None = None,
+        refine: Refinement = None,
+        *,
+        boundary_points: ArrayLike | None = None,
+        interior_points: ArrayLike | None = None,
+    ) -> Mesh:
+        """A mesh of the polygon; arguments and errors are those of `jeit.mesh.polygon`."""
+        curves = [closed_line(np.asarray(loop)) for loop in self.loops()]
+        target = Target.create(num_points, cell_size)
+        return mesh_within(curves, float(self.area), target, refine, boundary_points, interior_points)

@@ -1,0 +1,102 @@
+"""Closed loops of straight sides: what outlines made of them share.
+
+`loops` holds the vertices (k, 2) in metres of each, first not repeated: the outer one counter-clockwise, holes
+clockwise. Distances are worked out by NumPy where all values are known, for JAX would compile anew for every number of
+points. For checks of loops see `jeit.mesh.loops`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
+
+from jeit.mesh.loops import inside as enclosed
+from jeit.mesh.outline.domain import numerics
+
+Loop = Float[Array, "k 2"]
+
+
+def length(loop: Loop) -> Float[Array, ""]:
+    """Length of a loop in m."""
+    return jnp.sum(_side_lengths(loop))
+
+
+def area(loops: Sequence[Loop]) -> Float[Array, ""]:
+    """Area inside the first loop less that of the holes, m² (shoelace formula)."""
+    outer, *holes = (_shoelace(loop) for loop in loops)
+    return sum(holes, outer)
+
+
+def along(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
+    """Points (…, 2) on a loop at `arc_length` (…) in metres from its first vertex; it wraps round."""
+    closed = jnp.concatenate([loop, loop[:1]])
+    stops = jnp.concatenate([jnp.zeros(1), jnp.cumsum(_side_lengths(loop))])
+    wrapped = jnp.mod(jnp.asarray(arc_length, dtype=stops.dtype), stops[-1])
+    return jnp.stack([jnp.interp(wrapped, stops, closed[:, axis]) for axis in range(2)], axis=-1)
+
+
+def contains(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."]:
+    """True for each of `points` (…, 2) inside the first loop and outside the holes (even-odd rule)."""
+    points = jnp.asarray(points)
+    inside = jnp.zeros(points.shape[:-1], bool)
+    for loop in loops:
+        inside = inside ^ _inside(loop, points)
+    return inside
+
+
+def signed_distance(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, " p"]:
+    """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
+    xp = numerics(loops, points)
+    at, inside, place = _nearest_on(xp, loops, points)
+    apart = xp.sqrt(((at - place) ** 2).sum(axis=1) + 1e-24)  # with a derivative at zero too
+    return jnp.asarray(xp.where(inside, apart, -apart))
+
+
+def nearest(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "p 2"]:
+    """`points` (p, 2) inside as they are, others moved to the nearest place on a side."""
+    xp = numerics(loops, points)
+    at, inside, place = _nearest_on(xp, loops, points)
+    return jnp.asarray(xp.where(inside[:, None], at, place))
+
+
+def _nearest_on(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tuple[Any, Any, Any]:
+    """`points` (p, 2), which of them lie inside (p,), and the place on a side nearest to each, (p, 2)."""
+    chains, at = [xp.asarray(loop) for loop in loops], xp.asarray(points, float)
+    start = xp.concatenate(chains)
+    sides = xp.concatenate([xp.roll(loop, -1, axis=0) for loop in chains]) - start
+    offset = at[:, None] - start
+    fraction = xp.clip((offset * sides).sum(axis=-1) / (sides**2).sum(axis=-1), 0, 1)
+    on_sides = start + fraction[..., None] * sides  # (p, s, 2)
+    closest = xp.argmin(((at[:, None] - on_sides) ** 2).sum(axis=-1), axis=1)
+    place = xp.take_along_axis(on_sides, closest[:, None, None], axis=1)[:, 0]
+    inside = enclosed(at, chains) if xp is np else jax.lax.stop_gradient(contains(chains, at))
+    return at, inside, place
+
+
+def _side_lengths(loop: Loop) -> Float[Array, " k"]:
+    return jnp.sqrt(jnp.sum((jnp.roll(loop, -1, axis=0) - loop) ** 2, axis=1))
+
+
+def _shoelace(loop: Loop) -> Float[Array, ""]:
+    x, y = loop[:, 0], loop[:, 1]
+    return 0.5 * jnp.sum(x * jnp.roll(y, -1) - jnp.roll(x, -1) * y)
+
+
+def _inside(loop: Loop, points: Float[Array, "... 2"]) -> Bool[Array, "..."]:
+    """Even-odd rule: count the sides that a ray towards +x crosses."""
+
+    def crosses(inside: Array, side: Array) -> tuple[Array, None]:
+        (x0, y0), (x1, y1) = side
+        spans = (y0 > points[..., 1]) != (y1 > points[..., 1])
+        height = jnp.where(spans, y1 - y0, 1.0)
+        x = x0 + (points[..., 1] - y0) * (x1 - x0) / height
+        return inside ^ (spans & (points[..., 0] < x)), None
+
+    sides = jnp.stack([loop, jnp.roll(loop, -1, axis=0)], axis=1)
+    return jax.lax.scan(crosses, jnp.zeros(points.shape[:-1], bool), sides)[0]

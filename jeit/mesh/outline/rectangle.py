@@ -1,0 +1,121 @@
+"""`Rectangle`: sides along the axes, meshed in rows where nothing else is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
+
+from jeit.mesh.generate import structured
+from jeit.mesh.generate.curve import closed_line
+from jeit.mesh.generate.refine import Refinement
+from jeit.mesh.generate.unstructured import Target, check_total, mesh_within
+from jeit.mesh.mesh import Mesh
+from jeit.mesh.outline import polyline
+from jeit.mesh.outline.domain import Domain, Pen, check_length, check_position
+
+
+class Rectangle(Domain):
+    """A rectangle with sides along the axes, in metres; arc length starts at the lower left corner."""
+
+    width: float
+    height: float
+    centre: tuple[float, float]
+
+    def __init__(self, width: float, height: float, centre: Sequence[float] = (0.0, 0.0)):
+        """`width` (along x), `height` (along y) > 0 and `centre` in metres; raises `ValueError` otherwise."""
+        self.width = check_length("width", width)
+        self.height = check_length("height", height)
+        self.centre = check_position("centre", centre)
+
+    @property
+    def area(self) -> float:
+        """Width times height in m²."""
+        return self.width * self.height
+
+    @property
+    def perimeter(self) -> float:
+        """2 (width + height) in m."""
+        return 2.0 * (self.width + self.height)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """Bounding box (x_min, x_max, y_min, y_max) in metres."""
+        x, y = self.centre
+        return (x - self.width / 2, x + self.width / 2, y - self.height / 2, y + self.height / 2)
+
+    @property
+    def vertices(self) -> Float[Array, "4 2"]:
+        """Corners (4, 2) in metres, counter-clockwise from the lower left one."""
+        left, right, low, high = self.extent
+        return jnp.array([[left, low], [right, low], [right, high], [left, high]])
+
+    def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
+        """Points (…, 2) on the outline at `arc_length` (…) in metres, counter-clockwise from the lower left."""
+        return polyline.along(self.vertices, arc_length)
+
+    def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
+        """The corners."""
+        return (self.vertices,)
+
+    def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
+        """True for each of `points` (…, 2) in metres that lies in the rectangle or on its edge."""
+        offset = jnp.abs(jnp.asarray(points) - jnp.asarray(self.centre))
+        half = 0.5 * jnp.asarray([self.width, self.height])
+        return jnp.all(offset <= half * (1 + 1e-12), axis=-1)
+
+    def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
+        """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
+        return polyline.signed_distance(self.loops(), points)
+
+    def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
+        """`points` (p, 2) in metres, those outside moved to the nearest place on a side."""
+        return polyline.nearest(self.loops(), points)
+
+    def describe(self) -> dict:
+        """Shape, sides and centre."""
+        sides = {"width": float(self.width), "height": float(self.height)}
+        return {"shape": "rectangle", **sides, "centre": [float(x) for x in self.centre]}
+
+    def draw(self, pen: Pen) -> None:
+        """One loop of four sides."""
+        pen.loop(np.asarray(self.vertices))
+
+    def mesh(
+        self,
+        num_points: int | None = None,
+        cell_size: float | None = None,
+        refine: Refinement = None,
+        *,
+        boundary_points: ArrayLike | None = None,
+        interior_points: ArrayLike | None = None,
+    ) -> Mesh:
+        """A mesh of the rectangle, its sides tagged; arguments and errors are those of `jeit.mesh.rectangle`."""
+        target = Target.create(num_points, cell_size)
+        if refine is None and boundary_points is None and interior_points is None:
+            mesh = self._rows(target)
+        else:
+            curve = closed_line(np.asarray(self.vertices))
+            mesh = mesh_within([curve], self.area, target, refine, boundary_points, interior_points)
+        return Mesh(mesh.points, mesh.cells, mesh.facets, self._sides(mesh))
+
+    def _rows(self, target: Target) -> Mesh:
+        left, _, bottom, _ = self.extent
+        rows = structured.choose_rows(self.width, self.height, target.num_points, target.cell_size)
+        check_total(rows[0] * rows[1], "cell_size")
+        points, cells = structured.row_rectangle(self.width, self.height, *rows)
+        return Mesh.create(points + np.array([left, bottom]), cells)
+
+    def _sides(self, mesh: Mesh) -> dict:
+        """Facets of each side by its name."""
+        left, right, bottom, top = self.extent
+        ends = np.asarray(mesh.points)[np.asarray(mesh.facets)]
+        tolerance = 1e-9 * max(self.width, self.height)
+        sides = {"left": (0, left), "right": (0, right), "bottom": (1, bottom), "top": (1, top)}
+        return {
+            name: jnp.asarray(np.flatnonzero((np.abs(ends[:, :, axis] - value) < tolerance).all(axis=1)), jnp.int32)
+            for name, (axis, value) in sides.items()
+        }
