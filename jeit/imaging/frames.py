@@ -11,7 +11,7 @@ from jeit.imaging.preparation import Clock, body_of, calibrated_model, select_fr
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import GaussNewton
-from jeit.inverse.nonlinear.solvers import AbstractSolver
+from jeit.inverse.nonlinear.solvers import AbstractSolver, as_solver
 from jeit.inverse.stream.imager import check_memory
 
 
@@ -19,20 +19,23 @@ from jeit.inverse.stream.imager import check_memory
 class StreamSettings:
     """How to image frame after frame. The defaults here are jeit's defaults, for Python and command line alike.
 
-    - `solver`: `GaussNewton(max_steps=4)`, `LevenbergMarquardt()`, or `OneStep()` for linear images.
+    - `solver`: `GaussNewton(max_steps=4)`, `LevenbergMarquardt()`, or `OneStep()` for linear images; or
+      the name of one.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; "noise-figure" unless given.
     - `memory`: frames over which an image changes, see `jeit.inverse.Imager`; 0 takes every frame alone.
     - `contact`, `num_points`: as in `jeit.imaging.ImagingSettings`.
+
+    Raises `ValueError` for a solver that does not image frames, and a memory that is no number of them.
     """
 
-    solver: AbstractSolver = field(default_factory=GaussNewton)
+    solver: AbstractSolver | str = field(default_factory=GaussNewton)
     hyperparameter: float | str | None = None
     memory: float = 0.0
     contact: str | None = None
     num_points: int = 1200
 
     def __post_init__(self):
-        self.solver.for_frames()
+        as_solver(self.solver).for_frames()
         check_memory(self.memory)
 
 
