@@ -10,7 +10,8 @@ import numpy as np
 from benchmarks.problem import GAUSS_NEWTON, STEPS
 from jeit.electrodes import BoundaryElectrodes, NodeElectrodes
 from jeit.forward import ForwardModel
-from jeit.inverse import Imager, Noser, one_step
+from jeit.inverse import Imager, Noser, Parametrisation, one_step
+from jeit.inverse.nonlinear import GaussNewton
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 
@@ -74,9 +75,8 @@ class JeitContestant:
             prior=Noser(),
             hyperparameter=float(problem["hyperparameter"]),
             noise=problem["noise"],
-            steps=STEPS,
-            rtol=0.0,
-            informative=0.0,
+            solver=GaussNewton(max_steps=STEPS, rtol=0.0),
+            parametrisation=Parametrisation(informative=0.0),
         )
 
     @property

@@ -16,6 +16,7 @@ from jeit.data import read
 from jeit.image import Raster, challenge_score, segment
 from jeit.imaging.preparation import prepare_difference
 from jeit.inverse import TotalVariation, reconstruct
+from jeit.inverse.nonlinear import GaussNewton
 
 from .machine import heading
 
@@ -42,7 +43,7 @@ def scores(folder: Path, num_points: int = 1600, levels=LEVELS, report=print) ->
             start = time.perf_counter()
             found = reconstruct(
                 model, empty + difference, background,
-                prior=TotalVariation(), noise=prepared.deviation, mask=mask, max_steps=100,
+                prior=TotalVariation(), noise=prepared.deviation, mask=mask, solver=GaussNewton(max_steps=100),
             )  # fmt: skip
             image = raster.sample(jnp.log(found.conductivity / background))
             seconds = time.perf_counter() - start

@@ -30,6 +30,7 @@ def problems(num_points: int):
 
     from benchmarks.realtime import bodies, simulate
     from jeit.inverse import Gaussian, Noser, reconstruct
+    from jeit.inverse.nonlinear import GaussNewton
 
     for name, (make, reach) in bodies().items():
         model = make(num_points)
@@ -37,7 +38,13 @@ def problems(num_points: int):
         noise = 1e-2 * np.abs(frames[1]) + 1e-3 * np.abs(frames[1]).max()
         for prior in (Gaussian(0.03), Noser()):
             best = reconstruct(
-                model, jnp.asarray(frames[1]), 1.0, prior=prior, hyperparameter=3.0, noise=noise, rtol=1e-13
+                model,
+                jnp.asarray(frames[1]),
+                1.0,
+                prior=prior,
+                hyperparameter=3.0,
+                noise=noise,
+                solver=GaussNewton(rtol=1e-13),
             )
             size = best.inversion.num_coefficients
             yield (
@@ -52,8 +59,8 @@ def solvers():
     import jax.numpy as jnp
     import optimistix as optx
 
-    from jeit.inverse.nonlinear.bounded import minimise_between
-    from jeit_solvers import Descent
+    from jeit.inverse.nonlinear.solvers import minimise_between
+    from jeit_solvers import Descent, lbfgsb, projected_gradient
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -95,7 +102,8 @@ def solvers():
         def solve(inversion):
             first = start(inversion)
             least, greatest = jnp.full_like(first, -jnp.inf), jnp.full_like(first, jnp.inf)
-            return minimise_between(inversion, first, least, greatest, method, MOST_BOUNDED_STEPS, TOLERANCE)[:2]
+            found = minimise_between(inversion, first, least, greatest, method, MOST_BOUNDED_STEPS, TOLERANCE)
+            return found.x, found.steps
 
         return solve
 
@@ -109,8 +117,8 @@ def solvers():
         "optimistix Dogleg": optimistix(optx.Dogleg(**tolerance)),
         "jaxopt Gauss-Newton": jaxopt_solver(jaxopt.GaussNewton, tol=TOLERANCE),
         "jaxopt Levenberg-Marquardt": jaxopt_solver(jaxopt.LevenbergMarquardt, **marquardt),
-        "jaxopt L-BFGS-B": bounded("l-bfgs-b"),
-        "jaxopt projected gradient": bounded("projected-gradient"),
+        "jaxopt L-BFGS-B": bounded(lbfgsb),
+        "jaxopt projected gradient": bounded(projected_gradient),
     }
 
 

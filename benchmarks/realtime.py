@@ -135,7 +135,8 @@ def main() -> int:
 
     import numpy as np
 
-    from jeit.inverse import Imager
+    from jeit.inverse import Imager, Parametrisation
+    from jeit.inverse.nonlinear import GaussNewton, OneStep
 
     lines = ["| sensor | image | median ms | 99 % ms | limit ms | iterations | error |", "|---" * 7 + "|"]
     details, missed = [], []
@@ -145,14 +146,15 @@ def main() -> int:
         noise = 2 * NOISE * np.abs(rest) + 1e-2 * NOISE * np.abs(rest).max()
         common = {"reference": rest, "noise": noise, "hyperparameter": 3.0}  # the imager's own prior
         label = f"{name}, {model.mesh.num_points} nodes, {model.mesh.num_cells} cells, {frames.shape[1]} voltages"
-        linear = Imager.create(model, 1.0, method="linear", **common)
+        linear = Imager.create(model, 1.0, solver=OneStep(), **common)
         _, latency = stream_all(linear, frames)
         high = np.quantile(latency, 0.99)
         lines.append(f"| {label} | linear | {np.median(latency):.3f} | {high:.3f} | {LINEAR_MS} | 1 | |")
         missed += [] if high <= LINEAR_MS else [f"{name}, linear: {high:.3f} ms"]
-        imager = Imager.create(model, 1.0, steps=4, rtol=0.0, **common)
+        imager = Imager.create(model, 1.0, solver=GaussNewton(max_steps=4, rtol=0.0), **common)
         images, latency = stream_all(imager, frames)
-        exact = Imager.create(model, 1.0, steps=30, rtol=1e-12, informative=0.0, **common)
+        longer, every = GaussNewton(max_steps=30, rtol=1e-12), Parametrisation(informative=0.0)
+        exact = Imager.create(model, 1.0, solver=longer, parametrisation=every, **common)
         weighing, errors = exact.weighing(exact.mask), []
         for one in images[:: max(1, len(images) // 50)]:
             limit = np.asarray(exact.estimate(frames[one.number], weighing, exact.start).conductivity)

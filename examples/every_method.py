@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, one_step, plot_image, reconstruct, ring
 from jeit.inverse import Gaussian, TotalVariation, back_projection, greit, posterior
+from jeit.inverse.nonlinear import GaussNewton
 from jeit.mesh import centroids, measures
 
 
@@ -28,7 +29,10 @@ def main() -> float:
     difference, measured = frame - rest, frame - rest + model.voltages(1.0)
 
     smooth = reconstruct(model, measured, 1.0, prior=Gaussian(0.017), noise=noise, hyperparameter=3.0)
-    pieces = reconstruct(model, measured, 1.0, prior=TotalVariation(), noise=noise, hyperparameter=100.0, max_steps=60)
+    sharpen = GaussNewton(max_steps=60)
+    pieces = reconstruct(
+        model, measured, 1.0, prior=TotalVariation(), noise=noise, hyperparameter=100.0, solver=sharpen
+    )
     images = {
         "truth": body(model.mesh),
         "back-projection": 1 + back_projection(model, 1.0).image(difference),

@@ -1,6 +1,7 @@
 """From two frames to a picture in one call, `image_difference`, and what every rule for λ would choose on the way.
 
-`settings` says how to image, `preparation` checks, meshes and calibrates, `difference` images and looks for inclusions.
+`settings` says how to image, `preparation` checks, meshes and calibrates, `method` images, `difference` looks for
+inclusions; `frames` does it frame after frame.
 """
 
 from jeit.imaging.choice import ComparedRules as ComparedRules
@@ -8,11 +9,14 @@ from jeit.imaging.choice import RuleOutcome as RuleOutcome
 from jeit.imaging.choice import compare_on_data as compare_on_data
 from jeit.imaging.difference import ImagedDifference as ImagedDifference
 from jeit.imaging.difference import image_difference as image_difference
+from jeit.imaging.frames import StreamSettings as StreamSettings
+from jeit.imaging.frames import frames_of as frames_of
+from jeit.imaging.frames import prepare_imager as prepare_imager
+from jeit.imaging.method import METHODS as METHODS
 from jeit.imaging.preparation import PreparedDifference as PreparedDifference
 from jeit.imaging.preparation import calibrated_model as calibrated_model
 from jeit.imaging.preparation import imaging_mesh as imaging_mesh
 from jeit.imaging.preparation import prepare_difference as prepare_difference
 from jeit.imaging.preparation import select_frames as select_frames
 from jeit.imaging.settings import CONTACTS as CONTACTS
-from jeit.imaging.settings import METHODS as METHODS
 from jeit.imaging.settings import ImagingSettings as ImagingSettings

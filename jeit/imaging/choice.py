@@ -12,10 +12,11 @@ from jaxtyping import Array, Float
 
 from jeit.data import Measurement
 from jeit.image import Inclusion, find_inclusions
-from jeit.imaging.method import rule_for
+from jeit.imaging.method import prior_for, rule_for
 from jeit.imaging.preparation import Clock, PreparedDifference, prepare_difference
-from jeit.imaging.settings import ImagingSettings, prior_for
-from jeit.inverse import RULES, Choice
+from jeit.imaging.settings import ImagingSettings
+from jeit.inverse import RULES
+from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.rules import choose
 from jeit.inverse.linearisation import Linearisation
 

@@ -14,14 +14,12 @@ from jaxtyping import Array, Float, UInt8
 from jeit.data import Measurement
 from jeit.data.checks import FrameQuality
 from jeit.image import Inclusion, Raster, find_inclusions, segment
-from jeit.imaging.method import iterative_reconstruction, linear_reconstruction
+from jeit.imaging.method import METHODS
 from jeit.imaging.preparation import Clock, prepare_difference
-from jeit.imaging.settings import LINEAR_METHODS, ImagingSettings
-from jeit.inverse import (
-    Calibration,
-    LinearReconstruction,
-    Reconstruction,
-)
+from jeit.imaging.settings import ImagingSettings
+from jeit.inverse.calibration import Calibration
+from jeit.inverse.linear.one_step import LinearReconstruction
+from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.mesh import Mesh
 
 
@@ -106,12 +104,7 @@ def image_difference(
     )
     calibration, mesh = prepared.calibration, prepared.mesh
     with clock("image"):
-        if settings.method in LINEAR_METHODS:
-            reconstruction = linear_reconstruction(prepared, settings)
-            change = reconstruction.image(prepared.difference)
-        else:
-            reconstruction = iterative_reconstruction(prepared, settings)
-            change = reconstruction.conductivity - calibration.conductivity
+        reconstruction, change = METHODS[settings.method].image(prepared, settings)
         largest = float(jnp.abs(change).max())
         if not largest > 1e-9 * float(calibration.conductivity):
             raise ValueError(

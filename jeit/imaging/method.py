@@ -1,19 +1,56 @@
-"""The method that the settings name, applied to a prepared difference: linear or iterative, with its prior and λ."""
+"""Methods of imaging by name: what each makes of a prepared difference, what it takes, and its λ unless given."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
+
+from jaxtyping import Array, Float
 
 from jeit.imaging.preparation import PreparedDifference
-from jeit.imaging.settings import ImagingSettings, prior_for
-from jeit.inverse import (
-    RULES,
-    LinearReconstruction,
-    Reconstruction,
-    TotalVariation,
-    back_projection,
-    one_step,
-    reconstruct,
-)
+from jeit.inverse import RULES, TotalVariation, back_projection, one_step, reconstruct
+from jeit.inverse.hyperparameter.defaults import EDGE_PRICE, ITERATED, RULE
 from jeit.inverse.hyperparameter.rules import Rule, discrepancy
+from jeit.inverse.linear.one_step import LinearReconstruction
+from jeit.inverse.nonlinear import GaussNewton, LevenbergMarquardt
+from jeit.inverse.nonlinear.reconstruct import Reconstruction
+from jeit.inverse.nonlinear.solvers import AbstractSolver
+from jeit.inverse.prior.defaults import PRIORS
+from jeit.inverse.prior.priors import AbstractPrior
+from jeit.mesh import Domain
+from jeit_solvers import Status
+
+if TYPE_CHECKING:
+    from jeit.imaging.settings import ImagingSettings
+
+Imaged = tuple[LinearReconstruction | Reconstruction, Float[Array, " m"]]
+"""A reconstruction, and the change of conductivity per cell that it finds, S/m (2-D: S)."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """How to image a difference.
+
+    - `image`: the function that does it.
+    - `takes_prior`: whether of the prior in the settings; `prior`, what it is called where the method has its own.
+    - `hyperparameter`: λ unless given. `takes_hyperparameter`: whether it has any use for one; `number`: one that
+      serves, where λ cannot be chosen by a rule.
+    """
+
+    image: Callable[[PreparedDifference, "ImagingSettings"], Imaged]
+    takes_prior: bool = False
+    prior: str | None = None
+    hyperparameter: float | str | None = None
+    takes_hyperparameter: bool = True
+    number: float | None = None
+
+
+def prior_for(prior: str | AbstractPrior, domain: Domain) -> AbstractPrior:
+    """The prior itself, or the one of that name in `jeit.inverse.prior.defaults.PRIORS`, made for the body's size."""
+    if not isinstance(prior, str):
+        return prior
+    x_min, x_max, y_min, y_max = domain.extent
+    return PRIORS[prior](max(x_max - x_min, y_max - y_min))
 
 
 def rule_for(name: str, prepared: PreparedDifference) -> Rule:
@@ -29,47 +66,75 @@ def rule_for(name: str, prepared: PreparedDifference) -> Rule:
     return partial(discrepancy, noise=prepared.noise)
 
 
-def linear_reconstruction(prepared: PreparedDifference, settings: ImagingSettings) -> LinearReconstruction:
-    model, conductivity = prepared.model, prepared.calibration.conductivity
-    hyperparameter = settings.hyperparameter
-    if settings.method != "one-step":
-        filtered = settings.method.startswith("filtered")
-        given = {"hyperparameter": hyperparameter} if isinstance(hyperparameter, (int, float)) else {}
-        return back_projection(model, conductivity, filtered=filtered, mask=prepared.mask, **given)
-    assert hyperparameter is not None
-    return one_step(
-        model,
-        conductivity,
+def _weight(prepared: PreparedDifference, settings: "ImagingSettings") -> float | Rule:
+    """λ as the settings have it, with the rule in place of its name."""
+    value = settings.hyperparameter
+    assert value is not None
+    return rule_for(value, prepared) if isinstance(value, str) else value
+
+
+def _one_step(prepared: PreparedDifference, settings: "ImagingSettings") -> Imaged:
+    found = one_step(
+        prepared.model,
+        prepared.calibration.conductivity,
         prior=prior_for(settings.prior, prepared.domain),
-        hyperparameter=rule_for(hyperparameter, prepared) if isinstance(hyperparameter, str) else hyperparameter,
+        hyperparameter=_weight(prepared, settings),
         difference=prepared.difference,
         noise=prepared.deviation,
         mask=prepared.mask,
     )
+    return found, found.image(prepared.difference)
 
 
-def iterative_reconstruction(prepared: PreparedDifference, settings: ImagingSettings) -> Reconstruction:
+def _back_projection(prepared: PreparedDifference, settings: "ImagingSettings", *, filtered: bool) -> Imaged:
+    value = settings.hyperparameter
+    given = {"hyperparameter": value} if isinstance(value, (int, float)) else {}
+    conductivity = prepared.calibration.conductivity
+    found = back_projection(prepared.model, conductivity, filtered=filtered, mask=prepared.mask, **given)
+    return found, found.image(prepared.difference)
+
+
+def _iterated(
+    prepared: PreparedDifference,
+    settings: "ImagingSettings",
+    *,
+    solver: AbstractSolver,
+    prior: AbstractPrior | None = None,
+) -> Imaged:
     """The conductivity whose voltages differ from the model's own as the frame differs from its reference.
 
     So what the model gets wrong alike with and without objects is left out. Raises `ValueError` if the solver fails.
     """
     model, background = prepared.model, prepared.calibration.conductivity
-    total_variation = settings.method == "total-variation"
-    hyperparameter = settings.hyperparameter
-    if isinstance(hyperparameter, str):
-        hyperparameter = rule_for(hyperparameter, prepared)
     found = reconstruct(
         model,
         model.voltages(background) + prepared.difference,
         background,
-        prior=TotalVariation() if total_variation else prior_for(settings.prior, prepared.domain),
-        hyperparameter=hyperparameter,
+        prior=prior_for(settings.prior, prepared.domain) if prior is None else prior,
+        hyperparameter=_weight(prepared, settings),
         noise=prepared.deviation,
         mask=prepared.mask,
-        solver="gauss-newton" if total_variation else settings.method,
-        max_steps=100,
-        rtol=1e-4,
+        solver=solver,
     )
-    if found.status == "failed":
+    if found.status == Status.FAILED:
         raise ValueError(f"'{prepared.measurement.name}': the reconstruction failed. {found.reason}")
-    return found
+    return found, found.conductivity - background
+
+
+_GAUSS_NEWTON, _LEVENBERG_MARQUARDT = GaussNewton(100, 1e-4), LevenbergMarquardt(100, 1e-4)
+METHODS: dict[str, Method] = {
+    "one-step": Method(_one_step, takes_prior=True, hyperparameter=RULE),
+    "back-projection": Method(partial(_back_projection, filtered=False), takes_hyperparameter=False),
+    "filtered-back-projection": Method(partial(_back_projection, filtered=True), number=0.05),
+    "gauss-newton": Method(partial(_iterated, solver=_GAUSS_NEWTON), takes_prior=True, hyperparameter=ITERATED),
+    "levenberg-marquardt": Method(
+        partial(_iterated, solver=_LEVENBERG_MARQUARDT), takes_prior=True, hyperparameter=ITERATED
+    ),
+    "total-variation": Method(
+        partial(_iterated, solver=_GAUSS_NEWTON, prior=TotalVariation()),
+        prior="total variation",
+        hyperparameter=EDGE_PRICE,
+        number=EDGE_PRICE,
+    ),
+}
+"""Methods by the names of the command line."""

@@ -14,8 +14,10 @@ from jeit.data import Measurement, check_imageable
 from jeit.data.checks import FrameQuality
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
-from jeit.inverse import Calibration, calibrate, relative_noise
+from jeit.inverse import calibrate, relative_noise
+from jeit.inverse.calibration import Calibration
 from jeit.mesh import Domain, Mesh
+from jeit_solvers import Status
 
 
 class Clock:
@@ -127,13 +129,13 @@ def calibrated_model(
     with clock("calibrate"):
         chosen = contact or default_contact(base)
         calibration = calibrate(model, base.voltages[0], mask=base.mask[0], contact=chosen)
-        if contact is None and chosen == "each" and calibration.status != "converged":
+        if contact is None and chosen == "each" and calibration.status != Status.CONVERGED:
             chosen = "common"  # the data do not tell so many impedances apart
             calibration = calibrate(model, base.voltages[0], mask=base.mask[0], contact=chosen)
         calibration = jax.block_until_ready(calibration)
         if not np.isfinite(calibration.misfit):
             raise ValueError(
-                f"'{base.name}': calibration on it failed ({calibration.status}); is this a frame of the empty body, "
+                f"'{base.name}': calibration on it failed ({calibration.reason}); is this a frame of the empty body, "
                 "and are geometry and protocol right?"
             )
     return calibration, chosen

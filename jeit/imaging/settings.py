@@ -1,38 +1,15 @@
 """How to image: the method, the prior, λ, the mesh. The defaults here are jeit's, for Python and command line alike."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from jeit.inverse import (
-    RULES,
-    AbstractPrior,
-    Gaussian,
-    Laplace,
-    Noser,
-    Tikhonov,
-)
-from jeit.inverse.nonlinear.reconstruct import EDGE_PRICE
-from jeit.mesh import Domain
+from jeit.imaging.method import METHODS
+from jeit.inverse import RULES
+from jeit.inverse.prior.defaults import PRIORS
+from jeit.inverse.prior.priors import AbstractPrior
 
-LINEAR_METHODS = ("one-step", "back-projection", "filtered-back-projection")
-ITERATIVE_METHODS = ("gauss-newton", "levenberg-marquardt", "total-variation")
-METHODS = (*LINEAR_METHODS, *ITERATIVE_METHODS)
 CONTACTS = ("each", "common", "fixed")
-DEFAULT_HYPERPARAMETERS: dict[str, float | str] = {
-    "one-step": "noise-figure",
-    "gauss-newton": 5.0,
-    "levenberg-marquardt": 5.0,
-    "total-variation": EDGE_PRICE,
-}
-# Priors by name, made for a body of a given size: the longer side of its outline in metres.
-PRIORS: dict[str, Callable[[float], AbstractPrior]] = {
-    "tikhonov": lambda size: Tikhonov(),
-    "laplace": lambda size: Laplace(),
-    "noser": lambda size: Noser(),
-    "gaussian": lambda size: Gaussian(0.085 * size),
-}
 
 
 @dataclass(frozen=True)
@@ -40,7 +17,8 @@ class ImagingSettings:
     """How to image. The defaults here are jeit's defaults, for Python and command line alike.
 
     - `method`: one of `METHODS`: linear ones, and iterative ones that solve for conductivity itself.
-    - `prior`: a name in `PRIORS`, or a prior; used by one-step, Gauss-Newton and Levenberg-Marquardt imaging.
+    - `prior`: a name in `jeit.inverse.prior.defaults.PRIORS`, or a quadratic prior; used by one-step, Gauss-Newton and
+      Levenberg-Marquardt imaging.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; a number for total variation and filtered
       back-projection; not used by plain back-projection. None: "noise-figure" for one-step images, 5 for Gauss-Newton
       and Levenberg-Marquardt, 300 for total variation, what served on measured tanks.
@@ -68,18 +46,19 @@ class ImagingSettings:
         known = self.prior in PRIORS if isinstance(self.prior, str) else isinstance(self.prior, AbstractPrior)
         if not known:
             raise ValueError(f"prior: there is no {self.prior!r}; give one of {', '.join(PRIORS)}, or a prior.")
+        if isinstance(self.prior, AbstractPrior) and not self.prior.is_quadratic:
+            raise ValueError("prior: total variation is a method of its own; give method='total-variation'.")
         if self.hyperparameter is None:
-            object.__setattr__(self, "hyperparameter", DEFAULT_HYPERPARAMETERS.get(self.method))
+            object.__setattr__(self, "hyperparameter", METHODS[self.method].hyperparameter)
         elif isinstance(self.hyperparameter, str):
             if self.hyperparameter not in RULES:
                 raise ValueError(
                     f"hyperparameter: '{self.hyperparameter}' is neither a number nor a rule; the rules are "
                     f"{', '.join(RULES)}."
                 )
-            if self.method == "filtered-back-projection":
-                raise ValueError("hyperparameter: filtered back-projection takes a number such as 0.05, not a rule.")
-            if self.method == "total-variation":
-                raise ValueError("hyperparameter: total variation takes a number such as 300, not a rule.")
+            if (number := METHODS[self.method].number) is not None:
+                name = self.method.replace("-", " ").replace("back ", "back-")
+                raise ValueError(f"hyperparameter: {name} takes a number such as {number:g}, not a rule.")
         elif isinstance(self.hyperparameter, bool) or not (
             np.isfinite(self.hyperparameter) and self.hyperparameter > 0
         ):
@@ -88,11 +67,3 @@ class ImagingSettings:
             raise ValueError(f"contact: there is no '{self.contact}'; give one of {', '.join(CONTACTS)}.")
         if not 50 <= self.num_points <= 100_000:
             raise ValueError(f"num_points: give 50 to 100,000 nodes of the mesh; it is {self.num_points}.")
-
-
-def prior_for(prior: str | AbstractPrior, domain: Domain) -> AbstractPrior:
-    """The prior itself, or the one of that name in `PRIORS`, made for the size of the body."""
-    if not isinstance(prior, str):
-        return prior
-    x_min, x_max, y_min, y_max = domain.extent
-    return PRIORS[prior](max(x_max - x_min, y_max - y_min))

@@ -1,39 +1,23 @@
-"""Inverse problems: calibration, priors, linear and nonlinear images, and the rules that choose a hyperparameter."""
+"""Inverse problems: calibration, priors, linear and nonlinear images, and the rules that choose a hyperparameter.
 
-from jeit.inverse.calibration import Calibration as Calibration
+Solvers, links and further unknowns are in `jeit.inverse.nonlinear`; what results are made of, where it is computed.
+"""
+
 from jeit.inverse.calibration import calibrate as calibrate
-from jeit.inverse.hyperparameter.choice import Choice as Choice
 from jeit.inverse.hyperparameter.comparison import choose_hyperparameter as choose_hyperparameter
 from jeit.inverse.hyperparameter.comparison import compare_rules as compare_rules
 from jeit.inverse.hyperparameter.rules import RULES as RULES
 from jeit.inverse.linear.back_projection import back_projection as back_projection
 from jeit.inverse.linear.greit import greit as greit
-from jeit.inverse.linear.one_step import LinearReconstruction as LinearReconstruction
 from jeit.inverse.linear.one_step import one_step as one_step
 from jeit.inverse.noise import relative_noise as relative_noise
-from jeit.inverse.noise import repeated_noise as repeated_noise
-from jeit.inverse.nonlinear.links import AbstractLink as AbstractLink
-from jeit.inverse.nonlinear.links import Bounded as Bounded
-from jeit.inverse.nonlinear.links import Linear as Linear
-from jeit.inverse.nonlinear.links import Log as Log
-from jeit.inverse.nonlinear.problem import Inversion as Inversion
-from jeit.inverse.nonlinear.reconstruct import Reconstruction as Reconstruction
+from jeit.inverse.nonlinear.parametrisation import Parametrisation as Parametrisation
 from jeit.inverse.nonlinear.reconstruct import reconstruct as reconstruct
-from jeit.inverse.nonlinear.unknowns import AbstractUnknown as AbstractUnknown
-from jeit.inverse.nonlinear.unknowns import Background as Background
-from jeit.inverse.nonlinear.unknowns import ContactImpedance as ContactImpedance
-from jeit.inverse.nonlinear.unknowns import ElectrodePosition as ElectrodePosition
-from jeit.inverse.nonlinear.unknowns import Scale as Scale
-from jeit.inverse.prior.bases import Regions as Regions
-from jeit.inverse.prior.bases import pixels as pixels
-from jeit.inverse.prior.priors import AbstractPrior as AbstractPrior
 from jeit.inverse.prior.priors import Gaussian as Gaussian
 from jeit.inverse.prior.priors import Laplace as Laplace
 from jeit.inverse.prior.priors import Noser as Noser
 from jeit.inverse.prior.priors import Tikhonov as Tikhonov
 from jeit.inverse.prior.total_variation import TotalVariation as TotalVariation
 from jeit.inverse.stream.imager import Imager as Imager
-from jeit.inverse.stream.stream import FrameImage as FrameImage
 from jeit.inverse.stream.stream import stream as stream
-from jeit.inverse.uncertainty import Posterior as Posterior
 from jeit.inverse.uncertainty import posterior as posterior

@@ -7,6 +7,13 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from jeit.forward import ForwardModel
+from jeit_solvers import Status, ended
+
+_REASONS = {
+    Status.STEP_LIMIT: "Stopped after {} steps.",
+    Status.STALLED: "No step made the model fit better.",
+    Status.FAILED: "The fit became NaN.",
+}
 
 
 class Calibration(eqx.Module):
@@ -14,7 +21,7 @@ class Calibration(eqx.Module):
 
     **Fields**: `model`, with its electrodes' contact impedance fitted; `conductivity`, the uniform background
     (S/m; 2-D: S); `voltages` (M,), what the model predicts; `misfit`, ‖predicted - measured‖ / ‖measured‖ over the
-    channels used; `iterations`; `status`, "converged" or the reason why not.
+    channels used; `iterations`; `status`, how the fit ended, and `reason`, in a sentence, empty where all is well.
     """
 
     model: ForwardModel
@@ -22,7 +29,8 @@ class Calibration(eqx.Module):
     voltages: Float[Array, " M"]
     misfit: Float[Array, ""]
     iterations: int = eqx.field(static=True)
-    status: str = eqx.field(static=True)
+    status: Status = eqx.field(static=True)
+    reason: str = eqx.field(static=True, default="")
 
 
 def calibrate(
@@ -79,9 +87,9 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     fitted, conductivity = _fitted(model, solution.value)
     voltages = fitted.voltages(conductivity)
     misfit = jnp.linalg.norm(jnp.where(used, voltages - measured, 0)) / size
-    converged = solution.result == optx.RESULTS.successful
-    status = "converged" if converged else f"not converged in {max_steps} steps"
-    return Calibration(fitted, conductivity, voltages, misfit, int(solution.stats["num_steps"]), status)
+    status = ended(solution.result) if np.isfinite(misfit) else Status.FAILED
+    reason = "" if status == Status.CONVERGED else _REASONS[status].format(max_steps)
+    return Calibration(fitted, conductivity, voltages, misfit, int(solution.stats["num_steps"]), status, reason)
 
 
 def _fitted(model: ForwardModel, parameters) -> tuple[ForwardModel, Float[Array, ""]]:

@@ -39,6 +39,11 @@ class Linearisation(eqx.Module):
         prior = Noser() if prior is None else prior
         if not isinstance(prior, AbstractPrior):
             raise ValueError(f"prior must be one of those in jeit.inverse, such as Noser(), not {prior!r}.")
+        if not prior.is_quadratic:
+            raise ValueError(
+                f"prior: {type(prior).__name__} is not quadratic, so there is no linear image with it, nor a rule for "
+                "its weight; take Noser(), Gaussian(length), Laplace() or Tikhonov(), or reconstruct with this one."
+            )
         if jnp.iscomplexobj(conductivity):
             raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
         channels, root_weight = used_channels(model, noise, mask)

@@ -15,9 +15,10 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jeit.inverse.nonlinear.problem import Inversion, Ridge
+from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.mesh import measures
+from jeit_solvers import Status
 
 
 class Posterior(eqx.Module):
@@ -91,12 +92,12 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
     `ValueError` for total variation and bounded solvers, whose posterior is not near a Gaussian, and for a
     reconstruction that has failed.
     """
-    if not isinstance(reconstruction.inversion.penalty, Ridge):
+    if not reconstruction.inversion.penalty.is_standard_normal:
         raise ValueError(
             "posterior: only for smooth priors (Tikhonov, Noser, Laplace, Gaussian) and unbounded solvers; total "
             "variation and bounds have no Gaussian posterior."
         )
-    if reconstruction.status == "failed":
+    if reconstruction.status == Status.FAILED:
         raise ValueError(f"posterior: the reconstruction failed. {reconstruction.reason}")
     return _posterior(reconstruction.inversion, reconstruction.coefficients)
 

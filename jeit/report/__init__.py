@@ -6,6 +6,8 @@ from jeit.report.choice import write_choice as write_choice
 from jeit.report.image import draw_image as draw_image
 from jeit.report.image import report_image as report_image
 from jeit.report.image import write_image as write_image
+from jeit.report.measurement import report_measurement as report_measurement
+from jeit.report.stream import write_stream as write_stream
 from jeit.report.study import write_study_report as write_study_report
 from jeit.report.track import draw_track as draw_track
 from jeit.report.track import report_track as report_track

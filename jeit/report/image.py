@@ -7,8 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from jeit.image import Inclusion
 from jeit.imaging.difference import ImagedDifference
-from jeit.inverse import LinearReconstruction
+from jeit.imaging.method import METHODS
+from jeit.imaging.settings import ImagingSettings
+from jeit.inverse.linear.one_step import LinearReconstruction
+from jeit.protocol import Protocol
 from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain, version_of
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix", "matplotlib")
@@ -73,38 +77,18 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
 
 def report_image(result: ImagedDifference) -> dict[str, Any]:
     """All that was found and decided, as plain numbers, strings, lists and dictionaries; what is not known is None."""
-    calibration, reconstruction, quality = result.calibration, result.reconstruction, result.quality
-    electrodes, protocol = calibration.model.electrodes, result.measurement.protocol
-    unit = "S" if result.mesh.dimension == 2 else "S/m"
+    reconstruction, quality, settings = result.reconstruction, result.quality, result.settings
     noise = quality.difference_noise
-    settings = result.settings
-    background = float(calibration.conductivity)
     content = {
         "data": describe_measurement(result.measurement),
         "reference": describe_measurement(result.reference),
         "geometry": {
             **describe_domain(result.measurement.domain or result.reference.domain),
-            "electrodes": describe_electrodes(electrodes),
+            "electrodes": describe_electrodes(result.calibration.model.electrodes),
             "mesh": {"points": result.mesh.num_points, "cells": result.mesh.num_cells},
         },
-        "protocol": {
-            "name": protocol.name,
-            "electrodes": protocol.num_electrodes,
-            "drives": protocol.num_drives,
-            "measurements": protocol.num_measurements,
-            "largest_current": float(np.abs(np.asarray(protocol.drive)).max()),
-            "largest_current_unit": "A",
-        },
-        "calibration": {
-            "conductivity": background,
-            "conductivity_unit": unit,
-            "contact": settings.contact,
-            "contact_impedance": None if electrodes.is_point else electrodes.contact_impedance,
-            "contact_impedance_unit": "ohm·m" if result.mesh.dimension == 2 else "ohm·m²",
-            "relative_misfit": float(calibration.misfit),
-            "iterations": calibration.iterations,
-            "status": calibration.status,
-        },
+        "protocol": _protocol(result.measurement.protocol),
+        "calibration": _calibration(result),
         "noise": None
         if noise is None
         else {
@@ -120,7 +104,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "usable_channels": quality.usable_channels,
         },
         "reconstruction": {
-            "quantity": f"change of conductivity against the reference, {unit}",
+            "quantity": f"change of conductivity against the reference, {_unit(result)}",
             "method": settings.method,
             "least_change_relative_to_background": result.lowest,
             "prior": _prior(settings),
@@ -131,20 +115,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "chosen_by": reconstruction.rule,
             "note": (reconstruction.choice.note or None) if reconstruction.choice is not None else None,
         },
-        "inclusions": [
-            {
-                "sign": inclusion.sign,
-                "kind": inclusion.kind,
-                "centroid": list(inclusion.centroid),
-                "centroid_unit": "m",
-                "area": inclusion.area,
-                "area_unit": "m²" if result.mesh.dimension == 2 else "m³",
-                "peak": inclusion.peak,
-                "peak_unit": unit,
-                "peak_relative_to_background": inclusion.peak / background,
-            }
-            for inclusion in result.inclusions
-        ],
+        "inclusions": [_inclusion(result, one) for one in result.inclusions],
         "inclusion_settings": {"level": settings.level, "least_peak": settings.least_peak},
         "timings": {**result.timings, "unit": "s"},
         "versions": {name: version_of(name) for name in _PACKAGES},
@@ -152,11 +123,57 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
     return plain(content)
 
 
-def _prior(settings) -> str | None:
-    if settings.method == "total-variation":
-        return "total variation"
-    if settings.method.endswith("back-projection"):
-        return None
+def _unit(result: ImagedDifference) -> str:
+    return "S" if result.mesh.dimension == 2 else "S/m"
+
+
+def _protocol(protocol: Protocol) -> dict[str, Any]:
+    return {
+        "name": protocol.name,
+        "electrodes": protocol.num_electrodes,
+        "drives": protocol.num_drives,
+        "measurements": protocol.num_measurements,
+        "largest_current": float(np.abs(np.asarray(protocol.drive)).max()),
+        "largest_current_unit": "A",
+    }
+
+
+def _calibration(result: ImagedDifference) -> dict[str, Any]:
+    """How the model was fitted to the reference."""
+    calibration = result.calibration
+    electrodes = calibration.model.electrodes
+    return {
+        "conductivity": float(calibration.conductivity),
+        "conductivity_unit": _unit(result),
+        "contact": result.settings.contact,
+        "contact_impedance": None if electrodes.is_point else electrodes.contact_impedance,
+        "contact_impedance_unit": "ohm·m" if result.mesh.dimension == 2 else "ohm·m²",
+        "relative_misfit": float(calibration.misfit),
+        "iterations": calibration.iterations,
+        "status": str(calibration.status),
+        "reason": calibration.reason or None,
+    }
+
+
+def _inclusion(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]:
+    return {
+        "sign": inclusion.sign,
+        "kind": inclusion.kind,
+        "centroid": list(inclusion.centroid),
+        "centroid_unit": "m",
+        "area": inclusion.area,
+        "area_unit": "m²" if result.mesh.dimension == 2 else "m³",
+        "peak": inclusion.peak,
+        "peak_unit": _unit(result),
+        "peak_relative_to_background": inclusion.peak / float(result.calibration.conductivity),
+    }
+
+
+def _prior(settings: ImagingSettings) -> str | None:
+    """The prior's name, or that of the method's own; None where there is none."""
+    method = METHODS[settings.method]
+    if not method.takes_prior:
+        return method.prior
     return settings.prior if isinstance(settings.prior, str) else type(settings.prior).__name__
 
 
@@ -166,7 +183,7 @@ def _iteration(result: ImagedDifference) -> dict[str, Any]:
     if isinstance(found, LinearReconstruction):
         return {}
     return {
-        "status": found.status,
+        "status": str(found.status),
         "reason": found.reason,
         "iterations": found.iterations,
         "misfit": float(found.misfit),

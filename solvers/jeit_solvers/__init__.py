@@ -9,6 +9,7 @@ from jeit_solvers.batching import in_turn
 from jeit_solvers.dense.cholesky import symmetric_inverse
 from jeit_solvers.dense.ridge import QuadraticModel, ridge_model, ridge_step, solve_definite
 from jeit_solvers.kmeans import KMeans, kmeans
+from jeit_solvers.optimise.bounded import BoundedMinimum, lbfgsb, projected_gradient, scipy_lbfgsb
 from jeit_solvers.optimise.descent import Descent
 from jeit_solvers.optimise.small_problems import (
     Minimum,
@@ -19,6 +20,7 @@ from jeit_solvers.optimise.small_problems import (
     solve_small,
     symmetric_small,
 )
+from jeit_solvers.optimise.status import Status, ended
 from jeit_solvers.over_cores import over_cores
 from jeit_solvers.sparse.choose import choose_solver
 from jeit_solvers.sparse.conjugate_gradient import ConjugateGradient
@@ -30,6 +32,7 @@ from jeit_solvers.sparse.plan import FactorisationPlan, analyse
 from jeit_solvers.sparse.sparse_cholesky import SparseCholesky
 
 __all__ = [
+    "BoundedMinimum",
     "ConjugateGradient",
     "Descent",
     "Factor",
@@ -41,22 +44,27 @@ __all__ = [
     "SparseCholesky",
     "SparseSymmetric",
     "SparsityPattern",
+    "Status",
     "Strips",
     "analyse",
     "choose_solver",
     "definite_small",
+    "ended",
     "factorise",
     "half_solve",
     "hessian_small",
     "in_turn",
     "inverse_small",
     "kmeans",
+    "lbfgsb",
     "minimise_small",
     "near_inverse",
     "over_cores",
+    "projected_gradient",
     "quadratic_form",
     "ridge_model",
     "ridge_step",
+    "scipy_lbfgsb",
     "solve",
     "solve_definite",
     "solve_small",

@@ -1,4 +1,4 @@
-"""Reconstruction between bounds, by jaxopt."""
+"""Reconstruction between bounds."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,16 @@ import pytest
 
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
-from jeit.inverse import Bounded, Gaussian, Laplace, Linear, Log, Noser, TotalVariation, reconstruct
+from jeit.inverse import Gaussian, Laplace, Noser, Parametrisation, TotalVariation, reconstruct
+from jeit.inverse.nonlinear import (
+    LBFGSB,
+    Bounded,
+    GaussNewton,
+    LevenbergMarquardt,
+    Linear,
+    Log,
+    ProjectedGradient,
+)
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
@@ -33,18 +42,19 @@ def frame(model):
 @pytest.mark.parametrize(
     ("solver", "prior"),
     [
-        ("projected-gradient", Noser()),
-        pytest.param("l-bfgs-b", Noser(), marks=pytest.mark.slow),
-        pytest.param("l-bfgs-b", Laplace(), marks=pytest.mark.slow),
-        pytest.param("projected-gradient", Laplace(), marks=pytest.mark.slow),
-        pytest.param("l-bfgs-b", TotalVariation(), marks=pytest.mark.slow),
-        pytest.param("projected-gradient", TotalVariation(), marks=pytest.mark.slow),
+        (ProjectedGradient(), Noser()),
+        pytest.param(LBFGSB(), Noser(), marks=pytest.mark.slow),
+        pytest.param(LBFGSB(), Laplace(), marks=pytest.mark.slow),
+        pytest.param(ProjectedGradient(), Laplace(), marks=pytest.mark.slow),
+        pytest.param(LBFGSB(), TotalVariation(), marks=pytest.mark.slow),
+        pytest.param(ProjectedGradient(), TotalVariation(), marks=pytest.mark.slow),
     ],
 )
 def test_bounds_hold_and_are_reached(solver, prior, model, frame):
     options = {} if isinstance(prior, TotalVariation) else {"hyperparameter": 1.0}
+    between = Parametrisation(bounds=(0.95, 1.6))
     result = reconstruct(
-        model, frame[0], 1.0, prior=prior, noise=frame[1], bounds=(0.95, 1.6), solver=solver, **options
+        model, frame[0], 1.0, prior=prior, noise=frame[1], parametrisation=between, solver=solver, **options
     )
     values = np.asarray(result.conductivity)
     assert values.min() >= 0.95 * (1 - 1e-12)
@@ -53,12 +63,14 @@ def test_bounds_hold_and_are_reached(solver, prior, model, frame):
     assert result.costs[-1] < result.costs[0]
 
 
-@pytest.mark.parametrize("solver", ["l-bfgs-b", "projected-gradient"])
+@pytest.mark.parametrize("solver", [LBFGSB(max_steps=2000), ProjectedGradient(max_steps=2000)])
 @pytest.mark.slow
 def test_bounds_that_are_not_reached_change_nothing(solver, model, frame):
     options = {"prior": Laplace(), "noise": frame[1], "hyperparameter": 3.0}
     free = reconstruct(model, frame[0], 1.0, **options)
-    result = reconstruct(model, frame[0], 1.0, solver=solver, bounds=(1e-3, 1e3), max_steps=2000, **options)
+    result = reconstruct(
+        model, frame[0], 1.0, solver=solver, parametrisation=Parametrisation(bounds=(1e-3, 1e3)), **options
+    )
     assert result.status == "converged"
     assert float(result.costs[-1]) < 1.01 * float(free.costs[-1])
     np.testing.assert_allclose(result.conductivity, free.conductivity, rtol=0.05)
@@ -66,10 +78,15 @@ def test_bounds_that_are_not_reached_change_nothing(solver, model, frame):
 
 @pytest.mark.slow
 def test_bounds_alone_choose_a_bounded_solver_and_too_few_steps_are_said_so(model, frame):
-    options = {"prior": Noser(), "noise": frame[1], "hyperparameter": 1.0, "bounds": (0.9, 2.0)}
-    result = reconstruct(model, frame[0], 1.0, max_steps=2, **options)
-    assert float(result.conductivity.max()) <= 2.0 * (1 + 1e-12)
-    assert result.status == "not converged"
+    between = Parametrisation(bounds=(0.9, 2.0))
+    options = {"prior": Noser(), "noise": frame[1], "hyperparameter": 1.0, "parametrisation": between}
+    alone = reconstruct(model, frame[0], 1.0, **options)
+    assert alone.iterations > 2
+    result = reconstruct(model, frame[0], 1.0, solver=LBFGSB(max_steps=2), **options)
+    for one in (alone, result):
+        assert float(one.conductivity.max()) <= 2.0 * (1 + 1e-12)
+    assert result.status == "step limit"
+    assert "2 trial steps" in result.reason
 
 
 @pytest.mark.parametrize(
@@ -82,25 +99,30 @@ def test_bounds_alone_choose_a_bounded_solver_and_too_few_steps_are_said_so(mode
         ({"bounds": "ab"}, "two numbers"),
         ({"bounds": (2.0, 1.0), "prior": Gaussian(0.02)}, "lower < upper"),
         ({"bounds": (0.5, 2.0), "link": Bounded(0.1, 4.0)}, "bounded already"),
-        ({"bounds": (0.5, 2.0), "solver": "levenberg-marquardt"}, "knows none"),
+        ({"bounds": (0.5, 2.0), "solver": "levenberg-marquardt"}, "levenberg-marquardt knows none; use l-bfgs-b or"),
+        ({"bounds": (0.5, 2.0), "solver": LevenbergMarquardt()}, "knows none"),
+        ({"bounds": (0.5, 2.0), "solver": "gauss-newton"}, "gauss-newton knows none; use l-bfgs-b or"),
+        ({"bounds": (0.5, 2.0), "solver": GaussNewton()}, "knows none"),
         ({"bounds": (0.5, 2.0), "prior": Gaussian(0.02)}, "in place of bounds"),
         ({"bounds": (0.5, 2.0), "regions": True}, "every cell"),
     ],
 )
 def test_bad_input(change, message, model, frame):
+    change = dict(change)
     if "regions" in change:
         change = {**change, "regions": np.zeros(model.mesh.num_cells, int)}
+    own = {name: change.pop(name) for name in ("bounds", "link", "regions") if name in change}
     arguments = {"prior": Noser(), "noise": frame[1], **change}
     with pytest.raises(ValueError, match=message):
-        reconstruct(model, frame[0], 1.0, **arguments)
+        reconstruct(model, frame[0], 1.0, parametrisation=Parametrisation(**own), **arguments)
 
 
 @pytest.mark.parametrize("link", [Linear(), pytest.param(Log(), marks=pytest.mark.slow)], ids=["linear", "log"])
 def test_lower_bound_of_zero(link, model, frame):
     """Zero is outside what the logarithm can take, and no bound at all there."""
     result = reconstruct(
-        model, frame[0], 1.0, prior=Noser(), noise=frame[1], bounds=(0.0, 1.5), link=link, hyperparameter=1.0,
-        solver="projected-gradient", max_steps=200,
+        model, frame[0], 1.0, prior=Noser(), noise=frame[1], hyperparameter=1.0,
+        parametrisation=Parametrisation(bounds=(0.0, 1.5), link=link), solver=ProjectedGradient(max_steps=200),
     )  # fmt: skip
     assert (np.asarray(result.conductivity) > 0).all()
 
@@ -114,9 +136,8 @@ def test_gradient_of_the_cost(model, frame):
         prior=Noser(),
         noise=frame[1],
         hyperparameter=1.0,
-        bounds=(0.5, 4.0),
-        max_steps=3,
-        solver="projected-gradient",
+        parametrisation=Parametrisation(bounds=(0.5, 4.0)),
+        solver=ProjectedGradient(max_steps=3),
     )
     direction = jax.random.normal(jax.random.key(0), result.coefficients.shape)
     cost = result.inversion.cost

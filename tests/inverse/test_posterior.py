@@ -7,7 +7,8 @@ import pytest
 
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
-from jeit.inverse import Background, Gaussian, Imager, Laplace, Noser, posterior, reconstruct
+from jeit.inverse import Gaussian, Imager, Laplace, Noser, Parametrisation, posterior, reconstruct
+from jeit.inverse.nonlinear import Background, GaussNewton
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids, measures
 from jeit.protocol import adjacent
@@ -54,7 +55,8 @@ def test_against_dense_algebra(prior, model, noise):
 
 def test_credible_intervals_and_samples(model, noise):
     options = {"prior": Gaussian(LENGTH), "noise": noise, "hyperparameter": 3.0}
-    found = posterior(reconstruct(model, press(model), 1.0, unknowns=[Background(0.2)], **options))
+    options["parametrisation"] = Parametrisation(unknowns=[Background(0.2)])
+    found = posterior(reconstruct(model, press(model), 1.0, **options))
     lower, upper = found.credible_interval(0.9)
     assert (np.asarray(lower) > 0).all()
     drawn = found.sample(jax.random.key(1), 400)
@@ -72,8 +74,9 @@ def test_the_truth_is_covered_at_the_nominal_rate(model, noise):
     """200 bodies drawn from the prior, with noise: intervals hold the truth as often as they say, within 5 points."""
     scale = 5.0  # deviations of log σ of a fifth
     imager = Imager.create(
-        model, 1.0, prior=Gaussian(LENGTH), noise=noise, hyperparameter=scale, steps=8, rtol=1e-6, informative=0.0
-    )
+        model, 1.0, prior=Gaussian(LENGTH), noise=noise, hyperparameter=scale,
+        solver=GaussNewton(max_steps=8, rtol=1e-6), parametrisation=Parametrisation(informative=0.0),
+    )  # fmt: skip
     inversion = imager.inversion
     weighing = imager.weighing(imager.mask)
     result = reconstruct(model, model.voltages(1.0), 1.0, prior=Gaussian(LENGTH), noise=noise, hyperparameter=scale)
@@ -110,6 +113,8 @@ def test_the_truth_is_covered_at_the_nominal_rate(model, noise):
     ],
 )
 def test_bad_input(ask, message, model, noise):
-    found = posterior(reconstruct(model, press(model), 1.0, prior=Noser(), noise=noise, max_steps=2))
+    found = posterior(
+        reconstruct(model, press(model), 1.0, prior=Noser(), noise=noise, solver=GaussNewton(max_steps=2))
+    )
     with pytest.raises(ValueError, match=message):
         ask(found)

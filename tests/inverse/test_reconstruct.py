@@ -9,21 +9,29 @@ import pytest
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import (
-    Background,
-    Bounded,
-    ContactImpedance,
-    ElectrodePosition,
     Gaussian,
     Laplace,
-    Linear,
-    Log,
     Noser,
+    Parametrisation,
     Tikhonov,
     TotalVariation,
     posterior,
     reconstruct,
 )
 from jeit.inverse.hyperparameter.rules import noise_figure
+from jeit.inverse.nonlinear import (
+    LBFGSB,
+    Background,
+    Bounded,
+    ContactImpedance,
+    ElectrodePosition,
+    GaussNewton,
+    LevenbergMarquardt,
+    Linear,
+    Log,
+    ProjectedGradient,
+)
+from jeit.inverse.nonlinear.solvers import SOLVERS, solver_named
 from jeit.layout import ring
 from jeit.mesh import Disk, Refine, centroids, measures
 from jeit.protocol import adjacent
@@ -81,7 +89,8 @@ def test_contrast_and_place_of_an_inclusion(solver, rule, prior, model, frame):
 @pytest.mark.parametrize("prior", [Noser(), Tikhonov()], ids=["noser", "tikhonov"])
 def test_every_link(link, prior, model, frame):
     voltages, noise = frame
-    result = reconstruct(model, voltages, 1.0, prior=prior, link=link, noise=noise, max_steps=60)
+    scale, solver = Parametrisation(link=link), GaussNewton(max_steps=60)
+    result = reconstruct(model, voltages, 1.0, prior=prior, parametrisation=scale, noise=noise, solver=solver)
     _, centroid = contrast_and_centroid(model, result.conductivity)
     assert result.status == "converged"
     assert (np.asarray(result.conductivity) > 0).all()
@@ -93,7 +102,8 @@ def test_every_link(link, prior, model, frame):
 def test_derivative_of_the_misfit(model, frame):
     """Taylor's second order, and products with the Jacobian against autodiff."""
     voltages, noise = frame
-    inversion = reconstruct(model, voltages, 1.0, prior=Gaussian(0.03), noise=noise, max_steps=1).inversion
+    solver = GaussNewton(max_steps=1)
+    inversion = reconstruct(model, voltages, 1.0, prior=Gaussian(0.03), noise=noise, solver=solver).inversion
     point = 0.01 * jax.random.normal(jax.random.key(1), (inversion.basis.num_coefficients,))
     direction = jax.random.normal(jax.random.key(2), point.shape)
     misfit, jacobian = inversion.linearise(point)
@@ -136,8 +146,8 @@ def test_masked_channels_are_not_looked_at(model, frame):
 
 def test_too_few_steps_are_said_so(model, frame):
     voltages, noise = frame
-    result = reconstruct(model, voltages, 1.0, prior=Gaussian(0.02), noise=noise, max_steps=2)
-    assert result.status == "not converged"
+    result = reconstruct(model, voltages, 1.0, prior=Gaussian(0.02), noise=noise, solver=GaussNewton(max_steps=2))
+    assert result.status == "step limit"
     assert "2 trial steps" in result.reason
 
 
@@ -151,29 +161,20 @@ def test_too_few_steps_are_said_so(model, frame):
         ({"mask": np.ones(208)}, "booleans"),
         ({"noise": 0.0}, "noise"),
         ({"background": -1.0}, "between 0"),
-        ({"background": 5.0, "link": Bounded(0.5, 4.0)}, "between 0.5 and 4"),
+        ({"background": 5.0, "parametrisation": Parametrisation(link=Bounded(0.5, 4.0))}, "between 0.5 and 4"),
         ({"background": np.ones(3)}, "cells"),
         ({"background": 1 + 0.1j}, "real conductivity"),
         ({"voltages": (1 + 0.1j) * jnp.ones(208)}, "complex"),
         ({"noise": np.ones(3)}, "each channel"),
         ({"prior": "noser"}, "Noser"),
-        ({"link": "log"}, "Log"),
         ({"solver": "newton"}, "gauss-newton"),
+        ({"solver": "linear"}, "those of one_step"),
+        ({"solver": 3}, "such as GaussNewton"),
         ({"hyperparameter": "magic"}, "magic"),
         ({"hyperparameter": -1.0}, "positive"),
         ({"hyperparameter": noise_figure, "prior": TotalVariation()}, "takes a number"),
         ({"noise": 1e-4 + 1j}, "real number"),
         ({"noise": "small"}, "real number"),
-        ({"rtol": np.inf}, "rtol"),
-        ({"rtol": -1.0}, "rtol"),
-        ({"rtol": np.nan}, "rtol"),
-        ({"rtol": "fine"}, "rtol"),
-        ({"max_steps": 0}, "max_steps"),
-        ({"max_steps": 2.5}, "max_steps"),
-        ({"max_steps": "3"}, "max_steps"),
-        ({"unknowns": [Background(), Background()]}, "more than once"),
-        ({"unknowns": Background()}, "list of those"),
-        ({"unknowns": [Background]}, "list of those"),
         ({"start": "there"}, "what reconstruct has returned"),
     ],
 )
@@ -183,25 +184,68 @@ def test_bad_input(change, message, model, frame):
         reconstruct(model, **arguments)
 
 
+@pytest.mark.parametrize(
+    ("make", "change", "message"),
+    [
+        (GaussNewton, {"rtol": np.inf}, "rtol"),
+        (GaussNewton, {"rtol": -1.0}, "rtol"),
+        (GaussNewton, {"rtol": np.nan}, "rtol"),
+        (LevenbergMarquardt, {"rtol": "fine"}, "rtol"),
+        (LevenbergMarquardt, {"damping": 0.0}, "damping"),
+        (LBFGSB, {"tolerance": 1.0}, "tolerance"),
+        (GaussNewton, {"max_steps": 0}, "max_steps"),
+        (LevenbergMarquardt, {"max_steps": 2.5}, "max_steps"),
+        (ProjectedGradient, {"max_steps": "3"}, "max_steps"),
+        (Parametrisation, {"link": "log"}, "Log"),
+        (Parametrisation, {"unknowns": [Background(), Background()]}, "more than once"),
+        (Parametrisation, {"unknowns": Background()}, "list of those"),
+        (Parametrisation, {"unknowns": [Background]}, "list of those"),
+        (Parametrisation, {"informative": 1.5}, "informative"),
+    ],
+)
+def test_bad_settings(make, change, message):
+    """Of a solver and of a parametrisation, before there is a problem."""
+    with pytest.raises(ValueError, match=message):
+        make(**change)
+
+
+def test_a_name_is_a_solver():
+    for name in SOLVERS:
+        assert solver_named(name).name == name
+    with pytest.raises(ValueError, match="method: there is no 'newton'"):
+        solver_named("newton", "method")
+
+
+def test_informed_shapes_alter_an_image_little(model, frame):
+    """Those that the data tell nothing of stay as the prior has them."""
+    options = {"prior": Gaussian(0.02), "noise": frame[1], "hyperparameter": 30.0}
+    every = reconstruct(model, frame[0], 1.0, **options)
+    some = reconstruct(model, frame[0], 1.0, parametrisation=Parametrisation(informative=0.01), **options)
+    assert some.coefficients.size < 0.75 * every.coefficients.size
+    error = np.linalg.norm(some.conductivity - every.conductivity)
+    assert error < 0.02 * np.linalg.norm(every.conductivity - 1)
+
+
 def test_unknowns_of_another_model_are_refused(model, frame):
     electrodes = BoundaryElectrodes(ring(RADIUS, 8), 0.012, 1e-3)
     other = ForwardModel(model.mesh, electrodes, adjacent(8))
     for unknown in (ContactImpedance(other), ElectrodePosition(other, 1e-3)):
         with pytest.raises(ValueError, match="another model"):
-            reconstruct(model, frame[0], 1.0, unknowns=[unknown])
+            reconstruct(model, frame[0], 1.0, parametrisation=Parametrisation(unknowns=[unknown]))
 
 
 def test_a_misfit_that_is_not_finite_is_a_failure(model, frame):
     """However fine the conductivity looks; and nothing is built on it."""
-    result = reconstruct(model, frame[0], 1.0, noise=1e-300, hyperparameter=3.0, max_steps=2)
+    result = reconstruct(model, frame[0], 1.0, noise=1e-300, hyperparameter=3.0, solver=GaussNewton(max_steps=2))
     assert result.status == "failed"
     with pytest.raises(ValueError, match="failed"):
         posterior(result)
 
 
 def test_voltages_in_other_units_are_hinted_at(model, frame):
-    result = reconstruct(model, 1e3 * frame[0], 1.0, noise=1e3 * frame[1], hyperparameter=3.0, max_steps=2)
-    assert result.status == "not converged"
+    options = {"hyperparameter": 3.0, "solver": GaussNewton(max_steps=2)}
+    result = reconstruct(model, 1e3 * frame[0], 1.0, noise=1e3 * frame[1], **options)
+    assert result.status == "step limit"
     assert "times those of the background" in result.reason
 
 

@@ -7,7 +7,8 @@ import pytest
 
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
-from jeit.inverse import Gaussian, Noser, Regions, pixels, reconstruct
+from jeit.inverse import Gaussian, Noser, Parametrisation, reconstruct
+from jeit.inverse.prior.bases import Regions, pixels
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids, measures
 from jeit.protocol import adjacent
@@ -32,7 +33,8 @@ def test_values_of_regions_are_found_and_fixed_cells_kept(prior, model):
     truth = np.select([label == 0, label == 1], [0.5, 2.0], 1.0)
     voltages = model.voltages(truth)
     noise = 1e-4 * jnp.abs(voltages)
-    result = reconstruct(model, voltages, 1.0, prior=prior, noise=noise, hyperparameter=1e-3, regions=label)
+    shared = Parametrisation(regions=label)
+    result = reconstruct(model, voltages, 1.0, prior=prior, noise=noise, hyperparameter=1e-3, parametrisation=shared)
     assert result.status == "converged"
     if isinstance(prior, Noser):
         assert result.inversion.basis.num_coefficients == 2
@@ -47,7 +49,8 @@ def test_pixels_hold_one_value_each(model):
     inside = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.03, 0.02], axis=1) < 0.03
     voltages = model.voltages(jnp.where(inside, 2.0, 1.0))
     noise = 1e-2 * jnp.abs(voltages)
-    result = reconstruct(model, voltages, 1.0, prior=Noser(), noise=noise, hyperparameter=1.0, regions=label)
+    shared = Parametrisation(regions=label)
+    result = reconstruct(model, voltages, 1.0, prior=Noser(), noise=noise, hyperparameter=1.0, parametrisation=shared)
     values = np.asarray(result.conductivity)
     assert all(np.ptp(values[label == k]) == 0 for k in range(label.max() + 1))
     assert values[inside].mean() > 1.3
@@ -84,7 +87,7 @@ def test_means_are_weighted_by_area(model):
 def test_bad_input(label, message, model):
     assert model.mesh.num_cells == 551
     with pytest.raises(ValueError, match=message):
-        reconstruct(model, model.voltages(1.0), 1.0, regions=label)
+        reconstruct(model, model.voltages(1.0), 1.0, parametrisation=Parametrisation(regions=label))
 
 
 def test_pixels_need_a_shape(model):

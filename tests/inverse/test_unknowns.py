@@ -7,16 +7,8 @@ import pytest
 
 from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
 from jeit.forward import ForwardModel
-from jeit.inverse import (
-    Background,
-    ContactImpedance,
-    ElectrodePosition,
-    Gaussian,
-    Scale,
-    TotalVariation,
-    posterior,
-    reconstruct,
-)
+from jeit.inverse import Gaussian, Parametrisation, TotalVariation, posterior, reconstruct
+from jeit.inverse.nonlinear import Background, ContactImpedance, ElectrodePosition, GaussNewton, Scale
 from jeit.layout import grid, ring
 from jeit.mesh import Disk, Rectangle, centroids
 from jeit.protocol import adjacent
@@ -58,9 +50,11 @@ def test_positions_repair_an_image(model):
     shift = 2e-3 * np.sign(np.cos(2 * ANGLE + 0.2))
     truth = model_of(4000, shift)
     voltages, noise = noisy(truth.voltages(jnp.where(inclusion(truth.mesh), 3.0, 1.0)))
-    options = {"prior": TotalVariation(), "noise": noise, "hyperparameter": 100.0, "max_steps": 60}
+    options = {"prior": TotalVariation(), "noise": noise, "hyperparameter": 100.0}
+    options["solver"] = GaussNewton(max_steps=60)
     wrong = reconstruct(model, voltages, 1.0, **options)
-    right = reconstruct(model, voltages, 1.0, unknowns=[ElectrodePosition(model, 2e-3)], **options)
+    moving = Parametrisation(unknowns=[ElectrodePosition(model, 2e-3)])
+    right = reconstruct(model, voltages, 1.0, parametrisation=moving, **options)
     assert right.status == "converged"
     error = np.asarray(right.unknowns["ElectrodePosition"]) - shift
     motions = np.stack([np.ones(NUMBER), np.cos(ANGLE), np.sin(ANGLE)], axis=1)
@@ -82,7 +76,7 @@ def test_contact_impedances(model):
     model = model_of(900, driven=True)
     result = reconstruct(
         model, voltages, 1.0, prior=Gaussian(0.015), noise=4 * noise, hyperparameter=3.0,
-        unknowns=[ContactImpedance(model)],
+        parametrisation=Parametrisation(unknowns=[ContactImpedance(model)]),
     )  # fmt: skip
     assert result.status == "converged"
     found = np.exp(np.asarray(result.unknowns["ContactImpedance"]))
@@ -101,10 +95,11 @@ def test_background_and_scale(model):
     known = model_of(900, driven=True)
     voltages, noise = noisy(truth.voltages(1.3), 1e-4)
     options = {"prior": Gaussian(0.02), "noise": noise, "hyperparameter": 10.0}
-    background = reconstruct(known, voltages, 1.0, unknowns=[Background(1.0)], **options)
+    also = [Parametrisation(unknowns=[one]) for one in (Background(1.0), Scale(1.0))]
+    background = reconstruct(known, voltages, 1.0, parametrisation=also[0], **options)
     assert float(background.unknowns["Background"][0]) == pytest.approx(np.log(1.3), abs=0.02)
     np.testing.assert_allclose(background.conductivity, 1.3, rtol=5e-3)
-    doubled = reconstruct(known, 2 * voltages, 1.3, unknowns=[Scale(1.0)], **options)
+    doubled = reconstruct(known, 2 * voltages, 1.3, parametrisation=also[1], **options)
     assert float(doubled.unknowns["Scale"][0]) == pytest.approx(np.log(2), abs=0.02)
     np.testing.assert_allclose(doubled.conductivity, 1.3, rtol=5e-3)
     np.testing.assert_allclose(doubled.model.protocol.drive, 2 * known.protocol.drive, rtol=0.02)
@@ -116,8 +111,9 @@ def test_derivative_with_all_unknowns(model):
     voltages, noise = noisy(model.voltages(1.1))
     unknowns = [ContactImpedance(model), ElectrodePosition(model, 1e-4), Background(), Scale()]
     inversion = reconstruct(
-        model, voltages, 1.0, prior=Gaussian(0.02), noise=noise, hyperparameter=1.0, unknowns=unknowns, max_steps=1
-    ).inversion
+        model, voltages, 1.0, prior=Gaussian(0.02), noise=noise, hyperparameter=1.0, solver=GaussNewton(max_steps=1),
+        parametrisation=Parametrisation(unknowns=unknowns),
+    ).inversion  # fmt: skip
     point = 0.01 * jax.random.normal(jax.random.key(1), (inversion.num_coefficients,))
     direction = jax.random.normal(jax.random.key(2), point.shape)
     residual, jacobian = inversion.linearise(point)

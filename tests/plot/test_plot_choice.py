@@ -6,7 +6,8 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from jeit.inverse import RULES, Choice
+from jeit.inverse import RULES
+from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import disk
 from jeit.plot import plot_choice

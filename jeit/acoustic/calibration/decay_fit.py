@@ -5,9 +5,6 @@ unknowns; all of them together with the strengths one of K M + T, in which the s
 complement): what is left is no larger than the array. Both run through optimistix, with jeit_solvers' `Descent`.
 """
 
-import warnings
-from functools import cache
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,7 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from jeit.acoustic.decay import AbstractDecay
-from jeit_solvers import Descent, minimise_small, solve_definite, solve_small
+from jeit_solvers import Descent, minimise_small, scipy_lbfgsb, solve_definite, solve_small
 
 _MOST_STEPS = 100
 # In units of the weights, which are inverse variances: what is left once the data are met to rounding.
@@ -147,25 +144,21 @@ def fit_together(
 def fit_between(
     problem: DecayProblem, start: Float[Array, "K M"], strength: Float[Array, " T"], microphone: int, bounds
 ) -> tuple[Float[np.ndarray, " K"], float]:
-    """The parameters of one microphone, (K,), between bounds on their logarithms, and their cost, by jaxopt."""
+    """The parameters of one microphone, (K,), between bounds on their logarithms, and their cost, by L-BFGS-B."""
     lower, upper = (jnp.asarray(bound) for bound in bounds)
     first = jnp.clip(start[:, microphone], lower, upper)
     mine = jax.tree.map(lambda array: array[microphone][None], problem)
-    found = _bounded_solver().run(first, (lower, upper), mine, strength)
-    return np.asarray(found.params), float(found.state.fun_val)
+    found, cost, _ = scipy_lbfgsb(
+        lambda values: _cost_and_slope(values, mine, strength), first, lower, upper, tolerance=1e-12
+    )
+    return found, cost
 
 
-@cache
-def _bounded_solver():
-    """One for all microphones: it compiles its cost once."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says on import that it is not developed further
-        import jaxopt
-
-    def cost(values, mine, strength):
-        return 0.5 * jnp.sum(mine.weight * mine.residual(values[:, None], strength) ** 2)
-
-    return jaxopt.ScipyBoundedMinimize(fun=cost, method="L-BFGS-B", tol=1e-12)
+@jax.jit
+@jax.value_and_grad
+def _cost_and_slope(values: Float[Array, " K"], mine: DecayProblem, strength: Float[Array, " T"]):
+    """Of one microphone, kept with its axis of length one: compiled once for all of them."""
+    return 0.5 * jnp.sum(mine.weight * mine.residual(values[:, None], strength) ** 2)
 
 
 def log_covariance(

@@ -14,35 +14,32 @@ def info(
     description: Description = None,
 ) -> None:
     """Say what DATA holds: frames, electrodes, protocol, noise, and what was assumed or masked."""
-    import numpy as np
     from rich.console import Console
 
     from jeit.cli.console import pairs, percent, scaled
-    from jeit.data import estimate_noise, impossible_signs, read, reciprocity_error
-    from jeit.report.describe import describe_domain, describe_electrodes
+    from jeit.data import read
+    from jeit.report import report_measurement
 
     measurement = read(data, format, description)
-    protocol, mask = measurement.protocol, np.asarray(measurement.mask)
-    voltages = np.abs(np.asarray(measurement.filled()))
-    noise, signs = estimate_noise(measurement), impossible_signs(measurement)
-    names = f" ({', '.join(measurement.frame_names)})" if measurement.frame_names else ""
-    shape = describe_domain(measurement.domain)
-    electrodes = describe_electrodes(measurement.electrodes)
+    found = report_measurement(measurement)
+    body, noise = found["body"], found["noise"]
+    names = f" ({', '.join(found['frame_names'])})" if found["frame_names"] else ""
     size = ", ".join(
-        f"{key.replace('_', ' ')} {1e3 * shape[key]:g} mm" for key in ("radius", "width", "height") if key in shape
+        f"{key.replace('_', ' ')} {1e3 * body[key]:g} mm" for key in ("radius", "width", "height") if key in body
     )
+    known = noise and f"{scaled(noise['standard_deviation'], 'V')}, from {noise['method']}"
     rows = [
-        ("frames", f"{measurement.num_frames}{names}"),
-        ("protocol", protocol.name),
-        ("channels", f"{measurement.num_channels}, of {protocol.num_drives} drives"),
-        ("masked", f"{int((~mask).sum())} of {mask.size} voltages"),
-        ("largest current", scaled(float(np.abs(np.asarray(protocol.drive)).max()), "A")),
-        ("largest voltage", scaled(float(voltages.max()), "V")),
-        ("body", f"{shape['shape']}, {size}" if size else shape["shape"]),
-        ("electrodes", f"{protocol.num_electrodes}, {electrodes['kind']}"),
-        ("reciprocity error", percent(reciprocity_error(measurement))),
-        ("noise", "not known" if noise is None else f"{scaled(noise.standard_deviation, 'V')}, from {noise.method}"),
-        ("impossible signs", percent(None if signs is None else float(signs.max()))),
+        ("frames", f"{found['frames']}{names}"),
+        ("protocol", found["protocol"]),
+        ("channels", f"{found['channels']}, of {found['drives']} drives"),
+        ("masked", f"{found['masked']} of {found['voltages']} voltages"),
+        ("largest current", scaled(found["largest_current"], "A")),
+        ("largest voltage", scaled(found["largest_voltage"], "V")),
+        ("body", f"{body['shape']}, {size}" if size else body["shape"]),
+        ("electrodes", f"{found['electrodes']['number']}, {found['electrodes']['kind']}"),
+        ("reciprocity error", percent(found["reciprocity_error"])),
+        ("noise", known or "not known"),
+        ("impossible signs", percent(found["impossible_signs"])),
     ]
-    rows += [("note", note) for note in measurement.notes]
+    rows += [("note", note) for note in found["notes"]]
     Console(highlight=False).print(pairs(measurement.name, rows))

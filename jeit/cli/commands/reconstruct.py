@@ -65,7 +65,7 @@ def reconstruct(
 
     from jeit.cli.console import Steps
     from jeit.data import read
-    from jeit.imaging import ImagingSettings, image_difference
+    from jeit.imaging import METHODS, ImagingSettings, image_difference
     from jeit.report import write_image
 
     if segment and method is None:
@@ -78,11 +78,12 @@ def reconstruct(
         "contact": contact,
         "num_points": num_points,
     }
-    if method in ("back-projection", "filtered-back-projection", "total-variation") and prior is not None:
-        raise ValueError(f"--prior does not go with --method {method}; leave it out, or choose another method.")
-    if method == "back-projection" and hyperparameter is not None:
-        raise ValueError("--hyperparameter: plain back-projection has none; leave it out.")
     settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})
+    chosen_method = METHODS[settings.method]
+    if prior is not None and not chosen_method.takes_prior:
+        raise ValueError(f"--prior does not go with --method {method}; leave it out, or choose another method.")
+    if hyperparameter is not None and not chosen_method.takes_hyperparameter:
+        raise ValueError(f"--hyperparameter: plain {settings.method} has none; leave it out.")
     make_folder(output)
     console = Console(highlight=False)
     with Steps(console, quiet=quiet) as step:
@@ -103,7 +104,8 @@ def show(console, result: "ImagedDifference") -> None:
     from rich.table import Table
 
     from jeit.cli.console import pairs, percent, scaled
-    from jeit.inverse import Reconstruction
+    from jeit.inverse.nonlinear.reconstruct import Reconstruction
+    from jeit_solvers import Status
 
     calibration, reconstruction = result.calibration, result.reconstruction
     unit = "S" if result.mesh.dimension == 2 else "S/m"
@@ -117,14 +119,14 @@ def show(console, result: "ImagedDifference") -> None:
         ("method", f"{result.settings.method}, hyperparameter {chosen}"),
         ("mesh", f"{result.mesh.num_points:,} nodes, {result.mesh.num_cells:,} cells"),
     ]
-    if calibration.status != "converged":
-        rows.insert(1, ("calibration", calibration.status))
+    if calibration.status != Status.CONVERGED:
+        rows.insert(1, ("calibration", f"{calibration.status}. {calibration.reason}"))
     if reconstruction.choice is not None and reconstruction.choice.note:
         rows.append(("hyperparameter", reconstruction.choice.note))
     if isinstance(reconstruction, Reconstruction):
         misfit = f"misfit {float(reconstruction.misfit):.2g} standard deviations"
         rows.append(("iteration", f"{reconstruction.status}, {reconstruction.iterations} steps, {misfit}"))
-        if reconstruction.status != "converged":
+        if reconstruction.status != Status.CONVERGED:
             rows.append(("", reconstruction.reason))
     elif result.lowest < -1:
         fall = f"falls to {percent(result.lowest)} of the background: of changes so large only place and sign are right"

@@ -1,11 +1,12 @@
 """Bounded descent from several starts at once, step by step on record."""
 
-import warnings
 from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from jeit_solvers import Status, scipy_lbfgsb
 
 # A cost that falls by less in a step, relative, has settled.
 _TOLERANCE = 1e-5
@@ -27,15 +28,14 @@ class Record:
             self._callback(len(self.values) - 1, self.values[-1])
 
 
-def descend(cost, variables: Float[Array, "S v"], steps: int, record: Record, *, tolerance: float = _TOLERANCE):
-    """Minimise the sum of the starts' costs between 0 and 1 by L-BFGS; where it ends, and how: "converged",
-    "step limit", or "stalled" where no step along the gradient lowers it.
+def descend(
+    cost, variables: Float[Array, "S v"], steps: int, record: Record, *, tolerance: float = _TOLERANCE
+) -> tuple[Float[Array, "S v"], Status]:
+    """Minimise the sum of the starts' costs between 0 and 1 by L-BFGS; where it ends, and how: converged, at the step
+    limit, or stalled where no step along the gradient lowers it.
 
     `cost`: of variables (S, v) to costs (S,), scores (S,) for the record, and the gradient (S, v) of the costs.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # jaxopt says on import that it is not developed further
-        import jaxopt
     last = {}
 
     def value_and_slope(variables):
@@ -47,15 +47,7 @@ def descend(cost, variables: Float[Array, "S v"], steps: int, record: Record, *,
         same = np.array_equal(last["variables"], variables)
         record.add(variables, last["score"] if same else cost(variables)[1])
 
-    solver = jaxopt.ScipyBoundedMinimize(
-        fun=value_and_slope,
-        method="L-BFGS-B",
-        value_and_grad=True,
-        jit=False,
-        tol=tolerance,
-        maxiter=steps,
-        callback=after_step,
+    found, _, status = scipy_lbfgsb(
+        value_and_slope, variables, 0.0, 1.0, tolerance=tolerance, max_steps=steps, callback=after_step
     )
-    bounds = (jnp.zeros_like(variables), jnp.ones_like(variables))
-    found, info = solver.run(variables, bounds)
-    return found, "converged" if info.success else "step limit" if int(info.status) == 1 else "stalled"
+    return jnp.asarray(found), status

@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float
 
 from jeit.forward import ForwardModel
 from jeit.inverse.hyperparameter.choice import Choice
+from jeit.inverse.hyperparameter.defaults import RULE
 from jeit.inverse.hyperparameter.rules import RULES, Rule, choose
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.prior.priors import AbstractPrior
@@ -15,7 +16,7 @@ def choose_hyperparameter(
     model: ForwardModel,
     conductivity,
     *,
-    rule: str | Rule = "noise-figure",
+    rule: str | Rule = RULE,
     prior: AbstractPrior | None = None,
     difference: Float[Array, " M"] | None = None,
     noise: Float[Array, " M"] | float = 1.0,

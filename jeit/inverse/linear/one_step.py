@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jeit.forward import ForwardModel
 from jeit.inverse.hyperparameter.choice import Choice
+from jeit.inverse.hyperparameter.defaults import RULE
 from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.prior.priors import AbstractPrior
@@ -116,7 +117,7 @@ def one_step(
     conductivity,
     *,
     prior: AbstractPrior | None = None,
-    hyperparameter: float | str | Rule | Choice = "noise-figure",
+    hyperparameter: float | str | Rule | Choice = RULE,
     difference: Float[Array, " M"] | None = None,
     noise: Float[Array, " M"] | float = 1.0,
     mask: Bool[Array, " M"] | None = None,

@@ -1,17 +1,12 @@
 """What is asked of the arguments of reconstructions, before anything is compiled: errors that say what to give."""
 
-from collections.abc import Sequence
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.forward import ForwardModel
 from jeit.inverse.noise import relative_noise
-from jeit.inverse.nonlinear.links import AbstractLink
-from jeit.inverse.nonlinear.unknowns import AbstractUnknown
 from jeit.inverse.prior.priors import AbstractPrior
-from jeit.inverse.prior.total_variation import TotalVariation
 
 
 def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
@@ -61,14 +56,8 @@ def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[
 
 def check_prior(prior) -> None:
     """That it is one of jeit's, or made like them."""
-    if not isinstance(prior, (AbstractPrior, TotalVariation)):
+    if not isinstance(prior, AbstractPrior):
         raise ValueError(f"prior must be one of those in jeit.inverse, such as Noser(), not {prior!r}.")
-
-
-def check_link(link) -> None:
-    """That it is one of jeit's, or made like them."""
-    if not isinstance(link, AbstractLink):
-        raise ValueError(f"link must be one of those in jeit.inverse, such as Log(), not {link!r}.")
 
 
 def check_steps(name: str, steps) -> int:
@@ -78,29 +67,8 @@ def check_steps(name: str, steps) -> int:
     return int(steps)
 
 
-def check_tolerance(rtol) -> float:
+def check_tolerance(name: str, tolerance) -> float:
     """A number from 0 up to, but not including, 1."""
-    if not isinstance(rtol, (int, float, np.number)) or not 0 <= rtol < 1:
-        raise ValueError(f"rtol must be a number from 0 and less than 1; it is {rtol!r}.")
-    return float(rtol)
-
-
-def check_unknowns(unknowns, model: ForwardModel) -> tuple[AbstractUnknown, ...]:
-    """One of each kind at most, made for a model like this one."""
-    if not isinstance(unknowns, Sequence) or not all(isinstance(one, AbstractUnknown) for one in unknowns):
-        raise ValueError(f"unknowns must be a list of those in jeit.inverse, such as [Scale()]; it is {unknowns!r}.")
-    names = [type(one).__name__ for one in unknowns]
-    for one, name in zip(unknowns, names, strict=True):
-        if names.count(name) > 1:
-            raise ValueError(f"unknowns: {name} is there more than once.")
-        if not one.fits(model):
-            raise ValueError(f"unknowns: this {name} was made for another model; make it with the one given here.")
-    return tuple(unknowns)
-
-
-def check_bounds(bounds) -> tuple[float, float]:
-    """0 ≤ lower < upper."""
-    values = np.asarray((0.0, np.inf) if bounds is None else bounds)
-    if values.shape != (2,) or values.dtype.kind not in "iuf" or not 0 <= values[0] < values[1]:
-        raise ValueError(f"bounds: give two numbers, 0 ≤ lower < upper, S/m (2-D: S); they are {bounds!r}.")
-    return float(values[0]), float(values[1])
+    if not isinstance(tolerance, (int, float, np.number)) or not 0 <= tolerance < 1:
+        raise ValueError(f"{name} must be a number from 0 and less than 1; it is {tolerance!r}.")
+    return float(tolerance)

@@ -9,6 +9,9 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+# Share of the background below which no conductivity is taken where nothing else keeps it from zero.
+_LEAST = 1e-6
+
 
 class AbstractLink(eqx.Module):
     """Base of all links between the estimated quantity x and conductivity σ, increasing and smooth."""
@@ -24,6 +27,11 @@ class AbstractLink(eqx.Module):
     @abc.abstractmethod
     def estimate(self, conductivity: Float[Array, " m"]) -> Float[Array, " m"]:
         """x(σ), the inverse of `conductivity`. Raises `ValueError` for conductivities that no x gives."""
+
+    def ends(self, lower: float, upper: float, reference: Float[Array, " m"]) -> tuple[float, float]:
+        """The estimates that two bounds on σ stand for, in an image about `reference`. Raises `ValueError` for a link
+        that takes none."""
+        raise ValueError(f"bounds: link {type(self).__name__} takes none; take Log() or Linear().")
 
 
 class Linear(AbstractLink):
@@ -41,6 +49,10 @@ class Linear(AbstractLink):
         """σ."""
         return conductivity
 
+    def ends(self, lower, upper, reference):
+        """The bounds themselves, and no less than a millionth of the background."""
+        return max(lower, _LEAST * float(reference.mean())), upper
+
 
 class Log(AbstractLink):
     """σ = exp(x): always positive, and a ratio of conductivities counts alike on either side of one."""
@@ -57,6 +69,11 @@ class Log(AbstractLink):
         """log(σ)."""
         _check_inside(conductivity, 0, np.inf)
         return jnp.log(conductivity)
+
+    def ends(self, lower, upper, reference):
+        """Their logarithms: zero is no bound at all."""
+        with np.errstate(divide="ignore"):
+            return float(np.log(lower)), float(np.log(upper))
 
 
 class Bounded(AbstractLink):
@@ -83,6 +100,10 @@ class Bounded(AbstractLink):
         _check_inside(conductivity, self.lower, self.upper)
         share = (conductivity - self.lower) / (self.upper - self.lower)
         return jnp.log(share) - jnp.log1p(-share)
+
+    def ends(self, lower, upper, reference):
+        """Not beside its own. Raises `ValueError`."""
+        raise ValueError("bounds: the link is bounded already; give bounds or link=Bounded(lower, upper), not both.")
 
 
 def _check_inside(conductivity, lower, upper) -> None:

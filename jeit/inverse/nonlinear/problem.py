@@ -1,7 +1,5 @@
 """The nonlinear inverse problem as all solvers see it: coefficients in, misfit, Jacobian and cost out."""
 
-import abc
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,39 +10,8 @@ from jeit.inverse.channels import Data
 from jeit.inverse.nonlinear.links import AbstractLink
 from jeit.inverse.nonlinear.unknowns import AbstractUnknown
 from jeit.inverse.prior.bases import AbstractBasis
-from jeit_solvers import QuadraticModel, ridge_model
-
-
-class AbstractPenalty(eqx.Module):
-    """What an image costs apart from its misfit, as a function of its coefficients c."""
-
-    @abc.abstractmethod
-    def cost(self, coefficients: Float[Array, " n"]) -> Float[Array, ""]:
-        """The penalty, dimensionless."""
-
-    @abc.abstractmethod
-    def diagonal(self, coefficients: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Diagonal of the penalty's quadratic form at c: what scales a gradient method."""
-
-    @abc.abstractmethod
-    def model(self, residual, jacobian, coefficients, data: Data) -> QuadraticModel:
-        """The whole cost at c and its `step`, for `jeit_solvers.Descent`."""
-
-
-class Ridge(AbstractPenalty):
-    """½ ‖c‖²: coefficients of unit variance."""
-
-    def cost(self, coefficients):
-        """½ ‖c‖²."""
-        return 0.5 * coefficients @ coefficients
-
-    def diagonal(self, coefficients):
-        """Ones."""
-        return jnp.ones_like(coefficients)
-
-    def model(self, residual, jacobian, coefficients, data):
-        """Gauss-Newton's, in the space of data or of coefficients."""
-        return ridge_model(residual, jacobian, coefficients, data.covariance, data.precision)
+from jeit.inverse.prior.penalty import AbstractPenalty
+from jeit_solvers import QuadraticModel
 
 
 class Inversion(eqx.Module):

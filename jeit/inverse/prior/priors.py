@@ -16,7 +16,9 @@ import scipy.sparse
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, pivoted_cholesky
+from jeit.inverse.hyperparameter.defaults import RULE
+from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, Regions, pivoted_cholesky
+from jeit.inverse.prior.penalty import AbstractPenalty, QuadraticForm, Ridge
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geometry import interior_facets
 from jeit_solvers import SparsityPattern, analyse, factorise, solve
@@ -26,7 +28,45 @@ _FREEDOM = 1e-6
 
 
 class AbstractPrior(eqx.Module):
-    """Base of all priors on an image of one value per cell."""
+    """Base of all priors on an image of one value per cell.
+
+    A new quadratic one is a class with `covariance_product`, `precision` and `basis`; one whose energy is not xᵀQx
+    answers `penalty` itself, and raises `ValueError` where it is asked for what it has not.
+    """
+
+    @property
+    def is_quadratic(self) -> bool:
+        """Whether the energy is xᵀQx, of a Gaussian: what linear images, rules for λ and memories need."""
+        return True
+
+    @property
+    def default_hyperparameter(self) -> float | str:
+        """λ for `reconstruct` unless given, or the rule that chooses it."""
+        return RULE
+
+    def penalty(
+        self,
+        mesh: Mesh,
+        reference: Float[Array, " m"],
+        hyperparameter,
+        *,
+        jacobian: Float[Array, "M m"] | None = None,
+        regions: Regions | None = None,
+        per_cell: bool = False,
+    ) -> tuple[AbstractBasis, AbstractPenalty]:
+        """The shapes S of which an image x = `reference` + S c is made, and what c costs, weighted with λ.
+
+        `jacobian`: of the whitened data, on the link's scale. `regions`: cells that share a value. `per_cell`: every
+        coefficient is a cell's value, as bounds need it. Raises `ValueError` for what does not go together.
+        """
+        assert jacobian is not None  # a quadratic prior may look at it
+        if not per_cell:
+            basis = self.basis(mesh, jacobian).scaled(1 / hyperparameter)
+            return basis if regions is None else basis.pooled(regions), Ridge()
+        if regions is not None:
+            raise ValueError("regions: bounded solvers take every cell; use link=Bounded(lower, upper) instead.")
+        precision = self.precision(mesh, jacobian)
+        return DiagonalBasis(jnp.ones(mesh.num_cells)), QuadraticForm.create(precision, hyperparameter)
 
     @abc.abstractmethod
     def covariance_product(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> Float[Array, "m M"]:

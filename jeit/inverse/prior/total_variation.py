@@ -7,13 +7,17 @@ a smooth prior's, and lowers the true cost. Vogel and Oman, SIAM J. Sci. Comput.
 Graham, Adler and Lionheart, IEEE Trans. Med. Imaging 29 (2010) 44-54.
 """
 
-import equinox as eqx
+from typing import NoReturn
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.inverse.nonlinear.problem import AbstractPenalty
-from jeit.mesh import Mesh, centroids, measures
+from jeit.inverse.hyperparameter.defaults import EDGE_PRICE
+from jeit.inverse.prior.bases import DiagonalBasis
+from jeit.inverse.prior.penalty import AbstractPenalty
+from jeit.inverse.prior.priors import AbstractPrior
+from jeit.mesh import centroids, measures
 from jeit.mesh.geometry import interior_facets
 from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, solve, solve_definite
 
@@ -21,10 +25,11 @@ from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise,
 _LEVEL = 1e-3
 
 
-class TotalVariation(eqx.Module):
+class TotalVariation(AbstractPrior):
     """The prior of `reconstruct` for images of few pieces.
 
-    `smoothing` β: jumps below it, on the link's scale (`Log()`: relative), cost by their square.
+    `smoothing` β: jumps below it, on the link's scale (`Log()`: relative), cost by their square. Its energy is not
+    quadratic, so linear images and the rules that choose λ have no use for it: λ is a number, 300 unless given.
     """
 
     smoothing: float = 0.01
@@ -33,8 +38,33 @@ class TotalVariation(eqx.Module):
         if not (np.isfinite(self.smoothing) and self.smoothing > 0):
             raise ValueError(f"smoothing must be positive, on the link's scale; it is {self.smoothing}.")
 
-    def penalty(self, mesh: Mesh, reference: Float[Array, " m"], hyperparameter) -> "TotalVariationPenalty":
-        """The energy on a mesh, weighted with λ: what an edge as long as the body is wide costs per unit of jump."""
+    @property
+    def is_quadratic(self) -> bool:
+        """It is not."""
+        return False
+
+    @property
+    def default_hyperparameter(self) -> float:
+        """The price of an edge."""
+        return EDGE_PRICE
+
+    def covariance_product(self, mesh, jacobian) -> NoReturn:
+        """Not to be had. Raises `ValueError`."""
+        _refuse("covariance")
+
+    def precision(self, mesh, jacobian) -> NoReturn:
+        """Not to be had. Raises `ValueError`."""
+        _refuse("precision matrix")
+
+    def basis(self, mesh, jacobian) -> NoReturn:
+        """Not to be had. Raises `ValueError`."""
+        _refuse("basis of independent shapes")
+
+    def penalty(self, mesh, reference, hyperparameter, *, jacobian=None, regions=None, per_cell=False):
+        """Every cell on its own, and the energy, weighted with λ: what an edge as long as the body is wide costs per
+        unit of jump. Raises `ValueError` for `regions`."""
+        if regions is not None:
+            raise ValueError("regions: total variation finds its own; leave them out, or take another prior.")
         pairs, nodes = interior_facets(mesh)
         corners = np.asarray(mesh.points)[nodes]
         size = np.ptp(np.asarray(mesh.points), axis=0).max()
@@ -45,7 +75,7 @@ class TotalVariation(eqx.Module):
             length = np.linalg.norm(cross, axis=1) / 2
         pattern = SparsityPattern.from_elements([pairs, np.arange(mesh.num_cells)[:, None]], size=mesh.num_cells)
         area = measures(mesh)
-        return TotalVariationPenalty(
+        penalty = TotalVariationPenalty(
             pairs=jnp.asarray(pairs),
             weight=jnp.asarray(hyperparameter * length / size ** (mesh.dimension - 1)),
             level=hyperparameter * _LEVEL * area / area.sum(),
@@ -54,6 +84,14 @@ class TotalVariation(eqx.Module):
             pattern=pattern,
             plan=analyse(pattern, coordinates=np.asarray(centroids(mesh))),
         )
+        return DiagonalBasis(jnp.ones(mesh.num_cells)), penalty
+
+
+def _refuse(what: str) -> NoReturn:
+    raise ValueError(
+        f"prior: total variation has no {what}, so there is no linear image with it; take reconstruct, or an Imager "
+        "with gauss-newton or levenberg-marquardt, or another prior."
+    )
 
 
 class TotalVariationPenalty(AbstractPenalty):
@@ -66,6 +104,11 @@ class TotalVariationPenalty(AbstractPenalty):
     reference: Float[Array, " m"]
     pattern: SparsityPattern
     plan: FactorisationPlan
+
+    @property
+    def tolerance(self) -> float:
+        """Lagged diffusivity comes nearer by a constant share a step, and its last steps change nothing to be seen."""
+        return 1e-4
 
     def cost(self, coefficients):
         """The energy."""

@@ -2,9 +2,8 @@
 
 All that does not depend on the frame is worked out once: which channels are independent, the prior's basis, the
 hyperparameter, the electrodes' integrals, the linear image's matrix; and which combinations of the prior's shapes the
-data can tell of at all, some dozens, kept in single precision, which alters an image by a millionth. Array shapes never
-change, so nothing is compiled again: a channel that is masked keeps its place, and gets a variance so large that it
-does not count.
+data can tell of at all, some dozens. Array shapes never change, so nothing is compiled again: a channel that is masked
+keeps its place, and gets a variance so large that it does not count.
 """
 
 import functools
@@ -19,33 +18,24 @@ from jaxtyping import Array, Bool, Float, Int
 from jeit.electrodes.integrated import IntegratedElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import IndependentChannels, Weighing
-from jeit.inverse.nonlinear.checks import (
-    check_background,
-    check_frame,
-    check_link,
-    check_noise,
-    check_prior,
-    check_steps,
-    check_tolerance,
-)
-from jeit.inverse.nonlinear.links import AbstractLink, Log
-from jeit.inverse.nonlinear.problem import Inversion, Ridge
+from jeit.inverse.hyperparameter.rules import Rule
+from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise, check_prior
+from jeit.inverse.nonlinear.informed import informed
+from jeit.inverse.nonlinear.parametrisation import Parametrisation
+from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.reconstruct import pose
-from jeit.inverse.prior.bases import DenseBasis
-from jeit.inverse.prior.priors import AbstractPrior, Gaussian
-from jeit.inverse.prior.total_variation import TotalVariation
-from jeit_solvers import Descent
+from jeit.inverse.nonlinear.solvers import AbstractSolver, GaussNewton, as_solver, expand, residual
+from jeit.inverse.prior.defaults import smooth_prior
+from jeit.inverse.prior.priors import AbstractPrior
 
-METHODS = ("linear", "gauss-newton", "levenberg-marquardt")
+# What a frame is given unless the solver says otherwise; and what a shape must tell to be kept.
+_STEPS, _RTOL, _INFORMATIVE = 4, 1e-3, 0.03
 # Standard deviation of a masked channel over the largest noise.
 _BLIND = 1e5
 
 
-def check_settings(method: str, steps, memory) -> None:
-    """Raises `ValueError` for what `Imager.create` would refuse, before there is a model."""
-    if method not in METHODS:
-        raise ValueError(f"method: there is no '{method}'; give one of {', '.join(METHODS)}.")
-    check_steps("steps", steps)
+def check_memory(memory) -> None:
+    """Raises `ValueError` for what is no number of frames."""
     if not (np.isfinite(memory) and memory >= 0):
         raise ValueError(f"memory must be a number of frames, or 0 for none; it is {memory}.")
 
@@ -84,9 +74,8 @@ class Imager(eqx.Module):
     **Fields**: `channels`, which of them are independent; `inversion`, the problem, whose data are exchanged for every
     frame's; `noise` (M,), volts; `mask` (M,), the channels used at all; `expected` (M,) volts, an undisturbed frame;
     `offset` (M,) volts, added to frames: what the model's voltages have and the sensor's have not; `touching` (L, M),
-    channels that drive or read each electrode; `method`; `steps`, the most iterations a frame is given; `rtol`, the
-    relative change of the objective that ends them sooner; `persistence`, the share of the last image that the next one
-    is expected to keep, 0 without a memory.
+    channels that drive or read each electrode; `solver`, with the most iterations that a frame is given; `persistence`,
+    the share of the last image that the next one is expected to keep, 0 without a memory.
     """
 
     channels: IndependentChannels
@@ -96,9 +85,7 @@ class Imager(eqx.Module):
     expected: Float[Array, " M"]
     offset: Float[Array, " M"]
     touching: Bool[Array, "L M"]
-    method: str = eqx.field(static=True)
-    steps: int = eqx.field(static=True)
-    rtol: float = eqx.field(static=True)
+    solver: AbstractSolver
     persistence: float = eqx.field(static=True)
 
     @classmethod
@@ -108,61 +95,51 @@ class Imager(eqx.Module):
         background,
         *,
         reference: Float[Array, " M"] | None = None,
-        method: str = "gauss-newton",
-        prior: AbstractPrior | TotalVariation | None = None,
-        link: AbstractLink | None = None,
-        hyperparameter: float | str | None = None,
+        solver: AbstractSolver | str | None = None,
+        prior: AbstractPrior | None = None,
+        hyperparameter: float | str | Rule | None = None,
         noise: Float[Array, " M"] | float | None = None,
         mask: Bool[Array, " M"] | None = None,
-        steps: int = 4,
-        rtol: float = 1e-3,
-        informative: float = 0.03,
+        parametrisation: Parametrisation | None = None,
         memory: float = 0.0,
     ) -> "Imager":
         """`background`: conductivity of the undisturbed body, S/m (2-D: S). `reference` (M,): a measured frame of it,
         volts; frames are then imaged by their difference to it, which frees images from what the model gets wrong.
-        `prior`: `Gaussian` of a twelfth of the body's width unless given. `informative`: images are built of shapes
-        that the data of the undisturbed body tell more of than this, in standard deviations of the noise for one of the
-        prior, the rest staying as the prior has it; 0 takes all shapes. `memory`: frames over which an image changes;
-        the last image then tells of the next (a Kalman filter in its steady state, of coefficients with covariance
-        exp(-|t - t'| / memory) in time), which takes noise out and lags by a part of it; 0 takes every frame alone. The
-        rest as in `reconstruct`. Raises `ValueError` for arguments that do not fit.
+        `solver`: `GaussNewton()` unless given, `LevenbergMarquardt()` or, for linear images, `OneStep()`; by at most 4
+        steps a frame, and until the objective changes by less than 1e-3, unless it says otherwise. `prior`: `Gaussian`
+        of a twelfth of the body's width unless given. `parametrisation`: its link, regions and `informative` shapes.
+        `memory`: frames over which an image changes; the last image then tells of the next (a Kalman filter in its
+        steady state, of coefficients with covariance exp(-|t - t'| / memory) in time), which takes noise out and lags
+        by a part of it; 0 takes every frame alone. The rest as in `reconstruct`. Raises `ValueError` for arguments that
+        do not fit.
 
         Kaipio, Karjalainen, Somersalo and Vauhkonen, Ann. N. Y. Acad. Sci. 873 (1999) 430-439.
         """
-        check_settings(method, steps, memory)
-        rtol = check_tolerance(rtol)
-        if not 0 <= informative < 1:
-            raise ValueError(f"informative must lie between 0 and 1; it is {informative}.")
-        width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
-        prior = Gaussian(0.085 * width) if prior is None else prior
-        link = Log() if link is None else link
+        check_memory(memory)
+        chosen = as_solver(GaussNewton() if solver is None else solver).for_frames(_STEPS, _RTOL)
+        prior = smooth_prior(float(np.ptp(np.asarray(model.mesh.points), axis=0).max())) if prior is None else prior
         check_prior(prior)
-        check_link(link)
-        if memory > 0 and isinstance(prior, TotalVariation):
-            raise ValueError("memory: total variation has no covariance to carry on; take another prior, or memory 0.")
-        if method == "linear" and isinstance(prior, TotalVariation):
-            raise ValueError("prior: total variation is not linear; take method 'gauss-newton', or another prior.")
+        parametrisation = Parametrisation() if parametrisation is None else parametrisation
+        _check_together(chosen, prior, parametrisation, memory)
         background = check_background(model, background)
         predicted = model.voltages(background)
         frame, used = check_frame(model, predicted if reference is None else reference, mask)
         _check_reference(np.asarray(frame)[used], np.asarray(predicted)[used])
         deviation = check_noise(noise, frame, used)
         channels = IndependentChannels.create(model.protocol)
-        weighing = channels.weigh(_blinded(deviation, used))
         small = model.with_protocol(model.protocol.subset(np.asarray(channels.index)))
         inversion, _ = pose(
             eqx.tree_at(lambda m: m.electrodes, small, IntegratedElectrodes(model.electrodes, model.mesh)),
-            weighing.combine(predicted),
-            link,
+            channels.weigh(_blinded(deviation, used)).combine(predicted),
             background,
             prior,
             hyperparameter,
+            parametrisation,
         )
         persistence = float(np.exp(-1 / memory)) if memory > 0 else 0.0
-        if (informative > 0 or memory > 0) and isinstance(inversion.penalty, Ridge):
-            shapes = _informed_shapes(inversion, _singular_values(inversion), informative, persistence)
-            inversion = eqx.tree_at(lambda i: i.basis, inversion, DenseBasis(shapes))
+        least = _INFORMATIVE if parametrisation.informative is None else parametrisation.informative
+        if (least > 0 or memory > 0) and inversion.penalty.is_standard_normal:
+            inversion = informed(inversion, least, persistence)
         return cls(
             channels=channels,
             inversion=inversion,
@@ -171,9 +148,7 @@ class Imager(eqx.Module):
             expected=jnp.where(used, frame, predicted),
             offset=jnp.where(used, predicted - frame, 0),
             touching=jnp.asarray([model.protocol.channels_touching(k) for k in range(model.protocol.num_electrodes)]),
-            method=method,
-            steps=int(steps),
-            rtol=float(rtol),
+            solver=chosen,
             persistence=persistence,
         )
 
@@ -181,6 +156,11 @@ class Imager(eqx.Module):
     def start(self) -> Float[Array, " n"]:
         """Coefficients of the background: where the first frame starts."""
         return jnp.zeros(self.inversion.num_coefficients)
+
+    @property
+    def steps(self) -> int:
+        """Most iterations that a frame is given."""
+        return 1 if self.solver.is_linear else self.solver.descent(_STEPS, _RTOL).history
 
     def weighing(self, usable: Bool[Array, " M"]) -> Weighing:
         """How to combine frames of which only the `usable` channels count."""
@@ -199,29 +179,15 @@ class Imager(eqx.Module):
         return _estimate(self, frame, weighing, start)
 
 
-@jax.jit
-def _singular_values(inversion: Inversion):
-    """Of the whitened Jacobian at the background: squared singular values, and right vectors times their roots."""
-    start = jnp.zeros(inversion.num_coefficients)
-    rows = inversion.data.whiten(inversion.linearise(start)[1])
-    squares, left = jnp.linalg.eigh(rows @ rows.T)
-    return squares, left.T @ rows
-
-
-def _informed_shapes(inversion: Inversion, decomposition, least: float, persistence: float) -> Float[Array, "m k"]:
-    """The shapes that the data tell more of than `least`, as large as expected of a frame; in single precision."""
-    squares, rows = (np.asarray(values) for values in decomposition)
-    kept = squares > max(least**2, 1e-12 * squares[-1])
-    size = np.sqrt(_expected_variance(squares[kept], persistence) / squares[kept])
-    return jax.vmap(inversion.basis.expand)(jnp.asarray(size[:, None] * rows[kept])).T.astype(jnp.float32)
-
-
-def _expected_variance(strength, persistence: float):
-    """Variance of a coefficient before its frame comes, p = a² p / (1 + s p) + 1 - a², for data of `strength` s."""
-    fresh = 1 - persistence**2
-    half = fresh * (1 - strength) / 2
-    root = np.sqrt(half**2 + strength * fresh)
-    return np.where(half > 0, fresh / (half + root), (root - half) / strength)
+def _check_together(solver: AbstractSolver, prior: AbstractPrior, parametrisation: Parametrisation, memory) -> None:
+    """What needs a covariance, and what takes more than a bounded time."""
+    if memory > 0 and not prior.is_quadratic:
+        raise ValueError("memory: total variation has no covariance to carry on; take another prior, or memory 0.")
+    if solver.is_linear and not prior.is_quadratic:
+        raise ValueError("prior: total variation is not linear; take solver 'gauss-newton', or another prior.")
+    for name, given in (("bounds", parametrisation.bounds), ("unknowns", parametrisation.unknowns)):
+        if given:
+            raise ValueError(f"{name}: an Imager takes none, for its time a frame is bounded; take reconstruct.")
 
 
 def _check_reference(measured, predicted) -> None:
@@ -256,14 +222,6 @@ def _linear_map(inversion: Inversion, weighing: Weighing, offset, persistence: f
     return LinearMap(matrix, gain @ (weighing.weight[:, None] * weighing.estimator), level, carry)
 
 
-def _residual(coefficients, inversion: Inversion):
-    return inversion.residual(coefficients), coefficients
-
-
-def _expand(coefficients, inversion: Inversion):
-    return inversion.quadratic_model(coefficients)
-
-
 @jax.jit
 def _estimate(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate:
     data = weighing.combine(frame + imager.offset)
@@ -272,10 +230,9 @@ def _estimate(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate
     if imager.persistence > 0:  # the prior's centre moves, and the coefficients count from there
         expected, start = start, expected
         inversion = eqx.tree_at(lambda i: i.reference, inversion, inversion.estimate(expected))
-    damping = 1.0 if imager.method == "levenberg-marquardt" else 0.0
-    solver = Descent(rtol=imager.rtol, damping=damping, history=imager.steps)
+    descent = imager.solver.descent(_STEPS, _RTOL)
     solution = optx.least_squares(
-        _residual, solver, start, inversion, options={"expand": _expand}, max_steps=imager.steps, throw=False
+        residual, descent, start, inversion, options={"expand": expand}, max_steps=descent.history, throw=False
     )
     # The last step leads to a point not looked at yet. It takes voltages, but no Jacobian, to see if it is better.
     state = solution.state

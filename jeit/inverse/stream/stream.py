@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable, Iterator
+from enum import StrEnum
 
 import equinox as eqx
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.inverse.stream.imager import Imager
+from jeit_solvers import Status
 
 # A frame that differs by more than this, relative to an undisturbed one, is another sensor's, or a fault.
 _LARGEST_DIFFERENCE = 0.5
@@ -18,19 +20,30 @@ _SUSPICIOUS, _EXPLAINED, _LOST = 0.15, 0.5, 0.5
 _LEAST_CHANNELS = 0.5
 
 
+class FrameStatus(StrEnum):
+    """What became of a frame. Each is equal to its word."""
+
+    IMAGED = "imaged"
+    PARTIAL = "partial"
+    """Imaged, with some channels left out."""
+    STEP_LIMIT = Status.STEP_LIMIT.value
+    """Imaged, though the steps that a frame is given were too few for it to converge."""
+    REFUSED = "refused"
+    """There is no image of it."""
+
+
 class FrameImage(eqx.Module):
     """One frame of a stream.
 
-    **Fields**: `number`, from 0; `conductivity` (m,), S/m (2-D: S), NumPy, None for a frame that is refused; `status`:
-    "imaged"; "partial", some channels were left out; "not converged", within the steps a frame is given; "refused";
-    `reason`, in a sentence, empty where all is well; `usable` (M,), the channels used; `misfit`, root mean square in
-    standard deviations (NaN for linear images, which solve no forward problem, and refused frames); `iterations`;
-    `latency`, seconds from the frame to its image.
+    **Fields**: `number`, from 0; `conductivity` (m,), S/m (2-D: S), NumPy, None for a frame that is refused; `status`,
+    and its `reason`, in a sentence, empty where all is well; `usable` (M,), the channels used; `misfit`, root mean
+    square in standard deviations (NaN for linear images, which solve no forward problem, and refused frames);
+    `iterations`; `latency`, seconds from the frame to its image.
     """
 
     number: int
     conductivity: Float[np.ndarray, " m"] | None
-    status: str
+    status: FrameStatus
     reason: str
     usable: Bool[np.ndarray, " M"]
     misfit: float
@@ -80,7 +93,7 @@ class _Session:
         """The image of one frame, or why there is none."""
         begin = time.perf_counter()
         values, usable, status, reason = self._inspect(frame)
-        if status == "refused":
+        if status == FrameStatus.REFUSED:
             return FrameImage(number, None, status, reason, usable, np.nan, 0, time.perf_counter() - begin)
         if usable is not self.usable and not np.array_equal(usable, self.usable):
             self._weigh(usable)
@@ -89,16 +102,19 @@ class _Session:
         if not np.isfinite(conductivity).all():
             reason = "The image became NaN; the next frame starts from the background again."
             self.coefficients = np.asarray(self.imager.start)
-            return FrameImage(number, None, "refused", reason, usable, np.nan, iterations, time.perf_counter() - begin)
+            return FrameImage(
+                number, None, FrameStatus.REFUSED, reason, usable, np.nan, iterations, time.perf_counter() - begin
+            )
         self.last = filled
-        if not converged and status == "imaged":
-            status, reason = "not converged", f"More than {self.imager.steps} iterations are needed for this frame."
+        if not converged and status == FrameStatus.IMAGED:
+            status = FrameStatus.STEP_LIMIT
+            reason = f"More than {self.imager.steps} iterations are needed for this frame."
         return FrameImage(number, conductivity, status, reason, usable, misfit, iterations, time.perf_counter() - begin)
 
     def _weigh(self, usable) -> None:
         self.usable = usable
         self.weighing = self.imager.weighing(jnp.asarray(usable))
-        if self.imager.method == "linear":
+        if self.imager.solver.is_linear:
             linear = self.imager.linear_map(self.weighing)
             # Reading the matrix takes most of a linear image's time; it multiplies differences, so single will do, and
             # BLAS reads it column by column in half the time.
@@ -110,7 +126,7 @@ class _Session:
 
     def _estimate(self, frame):
         """Conductivity, misfit, iterations, and whether they converged."""
-        if self.imager.method == "linear":
+        if self.imager.solver.is_linear:
             weights = self.estimator @ frame - self.resting
             if self.imager.persistence > 0:
                 weights = self.coefficients = weights + self.carry @ self.coefficients
@@ -128,35 +144,40 @@ class _Session:
         try:
             values = np.asarray(frame)
         except ValueError:
-            return none, none, "refused", f"The frame is ragged, not {self.mask.size} real voltages."
+            return none, none, FrameStatus.REFUSED, f"The frame is ragged, not {self.mask.size} real voltages."
         if values.dtype.kind in "US":
-            return values, none, "refused", f"The frame is text, not {self.mask.size} real voltages."
+            return values, none, FrameStatus.REFUSED, f"The frame is text, not {self.mask.size} real voltages."
         if values.shape != self.mask.shape or values.dtype.kind not in "iuf":
             reason = f"The frame is {values.dtype} of shape {values.shape}, not {self.mask.size} real voltages."
-            return values, none, "refused", reason
+            return values, none, FrameStatus.REFUSED, reason
         change = (values - self.expected)[self.mask]
         if change @ change < self.ordinary:  # which NaN is not, nor a frame of zeros
-            return values, self.mask, "imaged", ""
+            return values, self.mask, FrameStatus.IMAGED, ""
         finite = np.isfinite(values)
         usable = self.mask if finite.all() else self.mask & finite
         count = np.count_nonzero(usable)
         if count < _LEAST_CHANNELS * np.count_nonzero(self.mask):
-            return values, usable, "refused", f"Only {count} of {np.count_nonzero(self.mask)} channels can be used."
+            return (
+                values,
+                usable,
+                FrameStatus.REFUSED,
+                f"Only {count} of {np.count_nonzero(self.mask)} channels can be used.",
+            )
         if not values[usable].any():
-            return values, none, "refused", "All channels read zero; the current source has failed."
+            return values, none, FrameStatus.REFUSED, "All channels read zero; the current source has failed."
         difference = np.where(usable, values - self.expected, 0)
         relative = np.linalg.norm(difference) / self.size
         if relative > _SUSPICIOUS:
             usable, reason = self._without_dead_electrode(difference, usable)
             if reason:
-                return values, usable, "partial", reason
+                return values, usable, FrameStatus.PARTIAL, reason
             if relative > _LARGEST_DIFFERENCE:
                 reason = f"It differs by {relative:.0%} from an undisturbed frame: another sensor's, or a fault."
-                return values, none, "refused", reason
+                return values, none, FrameStatus.REFUSED, reason
         if count < np.count_nonzero(self.mask):
             missing = np.count_nonzero(self.mask) - count
-            return values, usable, "partial", f"{missing} channels have no reading and are left out."
-        return values, usable, "imaged", ""
+            return values, usable, FrameStatus.PARTIAL, f"{missing} channels have no reading and are left out."
+        return values, usable, FrameStatus.IMAGED, ""
 
     def _without_dead_electrode(self, difference, usable):
         """The usable channels less those of an electrode that explains most of a large difference, and a sentence."""

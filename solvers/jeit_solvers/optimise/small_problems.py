@@ -5,7 +5,7 @@ systems are solved by formulas written out.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,6 +19,8 @@ Expansion = Callable[[Array, Any], tuple[Array, Array, Array]]
 _MOST_DAMPING = 1e12
 # Gathering fewer than so many is not worth it.
 _LEAST_PART = 32
+# Steps that the whole batch takes before what is left of it is gathered.
+_WHOLE_STEPS = 8
 
 
 class Minimum(eqx.Module):
@@ -92,6 +94,16 @@ class _State(eqx.Module):
     converged: Array
 
 
+class _Limits(NamedTuple):
+    """What steps are held to."""
+
+    lower: Array
+    upper: Array
+    largest_step: Array
+    max_steps: int
+    tolerance: float
+
+
 def minimise_small(
     expand: Expansion,
     start: Float[Array, "n F"],
@@ -103,7 +115,6 @@ def minimise_small(
     largest_step: Float[Array, "n 1"],
     max_steps: int = 30,
     tolerance: float = 1e-10,
-    whole_steps: int = 8,
     skip: Bool[Array, " F"] | None = None,
 ) -> Minimum:
     """Minimise F functions of n unknowns between bounds by projected, damped Newton steps (Bertsekas 1982).
@@ -113,55 +124,12 @@ def minimise_small(
     next step promises to lower the value by less than `tolerance` · (1 + |value|). Functions that are not finite at
     their start stay there, not converged, their value infinite; so do those to `skip`.
 
-    All take `whole_steps` steps together; those that need more, mostly few, are then gathered and go on, a quarter of
-    the batch at a time, with the expansion `finish` if there is one: a dearer one with the exact Hessian, say.
+    All take eight steps together; those that need more, mostly few, are then gathered and go on, a quarter of the batch
+    at a time, with the expansion `finish` if there is one: a dearer one with the exact Hessian, say.
     """
+    limits = _Limits(lower, upper, largest_step, max_steps, tolerance)
     first = jnp.clip(start, lower, upper)
     number = first.shape[1]
-
-    def step_from(state: _State):
-        x, gradient, matrix = state.x, state.gradient, state.matrix
-        held = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))
-        diagonal = jnp.eye(x.shape[0], dtype=bool)[:, :, None]
-        damped = matrix + diagonal * (state.damping * matrix + 1e-300)
-        damped = jnp.where(held[:, None] | held[None], jnp.where(diagonal, 1.0, 0.0), damped)
-        step = -solve_small(damped, jnp.where(held, 0.0, gradient))
-        step = jnp.where(jnp.isfinite(step), step, 0.0)
-        step = step / jnp.maximum(1.0, jnp.max(jnp.abs(step) / largest_step, axis=0))
-        new = jnp.clip(x + step, lower, upper)
-        return new, -jnp.sum((new - x) * gradient, axis=0)
-
-    def advance(state: _State, data, steps: int, expand: Expansion) -> _State:
-        def body(loop):
-            count, state = loop
-            # The first turn only looks at the start: no step leads away from there yet.
-            fresh = jnp.isinf(state.value)
-            trial, promised = step_from(state)
-            value, gradient, matrix = expand(trial, data)
-            better = (value <= state.value) & ~state.done
-            # Cut off at a bound, a step may lead uphill: then a more damped one, closer to the gradient, is tried.
-            settled = (promised >= 0) & (promised <= tolerance * (1 + jnp.abs(state.value))) & ~fresh
-            damping = jnp.where(better, jnp.maximum(state.damping / 10, 1e-12), 8 * jnp.maximum(state.damping, 1e-4))
-            taken = state.taken + ~(state.done | fresh)
-            # A step too small to tell better from worse ends the search as well.
-            converged = state.converged | (~state.done & (settled | (damping > _MOST_DAMPING)))
-            broken = fresh & ~jnp.isfinite(value)
-            return count + 1, _State(
-                x=jnp.where(better, trial, state.x),
-                value=jnp.where(better, value, state.value),
-                gradient=jnp.where(better, gradient, state.gradient),
-                matrix=jnp.where(better, matrix, state.matrix),
-                damping=damping,
-                taken=taken,
-                done=state.done | converged | broken | (taken >= max_steps),
-                converged=converged,
-            )
-
-        def go_on(loop):
-            return (loop[0] < steps) & ~jnp.all(loop[1].done)
-
-        return jax.lax.while_loop(go_on, body, (jnp.zeros((), int), state))[1]
-
     nothing = jnp.zeros(number, bool)
     state = _State(
         x=first,
@@ -175,17 +143,65 @@ def minimise_small(
     )
     part = number // 4
     if part < _LEAST_PART:
-        state = advance(state, data, max_steps + 1, finish or expand)
+        state = _advance(state, data, max_steps + 1, finish or expand, limits)
     else:
         if skip is None:
-            state = advance(state, data, whole_steps + 1, expand)
+            state = _advance(state, data, _WHOLE_STEPS + 1, expand, limits)
 
         def go_on_with_some(state: _State) -> _State:
             index = jnp.nonzero(~state.done, size=part, fill_value=number)[0]
             gathered, mine = jax.tree.map(lambda array: jnp.take(array, index, axis=-1, mode="clip"), (state, data))
             gathered = eqx.tree_at(lambda s: s.done, gathered, gathered.done | (index == number))
-            ended = advance(gathered, mine, max_steps + 1, finish or expand)
+            ended = _advance(gathered, mine, max_steps + 1, finish or expand, limits)
             return jax.tree.map(lambda all, some: all.at[..., index].set(some, mode="drop"), state, ended)
 
         state = jax.lax.while_loop(lambda state: ~jnp.all(state.done), go_on_with_some, state)
     return Minimum(state.x, state.value, state.converged, jnp.max(state.taken))
+
+
+def _step_from(state: _State, limits: _Limits) -> tuple[Array, Array]:
+    """Where the next step leads, and by how much it promises to lower the value, to first order."""
+    x, gradient, matrix = state.x, state.gradient, state.matrix
+    held = ((x <= limits.lower) & (gradient > 0)) | ((x >= limits.upper) & (gradient < 0))
+    diagonal = jnp.eye(x.shape[0], dtype=bool)[:, :, None]
+    damped = matrix + diagonal * (state.damping * matrix + 1e-300)
+    damped = jnp.where(held[:, None] | held[None], jnp.where(diagonal, 1.0, 0.0), damped)
+    step = -solve_small(damped, jnp.where(held, 0.0, gradient))
+    step = jnp.where(jnp.isfinite(step), step, 0.0)
+    step = step / jnp.maximum(1.0, jnp.max(jnp.abs(step) / limits.largest_step, axis=0))
+    new = jnp.clip(x + step, limits.lower, limits.upper)
+    return new, -jnp.sum((new - x) * gradient, axis=0)
+
+
+def _advance(state: _State, data, steps: int, expand: Expansion, limits: _Limits) -> _State:
+    """So many steps of all functions, or fewer if all are done."""
+
+    def body(loop):
+        count, state = loop
+        # The first turn only looks at the start: no step leads away from there yet.
+        fresh = jnp.isinf(state.value)
+        trial, promised = _step_from(state, limits)
+        value, gradient, matrix = expand(trial, data)
+        better = (value <= state.value) & ~state.done
+        # Cut off at a bound, a step may lead uphill: then a more damped one, closer to the gradient, is tried.
+        settled = (promised >= 0) & (promised <= limits.tolerance * (1 + jnp.abs(state.value))) & ~fresh
+        damping = jnp.where(better, jnp.maximum(state.damping / 10, 1e-12), 8 * jnp.maximum(state.damping, 1e-4))
+        taken = state.taken + ~(state.done | fresh)
+        # A step too small to tell better from worse ends the search as well.
+        converged = state.converged | (~state.done & (settled | (damping > _MOST_DAMPING)))
+        broken = fresh & ~jnp.isfinite(value)
+        return count + 1, _State(
+            x=jnp.where(better, trial, state.x),
+            value=jnp.where(better, value, state.value),
+            gradient=jnp.where(better, gradient, state.gradient),
+            matrix=jnp.where(better, matrix, state.matrix),
+            damping=damping,
+            taken=taken,
+            done=state.done | converged | broken | (taken >= limits.max_steps),
+            converged=converged,
+        )
+
+    def go_on(loop):
+        return (loop[0] < steps) & ~jnp.all(loop[1].done)
+
+    return jax.lax.while_loop(go_on, body, (jnp.zeros((), int), state))[1]

@@ -1,0 +1,93 @@
+"""Frame after frame to images: an imager for a measured sensor, and frames as they come from a file or a pipe."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.data import Measurement
+from jeit.imaging.preparation import Clock, body_of, calibrated_model, select_frames
+from jeit.inverse import Imager
+from jeit.inverse.calibration import Calibration
+from jeit.inverse.nonlinear import GaussNewton
+from jeit.inverse.nonlinear.solvers import AbstractSolver, as_solver
+from jeit.inverse.stream.imager import check_memory
+
+
+@dataclass(frozen=True)
+class StreamSettings:
+    """How to image frame after frame. The defaults here are jeit's defaults, for Python and command line alike.
+
+    - `solver`: `GaussNewton(max_steps=4)`, `LevenbergMarquardt()`, or `OneStep()` for linear images; or
+      the name of one.
+    - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; "noise-figure" unless given.
+    - `memory`: frames over which an image changes, see `jeit.inverse.Imager`; 0 takes every frame alone.
+    - `contact`, `num_points`: as in `jeit.imaging.ImagingSettings`.
+
+    Raises `ValueError` for a solver that does not image frames, and a memory that is no number of them.
+    """
+
+    solver: AbstractSolver | str = field(default_factory=GaussNewton)
+    hyperparameter: float | str | None = None
+    memory: float = 0.0
+    contact: str | None = None
+    num_points: int = 1200
+
+    def __post_init__(self):
+        as_solver(self.solver).for_frames()
+        check_memory(self.memory)
+
+
+def prepare_imager(
+    reference: Measurement,
+    settings: StreamSettings | None = None,
+    *,
+    measurement: Measurement | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Imager, Calibration]:
+    """An imager for the sensor whose undisturbed frames are `reference`, and the model calibrated on them.
+
+    `measurement`: what is to be imaged, if it is known already: its protocol must be the reference's. `progress` is
+    called with the name of each step as it begins. Raises `ValueError` for another protocol, and as `image_difference`.
+    """
+    settings = StreamSettings() if settings is None else settings
+    measured = reference if measurement is None else measurement
+    _, base = select_frames(measured, reference)
+    if not base.protocol.same_patterns(measured.protocol):
+        raise ValueError(f"'{measured.name}' was measured with another protocol than the reference '{base.name}'.")
+    domain, electrodes = body_of(measured, base)
+    clock = Clock(progress)
+    calibration, _ = calibrated_model(
+        base, domain, electrodes, contact=settings.contact, num_points=settings.num_points, clock=clock
+    )
+    with clock("prepare"):
+        imager = Imager.create(
+            calibration.model,
+            calibration.conductivity,
+            reference=base.filled()[0],
+            mask=base.mask[0],
+            solver=settings.solver,
+            hyperparameter=settings.hyperparameter,
+            memory=settings.memory,
+        )
+    return imager, calibration
+
+
+def frames_of(measurement: Measurement) -> Float[np.ndarray, "F M"]:
+    """The frames of a measurement, volts, NaN where a channel is masked: as `jeit.inverse.stream` takes them."""
+    return np.where(measurement.mask, measurement.voltages, np.nan)
+
+
+def parse_frames(lines: Iterable[str]) -> Iterator[object]:
+    """A frame for every line that is not empty, its voltages parted by spaces, commas or semicolons; one that does not
+    hold numbers comes as its text, and will be refused."""
+    for line in lines:
+        parts = line.strip().rstrip(",;").replace(";", ",").split(",")
+        words = line.split() if len(parts) == 1 else [part.strip() or "nan" for part in parts]
+        if not line.strip():
+            continue
+        try:
+            yield [float(word) for word in words]
+        except ValueError:
+            yield line

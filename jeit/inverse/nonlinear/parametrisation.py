@@ -1,0 +1,82 @@
+"""Parametrisation: what is estimated, on which scale and within which limits."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jeit.forward import ForwardModel
+from jeit.inverse.nonlinear.links import AbstractLink, Log
+from jeit.inverse.nonlinear.unknowns import AbstractUnknown
+from jeit.inverse.prior.bases import Regions
+from jeit.mesh import Mesh
+
+
+def _tuple(unknowns) -> tuple[AbstractUnknown, ...]:
+    if not isinstance(unknowns, Sequence) or not all(isinstance(one, AbstractUnknown) for one in unknowns):
+        raise ValueError(
+            f"unknowns must be a list of those in jeit.inverse.nonlinear, such as [Scale()]; it is {unknowns!r}."
+        )
+    return tuple(unknowns)
+
+
+class Parametrisation(eqx.Module):
+    """What is estimated of a body.
+
+    - `link`: the scale on which the prior acts, `Log()` unless given.
+    - `bounds`: least and greatest conductivity, S/m (2-D: S), held exactly; for solvers that keep bounds, with priors
+      that have a precision matrix, or total variation.
+    - `regions` (m,): integers, cells that share one value; -1 for cells held at the background. See
+      `jeit.inverse.prior.bases.pixels`.
+    - `unknowns`: what else to estimate, see `jeit.inverse.nonlinear.unknowns`.
+    - `informative`: images are built of combinations of the prior's shapes that the data of the background tell more of
+      than this, in standard deviations of the noise for one of the prior; 0 takes all shapes. None leaves it to who
+      asks: `reconstruct` takes all, an `Imager` those above 0.03.
+
+    Raises `ValueError` for what does not fit.
+    """
+
+    link: AbstractLink = eqx.field(default_factory=Log)
+    bounds: tuple[float, float] | None = None
+    regions: Int[np.ndarray, " m"] | None = None
+    unknowns: tuple[AbstractUnknown, ...] = eqx.field(default=(), converter=_tuple)
+    informative: float | None = None
+
+    def __check_init__(self):
+        if not isinstance(self.link, AbstractLink):
+            raise ValueError(f"link must be one of those in jeit.inverse.nonlinear, such as Log(), not {self.link!r}.")
+        values = np.asarray((0.0, np.inf) if self.bounds is None else self.bounds)
+        if values.shape != (2,) or values.dtype.kind not in "iuf" or not 0 <= values[0] < values[1]:
+            raise ValueError(f"bounds: give two numbers, 0 ≤ lower < upper, S/m (2-D: S); they are {self.bounds!r}.")
+        names = [type(one).__name__ for one in self.unknowns]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"unknowns: {name} is there more than once.")
+        if self.informative is not None and not 0 <= self.informative < 1:
+            raise ValueError(f"informative must lie between 0 and 1; it is {self.informative}.")
+
+    def check_model(self, model: ForwardModel) -> None:
+        """Raises `ValueError` for unknowns that were made for another model."""
+        for one in self.unknowns:
+            if not one.fits(model):
+                name = type(one).__name__
+                raise ValueError(f"unknowns: this {name} was made for another model; make it with the one given here.")
+
+    def regions_of(self, mesh: Mesh) -> Regions | None:
+        """The regions of this mesh, if there are any. Raises `ValueError` for labels that do not fit it."""
+        return None if self.regions is None else Regions.create(mesh, self.regions)
+
+    def box(self, background: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+        """The bounds on the coefficients, one for each cell and then those of the unknowns, which have none.
+
+        Raises `ValueError` for a link that takes no bounds, and a background beyond them.
+        """
+        lower, upper = (0.0, np.inf) if self.bounds is None else self.bounds
+        reference = self.link.estimate(background)
+        ends = self.link.ends(float(lower), float(upper), reference)
+        if not ((reference >= ends[0]) & (reference <= ends[1])).all():
+            raise ValueError(f"background must lie between the bounds, {lower:g} and {upper:g}.")
+        free = jnp.full(sum(one.size for one in self.unknowns), jnp.inf)
+        return jnp.concatenate([ends[0] - reference, -free]), jnp.concatenate([ends[1] - reference, free])

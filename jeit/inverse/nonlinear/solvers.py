@@ -1,0 +1,321 @@
+"""Solvers of the nonlinear problem, as small objects that say how many steps they take and what they can do.
+
+`SOLVERS` has them by the names of the command line, and `solver_named` is where a name becomes an object.
+"""
+
+import abc
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from jeit.inverse.nonlinear.checks import check_steps, check_tolerance
+from jeit.inverse.nonlinear.problem import Inversion
+from jeit_solvers import BoundedMinimum, Descent, Status, ended, lbfgsb, projected_gradient
+
+_Value = TypeVar("_Value")
+
+_MAX_STEPS = 30
+_REASONS = {
+    Status.CONVERGED: "The next step would change the objective by less than the tolerance.",
+    Status.STEP_LIMIT: "Stopped after {} trial steps; raise max_steps, or the hyperparameter.",
+    Status.STALLED: "No shorter step lowered the objective; the model is at odds with the data.",
+}
+
+
+class Solved(NamedTuple):
+    """Where a solver ended: coefficients (n,), iterations, the objective at the accepted iterates, how and why."""
+
+    coefficients: Float[Array, " n"]
+    iterations: int
+    costs: Float[Array, " steps"]
+    status: Status
+    reason: str
+
+
+class AbstractSolver(eqx.Module):
+    """Base of all solvers of `reconstruct`. A new one is a class with `minimise`, and an entry in `SOLVERS`."""
+
+    name: ClassVar[str]
+
+    @property
+    def keeps_bounds(self) -> bool:
+        """Whether it minimises between bounds, one coefficient for each cell."""
+        return False
+
+    @property
+    def needs_squares(self) -> bool:
+        """Whether the objective must be a sum of squares, which total variation is not."""
+        return False
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether it takes a single step from the background, the same matrix for every frame."""
+        return False
+
+    @abc.abstractmethod
+    def minimise(self, inversion: Inversion, start: Float[Array, " n"], box) -> Solved:
+        """The coefficients of least cost, from `start`; between the ends of `box`, (n,) each, if it keeps bounds."""
+
+    def for_frames(self, max_steps: int | None = None, rtol: float | None = None) -> "AbstractSolver":
+        """Itself with these settings where it has none of its own, for an `Imager`. Raises `ValueError` if it is not
+        one that images a frame in a bounded time."""
+        raise ValueError(
+            f"solver: {self.name} does not image frames in a bounded time; take linear, gauss-newton or "
+            "levenberg-marquardt."
+        )
+
+    def descent(self, max_steps: int, rtol: float) -> Descent:
+        """Its steps, for optimistix; the arguments hold where it has none of its own. Raises `ValueError` if it takes
+        other steps."""
+        raise ValueError(f"solver: {self.name} does not descend along quadratic models.")
+
+
+class GaussNewton(AbstractSolver):
+    """Gauss-Newton steps with a backtracking line search; total variation by lagged diffusivity.
+
+    `max_steps`: 30 unless given, for an `Imager` 4. `rtol`: the relative change of the objective that ends the
+    iteration, 1e-6 unless given, with total variation 1e-4, for an `Imager` 1e-3.
+    """
+
+    name: ClassVar[str] = "gauss-newton"
+    max_steps: int | None = eqx.field(static=True, default=None)
+    rtol: float | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        _check(self.max_steps, self.rtol)
+
+    def minimise(self, inversion, start, box):
+        """By `jeit_solvers.Descent`."""
+        return _descend(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
+
+    def for_frames(self, max_steps=None, rtol=None):
+        """Itself."""
+        return GaussNewton(_first(self.max_steps, max_steps), _first(self.rtol, rtol))
+
+    def descent(self, max_steps, rtol):
+        """Without damping."""
+        return Descent(history=_first(self.max_steps, max_steps), rtol=_first(self.rtol, rtol))
+
+
+class LevenbergMarquardt(AbstractSolver):
+    """Levenberg-Marquardt: Gauss-Newton steps, damped while they lead too far.
+
+    `max_steps`, `rtol`: as for `GaussNewton`. `damping`: that of the first step, relative to the prior.
+    """
+
+    name: ClassVar[str] = "levenberg-marquardt"
+    max_steps: int | None = eqx.field(static=True, default=None)
+    rtol: float | None = eqx.field(static=True, default=None)
+    damping: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self):
+        _check(self.max_steps, self.rtol)
+        if not self.damping > 0:
+            raise ValueError(f"damping must be positive; it is {self.damping}. Without it, take GaussNewton().")
+
+    def minimise(self, inversion, start, box):
+        """By `jeit_solvers.Descent`."""
+        return _descend(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
+
+    def for_frames(self, max_steps=None, rtol=None):
+        """Itself."""
+        return LevenbergMarquardt(_first(self.max_steps, max_steps), _first(self.rtol, rtol), self.damping)
+
+    def descent(self, max_steps, rtol):
+        """With damping."""
+        steps, tolerance = _first(self.max_steps, max_steps), _first(self.rtol, rtol)
+        return Descent(history=steps, rtol=tolerance, damping=self.damping)
+
+
+class LBFGSB(AbstractSolver):
+    """L-BFGS-B between bounds. `tolerance`: of a step along the projected gradient, coefficients scaled to size one."""
+
+    name: ClassVar[str] = "l-bfgs-b"
+    max_steps: int = eqx.field(static=True, default=1000)
+    tolerance: float = eqx.field(static=True, default=1e-6)
+
+    def __check_init__(self):
+        _check(self.max_steps, self.tolerance, "tolerance")
+
+    @property
+    def keeps_bounds(self):
+        """It does."""
+        return True
+
+    def minimise(self, inversion, start, box):
+        """By `jeit_solvers.lbfgsb`."""
+        return _between(lbfgsb, inversion, start, box, self.max_steps, self.tolerance)
+
+
+class ProjectedGradient(AbstractSolver):
+    """Accelerated projected gradients between bounds. `tolerance`: as for `LBFGSB`."""
+
+    name: ClassVar[str] = "projected-gradient"
+    max_steps: int = eqx.field(static=True, default=1000)
+    tolerance: float = eqx.field(static=True, default=1e-6)
+
+    def __check_init__(self):
+        _check(self.max_steps, self.tolerance, "tolerance")
+
+    @property
+    def keeps_bounds(self):
+        """It does."""
+        return True
+
+    def minimise(self, inversion, start, box):
+        """By `jeit_solvers.projected_gradient`."""
+        return _between(projected_gradient, inversion, start, box, self.max_steps, self.tolerance)
+
+
+class LeastSquares(AbstractSolver):
+    """Any least-squares `solver` of optimistix, with its own tolerances; not for total variation."""
+
+    name: ClassVar[str] = "a solver of optimistix"
+    solver: optx.AbstractLeastSquaresSolver
+    max_steps: int = eqx.field(static=True, default=_MAX_STEPS)
+
+    def __check_init__(self):
+        _check(self.max_steps, None)
+
+    @property
+    def needs_squares(self):
+        """It does."""
+        return True
+
+    def minimise(self, inversion, start, box):
+        """Of the residuals of data and prior together."""
+        solution = _least_squares(inversion, start, self.solver, self.max_steps, {})
+        costs = jnp.stack([_cost(inversion, start), _cost(inversion, solution.value)])
+        status = ended(solution.result)
+        reason = _REASONS[status].format(self.max_steps)
+        return Solved(solution.value, int(solution.stats["num_steps"]), costs, status, reason)
+
+
+class OneStep(AbstractSolver):
+    """The linear image, one Gauss-Newton step from the background: for an `Imager`."""
+
+    name: ClassVar[str] = "linear"
+
+    @property
+    def is_linear(self):
+        """It is."""
+        return True
+
+    def minimise(self, inversion, start, box):
+        """Not to be had. Raises `ValueError`."""
+        raise ValueError("solver: linear images are those of one_step, or of an Imager; take another solver.")
+
+    def for_frames(self, max_steps=None, rtol=None):
+        """Itself."""
+        return self
+
+
+SOLVERS: dict[str, type[AbstractSolver]] = {
+    one.name: one for one in (OneStep, GaussNewton, LevenbergMarquardt, LBFGSB, ProjectedGradient)
+}
+"""Solvers by the names of the command line."""
+
+
+def solver_named(name: str, argument: str = "solver") -> AbstractSolver:
+    """The solver of that name in `SOLVERS`, with its defaults. Raises `ValueError`, about `argument`, for others."""
+    if name not in SOLVERS:
+        raise ValueError(f"{argument}: there is no '{name}'; give one of {', '.join(SOLVERS)}.")
+    return SOLVERS[name]()
+
+
+def as_solver(solver: "AbstractSolver | optx.AbstractLeastSquaresSolver | str") -> AbstractSolver:
+    """A solver itself, or the one meant by a name or by a solver of optimistix. Raises `ValueError` for others."""
+    if isinstance(solver, str):
+        return solver_named(solver)
+    if isinstance(solver, optx.AbstractLeastSquaresSolver):
+        return LeastSquares(solver)
+    if not isinstance(solver, AbstractSolver):
+        raise ValueError(
+            f"solver must be one of jeit.inverse.nonlinear, such as GaussNewton(), the name of one "
+            f"({', '.join(SOLVERS)}), or a least-squares solver of optimistix; it is {solver!r}."
+        )
+    return solver
+
+
+def expand(coefficients: Float[Array, " n"], inversion: Inversion):
+    """Cost and step of a problem at these coefficients: the option `expand` of `jeit_solvers.Descent`."""
+    return inversion.quadratic_model(coefficients)
+
+
+def residual(coefficients: Float[Array, " n"], inversion: Inversion):
+    """Residuals of data and prior, each of unit variance: the function of optimistix's least squares."""
+    return inversion.data.whiten(inversion.residual(coefficients)), coefficients
+
+
+def _check(max_steps, tolerance, name: str = "rtol") -> None:
+    if max_steps is not None:
+        check_steps("max_steps", max_steps)
+    if tolerance is not None:
+        check_tolerance(name, tolerance)
+
+
+def _first(own: _Value | None, other: _Value) -> _Value:
+    return other if own is None else own
+
+
+@eqx.filter_jit
+def _least_squares(inversion: Inversion, start, solver, max_steps: int, options: dict[str, Any]) -> Any:
+    return optx.least_squares(residual, solver, start, inversion, options=options, max_steps=max_steps, throw=False)
+
+
+def _descend(descent: Descent, inversion: Inversion, start) -> Solved:
+    solution = _least_squares(inversion, start, descent, descent.history, {"expand": expand})
+    accepted, status = int(solution.state.num_accepted), ended(solution.result)
+    reason = _REASONS[status].format(descent.history)
+    return Solved(solution.value, max(accepted - 1, 0), solution.state.history[:accepted], status, reason)
+
+
+def _between(minimise, inversion: Inversion, start, box, max_steps: int, tolerance: float) -> Solved:
+    start = jnp.clip(start, *box)
+    lower, upper = box
+    found = minimise_between(inversion, start, lower, upper, minimise, int(max_steps), float(tolerance))
+    costs = jnp.stack([_cost(inversion, start), _cost(inversion, found.x)])
+    if found.converged:
+        reason = "No step between the bounds would change the image much."
+        return Solved(found.x, int(found.steps), costs, Status.CONVERGED, reason)
+    reason = _REASONS[Status.STEP_LIMIT].format(int(found.steps))
+    return Solved(found.x, int(found.steps), costs, Status.STEP_LIMIT, reason)
+
+
+@eqx.filter_jit
+def minimise_between(
+    inversion: Inversion,
+    start: Float[Array, " n"],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+    minimise,
+    max_steps: int,
+    tolerance: float,
+) -> BoundedMinimum:
+    """The coefficients of least cost between two bounds, by `jeit_solvers.lbfgsb` or `projected_gradient`.
+
+    Converged: a step along the projected gradient, scaled by each coefficient's own curvature, changes none by more
+    than `tolerance`.
+    """
+    # One size for all coefficients: conditioning decides how many steps a gradient method takes.
+    _, jacobian = inversion.linearise(start)
+    scale = jax.lax.rsqrt(jnp.sum(jacobian**2, axis=0) + inversion.penalty.diagonal(start))
+    unit = inversion.cost(start)
+    found = minimise(
+        lambda scaled: inversion.cost(scale * scaled) / unit,
+        start / scale,
+        lower / scale,
+        upper / scale,
+        max_steps=max_steps,
+        tolerance=tolerance,
+    )
+    return BoundedMinimum(scale * found.x, found.steps, found.converged)
+
+
+@eqx.filter_jit
+def _cost(inversion: Inversion, coefficients):
+    return inversion.cost(coefficients)

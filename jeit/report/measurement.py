@@ -1,0 +1,30 @@
+"""What a measured file holds, and how good it is, as plain numbers and words."""
+
+from typing import Any
+
+import numpy as np
+
+from jeit.data import Measurement, estimate_noise, impossible_signs, reciprocity_error
+from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain
+
+
+def report_measurement(measurement: Measurement) -> dict[str, Any]:
+    """What `jeit info` prints: frames, body, electrodes, protocol and noise of a measurement, in SI units; what is not
+    known is None."""
+    protocol, noise, signs = measurement.protocol, estimate_noise(measurement), impossible_signs(measurement)
+    content = {
+        **describe_measurement(measurement),
+        "frames": measurement.num_frames,
+        "frame_names": list(measurement.frame_names),
+        "voltages": int(np.asarray(measurement.mask).size),
+        "protocol": protocol.name,
+        "drives": protocol.num_drives,
+        "largest_current": float(np.abs(np.asarray(protocol.drive)).max()),
+        "largest_voltage": float(np.abs(np.asarray(measurement.filled())).max()),
+        "body": describe_domain(measurement.domain),
+        "electrodes": {**describe_electrodes(measurement.electrodes), "number": protocol.num_electrodes},
+        "reciprocity_error": reciprocity_error(measurement),
+        "noise": None if noise is None else {"standard_deviation": noise.standard_deviation, "method": noise.method},
+        "impossible_signs": None if signs is None else float(signs.max()),
+    }
+    return plain(content)

@@ -1,0 +1,84 @@
+"""What is left of a stream on disk: a line for every frame as it comes, and all images at the end."""
+
+import csv
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.inverse.calibration import Calibration
+from jeit.inverse.stream.stream import FrameImage
+from jeit.mesh import centroids
+
+_COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
+
+
+@dataclass(frozen=True)
+class WrittenStream:
+    """What `write_stream` has written: the `number` of frames, `counts` of them by status, and the `latency` in seconds
+    of those that were imaged, (K,)."""
+
+    number: int
+    counts: dict[str, int]
+    latency: Float[np.ndarray, " K"]
+
+
+def write_stream(
+    images: Iterable[FrameImage],
+    calibration: Calibration,
+    folder: str | Path,
+    *,
+    name: str = "stream",
+    progress: Callable[[FrameImage], None] | None = None,
+) -> WrittenStream:
+    """Write `frames.csv`, a line for every image as it comes, and at the end `images.npz`, into `folder`.
+
+    `images`: those of `jeit.inverse.stream`, of an imager made with `calibration`, see `jeit.imaging.prepare_imager`.
+    The table has the place in metres and the height, S (3-D: S/m), of each image's strongest change. The NPZ holds
+    `conductivity` (frames, cells), NaN for frames that were refused, `background`, `points` and `cells`. `progress` is
+    called with every image. An earlier stream's images are taken away first. Raises `ValueError`, with the `name` of
+    the stream, if no frame came.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "images.npz").unlink(missing_ok=True)  # would not go with these frames
+    mesh, background = calibration.model.mesh, float(calibration.conductivity)
+    centre = np.asarray(centroids(mesh))[:, :2]
+    nothing = np.full(mesh.num_cells, np.nan, np.float32)
+    kept, latency, counts = [], [], {}
+    with open(folder / "frames.csv", "w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(_COLUMNS)
+        for one in images:
+            table.writerow(_row(one, centre, background))
+            file.flush()  # whoever follows the file sees every frame at once
+            kept.append(nothing if one.conductivity is None else one.conductivity.astype(np.float32))
+            latency += [one.latency] if one.imaged else []
+            counts[str(one.status)] = counts.get(str(one.status), 0) + 1
+            if progress is not None:
+                progress(one)
+    if not kept:
+        raise ValueError(f"'{name}': there was no frame in it.")
+    np.savez_compressed(
+        folder / "images.npz",
+        conductivity=np.stack(kept),
+        background=np.asarray(calibration.conductivity),
+        points=np.asarray(mesh.points),
+        cells=np.asarray(mesh.cells),
+    )
+    return WrittenStream(len(kept), counts, np.array(latency))
+
+
+def _row(one: FrameImage, centre, background: float) -> list[object]:
+    """The columns of a frame."""
+    spent = f"{1e3 * one.latency:.3f}"
+    if one.conductivity is None:
+        return [one.number, one.status, int(one.usable.sum()), "", one.iterations, spent, "", "", "", one.reason]
+    change = one.conductivity - background
+    peak = int(np.argmax(np.abs(change)))
+    misfit = "" if np.isnan(one.misfit) else f"{one.misfit:.4g}"
+    place = [f"{value:.5f}" for value in centre[peak]]
+    head = [one.number, one.status, int(one.usable.sum()), misfit, one.iterations, spent]
+    return [*head, *place, f"{change[peak]:.5g}", one.reason]
