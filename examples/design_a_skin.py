@@ -13,7 +13,7 @@ def main() -> float:
     felt = []
     for row, name in zip(figure.subplots(2, 2), ("park-inner", "park-boundary"), strict=True):
         layout = named_layout(name)
-        grid = touches_away_from_the_edge(layout.skin, margin=0.01, columns=32, rows=32)
+        grid = touches_away_from_the_edge(layout.known_outline, margin=0.01, columns=32, rows=32)
         felt.append(feel(layout, grid, key=jax.random.key(0), cell_size=6e-3, num_layers=4))
         plot_sensitivity_map(felt[-1].sensitivity, electrodes=layout.centres, title=name, ax=row[0])
         plot_taxels(felt[-1].taxels, electrodes=layout.centres, title="virtual taxels", ax=row[1])

@@ -42,7 +42,7 @@ def read(name: str, width: float, height: float) -> "tuple[Layout, Domain]":
         found = read_layout(name, outline=Rectangle(1e-3 * width, 1e-3 * height))
     if found.num_electrodes < 3:
         raise ValueError(f"'{found.name}' has {found.num_electrodes} electrodes; give a layout of three or more.")
-    return found, _plain(found.skin)
+    return found, _plain(found.known_outline)
 
 
 def check_layer(thickness: float, conductivity: float) -> None:

@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.design.measurements.selection import nearest_pairs
-from jeit.design.sensitivity import SensitivityMap, TouchGrid, touch_grid
+from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.cell_size import check_cell_size
 from jeit.design.skin.indentation import AbstractIndentation, Bell
+from jeit.design.skin.touch_grid import TouchGrid
 from jeit.design.skin.touched_cells import TouchedCells, touched_cells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.design.taxels import Taxels, find_taxels
@@ -40,7 +41,7 @@ class SkinResponse(eqx.Module):
 class TouchedSkin(eqx.Module):
     """A layer with a layout on its bottom, checked and meshed, to be touched at every place of a grid.
 
-    **Fields**: `layout`; `grid`; `model`; `conductivity` of its cells, S/m; `presses`, what the touches change;
+    **Fields**: `layout`; `grid`; `model`; `conductivity` of its cells, S/m; `touched`, what the touches change;
     `num_taxels` and `threshold`, as in `find_taxels`. Make it with `TouchedSkin.create`.
     """
 
@@ -48,7 +49,7 @@ class TouchedSkin(eqx.Module):
     grid: TouchGrid
     model: ForwardModel
     conductivity: Float[Array, "..."]
-    presses: TouchedCells
+    touched: TouchedCells
     num_taxels: int = eqx.field(static=True)
     threshold: float = eqx.field(static=True)
 
@@ -79,7 +80,7 @@ class TouchedSkin(eqx.Module):
         layer that is thinner than touches are deep or so thick that they change no cell, a contrast that changes
         nothing, cells too small for any mesh, and electrodes too small for them.
         """
-        outline = layout.skin
+        outline = layout.known_outline
         indentation = Bell() if indentation is None else indentation
         number = _number_of_pairs(layout, num_pairs)
         if not 1 <= num_taxels <= len(grid.places):
@@ -102,12 +103,12 @@ class TouchedSkin(eqx.Module):
             raise ValueError(f"cell_size is {1e3 * cell_size:g} mm, too large: {across}; give less.") from None
         everything = two_terminal(layout.num_electrodes, current=current)
         model = ForwardModel(mesh, electrodes, everything.subset(np.sort(nearest_pairs(centres, number))))
-        presses = touched_cells(mesh, indentation, grid.places, contrast=contrast)
-        return cls(layout, grid, model, check_conductivity(mesh, conductivity), presses, num_taxels, threshold)
+        touched = touched_cells(mesh, indentation, grid.places, contrast=contrast)
+        return cls(layout, grid, model, check_conductivity(mesh, conductivity), touched, num_taxels, threshold)
 
     def feel(self, key: Array) -> SkinResponse:
         """Touch it, one place at a time; `key`: for the taxels' k-means."""
-        sensitivity = SensitivityMap(self.grid, touch_changes(self.model, self.conductivity, self.presses))
+        sensitivity = SensitivityMap(self.grid, touch_changes(self.model, self.conductivity, self.touched))
         taxels = find_taxels(
             sensitivity.changes,
             self.grid.places,
@@ -117,16 +118,6 @@ class TouchedSkin(eqx.Module):
             key=key,
         )
         return SkinResponse(self.layout, sensitivity, taxels)
-
-
-def touches_away_from_the_edge(outline: Domain, margin: float, columns: int = 48, rows: int = 48) -> TouchGrid:
-    """The places of `touch_grid` whose touches reach over no edge: farther than `margin` (metres) from the outline."""
-    grid = touch_grid(outline, columns, rows)
-    offsets = margin * np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 16, endpoint=False)])
-    kept = np.all([np.asarray(outline.contains(grid.places + offset)) for offset in offsets], axis=0)
-    if not kept.any():
-        raise ValueError(f"margin is {1e3 * margin:g} mm: no place of the skin is so far from its edge; give less.")
-    return TouchGrid(grid.places[kept], grid.rows[kept], grid.columns[kept], grid.shape, grid.pitch)
 
 
 def feel(layout: Layout, grid: TouchGrid, *, key: Array, **options: Any) -> SkinResponse:

@@ -76,7 +76,7 @@ class Layout(eqx.Module):
         return self.centres.shape[0]
 
     @property
-    def skin(self) -> Domain:
+    def known_outline(self) -> Domain:
         """The outline, for what cannot do without. Raises `ValueError` if it is not known."""
         if self.outline is None:
             raise ValueError(

@@ -20,7 +20,7 @@ from jeit.design import (
     touches_away_from_the_edge,
 )
 from jeit.design.optimisation.constraints import pulled_inside
-from jeit.design.optimisation.variables import Design, Skin
+from jeit.design.optimisation.variables import Variables, Varied
 from jeit.electrodes import PointElectrodes
 from jeit.forward import ForwardModel
 from jeit.layout import Layout, named_layout, perimeter
@@ -229,9 +229,9 @@ def test_errors_teach():
         optimise(Layout(START.centres, 8e-3))
     with pytest.raises(ValueError, match="the model 8; their number cannot change"):
         optimise(Layout(START.centres[:6], 8e-3, outline=SKIN))
-    five = Skin(START.centres[:5], START.diameters[:5] / 2, jnp.ones(5), jnp.ones(()))
+    five = Varied(START.centres[:5], START.diameters[:5] / 2, jnp.ones(5), jnp.ones(()))
     with pytest.raises(ValueError, match="add or remove 1, or choose another symmetry"):
-        Design.create(SKIN, five, symmetry="mirror-x")
+        Variables.create(SKIN, five, symmetry="mirror-x")
     with pytest.raises(ValueError, match="contact_impedance must be two values"):
         optimise(contact_impedance=(1e-3, 1e-4))
     with pytest.raises(ValueError, match=r"the touches are 2\.5 mm deep"):

@@ -138,7 +138,7 @@ def test_a_place_that_cannot_be_told_is_infinite_and_counted(tmp_path, store_pat
 
 
 def test_a_batch_factorises_once_and_calls_no_library(study):
-    shared, skin = batch._shared(study, study.points[0].shape), batch._skin(study.points[0], study.current)
+    shared, skin = batch._shared(study, study.points[0].shape), batch._varied(study.points[0], study.current)
     skins, options = batch._stacked([skin] * 2), {"num_taxels": 5, "threshold": 0.7, "num_devices": 1}
 
     def compiled(*scores):

@@ -168,7 +168,7 @@ def _draw(felt: "list[SkinResponse]"):
     largest = max(float(one.taxels.max_area) for one in felt)
     names = _told_apart([_shortened(one.layout.name) for one in felt])
     for row, name, one in zip(axes, names, felt, strict=True):
-        centres, skin = one.layout.centres, one.layout.skin
+        centres, skin = one.layout.centres, one.layout.known_outline
         plot_sensitivity_map(one.sensitivity, electrodes=centres, limit=highest, title=name, ax=row[0])
         plot_taxels(one.taxels, electrodes=centres, limit=largest, title=f"{name}: taxels", ax=row[1])
         # Its bar, drawn last, is placed by the touched part; both maps are of the whole skin.

@@ -16,8 +16,9 @@ from jaxtyping import Array, Float
 
 from jeit.design.optimisation.constraints import Constraints, pulled_inside
 from jeit.design.optimisation.search import Record, descend
-from jeit.design.optimisation.variables import Design, Skin, Symmetry
-from jeit.design.scores import Score, Scores, SheetTouches, TouchPrior, layout_scores
+from jeit.design.optimisation.variables import Symmetry, Variables, Varied
+from jeit.design.scores import Score, Scores, TouchPrior, layout_scores
+from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.electrodes import SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.layout import Layout
@@ -127,9 +128,9 @@ def optimise_layout(
     _check_keep_out(keep_out)
     constraints = Constraints(outline, float(minimum_spacing), tuple(keep_out))
     task = _Task(model, jnp.asarray(conductivity), touches, prior, jnp.asarray(noise, float), temperature)
-    skin = Skin(layout.centres, layout.diameters / 2, _contacts(model), touches.thickness)
+    skin = Varied(layout.centres, layout.diameters / 2, _contacts(model), touches.thickness)
     options = {"sizes": sizes, "contacts": contact_impedance, "thickness": thickness}
-    design = Design.create(outline, skin, symmetry=symmetry, **options)
+    design = Variables.create(outline, skin, symmetry=symmetry, **options)
     if thickness is not None:
         _check_thickness(thickness, touches, outline)
     constraints.check_room(design.smallest)
@@ -156,13 +157,13 @@ def optimise_layout(
         if budget:
             variables, status = descend(partial(cost, weight=weight), variables, budget, record)
     variables = _feasible(design, constraints, variables)
-    ends = jax.tree.map(np.asarray, _skins(design, variables))
+    ends = jax.tree.map(np.asarray, _varied(design, variables))
     values = np.asarray(cost(variables, 0.0)[1])
     lacking = np.array([_lacking(constraints, *one) for one in zip(ends.centres, ends.radii, strict=True)])
     best, status, reason = _judge(design.holds(skin), layout, constraints, ends, values, lacking, start_value, status)
     found, scores = layout, given
     if best is not None:
-        end = Skin(*(part[best] for part in ends))
+        end = Varied(*(part[best] for part in ends))
         found, scores = _named(layout, end, outline, contact_impedance is not None), task.scores(end)
     return Optimisation(
         layout=found,
@@ -173,7 +174,7 @@ def optimise_layout(
         values=values,
         shortfall=np.maximum(lacking, 0),
         history=np.stack(record.values, axis=1),
-        snapshots=np.stack([np.asarray(_skins(design, one).centres) for one in record.variables], axis=1),
+        snapshots=np.stack([np.asarray(_varied(design, one).centres) for one in record.variables], axis=1),
         best=best,
         status=status,
         reason=reason,
@@ -190,7 +191,7 @@ class _Task(eqx.Module):
     noise: Array
     temperature: float
 
-    def scores(self, skin: Skin) -> Scores:
+    def scores(self, skin: Varied) -> Scores:
         moved = self.model.with_electrodes(SheetDiscs(skin.centres, skin.radii, skin.contact_impedance))
         conductance = self.conductivity * (skin.thickness / self.touches.thickness)
         touches = self.touches.at_thickness(skin.thickness)
@@ -199,7 +200,7 @@ class _Task(eqx.Module):
         )
 
 
-def _random(design: Design, constraints: Constraints, count: int, key) -> list[np.ndarray]:
+def _random(design: Variables, constraints: Constraints, count: int, key) -> list[np.ndarray]:
     """Variables of `count` layouts of places drawn evenly from the outline without what is to be kept free."""
     starts, number = [], design.num_generators
     for one in jax.random.split(key, count) if count else ():
@@ -216,8 +217,8 @@ def _random(design: Design, constraints: Constraints, count: int, key) -> list[n
     return starts
 
 
-def _penalty(design: Design, constraints: Constraints, variables, spare=0.0) -> Float[Array, ""]:
-    shortfall = constraints.shortfall(*design.skin(variables)[:2]) + spare
+def _penalty(design: Variables, constraints: Constraints, variables, spare=0.0) -> Float[Array, ""]:
+    shortfall = constraints.shortfall(*design.varied(variables)[:2]) + spare
     return jnp.sum((jnp.maximum(shortfall, 0) / design.pitch) ** 2)
 
 
@@ -226,7 +227,7 @@ def _lacking(constraints: Constraints, centres, radii) -> float:
     return float(jnp.max(constraints.shortfall(jnp.asarray(centres), jnp.asarray(radii))))
 
 
-def _feasible(design: Design, constraints: Constraints, variables):
+def _feasible(design: Variables, constraints: Constraints, variables):
     """The starts (S, v) moved until they satisfy the constraints, as far as descent of the penalty leads."""
 
     def cost(variables):
@@ -237,17 +238,17 @@ def _feasible(design: Design, constraints: Constraints, variables):
 
 
 @eqx.filter_jit
-def _missing(variables, design: Design, constraints: Constraints):
+def _missing(variables, design: Variables, constraints: Constraints):
     """Penalty of each start (S,) and its gradient (S, v); steep, for the descent is to end at zero, not near it."""
     return jax.vmap(jax.value_and_grad(lambda own: 1e6 * _penalty(design, constraints, own, _SPARE)))(variables)
 
 
 @eqx.filter_jit
-def _cost(variables, weight, design: Design, constraints: Constraints, task: _Task, score: Score):
+def _cost(variables, weight, design: Variables, constraints: Constraints, task: _Task, score: Score):
     """Penalised cost of each start (S,), its score (S,) and the gradient of the cost (S, v)."""
 
     def one(own):
-        skin = design.skin(own)
+        skin = design.varied(own)
         # An electrode off the skin has no score: a step that goes too far is judged by how it is at the edge.
         value = score(task.scores(skin._replace(centres=pulled_inside(skin.centres, constraints.outline))))
         return weight * _penalty(design, constraints, own) - value, value
@@ -258,8 +259,8 @@ def _cost(variables, weight, design: Design, constraints: Constraints, task: _Ta
 
 
 @eqx.filter_jit
-def _skins(design: Design, variables) -> Skin:
-    return jax.vmap(design.skin)(variables)
+def _varied(design: Variables, variables) -> Varied:
+    return jax.vmap(design.varied)(variables)
 
 
 def _judge(holds, layout, constraints, ends, values, lacking, start_value, status) -> tuple[int | None, str, str]:
@@ -285,7 +286,7 @@ def _judge(holds, layout, constraints, ends, values, lacking, start_value, statu
     return best, status, reason
 
 
-def _named(layout: Layout, skin: Skin, outline: Domain, contacts: bool) -> Layout:
+def _named(layout: Layout, skin: Varied, outline: Domain, contacts: bool) -> Layout:
     return Layout(
         skin.centres,
         2 * skin.radii,

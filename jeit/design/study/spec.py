@@ -90,7 +90,7 @@ class Study:
     """A sweep: every combination of the lists in a study file. Make it with `read_study`.
 
     - `points`: the skins, in the order of the lists, the last list fastest.
-    - `skin`: their outline; `indentation`, `contrast`: the touch, as in `touched_cells`; `exact`: whether its changes
+    - `outline`: theirs; `indentation`, `contrast`: the touch, as in `touched_cells`; `exact`: whether its changes
       are, or linear; `columns`, `rows`: of the grid of touches.
     - `current`: amperes. `scores`: those wanted; `num_taxels`, `threshold`, `seed`: of `find_taxels`; `correlation`: of
       `TouchPrior`, metres.
@@ -101,7 +101,7 @@ class Study:
 
     name: str
     points: tuple[Point, ...]
-    skin: Rectangle
+    outline: Rectangle
     indentation: AbstractIndentation
     contrast: float
     exact: bool
@@ -130,7 +130,7 @@ class Study:
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of all that decides the results: not of comments or the study's name."""
-        content = [_VERSION, *map(float, self.skin.extent), type(self.indentation).__name__]
+        content = [_VERSION, *map(float, self.outline.extent), type(self.indentation).__name__]
         content += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
         content += [self.contrast, self.exact, *self.scores, self.num_taxels, self.threshold, self.correlation]
         content += [self.seed, self.chunk_points]
@@ -197,7 +197,7 @@ def read_study(path: str | Path) -> Study:
 
 
 def _study(text: str, values: dict, folder: Path) -> Study:
-    skin = Rectangle(1e-3 * values["skin.width_mm"], 1e-3 * values["skin.height_mm"])
+    outline = Rectangle(1e-3 * values["skin.width_mm"], 1e-3 * values["skin.height_mm"])
     depth, thinnest = values["touch.depth_mm"], min(values["skin.thickness_mm"])
     if depth >= thinnest:
         raise ValueError(f"touch.depth_mm is {depth:g}, and the skin {thinnest:g} mm thick; press less.")
@@ -217,7 +217,7 @@ def _study(text: str, values: dict, folder: Path) -> Study:
         )
     layers = values["mesh.layers"] if values["skin.model"] == "layer" else 0
     layouts = [
-        study_layout(name, folder, skin, diameter, impedance, 1e-3 * values["electrodes.minimum_gap_mm"])
+        study_layout(name, folder, outline, diameter, impedance, 1e-3 * values["electrodes.minimum_gap_mm"])
         for name in values["electrodes.layouts"]
         for diameter in _metres(values["electrodes.diameter_mm"])
         for impedance in values["electrodes.contact_impedance_ohm_m2"]
@@ -235,7 +235,7 @@ def _study(text: str, values: dict, folder: Path) -> Study:
     study = Study(
         name=values["name"],
         points=tuple(points),
-        skin=skin,
+        outline=outline,
         indentation=indentation,
         contrast=float(values["touch.contrast"]),
         exact=values["touch.exact"],
@@ -272,7 +272,7 @@ def _check(study: Study) -> None:
                 f"mesh.cell_mm is {1e3 * point.cell_size:g}, too coarse for electrodes {1e3 * smallest:.3g} mm across; "
                 f"{1e3 * smallest / 2:.3g} would do."
             )
-        check_cell_size("mesh.cell_mm", point.cell_size, study.skin.area, point.layers)
+        check_cell_size("mesh.cell_mm", point.cell_size, study.outline.area, point.layers)
 
 
 def _check_measurement(point: Point) -> None:
