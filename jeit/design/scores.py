@@ -23,6 +23,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jeit.design.sensitivity import uniformity
+from jeit.design.skin.defaults import TEMPERATURE
 from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity
@@ -110,7 +111,7 @@ def layout_scores(
     *,
     prior: TouchPrior,
     noise,
-    temperature: float = 0.1,
+    temperature: float = TEMPERATURE,
 ) -> Scores:
     """All scores of the layout of a model on a sheet, from one factorisation and the Jacobian.
 

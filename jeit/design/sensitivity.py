@@ -6,6 +6,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jeit.design.skin.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation, Bell
 from jeit.design.skin.touch_grid import TouchGrid
 from jeit.design.skin.touched_cells import touched_cells
@@ -73,7 +74,7 @@ def sensitivity_map(
     *,
     indentation: AbstractIndentation | None = None,
     thickness: float | None = None,
-    contrast: float = 0.0,
+    contrast: float = CONTRAST,
     linear: bool = False,
 ) -> SensitivityMap:
     """Touch a skin at every place of `grid` and see how its voltages change.

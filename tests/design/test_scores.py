@@ -6,15 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.design import (
-    Bell,
-    TouchPrior,
-    layout_scores,
-    sheet_touches,
-    touch_changes,
-    touch_grid,
-    touched_cells,
-)
+from jeit.design import Bell, TouchPrior, layout_scores, touch_grid
+from jeit.design.skin.sheet_touches import sheet_touches
+from jeit.design.skin.touched_cells import touched_cells
+from jeit.design.skin.voltage_changes import touch_changes
 from jeit.electrodes import SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.mesh import Rectangle, box, rectangle

@@ -6,7 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.design import Bell, Hemisphere, TouchedCells, touch_changes, touched_cells
+from jeit.design import Bell, Hemisphere
+from jeit.design.skin.touched_cells import TouchedCells, touched_cells
+from jeit.design.skin.voltage_changes import touch_changes
 from jeit.electrodes import FaceDiscs, PointElectrodes, SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.layout import grid

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jeit.design.skin.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
 from jeit.design.skin.touched_cells import TouchedCells, touched_cells
 from jeit.mesh import Mesh, centroids
@@ -40,7 +41,7 @@ class SheetTouches(eqx.Module):
 
 
 def sheet_touches(
-    mesh: Mesh, indentation: AbstractIndentation, places, *, thickness: float, contrast: float = 0.0
+    mesh: Mesh, indentation: AbstractIndentation, places, *, thickness: float, contrast: float = CONTRAST
 ) -> SheetTouches:
     """Indent a sheet (2-D mesh) of a layer of `thickness` metres at `places` (n, 2), metres.
 

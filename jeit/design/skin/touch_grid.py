@@ -4,6 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jeit.design.skin.defaults import PLACES
 from jeit.mesh import Domain
 
 
@@ -32,7 +33,7 @@ class TouchGrid(eqx.Module):
         return image
 
 
-def touch_grid(outline: Domain, columns: int = 48, rows: int = 48) -> TouchGrid:
+def touch_grid(outline: Domain, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
     """Rectangles over the bounding box of `outline`, those whose middle lies inside; 48 × 48 as in Park et al. 2022.
 
     Raises `ValueError` for fewer than one row or column.
@@ -50,7 +51,7 @@ def touch_grid(outline: Domain, columns: int = 48, rows: int = 48) -> TouchGrid:
     return TouchGrid(places[inside], row, column, (rows, columns), (float(width), float(height)))
 
 
-def touches_away_from_the_edge(outline: Domain, margin: float, columns: int = 48, rows: int = 48) -> TouchGrid:
+def touches_away_from_the_edge(outline: Domain, margin: float, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
     """The places of `touch_grid` whose touches reach over no edge: farther than `margin` (metres) from the outline."""
     grid = touch_grid(outline, columns, rows)
     offsets = margin * np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 16, endpoint=False)])

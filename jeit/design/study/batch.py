@@ -12,20 +12,19 @@ from jax.sharding import Mesh as Devices
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float
 
-from jeit.design.measurements.selection import nearest_pairs
 from jeit.design.scores import TouchPrior, layout_scores
 from jeit.design.sensitivity import SensitivityMap
-from jeit.design.skin.sheet_touches import SheetTouches, sheet_touches
+from jeit.design.skin.sheet_touches import SheetTouches
+from jeit.design.skin.skin import Skin, model_conductivity
 from jeit.design.skin.touch_grid import TouchGrid, touch_grid
-from jeit.design.skin.touched_cells import TouchedCells, touched_cells
+from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.design.study.keys import OPTIMALITY
 from jeit.design.study.spec import Point, Shape, Study
 from jeit.design.taxels import find_taxels
 from jeit.electrodes import FaceDiscs, SheetDiscs
 from jeit.forward import ForwardModel
-from jeit.mesh import Mesh, layer, rectangle
-from jeit.protocol import Protocol, adjacent, opposite, two_terminal
+from jeit.protocol import Protocol
 
 
 class _Shared(eqx.Module):
@@ -53,7 +52,7 @@ class _Varied(eqx.Module):
 
 
 def check_points(study: Study) -> None:
-    """Make every mesh, touch it, and place every electrode. Raises `ValueError` for a mesh that is too coarse."""
+    """Make every skin, touch it, and place every electrode. Raises `ValueError` for a mesh that is too coarse."""
     seen = set()
     for index in itertools.chain.from_iterable(study.chunks):  # one shape after the other
         point = study.points[index]
@@ -64,7 +63,7 @@ def check_points(study: Study) -> None:
         layers = f" and mesh.layers = {point.layers}" if point.layers else ""
         where = f"mesh.cell_mm = {1e3 * point.cell_size:g}{layers}"
         try:
-            point.electrodes.check(_mesh(study, point.shape))
+            _skin(study, point.shape).with_layout(point.layout)
         except ValueError:
             smallest = 1e3 * float(np.min(point.layout.diameters))
             raise ValueError(
@@ -105,45 +104,37 @@ def study_grid(study: Study) -> TouchGrid:
 
 
 @lru_cache(maxsize=4)
-def _mesh(study: Study, shape: Shape) -> Mesh:
-    """Of the sheet, or the layer."""
-    plane = rectangle(study.outline.width, study.outline.height, cell_size=shape.cell_size)
-    return layer(plane, shape.thickness, shape.layers) if shape.layers else plane
+def _skin(study: Study, shape: Shape) -> Skin:
+    """Of the first point of a shape; the others are of the same mesh."""
+    point = next(point for point in study.points if point.shape == shape)
+    return Skin.create(
+        point.layout,
+        thickness=point.thickness,
+        conductivity=point.conductivity,
+        num_layers=point.layers,
+        cell_size=point.cell_size,
+        protocol=point.measured(study.current),
+    )
 
 
 @lru_cache(maxsize=4)
 def _shared(study: Study, shape: Shape) -> _Shared:
-    point = next(point for point in study.points if point.shape == shape)
-    mesh = _mesh(study, shape)
-    model = ForwardModel(mesh, point.electrodes, _protocol(point, study.current))
-    grid, touches, prior = study_grid(study), None, None
-    thickness = None if shape.layers else point.thickness
+    skin, grid, touches, prior = _skin(study, shape), study_grid(study), None, None
     if set(OPTIMALITY) & set(study.scores):
-        assert thickness is not None
-        touches = sheet_touches(mesh, study.indentation, grid.places, thickness=thickness, contrast=study.contrast)
+        touches = skin.sheet_touches(grid.places, study.indentation, contrast=study.contrast)
         touched = touches.touched
         prior = TouchPrior.create(grid.places, correlation=study.correlation)
     else:
-        touched = touched_cells(mesh, study.indentation, grid.places, thickness=thickness, contrast=study.contrast)
-    return _Shared(model, touched, touches, prior, grid, point.thickness, jax.random.key(study.seed))
-
-
-def _protocol(point: Point, current: float) -> Protocol:
-    number = point.layout.num_electrodes
-    if not point.pairs:
-        return {"adjacent": adjacent, "opposite": opposite, "two-terminal": two_terminal}[point.protocol](
-            number, current=current
-        )
-    nearest = np.sort(nearest_pairs(point.layout.centres, point.pairs))
-    return two_terminal(number, np.column_stack(np.triu_indices(number, 1))[nearest], current=current)
+        touched = skin.touched_cells(grid.places, study.indentation, contrast=study.contrast)
+    return _Shared(skin.model, touched, touches, prior, grid, skin.thickness, jax.random.key(study.seed))
 
 
 def _varied(point: Point, current: float) -> _Varied:
     return _Varied(
         electrodes=point.electrodes,
-        protocol=_protocol(point, current),
+        protocol=point.measured(current),
         thickness=jnp.asarray(point.thickness),
-        conductivity=jnp.asarray(point.conductivity * (1.0 if point.layers else point.thickness)),
+        conductivity=jnp.asarray(model_conductivity(point.conductivity, point.thickness, point.layers)),
         noise=jnp.asarray(point.noise),
     )
 

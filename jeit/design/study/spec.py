@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import tomllib
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,13 +11,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jeit.design.skin import defaults
 from jeit.design.skin.cell_size import check_cell_size
 from jeit.design.skin.indentation import AbstractIndentation, Bell, Hemisphere
+from jeit.design.skin.protocol import ProtocolName, skin_protocol
+from jeit.design.skin.skin import skin_electrodes
 from jeit.design.study.keys import OPTIMALITY, read_keys
 from jeit.design.study.layouts import is_file, study_layout
 from jeit.electrodes import FaceDiscs, SheetDiscs
 from jeit.layout import Layout
 from jeit.mesh import Rectangle
+from jeit.protocol import Protocol
 
 # Bump when the same study would give other numbers.
 _VERSION = 2
@@ -47,7 +52,7 @@ class Point:
     layout: Layout
     thickness: float
     conductivity: float
-    protocol: str
+    protocol: ProtocolName
     pairs: int
     noise: float
     cell_size: float
@@ -62,11 +67,11 @@ class Point:
     @property
     def electrodes(self) -> SheetDiscs | FaceDiscs:
         """In the sheet, or on the bottom of the layer."""
-        discs = self.layout.sheet_discs()
-        if not self.layers:
-            return discs
-        bottom = np.column_stack([discs.position, np.zeros(discs.num_electrodes)])
-        return FaceDiscs(bottom, discs.radius, discs.contact_impedance)
+        return skin_electrodes(self.layout, self.layers)
+
+    def measured(self, current: float) -> Protocol:
+        """What is measured at a `current` in amperes."""
+        return skin_protocol(self.layout, self.protocol, num_pairs=self.pairs, current=current)
 
     @property
     def coordinates(self) -> dict[str, str | int | float]:
@@ -159,28 +164,29 @@ def read_study(path: str | Path) -> Study:
         conductivity_S_per_m = 1.0
         [electrodes]
         layouts = ["park-inner", "park-boundary", "grid-8x4", "perimeter-32", "inner-32", "mine.csv"]
-        diameter_mm = [6, 8]                 # and contact_impedance_ohm_m2: the file's own, or 6 and 1e-3, unless given
+        diameter_mm = [6, 8]                 # and contact_impedance_ohm_m2: the file's own, or 6 and 1e-4, unless given
         minimum_gap_mm = 2
         [measurement]
         protocol = "two-terminal"            # or "adjacent", "opposite"
-        pairs = [0, 94]                      # of two-terminal: so many between the nearest electrodes; 0: all
+        pairs = [0, 94]                      # of two-terminal: so many of the nearest electrodes; 0: all; 94, or all
         current_mA = 1
-        noise_V = 1e-6
+        noise_V = 2e-5
         [touch]
         indentation = "bell"                 # depth_mm, deviation_mm; or "hemisphere": depth_mm, diameter_mm
         contrast = 0                         # of the touched part's conductivity; above 1 for a conductor
         exact = false                        # true: solved anew for every touch, one point after the other
         columns = 24                         # and rows
         [mesh]
-        cell_mm = 4
+        cell_mm = 4.5
         [scores]
         wanted = ["minimum", "mean", "uniformity", "blind_spot", "taxels"]    # num_taxels, threshold, seed
         # of sheets also "information", "mean_variance", "largest_variance", "localisation_error": correlation_mm
 
-    Only `electrodes.layouts` must be there. Files are looked for beside the study's. Raises `FileNotFoundError` if
-    there is no such file and `ValueError`, naming the key and what to do, for keys that are not known or have no effect
-    beside the others, values out of range (such as metres for millimetres), electrodes that overlap, impossible
-    spacings, and layouts that do not have the electrodes that a protocol needs.
+    Only `electrodes.layouts` must be there; defaults are those of `jeit.design.skin.defaults`. Files are looked for
+    beside the study's. Raises `FileNotFoundError` if there is no such file and `ValueError`, naming the key and what to
+    do, for keys that are not known or have no effect beside the others, values out of range (such as metres for
+    millimetres), electrodes that overlap, impossible spacings, and layouts that do not have the electrodes that a
+    protocol needs.
     """
     path = Path(path)
     if not path.is_file():
@@ -223,13 +229,15 @@ def _study(text: str, values: dict, folder: Path) -> Study:
         for impedance in values["electrodes.contact_impedance_ohm_m2"]
     ]
     points = (
-        Point(layout, thickness, float(conductivity), protocol, pairs, float(noise), cell_size, layers)
+        Point(
+            layout, thickness, float(conductivity), protocol, _pairs(layout, protocol, pairs), noise, cell_size, layers
+        )
         for layout in layouts
         for thickness in _metres(values["skin.thickness_mm"])
-        for conductivity in values["skin.conductivity_S_per_m"]
+        for conductivity in map(float, values["skin.conductivity_S_per_m"])
         for protocol in values["measurement.protocol"]
         for pairs in values["measurement.pairs"]
-        for noise in values["measurement.noise_V"]
+        for noise in map(float, values["measurement.noise_V"])
         for cell_size in _metres(values["mesh.cell_mm"])
     )
     study = Study(
@@ -252,6 +260,14 @@ def _study(text: str, values: dict, folder: Path) -> Study:
     )
     _check(study)
     return study
+
+
+def _pairs(layout: Layout, protocol: str, pairs: float) -> int:
+    """As many as are asked for, 0 for all; where nobody says, as many as other skins have, or all."""
+    if not math.isnan(pairs):
+        return int(pairs)
+    all_pairs = layout.num_electrodes * (layout.num_electrodes - 1) // 2
+    return defaults.NUM_PAIRS if protocol == "two-terminal" and all_pairs > defaults.NUM_PAIRS else 0
 
 
 def _check(study: Study) -> None:
