@@ -56,7 +56,9 @@ def exact_map(kind: str, cell_size: float, places: int, sample: int, rounds: int
     """A row of the table, times faster than SciPy, whether both agree, nodes, and seconds."""
     import jax
 
-    from jeit.design import Bell, touch_changes, touch_grid, touched_cells
+    from jeit.design import Bell, touch_grid
+    from jeit.design.skin.touched_cells import touched_cells
+    from jeit.design.skin.voltage_changes import touch_changes
     from jeit.mesh import Rectangle
 
     model, conductivity, options = skin(kind, cell_size)
@@ -86,7 +88,9 @@ def many_layouts(numbers: tuple[int, ...], rounds: int):
     import jax
     import jax.numpy as jnp
 
-    from jeit.design import Bell, touch_changes, touch_grid, touched_cells
+    from jeit.design import Bell, touch_grid
+    from jeit.design.skin.touched_cells import touched_cells
+    from jeit.design.skin.voltage_changes import touch_changes
     from jeit.mesh import Rectangle
 
     model, conductivity, options = skin("sheet", 6.3e-3)
@@ -120,7 +124,10 @@ def clusters(rounds: int):
     from sklearn.cluster import KMeans
     from threadpoolctl import threadpool_limits
 
-    from jeit.design import Bell, nearest_pairs, touch_changes, touch_grid, touched_cells
+    from jeit.design import Bell, touch_grid
+    from jeit.design.measurements.selection import nearest_pairs
+    from jeit.design.skin.touched_cells import touched_cells
+    from jeit.design.skin.voltage_changes import touch_changes
     from jeit.layout import named_layout
     from jeit.mesh import Rectangle
     from jeit_solvers import kmeans

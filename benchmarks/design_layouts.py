@@ -13,7 +13,18 @@ def optimised(nodes: tuple[int, int], columns: tuple[int, int], starts: int, ste
     """Layouts before and after, on a sheet of 2 mS, judged on a finer mesh (nodes and touches along a side of each)."""
     import jax
 
-    from jeit.design import Bell, TouchPrior, layout_scores, optimise_layout, sensitivity_map, sheet_touches, touch_grid
+    from jeit.design import (
+        Bell,
+        DesignSpace,
+        Objective,
+        Skin,
+        TouchPrior,
+        layout_scores,
+        optimise_layout,
+        sensitivity_map,
+        touch_grid,
+    )
+    from jeit.design.skin.sheet_touches import sheet_touches
     from jeit.forward import ForwardModel
     from jeit.layout import Layout, named_layout
     from jeit.mesh import Rectangle, rectangle
@@ -28,8 +39,9 @@ def optimised(nodes: tuple[int, int], columns: tuple[int, int], starts: int, ste
         return model, grid, touches, {"prior": TouchPrior.create(grid.places, correlation=15e-3), "noise": 1e-4}
 
     model, _, touches, options = setting(nodes[0], columns[0])
-    limits = {"minimum_spacing": 8e-3, "starts": starts, "steps": steps, "key": jax.random.key(0)}
-    found = optimise_layout(start, model, CONDUCTANCE, touches, **options, **limits)
+    sheet = Skin(start, model, thickness=10e-3, conductivity=CONDUCTANCE / 10e-3)
+    limits = {"starts": starts, "steps": steps, "key": jax.random.key(0)}
+    found = optimise_layout(sheet, Objective(touches, **options), DesignSpace(minimum_spacing=8e-3), **limits)
     coarse = model.mesh.num_points
     layouts = {name: named_layout(name) for name in ("park-inner", "grid-8x4", "park-boundary")}
     for number, (centres, radii) in enumerate(zip(found.centres, found.radii, strict=True)):
@@ -61,14 +73,8 @@ def selected(name: str, number: int, cell_sizes: tuple[float, float], correlatio
     voltage; cell sizes of the sheet and under electrodes, metres; of `count` random choices the median."""
     import jax
 
-    from jeit.design import (
-        Candidates,
-        information,
-        information_bound,
-        nearest_pairs,
-        random_selections,
-        select_measurements,
-    )
+    from jeit.design import Candidates, information_bound, select_measurements
+    from jeit.design.measurements.selection import information, nearest_pairs, random_selections
     from jeit.forward import ForwardModel
     from jeit.inverse import Gaussian
     from jeit.layout import named_layout

@@ -14,7 +14,8 @@ from benchmarks.report import markdown
 if TYPE_CHECKING:
     from jaxtyping import Array
 
-    from jeit.design import AbstractIndentation, SkinResponse
+    from jeit.design.response import SkinResponse
+    from jeit.design.skin.indentation import AbstractIndentation
 
 LAYOUTS = ("park-inner", "park-boundary")
 MARGIN, PAIRS, THICKNESS = 10e-3, 94, 10e-3
@@ -47,7 +48,7 @@ def changes(
     indentation: AbstractIndentation | None = None,
     contrast: float = 0.0,
 ) -> Array:
-    """Changes (n, 496) of the voltages of all pairs at 1 mA, by touches of the whole skin of 1 S/m, as `feel` does."""
+    """Changes (n, 496) of the voltages of all pairs at 1 mA, by touches of the whole skin of 1 S/m."""
     from jeit.design import sensitivity_map, touch_grid
     from jeit.electrodes import FaceDiscs
     from jeit.forward import ForwardModel
@@ -67,7 +68,10 @@ def felt(name: str, setting: Setting, changed: Array, margin: float = MARGIN, pa
     """What the layout feels farther than `margin` from the edge with the nearest `pairs`, given all changes."""
     import jax
 
-    from jeit.design import SensitivityMap, SkinResponse, find_taxels, nearest_pairs, touches_away_from_the_edge
+    from jeit.design import find_taxels, touches_away_from_the_edge
+    from jeit.design.measurements.selection import nearest_pairs
+    from jeit.design.response import SkinResponse
+    from jeit.design.sensitivity import SensitivityMap
     from jeit.layout import named_layout
     from jeit.mesh import Rectangle
 
@@ -98,7 +102,7 @@ def blind(told: dict) -> str:
 
 def comparison_table(setting: Setting, changed: dict[str, Array]) -> str:
     """Both layouts for several margins, and with all pairs, beside the paper."""
-    from jeit.design import comparison
+    from jeit.design.comparison import comparison
 
     rows = [["Park et al. 2022", "94", "33 %", "", "12.6 ± 1.4", "41", "30.5 ± 27.3", "112"]]
     for margin, pairs in [*((margin, PAIRS) for margin in setting.margins), (MARGIN, 496)]:
@@ -115,7 +119,7 @@ def comparison_table(setting: Setting, changed: dict[str, Array]) -> str:
 
 def thickness_table(setting: Setting, step) -> tuple[str, dict[float, list[SkinResponse]]]:
     """Both layouts on layers of several thicknesses, and what they feel."""
-    from jeit.design import comparison
+    from jeit.design.comparison import comparison
 
     rows, studied = [], {}
     for thickness, num_layers in (*setting.study, *setting.check):
@@ -134,7 +138,8 @@ def thickness_table(setting: Setting, step) -> tuple[str, dict[float, list[SkinR
 
 def kinds_table(setting: Setting, changed: dict[str, Array], step) -> str:
     """Both layouts for a bell and a hemisphere, insulating and conducting ten times as well as the skin."""
-    from jeit.design import Bell, Hemisphere, comparison
+    from jeit.design import Bell, Hemisphere
+    from jeit.design.comparison import comparison
 
     rows = []
     for shape in setting.shapes:

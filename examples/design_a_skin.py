@@ -1,24 +1,22 @@
 """Two layouts of 32 electrodes on a 200 × 200 × 10 mm skin, touched all over; see `design_a_skin.png`."""
 
-import jax
 from matplotlib.figure import Figure
 
-from jeit.design import comparison, feel, touches_away_from_the_edge
+from jeit.design import Skin, compare_layouts
 from jeit.layout import named_layout
 from jeit.plot import plot_sensitivity_map, plot_taxels
 
 
 def main() -> float:
+    skins = [Skin.create(named_layout(name), cell_size=6e-3, num_layers=4) for name in ("park-inner", "park-boundary")]
+    result = compare_layouts(skins[0], skins[1], places=32)
     figure = Figure(figsize=(10, 8.4), layout="constrained")
-    felt = []
-    for row, name in zip(figure.subplots(2, 2), ("park-inner", "park-boundary"), strict=True):
-        layout = named_layout(name)
-        grid = touches_away_from_the_edge(layout.skin, margin=0.01, columns=32, rows=32)
-        felt.append(feel(layout, grid, key=jax.random.key(0), cell_size=6e-3, num_layers=4))
-        plot_sensitivity_map(felt[-1].sensitivity, electrodes=layout.centres, title=name, ax=row[0])
-        plot_taxels(felt[-1].taxels, electrodes=layout.centres, title="virtual taxels", ax=row[1])
+    for row, response in zip(figure.subplots(2, 2), result.responses, strict=True):
+        layout = response.layout
+        plot_sensitivity_map(response.sensitivity, electrodes=layout.centres, title=layout.name, ax=row[0])
+        plot_taxels(response.taxels, electrodes=layout.centres, title="virtual taxels", ax=row[1])
     figure.savefig("design_a_skin.png", dpi=120)
-    inner, boundary = comparison(*felt)
+    inner, boundary = result.figures
     for told in (inner, boundary):
         area = told["taxel_area_cm2"]
         print(f"{told['layout']}: taxels of {area['mean']:.1f} ± {area['std']:.1f} cm²")

@@ -16,6 +16,9 @@ height_mm = 80
 [electrodes]
 layouts = ["grid-4x2", "perimeter-8"]
 diameter_mm = 10
+contact_impedance_ohm_m2 = 1e-3
+[measurement]
+protocol = "adjacent"
 [touch]
 columns = 6
 rows = 5
@@ -33,7 +36,9 @@ conductivity_S_per_m = 0.5
 [electrodes]
 layouts = ["grid-4x2", "perimeter-8", "inner-8"]
 diameter_mm = 10
+contact_impedance_ohm_m2 = 1e-3
 [measurement]
+protocol = "adjacent"
 noise_V = 1e-3
 [touch]
 columns = 6
@@ -54,6 +59,8 @@ def changed(**lines: str) -> str:
     """The sweep with two of its layouts and no scores, and with other lines at the beginnings of sections."""
     text = SWEEP.replace('"grid-4x2", "perimeter-8", "inner-8"', '"grid-4x2", "perimeter-8"')
     text = text[: text.index("[scores]")].replace("noise_V = 1e-3\n", "")
+    if "protocol" in lines.get("measurement", ""):
+        text = text.replace('protocol = "adjacent"\n', "")
     for section, more in lines.items():
         text = text.replace(f"[{section}]\n", f"[{section}]\n{more}\n")
     return text

@@ -9,25 +9,25 @@ from jeit.cli.options import check_within
 
 if TYPE_CHECKING:
     from jeit.layout import Layout
-    from jeit.mesh import Domain
 
 LayoutName = Annotated[
     str,
     typer.Argument(
-        help="Built-in layout (park-inner, park-boundary, grid-CxR), or a file: CSV in millimetres, DXF or SVG.",
+        help="Layout by name (park-inner, park-boundary, grid-CxR, perimeter-N, inner-N), or a file: CSV in "
+        "millimetres, DXF or SVG.",
         show_default=False,
     ),
 ]
-Width = Annotated[float, typer.Option("--width-mm", help="Of the skin, centred at 0, if a file does not say it.")]
-Height = Annotated[float, typer.Option("--height-mm", help="Of the skin, centred at 0, if a file does not say it.")]
+Width = Annotated[float, typer.Option("--width-mm", help="Of the skin, centred at 0, if the layout does not say it.")]
+Height = Annotated[float, typer.Option("--height-mm", help="Of the skin, centred at 0, if the layout does not say it.")]
 Thickness = Annotated[float, typer.Option("--thickness-mm", help="Of the skin, millimetres.")]
 Conductivity = Annotated[float, typer.Option("--conductivity", help="Of the skin, siemens per metre.")]
 # Of conductivities in S/m: deionised water and silver, with room to spare.
 _LEAST_CONDUCTIVITY, _MOST_CONDUCTIVITY = 1e-9, 1e9
 
 
-def read(name: str, width: float, height: float) -> "tuple[Layout, Domain]":
-    """A layout, by name or from a file, and its skin's outline: width × height (mm) where a file does not say it.
+def read(name: str, width: float, height: float) -> "Layout":
+    """A layout with its skin, by name or from a file; the skin is width × height (mm) where neither says it.
 
     Raises `ValueError` for fewer than three electrodes.
     """
@@ -35,36 +35,28 @@ def read(name: str, width: float, height: float) -> "tuple[Layout, Domain]":
     from jeit.layout.layout import LARGEST, SMALLEST
     from jeit.mesh import Rectangle
 
-    found = read_layout(name) if Path(name).suffix else named_layout(name)
-    if found.outline is None:
+    def given() -> Rectangle:
         for option, side in (("--width-mm", width), ("--height-mm", height)):
             check_within(option, side, 1e3 * SMALLEST, 1e3 * LARGEST, "mm")
-        found = read_layout(name, outline=Rectangle(1e-3 * width, 1e-3 * height))
+        return Rectangle(1e-3 * width, 1e-3 * height)
+
+    if not Path(name).suffix:
+        found = named_layout(name) if name.startswith("park-") else named_layout(name, given())
+    else:
+        found = read_layout(name)
+        if found.outline is None:
+            found = read_layout(name, outline=given())
     if found.num_electrodes < 3:
         raise ValueError(f"'{found.name}' has {found.num_electrodes} electrodes; give a layout of three or more.")
-    return found, _plain(found.skin)
+    return found
 
 
 def check_layer(thickness: float, conductivity: float) -> None:
     """Raise `ValueError` unless --thickness-mm is more than a touch is deep and --conductivity one that a skin has."""
-    from jeit.design import Bell
+    from jeit.design.skin.defaults import DEPTH
 
-    deepest = 1e3 * Bell().depth
-    if not deepest < thickness < float("inf"):
+    if not 1e3 * DEPTH < thickness < float("inf"):
         raise ValueError(
-            f"--thickness-mm must be more than the {deepest:g} mm that a touch is deep; it is {thickness:g}."
+            f"--thickness-mm must be more than the {1e3 * DEPTH:g} mm that a touch is deep; it is {thickness:g}."
         )
     check_within("--conductivity", conductivity, _LEAST_CONDUCTIVITY, _MOST_CONDUCTIVITY, "S/m")
-
-
-def _plain(outline: "Domain") -> "Domain":
-    """A drawing's four corners are a rectangle if they are one: it is then meshed as one."""
-    from jeit.mesh import Rectangle
-
-    if [len(loop) for loop in outline.loops()] != [4]:
-        return outline
-    low_x, high_x, low_y, high_y = outline.extent
-    width, height = high_x - low_x, high_y - low_y
-    if abs(width * height - outline.area) > 1e-6 * width * height:
-        return outline
-    return Rectangle(width, height, ((low_x + high_x) / 2, (low_y + high_y) / 2))

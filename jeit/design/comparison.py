@@ -1,8 +1,93 @@
 """Two layouts of a skin side by side, as in text S4 of Park et al. 2022: sensitivity, blind spots, virtual taxels."""
 
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
 import numpy as np
 
-from jeit.design.skin_response import SkinResponse
+from jeit.design.response import SkinResponse, number_of_taxels, skin_response
+from jeit.design.skin.defaults import CONTRAST, MARGIN, PLACES
+from jeit.design.skin.skin import Skin
+from jeit.design.skin.touch_grid import touches_away_from_the_edge
+from jeit.layout import Layout
+
+
+class LayoutComparison(eqx.Module):
+    """What two skins feel.
+
+    **Fields**: `skins`; `responses` of each; `margin`, metres, `places` along a side, `contrast` and `seed` of the
+    touches, as in `compare_layouts`.
+    """
+
+    skins: tuple[Skin, Skin]
+    responses: tuple[SkinResponse, SkinResponse]
+    margin: float
+    places: int = eqx.field(static=True)
+    contrast: float
+    seed: int = eqx.field(static=True)
+
+    @property
+    def figures(self) -> list[dict]:
+        """What is told of each, as in `comparison`."""
+        return comparison(*self.responses)
+
+
+def compare_layouts(
+    first: Skin,
+    second: Skin,
+    *,
+    margin: float = MARGIN,
+    places: int = PLACES,
+    contrast: float = CONTRAST,
+    num_taxels: int | None = None,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> LayoutComparison:
+    """Touch two skins of different layouts all over, one place at a time; as `jeit layout compare`.
+
+    **Arguments:**
+
+    - `first`, `second`: of the same outline, made with `Skin.create`.
+    - `margin`: touched no nearer to the edge, where a touch is partly off the skin, metres; `places`: along a side.
+    - `contrast`: of the touched part's conductivity: 0 for an insulator, above 1 for a conductor.
+    - `num_taxels`: virtual taxels to look for, 90 unless given, or one a place; `seed`: of their k-means.
+    - `progress`: called with the name of each step as it begins.
+
+    Raises `ValueError`, before either is touched, for skins of different outlines, a margin that leaves no place, and
+    as `skin_response` does.
+    """
+    check_same_outline(first.layout, second.layout)
+    tell = progress or (lambda step: None)
+    ready = []
+    # Both, before either is touched: what is wrong with one is said at once.
+    for skin in (first, second):
+        grid = touches_away_from_the_edge(skin.outline, margin, places, places)
+        number = number_of_taxels(grid, num_taxels)
+        ready.append((skin, grid, skin.touched_cells(grid.places, contrast=contrast), number))
+    responses = []
+    for skin, grid, touched, number in ready:
+        tell(f"touch {skin.layout.name}")
+        key = jax.random.key(seed)
+        responses.append(skin_response(skin, grid, key=key, touched=touched, num_taxels=number))
+    return LayoutComparison((first, second), (responses[0], responses[1]), margin, places, contrast, seed)
+
+
+def check_same_outline(first: Layout, second: Layout) -> None:
+    """Raise `ValueError` unless both are on the same skin, but for where its drawing has its origin."""
+    sizes = []
+    for layout in (first, second):
+        low_x, high_x, low_y, high_y = layout.known_outline.extent
+        sizes.append((high_x - low_x, high_y - low_y, layout.known_outline.area))
+    if any(abs(a - b) > 1e-3 * a for a, b in zip(*sizes, strict=True)):
+        said = " and ".join(
+            f"'{layout.name}' {1e3 * width:.4g} × {1e3 * height:.4g} mm"
+            for layout, (width, height, _) in zip((first, second), sizes, strict=True)
+        )
+        raise ValueError(
+            f"the layouts are on different skins, {said}; a file that does not say its skin takes --width-mm and "
+            "--height-mm."
+        )
 
 
 def comparison(one: SkinResponse, other: SkinResponse) -> list[dict]:
@@ -15,12 +100,12 @@ def comparison(one: SkinResponse, other: SkinResponse) -> list[dict]:
     return [_told(*pair) for pair in ((one, other), (other, one))]
 
 
-def _told(felt: SkinResponse, other: SkinResponse) -> dict:
-    theta, taxels = felt.sensitivity, felt.taxels
+def _told(response: SkinResponse, other: SkinResponse) -> dict:
+    theta, taxels = response.sensitivity, response.taxels
     areas = 1e4 * np.asarray(taxels.areas)
     return {
-        "layout": felt.layout.name,
-        "electrodes": felt.layout.num_electrodes,
+        "layout": response.layout.name,
+        "electrodes": response.layout.num_electrodes,
         "measurements": theta.changes.shape[1],
         "sensitivity_min_V": float(theta.minimum),
         "sensitivity_mean_V": float(theta.mean),

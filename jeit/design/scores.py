@@ -23,67 +23,14 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jeit.design.sensitivity import uniformity
-from jeit.design.skin.indentation import AbstractIndentation
-from jeit.design.skin.touched_cells import TouchedCells, touched_cells
+from jeit.design.skin.defaults import TEMPERATURE
+from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity
-from jeit.mesh import Mesh, centroids
 from jeit_solvers.dense.cholesky import inverse_cholesky
 
 # The largest eigenvalue to ln(r) / 2^k, relative, however close the next.
 _SQUARINGS = 10
-
-
-class SheetTouches(eqx.Module):
-    """Touches of a sheet at n places, and how they change as the places move; make them with `sheet_touches`.
-
-    **Fields**: `presses`; `slope` (n, c, 2), the derivative of `presses.change` in the place, per metre; `thickness` of
-    the layer that the sheet stands for and `depth` of the touches, metres.
-    """
-
-    presses: TouchedCells
-    slope: Float[Array, "n c 2"]
-    thickness: Float[Array, ""]
-    depth: float
-
-    def at_thickness(self, thickness) -> "SheetTouches":
-        """The same touches of a layer of another thickness, metres: they take depth / thickness of the way."""
-        share = self.thickness / thickness
-        presses = eqx.tree_at(lambda one: one.change, self.presses, self.presses.change * share)
-        return SheetTouches(presses, self.slope * share, jnp.asarray(thickness), self.depth)
-
-    def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:
-        """Change of every cell's conductivity by every touch, siemens, and its derivative in the place."""
-        cells = self.presses.cells
-        blank = jnp.zeros((len(cells), len(conductivity)))
-
-        def spread(change):
-            return blank.at[jnp.arange(len(cells))[:, None], cells].add(change * conductivity[cells])
-
-        return spread(self.presses.change), jnp.stack([spread(self.slope[..., axis]) for axis in range(2)])
-
-
-def sheet_touches(
-    mesh: Mesh, indentation: AbstractIndentation, places, *, thickness: float, contrast: float = 0.0
-) -> SheetTouches:
-    """Indent a sheet (2-D mesh) of a layer of `thickness` metres at `places` (n, 2), metres.
-
-    The rest as in `touched_cells`. The derivative is of the indentation's depth at the middles of the cells. Raises
-    `ValueError` as `touched_cells` does, and for a mesh that is no sheet.
-    """
-    if mesh.dimension != 2:
-        raise ValueError(f"mesh is {mesh.dimension}-D; scores are of the equivalent sheet, with a 2-D mesh.")
-    presses = touched_cells(mesh, indentation, places, thickness=thickness, contrast=contrast)
-
-    def change(place, middle):
-        # The root has no derivative at 0; a thousandth of a micrometre is nothing to a depth.
-        distance = jnp.sqrt(jnp.sum((place - middle) ** 2) + 1e-18)
-        return (contrast - 1) * indentation.depth_at(distance) / thickness
-
-    middles = centroids(mesh)[presses.cells]
-    slope = jax.jit(jax.vmap(jax.vmap(jax.grad(change), (None, 0))))(presses.places, middles)
-    slope = jnp.where(presses.change[..., None] != 0, slope, 0.0)
-    return SheetTouches(presses, slope, jnp.asarray(thickness, float), float(indentation.depth_at(jnp.zeros(()))))
 
 
 class TouchPrior(eqx.Module):
@@ -164,7 +111,7 @@ def layout_scores(
     *,
     prior: TouchPrior,
     noise,
-    temperature: float = 0.1,
+    temperature: float = TEMPERATURE,
 ) -> Scores:
     """All scores of the layout of a model on a sheet, from one factorisation and the Jacobian.
 
@@ -195,7 +142,7 @@ def _check(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise,
     if len(prior.factor) != len(touches.slope):
         raise ValueError(
             f"prior is of {len(prior.factor)} places and there are {len(touches.slope)} touches; make it of theirs, "
-            "TouchPrior.create(touches.presses.places, …)."
+            "TouchPrior.create(touches.touched.places, …)."
         )
     if noise.shape not in ((), (channels,)):
         raise ValueError(f"noise has shape {noise.shape}; give one number, or one for each of {channels} channels.")

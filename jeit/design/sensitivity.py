@@ -6,54 +6,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jeit.design.skin.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation, Bell
+from jeit.design.skin.touch_grid import TouchGrid
 from jeit.design.skin.touched_cells import touched_cells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
-from jeit.mesh import Domain
-
-
-class TouchGrid(eqx.Module):
-    """Where a skin is touched: the middles of equal rectangles that cover it.
-
-    - `places`: (n, 2) metres; `rows`, `columns`: (n,) of each in the raster, row 0 at the least y.
-    - `shape`: (rows, columns) of the raster; `pitch`: (width, height) of a rectangle, metres.
-    """
-
-    places: Float[np.ndarray, "n 2"]
-    rows: np.ndarray
-    columns: np.ndarray
-    shape: tuple[int, int] = eqx.field(static=True)
-    pitch: tuple[float, float] = eqx.field(static=True)
-
-    @property
-    def cell_area(self) -> float:
-        """Of a rectangle, m²."""
-        return self.pitch[0] * self.pitch[1]
-
-    def raster(self, values) -> Float[np.ndarray, "rows columns"]:
-        """Values (n,) as an image, NaN off the skin."""
-        image = np.full(self.shape, np.nan)
-        image[self.rows, self.columns] = np.asarray(values)
-        return image
-
-
-def touch_grid(outline: Domain, columns: int = 48, rows: int = 48) -> TouchGrid:
-    """Rectangles over the bounding box of `outline`, those whose middle lies inside; 48 × 48 as in Park et al. 2022.
-
-    Raises `ValueError` for fewer than one row or column.
-    """
-    if columns < 1 or rows < 1:
-        raise ValueError(
-            f"a grid needs one column and one row at least; {columns} columns and {rows} rows were asked for."
-        )
-    low_x, high_x, low_y, high_y = outline.extent
-    width, height = (high_x - low_x) / columns, (high_y - low_y) / rows
-    x, y = low_x + width * (np.arange(columns) + 0.5), low_y + height * (np.arange(rows) + 0.5)
-    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    inside = np.asarray(outline.contains(places))
-    row, column = np.divmod(np.flatnonzero(inside), columns)
-    return TouchGrid(places[inside], row, column, (rows, columns), (float(width), float(height)))
 
 
 def uniformity(sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
@@ -116,7 +74,7 @@ def sensitivity_map(
     *,
     indentation: AbstractIndentation | None = None,
     thickness: float | None = None,
-    contrast: float = 0.0,
+    contrast: float = CONTRAST,
     linear: bool = False,
 ) -> SensitivityMap:
     """Touch a skin at every place of `grid` and see how its voltages change.
@@ -124,5 +82,5 @@ def sensitivity_map(
     `indentation`: the unit deformation of Park et al. 2022 unless given. `thickness` (a sheet's) and `contrast` as in
     `touched_cells`; `linear` as in `touch_changes`. Raises `ValueError` as they do.
     """
-    presses = touched_cells(model.mesh, indentation or Bell(), grid.places, thickness=thickness, contrast=contrast)
-    return SensitivityMap(grid, touch_changes(model, conductivity, presses, linear=linear))
+    touched = touched_cells(model.mesh, indentation or Bell(), grid.places, thickness=thickness, contrast=contrast)
+    return SensitivityMap(grid, touch_changes(model, conductivity, touched, linear=linear))

@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jeit.design.skin.defaults import NUM_TAXELS, THRESHOLD
 from jeit_solvers import KMeans, kmeans
 
 
@@ -94,8 +95,8 @@ def find_taxels(
     places: ArrayLike,
     cell_area: ArrayLike,
     *,
-    num_taxels: int = 90,
-    threshold: float = 0.7,
+    num_taxels: int = NUM_TAXELS,
+    threshold: float = THRESHOLD,
     key: Any,
     directions: bool = False,
     restarts: int = 10,

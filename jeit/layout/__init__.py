@@ -12,4 +12,5 @@ from jeit.layout.arrangements import ring_and_centre as ring_and_centre
 from jeit.layout.files import read_layout as read_layout
 from jeit.layout.files import write_layout as write_layout
 from jeit.layout.layout import Layout as Layout
-from jeit.layout.layout import named_layout as named_layout
+from jeit.layout.names import BUILT_IN as BUILT_IN
+from jeit.layout.names import named_layout as named_layout

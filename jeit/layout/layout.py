@@ -1,6 +1,5 @@
-"""`Layout`: where round electrodes sit on a flat skin, and the layouts that have a name."""
+"""`Layout`: where round electrodes sit on a flat skin."""
 
-import re
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -10,8 +9,7 @@ from jaxtyping import Array, Float
 
 from jeit.electrodes.discs import SheetDiscs
 from jeit.electrodes.electrodes import as_electrode_values, as_positions, is_concrete
-from jeit.layout.arrangements import grid, quasi_uniform
-from jeit.mesh import Domain, Rectangle
+from jeit.mesh import Domain
 
 # A skin outside these is not known to exist: its lengths would be in millimetres, or have been divided by 1000 twice.
 SMALLEST, LARGEST = 1e-3, 5.0  # m
@@ -75,7 +73,7 @@ class Layout(eqx.Module):
         return self.centres.shape[0]
 
     @property
-    def skin(self) -> Domain:
+    def known_outline(self) -> Domain:
         """The outline, for what cannot do without. Raises `ValueError` if it is not known."""
         if self.outline is None:
             raise ValueError(
@@ -99,53 +97,6 @@ class Layout(eqx.Module):
         if chosen is None:
             raise ValueError(f"contact_impedance: '{self.name}' does not say it; give it in ohm·m².")
         return SheetDiscs(self.centres, self.diameters / 2, chosen)
-
-
-# The paper's skin and the electrodes of its Fig. S4, in metres. It does not say how far the electrodes of its
-# conventional layout sit from the edge: here they leave 2 mm of hydrogel outside them.
-_SIDE, _DIAMETER, _FROM_EDGE = 0.2, 6e-3, 5e-3
-
-BUILT_IN = {
-    "park-inner": "32 electrodes spread evenly inside 200 × 200 mm (Park et al. 2022, the proposed design)",
-    "park-boundary": "32 electrodes evenly along the edge of 200 × 200 mm (Park et al. 2022, the conventional design)",
-    "grid-8x4": "a regular grid of 8 columns and 4 rows on 200 × 200 mm; any other counts likewise",
-}
-
-
-def named_layout(name: str) -> Layout:
-    """One of the layouts in `BUILT_IN`, on a 200 × 200 mm skin centred at the origin, electrodes 6 mm across.
-
-    - "park-inner" and "park-boundary": the two designs that text S4 of Park et al., Science Robotics 7, eabm7187 (2022)
-      compares. Its coordinates are not published, only "as evenly as possible in a square area" and "about 40 mm"
-      apart: here a centroidal Voronoi tessellation, nearest neighbours 31 to 38 mm apart. Around the edge, electrodes
-      lie 5 mm from it, 23.75 mm apart, none in a corner, counter-clockwise from the lower left.
-    - "grid-CxR": C columns and R rows, each electrode in the middle of an equal rectangle.
-
-    Raises `ValueError` for another name, and for a grid whose electrodes would overlap.
-    """
-    outline = Rectangle(_SIDE, _SIDE)
-    if name == "park-inner":
-        return Layout(quasi_uniform(outline, 32), _DIAMETER, outline=outline, name=name)
-    if name == "park-boundary":
-        track = Rectangle(_SIDE - 2 * _FROM_EDGE, _SIDE - 2 * _FROM_EDGE)
-        pitch = track.perimeter / 32
-        return Layout(track.boundary(pitch * (np.arange(32) + 0.5)), _DIAMETER, outline=outline, name=name)
-    counts = re.fullmatch(r"grid-(\d{1,4})x(\d{1,4})", name) if isinstance(name, str) else None
-    if counts is None:
-        raise ValueError(
-            f"name: there is no layout {name!r}; take {', '.join(BUILT_IN)} (or another grid-CxR), or a file's."
-        )
-    columns, rows = (int(count) for count in counts.groups())
-    if min(columns, rows) < 1:
-        raise ValueError(f"name: {name!r} has no electrodes; give at least one column and one row.")
-    pitches = _SIDE / columns, _SIDE / rows
-    if min(pitches) < _DIAMETER:
-        raise ValueError(
-            f"name: the electrodes of {name!r} would be {1e3 * min(pitches):.3g} mm apart, and they are "
-            f"{1e3 * _DIAMETER:g} mm across; give fewer."
-        )
-    centres = grid(_SIDE - pitches[0], _SIDE - pitches[1], columns, rows)
-    return Layout(centres, _DIAMETER, outline=outline, name=name)
 
 
 def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain | None, called: Sequence[str]) -> None:

@@ -6,6 +6,12 @@ from jeit.report.choice import write_choice as write_choice
 from jeit.report.image import draw_image as draw_image
 from jeit.report.image import report_image as report_image
 from jeit.report.image import write_image as write_image
+from jeit.report.layout_comparison import draw_layout_comparison as draw_layout_comparison
+from jeit.report.layout_comparison import report_layout_comparison as report_layout_comparison
+from jeit.report.layout_comparison import write_layout_comparison as write_layout_comparison
+from jeit.report.layout_improvement import draw_improved_layout as draw_improved_layout
+from jeit.report.layout_improvement import report_improved_layout as report_improved_layout
+from jeit.report.layout_improvement import write_improved_layout as write_improved_layout
 from jeit.report.measurement import report_measurement as report_measurement
 from jeit.report.stream import write_stream as write_stream
 from jeit.report.study import write_study_report as write_study_report

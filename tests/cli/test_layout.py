@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from jeit.design import TouchedSkin
+from jeit.design import Skin
 from jeit.layout import Layout, grid, write_layout
 from jeit.mesh import Rectangle
 
@@ -44,7 +44,7 @@ def test_two_files_side_by_side(layouts, run, tmp_path):
 
 def test_the_second_layout_is_checked_before_the_first_is_touched(layouts, run, tmp_path, monkeypatch):
     touched = []
-    monkeypatch.setattr(TouchedSkin, "feel", lambda skin, key: touched.append(skin.layout.name))
+    monkeypatch.setattr(Skin, "voltage_changes", lambda skin, cells: touched.append(skin.layout.name))
     write_layout(Layout(grid(0.04, 0.03, 3, 2), 3e-3, outline=SKIN), tmp_path / "small.svg")
     write_layout(Layout(grid(0.04, 0.0, 3, 1), 8e-3, outline=SKIN), tmp_path / "three.svg")
     for second, said in (

@@ -9,17 +9,20 @@ from matplotlib.path import Path
 
 from jeit.design import (
     Bell,
-    Constraints,
+    DesignSpace,
+    Objective,
+    Skin,
     TouchPrior,
-    balanced,
     layout_scores,
     optimise_layout,
     sensitivity_map,
-    sheet_touches,
     touch_grid,
     touches_away_from_the_edge,
 )
-from jeit.design.optimisation.variables import Design, Skin
+from jeit.design.optimisation.constraints import Constraints
+from jeit.design.optimisation.objective import balanced
+from jeit.design.optimisation.variables import Variables, Varied
+from jeit.design.skin.sheet_touches import sheet_touches
 from jeit.electrodes import PointElectrodes
 from jeit.forward import ForwardModel
 from jeit.layout import Layout, named_layout, perimeter
@@ -40,8 +43,12 @@ KEEP_OUT = Disk(0.015, (0.02, 0.02))
 SETTING = {"prior": TouchPrior.create(PLACES, correlation=0.02), "noise": 1e-4}
 
 
-def optimise(layout=START, **options):
-    return optimise_layout(layout, MODEL, 2e-3, TOUCHES, **SETTING, **options)
+def optimise(layout=START, *, model=MODEL, steps=100, starts=1, key=None, callback=None, **space):
+    skin = Skin(layout, model, thickness=0.01, conductivity=0.2)
+    found = DesignSpace(**space)
+    return optimise_layout(
+        skin, Objective(TOUCHES, **SETTING), found, steps=steps, starts=starts, key=key, callback=callback
+    )
 
 
 def optimise_from_three(**options):
@@ -159,10 +166,10 @@ def test_skins_that_leave_room_in_their_box(outline):
     rim = inside[np.argsort(-np.linalg.norm(inside - middle, axis=1), kind="stable")]
     layout = Layout(rim[: 2 * NUMBER : 2], 6e-3, outline=outline)
     places = touch_grid(outline, 7, 7).places
-    setting = {"prior": TouchPrior.create(places, correlation=0.02), "noise": 1e-4}
     model = ForwardModel(mesh, layout.sheet_discs(1e-4), two_terminal(NUMBER))
-    touches = sheet_touches(mesh, Bell(), places, thickness=0.01)
-    found = optimise_layout(layout, model, 2e-3, touches, **setting, steps=10, starts=2, key=jax.random.key(0))
+    skin = Skin(layout, model, thickness=0.01, conductivity=0.2)
+    objective = Objective.create(skin, places, correlation=0.02, noise=1e-4)
+    found = optimise_layout(skin, objective, steps=10, starts=2, key=jax.random.key(0))
     assert found.status != "stalled"
     assert found.history.shape[1] > 5
     assert found.value > found.start_value + 0.5
@@ -190,7 +197,8 @@ def test_optimised_skin_beats_the_paper_s_and_a_regular_grid():
         return ForwardModel(mesh, start.sheet_discs(1e-4), protocol), grid, touches, {"prior": prior, "noise": 1e-4}
 
     model, _, touches, options = setting(1300, 14)
-    found = optimise_layout(start, model, conductance, touches, **options, minimum_spacing=8e-3, steps=25)
+    skin = Skin(start, model, thickness=0.01, conductivity=conductance / 0.01)
+    found = optimise_layout(skin, Objective(touches, **options), DesignSpace(minimum_spacing=8e-3), steps=25)
     model, grid, touches, options = setting(6000, 24)
     worst, variance = {}, {}
     for layout in (found.layout, start, named_layout("park-inner"), named_layout("grid-8x4")):
@@ -228,9 +236,9 @@ def test_errors_teach():
         optimise(Layout(START.centres, 8e-3))
     with pytest.raises(ValueError, match="the model 8; their number cannot change"):
         optimise(Layout(START.centres[:6], 8e-3, outline=SKIN))
-    five = Skin(START.centres[:5], START.diameters[:5] / 2, jnp.ones(5), jnp.ones(()))
+    five = Varied(START.centres[:5], START.diameters[:5] / 2, jnp.ones(5), jnp.ones(()))
     with pytest.raises(ValueError, match="add or remove 1, or choose another symmetry"):
-        Design.create(SKIN, five, symmetry="mirror-x")
+        Variables.create(SKIN, five, symmetry="mirror-x")
     with pytest.raises(ValueError, match="contact_impedance must be two values"):
         optimise(contact_impedance=(1e-3, 1e-4))
     with pytest.raises(ValueError, match=r"the touches are 2\.5 mm deep"):
@@ -241,7 +249,12 @@ def test_errors_teach():
         optimise(steps=0)
     points = ForwardModel(MESH, PointElectrodes(START.centres), two_terminal(NUMBER))
     with pytest.raises(ValueError, match="model has PointElectrodes"):
-        optimise_layout(START, points, 2e-3, TOUCHES, **SETTING)
+        optimise(model=points)
+    thicker = Skin(START, MODEL, thickness=0.02, conductivity=0.2)
+    with pytest.raises(ValueError, match="touches are of a sheet 10 mm thick, and the skin is 20 mm thick"):
+        optimise_layout(thicker, Objective(TOUCHES, **SETTING))
+    with pytest.raises(ValueError, match="skin is a layer; layouts are optimised on a sheet"):
+        optimise_layout(Skin.create(START, cell_size=0.012), Objective(TOUCHES, **SETTING))
 
 
 def test_constraints_that_cannot_be_met_are_reported():

@@ -6,15 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.design import (
-    Bell,
-    TouchPrior,
-    layout_scores,
-    sheet_touches,
-    touch_changes,
-    touch_grid,
-    touched_cells,
-)
+from jeit.design import Bell, TouchPrior, layout_scores, touch_grid
+from jeit.design.skin.sheet_touches import sheet_touches
+from jeit.design.skin.touched_cells import touched_cells
+from jeit.design.skin.voltage_changes import touch_changes
 from jeit.electrodes import SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.mesh import Rectangle, box, rectangle
@@ -62,7 +57,7 @@ def scores():
 
 @pytest.fixture(scope="module")
 def changes():
-    return np.asarray(touch_changes(MODEL, CONDUCTANCE, TOUCHES.presses, linear=True))
+    return np.asarray(touch_changes(MODEL, CONDUCTANCE, TOUCHES.touched, linear=True))
 
 
 def test_sensitivity_is_that_of_linear_touches(scores, changes):
@@ -85,7 +80,7 @@ def test_optimality_is_that_of_dense_matrices(scores, changes):
     np.testing.assert_allclose(scores.largest_variance, np.linalg.eigvalsh(covariance)[-1], rtol=1e-3)
 
 
-def test_slopes_are_those_of_shifted_presses():
+def test_slopes_are_those_of_shifted_touches():
     step = 1e-6
     for axis in range(2):
         shift = step * np.eye(2)[axis]

@@ -4,30 +4,38 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.design import TouchedSkin, comparison, feel, sensitivity_map, touches_away_from_the_edge
+from jeit.design import Skin, sensitivity_map, skin_response, touches_away_from_the_edge
+from jeit.design.comparison import comparison
+from jeit.design.skin import defaults
+from jeit.design.skin.protocol import skin_protocol
 from jeit.layout import Layout, grid
-from jeit.mesh import Rectangle
+from jeit.mesh import Polygon, Rectangle
 
-SKIN = Rectangle(0.06, 0.05)
-LAYOUT = Layout(grid(0.04, 0.03, 3, 2), 8e-3, outline=SKIN, name="six")
-GRID = touches_away_from_the_edge(SKIN, 5e-3, 10, 10)
-OPTIONS = {"num_pairs": 6, "num_taxels": 8, "num_layers": 4, "cell_size": 6e-3}
+OUTLINE = Rectangle(0.06, 0.05)
+LAYOUT = Layout(grid(0.04, 0.03, 3, 2), 8e-3, outline=OUTLINE, name="six")
+GRID = touches_away_from_the_edge(OUTLINE, 5e-3, 10, 10)
+OPTIONS = {"num_layers": 4, "cell_size": 6e-3}
+
+
+def respond(*, num_pairs=6, num_taxels=8, contrast=0.0, **options):
+    skin = Skin.create(LAYOUT, protocol=skin_protocol(LAYOUT, num_pairs=num_pairs), **{**OPTIONS, **options})
+    touched = skin.touched_cells(GRID.places, contrast=contrast)
+    return skin, skin_response(skin, GRID, key=jax.random.key(0), touched=touched, num_taxels=num_taxels)
 
 
 @pytest.mark.parametrize("contrast", [0.0, 5.0])
 def test_touches_insulate_or_conduct(contrast):
-    felt = feel(LAYOUT, GRID, key=jax.random.key(0), contrast=contrast, **OPTIONS)
-    model = TouchedSkin.create(LAYOUT, GRID, contrast=contrast, **OPTIONS).model
-    alone = sensitivity_map(model, 1.0, GRID, contrast=contrast)
-    np.testing.assert_allclose(felt.sensitivity.values, alone.values, rtol=1e-10)  # the solves' rounding
+    skin, response = respond(contrast=contrast)
+    alone = sensitivity_map(skin.model, 1.0, GRID, contrast=contrast)
+    np.testing.assert_allclose(response.sensitivity.values, alone.values, rtol=1e-10)  # the solves' rounding
 
 
 def test_a_comparison_with_itself_has_no_blind_spot():
-    felt = feel(LAYOUT, GRID, key=jax.random.key(0), **OPTIONS)
-    one, other = comparison(felt, felt)
+    _, response = respond()
+    one, other = comparison(response, response)
     assert one == other
     assert one["blind_spot_fraction"] == 0
-    theta = np.asarray(felt.sensitivity.values)
+    theta = np.asarray(response.sensitivity.values)
     assert one["sensitivity_uniformity"] == pytest.approx(theta.mean() / np.sqrt((theta**2).mean()))
 
 
@@ -38,11 +46,38 @@ def test_a_comparison_with_itself_has_no_blind_spot():
         ({"cell_size": 1e-5}, r"cell_size is 0\.01 mm, which makes about 1\.8e\+08 nodes; give 0\.14 mm or more"),
         ({"cell_size": 0.1}, "cell_size is 100 mm; give no more than 12 mm"),
         ({"thickness": 2e-3}, "thickness is 2 mm; give more than the 2.5 mm"),
+        ({"thickness": 0.5}, "thickness is 500 mm; give more than the 2.5 mm"),
         ({"conductivity": -1.0}, "conductivity"),
         ({"num_pairs": 16}, "num_pairs is 16; 'six' has 6 electrodes, and they make 15 pairs"),
         ({"num_taxels": 200}, "num_taxels is 200"),
     ],
 )
-def test_what_cannot_be_felt_is_refused_before_it_is_touched(options, said):
+def test_what_cannot_be_felt_is_refused_before_it_is_touched(options, said, monkeypatch):
+    monkeypatch.setattr(Skin, "voltage_changes", None)
     with pytest.raises(ValueError, match=said):
-        TouchedSkin.create(LAYOUT, GRID, **{**OPTIONS, **options})
+        respond(**options)
+
+
+def test_a_skin_is_a_sheet_or_a_layer_with_one_set_of_defaults():
+    sheet, layer = (Skin.create(LAYOUT, num_layers=number, cell_size=6e-3) for number in (0, 4))
+    assert [skin.model.mesh.dimension for skin in (sheet, layer)] == [2, 3]
+    for skin in (sheet, layer):
+        np.testing.assert_array_equal(skin.model.electrodes.contact_impedance, defaults.CONTACT_IMPEDANCE)
+        assert skin.model.protocol.num_measurements == 15  # all pairs, as there are no 94
+        assert (skin.thickness, float(skin.conductivity)) == (defaults.THICKNESS, defaults.CONDUCTIVITY)
+    assert float(sheet.model_conductivity) == pytest.approx(0.01)
+    assert float(layer.model_conductivity) == 1.0
+
+
+def test_the_same_mesh_with_other_electrodes():
+    skin = Skin.create(LAYOUT, num_layers=0, cell_size=6e-3)
+    moved = skin.with_layout(Layout(LAYOUT.centres + 2e-3, 8e-3, outline=OUTLINE, contact_impedance=5e-4))
+    assert moved.model.mesh.points is skin.model.mesh.points
+    np.testing.assert_array_equal(moved.model.electrodes.contact_impedance, 5e-4)
+    with pytest.raises(ValueError, match="cell_size is 6 mm; give no more than 3 mm"):
+        skin.with_layout(Layout(LAYOUT.centres, 2e-3, outline=OUTLINE))
+
+
+def test_a_drawing_of_a_rectangle_is_meshed_as_one():
+    drawn = Layout(LAYOUT.centres, 8e-3, outline=Polygon(OUTLINE.vertices))
+    assert isinstance(Skin.create(drawn, num_layers=0, cell_size=6e-3).outline, Rectangle)

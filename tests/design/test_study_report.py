@@ -115,10 +115,10 @@ def test_what_is_infinite_stands_in_table_and_picture(folder, tmp_path):
 
 
 def test_titles_tell_what_differs(tmp_path):
-    varied = TEXT.replace("diameter_mm = 10", "diameter_mm = [8, 10]").replace(
-        "[touch]",
-        '[measurement]\nprotocol = "two-terminal"\npairs = [0, 9]\nnoise_V = [1e-6, 2e-6]\n'
-        '[scores]\nwanted = "blind_spot"\n[touch]',
+    varied = (
+        TEXT.replace("diameter_mm = 10", "diameter_mm = [8, 10]")
+        .replace('protocol = "adjacent"', 'protocol = "two-terminal"\npairs = [0, 9]\nnoise_V = [1e-6, 2e-6]')
+        .replace("[touch]", '[scores]\nwanted = "blind_spot"\n[touch]')
     )
     (tmp_path / "study.toml").write_text(varied, "utf-8")
     titles = pictures.titles_of(read_study(tmp_path / "study.toml"))

@@ -9,15 +9,17 @@ from studies import changed, in_another_process
 
 from jeit.design import (
     Bell,
+    Skin,
     TouchPrior,
-    feel,
     find_taxels,
     layout_scores,
-    nearest_pairs,
     sensitivity_map,
-    sheet_touches,
+    skin_response,
     touch_grid,
 )
+from jeit.design.measurements.selection import nearest_pairs
+from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.sheet_touches import sheet_touches
 from jeit.design.study import batch, open_results, read_study, run_study
 from jeit.electrodes import FaceDiscs, SheetDiscs
 from jeit.forward import ForwardModel
@@ -105,18 +107,16 @@ def test_a_layer_is_touched_on_its_top(results):
 def test_exact_maps_of_layers_are_those_of_a_comparison(results):
     lines = {"skin": 'model = "layer"', "mesh": "layers = 3", "touch": "exact = true"}
     for point, values in results(measurement='protocol = "two-terminal"\npairs = 10', **lines):
-        felt = feel(
+        skin = Skin.create(
             point.layout,
-            GRID,
-            key=jax.random.key(0),
             thickness=point.thickness,
             conductivity=0.5,
             cell_size=8e-3,
             num_layers=3,
-            num_pairs=10,
-            num_taxels=3,
+            protocol=skin_protocol(point.layout, num_pairs=10),
         )
-        np.testing.assert_allclose(values, felt.sensitivity.values, rtol=1e-8)
+        response = skin_response(skin, GRID, key=jax.random.key(0), num_taxels=3)
+        np.testing.assert_allclose(values, response.sensitivity.values, rtol=1e-8)
 
 
 @pytest.mark.parametrize("exact", [True, False])
@@ -138,7 +138,7 @@ def test_a_place_that_cannot_be_told_is_infinite_and_counted(tmp_path, store_pat
 
 
 def test_a_batch_factorises_once_and_calls_no_library(study):
-    shared, skin = batch._shared(study, study.points[0].shape), batch._skin(study.points[0], study.current)
+    shared, skin = batch._shared(study, study.points[0].shape), batch._varied(study.points[0], study.current)
     skins, options = batch._stacked([skin] * 2), {"num_taxels": 5, "threshold": 0.7, "num_devices": 1}
 
     def compiled(*scores):

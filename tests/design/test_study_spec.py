@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from jeit.design import Bell, Hemisphere
+from jeit.design.skin import defaults
+from jeit.design.skin.protocol import skin_protocol
 from jeit.design.study import read_study
 from jeit.electrodes import FaceDiscs
 from jeit.layout import Layout, grid, write_layout
@@ -31,6 +33,7 @@ def test_a_sweep_is_the_product_of_its_lists(read):
     study = read(
         'name = "all"\nchunk_points = 4\n[skin]\nthickness_mm = [5, 10]\nconductivity_S_per_m = [0.5, 1, 2]\n'
         '[electrodes]\nlayouts = ["grid-4x4", "perimeter-16", "inner-12"]\ndiameter_mm = [6, 8]\n'
+        "contact_impedance_ohm_m2 = 1e-3\n"
         '[measurement]\nprotocol = ["adjacent", "two-terminal"]\nnoise_V = [1e-6, 1e-5]\n[mesh]\ncell_mm = [5, 6]\n'
         '[scores]\nwanted = "blind_spot"'
     )
@@ -84,7 +87,7 @@ def test_files_lie_beside_the_study_and_keep_their_own_sizes(read, tmp_path):
     np.testing.assert_allclose(first.layout.centres, centres, atol=1e-9)
     assert first.coordinates["diameter_mm"] == 9.0
     assert first.coordinates["contact_impedance_ohm_m2"] == 0.02
-    assert second.coordinates["contact_impedance_ohm_m2"] == 1e-3
+    assert second.coordinates["contact_impedance_ohm_m2"] == defaults.CONTACT_IMPEDANCE
     assert {point.coordinates["diameter_mm"] for point in read(text + "diameter_mm = 7").points} == {7.0}
     with pytest.raises(ValueError, match=r"mine\.svg.*skin spans -100 to 100 mm.*skin\.width_mm"):
         read(text + "[skin]\nwidth_mm = 300\nheight_mm = 200")
@@ -95,6 +98,17 @@ def test_touches_are_those_of_the_library(read):
     study = read(one(rest='[touch]\nindentation = "hemisphere"\ndepth_mm = 2'))
     assert study.indentation == Hemisphere(2e-3, 15e-3)
     assert (study.columns, study.rows) == (24, 24)
+
+
+def test_a_study_s_defaults_are_those_of_a_skin(read):
+    [few, many] = read(one(rest="").replace('"grid-4x4"', '["grid-4x3", "grid-4x4"]')).points
+    for point, pairs in ((few, 66), (many, defaults.NUM_PAIRS)):
+        assert (point.thickness, point.conductivity) == (defaults.THICKNESS, defaults.CONDUCTIVITY)
+        assert (point.cell_size, point.noise) == (pytest.approx(defaults.CELL_SIZE), defaults.NOISE)
+        np.testing.assert_array_equal(point.layout.contact_impedance, defaults.CONTACT_IMPEDANCE)
+        protocol = skin_protocol(point.layout)
+        assert protocol.num_measurements == pairs
+        np.testing.assert_array_equal(point.measured(defaults.CURRENT).drive, protocol.drive)
 
 
 def test_a_fingerprint_tells_what_decides_the_results(read, tmp_path):
@@ -121,7 +135,7 @@ def test_a_fingerprint_tells_what_decides_the_results(read, tmp_path):
         one(rest="[touch]\nexact = true"),
         one(rest='[skin]\nmodel = "layer"'),
         one(rest='[skin]\nmodel = "layer"\n[mesh]\nlayers = 4'),
-        one(rest='[measurement]\nprotocol = "two-terminal"'),
+        one(rest='[measurement]\nprotocol = "adjacent"'),
         one(rest='[measurement]\nprotocol = "two-terminal"\npairs = 30'),
         "chunk_points = 2\n" + one(),
     ]
@@ -241,7 +255,7 @@ def test_refused_naming_the_key_and_what_to_do(read, text, message):
         ("mesh.layers", "layers = 3", "skin.model", ["layer"]),
         ("touch.diameter_mm", "diameter_mm = 20", "touch.indentation", ["hemisphere"]),
         ("touch.deviation_mm", "indentation = 'hemisphere'\ndeviation_mm = 8", "touch.indentation", ["bell"]),
-        ("measurement.pairs", "pairs = 30", "measurement.protocol", ["two-terminal"]),
+        ("measurement.pairs", "protocol = 'adjacent'\npairs = 30", "measurement.protocol", ["two-terminal"]),
         ("measurement.noise_V", "noise_V = [1e-5, 1e-6]", "scores.wanted", ["blind_spot", "localisation_error"]),
         ("scores.num_taxels", "num_taxels = 80", "scores.wanted", ["taxels"]),
         ("scores.threshold", "threshold = 0.8", "scores.wanted", ["taxels"]),

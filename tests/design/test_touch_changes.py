@@ -6,7 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.design import Bell, Hemisphere, TouchedCells, touch_changes, touched_cells
+from jeit.design import Bell, Hemisphere
+from jeit.design.skin.touched_cells import TouchedCells, touched_cells
+from jeit.design.skin.voltage_changes import touch_changes
 from jeit.electrodes import FaceDiscs, PointElectrodes, SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.layout import grid
@@ -35,11 +37,11 @@ def models():
     }
 
 
-def anew(model, conductivity, presses):
+def anew(model, conductivity, touched):
     """The straightforward way: the model solved for every touch; what is cut off keeps a billionth."""
     before = np.asarray(model.voltages(conductivity))
     found = []
-    for cells, change in zip(np.asarray(presses.cells), np.asarray(presses.change), strict=True):
+    for cells, change in zip(np.asarray(touched.cells), np.asarray(touched.change), strict=True):
         values = np.array(conductivity)
         np.add.at(values, cells, values[cells] * change)
         found.append(np.asarray(model.voltages(np.maximum(values, 1e-9 * conductivity))) - before)
@@ -62,9 +64,9 @@ def test_exact_changes_are_those_of_solving_anew(kind, options, models):
     model = models[kind]
     conductivity = 0.5 + 0.4 * np.random.default_rng(0).random(model.mesh.num_cells)
     for indentation in (Bell(), Hemisphere(depth=3e-3, diameter=20e-3)):
-        presses = touched_cells(model.mesh, indentation, PLACES, **options)
-        expected = anew(model, conductivity, presses)
-        found = touch_changes(model, conductivity, presses)
+        touched = touched_cells(model.mesh, indentation, PLACES, **options)
+        expected = anew(model, conductivity, touched)
+        found = touch_changes(model, conductivity, touched)
         np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
@@ -76,12 +78,12 @@ def test_a_touch_that_is_found_at_once_waits_for_a_slow_one(models):
     change = 10 ** draw.uniform(-3, 4, (8, 60)) - 1
     change[::2] = 0
     change[0, 0], change[2, 0], change[4, :5], change[6, :12] = -0.1, -1.0, -1.0, -1.0
-    presses = TouchedCells(
+    touched = TouchedCells(
         jnp.zeros((8, 2)), jnp.asarray(np.tile(cells, (8, 1))), jnp.asarray(change), model.mesh.num_cells
     )
     conductivity = np.full(model.mesh.num_cells, 0.5)
-    expected = anew(model, conductivity, presses)
-    found = touch_changes(model, conductivity, presses)
+    expected = anew(model, conductivity, touched)
+    found = touch_changes(model, conductivity, touched)
     np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
@@ -91,18 +93,18 @@ def test_nearly_cut_off_layers_are_exact(models):
     model = models["layer"]
     conductivity = np.full(model.mesh.num_cells, 0.5)
     for indentation in (Bell(), Bell(depth=5e-3), Hemisphere(depth=3e-3, diameter=20e-3)):
-        presses = touched_cells(model.mesh, indentation, PLACES, edge=1e-3)
-        expected = anew(model, conductivity, presses)
-        found = touch_changes(model, conductivity, presses)
+        touched = touched_cells(model.mesh, indentation, PLACES, edge=1e-3)
+        expected = anew(model, conductivity, touched)
+        found = touch_changes(model, conductivity, touched)
         np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
 def test_touches_that_are_not_found_are_an_error(models, monkeypatch):
     monkeypatch.setattr("jeit.design.skin.voltage_changes._MOST_STEPS", 1)
     model = models["sheet"]
-    presses = touched_cells(model.mesh, Bell(), np.array([[0.01, 0.02], [0.0, 0.0], [0.02, 0.0]]), **SHEET)
+    touched = touched_cells(model.mesh, Bell(), np.array([[0.01, 0.02], [0.0, 0.0], [0.02, 0.0]]), **SHEET)
     with pytest.raises(RuntimeError, match=r"3 of 3 touches were not found in 1 steps, the first at \(10, 20\) mm"):
-        touch_changes(model, 0.5, presses)
+        touch_changes(model, 0.5, touched)
 
 
 def test_conductors_that_drown_the_voltages_in_rounding_are_an_error(models):
@@ -117,9 +119,9 @@ def test_conductors_that_drown_the_voltages_in_rounding_are_an_error(models):
 
 def test_exact_changes_are_not_traced(models):
     model = models["sheet"]
-    presses = touched_cells(model.mesh, Bell(), PLACES, **SHEET)
+    touched = touched_cells(model.mesh, Bell(), PLACES, **SHEET)
     with pytest.raises(ValueError, match="cannot be traced"):
-        jax.jit(lambda conductivity: touch_changes(model, conductivity, presses))(0.5)
+        jax.jit(lambda conductivity: touch_changes(model, conductivity, touched))(0.5)
 
 
 def test_touches_that_change_nothing_change_no_voltage(models):
@@ -129,9 +131,9 @@ def test_touches_that_change_nothing_change_no_voltage(models):
 
 
 def test_touches_of_another_mesh_are_refused(models):
-    presses = touched_cells(models["layer"].mesh, Bell(), PLACES)
+    touched = touched_cells(models["layer"].mesh, Bell(), PLACES)
     with pytest.raises(ValueError, match="the touches are of a mesh of"):
-        touch_changes(models["sheet"], 0.5, presses)
+        touch_changes(models["sheet"], 0.5, touched)
 
 
 def test_small_touches_are_linear(models):
@@ -139,8 +141,8 @@ def test_small_touches_are_linear(models):
     model = models["sheet"]
     left = []
     for depth in (1e-4, 2e-4):
-        presses = touched_cells(model.mesh, Bell(depth=depth), PLACES, **SHEET)
-        exact, linear = (touch_changes(model, 0.5, presses, linear=linear) for linear in (False, True))
+        touched = touched_cells(model.mesh, Bell(depth=depth), PLACES, **SHEET)
+        exact, linear = (touch_changes(model, 0.5, touched, linear=linear) for linear in (False, True))
         left.append(np.abs(exact - linear).max())
     assert left[1] / left[0] == pytest.approx(4, rel=0.05)
     assert left[0] < 0.02 * np.abs(linear).max()
@@ -148,12 +150,12 @@ def test_small_touches_are_linear(models):
 
 def test_linear_changes_have_derivatives_in_electrode_positions_and_batch(models):
     model = models["sheet"]
-    presses = touched_cells(model.mesh, Bell(), PLACES, **SHEET)
+    touched = touched_cells(model.mesh, Bell(), PLACES, **SHEET)
     direction = np.random.default_rng(1).normal(size=CENTRES.shape)
 
     def changes(move):
         moved = eqx.tree_at(lambda e: e.position, model.electrodes, model.electrodes.position + move * direction)
-        return touch_changes(model.with_electrodes(moved), 0.5, presses, linear=True)
+        return touch_changes(model.with_electrodes(moved), 0.5, touched, linear=True)
 
     slope = jax.jvp(changes, (0.0,), (1.0,))[1]
     step = 1e-6
@@ -168,9 +170,9 @@ def test_linear_changes_have_derivatives_in_electrode_positions_and_batch(models
 def test_touches_weaken_and_do_not_depend_on_their_order(models):
     """An insulating touch raises every self-impedance; touches do not see each other."""
     model = models["layer"]
-    presses = touched_cells(model.mesh, Bell(), PLACES)
+    touched = touched_cells(model.mesh, Bell(), PLACES)
     turned = touched_cells(model.mesh, Bell(), PLACES[::-1])
-    found = touch_changes(model, 1.0, presses)
+    found = touch_changes(model, 1.0, touched)
     np.testing.assert_allclose(found[::-1], touch_changes(model, 1.0, turned), rtol=1e-9, atol=1e-18)
 
 

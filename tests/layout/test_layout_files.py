@@ -239,14 +239,14 @@ def test_svg_roles_by_class_and_holes_in_a_path(tmp_path):
     np.testing.assert_allclose(layout.centres, [[0.019, -0.02], [0.04, -0.02]], atol=1e-9)
     assert layout.labels == ("A", "B")
     assert len(layout.outline.holes) == 1
-    np.testing.assert_allclose(layout.skin.area, 3200e-6 - 16e-6)
+    np.testing.assert_allclose(layout.known_outline.area, 3200e-6 - 16e-6)
 
 
 def test_svg_without_a_skin_takes_the_one_given(tmp_path):
     (tmp_path / "hand.svg").write_text(DRAWN.format(width="100mm", height="50mm", skin=""))
     assert read_layout(tmp_path / "hand.svg", outline=Rectangle(0.2, 0.2)).outline.width == 0.2
     with pytest.raises(ValueError, match=r"'hand' does not say the skin's; give it, as in read_layout"):
-        _ = read_layout(tmp_path / "hand.svg").skin
+        _ = read_layout(tmp_path / "hand.svg").known_outline
 
 
 class TestDrawings:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.layout import grid, perimeter, quasi_uniform, ring, ring_and_centre
+from jeit.layout import grid, named_layout, perimeter, quasi_uniform, ring, ring_and_centre
 from jeit.mesh import Disk, Polygon, Rectangle
 
 
@@ -55,3 +55,36 @@ def test_quasi_uniform_fills_any_outline_evenly(domain):
     assert gap.min() > 0.6 * ideal
     assert gap.max() < 1.3 * ideal
     np.testing.assert_array_equal(position, quasi_uniform(domain, 32, margin=0.005))
+
+
+@pytest.mark.parametrize(
+    ("name", "outline", "number"),
+    [
+        ("grid-5x3", Rectangle(0.1, 0.06, (0.01, 0.02)), 15),
+        ("perimeter-16", Rectangle(0.1, 0.06, (0.01, 0.02)), 16),
+        ("perimeter-12", Disk(0.05, (0.01, 0.02)), 12),
+        ("inner-9", Disk(0.05, (0.01, 0.02)), 9),
+        ("inner-9", Polygon([[0, 0], [0.2, 0], [0.2, 0.1], [0, 0.05]]), 9),
+    ],
+)
+def test_names_are_made_for_any_skin_and_diameter(name, outline, number):
+    layout = named_layout(name, outline, diameter=4e-3)  # Layout refuses electrodes that leave their skin
+    assert (layout.num_electrodes, layout.name, layout.outline) == (number, name, outline)
+    np.testing.assert_array_equal(layout.diameters, 4e-3)
+    if name.startswith("perimeter") and isinstance(outline, Disk):
+        distance = np.linalg.norm(np.asarray(layout.centres) - outline.centre, axis=1)
+        np.testing.assert_allclose(distance, 0.05 - 4e-3)  # a radius and 2 mm of skin
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("park-inner", "its skin spans -100 to 100 mm by -100 to 100 mm; on another take inner-32"),
+        ("perimeter-8", "'perimeter-8' is of rectangles and disks"),
+        ("inner-2000", "has 2000 electrodes; give 1024 or fewer"),
+        ("park-iner", "did you mean 'park-inner'"),
+    ],
+)
+def test_names_that_a_skin_has_not(name, said):
+    with pytest.raises(ValueError, match=said):
+        named_layout(name, Polygon([[0, 0], [0.2, 0], [0.2, 0.1], [0, 0.05]]))

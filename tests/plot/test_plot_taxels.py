@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import StepPatch
 from matplotlib.tri import TriContourSet
 
-from jeit.design import Taxels
+from jeit.design.taxels import Taxels
 from jeit.layout import grid
 from jeit.plot import plot_similarity, plot_taxel_areas, plot_taxels
 from jeit_solvers import KMeans

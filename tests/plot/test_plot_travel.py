@@ -6,7 +6,8 @@ import pytest
 from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
 
-from jeit.design import Optimisation, Scores
+from jeit.design.optimisation.optimise import Optimisation
+from jeit.design.scores import Scores
 from jeit.layout import Layout, grid
 from jeit.mesh import Disk, Rectangle
 from jeit.plot import plot_travel

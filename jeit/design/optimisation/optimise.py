@@ -5,7 +5,7 @@ stage to stage (the quadratic penalty method: Nocedal and Wright, Numerical Opti
 constraints is still missing then is made up by the nearest descent of the penalty alone.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -15,11 +15,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.design.optimisation.constraints import Constraints
+from jeit.design.optimisation.design_space import DesignSpace, varied_of
+from jeit.design.optimisation.objective import Objective
 from jeit.design.optimisation.search import Record, descend
-from jeit.design.optimisation.variables import Design, Skin, Symmetry
-from jeit.design.scores import Score, Scores, SheetTouches, TouchPrior, layout_scores
-from jeit.electrodes import SheetDiscs
-from jeit.forward import ForwardModel
+from jeit.design.optimisation.variables import Variables, Varied
+from jeit.design.scores import Scores
+from jeit.design.skin.defaults import STEPS
+from jeit.design.skin.skin import Skin
 from jeit.layout import Layout
 from jeit.mesh import Domain
 
@@ -68,102 +70,54 @@ class Optimisation(eqx.Module):
     reason: str = eqx.field(static=True)
 
 
-def balanced(scores: Scores) -> Float[Array, ""]:
-    """log of the soft-worst sensitivity minus that of the mean variance: a per cent of either counts alike."""
-    return jnp.log(scores.soft_worst) - jnp.log(scores.mean_variance)
-
-
 def optimise_layout(
-    layout: Layout,
-    model: ForwardModel,
-    conductivity,
-    touches: SheetTouches,
+    skin: Skin,
+    objective: Objective,
+    space: DesignSpace | None = None,
     *,
-    prior: TouchPrior,
-    noise,
-    score: Score = balanced,
-    temperature: float = 0.1,
-    outline: Domain | None = None,
-    minimum_spacing: float = 0.0,
-    keep_out: Sequence[Domain] = (),
-    symmetry: Symmetry | None = None,
-    sizes: bool | tuple[float, float] = False,
-    contact_impedance: tuple[float, float] | None = None,
-    thickness: tuple[float, float] | None = None,
-    steps: int = 100,
+    steps: int = STEPS,
     starts: int = 1,
     key: Array | None = None,
     callback: Callable[[int, Float[np.ndarray, " S"]], None] | None = None,
 ) -> Optimisation:
-    """Move the electrodes of `layout` on a sheet until `score` is as large as it gets.
+    """Move the electrodes of a sheet until its `objective` is as large as it gets.
 
-    The model gives mesh, protocol and contact impedance, and may be of any `SheetDiscs` of as many electrodes; take a
-    protocol that does not depend on the order of electrodes, such as `two_terminal`, and confirm what comes out on a
-    finer mesh. Same arguments, same result.
+    Take a protocol that does not depend on the order of electrodes, such as that of all two-terminal pairs, and confirm
+    what comes out on a finer mesh. Same arguments, same result.
 
     **Arguments:**
 
-    - `conductivity`, `touches`, `prior`, `noise`, `temperature`: as in `layout_scores`.
-    - `score`: of `Scores`, to be made large, with differences of order 1, as logarithms have; `balanced` unless given.
-    - `outline`: of the sheet, the layout's unless given. `minimum_spacing`: of centres, metres; electrodes never
-      overlap. `keep_out`: domains that no electrode may touch.
-    - `symmetry`: about the middle of the outline's box. The layout must have an equal share of its electrodes in every
-      half (x or y below the middle) or quarter; those of the first are kept, and the others become their images. Take
-      several starts: there are fewer ways out of a poor layout.
-    - `sizes`: electrodes' sizes are moved too, between half and twice what they are, or between two diameters, metres.
-    - `contact_impedance`: electrodes' are varied too, between two values, ohm·m². `thickness`: that of the sheet is
-      varied too, between two values, metres, from that of `touches` on; `conductivity`, the sheet's, grows with it.
+    - `skin`: a sheet, of the layout to begin with. `objective`: of its touches.
+    - `space`: the layouts allowed; all on the skin unless given.
     - `steps`: of L-BFGS, at most, for all starts at once. `starts`: how many: the layout, and random ones, drawn with
       `key` and moved apart.
     - `callback`: called after each step with its number and the scores (S,).
 
-    Raises `ValueError` for what `layout_scores` refuses, electrodes that do not fit the model, and constraints that
+    Raises `ValueError` for a layer, what `layout_scores` refuses, touches of another thickness, and constraints that
     cannot be.
     """
-    outline = layout.outline if outline is None else outline
-    if outline is None:
-        raise ValueError("outline: the layout does not know that of its skin; give one, such as Rectangle(0.2, 0.2).")
-    _check(layout, model, steps, starts, key)
-    _check_keep_out(keep_out)
-    constraints = Constraints(outline, float(minimum_spacing), tuple(keep_out))
-    task = _Task(model, jnp.asarray(conductivity), touches, prior, jnp.asarray(noise, float), temperature)
-    skin = Skin(layout.centres, layout.diameters / 2, _contacts(model), touches.thickness)
-    options = {"sizes": sizes, "contacts": contact_impedance, "thickness": thickness}
-    design = Design.create(outline, skin, symmetry=symmetry, **options)
-    if thickness is not None:
-        _check_thickness(thickness, touches, outline)
-    constraints.check_room(design.smallest)
-    _check_outline(outline, model)
-    begin = np.stack([design.start, *_random(design, constraints, starts - 1, key)])
+    space = DesignSpace() if space is None else space
+    _check(skin, objective, steps, starts, key)
+    constraints = space.constraints(skin)
+    variables = space.variables(skin, constraints, objective.touches.depth)
+    _check_outline(constraints.outline, skin)
+    begin = np.stack([variables.start, *_random(variables, constraints, starts - 1, key)])
     # A layout given is taken as it is, unless symmetry or the constraints forbid.
-    begin = np.array(_feasible(design, constraints, jnp.asarray(begin)))
-
-    given = task.scores(skin)
-    start_value = float(score(given))
+    begin = _feasible(variables, constraints, jnp.asarray(np.array(begin)))
+    given = objective.scores_of_varied(skin, varied_of(skin))
+    start_value = float(objective.score(given))
     if not np.isfinite(start_value):
         raise ValueError("score is not finite for the layout given; does some touch change no voltage?")
-
-    def cost(variables, weight):
-        return _cost(variables, jnp.asarray(weight), design, constraints, task, score)
-
-    record = Record(callback)
-    variables, status = jnp.asarray(begin), "step limit"
-    record.add(variables, cost(variables, _STAGES[0][0])[1])
-    done = 0
-    for weight, share in _STAGES:
-        budget = round(share * steps) - done
-        done += budget
-        if budget:
-            variables, status = descend(partial(cost, weight=weight), variables, budget, record)
-    variables = _feasible(design, constraints, variables)
-    ends = jax.tree.map(np.asarray, _skins(design, variables))
-    values = np.asarray(cost(variables, 0.0)[1])
+    search = _Search(skin, objective, constraints, variables)
+    ended, record, status = search.run(jnp.asarray(np.array(begin)), steps, callback)
+    ends = jax.tree.map(np.asarray, _varied(variables, ended))
+    values = np.asarray(search.cost(ended, 0.0)[1])
     lacking = np.array([_lacking(constraints, *one) for one in zip(ends.centres, ends.radii, strict=True)])
-    best, status, reason = _judge(design.holds(skin), layout, constraints, ends, values, lacking, start_value, status)
-    found, scores = layout, given
+    best, status, reason = search.judge(ends, values, lacking, start_value, status)
+    found, scores = skin.layout, given
     if best is not None:
-        end = Skin(*(part[best] for part in ends))
-        found, scores = _named(layout, end, outline, contact_impedance is not None), task.scores(end)
+        end = Varied(*(part[best] for part in ends))
+        found, scores = search.named(end, space.contact_impedance is not None), objective.scores_of_varied(skin, end)
     return Optimisation(
         layout=found,
         scores=scores,
@@ -173,52 +127,94 @@ def optimise_layout(
         values=values,
         shortfall=np.maximum(lacking, 0),
         history=np.stack(record.values, axis=1),
-        snapshots=np.stack([np.asarray(_skins(design, one).centres) for one in record.variables], axis=1),
+        snapshots=np.stack([np.asarray(_varied(variables, one).centres) for one in record.variables], axis=1),
         best=best,
         status=status,
         reason=reason,
     )
 
 
-class _Task(eqx.Module):
-    """What scores depend on besides the electrodes."""
+class _Search(eqx.Module):
+    """From where S starts are to where they end, and what is said of it."""
 
-    model: ForwardModel
-    conductivity: Array
-    touches: SheetTouches
-    prior: TouchPrior
-    noise: Array
-    temperature: float
+    skin: Skin
+    objective: Objective
+    constraints: Constraints
+    variables: Variables
 
-    def scores(self, skin: Skin) -> Scores:
-        moved = self.model.with_electrodes(SheetDiscs(skin.centres, skin.radii, skin.contact_impedance))
-        conductance = self.conductivity * (skin.thickness / self.touches.thickness)
-        touches = self.touches.at_thickness(skin.thickness)
-        return layout_scores(
-            moved, conductance, touches, prior=self.prior, noise=self.noise, temperature=self.temperature
+    def cost(self, values, weight):
+        """Penalised cost of each start (S,), its score (S,) and the gradient of the cost (S, v)."""
+        return _cost(values, jnp.asarray(weight), self)
+
+    def run(self, begin: Float[Array, "S v"], steps: int, callback) -> tuple[Float[Array, "S v"], Record, str]:
+        """Where the starts end, the way there, and how the last stage ended."""
+        record = Record(callback)
+        values, status, done = begin, "step limit", 0
+        record.add(values, self.cost(values, _STAGES[0][0])[1])
+        for weight, share in _STAGES:
+            budget = round(share * steps) - done
+            done += budget
+            if budget:
+                values, status = descend(partial(self.cost, weight=weight), values, budget, record)
+        return _feasible(self.variables, self.constraints, values), record, status
+
+    def judge(self, ends: Varied, values, lacking, start_value: float, status: str) -> tuple[int | None, str, str]:
+        """Which start is best, None if not one improves on the layout given, and what to say of it."""
+        layout = self.skin.layout
+        good = (lacking <= 0) & np.isfinite(values)
+        fits = self.variables.holds(varied_of(self.skin))
+        fits = fits and _lacking(self.constraints, layout.centres, layout.diameters / 2) <= 1e-9
+        if not good.any():
+            nearest = int(lacking.argmin())
+            parts = self.constraints.shortfalls(jnp.asarray(ends.centres[nearest]), jnp.asarray(ends.radii[nearest]))
+            worst = max(parts, key=lambda name: float(jnp.max(parts[name], initial=-jnp.inf)))
+            reason = (
+                f"no start satisfies the constraints: {worst} lacks {1e3 * lacking.min():.3g} mm at best; ask for less."
+            )
+            return None, "infeasible", reason
+        best = int(np.where(good, values, -np.inf).argmax())
+        if fits and values[best] <= start_value + _ROUNDING * abs(start_value):
+            return None, status, "no start is better than the layout given."
+        reason = f"start {best + 1} of {len(values)} is best; {good.sum()} satisfy the constraints."
+        if not fits:
+            reason += (
+                " The layout given does not satisfy what is asked, and was changed until it did before the first step."
+            )
+        return best, status, reason
+
+    def named(self, end: Varied, contacts: bool) -> Layout:
+        """The layout that ended so; with its contact impedances, if those were varied."""
+        layout = self.skin.layout
+        return Layout(
+            end.centres,
+            2 * end.radii,
+            contact_impedance=end.contact_impedance if contacts else layout.contact_impedance,
+            outline=self.constraints.outline,
+            labels=layout.labels,
+            name=f"{layout.name}, optimised",
         )
 
 
-def _random(design: Design, constraints: Constraints, count: int, key) -> list[np.ndarray]:
+def _random(variables: Variables, constraints: Constraints, count: int, key) -> list[np.ndarray]:
     """Variables of `count` layouts of places drawn evenly from the outline without what is to be kept free."""
-    starts, number = [], design.num_generators
+    starts, number = [], variables.num_generators
     for one in jax.random.split(key, count) if count else ():
         drawn = jax.random.uniform(one, (_DRAWS, 2))
-        place = drawn * design.size + design.low
+        place = drawn * variables.size + variables.low
         free = constraints.outline.contains(place)
         for domain in constraints.keep_out:
             free &= ~domain.contains(place)
         usable = np.asarray(drawn)[np.asarray(free)]
         if len(usable) < number:
             raise ValueError("keep_out: it leaves no room for the electrodes inside the outline; give less.")
-        rest = design.start[2 * number :]
+        rest = variables.start[2 * number :]
         starts.append(np.concatenate([usable[:number].ravel(), rest]))
     return starts
 
 
-def _penalty(design: Design, constraints: Constraints, variables, spare=0.0) -> Float[Array, ""]:
-    shortfall = constraints.shortfall(*design.skin(variables)[:2]) + spare
-    return jnp.sum((jnp.maximum(shortfall, 0) / design.pitch) ** 2)
+def _penalty(variables: Variables, constraints: Constraints, values, spare=0.0) -> Float[Array, ""]:
+    shortfall = constraints.shortfall(*variables.varied(values)[:2]) + spare
+    return jnp.sum((jnp.maximum(shortfall, 0) / variables.pitch) ** 2)
 
 
 def _lacking(constraints: Constraints, centres, radii) -> float:
@@ -226,90 +222,50 @@ def _lacking(constraints: Constraints, centres, radii) -> float:
     return float(jnp.max(constraints.shortfall(jnp.asarray(centres), jnp.asarray(radii))))
 
 
-def _feasible(design: Design, constraints: Constraints, variables):
+def _feasible(variables: Variables, constraints: Constraints, values):
     """The starts (S, v) moved until they satisfy the constraints, as far as descent of the penalty leads."""
 
-    def cost(variables):
-        value, slope = _missing(variables, design, constraints)
+    def cost(values):
+        value, slope = _missing(values, variables, constraints)
         return value, -value, slope
 
-    return descend(cost, variables, 500, Record(), tolerance=0.0)[0]
+    return descend(cost, values, 500, Record(), tolerance=0.0)[0]
 
 
 @eqx.filter_jit
-def _missing(variables, design: Design, constraints: Constraints):
+def _missing(values, variables: Variables, constraints: Constraints):
     """Penalty of each start (S,) and its gradient (S, v); steep, for the descent is to end at zero, not near it."""
-    return jax.vmap(jax.value_and_grad(lambda own: 1e6 * _penalty(design, constraints, own, _SPARE)))(variables)
+    return jax.vmap(jax.value_and_grad(lambda own: 1e6 * _penalty(variables, constraints, own, _SPARE)))(values)
 
 
 @eqx.filter_jit
-def _cost(variables, weight, design: Design, constraints: Constraints, task: _Task, score: Score):
-    """Penalised cost of each start (S,), its score (S,) and the gradient of the cost (S, v)."""
+def _cost(values, weight, search: _Search):
+    variables, constraints, objective = search.variables, search.constraints, search.objective
 
     def one(own):
-        skin = design.skin(own)
+        end = variables.varied(own)
         # An electrode off the skin has no score: a step that goes too far is judged by how it is at the edge.
-        value = score(task.scores(skin._replace(centres=constraints.outline.nearest(skin.centres))))
-        return weight * _penalty(design, constraints, own) - value, value
+        end_inside = end._replace(centres=constraints.outline.nearest(end.centres))
+        value = objective.score(objective.scores_of_varied(search.skin, end_inside))
+        return weight * _penalty(variables, constraints, own) - value, value
 
     # One start after the other: the Jacobian of one fills the cache.
-    (cost, value), slope = jax.lax.map(jax.value_and_grad(one, has_aux=True), variables)
+    (cost, value), slope = jax.lax.map(jax.value_and_grad(one, has_aux=True), values)
     return cost, value, slope
 
 
 @eqx.filter_jit
-def _skins(design: Design, variables) -> Skin:
-    return jax.vmap(design.skin)(variables)
+def _varied(variables: Variables, values) -> Varied:
+    return jax.vmap(variables.varied)(values)
 
 
-def _judge(holds, layout, constraints, ends, values, lacking, start_value, status) -> tuple[int | None, str, str]:
-    """Which start is best, None if not one improves on the layout given, and what to say of it."""
-    good = (lacking <= 0) & np.isfinite(values)
-    fits = holds and _lacking(constraints, layout.centres, layout.diameters / 2) <= 1e-9
-    if not good.any():
-        nearest = int(lacking.argmin())
-        parts = constraints.shortfalls(jnp.asarray(ends.centres[nearest]), jnp.asarray(ends.radii[nearest]))
-        worst = max(parts, key=lambda name: float(jnp.max(parts[name], initial=-jnp.inf)))
-        reason = (
-            f"no start satisfies the constraints: {worst} lacks {1e3 * lacking.min():.3g} mm at best; ask for less."
-        )
-        return None, "infeasible", reason
-    best = int(np.where(good, values, -np.inf).argmax())
-    if fits and values[best] <= start_value + _ROUNDING * abs(start_value):
-        return None, status, "no start is better than the layout given."
-    reason = f"start {best + 1} of {len(values)} is best; {good.sum()} satisfy the constraints."
-    if not fits:
-        reason += (
-            " The layout given does not satisfy what is asked, and was changed until it did before the first step."
-        )
-    return best, status, reason
-
-
-def _named(layout: Layout, skin: Skin, outline: Domain, contacts: bool) -> Layout:
-    return Layout(
-        skin.centres,
-        2 * skin.radii,
-        contact_impedance=skin.contact_impedance if contacts else layout.contact_impedance,
-        outline=outline,
-        labels=layout.labels,
-        name=f"{layout.name}, optimised",
-    )
-
-
-def _contacts(model: ForwardModel) -> Float[Array, " L"]:
-    return model.electrodes.contact_impedance
-
-
-def _check(layout: Layout, model: ForwardModel, steps: int, starts: int, key) -> None:
-    if not isinstance(model.electrodes, SheetDiscs):
+def _check(skin: Skin, objective: Objective, steps: int, starts: int, key) -> None:
+    if skin.num_layers:
+        raise ValueError("skin is a layer; layouts are optimised on a sheet: Skin.create(…, num_layers=0).")
+    if not np.isclose(float(objective.touches.thickness), float(skin.thickness), rtol=1e-9):
         raise ValueError(
-            f"model has {type(model.electrodes).__name__}; layouts are optimised on a sheet with SheetDiscs, such as "
-            "layout.sheet_discs(contact_impedance)."
-        )
-    if model.electrodes.num_electrodes != layout.num_electrodes:
-        raise ValueError(
-            f"layout has {layout.num_electrodes} electrodes and the model {model.electrodes.num_electrodes}; their "
-            "number cannot change."
+            f"objective: its touches are of a sheet {1e3 * float(objective.touches.thickness):.4g} mm thick, and the "
+            f"skin is {1e3 * float(skin.thickness):.4g} mm thick; make them with skin.sheet_touches(…)."
         )
     for name, number in (("steps", steps), ("starts", starts)):
         if not isinstance(number, int) or number < 1:
@@ -318,23 +274,10 @@ def _check(layout: Layout, model: ForwardModel, steps: int, starts: int, key) ->
         raise ValueError("key: random starts need one, such as jax.random.key(0).")
 
 
-def _check_keep_out(keep_out) -> None:
-    if isinstance(keep_out, Domain) or not all(isinstance(one, Domain) for one in keep_out):
-        raise ValueError(f"keep_out must be a list of domains, such as [Disk(0.01, (0.02, 0.0))]; it is {keep_out!r}.")
-
-
-def _check_outline(outline: Domain, model: ForwardModel) -> None:
+def _check_outline(outline: Domain, skin: Skin) -> None:
     low_x, high_x, low_y, high_y = outline.extent
-    points = np.asarray(model.mesh.points)
+    points = np.asarray(skin.model.mesh.points)
     off = max(*(points.min(axis=0) - (low_x, low_y)), *((high_x, high_y) - points.max(axis=0)))
     # The mesh of a disk is a polygon inside it.
     if off > _OFF * max(high_x - low_x, high_y - low_y):
         raise ValueError(f"outline: it reaches {1e3 * off:.3g} mm beyond the model's mesh; give the skin's own.")
-
-
-def _check_thickness(thickness, touches: SheetTouches, outline: Domain) -> None:
-    low_x, high_x, low_y, high_y = outline.extent
-    if np.min(thickness) <= touches.depth:
-        raise ValueError(f"thickness: the touches are {1e3 * touches.depth:.3g} mm deep; let the sheet be thicker.")
-    if np.max(thickness) > max(high_x - low_x, high_y - low_y):
-        raise ValueError(f"thickness is {thickness!r} metres, more than the skin is wide; are they millimetres?")

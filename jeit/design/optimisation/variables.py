@@ -20,7 +20,7 @@ _IMAGES = {
 }
 
 
-class Skin(NamedTuple):
+class Varied(NamedTuple):
     """Electrodes on a sheet: `centres` (L, 2) and `radii` (L,) in metres, `contact_impedance` (L,) in ohm·m², and the
     sheet's `thickness` in metres."""
 
@@ -53,11 +53,11 @@ class Range(eqx.Module):
         return jnp.asarray(self.least) * jnp.exp(self.span * variables)
 
 
-class Design(eqx.Module):
-    """From variables between 0 and 1 to a `Skin`: G generators, of which the other electrodes are images.
+class Variables(eqx.Module):
+    """From variables between 0 and 1 to a `Varied`: G generators, of which the other electrodes are images.
 
     **Fields**: `low`, `size` (2,) of the box of centres, metres; `images` (k, 2, 2); `order` (L,) of the images in the
-    layout; `given`, the skin to start from; `sizes` (G), `contacts` (G) and `thickness` (1), the ranges of what is
+    layout; `given`, what to start from; `sizes` (G), `contacts` (G) and `thickness` (1), the ranges of what is
     varied besides the places; `start`, its variables; `pitch`, side of the square that each electrode would have to
     itself, metres.
     """
@@ -66,7 +66,7 @@ class Design(eqx.Module):
     size: np.ndarray
     images: np.ndarray
     order: np.ndarray
-    given: Skin
+    given: Varied
     sizes: Range | None
     contacts: Range | None
     thickness: Range | None
@@ -75,9 +75,9 @@ class Design(eqx.Module):
 
     @classmethod
     def create(
-        cls, outline: Domain, given: Skin, *, symmetry=None, sizes=False, contacts=None, thickness=None
-    ) -> "Design":
-        """The variables of a `given` skin. Raises `ValueError` for what cannot be."""
+        cls, outline: Domain, given: Varied, *, symmetry=None, sizes=False, contacts=None, thickness=None
+    ) -> "Variables":
+        """The variables of what is `given`. Raises `ValueError` for what cannot be."""
         if symmetry not in _IMAGES:
             raise ValueError(f"symmetry must be None or one of {', '.join(filter(None, _IMAGES))}; it is {symmetry!r}.")
         centres, radii = np.asarray(given.centres), np.asarray(given.radii)
@@ -115,16 +115,16 @@ class Design(eqx.Module):
         radii, impedance = (
             jnp.tile(jnp.asarray(values)[first], len(images))[order] for values in (radii, given.contact_impedance)
         )
-        repeated = Skin(given.centres, radii, impedance, given.thickness)
+        repeated = Varied(given.centres, radii, impedance, given.thickness)
         pitch = float(np.sqrt(np.prod(size) / len(order)))
         ranges = size_range, contact_range, thickness_range
         return cls(low, size, images, order, repeated, *ranges, np.concatenate(start), pitch)
 
-    def holds(self, skin: Skin) -> bool:
-        """Whether the variables can stand for `skin`: it is symmetric as asked, and within the ranges."""
-        found = self.skin(jnp.asarray(self.start))
-        same = (np.allclose(one, other, rtol=1e-6, atol=0) for one, other in zip(found[1:], skin[1:], strict=True))
-        return bool(np.allclose(found.centres, skin.centres, atol=1e-6)) and all(same)
+    def holds(self, varied: Varied) -> bool:
+        """Whether the variables can stand for `varied`: it is symmetric as asked, and within the ranges."""
+        found = self.varied(jnp.asarray(self.start))
+        same = (np.allclose(one, other, rtol=1e-6, atol=0) for one, other in zip(found[1:], varied[1:], strict=True))
+        return bool(np.allclose(found.centres, varied.centres, atol=1e-6)) and all(same)
 
     @property
     def num_generators(self) -> int:
@@ -138,7 +138,7 @@ class Design(eqx.Module):
             return np.asarray(self.given.radii)
         return np.tile(self.sizes.least, len(self.images))[self.order]
 
-    def skin(self, variables: Float[Array, " v"]) -> Skin:
+    def varied(self, variables: Float[Array, " v"]) -> Varied:
         """What the variables stand for."""
         number = self.num_generators
         place, rest = variables[: 2 * number].reshape(number, 2) * self.size - self.size / 2, variables[2 * number :]
@@ -150,7 +150,7 @@ class Design(eqx.Module):
             contact_impedance, rest = self._repeated(self.contacts.values(rest[:number])), rest[number:]
         if self.thickness is not None:
             thickness = self.thickness.values(rest)[0]
-        return Skin(centres[self.order], radii, contact_impedance, thickness)
+        return Varied(centres[self.order], radii, contact_impedance, thickness)
 
     def _repeated(self, values: Float[Array, " G"]) -> Float[Array, " L"]:
         return jnp.tile(values, len(self.images))[self.order]

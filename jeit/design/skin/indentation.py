@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jeit.design.skin.defaults import BALL_DIAMETER, DEPTH, DEVIATION
 from jeit.mesh.outline.domain import check_length
 
 
@@ -31,7 +32,7 @@ class Bell(AbstractIndentation):
     depth: float
     deviation: float
 
-    def __init__(self, depth: float = 2.5e-3, deviation: float = 7.5e-3):
+    def __init__(self, depth: float = DEPTH, deviation: float = DEVIATION):
         """Both in metres."""
         self.depth = check_length("depth", depth)
         self.deviation = check_length("deviation", deviation)
@@ -53,7 +54,7 @@ class Hemisphere(AbstractIndentation):
     depth: float
     diameter: float
 
-    def __init__(self, depth: float = 2.5e-3, diameter: float = 15e-3):
+    def __init__(self, depth: float = DEPTH, diameter: float = BALL_DIAMETER):
         """Both in metres. Raises `ValueError` for a ball pressed in beyond its middle."""
         self.depth = check_length("depth", depth)
         self.diameter = check_length("diameter", diameter)

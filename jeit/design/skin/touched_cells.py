@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
+from jeit.design.skin.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
 from jeit.electrodes.window import smooth_step
 from jeit.mesh import Mesh, centroids
@@ -33,7 +34,7 @@ def touched_cells(
     places,
     *,
     thickness: float | None = None,
-    contrast: float = 0.0,
+    contrast: float = CONTRAST,
     edge: float = 0.0,
 ) -> TouchedCells:
     """Indent the top of a layer, or a sheet, at `places` (n, 2) in metres, one at a time.

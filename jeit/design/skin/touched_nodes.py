@@ -24,9 +24,9 @@ class TouchedNodes(eqx.Module):
     corners: Int[np.ndarray, "n c q"]
 
 
-def touched_nodes(model: ForwardModel, presses: TouchedCells) -> TouchedNodes:
+def touched_nodes(model: ForwardModel, touches: TouchedCells) -> TouchedNodes:
     """Nodes of the cells that touches change."""
-    mesh, cells, real = model.mesh, np.asarray(presses.cells), np.asarray(presses.change) != 0
+    mesh, cells, real = model.mesh, np.asarray(touches.cells), np.asarray(touches.change) != 0
     touched = np.zeros(mesh.num_points, bool)
     touched[np.asarray(mesh.cells)[cells[real]]] = True
     strips = Strips.create(model.system.pattern, np.asarray(mesh.points), touched)

@@ -39,7 +39,7 @@ _EXACT, _LINEAR = 2, 8
 
 
 def touch_changes(
-    model: ForwardModel, conductivity, presses: TouchedCells, *, linear: bool = False
+    model: ForwardModel, conductivity, touched: TouchedCells, *, linear: bool = False
 ) -> Float[Array, "n M"]:
     """Changes (n, M) of the protocol's M voltages by n touches, one at a time, in volts.
 
@@ -51,41 +51,41 @@ def touch_changes(
     conductivity = check_conductivity(model.mesh, conductivity)
     if conductivity.ndim == 3 or jnp.iscomplexobj(conductivity):
         raise ValueError("touches need a real, scalar conductivity.")
-    if presses.num_cells != model.mesh.num_cells:
+    if touched.num_cells != model.mesh.num_cells:
         raise ValueError(
-            f"the touches are of a mesh of {presses.num_cells} cells, and the model's has {model.mesh.num_cells}; "
-            "press on the model's own, press(model.mesh, …)."
+            f"the touches are of a mesh of {touched.num_cells} cells, and the model's has {model.mesh.num_cells}; "
+            "touch the model's own, touched_cells(model.mesh, …)."
         )
-    if not linear and any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((model, conductivity, presses))):
+    if not linear and any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((model, conductivity, touched))):
         raise ValueError("exact changes cannot be traced by jit, grad or vmap; take linear=True there.")
     if linear:
-        return _linear(model, cell_conductivity(model.mesh, conductivity), presses)
-    return _exact(model, cell_conductivity(model.mesh, conductivity), presses)
+        return _linear(model, cell_conductivity(model.mesh, conductivity), touched)
+    return _exact(model, cell_conductivity(model.mesh, conductivity), touched)
 
 
 @jax.jit
-def _linear(model: ForwardModel, conductivity, presses: TouchedCells):
+def _linear(model: ForwardModel, conductivity, touched: TouchedCells):
     jacobian = model.jacobian(conductivity).T  # (m, M)
-    changed = presses.change * conductivity[presses.cells]
+    changed = touched.change * conductivity[touched.cells]
 
     def some(index):
-        return jnp.einsum("bc,bcm->bm", changed[index], jacobian[presses.cells[index]])
+        return jnp.einsum("bc,bcm->bm", changed[index], jacobian[touched.cells[index]])
 
     number = len(changed)
     index = jnp.minimum(jnp.arange(-(-number // _LINEAR) * _LINEAR), number - 1).reshape(-1, _LINEAR)
     return _joined(jax.lax.map(some, index))[:number]
 
 
-def _exact(model: ForwardModel, conductivity, presses: TouchedCells):
-    touched = touched_nodes(model, presses)
-    reach = touched.strips.reach(touched.nodes)
-    known = fields_and_inverse(model.mesh, conductivity, model.electrodes, model.system, touched.strips, reach)
-    touches = jax.tree.map(jnp.asarray, (presses.cells, presses.change, touched.nodes, touched.corners))
-    number = len(presses.cells)
+def _exact(model: ForwardModel, conductivity, touched: TouchedCells):
+    touched_at = touched_nodes(model, touched)
+    reach = touched_at.strips.reach(touched_at.nodes)
+    known = fields_and_inverse(model.mesh, conductivity, model.electrodes, model.system, touched_at.strips, reach)
+    touches = jax.tree.map(jnp.asarray, (touched.cells, touched.change, touched_at.nodes, touched_at.corners))
+    number = len(touched.cells)
     found = over_cores(partial(_changes, model, conductivity, known, touches), number, _EXACT)[:number]
     lost = np.flatnonzero(~np.isfinite(np.asarray(found)).all(axis=1))
     if lost.size:
-        x, y = np.asarray(presses.places)[lost[0]]
+        x, y = np.asarray(touched.places)[lost[0]]
         raise RuntimeError(
             f"the changes by {lost.size} of {number} touches were not found in {_MOST_STEPS} steps, the first at "
             f"({1e3 * x:.4g}, {1e3 * y:.4g}) mm; does it cut an electrode off, or are conductivities many orders of "

@@ -12,26 +12,27 @@ from jax.sharding import Mesh as Devices
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float
 
-from jeit.design.measurements.selection import nearest_pairs
-from jeit.design.scores import SheetTouches, TouchPrior, layout_scores, sheet_touches
-from jeit.design.sensitivity import SensitivityMap, TouchGrid, touch_grid
-from jeit.design.skin.touched_cells import TouchedCells, touched_cells
+from jeit.design.scores import TouchPrior, layout_scores
+from jeit.design.sensitivity import SensitivityMap
+from jeit.design.skin.sheet_touches import SheetTouches
+from jeit.design.skin.skin import Skin, model_conductivity
+from jeit.design.skin.touch_grid import TouchGrid, touch_grid
+from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.design.study.keys import OPTIMALITY
 from jeit.design.study.spec import Point, Shape, Study
 from jeit.design.taxels import find_taxels
 from jeit.electrodes import FaceDiscs, SheetDiscs
 from jeit.forward import ForwardModel
-from jeit.mesh import Mesh, layer, rectangle
-from jeit.protocol import Protocol, adjacent, opposite, two_terminal
+from jeit.protocol import Protocol
 
 
 class _Shared(eqx.Module):
-    """What points of one shape have in common; `presses` on a skin of `thickness` metres, the same as `touches`, which
+    """What points of one shape have in common; `touched` on a skin of `thickness` metres, the same as `touches`, which
     are None, as the `prior` is, unless a score needs them."""
 
     model: ForwardModel
-    presses: TouchedCells
+    touched: TouchedCells
     touches: SheetTouches | None
     prior: TouchPrior | None
     grid: TouchGrid
@@ -39,7 +40,7 @@ class _Shared(eqx.Module):
     key: Array
 
 
-class _Skin(eqx.Module):
+class _Varied(eqx.Module):
     """Where points of one shape differ; `conductivity` of the mesh's cells, noise in volts. A batch of k of them is one
     whose every array leads with an axis of k."""
 
@@ -51,7 +52,7 @@ class _Skin(eqx.Module):
 
 
 def check_points(study: Study) -> None:
-    """Make every mesh, touch it, and place every electrode. Raises `ValueError` for a mesh that is too coarse."""
+    """Make every skin, touch it, and place every electrode. Raises `ValueError` for a mesh that is too coarse."""
     seen = set()
     for index in itertools.chain.from_iterable(study.chunks):  # one shape after the other
         point = study.points[index]
@@ -62,7 +63,7 @@ def check_points(study: Study) -> None:
         layers = f" and mesh.layers = {point.layers}" if point.layers else ""
         where = f"mesh.cell_mm = {1e3 * point.cell_size:g}{layers}"
         try:
-            point.electrodes.check(_mesh(study, point.shape))
+            _skin(study, point.shape).with_layout(point.layout)
         except ValueError:
             smallest = 1e3 * float(np.min(point.layout.diameters))
             raise ValueError(
@@ -85,63 +86,55 @@ def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None 
     shared = _shared(study, points[0].shape)
     options = {"scores": study.scores, "num_taxels": study.num_taxels, "threshold": study.threshold}
     if study.exact:
-        results = _stacked(_exact(shared, [_skin(point, study.current) for point in points], options, solved))
+        results = _stacked(_exact(shared, [_varied(point, study.current) for point in points], options, solved))
     else:
         devices = jax.devices()
         same = sum(point.shape == points[0].shape for point in study.points)
         size = -(-min(study.chunk_points, same) // len(devices)) * len(devices)
-        skins = [_skin(point, study.current) for point in points]
+        varied = [_varied(point, study.current) for point in points]
         results = _batch(
-            shared, _stacked(skins + skins[-1:] * (size - len(skins))), **options, num_devices=len(devices)
+            shared, _stacked(varied + varied[-1:] * (size - len(varied))), **options, num_devices=len(devices)
         )
     return {name: np.asarray(values)[: len(points)] for name, values in results.items()}
 
 
 def study_grid(study: Study) -> TouchGrid:
     """Where the skins are touched."""
-    return touch_grid(study.skin, study.columns, study.rows)
+    return touch_grid(study.outline, study.columns, study.rows)
 
 
 @lru_cache(maxsize=4)
-def _mesh(study: Study, shape: Shape) -> Mesh:
-    """Of the sheet, or the layer."""
-    plane = rectangle(study.skin.width, study.skin.height, cell_size=shape.cell_size)
-    return layer(plane, shape.thickness, shape.layers) if shape.layers else plane
+def _skin(study: Study, shape: Shape) -> Skin:
+    """Of the first point of a shape; the others are of the same mesh."""
+    point = next(point for point in study.points if point.shape == shape)
+    return Skin.create(
+        point.layout,
+        thickness=point.thickness,
+        conductivity=point.conductivity,
+        num_layers=point.layers,
+        cell_size=point.cell_size,
+        protocol=point.measured(study.current),
+    )
 
 
 @lru_cache(maxsize=4)
 def _shared(study: Study, shape: Shape) -> _Shared:
-    point = next(point for point in study.points if point.shape == shape)
-    mesh = _mesh(study, shape)
-    model = ForwardModel(mesh, point.electrodes, _protocol(point, study.current))
-    grid, touches, prior = study_grid(study), None, None
-    thickness = None if shape.layers else point.thickness
+    skin, grid, touches, prior = _skin(study, shape), study_grid(study), None, None
     if set(OPTIMALITY) & set(study.scores):
-        assert thickness is not None
-        touches = sheet_touches(mesh, study.indentation, grid.places, thickness=thickness, contrast=study.contrast)
-        presses = touches.presses
+        touches = skin.sheet_touches(grid.places, study.indentation, contrast=study.contrast)
+        touched = touches.touched
         prior = TouchPrior.create(grid.places, correlation=study.correlation)
     else:
-        presses = touched_cells(mesh, study.indentation, grid.places, thickness=thickness, contrast=study.contrast)
-    return _Shared(model, presses, touches, prior, grid, point.thickness, jax.random.key(study.seed))
+        touched = skin.touched_cells(grid.places, study.indentation, contrast=study.contrast)
+    return _Shared(skin.model, touched, touches, prior, grid, skin.thickness, jax.random.key(study.seed))
 
 
-def _protocol(point: Point, current: float) -> Protocol:
-    number = point.layout.num_electrodes
-    if not point.pairs:
-        return {"adjacent": adjacent, "opposite": opposite, "two-terminal": two_terminal}[point.protocol](
-            number, current=current
-        )
-    nearest = np.sort(nearest_pairs(point.layout.centres, point.pairs))
-    return two_terminal(number, np.column_stack(np.triu_indices(number, 1))[nearest], current=current)
-
-
-def _skin(point: Point, current: float) -> _Skin:
-    return _Skin(
+def _varied(point: Point, current: float) -> _Varied:
+    return _Varied(
         electrodes=point.electrodes,
-        protocol=_protocol(point, current),
+        protocol=point.measured(current),
         thickness=jnp.asarray(point.thickness),
-        conductivity=jnp.asarray(point.conductivity * (1.0 if point.layers else point.thickness)),
+        conductivity=jnp.asarray(model_conductivity(point.conductivity, point.thickness, point.layers)),
         noise=jnp.asarray(point.noise),
     )
 
@@ -153,49 +146,49 @@ def _stacked(trees):
 
 @partial(jax.jit, static_argnames=("scores", "num_taxels", "threshold", "num_devices"))
 def _batch(
-    shared: _Shared, skins: _Skin, *, scores: tuple[str, ...], num_taxels: int, threshold: float, num_devices: int
+    shared: _Shared, varied: _Varied, *, scores: tuple[str, ...], num_taxels: int, threshold: float, num_devices: int
 ) -> dict[str, Array]:
-    def one(shared: _Shared, skin: _Skin) -> dict[str, Array]:
-        model, presses = _touched(shared, skin)
-        changes = touch_changes(model, skin.conductivity, presses, linear=True)
-        return _results(shared, skin, changes, scores=scores, num_taxels=num_taxels, threshold=threshold)
+    def one(shared: _Shared, varied: _Varied) -> dict[str, Array]:
+        model, touched = _touched(shared, varied)
+        changes = touch_changes(model, varied.conductivity, touched, linear=True)
+        return _results(shared, varied, changes, scores=scores, num_taxels=num_taxels, threshold=threshold)
 
     batch = jax.vmap(one, in_axes=(None, 0))
     if num_devices == 1:
-        return batch(shared, skins)
+        return batch(shared, varied)
     devices = Devices(np.array(jax.devices()), ("point",))
     split = PartitionSpec("point")
     return jax.shard_map(batch, mesh=devices, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False)(
-        shared, skins
+        shared, varied
     )
 
 
 def _exact(
-    shared: _Shared, skins: list[_Skin], options: dict, solved: Callable[[int], None] | None
+    shared: _Shared, varied: list[_Varied], options: dict, solved: Callable[[int], None] | None
 ) -> Iterator[dict[str, Array]]:
     """Results of each skin, whose maps are exact."""
-    for number, skin in enumerate(skins, 1):
-        model, presses = _touched(shared, skin)
-        yield _results(shared, skin, touch_changes(model, skin.conductivity, presses), **options)
-        if solved is not None and number < len(skins):
+    for number, one in enumerate(varied, 1):
+        model, touched = _touched(shared, one)
+        yield _results(shared, one, touch_changes(model, one.conductivity, touched), **options)
+        if solved is not None and number < len(varied):
             solved(number)
 
 
-def _touched(shared: _Shared, skin: _Skin) -> tuple[ForwardModel, TouchedCells]:
+def _touched(shared: _Shared, varied: _Varied) -> tuple[ForwardModel, TouchedCells]:
     """The model of a skin, and its touches."""
-    model = shared.model.with_electrodes(skin.electrodes).with_protocol(skin.protocol)
-    presses = eqx.tree_at(
+    model = shared.model.with_electrodes(varied.electrodes).with_protocol(varied.protocol)
+    touched = eqx.tree_at(
         # A touch of a sheet takes depth / thickness of the current's way; layers of one shape are equally thick.
         lambda all: all.change,
-        shared.presses,
-        replace_fn=lambda change: change * (shared.thickness / skin.thickness),
+        shared.touched,
+        replace_fn=lambda change: change * (shared.thickness / varied.thickness),
     )
-    return model, presses
+    return model, touched
 
 
 @partial(jax.jit, static_argnames=("scores", "num_taxels", "threshold"))
 def _results(
-    shared: _Shared, skin: _Skin, changes: Float[Array, "n M"], *, scores, num_taxels: int, threshold: float
+    shared: _Shared, varied: _Varied, changes: Float[Array, "n M"], *, scores, num_taxels: int, threshold: float
 ) -> dict[str, Array]:
     """What is told of one skin whose touches make these changes, volts."""
     found = SensitivityMap(shared.grid, changes)
@@ -204,7 +197,7 @@ def _results(
         if name in scores:
             results[name] = getattr(found, name)
     if "blind_spot" in scores:
-        results["blind_spot"] = found.blind_spot(skin.noise * jnp.sqrt(1.0 * found.changes.shape[-1]))
+        results["blind_spot"] = found.blind_spot(varied.noise * jnp.sqrt(1.0 * found.changes.shape[-1]))
     if "taxels" in scores:
         taxels = find_taxels(
             found.changes,
@@ -219,17 +212,17 @@ def _results(
         results["taxel_area_std"] = 1e4 * taxels.std_area
         results["taxel_area_max"] = 1e4 * taxels.max_area
     if shared.touches is not None and shared.prior is not None:
-        results |= _optimality(shared, skin, shared.touches, shared.prior, scores)
+        results |= _optimality(shared, varied, shared.touches, shared.prior, scores)
     return results
 
 
 def _optimality(
-    shared: _Shared, skin: _Skin, touches: SheetTouches, prior: TouchPrior, scores: tuple[str, ...]
+    shared: _Shared, varied: _Varied, touches: SheetTouches, prior: TouchPrior, scores: tuple[str, ...]
 ) -> dict[str, Array]:
     """Scores of linear changes. A batch has the Jacobian already, and XLA does not compute it again."""
-    model, _ = _touched(shared, skin)
-    touches = touches.at_thickness(skin.thickness)
-    found = layout_scores(model, skin.conductivity, touches, prior=prior, noise=skin.noise)
+    model, _ = _touched(shared, varied)
+    touches = touches.at_thickness(varied.thickness)
+    found = layout_scores(model, varied.conductivity, touches, prior=prior, noise=varied.noise)
     results = {}
     if "information" in scores:
         results["information"] = found.log_information

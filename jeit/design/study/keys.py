@@ -5,6 +5,9 @@ import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+from jeit.design.skin import defaults
+from jeit.design.skin.protocol import PROTOCOLS
+
 
 class Quantity(NamedTuple):
     """A number from `low` to `high`; `swept`: a list of them will do as well; `default` None: must be given."""
@@ -77,7 +80,6 @@ class Flag(NamedTuple):
 # Of linear changes of a sheet's voltages, with a prior: see `jeit.design.layout_scores`.
 OPTIMALITY = ("information", "mean_variance", "largest_variance", "localisation_error")
 SCORES = ("minimum", "mean", "uniformity", "blind_spot", "taxels", *OPTIMALITY)
-PROTOCOLS = ("adjacent", "opposite", "two-terminal")
 
 _Key = Quantity | Words | Flag
 _TOP: dict[str, _Key] = {
@@ -87,10 +89,10 @@ _TOP: dict[str, _Key] = {
 _SECTIONS: dict[str, dict[str, _Key]] = {
     "skin": {
         "model": Words(("sheet", "layer"), "sheet"),
-        "width_mm": Quantity(5, 5000, 200),
-        "height_mm": Quantity(5, 5000, 200),
-        "thickness_mm": Quantity(0.05, 200, 10, swept=True),
-        "conductivity_S_per_m": Quantity(1e-6, 1e8, 1, swept=True),
+        "width_mm": Quantity(5, 5000, 1e3 * defaults.SIDE),
+        "height_mm": Quantity(5, 5000, 1e3 * defaults.SIDE),
+        "thickness_mm": Quantity(0.05, 200, 1e3 * defaults.THICKNESS, swept=True),
+        "conductivity_S_per_m": Quantity(1e-6, 1e8, defaults.CONDUCTIVITY, swept=True),
     },
     "electrodes": {
         "layouts": Words((), None, swept=True),
@@ -99,30 +101,30 @@ _SECTIONS: dict[str, dict[str, _Key]] = {
         "minimum_gap_mm": Quantity(0, 1000, 0),
     },
     "measurement": {
-        "protocol": Words(PROTOCOLS, "adjacent", swept=True),
-        "pairs": Quantity(0, 523_776, 0, swept=True, whole=True),
-        "current_mA": Quantity(1e-4, 1e3, 1),
-        "noise_V": Quantity(1e-12, 1, 1e-6, swept=True),
+        "protocol": Words(PROTOCOLS, defaults.PROTOCOL, swept=True),
+        "pairs": Quantity(0, 523_776, math.nan, swept=True, whole=True),
+        "current_mA": Quantity(1e-4, 1e3, 1e3 * defaults.CURRENT),
+        "noise_V": Quantity(1e-12, 1, defaults.NOISE, swept=True),
     },
     "touch": {
         "indentation": Words(("bell", "hemisphere"), "bell"),
-        "depth_mm": Quantity(0.01, 100, 2.5),
-        "deviation_mm": Quantity(0.1, 200, 7.5),
-        "diameter_mm": Quantity(0.1, 200, 15),
-        "contrast": Quantity(0, 1e6, 0),
+        "depth_mm": Quantity(0.01, 100, 1e3 * defaults.DEPTH),
+        "deviation_mm": Quantity(0.1, 200, 1e3 * defaults.DEVIATION),
+        "diameter_mm": Quantity(0.1, 200, 1e3 * defaults.BALL_DIAMETER),
+        "contrast": Quantity(0, 1e6, defaults.CONTRAST),
         "exact": Flag(False),
-        "columns": Quantity(1, 1000, 24, whole=True),
-        "rows": Quantity(1, 1000, 24, whole=True),
+        "columns": Quantity(1, 1000, defaults.STUDY_PLACES, whole=True),
+        "rows": Quantity(1, 1000, defaults.STUDY_PLACES, whole=True),
     },
     "mesh": {
-        "cell_mm": Quantity(0.1, 200, 4, swept=True),
-        "layers": Quantity(1, 50, 5, whole=True),
+        "cell_mm": Quantity(0.1, 200, 1e3 * defaults.CELL_SIZE, swept=True),
+        "layers": Quantity(1, 50, defaults.NUM_LAYERS, whole=True),
     },
     "scores": {
         "wanted": Words(SCORES, ["minimum", "mean", "uniformity"], swept=True),
-        "num_taxels": Quantity(1, 10_000, 90, whole=True),
-        "threshold": Quantity(0.01, 0.99, 0.7),
-        "correlation_mm": Quantity(0.1, 1000, 15),
+        "num_taxels": Quantity(1, 10_000, defaults.NUM_TAXELS, whole=True),
+        "threshold": Quantity(0.01, 0.99, defaults.THRESHOLD),
+        "correlation_mm": Quantity(0.1, 1000, 1e3 * defaults.CORRELATION),
         "seed": Quantity(0, 2**31 - 1, 0, whole=True),
     },
 }

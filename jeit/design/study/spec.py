@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import tomllib
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,13 +11,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jeit.design.skin import defaults
 from jeit.design.skin.cell_size import check_cell_size
 from jeit.design.skin.indentation import AbstractIndentation, Bell, Hemisphere
+from jeit.design.skin.protocol import ProtocolName, skin_protocol
+from jeit.design.skin.skin import skin_electrodes
 from jeit.design.study.keys import OPTIMALITY, read_keys
 from jeit.design.study.layouts import is_file, study_layout
 from jeit.electrodes import FaceDiscs, SheetDiscs
 from jeit.layout import Layout
 from jeit.mesh import Rectangle
+from jeit.protocol import Protocol
 
 # Bump when the same study would give other numbers.
 _VERSION = 2
@@ -47,7 +52,7 @@ class Point:
     layout: Layout
     thickness: float
     conductivity: float
-    protocol: str
+    protocol: ProtocolName
     pairs: int
     noise: float
     cell_size: float
@@ -62,11 +67,11 @@ class Point:
     @property
     def electrodes(self) -> SheetDiscs | FaceDiscs:
         """In the sheet, or on the bottom of the layer."""
-        discs = self.layout.sheet_discs()
-        if not self.layers:
-            return discs
-        bottom = np.column_stack([discs.position, np.zeros(discs.num_electrodes)])
-        return FaceDiscs(bottom, discs.radius, discs.contact_impedance)
+        return skin_electrodes(self.layout, self.layers)
+
+    def measured(self, current: float) -> Protocol:
+        """What is measured at a `current` in amperes."""
+        return skin_protocol(self.layout, self.protocol, num_pairs=self.pairs, current=current)
 
     @property
     def coordinates(self) -> dict[str, str | int | float]:
@@ -90,7 +95,7 @@ class Study:
     """A sweep: every combination of the lists in a study file. Make it with `read_study`.
 
     - `points`: the skins, in the order of the lists, the last list fastest.
-    - `skin`: their outline; `indentation`, `contrast`: the touch, as in `touched_cells`; `exact`: whether its changes
+    - `outline`: theirs; `indentation`, `contrast`: the touch, as in `touched_cells`; `exact`: whether its changes
       are, or linear; `columns`, `rows`: of the grid of touches.
     - `current`: amperes. `scores`: those wanted; `num_taxels`, `threshold`, `seed`: of `find_taxels`; `correlation`: of
       `TouchPrior`, metres.
@@ -101,7 +106,7 @@ class Study:
 
     name: str
     points: tuple[Point, ...]
-    skin: Rectangle
+    outline: Rectangle
     indentation: AbstractIndentation
     contrast: float
     exact: bool
@@ -130,7 +135,7 @@ class Study:
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of all that decides the results: not of comments or the study's name."""
-        content = [_VERSION, *map(float, self.skin.extent), type(self.indentation).__name__]
+        content = [_VERSION, *map(float, self.outline.extent), type(self.indentation).__name__]
         content += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
         content += [self.contrast, self.exact, *self.scores, self.num_taxels, self.threshold, self.correlation]
         content += [self.seed, self.chunk_points]
@@ -159,28 +164,29 @@ def read_study(path: str | Path) -> Study:
         conductivity_S_per_m = 1.0
         [electrodes]
         layouts = ["park-inner", "park-boundary", "grid-8x4", "perimeter-32", "inner-32", "mine.csv"]
-        diameter_mm = [6, 8]                 # and contact_impedance_ohm_m2: the file's own, or 6 and 1e-3, unless given
+        diameter_mm = [6, 8]                 # and contact_impedance_ohm_m2: the file's own, or 6 and 1e-4, unless given
         minimum_gap_mm = 2
         [measurement]
         protocol = "two-terminal"            # or "adjacent", "opposite"
-        pairs = [0, 94]                      # of two-terminal: so many between the nearest electrodes; 0: all
+        pairs = [0, 94]                      # of two-terminal: so many of the nearest electrodes; 0: all; 94, or all
         current_mA = 1
-        noise_V = 1e-6
+        noise_V = 2e-5
         [touch]
         indentation = "bell"                 # depth_mm, deviation_mm; or "hemisphere": depth_mm, diameter_mm
         contrast = 0                         # of the touched part's conductivity; above 1 for a conductor
         exact = false                        # true: solved anew for every touch, one point after the other
         columns = 24                         # and rows
         [mesh]
-        cell_mm = 4
+        cell_mm = 4.5
         [scores]
         wanted = ["minimum", "mean", "uniformity", "blind_spot", "taxels"]    # num_taxels, threshold, seed
         # of sheets also "information", "mean_variance", "largest_variance", "localisation_error": correlation_mm
 
-    Only `electrodes.layouts` must be there. Files are looked for beside the study's. Raises `FileNotFoundError` if
-    there is no such file and `ValueError`, naming the key and what to do, for keys that are not known or have no effect
-    beside the others, values out of range (such as metres for millimetres), electrodes that overlap, impossible
-    spacings, and layouts that do not have the electrodes that a protocol needs.
+    Only `electrodes.layouts` must be there; defaults are those of `jeit.design.skin.defaults`. Files are looked for
+    beside the study's. Raises `FileNotFoundError` if there is no such file and `ValueError`, naming the key and what to
+    do, for keys that are not known or have no effect beside the others, values out of range (such as metres for
+    millimetres), electrodes that overlap, impossible spacings, and layouts that do not have the electrodes that a
+    protocol needs.
     """
     path = Path(path)
     if not path.is_file():
@@ -197,7 +203,7 @@ def read_study(path: str | Path) -> Study:
 
 
 def _study(text: str, values: dict, folder: Path) -> Study:
-    skin = Rectangle(1e-3 * values["skin.width_mm"], 1e-3 * values["skin.height_mm"])
+    outline = Rectangle(1e-3 * values["skin.width_mm"], 1e-3 * values["skin.height_mm"])
     depth, thinnest = values["touch.depth_mm"], min(values["skin.thickness_mm"])
     if depth >= thinnest:
         raise ValueError(f"touch.depth_mm is {depth:g}, and the skin {thinnest:g} mm thick; press less.")
@@ -217,25 +223,27 @@ def _study(text: str, values: dict, folder: Path) -> Study:
         )
     layers = values["mesh.layers"] if values["skin.model"] == "layer" else 0
     layouts = [
-        study_layout(name, folder, skin, diameter, impedance, 1e-3 * values["electrodes.minimum_gap_mm"])
+        study_layout(name, folder, outline, diameter, impedance, 1e-3 * values["electrodes.minimum_gap_mm"])
         for name in values["electrodes.layouts"]
         for diameter in _metres(values["electrodes.diameter_mm"])
         for impedance in values["electrodes.contact_impedance_ohm_m2"]
     ]
     points = (
-        Point(layout, thickness, float(conductivity), protocol, pairs, float(noise), cell_size, layers)
+        Point(
+            layout, thickness, float(conductivity), protocol, _pairs(layout, protocol, pairs), noise, cell_size, layers
+        )
         for layout in layouts
         for thickness in _metres(values["skin.thickness_mm"])
-        for conductivity in values["skin.conductivity_S_per_m"]
+        for conductivity in map(float, values["skin.conductivity_S_per_m"])
         for protocol in values["measurement.protocol"]
         for pairs in values["measurement.pairs"]
-        for noise in values["measurement.noise_V"]
+        for noise in map(float, values["measurement.noise_V"])
         for cell_size in _metres(values["mesh.cell_mm"])
     )
     study = Study(
         name=values["name"],
         points=tuple(points),
-        skin=skin,
+        outline=outline,
         indentation=indentation,
         contrast=float(values["touch.contrast"]),
         exact=values["touch.exact"],
@@ -252,6 +260,14 @@ def _study(text: str, values: dict, folder: Path) -> Study:
     )
     _check(study)
     return study
+
+
+def _pairs(layout: Layout, protocol: str, pairs: float) -> int:
+    """As many as are asked for, 0 for all; where nobody says, as many as other skins have, or all."""
+    if not math.isnan(pairs):
+        return int(pairs)
+    all_pairs = layout.num_electrodes * (layout.num_electrodes - 1) // 2
+    return defaults.NUM_PAIRS if protocol == "two-terminal" and all_pairs > defaults.NUM_PAIRS else 0
 
 
 def _check(study: Study) -> None:
@@ -272,7 +288,7 @@ def _check(study: Study) -> None:
                 f"mesh.cell_mm is {1e3 * point.cell_size:g}, too coarse for electrodes {1e3 * smallest:.3g} mm across; "
                 f"{1e3 * smallest / 2:.3g} would do."
             )
-        check_cell_size("mesh.cell_mm", point.cell_size, study.skin.area, point.layers)
+        check_cell_size("mesh.cell_mm", point.cell_size, study.outline.area, point.layers)
 
 
 def _check_measurement(point: Point) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
-from jeit.design import SensitivityMap
+from jeit.design.sensitivity import SensitivityMap
 from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar
 
 _COLOURS = (INK, "#c8102e", "#1f6fb4", "#2a9d6f")

@@ -9,7 +9,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.tri import Triangulation
 from numpy.typing import ArrayLike
 
-from jeit.design import Taxels
+from jeit.design.taxels import Taxels
 from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar, extent_of
 
 _COLOURS = (INK, "#c8102e", "#1f6fb4", "#2a9d6f", "#8a5cb8", "#d98a1c")

@@ -6,7 +6,7 @@ from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.patches import Circle, PathPatch
 from matplotlib.path import Path
 
-from jeit.design import Optimisation
+from jeit.design.optimisation.optimise import Optimisation
 from jeit.mesh import Domain
 from jeit.plot.axes import INK, SOFT, axes_or_new, bare, draw_scale_bar
 from jeit.plot.imaging.electrodes import METAL

@@ -112,7 +112,7 @@ def draw_maps(study: Study, data):
     height = 2.4 + 0.15 * max(title.count("\n") for title in titles)
     figure = Figure(figsize=(max(2.6 * columns, 4.0) + 0.8, height * rows + 0.3), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    low_x, high_x, low_y, high_y = (1e3 * length for length in study.skin.extent)
+    low_x, high_x, low_y, high_y = (1e3 * length for length in study.outline.extent)
     image = None
     for axes, number, map_values in zip(panels, numbers, values, strict=False):
         layout = study.points[number].layout

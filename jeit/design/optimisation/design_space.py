@@ -1,0 +1,92 @@
+"""Which layouts a search may take: where electrodes may be, and what of them is varied besides their places."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jeit.design.optimisation.constraints import Constraints
+from jeit.design.optimisation.variables import Symmetry, Variables, Varied
+from jeit.design.skin.skin import Skin
+from jeit.mesh import Domain
+
+
+class DesignSpace(eqx.Module):
+    """The layouts of a skin that a search may take.
+
+    **Fields**
+
+    - `outline`: that electrodes stay inside of, the skin's unless given. `minimum_spacing`: of centres, metres;
+      electrodes never overlap. `keep_out`: domains that no electrode may touch.
+    - `symmetry`: about the middle of the outline's box. The layout must have an equal share of its electrodes in every
+      half (x or y below the middle) or quarter; those of the first are kept, and the others become their images. Take
+      several starts: there are fewer ways out of a poor layout.
+    - `sizes`: electrodes' sizes are moved too, between half and twice what they are, or between two diameters, metres.
+    - `contact_impedance`: electrodes' are varied too, between two values, ohm·m². `thickness`: that of the sheet is
+      varied too, between two values, metres, from the skin's on; its conductance grows with it.
+    """
+
+    outline: Domain | None
+    minimum_spacing: float
+    keep_out: tuple[Domain, ...]
+    symmetry: Symmetry | None = eqx.field(static=True)
+    sizes: bool | tuple[float, float] = eqx.field(static=True)
+    contact_impedance: tuple[float, float] | None = eqx.field(static=True)
+    thickness: tuple[float, float] | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        *,
+        outline: Domain | None = None,
+        minimum_spacing: float = 0.0,
+        keep_out: Sequence[Domain] = (),
+        symmetry: Symmetry | None = None,
+        sizes: bool | tuple[float, float] = False,
+        contact_impedance: tuple[float, float] | None = None,
+        thickness: tuple[float, float] | None = None,
+    ):
+        """Raises `ValueError` where `keep_out` is no list of domains; the rest is judged with a skin."""
+        if isinstance(keep_out, Domain) or not all(isinstance(one, Domain) for one in keep_out):
+            raise ValueError(
+                f"keep_out must be a list of domains, such as [Disk(0.01, (0.02, 0.0))]; it is {keep_out!r}."
+            )
+        self.outline, self.minimum_spacing, self.keep_out = outline, float(minimum_spacing), tuple(keep_out)
+        self.symmetry, self.sizes = symmetry, sizes
+        self.contact_impedance, self.thickness = contact_impedance, thickness
+
+    def constraints(self, skin: Skin) -> Constraints:
+        """What its layouts satisfy on a `skin`. Raises `ValueError` where neither says the outline, and for a spacing
+        that is none."""
+        outline = skin.layout.outline if self.outline is None else self.outline
+        if outline is None:
+            raise ValueError(
+                "outline: the layout does not know that of its skin; give one, such as Rectangle(0.2, 0.2)."
+            )
+        return Constraints(outline, self.minimum_spacing, self.keep_out)
+
+    def variables(self, skin: Skin, constraints: Constraints, depth: float) -> Variables:
+        """What stands for its layouts, from that of a `skin` on, whose touches are `depth` metres deep. Raises
+        `ValueError` for what cannot be."""
+        options = {"sizes": self.sizes, "contacts": self.contact_impedance, "thickness": self.thickness}
+        outline = constraints.outline
+        variables = Variables.create(outline, varied_of(skin), symmetry=self.symmetry, **options)
+        if self.thickness is not None:
+            _check_thickness(self.thickness, depth, outline)
+        constraints.check_room(variables.smallest)
+        return variables
+
+
+def varied_of(skin: Skin) -> Varied:
+    """What of a sheet a search may vary, as it is."""
+    discs = skin.model.electrodes
+    contact_impedance = discs.contact_impedance  # pyright: ignore[reportAttributeAccessIssue]
+    return Varied(skin.layout.centres, skin.layout.diameters / 2, contact_impedance, jnp.asarray(skin.thickness, float))
+
+
+def _check_thickness(thickness: tuple[float, float], depth: float, outline: Domain) -> None:
+    low_x, high_x, low_y, high_y = outline.extent
+    if np.min(thickness) <= depth:
+        raise ValueError(f"thickness: the touches are {1e3 * depth:.3g} mm deep; let the sheet be thicker.")
+    if np.max(thickness) > max(high_x - low_x, high_y - low_y):
+        raise ValueError(f"thickness is {thickness!r} metres, more than the skin is wide; are they millimetres?")

@@ -1,0 +1,62 @@
+"""What a search makes large: a score of a sheet's layout."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jeit.design.optimisation.variables import Varied
+from jeit.design.scores import Score, Scores, TouchPrior, layout_scores
+from jeit.design.skin.defaults import CONTRAST, CORRELATION, NOISE, TEMPERATURE
+from jeit.design.skin.indentation import AbstractIndentation
+from jeit.design.skin.sheet_touches import SheetTouches
+from jeit.design.skin.skin import Skin
+from jeit.electrodes import SheetDiscs
+
+
+def balanced(scores: Scores) -> Float[Array, ""]:
+    """log of the soft-worst sensitivity minus that of the mean variance: a per cent of either counts alike."""
+    return jnp.log(scores.soft_worst) - jnp.log(scores.mean_variance)
+
+
+class Objective(eqx.Module):
+    """`score` of the `Scores` of a layout, to be made large.
+
+    **Fields**: `touches`, of the skin, as of `Skin.sheet_touches`; `prior`, `noise` (volts) and `temperature` as in
+    `layout_scores`; `score`, a function of `Scores` with differences of order 1, as logarithms have.
+    """
+
+    touches: SheetTouches
+    prior: TouchPrior
+    noise: Float[Array, "..."] = eqx.field(default=NOISE, converter=lambda noise: jnp.asarray(noise, float))
+    score: Score = eqx.field(default=balanced, static=True)
+    temperature: float = TEMPERATURE
+
+    @classmethod
+    def create(
+        cls,
+        skin: Skin,
+        places,
+        indentation: AbstractIndentation | None = None,
+        *,
+        contrast: float = CONTRAST,
+        correlation: float = CORRELATION,
+        **options,
+    ) -> "Objective":
+        """Of touches of a `skin` at `places` (n, 2), metres, as in `Skin.sheet_touches`, whose amplitudes are
+        correlated over `correlation` metres; `options`: `noise`, `score`, `temperature`. Raises `ValueError` as
+        `Skin.sheet_touches` and `TouchPrior.create` do."""
+        touches = skin.sheet_touches(places, indentation, contrast=contrast)
+        return cls(touches, TouchPrior.create(places, correlation=correlation), **options)
+
+    def scores(self, skin: Skin) -> Scores:
+        """All scores of a skin. Raises `ValueError` as `layout_scores` does."""
+        options = {"prior": self.prior, "noise": self.noise, "temperature": self.temperature}
+        return layout_scores(skin.model, skin.model_conductivity, self.touches, **options)
+
+    def scores_of_varied(self, skin: Skin, varied: Varied) -> Scores:
+        """The same with other electrodes and another thickness; differentiable in them."""
+        model = skin.model.with_electrodes(SheetDiscs(varied.centres, varied.radii, varied.contact_impedance))
+        conductance = skin.model_conductivity * (varied.thickness / skin.thickness)
+        touches = self.touches.at_thickness(varied.thickness)
+        options = {"prior": self.prior, "noise": self.noise, "temperature": self.temperature}
+        return layout_scores(model, conductance, touches, **options)

@@ -1,0 +1,62 @@
+"""What a skin of one layout feels, as in text S4 of Park et al. 2022: sensitivity and virtual taxels."""
+
+import equinox as eqx
+from jaxtyping import Array
+
+from jeit.design.sensitivity import SensitivityMap
+from jeit.design.skin.defaults import NUM_TAXELS, THRESHOLD
+from jeit.design.skin.skin import Skin
+from jeit.design.skin.touch_grid import TouchGrid
+from jeit.design.skin.touched_cells import TouchedCells
+from jeit.design.taxels import Taxels, find_taxels
+from jeit.layout import Layout
+
+
+class SkinResponse(eqx.Module):
+    """What a skin of one `layout` feels: its `sensitivity`, and its `taxels`."""
+
+    layout: Layout
+    sensitivity: SensitivityMap
+    taxels: Taxels
+
+
+def skin_response(
+    skin: Skin,
+    grid: TouchGrid,
+    *,
+    key: Array,
+    touched: TouchedCells | None = None,
+    num_taxels: int | None = None,
+    threshold: float = THRESHOLD,
+    linear: bool = False,
+) -> SkinResponse:
+    """Touch a skin at every place of `grid`, one at a time.
+
+    **Arguments:**
+
+    - `key`: for the taxels' k-means, from `jax.random.key`.
+    - `touched`: what the touches change, `skin.touched_cells(grid.places)` unless given.
+    - `num_taxels`: 90 unless given, or one a place; `threshold`: as in `find_taxels`.
+    - `linear`: changes of the voltages are linear, instead of exact.
+
+    Raises `ValueError` for more taxels than places, touches of other places, and as `Skin.touched_cells` and
+    `Skin.voltage_changes` do.
+    """
+    number = number_of_taxels(grid, num_taxels)
+    touched = skin.touched_cells(grid.places) if touched is None else touched
+    if len(touched.places) != len(grid.places):
+        raise ValueError(f"touched is of {len(touched.places)} places, and grid has {len(grid.places)}; give its own.")
+    sensitivity = SensitivityMap(grid, skin.voltage_changes(touched, linear=linear))
+    taxels = find_taxels(
+        sensitivity.changes, grid.places, grid.cell_area, num_taxels=number, threshold=threshold, key=key
+    )
+    return SkinResponse(skin.layout, sensitivity, taxels)
+
+
+def number_of_taxels(grid: TouchGrid, num_taxels: int | None) -> int:
+    """How many taxels are looked for, as in `skin_response`. Raises `ValueError` for none, or more than places."""
+    if num_taxels is None:
+        return min(NUM_TAXELS, len(grid.places))
+    if not 1 <= num_taxels <= len(grid.places):
+        raise ValueError(f"num_taxels is {num_taxels}; give from 1 to the {len(grid.places)} places touched.")
+    return num_taxels

@@ -1,0 +1,48 @@
+"""What is measured of a skin."""
+
+from typing import Literal
+
+import numpy as np
+
+from jeit.design.measurements.selection import nearest_pairs
+from jeit.design.skin.defaults import CURRENT, NUM_PAIRS, PROTOCOL
+from jeit.layout import Layout
+from jeit.protocol import Protocol, adjacent, opposite, two_terminal
+
+ProtocolName = Literal["adjacent", "opposite", "two-terminal"]
+PROTOCOLS: tuple[ProtocolName, ...] = ("adjacent", "opposite", "two-terminal")
+
+
+def skin_protocol(
+    layout: Layout, name: ProtocolName = PROTOCOL, *, num_pairs: int | None = None, current: float = CURRENT
+) -> Protocol:
+    """The measurements of a skin with electrodes of `layout`, at `current` amperes.
+
+    `num_pairs`, of "two-terminal" only: between so many of the electrodes nearest to each other, 0 for all pairs; 94
+    unless given, as in Park et al. 2022, or all if there are fewer. Raises `ValueError` for another name, more pairs
+    than there are, pairs of another protocol, and as the protocols do.
+    """
+    if name not in PROTOCOLS:
+        raise ValueError(f"protocol: there is no {name!r}; take {', '.join(PROTOCOLS)}.")
+    if name != "two-terminal":
+        if num_pairs:
+            raise ValueError(f"num_pairs is {num_pairs}, and only 'two-terminal' has pairs, not {name!r}.")
+        return {"adjacent": adjacent, "opposite": opposite}[name](layout.num_electrodes, current=current)
+    number = number_of_pairs(layout, num_pairs)
+    pairs = np.column_stack(np.triu_indices(layout.num_electrodes, 1))
+    if number < len(pairs):
+        pairs = pairs[np.sort(nearest_pairs(layout.centres, number))]
+    return two_terminal(layout.num_electrodes, pairs, current=current)
+
+
+def number_of_pairs(layout: Layout, num_pairs: int | None) -> int:
+    """How many pairs are measured, as in `skin_protocol`. Raises `ValueError` for more than there are."""
+    pairs = layout.num_electrodes * (layout.num_electrodes - 1) // 2
+    if num_pairs is None:
+        return min(NUM_PAIRS, pairs)
+    if not 0 <= num_pairs <= pairs:
+        raise ValueError(
+            f"num_pairs is {num_pairs}; '{layout.name}' has {layout.num_electrodes} electrodes, and they make {pairs} "
+            "pairs; give so many or fewer."
+        )
+    return num_pairs or pairs

@@ -1,0 +1,235 @@
+"""`Skin`: a layout of electrodes in a conducting sheet, or on the bottom of a layer; checked, meshed, and touched."""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jeit.design.skin.cell_size import check_cell_size
+from jeit.design.skin.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
+from jeit.design.skin.indentation import AbstractIndentation, Bell
+from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.sheet_touches import SheetTouches, sheet_touches
+from jeit.design.skin.touched_cells import TouchedCells, touched_cells
+from jeit.design.skin.voltage_changes import touch_changes
+from jeit.electrodes import FaceDiscs, SheetDiscs
+from jeit.forward import ForwardModel
+from jeit.forward.assembly import check_conductivity
+from jeit.layout import Layout
+from jeit.mesh import Domain, Mesh, Rectangle, layer
+from jeit.protocol import Protocol
+
+# Of cells, times the smallest diameter of electrodes.
+_COARSEST = 1.5
+# Of a layer of cells, times a touch's depth: the middle of its uppermost cells is a quarter of it below the surface.
+_THICKEST = 3.0
+
+
+class Skin(eqx.Module):
+    """A flat skin of one layout: its electrodes' discs in a sheet, or on the bottom of a layer touched on its top.
+
+    **Fields**
+
+    - `layout`: of the electrodes, with the skin's outline.
+    - `model`: its forward model: mesh, electrodes and protocol.
+    - `thickness`: metres, of a sheet that of the layer which it stands for.
+    - `conductivity`: of the material, S/m, one number or one for each cell.
+    - `num_layers`: of cells of a layer; 0 for a sheet.
+    - `cell_size`: metres, of the plane mesh, if that was asked for.
+
+    Make it with `Skin.create`, which checks and meshes; or from a `model` of one's own, of `SheetDiscs` or `FaceDiscs`.
+    """
+
+    layout: Layout
+    model: ForwardModel
+    thickness: float
+    conductivity: Float[Array, "..."]
+    num_layers: int = eqx.field(static=True)
+    cell_size: float | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        layout: Layout,
+        model: ForwardModel,
+        *,
+        thickness: float,
+        conductivity,
+        num_layers: int = 0,
+        cell_size: float | None = None,
+    ):
+        """Raises `ValueError` for a model of other electrodes, or of another dimension."""
+        wanted = FaceDiscs if num_layers else SheetDiscs
+        if not isinstance(model.electrodes, wanted):
+            raise ValueError(
+                f"model has {type(model.electrodes).__name__}; a {'layer' if num_layers else 'sheet'} has "
+                f"{wanted.__name__}, such as those of Skin.create."
+            )
+        if model.electrodes.num_electrodes != layout.num_electrodes:
+            raise ValueError(
+                f"layout has {layout.num_electrodes} electrodes and the model {model.electrodes.num_electrodes}; their "
+                "number cannot change."
+            )
+        if not 0 < thickness < math.inf:
+            raise ValueError(f"thickness must be positive, in metres; it is {thickness!r}.")
+        self.layout, self.model, self.thickness = layout, model, thickness
+        self.num_layers, self.cell_size = num_layers, cell_size
+        checked = check_conductivity(model.mesh, conductivity)
+        self.conductivity = jnp.asarray(conductivity, checked.dtype)
+
+    @classmethod
+    def create(
+        cls,
+        layout: Layout,
+        *,
+        thickness: float = THICKNESS,
+        conductivity=CONDUCTIVITY,
+        contact_impedance=None,
+        num_layers: int = NUM_LAYERS,
+        cell_size: float | None = None,
+        num_points: int | None = None,
+        protocol: Protocol | None = None,
+    ) -> "Skin":
+        """Check and mesh a skin with electrodes of `layout`.
+
+        `thickness` in metres, `conductivity` in S/m. `contact_impedance` of the electrodes, ohm·m²: the layout's unless
+        given, and 1e-4 where it does not say. `num_layers` of cells, 0 for a sheet. `cell_size`, metres (4.5e-3), or
+        `num_points`, about, of the plane mesh. `protocol`: that of `skin_protocol(layout)` unless given.
+
+        Raises `ValueError` for a layout without an outline, cells too small for any mesh, and electrodes too small for
+        them.
+        """
+        outline = plain_outline(layout.known_outline)
+        if cell_size is None and num_points is None:
+            cell_size = CELL_SIZE
+        if cell_size is not None:
+            _check_cells(layout, cell_size, outline, num_layers)
+        electrodes = skin_electrodes(layout, num_layers, contact_impedance)
+        plane = outline.mesh(num_points=num_points, cell_size=cell_size)
+        mesh = layer(plane, thickness, num_layers) if num_layers else plane
+        _check_electrodes(layout, electrodes, mesh, cell_size, num_points)
+        model = ForwardModel(mesh, electrodes, skin_protocol(layout) if protocol is None else protocol)
+        layout = eqx.tree_at(lambda one: one.outline, layout, outline)
+        options = {"num_layers": num_layers, "cell_size": cell_size}
+        return cls(layout, model, thickness=thickness, conductivity=conductivity, **options)
+
+    @property
+    def outline(self) -> Domain:
+        """Of the skin, metres."""
+        return self.layout.known_outline
+
+    @property
+    def model_conductivity(self) -> Float[Array, "..."]:
+        """What the model takes: the material's in S/m for a layer, a sheet's in siemens."""
+        return model_conductivity(self.conductivity, self.thickness, self.num_layers)
+
+    def with_layout(self, layout: Layout, contact_impedance=None) -> "Skin":
+        """The same skin, on the same mesh and with the same protocol, with as many electrodes of another layout.
+
+        `contact_impedance` as in `create`. Raises `ValueError` for electrodes off the mesh or too small for it.
+        """
+        electrodes, mesh = skin_electrodes(layout, self.num_layers, contact_impedance), self.model.mesh
+        if self.cell_size is None:
+            electrodes.check(mesh)
+        else:
+            _check_cells(layout, self.cell_size, self.outline, self.num_layers)
+            _check_electrodes(layout, electrodes, mesh, self.cell_size, None)
+        return eqx.tree_at(lambda one: (one.layout, one.model), self, (layout, self.model.with_electrodes(electrodes)))
+
+    def touched_cells(
+        self, places, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
+    ) -> TouchedCells:
+        """What touches at `places` (n, 2), metres, change, one at a time; `Bell` unless given, as in `touched_cells`.
+
+        Raises `ValueError` for touches as deep as the skin, of which one changes no cell, as where a layer has too few
+        layers of cells, and for a contrast that changes nothing.
+        """
+        indentation = Bell() if indentation is None else indentation
+        if not self.num_layers:
+            return touched_cells(
+                self.model.mesh, indentation, places, thickness=float(self.thickness), contrast=contrast
+            )
+        deepest = float(indentation.depth_at(jnp.asarray(0.0)))
+        most = _THICKEST * self.num_layers * deepest
+        said = (
+            f"thickness is {1e3 * self.thickness:g} mm; give more than the {1e3 * deepest:g} mm that a touch is deep, "
+            f"and no more than {1e3 * most:g} mm, where {self.num_layers} layers of cells become too coarse for it"
+        )
+        if deepest >= self.thickness:
+            raise ValueError(f"{said}.")
+        try:
+            return touched_cells(self.model.mesh, indentation, places, contrast=contrast)
+        except ValueError as error:
+            if self.thickness > most:
+                raise ValueError(f"{said}: {error}") from None
+            raise
+
+    def sheet_touches(
+        self, places, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
+    ) -> SheetTouches:
+        """The same of a sheet, with derivatives in the places. Raises `ValueError` as `jeit.design.sheet_touches`."""
+        indentation = Bell() if indentation is None else indentation
+        return sheet_touches(self.model.mesh, indentation, places, thickness=float(self.thickness), contrast=contrast)
+
+    def voltage_changes(self, touched: TouchedCells, *, linear: bool = False) -> Float[Array, "n M"]:
+        """Changes (n, M) of its voltages by touches, volts: exact, or linear; errors and limits of `touch_changes`."""
+        return touch_changes(self.model, self.model_conductivity, touched, linear=linear)
+
+
+def model_conductivity(conductivity, thickness, num_layers: int):
+    """What a forward model takes: the material's `conductivity`, S/m, for a layer, a sheet's in siemens."""
+    return conductivity if num_layers else conductivity * thickness
+
+
+def plain_outline(outline: Domain) -> Domain:
+    """A drawing's four corners are a rectangle if they are one: it is then meshed as one."""
+    if [len(loop) for loop in outline.loops()] != [4]:
+        return outline
+    low_x, high_x, low_y, high_y = outline.extent
+    width, height = high_x - low_x, high_y - low_y
+    if abs(width * height - outline.area) > 1e-6 * width * height:
+        return outline
+    return Rectangle(width, height, ((low_x + high_x) / 2, (low_y + high_y) / 2))
+
+
+def skin_electrodes(layout: Layout, num_layers: int, contact_impedance=None) -> SheetDiscs | FaceDiscs:
+    """Discs in a sheet (`num_layers` 0), or on the bottom of a layer. Contact impedance in ohm·m²: the layout's unless
+    given, and 1e-4 where it does not say."""
+    if contact_impedance is None and layout.contact_impedance is None:
+        contact_impedance = CONTACT_IMPEDANCE
+    discs = layout.sheet_discs(contact_impedance)
+    if not num_layers:
+        return discs
+    centres = np.asarray(discs.position)
+    return FaceDiscs(np.column_stack([centres, np.zeros(len(centres))]), discs.radius, discs.contact_impedance)
+
+
+def _check_cells(layout: Layout, cell_size: float, outline: Domain, num_layers: int) -> None:
+    most = _COARSEST * _smallest(layout)
+    if not 0 < 1e3 * cell_size <= (1 + 1e-9) * most:
+        raise ValueError(
+            f"cell_size is {1e3 * cell_size:g} mm; give no more than {most:.3g} mm, as electrodes of '{layout.name}' "
+            f"are {_smallest(layout):.3g} mm across."
+        )
+    check_cell_size("cell_size", cell_size, float(outline.area), num_layers)
+
+
+def _check_electrodes(layout: Layout, electrodes, mesh: Mesh, cell_size: float | None, num_points: int | None) -> None:
+    try:
+        electrodes.check(mesh)
+    except ValueError:
+        across = f"{_smallest(layout):.3g} mm across"
+        if num_points is not None:
+            said = f"num_points {num_points} makes cells too coarse for electrodes {across}; give more."
+        else:
+            said = (
+                f"cell_size is {1e3 * (cell_size or 0):g} mm, too large: electrodes of '{layout.name}' are {across}; "
+                "give less."
+            )
+        raise ValueError(said) from None
+
+
+def _smallest(layout: Layout) -> float:
+    """Diameter of the smallest electrode, millimetres."""
+    return 1e3 * float(np.min(layout.diameters))

@@ -1,0 +1,61 @@
+"""Where a skin is touched: the middles of equal rectangles over it."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jeit.design.skin.defaults import PLACES
+from jeit.mesh import Domain
+
+
+class TouchGrid(eqx.Module):
+    """Where a skin is touched: the middles of equal rectangles that cover it.
+
+    - `places`: (n, 2) metres; `rows`, `columns`: (n,) of each in the raster, row 0 at the least y.
+    - `shape`: (rows, columns) of the raster; `pitch`: (width, height) of a rectangle, metres.
+    """
+
+    places: Float[np.ndarray, "n 2"]
+    rows: np.ndarray
+    columns: np.ndarray
+    shape: tuple[int, int] = eqx.field(static=True)
+    pitch: tuple[float, float] = eqx.field(static=True)
+
+    @property
+    def cell_area(self) -> float:
+        """Of a rectangle, m²."""
+        return self.pitch[0] * self.pitch[1]
+
+    def raster(self, values) -> Float[np.ndarray, "rows columns"]:
+        """Values (n,) as an image, NaN off the skin."""
+        image = np.full(self.shape, np.nan)
+        image[self.rows, self.columns] = np.asarray(values)
+        return image
+
+
+def touch_grid(outline: Domain, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
+    """Rectangles over the bounding box of `outline`, those whose middle lies inside; 48 × 48 as in Park et al. 2022.
+
+    Raises `ValueError` for fewer than one row or column.
+    """
+    if columns < 1 or rows < 1:
+        raise ValueError(
+            f"a grid needs one column and one row at least; {columns} columns and {rows} rows were asked for."
+        )
+    low_x, high_x, low_y, high_y = outline.extent
+    width, height = (high_x - low_x) / columns, (high_y - low_y) / rows
+    x, y = low_x + width * (np.arange(columns) + 0.5), low_y + height * (np.arange(rows) + 0.5)
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    inside = np.asarray(outline.contains(places))
+    row, column = np.divmod(np.flatnonzero(inside), columns)
+    return TouchGrid(places[inside], row, column, (rows, columns), (float(width), float(height)))
+
+
+def touches_away_from_the_edge(outline: Domain, margin: float, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
+    """The places of `touch_grid` whose touches reach over no edge: farther than `margin` (metres) from the outline."""
+    grid = touch_grid(outline, columns, rows)
+    offsets = margin * np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 16, endpoint=False)])
+    kept = np.all([np.asarray(outline.contains(grid.places + offset)) for offset in offsets], axis=0)
+    if not kept.any():
+        raise ValueError(f"margin is {1e3 * margin:g} mm: no place of the skin is so far from its edge; give less.")
+    return TouchGrid(grid.places[kept], grid.rows[kept], grid.columns[kept], grid.shape, grid.pitch)

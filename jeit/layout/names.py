@@ -1,0 +1,134 @@
+"""The layouts that have a name: two of the literature's, and regular ones made for any skin."""
+
+import difflib
+import math
+import re
+from functools import lru_cache
+
+import numpy as np
+
+from jeit.layout.arrangements import grid, perimeter, quasi_uniform
+from jeit.layout.layout import Layout
+from jeit.mesh import Disk, Domain, Rectangle
+
+# The paper's skin and the electrodes of its Fig. S4, in metres. It does not say how far the electrodes of its
+# conventional layout sit from the edge: here they leave 2 mm of hydrogel outside them.
+_SIDE, DIAMETER, _FROM_EDGE = 0.2, 6e-3, 2e-3
+_PARK = ("park-inner", "park-boundary")
+# Electrodes of a made layout: each has its distance from every other looked at.
+_MOST = 1024
+
+BUILT_IN = {
+    "park-inner": "32 electrodes spread evenly inside 200 × 200 mm (Park et al. 2022, the proposed design)",
+    "park-boundary": "32 electrodes evenly along the edge of 200 × 200 mm (Park et al. 2022, the conventional design)",
+    "grid-8x4": "a regular grid of 8 columns and 4 rows; any other counts likewise, and any rectangular skin",
+}
+NAMES = (*_PARK, "grid-CxR", "perimeter-N", "inner-N")
+
+
+def named_layout(name: str, outline: Domain | None = None, *, diameter: float = DIAMETER) -> Layout:
+    """A layout by its name, on a skin of `outline`, 200 × 200 mm about the origin unless given.
+
+    - "park-inner" and "park-boundary": the two designs that text S4 of Park et al., Science Robotics 7, eabm7187 (2022)
+      compares, of that skin only. Its coordinates are not published, only "as evenly as possible in a square area" and
+      "about 40 mm" apart: here a centroidal Voronoi tessellation, nearest neighbours 31 to 38 mm apart. Around the
+      edge, electrodes lie 5 mm from it, 23.75 mm apart, none in a corner, counter-clockwise from the lower left.
+    - "grid-CxR": C columns and R rows, each electrode in the middle of an equal rectangle of the skin's box.
+    - "perimeter-N": along the edge of a rectangle or a disk, 2 mm of skin outside them.
+    - "inner-N": spread evenly inside any outline.
+
+    `diameter` of the electrodes, metres. Raises `ValueError` for another name, for a skin that has no such layout, and
+    for electrodes that would overlap.
+    """
+    outline = Rectangle(_SIDE, _SIDE) if outline is None else outline
+    made = re.fullmatch(r"(perimeter|inner)-(\d{1,4})", name) if isinstance(name, str) else None
+    counts = re.fullmatch(r"grid-(\d{1,4})x(\d{1,4})", name) if isinstance(name, str) else None
+    if name in _PARK:
+        _check_park(name, outline)
+        centres = _park(name)
+    elif counts is not None:
+        centres = _lattice(name, outline, diameter, int(counts[1]), int(counts[2]))
+    elif made is not None:
+        number = int(made[2])
+        if number > _MOST:
+            raise ValueError(f"name: {name!r} has {number} electrodes; give {_MOST} or fewer.")
+        centres = _inner(outline, number, diameter) if made[1] == "inner" else _around(name, outline, diameter, number)
+    else:
+        raise ValueError(
+            f"name: there is no layout {name!r}{_meant(name)}; take {', '.join(BUILT_IN)} (or another grid-CxR), "
+            "perimeter-N, inner-N, or a file's."
+        )
+    return Layout(centres, diameter, outline=outline, name=name)
+
+
+def same_outline(one: Domain | None, other: Domain) -> bool:
+    """Whether two outlines are the same but for rounding: lengths come as decimal millimetres."""
+    return (
+        one is not None
+        and np.allclose(one.extent, other.extent, atol=1e-6)
+        and math.isclose(other.area, one.area, rel_tol=1e-3)
+    )
+
+
+@lru_cache(maxsize=2)
+def _park(name: str) -> np.ndarray:
+    if name == "park-inner":
+        return quasi_uniform(Rectangle(_SIDE, _SIDE), 32)
+    inset = DIAMETER + 2 * _FROM_EDGE
+    track = Rectangle(_SIDE - inset, _SIDE - inset)
+    pitch = track.perimeter / 32
+    return np.asarray(track.boundary(pitch * (np.arange(32) + 0.5)))
+
+
+def _check_park(name: str, outline: Domain) -> None:
+    if not same_outline(outline, Rectangle(_SIDE, _SIDE)):
+        span = f"{-5e2 * _SIDE:g} to {5e2 * _SIDE:g} mm"
+        other = "inner-32" if name == "park-inner" else "perimeter-32"
+        raise ValueError(f"name: its skin spans {span} by {span}; on another take {other}.")
+
+
+def _lattice(name: str, outline: Domain, diameter: float, columns: int, rows: int) -> np.ndarray:
+    if min(columns, rows) < 1:
+        raise ValueError(f"name: {name!r} has no electrodes; give at least one column and one row.")
+    x_min, x_max, y_min, y_max = outline.extent
+    pitches = (x_max - x_min) / columns, (y_max - y_min) / rows
+    if min(pitches) < diameter:
+        raise ValueError(
+            f"name: the electrodes of {name!r} would be {1e3 * min(pitches):.3g} mm apart, and they are "
+            f"{1e3 * diameter:g} mm across: they would overlap by {1e3 * (diameter - min(pitches)):.3g} mm; give "
+            "fewer, or move them apart."
+        )
+    middle = (x_min + x_max) / 2, (y_min + y_max) / 2
+    return grid(x_max - x_min - pitches[0], y_max - y_min - pitches[1], columns, rows, centre=middle)
+
+
+def _around(name: str, outline: Domain, diameter: float, number: int) -> np.ndarray:
+    if not isinstance(outline, Disk | Rectangle):
+        raise ValueError(f"name: {name!r} is of rectangles and disks, and this skin is neither; take inner-N.")
+    x_min, x_max, y_min, y_max = outline.extent
+    width, height, inset = x_max - x_min, y_max - y_min, diameter + 2 * _FROM_EDGE
+    if inset >= min(width, height):
+        raise ValueError(
+            f"name: electrodes {1e3 * diameter:g} mm across do not fit around the edge; make them smaller."
+        )
+    if isinstance(outline, Disk):
+        return perimeter(Disk(outline.radius - inset / 2, outline.centre), number)
+    track = Rectangle(width - inset, height - inset, outline.centre)
+    return perimeter(track, number, start=track.perimeter / number / 2 if number else 0.0)
+
+
+def _inner(outline: Domain, number: int, diameter: float) -> np.ndarray:
+    """Kept for skins that are asked for again, as a study does for every diameter and contact impedance."""
+    if isinstance(outline, Rectangle):
+        return _spread(outline, number, diameter)
+    return quasi_uniform(outline, number, margin=diameter / 2)
+
+
+@lru_cache(maxsize=256)
+def _spread(outline: Rectangle, number: int, diameter: float) -> np.ndarray:
+    return quasi_uniform(outline, number, margin=diameter / 2)
+
+
+def _meant(name) -> str:
+    close = difflib.get_close_matches(name, [*_PARK, *NAMES[2:]], n=1) if isinstance(name, str) else ()
+    return f" (did you mean {close[0]!r}?)" if close else ""
