@@ -32,7 +32,8 @@ def frames(number: int):
 
     from jeit.acoustic import IntensityNoise, InverseSquare, MicrophoneArray, make_surface
     from jeit.mesh import Rectangle
-    from jeit.simulate.sounding_skin import SoundingSkin, expected_power, microphone_grid, noise_power
+    from jeit.simulate import SoundingSkin, microphone_grid
+    from jeit.simulate.acoustic.propagation import expected_power, noise_power
 
     skin = SoundingSkin(jax.random.key(0))
     microphones = np.asarray(skin.microphones)
@@ -146,8 +147,7 @@ def recording(rounds: int) -> tuple[float, float, int]:
     import jax
 
     from jeit.acoustic import Recording, Taps, calibrate_microphones, locate, track
-    from jeit.simulate.sounding_skin import SoundingSkin, microphone_grid
-    from jeit.simulate.touch_sounds import calibration_taps, stroke
+    from jeit.simulate import SoundingSkin, calibration_taps, microphone_grid, stroke
 
     skin = SoundingSkin(jax.random.key(0), multiplexed=False)
     taps = calibration_taps(skin, jax.random.key(1), microphone_grid(9), repeats=1)

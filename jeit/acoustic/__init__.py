@@ -12,13 +12,13 @@ from jeit.acoustic.decay import AbstractDecay as AbstractDecay
 from jeit.acoustic.decay import AttenuatedInverseSquare as AttenuatedInverseSquare
 from jeit.acoustic.decay import Exponential as Exponential
 from jeit.acoustic.decay import InverseSquare as InverseSquare
-from jeit.acoustic.localisation.bound import cramer_rao as cramer_rao
+from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities as calibrated_intensities
+from jeit.acoustic.localisation.cramer_rao import cramer_rao as cramer_rao
 from jeit.acoustic.localisation.localiser import Localiser as Localiser
 from jeit.acoustic.localisation.localiser import SourceEstimate as SourceEstimate
 from jeit.acoustic.localisation.locate import Locations as Locations
 from jeit.acoustic.localisation.locate import locate as locate
-from jeit.acoustic.localisation.locate import prepare as prepare
-from jeit.acoustic.localisation.measure import measure as measure
+from jeit.acoustic.localisation.locate import microphones_in_use as microphones_in_use
 from jeit.acoustic.localisation.overlay import brightness as brightness
 from jeit.acoustic.localisation.overlay import fade as fade
 from jeit.acoustic.localisation.overlay import overlay as overlay

@@ -17,7 +17,7 @@ from jeit.acoustic import (
     Track,
     brightness,
     fade,
-    prepare,
+    microphones_in_use,
 )
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
@@ -123,7 +123,7 @@ def _picture(locations: Locations, calibration: Calibration, heard: Intensities,
     located = np.flatnonzero(locations.located & (locations.status != "two touches"))
     if not located.size:
         return None, None
-    microphone_array, use, _ = prepare(heard, calibration)
+    microphone_array, use, _ = microphones_in_use(heard, calibration)
     localiser = Localiser.create(microphone_array, method=method, map_shape=(_PIXELS, _PIXELS))
     times = locations.times[located]
     time_constant = max(0.3, 0.5 * float(times[-1] - times[0]))

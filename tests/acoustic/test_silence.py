@@ -14,14 +14,14 @@ from jeit.acoustic import (
     InverseSquare,
     MicrophoneArray,
     Recording,
+    calibrated_intensities,
     intensities,
     locate,
     make_surface,
-    measure,
 )
 from jeit.layout import grid
-from jeit.simulate.sounding_skin import SoundingSkin, expected_power, transfer
-from jeit.simulate.touch_sounds import quiet
+from jeit.simulate import SoundingSkin, quiet
+from jeit.simulate.acoustic.propagation import expected_power, transfer
 
 PLACE = np.array([0.02, -0.03])
 
@@ -88,7 +88,9 @@ def test_a_touch_without_pauses(vibration, silent, heard_before):
     assert np.isin(found.status, ["touch", "ambiguous"]).all()
     # Nine microphones 7 cm apart, and a model that knows nothing of echoes.
     assert np.median(np.linalg.norm(found.position - PLACE, axis=1)) < 0.012
-    np.testing.assert_allclose(measure(vibration, heard_before, silence=silent).floor, intensities(silent).floor)
+    np.testing.assert_allclose(
+        calibrated_intensities(vibration, heard_before, silence=silent).floor, intensities(silent).floor
+    )
 
 
 def test_a_floor_is_compared_with_its_own_kind(skin, vibration, silent, heard_before):

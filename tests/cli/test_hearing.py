@@ -9,7 +9,7 @@ import pytest
 from pages import run_page
 from scipy.io import wavfile
 
-from jeit.acoustic import Calibration, measure, read_recording, write_recording
+from jeit.acoustic import Calibration, calibrated_intensities, read_recording, write_recording
 from jeit.cli import main
 from jeit.layout import grid
 
@@ -104,7 +104,7 @@ def test_samples_to_a_track(name, folder, tmp_path):
 
 def test_intensities_of_samples_are_smoothed_as_those_are(folder, tmp_path):
     """Written to a file, with their overlap: the same track, and as sure of it."""
-    heard = measure(read_recording(folder / "touch.npz"), Calibration.load(folder / "sound.json"))
+    heard = calibrated_intensities(read_recording(folder / "touch.npz"), Calibration.load(folder / "sound.json"))
     assert heard.overlap == 4
     write_recording(tmp_path / "heard.npz", heard)
     for name, output in ((folder / "touch.npz", "samples"), (tmp_path / "heard.npz", "intensities")):

@@ -224,7 +224,7 @@ def test_the_papers_loss_is_in_decibels(ax):
     ],
 )
 def test_loss_maps_refuse_what_makes_no_sense(match, change, ax):
-    arguments = {"values": np.ones((3, 3)), "skin": calibration().microphone_array, "ax": ax} | change
+    arguments = {"values": np.ones((3, 3)), "surface": calibration().microphone_array, "ax": ax} | change
     with pytest.raises(ValueError, match=match):
         plot_loss_map(**arguments)
 
@@ -358,13 +358,13 @@ def test_the_ellipse_lies_in_the_plane_of_the_skin(ax):
     [
         ("overlay has shape", {"overlay": np.zeros((3, 4, 4))}),
         ("truth has shape", {"truth": np.zeros((4, 3))}),
-        ("locations: 20 frames of 9 microphones", {"skin": calibration(16)}),
+        ("locations: 20 frames of 9 microphones", {"array": calibration(16)}),
         ("locations", {"locations": recorded(stroke(19))[1]}),
     ],
 )
 def test_tracks_refuse_what_does_not_match(match, change, ax):
     track, locations = recorded(stroke())
-    arguments = {"track": track, "locations": locations, "skin": calibration(), "ax": ax} | change
+    arguments = {"track": track, "locations": locations, "array": calibration(), "ax": ax} | change
     with pytest.raises(ValueError, match=match):
         plot_track(**arguments)
 

@@ -5,15 +5,18 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from jeit.simulate.sounding_skin import (
+from jeit.simulate import (
     SoundingSkin,
-    expected_power,
+    calibration_taps,
     microphone_grid,
-    noise_power,
-    nominal_power,
-    transfer,
+    pat,
+    quiet,
+    stroke,
+    superpose,
+    tap,
+    tickle,
 )
-from jeit.simulate.touch_sounds import calibration_taps, pat, quiet, stroke, superpose, tap, tickle
+from jeit.simulate.acoustic.propagation import expected_power, noise_power, nominal_power, transfer
 
 KEY = jax.random.key(0)
 # No spread from microphone to microphone, and no coupling: what is left has closed forms.
@@ -131,7 +134,7 @@ def test_drawn_bursts_have_the_expected_power(small):
 def test_pieces_of_a_calibration_do_not_show(small, monkeypatch):
     places = [(0.0, 0.01), (0.03, 0.02), (-0.08, 0.0)]
     whole = calibration_taps(small, KEY, places, repeats=2, duration=0.1)
-    monkeypatch.setattr("jeit.simulate.touch_sounds.PIECE", 12_000)
+    monkeypatch.setattr("jeit.simulate.acoustic.calibration_taps.PIECE", 12_000)
     # Two pieces of two places, the last one twice.
     parts = calibration_taps(small, KEY, places, repeats=2, duration=0.1)
     np.testing.assert_allclose(parts.samples, whole.samples, rtol=1e-9, atol=1e-12)

@@ -1,7 +1,7 @@
 """Calibration: decay models and noise of every microphone, from taps at known places and of unknown strength.
 
-Rounds of robust least squares fit them; here it is judged which microphones they are good for. Taps that no microphone
-agrees with are left out, and said.
+Robust least squares fit them; here it is judged which microphones they are good for. Taps that no microphone agrees
+with are left out, and said.
 """
 
 import equinox as eqx
@@ -10,7 +10,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.acoustic.calibration.calibration import Calibration
-from jeit.acoustic.calibration.robust_fit import ABOVE, BELOW, FREE, SHARED, TapFit, first_fit, standard_errors, without
+from jeit.acoustic.calibration.robust_least_squares import (
+    ABOVE,
+    BELOW,
+    FREE,
+    SHARED,
+    TapFit,
+    fit_taps,
+    refit_without,
+    standard_errors,
+)
 from jeit.acoustic.decay import AbstractDecay, find_decay
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.noise import IntensityNoise, below_nothing
@@ -76,13 +85,13 @@ def calibrate_microphones(
     distance = np.linalg.norm(difference, axis=-1)
     enough = _check(kind, distance.T, np.where(usable, power, np.nan).T, faults)
     squared, power = np.sum(difference**2, axis=-1).T, np.where(usable, power, np.nan).T
-    fit = first_fit(kind, taps.microphones, squared, power, noise, known_noise)
+    fit = fit_taps(kind, taps.microphones, squared, power, noise, known_noise)
     tried = fit.use.T
     reasons, explained = _judge(fit, faults)
     bad = np.array([bool(reason) for reason in reasons])
     # What some are left out for may show in others only without them.
     while bad.any() and (~fit.dropped & ~bad).sum() >= 3:
-        fit = without(fit, bad)
+        fit = refit_without(fit, bad)
         again, explained = _judge(fit, ("",) * len(bad), explained)
         bad = np.array([bool(reason) for reason in again]) & ~fit.dropped
         reasons = tuple(new if worse else old for new, old, worse in zip(again, reasons, bad, strict=True))

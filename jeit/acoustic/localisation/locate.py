@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
 from jeit.acoustic.calibration.calibration import Calibration
+from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
 from jeit.acoustic.localisation.localiser import Localiser, SourceEstimate
-from jeit.acoustic.localisation.measure import measure
 from jeit.acoustic.localisation.setup_changes import find_setup_changes
 from jeit.acoustic.localisation.two_sources import locate_two
 from jeit.acoustic.microphones import MicrophoneArray
@@ -16,7 +16,7 @@ from jeit.acoustic.noise import IntensityNoise, below_nothing
 from jeit.acoustic.signal.faults import describe_faults
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
-from jeit.acoustic.surface import size
+from jeit.acoustic.surface import longer_side
 
 STATUSES = ("touch", "no touch", "outside", "two touches", "ambiguous", "misfit", "unusable")
 # Chance that a silent frame is taken for a touch; that a frame one source explains is said not to be.
@@ -92,11 +92,11 @@ def locate(
 
     `method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster that is
     searched, (200, 200) in the paper; a coarse grid unless given (both are refined). `intensity`: band and window for
-    samples, those of the calibration unless given; `silence`: the array untouched, as of `measure`. Raises
-    `ValueError` for a recording of another number of microphones, and where fewer than three can be used.
+    samples, those of the calibration unless given; `silence`: the array untouched, as of `calibrated_intensities`.
+    Raises `ValueError` for a recording of another number of microphones, and where fewer than three can be used.
     """
-    heard = measure(recording, calibration, intensity, silence=silence)
-    microphone_array, use, faults = prepare(heard, calibration)
+    heard = calibrated_intensities(recording, calibration, intensity, silence=silence)
+    microphone_array, use, faults = microphones_in_use(heard, calibration)
     touched = use.any(axis=1) & _above_floor(heard, microphone_array.noise, use)
     enough = use.sum(axis=1) >= 3
     solve = touched & enough
@@ -129,7 +129,7 @@ def locate(
         excess = np.zeros(frames)
         excess[solve] = np.asarray(judge.excess)[:number]
         status[(status == "misfit") & (excess > _OUTSIDE)] = "outside"
-        _bound(status, result, float(size(microphone_array.surface)))
+        _bound(status, result, float(longer_side(microphone_array.surface)))
         notes += _notes(status, heard, use, microphone_array)
     return Locations(
         np.asarray(heard.times),
@@ -233,7 +233,9 @@ def _unit(strength: np.ndarray, heard: Intensities, use: np.ndarray, calibration
     return [f"what is heard is {ratio:.3g} times as loud as the calibration's noise: {asked}"] if low else []
 
 
-def prepare(heard: Intensities, calibration: Calibration) -> tuple[MicrophoneArray, np.ndarray, tuple[str, ...]]:
+def microphones_in_use(
+    heard: Intensities, calibration: Calibration
+) -> tuple[MicrophoneArray, np.ndarray, tuple[str, ...]]:
     """The microphones with the noise of these intensities, which are to be used (F, M), and what is wrong with others.
 
     Raises `ValueError` if fewer than three microphones are left.

@@ -51,7 +51,7 @@ def locate(
     import numpy as np
     from rich.console import Console
 
-    from jeit.acoustic import Calibration, Recording, measure, read_recording, track
+    from jeit.acoustic import Calibration, Recording, calibrated_intensities, read_recording, track
     from jeit.acoustic import locate as find
     from jeit.acoustic.localisation.localiser import METHODS
     from jeit.acoustic.signal.faults import describe_faults
@@ -75,7 +75,7 @@ def locate(
         if quiet_sound is not None and not (isinstance(sound, Recording) and isinstance(quiet_sound, Recording)):
             raise ValueError("--silence is for samples, and must hold samples: intensities have their floor.")
         step("measure intensities")
-        heard = measure(sound, known, settings, silence=quiet_sound)
+        heard = calibrated_intensities(sound, known, settings, silence=quiet_sound)
         if len(heard.times) > 1 and np.median(np.diff(heard.times)) > gap:
             raise ValueError(
                 f"frames are {np.median(np.diff(heard.times)):g} s apart, more than the --gap of {gap:g} s that ends a "

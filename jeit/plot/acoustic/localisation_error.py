@@ -8,7 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
 
-from jeit.plot.acoustic.surface_view import FOUND, Skin, draw_legend, draw_skin, view_of
+from jeit.plot.acoustic.surface_view import FOUND, AnySurface, draw_legend, draw_surface, view_of
 from jeit.plot.axes import INK, SOFT, axes_or_new
 
 _COLOURS = ("#1f6fb4", "#d1495b", "#2a9d6f", "#8a5cb8", "#d98a1c", "#5b6470")
@@ -24,24 +24,24 @@ def plot_pairs(
     true: ArrayLike,
     found: ArrayLike,
     microphones: ArrayLike,
-    skin: Skin,
+    surface: AnySurface,
     *,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw true places (P, d) and those `found` (P, d), pair by pair, over `microphones` (M, d); all in metres.
 
-    `skin`: its outline, a surface, `MicrophoneArray` or a `Calibration`. Places that were not found, NaN, are hollow.
-    The title is mean ± standard deviation of the error unless given. Raises `ValueError` for shapes that disagree.
+    `surface`: its outline, a surface, `MicrophoneArray` or a `Calibration`. Places that were not found, NaN, are
+    hollow. The title is mean ± standard deviation of the error unless given. Raises `ValueError` for shapes that disagree.
     """
-    view = view_of(skin, microphones)
+    view = view_of(surface, microphones)
     place, guess = view.chart(true, "true"), view.chart(found, "found")
     if place.shape != guess.shape:
         raise ValueError(f"true has {len(place)} places and found {len(guess)}; give them pair by pair.")
     there = np.isfinite(guess).all(axis=1)
     error = 1e3 * np.linalg.norm(np.asarray(found, float) - np.asarray(true, float), axis=1)[there]
     ax = axes_or_new(ax)
-    handles = draw_skin(ax, view)
+    handles = draw_surface(ax, view)
     ax.add_collection(
         LineCollection(list(np.stack([place, guess], axis=1)[there]), colors=INK, linewidths=0.9, zorder=3)
     )

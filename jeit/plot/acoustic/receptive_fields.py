@@ -1,4 +1,4 @@
-"""Microphones under a skin: what each of them receives from where, and the map of one touch."""
+"""Receptive fields: what each microphone receives of taps, against their distance."""
 
 import textwrap
 from typing import Any
@@ -6,35 +6,16 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 from numpy.typing import ArrayLike
 
 from jeit.acoustic import CalibrationFit
-from jeit.plot.acoustic.surface_view import (
-    FOUND,
-    HALO,
-    MICROPHONE,
-    Skin,
-    draw_ellipse,
-    draw_legend,
-    draw_skin,
-    outline_of,
-    view_of,
-)
-from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, draw_colour_bar
+from jeit.plot.acoustic.surface_view import FOUND, HALO
+from jeit.plot.axes import INK, SOFT, axes_or_new
 
 _TAP = "#8fb4d9"
-# Decibels over which the size of a microphone's circle says how much it received.
-_RANGE = 30.0
-# A map is drawn up to so many standard deviations, or decibels, above its least.
-_MOST = {"likelihood": 15.0, "consistency": 40.0}
-_MAP_LABELS = {
-    "likelihood": "Standard deviations worse than the best place",
-    "consistency": "Loss above the least (dB)",
-}
 
 
 def plot_receptive_fields(
@@ -110,69 +91,6 @@ def plot_receptive_fields(
     return ax
 
 
-def plot_loss_map(
-    values: ArrayLike,
-    skin: Skin,
-    *,
-    microphones: ArrayLike | None = None,
-    received: ArrayLike | None = None,
-    truth: ArrayLike | None = None,
-    estimate: ArrayLike | None = None,
-    covariance: ArrayLike | None = None,
-    method: str = "likelihood",
-    title: str | None = None,
-    colour_bar: bool = True,
-    ax: Axes | None = None,
-) -> Axes:
-    """Draw the map of one frame, as `Localiser.with_maps` makes it: brightest where the touch most probably is.
-
-    `values` (rows, columns), bottom row first, over the box of the skin's outline, NaN outside it. `skin`: a
-    `Calibration`, `MicrophoneArray`, a surface, or an outline. `microphones` (M, d): metres, those of the array unless
-    given; their circles are the larger the more they have `received` (M,), intensities. `truth` and `estimate`: places
-    (d,), metres; `covariance` (d, d) of the estimate, m², for an ellipse that holds 95 %. `method`: "likelihood" maps
-    are drawn as √(2 (map − least)), standard deviations in which a place is worse than the best; the paper's loss,
-    "consistency", in decibels above its least. Raises `ValueError` for other methods and shapes.
-    """
-    pixels = np.asarray(values, float)
-    if pixels.ndim != 2 or not np.isfinite(pixels).any():
-        raise ValueError(f"values has shape {pixels.shape}; give (rows, columns) with at least one finite value.")
-    if method not in _MAP_LABELS:
-        raise ValueError(f"method must be one of {', '.join(_MAP_LABELS)}; it is {method!r}.")
-    view = view_of(skin, microphones)
-    number = len(view.microphones)
-    level = None if received is None else np.asarray(received, float)
-    if level is not None and level.shape != (number,):
-        raise ValueError(f"received has shape {level.shape}; give one for each of the {number} microphones.")
-    if covariance is not None and estimate is None:
-        raise ValueError("covariance needs an estimate: the place that it is the covariance of.")
-    known = None if truth is None else view.chart_point(truth, "truth")
-    found = None if estimate is None else view.chart_point(estimate, "estimate")
-    spread = None if covariance is None else view.chart_covariance(covariance, np.asarray(estimate, float))
-    ax = axes_or_new(ax)
-    shown = _above_least(pixels, method)
-    most = min(float(np.nanmax(shown)), _MOST[method]) or 1.0
-    colours = colormaps[SEQUENTIAL + "_r"].copy()
-    colours.colorbar_extend = "max" if np.nanmax(shown) > most else "neither"  # pyright: ignore[reportAttributeAccessIssue]
-    drawn = ax.imshow(shown, extent=view.extent, origin="lower", interpolation="nearest", cmap=colours, clim=(0, most))
-    drawn.set_clip_path(outline_of(view), ax.transData)
-    handles = draw_skin(ax, view, microphones=level is None and number > 0)
-    if level is not None:
-        handles.append(_draw_levels(ax, view.microphones, level))
-    if spread is not None and found is not None:
-        draw_ellipse(ax, found, spread)
-    mark: dict[str, Any] = {"linestyle": "none", "zorder": 5, "path_effects": HALO}
-    if known is not None:
-        handles += ax.plot(*known, marker="+", color=INK, markersize=13, markeredgewidth=1.8, label="truth", **mark)
-    if found is not None:
-        label = "estimate" if spread is None else "estimate, 95 %"
-        handles += ax.plot(*found, marker="o", color=FOUND, markersize=5.5, label=label, **mark)
-    draw_legend(ax, handles)
-    ax.set_title(title or "")
-    if colour_bar:
-        draw_colour_bar(ax, drawn, _MAP_LABELS[method])
-    return ax
-
-
 def _strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
     """Of every tap: those left out of the fit have none, and get the median of what the microphones say."""
     squares = jnp.asarray(fit.distance.T**2)
@@ -218,31 +136,3 @@ def _draw_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, c
     panel.yaxis.set_major_locator(LogLocator(numticks=4))
     panel.yaxis.set_minor_locator(NullLocator())
     panel.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _above_least(pixels: np.ndarray, method: str) -> np.ndarray:
-    least = np.nanmin(pixels)
-    if method == "likelihood":
-        return np.sqrt(2 * (pixels - least))
-    # The loss may vanish, in the noiseless case: nothing is drawn more than 120 dB under its greatest.
-    bottom = max(least, 1e-12 * np.nanmax(pixels), np.finfo(float).tiny)
-    return 10 * np.log10(np.maximum(pixels, bottom) / bottom)
-
-
-def _draw_levels(ax: Axes, place: np.ndarray, received: np.ndarray) -> Line2D:
-    """Microphones, their circles' areas in proportion to how many decibels they are above the least shown."""
-    positive = np.isfinite(received) & (received > 0)
-    loudest = received[positive].max(initial=1e-300)
-    level = 10 * np.log10(np.where(positive, received, 1e-300) / loudest)
-    area = 8 + 150 * np.clip(1 + level / _RANGE, 0, 1)
-    ax.scatter(*place.T, s=area, facecolor="white", edgecolor=MICROPHONE, linewidth=1.2, alpha=0.9, zorder=3)
-    return Line2D(
-        [],
-        [],
-        marker="o",
-        linestyle="none",
-        markersize=8,
-        markerfacecolor="white",
-        markeredgecolor=MICROPHONE,
-        label="microphone, by level",
-    )

@@ -11,21 +11,21 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
 from jeit.acoustic import Calibration, Locations, MicrophoneArray, Touch, Track
-from jeit.plot.acoustic.surface_view import View, draw_ellipse, draw_legend, draw_skin, outline_of, view_of
+from jeit.plot.acoustic.surface_view import View, draw_ellipse, draw_legend, draw_surface, outline_of, view_of
 from jeit.plot.axes import INK, SOFT, axes_or_new, draw_colour_bar
 
 _GLOW = LinearSegmentedColormap.from_list("glow", ["#ffffff", "#bccddf", "#6a8aae"])
 _TIME = LinearSegmentedColormap.from_list("time", ["#0d0887", "#7e03a8", "#cc4778", "#f89540", "#fbd724"])
 # Frames that are no plain touch, each with its marker.
 _ODD = {"two touches": "D", "outside": "^", "misfit": "X", "ambiguous": "P"}
-# A touch that has moved by less than so many standard deviations, or this part of the skin, has stayed where it was.
+# A touch that has moved by less than so many standard deviations, or this part of the surface, has stayed where it was.
 _MOVED, _LEAST = 4.0, 0.05
 
 
 def plot_track(
     track: Track,
     locations: Locations,
-    skin: Calibration | MicrophoneArray,
+    array: Calibration | MicrophoneArray,
     *,
     overlay: ArrayLike | None = None,
     extent: tuple[float, float, float, float] | None = None,
@@ -36,19 +36,19 @@ def plot_track(
 ) -> Axes:
     """Draw the path of every touch, coloured by time, with its onset and offset; dots are the frames it comes from.
 
-    `skin`: the `Calibration`, whose unusable microphones are crossed, as are those not used at all in `locations`; or
+    `array`: the `Calibration`, whose unusable microphones are crossed, as are those not used at all in `locations`; or
     `MicrophoneArray`. `overlay` (rows, columns), bottom row first: what was heard, 0 to 1, as the last of
     `jeit.acoustic.localisation.overlay`; it fills `extent` (x_min, x_max, y_min, y_max), metres, the box of the
     outline unless given. `truth` (N, d), metres: a path known otherwise. A touch that has stayed where it was is drawn
     as a dot with an ellipse that holds 95 %. Frames that are no plain touch are marked, and named where there are any.
     On a curved surface everything is in its chart. Raises `ValueError` for shapes that disagree.
     """
-    view = view_of(skin)
+    view = view_of(array)
     number = len(view.microphones)
     if locations.used.shape != (len(track.times), number) or track.position.shape != locations.position.shape:
         raise ValueError(
             f"locations: {locations.used.shape[0]} frames of {locations.used.shape[1]} microphones do not go with a "
-            f"track of {len(track.times)} frames and a skin of {number} microphones."
+            f"track of {len(track.times)} frames and an array of {number} microphones."
         )
     image = None if overlay is None else np.asarray(overlay, float)
     if image is not None and image.ndim != 2:
@@ -63,7 +63,7 @@ def plot_track(
         shown = np.nan_to_num(image)
         drawn = ax.imshow(shown, extent=box, origin="lower", interpolation="bilinear", cmap=_GLOW, clim=(0, 1))
         drawn.set_clip_path(outline_of(view), ax.transData)
-    handles = draw_skin(ax, view, faint=True)
+    handles = draw_surface(ax, view, faint=True)
     ax.set_title(title or "")
     if known is not None:
         handles += ax.plot(*known.T, color=INK, linewidth=0.9, linestyle=(0, (4, 3)), zorder=3.6, label="truth")
