@@ -148,8 +148,9 @@ def recording(rounds: int) -> tuple[float, float, int]:
 
     from jeit.acoustic import Recording, Taps, calibrate_microphones, locate, track
     from jeit.simulate import SoundingSkin, calibration_taps, microphone_grid, stroke
+    from jeit.simulate.acoustic.microphones import Readout
 
-    skin = SoundingSkin(jax.random.key(0), multiplexed=False)
+    skin = SoundingSkin(jax.random.key(0), readout=Readout(multiplexed=False))
     taps = calibration_taps(skin, jax.random.key(1), microphone_grid(9), repeats=1)
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.1
     array = np.asarray(skin.microphones)

@@ -95,6 +95,7 @@ def main() -> int:
     from jeit.layout import grid
     from jeit.plot import plot_error_curve
     from jeit.simulate import SoundingSkin, microphone_grid
+    from jeit.simulate.acoustic.microphones import MicrophoneModel
     from jeit.simulate.acoustic.propagation import expected_power, noise_power
 
     places = grid(0.15, 0.15, 13, 13)
@@ -114,7 +115,7 @@ def main() -> int:
     curve: dict[str, list] = {"paper's loss": [], "likelihood": []}
     rows, bounds = [], []
     for ratio in RATIOS:
-        noisy = SoundingSkin(key, snr_db=ratio - loudest)
+        noisy = SoundingSkin(key, model=MicrophoneModel(snr_db=ratio - loudest))
         off, cover, least = errors(calibration, noisy, places, 1, 256)
         roots = [np.sqrt(np.mean(off[name] ** 2)) for name in METHODS]
         bounds.append(least)

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from jeit.acoustic import Localiser, Recording, Taps, calibrate_microphones, intensities
 from jeit.layout import grid
 from jeit.plot import plot_loss_map
-from jeit.simulate import SoundingSkin, calibration_taps, tap
+from jeit.simulate import Burst, SoundingSkin, calibration_taps, tap
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
 TITLES = {"consistency": "Intensity consistency (Park 2022)", "likelihood": "Likelihood"}
@@ -20,7 +20,7 @@ def main() -> float:
     microphone_array = calibrate_microphones(known).calibration.microphone_array
 
     truth = np.array([0.031, -0.022])
-    light = tap(skin, jax.random.key(2), truth, strength=0.7, duration=0.5)
+    light = tap(skin, jax.random.key(2), truth, burst=Burst(0.7), duration=0.5)
     heard = intensities(Recording(light.samples, light.rate))
     loudest = heard.power[[heard.power.sum(axis=1).argmax()]]
 

@@ -32,7 +32,8 @@ def plot_pairs(
     """Draw true places (P, d) and those `found` (P, d), pair by pair, over `microphones` (M, d); all in metres.
 
     `surface`: its outline, a surface, `MicrophoneArray` or a `Calibration`. Places that were not found, NaN, are
-    hollow. The title is mean ± standard deviation of the error unless given. Raises `ValueError` for shapes that disagree.
+    hollow. The title is mean ± standard deviation of the error unless given. Raises `ValueError` for shapes that
+    disagree.
     """
     view = view_of(surface, microphones)
     place, guess = view.chart(true, "true"), view.chart(found, "found")

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.simulate.acoustic.bursts import ONSET, burst_envelope, check_burst
-from jeit.simulate.acoustic.checks import check_inside
+from jeit.simulate.acoustic.bursts import ONSET, VIBRATOR, Burst
+from jeit.simulate.acoustic.checks import check_not_negative
 from jeit.simulate.acoustic.propagation import noise_power, transfer
 from jeit.simulate.acoustic.sounding_skin import SoundingSkin
 from jeit.simulate.acoustic.synthesis import (
@@ -41,28 +41,28 @@ def calibration_taps(
     positions,
     *,
     repeats: int = 3,
-    strength: float = 1.0,
+    burst: Burst = VIBRATOR,
     strength_spread: float = 0.3,
-    length: float = 0.06,
     duration: float = 0.15,
     noise: bool = True,
 ) -> CalibrationTaps:
     """`repeats` taps at each of `positions` (P, 2), metres: T = P · repeats recordings, those of one place together.
 
-    Strengths are log-normal about `strength` with standard deviation `strength_spread` in the logarithm, as a hand's
-    or a vibrator's are: whoever calibrates does not know them. Otherwise as `tap`. Raises `ValueError`.
+    Strengths are log-normal about that of `burst` with standard deviation `strength_spread` in the logarithm, as a
+    hand's or a vibrator's are: whoever calibrates does not know them. Otherwise as `tap`, which says what is raised.
     """
-    places = check_inside("positions", positions, skin.width, skin.height)
+    places = skin.layer.check_inside("positions", positions)
     if repeats < 1:
         raise ValueError(f"repeats: give at least one tap for each position, not {repeats}.")
-    if not (np.isfinite(strength_spread) and strength_spread >= 0):
-        raise ValueError(f"strength_spread must be zero or positive; it is {strength_spread}.")
-    check_burst(strength, length, duration)
+    check_not_negative("strength_spread", strength_spread)
+    burst.check_fits(duration)
     times = sample_times(skin, duration)
     loudness, rest = jax.random.split(key)
-    strengths = strength * np.exp(strength_spread * np.asarray(jax.random.normal(loudness, (len(places), repeats))))
-    envelope = burst_envelope(times, np.array([ONSET]), length, np.array([1.0]))
-    size = transform_size(len(times), skin.longest_delay + RINGING, skin.rate)
+    strengths = burst.strength * np.exp(
+        strength_spread * np.asarray(jax.random.normal(loudness, (len(places), repeats)))
+    )
+    envelope = burst.envelope(times, np.array([ONSET]), np.array([1.0]))
+    size = transform_size(len(times), skin.layer.longest_delay + RINGING, skin.rate)
     samples = np.empty((len(places), repeats, skin.num_microphones, len(times)))
     level = noise_power(skin) if noise else None
     keys = jax.random.split(rest, len(places))

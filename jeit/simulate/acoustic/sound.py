@@ -52,7 +52,7 @@ class SimulatedSound(eqx.Module):
 
 
 def quiet(skin: SoundingSkin, key: Array, *, duration: float = 1.0) -> SimulatedSound:
-    """The microphones' own noise and nothing else, for `duration` seconds."""
+    """The microphones' own noise and nothing else, for `duration` seconds. Raises `ValueError` where that is none."""
     check_positive("duration", duration)
     times = sample_times(skin, duration)
     samples = microphone_noise(skin, key, len(times))
@@ -83,7 +83,7 @@ def record(skin: SoundingSkin, key: Array, places: np.ndarray, envelope: np.ndar
     count, centres = len(envelope), block_times(skin, len(envelope))
     places = np.broadcast_to(places, (len(centres), 2))
     whole = transform_size(count, RINGING, skin.rate)
-    block = transform_size(2 * round(HOP * skin.rate), skin.longest_delay, skin.rate)
+    block = transform_size(2 * round(HOP * skin.rate), skin.layer.longest_delay, skin.rate)
     samples = np.asarray(_moving(skin, source, places, envelope, whole, block, filled_bins(skin, block, blur=4 / HOP)))
     if noise:
         samples = samples + microphone_noise(skin, own, count)

@@ -9,7 +9,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 from scipy.fft import next_fast_len
 
 from jeit.simulate.acoustic.propagation import band_filter, noise_power, source_density
@@ -20,12 +20,13 @@ RINGING = 0.05
 
 
 def bin_frequencies(skin: SoundingSkin, size: int, bins: int) -> Array:
+    """The lowest `bins` frequencies (bins,), Hz, of a transform of `size` samples."""
     return jnp.arange(bins) * (skin.rate / size)
 
 
 def filled_bins(skin: SoundingSkin, size: int, *, blur: float = 0.0) -> int:
     """How many bins of a real transform of `size` samples are not empty: half an octave over the band, and `blur`."""
-    return min(int((np.sqrt(2) * skin.band[1] + blur) * size / skin.rate) + 1, size // 2)
+    return min(int((np.sqrt(2) * skin.readout.band[1] + blur) * size / skin.rate) + 1, size // 2)
 
 
 def transform_size(count: int, padding: float, rate: float) -> int:
@@ -59,11 +60,13 @@ def _noise_samples(skin, key, level, count, size, bins):
     return jnp.fft.irfft(noise_spectrum(skin, key, level, size, bins), size)[:, :count]
 
 
-def microphone_noise(skin: SoundingSkin, key: Array, count: int) -> np.ndarray:
+def microphone_noise(skin: SoundingSkin, key: Array, count: int) -> Float[np.ndarray, "M S"]:
+    """`count` samples (M, S) of the microphones' own noise."""
     # Noise made from a spectrum repeats after `size` samples; a tail that is cut off parts its end from its beginning.
     size = transform_size(count, RINGING, skin.rate)
     return np.asarray(_noise_samples(skin, key, noise_power(skin), count, size, filled_bins(skin, size)))
 
 
-def sample_times(skin: SoundingSkin, duration: float) -> np.ndarray:
+def sample_times(skin: SoundingSkin, duration: float) -> Float[np.ndarray, " S"]:
+    """When the first channel is sampled in `duration` seconds, (S,) s."""
     return np.arange(max(2, round(duration * skin.rate))) / skin.rate

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jeit.simulate.acoustic.bursts import ONSET, burst_envelope, check_burst
-from jeit.simulate.acoustic.checks import check_inside, check_positive
+from jeit.simulate.acoustic.bursts import FIRM, LIGHT, ONSET, VIBRATOR, Burst
+from jeit.simulate.acoustic.checks import check_positive
 from jeit.simulate.acoustic.sound import HOP, SimulatedSound, block_times, record
 from jeit.simulate.acoustic.sounding_skin import SoundingSkin
 from jeit.simulate.acoustic.synthesis import sample_times
@@ -24,27 +24,25 @@ def tap(
     key: Array,
     position,
     *,
-    strength: float = 1.0,
+    burst: Burst = VIBRATOR,
     repeats: int = 1,
     frequency: float = 10.0,
-    length: float = 0.06,
     duration: float = 0.15,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Bursts at one `position` (2,), metres, as of a vibrator with a rubber tip: `repeats` of them at `frequency`, Hz.
+    """A `burst` at one `position` (2,), metres, as of a vibrator with a rubber tip: `repeats` of it at `frequency`, Hz.
 
-    Each rises fast and dies away within `length` seconds, over which its root mean square is `strength`. `duration` of
-    the recording in seconds, made longer where the bursts need it. `noise`: whether to add the microphones' own.
-    Raises `ValueError`.
+    `duration` of the recording in seconds, made longer where the bursts need it. `noise`: whether to add the
+    microphones' own. Raises `ValueError` for a position off the skin, and for what is not positive or does not fit.
     """
     check_positive("frequency", frequency)
     if repeats < 1:
         raise ValueError(f"repeats: give at least one tap, not {repeats}.")
-    check_burst(strength, length, duration)
+    burst.check_fits(duration)
     onsets = ONSET + np.arange(repeats) / frequency
-    times = sample_times(skin, max(duration, onsets[-1] + length + 0.03))
-    envelope = burst_envelope(times, onsets, length, np.full(repeats, strength))
-    return record(skin, key, _one(skin, position), envelope, noise)
+    times = sample_times(skin, max(duration, onsets[-1] + burst.length + 0.03))
+    envelope = burst.envelope(times, onsets, np.full(repeats, burst.strength))
+    return record(skin, key, _place(skin, position), envelope, noise)
 
 
 def pat(
@@ -52,26 +50,16 @@ def pat(
     key: Array,
     position,
     *,
+    burst: Burst = FIRM,
     taps: int = 3,
     interval: float = 0.3,
-    strength: float = 2.0,
-    length: float = 0.08,
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
     """A few firm taps of a hand at one `position` (2,), metres, `interval` seconds apart; see `tap`."""
     check_positive("interval", interval)
-    return tap(
-        skin,
-        key,
-        position,
-        strength=strength,
-        repeats=taps,
-        frequency=1 / interval,
-        length=length,
-        duration=duration,
-        noise=noise,
-    )
+    repeated = {"repeats": taps, "frequency": 1 / interval}
+    return tap(skin, key, position, burst=burst, **repeated, duration=duration, noise=noise)
 
 
 def tickle(
@@ -79,38 +67,37 @@ def tickle(
     key: Array,
     position,
     *,
+    burst: Burst = LIGHT,
     radius: float = 0.01,
     taps_per_second: float = 15.0,
-    strength: float = 0.7,
-    length: float = 0.04,
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
     """Many light taps that wander round `position` (2,), metres, of random strength and rhythm.
 
     Each lands within `radius` metres of `position` (at the edge, on the skin), half way between a new place there and
-    the place before it. Strengths are log-normal about `strength` with standard deviation 0.3 in the logarithm, the
-    times random by a quarter of the interval. Raises `ValueError`.
+    the place before it. Strengths are log-normal about that of `burst` with standard deviation 0.3 in the logarithm,
+    the times random by a quarter of the interval. Raises `ValueError` as `tap` does.
     """
-    middle = _one(skin, position)[0]
+    middle = _place(skin, position)[0]
     check_positive("radius", radius)
     check_positive("taps_per_second", taps_per_second)
-    check_burst(strength, length, duration)
+    burst.check_fits(duration)
     times = sample_times(skin, duration)
-    count = max(1, int((duration - ONSET - length) * taps_per_second))
+    count = max(1, int((duration - ONSET - burst.length) * taps_per_second))
     where, jitter, loudness, rest = jax.random.split(key, 4)
     onsets = ONSET + (np.arange(count) + 0.25 * np.asarray(jax.random.uniform(jitter, (count,)))) / taps_per_second
-    strengths = strength * np.exp(0.3 * np.asarray(jax.random.normal(loudness, (count,))))
+    strengths = burst.strength * np.exp(0.3 * np.asarray(jax.random.normal(loudness, (count,))))
     distance, angle = np.asarray(jax.random.uniform(where, (2, count)))
     # The root spreads places evenly over the disc.
     offsets = (radius * np.sqrt(distance) * [np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)]).T
     for index in range(1, count):
         offsets[index] = (offsets[index - 1] + offsets[index]) / 2
-    half = np.array([skin.width, skin.height]) / 2
+    half = np.array([skin.layer.width, skin.layer.height]) / 2
     places = np.clip(middle + offsets, -half, half)
     # From its onset on, the source is where that tap is.
     blocks = np.maximum(np.searchsorted(onsets, block_times(skin, len(times)) + HOP, side="right") - 1, 0)
-    return record(skin, rest, places[blocks], burst_envelope(times, onsets, length, strengths), noise)
+    return record(skin, rest, places[blocks], burst.envelope(times, onsets, strengths), noise)
 
 
 def stroke(
@@ -132,7 +119,7 @@ def stroke(
     check_positive("duration", duration)
     times = sample_times(skin, duration)
     follow = path if callable(path) else _polyline(skin, path, duration)
-    track = check_inside("path", follow(times), skin.width, skin.height)
+    track = skin.layer.check_inside("path", follow(times))
     if len(track) != len(times):
         raise ValueError(f"path: the function gave {len(track)} positions for {len(times)} times; give one for each.")
     speed = np.linalg.norm(np.gradient(track, times, axis=0), axis=1)
@@ -146,10 +133,10 @@ def stroke(
 
 
 def _polyline(skin: SoundingSkin, corners, duration: float) -> Callable[[np.ndarray], np.ndarray]:
-    place = check_inside("path", corners, skin.width, skin.height)
+    place = skin.layer.check_inside("path", corners)
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
     return lambda times: np.stack([np.interp(times / duration * along[-1], along, axis) for axis in place.T], axis=-1)
 
 
-def _one(skin: SoundingSkin, position) -> np.ndarray:
-    return check_inside("position", np.asarray(position, float)[None], skin.width, skin.height)
+def _place(skin: SoundingSkin, position) -> np.ndarray:
+    return skin.layer.check_inside("position", np.asarray(position, float)[None])
