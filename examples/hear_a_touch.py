@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from jeit.acoustic import Localiser, Recording, Taps, calibrate_microphones, intensities
 from jeit.layout import grid
-from jeit.plot import plot_loss_map
+from jeit.plot import Marks, plot_loss_map
 from jeit.simulate import Burst, SoundingSkin, calibration_taps, tap
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
@@ -31,9 +31,9 @@ def main() -> float:
         found, maps = localiser.with_maps(loudest)
         place, spread = np.asarray(found.position[0]), found.covariance[0]
         error[method] = float(np.hypot(*(place - truth)))
-        marks = {"received": loudest[0], "truth": truth, "estimate": place, "covariance": spread}
+        marks = Marks(truth, estimate=place, covariance=spread)
         title = f"{title}: {1e3 * error[method]:.1f} mm off"
-        plot_loss_map(maps[0], microphone_array, **marks, method=method, title=title, ax=ax)
+        plot_loss_map(maps[0], microphone_array, received=loudest[0], marks=marks, method=method, title=title, ax=ax)
     figure.savefig("hear_a_touch.png", dpi=120)
     return error["likelihood"]
 

@@ -6,9 +6,11 @@ in metres in the arguments and in millimetres in the pictures.
 
 from jeit.plot.acoustic.localisation_error import plot_error_curve as plot_error_curve
 from jeit.plot.acoustic.localisation_error import plot_pairs as plot_pairs
+from jeit.plot.acoustic.loss_map import Marks as Marks
 from jeit.plot.acoustic.loss_map import plot_loss_map as plot_loss_map
 from jeit.plot.acoustic.receptive_fields import plot_receptive_fields as plot_receptive_fields
 from jeit.plot.acoustic.track import plot_track as plot_track
+from jeit.plot.colour_scale import ColourScale as ColourScale
 from jeit.plot.design.sensitivity_map import plot_sensitivity_histograms as plot_sensitivity_histograms
 from jeit.plot.design.sensitivity_map import plot_sensitivity_map as plot_sensitivity_map
 from jeit.plot.design.taxels import plot_similarity as plot_similarity

@@ -113,16 +113,16 @@ def draw_track(
     from jeit.plot import plot_track
 
     figure = Figure(figsize=(6.6, 5.8), layout="constrained")
-    image, extent = _picture(locations, calibration, heard, method)
-    plot_track(track, locations, calibration, overlay=image, extent=extent, title=locations.name, ax=figure.subplots())
+    image = _overlay(locations, calibration, heard, method)
+    plot_track(track, locations, calibration, overlay=image, title=locations.name, ax=figure.subplots())
     return figure
 
 
-def _picture(locations: Locations, calibration: Calibration, heard: Intensities, method: str):
-    """The maps of all located frames, the older the fainter, and their extent in the chart; None without a touch."""
+def _overlay(locations: Locations, calibration: Calibration, heard: Intensities, method: str) -> np.ndarray | None:
+    """The maps of all located frames, the older the fainter (rows, columns); None without a touch."""
     located = np.flatnonzero(locations.located & (locations.status != "two touches"))
     if not located.size:
-        return None, None
+        return None
     microphone_array, use, _ = microphones_in_use(heard, calibration)
     localiser = Localiser.create(microphone_array, method=method, map_shape=(_PIXELS, _PIXELS))
     times = locations.times[located]
@@ -133,8 +133,7 @@ def _picture(locations: Locations, calibration: Calibration, heard: Intensities,
         some = located[np.minimum(np.arange(start, start + _FRAMES), located.size - 1)]
         bright = brightness(localiser.maps(heard.power[some], use[some]), method=method)
         image = np.maximum(image, fade(bright, locations.times[some], at=times[-1], time_constant=time_constant))
-    left, right, bottom, top = microphone_array.surface.outline.extent
-    return image, (left, right, bottom, top)
+    return image
 
 
 def _columns(d: int) -> list[str]:

@@ -20,7 +20,7 @@ from jeit.acoustic import (
     make_surface,
 )
 from jeit.layout import grid
-from jeit.plot import plot_error_curve, plot_loss_map, plot_pairs, plot_receptive_fields, plot_track
+from jeit.plot import Marks, plot_error_curve, plot_loss_map, plot_pairs, plot_receptive_fields, plot_track
 from jeit.plot.acoustic.surface_view import FOUND
 
 OUTLINE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
@@ -175,8 +175,8 @@ def test_a_loss_map_lies_bottom_row_first_and_is_least_at_the_source(ax):
     values = np.full((20, 40), 50.0)
     values[0, 0], values[5, 30] = np.nan, 2.0
     place, spread = np.array([0.05, -0.04]), np.diag([4e-6, 1e-6])
-    marks = {"truth": [0.052, -0.041], "estimate": place, "covariance": spread}
-    assert plot_loss_map(values, known.microphone_array, received=np.linspace(0, 1, 9), **marks, ax=ax) is ax
+    marks = Marks([0.052, -0.041], estimate=place, covariance=spread)
+    assert plot_loss_map(values, known.microphone_array, received=np.linspace(0, 1, 9), marks=marks, ax=ax) is ax
     (drawn,) = ax.images
     assert list(drawn.get_extent()) == pytest.approx([-0.1, 0.1, -0.1, 0.1])
     assert drawn.origin == "lower"
@@ -217,10 +217,10 @@ def test_the_papers_loss_is_in_decibels(ax):
         ("method must be", {"method": "loudest"}),
         ("received has shape", {"received": np.ones(8)}),
         ("microphones has shape", {"microphones": np.ones((9, 3))}),
-        ("truth has shape", {"truth": [0.0, 0.0, 0.0]}),
-        ("estimate has shape", {"estimate": 0.0}),
-        ("covariance needs an estimate", {"covariance": np.eye(2)}),
-        ("covariance has shape", {"covariance": np.eye(3), "estimate": [0.0, 0.0]}),
+        ("truth has shape", {"marks": Marks(truth=[0.0, 0.0, 0.0])}),
+        ("estimate has shape", {"marks": Marks(estimate=0.0)}),
+        ("covariance needs an estimate", {"marks": Marks(covariance=np.eye(2))}),
+        ("covariance has shape", {"marks": Marks(estimate=[0.0, 0.0], covariance=np.eye(3))}),
     ],
 )
 def test_loss_maps_refuse_what_makes_no_sense(match, change, ax):

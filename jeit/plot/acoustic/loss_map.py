@@ -1,6 +1,6 @@
 """The map of one touch: how well every place explains what the microphones received."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -13,6 +13,7 @@ from jeit.plot.acoustic.surface_view import (
     HALO,
     MICROPHONE,
     AnySurface,
+    View,
     draw_ellipse,
     draw_legend,
     draw_surface,
@@ -31,15 +32,22 @@ _MAP_LABELS = {
 }
 
 
+class Marks(NamedTuple):
+    """Places marked on a map: the `truth` (d,) and an `estimate` (d,), metres, whose `covariance` (d, d), m², is drawn
+    as the ellipse that holds 95 %."""
+
+    truth: ArrayLike | None = None
+    estimate: ArrayLike | None = None
+    covariance: ArrayLike | None = None
+
+
 def plot_loss_map(
     values: ArrayLike,
     surface: AnySurface,
     *,
     microphones: ArrayLike | None = None,
     received: ArrayLike | None = None,
-    truth: ArrayLike | None = None,
-    estimate: ArrayLike | None = None,
-    covariance: ArrayLike | None = None,
+    marks: Marks | None = None,
     method: str = "likelihood",
     title: str | None = None,
     colour_bar: bool = True,
@@ -49,8 +57,8 @@ def plot_loss_map(
 
     `values` (rows, columns), bottom row first, over the box of the outline, NaN outside it. `surface`: a
     `Calibration`, `MicrophoneArray`, a surface, or an outline. `microphones` (M, d): metres, those of the array unless
-    given; their circles are the larger the more they have `received` (M,), intensities. `truth` and `estimate`: places
-    (d,), metres; `covariance` (d, d) of the estimate, m², for an ellipse that holds 95 %. `method`: "likelihood" maps
+    given; their circles are the larger the more they have `received` (M,), intensities. `marks`: places to
+    mark, the truth and an estimate. `method`: "likelihood" maps
     are drawn as √(2 (map − least)), standard deviations in which a place is worse than the best; the paper's loss,
     "consistency", in decibels above its least. Raises `ValueError` for other methods and shapes.
     """
@@ -64,11 +72,6 @@ def plot_loss_map(
     level = None if received is None else np.asarray(received, float)
     if level is not None and level.shape != (number,):
         raise ValueError(f"received has shape {level.shape}; give one for each of the {number} microphones.")
-    if covariance is not None and estimate is None:
-        raise ValueError("covariance needs an estimate: the place that it is the covariance of.")
-    known = None if truth is None else view.chart_point(truth, "truth")
-    found = None if estimate is None else view.chart_point(estimate, "estimate")
-    spread = None if covariance is None else view.chart_covariance(covariance, np.asarray(estimate, float))
     ax = axes_or_new(ax)
     shown = _above_least(pixels, method)
     most = min(float(np.nanmax(shown)), _MOST[method]) or 1.0
@@ -79,19 +82,31 @@ def plot_loss_map(
     handles = draw_surface(ax, view, microphones=level is None and number > 0)
     if level is not None:
         handles.append(_draw_levels(ax, view.microphones, level))
-    if spread is not None and found is not None:
-        draw_ellipse(ax, found, spread)
-    mark: dict[str, Any] = {"linestyle": "none", "zorder": 5, "path_effects": HALO}
-    if known is not None:
-        handles += ax.plot(*known, marker="+", color=INK, markersize=13, markeredgewidth=1.8, label="truth", **mark)
-    if found is not None:
-        label = "estimate" if spread is None else "estimate, 95 %"
-        handles += ax.plot(*found, marker="o", color=FOUND, markersize=5.5, label=label, **mark)
+    if marks is not None:
+        handles += _draw_marks(ax, view, marks)
     draw_legend(ax, handles)
     ax.set_title(title or "")
     if colour_bar:
         draw_colour_bar(ax, drawn, _MAP_LABELS[method])
     return ax
+
+
+def _draw_marks(ax: Axes, view: View, marks: Marks) -> list[Line2D]:
+    """The marks, and what of them a legend names. Raises `ValueError` for shapes that do not go with the surface."""
+    if marks.covariance is not None and marks.estimate is None:
+        raise ValueError("covariance needs an estimate: the place that it is the covariance of.")
+    handles = []
+    style: dict[str, Any] = {"linestyle": "none", "zorder": 5, "path_effects": HALO}
+    if marks.truth is not None:
+        cross: dict[str, Any] = {"marker": "+", "color": INK, "markersize": 13, "markeredgewidth": 1.8}
+        handles += ax.plot(*view.chart_point(marks.truth, "truth"), label="truth", **cross, **style)
+    if marks.estimate is not None:
+        found, label = view.chart_point(marks.estimate, "estimate"), "estimate"
+        if marks.covariance is not None:
+            draw_ellipse(ax, found, view.chart_covariance(marks.covariance, marks.estimate))
+            label = "estimate, 95 %"
+        handles += ax.plot(*found, marker="o", color=FOUND, markersize=5.5, label=label, **style)
+    return handles
 
 
 def _above_least(pixels: np.ndarray, method: str) -> np.ndarray:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic import CalibrationFit
 from jeit.plot.acoustic.surface_view import FOUND, HALO
-from jeit.plot.axes import INK, SOFT, axes_or_new
+from jeit.plot.axes import INK, SOFT, axes_or_new, soften_axes
 
 _TAP = "#8fb4d9"
 
@@ -46,9 +46,10 @@ def plot_receptive_fields(
     relative = fit.power / _strengths(fit)[:, None]
     noise = np.asarray(fit.calibration.microphone_array.noise.deviation) / np.nanmedian(fit.strength)
     seen = relative[:, chosen][np.isfinite(relative[:, chosen]) & (relative[:, chosen] > 0)]
-    told = curve[chosen][fit.calibration.usable[chosen]] if fit.calibration.usable[chosen].any() else curve[chosen]
-    low = min(told.min(), np.quantile(seen, 0.02) if seen.size else np.inf) / 1.5
-    high = max(told.max(), np.quantile(seen, 0.999) if seen.size else 0.0) * 1.8
+    usable = fit.calibration.usable[chosen]
+    curves = curve[chosen][usable] if usable.any() else curve[chosen]
+    low = min(curves.min(), np.quantile(seen, 0.02) if seen.size else np.inf) / 1.5
+    high = max(curves.max(), np.quantile(seen, 0.999) if seen.size else 0.0) * 1.8
     wide, tall = 1 / columns, 1 / rows
     for place, index in enumerate(chosen):
         row, column = divmod(place, columns)
@@ -57,52 +58,42 @@ def plot_receptive_fields(
         panel.set_xlim(0, 1e3 * distance[-1])
         panel.set_ylim(low, high)
         panel.tick_params(labelleft=column == 0, labelbottom=place + columns >= chosen.size)
-    label: dict[str, Any] = {"textcoords": "offset points", "color": INK, "annotation_clip": False}
-    ax.annotate("Distance (mm)", (0.5, 0), (0, -22), xycoords="axes fraction", ha="center", va="top", **label)
-    ax.annotate(
-        "Intensity / strength of the tap",
-        (0, 0.5),
-        (-34, 0),
-        xycoords="axes fraction",
-        ha="right",
-        va="center",
-        rotation=90,
-        **label,
-    )
+    _label(ax, fit, noise_shown=bool(noise[chosen].max() > low))
+    return ax
+
+
+def _label(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
+    """What the axes of all panels say, and the legend above them."""
+    label: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": INK}
+    label["annotation_clip"] = False
+    ax.annotate("Distance (mm)", (0.5, 0), (0, -22), ha="center", va="top", **label)
+    ax.annotate("Intensity / strength of the tap", (0, 0.5), (-34, 0), ha="right", va="center", rotation=90, **label)
     handles = [
         Line2D([], [], marker="o", linestyle="none", color=_TAP, markersize=4, label="tap"),
         Line2D([], [], color=INK, linewidth=1.6, label=f"fit, {type(fit.calibration.microphone_array.decay).name}"),
     ]
-    if noise[chosen].max() > low:
+    if noise_shown:
         handles.append(Line2D([], [], color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), label="noise, 1 σ"))
     if fit.outlier.any():
-        handles.append(
-            Line2D([], [], marker="o", linestyle="none", color=FOUND, fillstyle="none", markersize=4, label="left out")
-        )
-    ax.legend(
-        handles=handles,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.0),
-        ncols=4,
-        frameon=False,
-        fontsize=9.5,
-        borderpad=0,
-    )
-    return ax
+        ring: dict[str, Any] = {"marker": "o", "linestyle": "none", "fillstyle": "none", "markersize": 4}
+        handles.append(Line2D([], [], color=FOUND, label="left out", **ring))
+    place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 4}
+    ax.legend(handles=handles, frameon=False, fontsize=9.5, borderpad=0, **place)
 
 
 def _strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
     """Of every tap: those left out of the fit have none, and get the median of what the microphones say."""
     squares = jnp.asarray(fit.distance.T**2)
     response = np.asarray(fit.calibration.microphone_array.decay.response(squares)).T
-    told = np.where((fit.power > 0) & fit.calibration.usable, fit.power / response, np.nan)
-    heard = np.isfinite(told).any(axis=1)
-    median = np.full(len(told), np.nan)
-    median[heard] = np.nanmedian(told[heard], axis=1)
+    strength = np.where((fit.power > 0) & fit.calibration.usable, fit.power / response, np.nan)
+    heard = np.isfinite(strength).any(axis=1)
+    median = np.full(len(strength), np.nan)
+    median[heard] = np.nanmedian(strength[heard], axis=1)
     return np.where(np.isfinite(fit.strength), fit.strength, median)
 
 
 def _draw_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, columns: int) -> None:
+    """One panel: taps, curve and noise of a microphone; `lines`: distances (m), the curve there, and the noise."""
     distance, curve, noise = lines
     reason = fit.calibration.reasons[index]
     shown = np.isfinite(relative) & (relative > 0)
@@ -124,14 +115,13 @@ def _draw_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, c
     panel.text(0.05, 0.97, str(index), ha="left", fontsize=fontsize, fontweight="bold", color=INK, **text)
     if reason:
         short = textwrap.shorten(reason.split(" (")[0], 60, placeholder=" …")
-        told = textwrap.fill(short, 24 if columns <= 5 else 18)
-        panel.text(0.97, 0.97, told, ha="right", fontsize=fontsize - 1, color=FOUND, **text)
+        wrapped = textwrap.fill(short, 24 if columns <= 5 else 18)
+        panel.text(0.97, 0.97, wrapped, ha="right", fontsize=fontsize - 1, color=FOUND, **text)
     elif columns <= 6:
         half = distance[np.argmin(np.abs(curve / curve[0] - 0.5))]
         panel.text(0.97, 0.97, f"½ at {1e3 * half:.0f} mm", ha="right", fontsize=fontsize - 1, color=INK, **text)
-    panel.spines[["top", "right"]].set_visible(False)
-    panel.spines[["left", "bottom"]].set_color(SOFT)
-    panel.tick_params(length=2.5, color=SOFT, labelcolor=INK, labelsize=fontsize - 0.5, which="both")
+    soften_axes(panel)
+    panel.tick_params(length=2.5, labelsize=fontsize - 0.5, which="both")
     panel.xaxis.set_major_locator(MaxNLocator(4 if columns <= 5 else 3, steps=[1, 2, 5, 10], prune="upper"))
     panel.yaxis.set_major_locator(LogLocator(numticks=4))
     panel.yaxis.set_minor_locator(NullLocator())

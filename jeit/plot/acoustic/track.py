@@ -28,7 +28,6 @@ def plot_track(
     array: Calibration | MicrophoneArray,
     *,
     overlay: ArrayLike | None = None,
-    extent: tuple[float, float, float, float] | None = None,
     truth: ArrayLike | None = None,
     title: str | None = None,
     colour_bar: bool = True,
@@ -37,11 +36,11 @@ def plot_track(
     """Draw the path of every touch, coloured by time, with its onset and offset; dots are the frames it comes from.
 
     `array`: the `Calibration`, whose unusable microphones are crossed, as are those not used at all in `locations`; or
-    `MicrophoneArray`. `overlay` (rows, columns), bottom row first: what was heard, 0 to 1, as the last of
-    `jeit.acoustic.localisation.overlay`; it fills `extent` (x_min, x_max, y_min, y_max), metres, the box of the
-    outline unless given. `truth` (N, d), metres: a path known otherwise. A touch that has stayed where it was is drawn
-    as a dot with an ellipse that holds 95 %. Frames that are no plain touch are marked, and named where there are any.
-    On a curved surface everything is in its chart. Raises `ValueError` for shapes that disagree.
+    `MicrophoneArray`. `overlay` (rows, columns), bottom row first, over the box of the outline: what was heard, 0 to 1,
+    as the last of `jeit.acoustic.localisation.overlay`. `truth` (N, d), metres: a path known otherwise. A touch that
+    has stayed where it was is drawn as a dot with an ellipse that holds 95 %. Frames that are no plain touch are
+    marked, and named where there are any. On a curved surface everything is in its chart. Raises `ValueError` for
+    shapes that disagree.
     """
     view = view_of(array)
     number = len(view.microphones)
@@ -56,45 +55,37 @@ def plot_track(
     if len(track.times):
         view = view._replace(usable=view.usable & locations.used.any(axis=0))
     known = None if truth is None else view.chart(truth, "truth")
-    path, places = view.chart(track.position, "track"), view.chart(locations.position, "locations")
+    path = view.chart(track.position, "track")
     ax = axes_or_new(ax)
     if image is not None:
-        box = view.extent if extent is None else extent
-        shown = np.nan_to_num(image)
-        drawn = ax.imshow(shown, extent=box, origin="lower", interpolation="bilinear", cmap=_GLOW, clim=(0, 1))
+        style: dict[str, Any] = {"interpolation": "bilinear", "cmap": _GLOW, "clim": (0, 1)}
+        drawn = ax.imshow(np.nan_to_num(image), extent=view.extent, origin="lower", **style)
         drawn.set_clip_path(outline_of(view), ax.transData)
     handles = draw_surface(ax, view, faint=True)
     ax.set_title(title or "")
     if known is not None:
         handles += ax.plot(*known.T, color=INK, linewidth=0.9, linestyle=(0, (4, 3)), zorder=3.6, label="truth")
     if not track.touches:
-        left, right, bottom, top = view.extent
-        words = "no touch" if (locations.status != "unusable").any() else "no usable frame"
-        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-        text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 15, "color": INK, "zorder": 5}
-        ax.text((left + right) / 2, (bottom + top) / 2, words, bbox=box, **text)
+        _say_that_there_is_none(ax, view, locations)
         draw_legend(ax, handles)
         return ax
     first, last = track.touches[0].onset, track.touches[-1].offset
     times = ScalarMappable(Normalize(first, last if last > first else first + 1e-3), _TIME)
     for touch in track.touches:
         handles += _draw_touch(ax, view, track, touch, path, times, named={handle.get_label() for handle in handles})
-    plain = locations.located & ~np.isin(locations.status, list(_ODD))
-    believed, doubted = plain & ~track.rejected, locations.located & track.rejected
-    dots = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
-    ax.scatter(*places[believed].T, color=times.to_rgba(track.times[believed]), **dots)
-    if doubted.any():
-        # Around the marker of a frame that is no plain touch.
-        rings: dict[str, Any] = {"s": np.where(plain, 16, 60)[doubted], "linewidths": 0.8, "facecolors": "none"}
-        rings |= {"zorder": 3.7, "edgecolors": times.to_rgba(track.times[doubted])}
-        ax.scatter(*places[doubted].T, **rings)
-        ring: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markeredgecolor": SOFT}
-        handles.append(Line2D([], [], marker="o", markersize=4, label=f"not believed ({doubted.sum()})", **ring))
-    handles += _draw_odd(ax, view, locations, places, times)
+    handles += _draw_frames(ax, view, track, locations, times)
     draw_legend(ax, handles)
     if colour_bar and last > first:
         draw_colour_bar(ax, times, "Time (s)")
     return ax
+
+
+def _say_that_there_is_none(ax: Axes, view: View, locations: Locations) -> None:
+    left, right, bottom, top = view.extent
+    words = "no touch" if (locations.status != "unusable").any() else "no usable frame"
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
+    text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 15, "color": INK, "zorder": 5}
+    ax.text((left + right) / 2, (bottom + top) / 2, words, bbox=box, **text)
 
 
 def _draw_touch(ax: Axes, view: View, track: Track, touch: Touch, path, times: ScalarMappable, named: set) -> list:
@@ -122,6 +113,24 @@ def _draw_touch(ax: Axes, view: View, track: Track, touch: Touch, path, times: S
         end = ax.plot(*place, marker=marker, markersize=7.5, markerfacecolor="white", **mark, label=name)
         ends += [] if name in named else end
     return ends
+
+
+def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, times: ScalarMappable) -> list:
+    """Where each frame alone was located: dots, rings round those that the track rejects, and frames that are odd."""
+    places = view.chart(locations.position, "locations")
+    plain = locations.located & ~np.isin(locations.status, list(_ODD))
+    believed, doubted = plain & ~track.rejected, locations.located & track.rejected
+    handles = []
+    dots = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
+    ax.scatter(*places[believed].T, color=times.to_rgba(track.times[believed]), **dots)
+    if doubted.any():
+        # Around the marker of a frame that is no plain touch.
+        rings: dict[str, Any] = {"s": np.where(plain, 16, 60)[doubted], "linewidths": 0.8, "facecolors": "none"}
+        rings |= {"zorder": 3.7, "edgecolors": times.to_rgba(track.times[doubted])}
+        ax.scatter(*places[doubted].T, **rings)
+        ring: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markeredgecolor": SOFT}
+        handles.append(Line2D([], [], marker="o", markersize=4, label=f"not believed ({doubted.sum()})", **ring))
+    return handles + _draw_odd(ax, view, locations, places, times)
 
 
 def _draw_odd(ax: Axes, view: View, locations: Locations, places: np.ndarray, times: ScalarMappable) -> list:
