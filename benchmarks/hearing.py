@@ -30,7 +30,10 @@ def frames(number: int):
     import jax
     import jax.numpy as jnp
 
-    from jeit.acoustic import IntensityNoise, InverseSquare, MicrophoneArray, make_surface
+    from jeit.acoustic import MicrophoneArray
+    from jeit.acoustic.decay import InverseSquare
+    from jeit.acoustic.noise import IntensityNoise
+    from jeit.acoustic.surface import make_surface
     from jeit.mesh import Rectangle
     from jeit.simulate import SoundingSkin, microphone_grid
     from jeit.simulate.acoustic.propagation import expected_power, noise_power

@@ -4,8 +4,9 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from jeit.acoustic import Localiser, Recording, Taps, brightness, calibrate_microphones, intensities, locate, overlay
+from jeit.acoustic import Localiser, Recording, Taps, calibrate_microphones, intensities, locate
 from jeit.acoustic import track as follow
+from jeit.acoustic.localisation.overlay import brightness, overlay
 from jeit.layout import grid
 from jeit.plot import plot_track
 from jeit.simulate import Burst, SoundingSkin, calibration_taps, pat, stroke, tickle

@@ -7,18 +7,11 @@ import numpy as np
 import pytest
 from microphone_arrays import MICROPHONES, OUTLINE
 
-from jeit.acoustic import (
-    Calibration,
-    IntensityNoise,
-    IntensitySettings,
-    InverseSquare,
-    MicrophoneArray,
-    Recording,
-    calibrated_intensities,
-    intensities,
-    locate,
-    make_surface,
-)
+from jeit.acoustic import Calibration, IntensitySettings, MicrophoneArray, Recording, intensities, locate
+from jeit.acoustic.decay import InverseSquare
+from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
+from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.surface import make_surface
 from jeit.layout import grid
 from jeit.simulate import SoundingSkin, quiet
 from jeit.simulate.acoustic.propagation import expected_power, transfer

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from microphone_arrays import OUTLINE
 
-from jeit.acoustic import make_surface
-from jeit.acoustic.surface import CurvedSurface, Plane, bounding_box, chart_grid, in_space, longer_side, outline_sides
+from jeit.acoustic.surface import (
+    CurvedSurface,
+    Plane,
+    bounding_box,
+    chart_grid,
+    in_space,
+    longer_side,
+    make_surface,
+    outline_sides,
+)
 from jeit.mesh import Disk, Polygon, Rectangle
 
 RADIUS = 0.15

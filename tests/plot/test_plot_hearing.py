@@ -8,17 +8,13 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from jeit.acoustic import (
-    Calibration,
-    CalibrationFit,
-    IntensityNoise,
-    InverseSquare,
-    Locations,
-    MicrophoneArray,
-    Touch,
-    Track,
-    make_surface,
-)
+from jeit.acoustic import Calibration, MicrophoneArray
+from jeit.acoustic.calibration.calibrate import CalibrationFit
+from jeit.acoustic.decay import InverseSquare
+from jeit.acoustic.localisation.locations import Locations
+from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.surface import make_surface
+from jeit.acoustic.track import Touch, Track
 from jeit.layout import grid
 from jeit.plot import Marks, plot_error_curve, plot_loss_map, plot_pairs, plot_receptive_fields, plot_track
 from jeit.plot.acoustic.surface_view import FOUND

@@ -65,10 +65,15 @@ def calibrate_microphones(
     """Fit the decay model of every microphone to `taps`.
 
     `decay`: "inverse-square", a / (r² + b), the paper's; "exponential", a exp(−r / l); or "attenuated",
-    a exp(−r / l) / (r² + b). `intensity`: band and window, for taps that come as samples. Raises `ValueError` where
-    fewer than three microphones can be calibrated, and where most do not hear what is said to be tapped.
+    a exp(−r / l) / (r² + b). `intensity`: band and window, for taps that come as samples.
+
+    What `jeit calibrate-microphones` does; `jeit.report.write_calibration` writes what it writes. Raises `ValueError`
+    where fewer than three microphones can be calibrated, where most do not hear what is said to be tapped, for another
+    `decay`, and for `intensity` where the taps are intensities.
     """
     kind = find_decay(decay)
+    if intensity is not None and taps.samples is None:
+        raise ValueError("intensity: band and window are for taps that come as samples; these are intensities.")
     surface = make_surface(taps.outline, taps.positions)
     settings = None
     if taps.samples is None:

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 from numpy.typing import ArrayLike
 
-from jeit.acoustic import CalibrationFit
+from jeit.acoustic.calibration.calibrate import CalibrationFit
 from jeit.plot.acoustic.surface_view import FOUND, HALO
 from jeit.plot.axes import INK, SOFT, axes_or_new, soften_axes
 

@@ -13,8 +13,8 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from jeit.acoustic import Calibration, MicrophoneArray, make_surface
-from jeit.acoustic.surface import AbstractSurface, bounding_box
+from jeit.acoustic import Calibration, MicrophoneArray
+from jeit.acoustic.surface import AbstractSurface, bounding_box, make_surface
 from jeit.mesh import Domain
 from jeit.plot.axes import INK, SOFT, bare, draw_scale_bar, extent_of
 
@@ -44,14 +44,17 @@ class View(NamedTuple):
         return chart_of(self.surface, points, name)
 
     def chart_point(self, point: ArrayLike, name: str) -> np.ndarray:
-        """The same of one point (d,)."""
+        """Chart coordinates (2,) of one `point` (d,), metres; raises `ValueError` that names the argument."""
         place = np.asarray(point, float)
         if place.shape != (self.surface.dimension,):
             raise ValueError(f"{name} has shape {place.shape}; give one place ({self.surface.dimension},) in metres.")
         return self.chart(place[None], name)[0]
 
     def chart_covariance(self, covariance: ArrayLike, point: ArrayLike, name: str = "covariance") -> np.ndarray:
-        """Covariance (2, 2) in the chart of a `covariance` (d, d) at `point` (d,)."""
+        """Covariance (2, 2), m², in the chart of a `covariance` (d, d), m², at `point` (d,), metres.
+
+        Raises `ValueError` for another shape, by `name`.
+        """
         spread, d = np.asarray(covariance, float), self.surface.dimension
         if spread.shape != (d, d):
             raise ValueError(f"{name} has shape {spread.shape}; give ({d}, {d}) in m².")
@@ -79,7 +82,7 @@ def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: A
 
 
 def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarray:
-    """Chart coordinates (n, 2) of `points` (n, d)."""
+    """Chart coordinates (n, 2) of `points` (n, d), metres; raises `ValueError` that names the argument."""
     place = np.asarray(points, float)
     if place.ndim != 2 or place.shape[1] != surface.dimension:
         raise ValueError(f"{name} has shape {place.shape}; give (n, {surface.dimension}) in metres.")
