@@ -11,7 +11,11 @@ from jeit.forward import ForwardModel
 from jeit.image import Inclusion
 from jeit.layout import ring
 from jeit.mesh import Polygon, centroids, disk, layer, rectangle
-from jeit.plot import ColourScale, draw_electrodes, plot_image, plot_mesh, plot_raster, plot_sensitivity, plot_voltages
+from jeit.plot import ColourScale, plot_image, plot_mesh
+from jeit.plot.imaging.electrodes import draw_electrodes
+from jeit.plot.imaging.image import plot_raster
+from jeit.plot.imaging.sensitivity import plot_sensitivity
+from jeit.plot.imaging.voltages import plot_voltages
 from jeit.protocol import adjacent
 
 RADIUS = 0.05
