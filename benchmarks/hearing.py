@@ -30,9 +30,13 @@ def frames(number: int):
     import jax
     import jax.numpy as jnp
 
-    from jeit.acoustic import IntensityNoise, InverseSquare, MicrophoneArray, make_surface
+    from jeit.acoustic import MicrophoneArray
+    from jeit.acoustic.decay import InverseSquare
+    from jeit.acoustic.noise import IntensityNoise
+    from jeit.acoustic.surface import make_surface
     from jeit.mesh import Rectangle
-    from jeit.simulate.sounding_skin import SoundingSkin, expected_power, microphone_grid, noise_power
+    from jeit.simulate import SoundingSkin, microphone_grid
+    from jeit.simulate.acoustic.propagation import expected_power, noise_power
 
     skin = SoundingSkin(jax.random.key(0))
     microphones = np.asarray(skin.microphones)
@@ -146,10 +150,10 @@ def recording(rounds: int) -> tuple[float, float, int]:
     import jax
 
     from jeit.acoustic import Recording, Taps, calibrate_microphones, locate, track
-    from jeit.simulate.sounding_skin import SoundingSkin, microphone_grid
-    from jeit.simulate.touch_sounds import calibration_taps, stroke
+    from jeit.simulate import SoundingSkin, calibration_taps, microphone_grid, stroke
+    from jeit.simulate.acoustic.microphones import Readout
 
-    skin = SoundingSkin(jax.random.key(0), multiplexed=False)
+    skin = SoundingSkin(jax.random.key(0), readout=Readout(multiplexed=False))
     taps = calibration_taps(skin, jax.random.key(1), microphone_grid(9), repeats=1)
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.1
     array = np.asarray(skin.microphones)

@@ -28,7 +28,7 @@ def calibrated(skin):
 
     from jeit.acoustic import Taps, calibrate_microphones
     from jeit.layout import grid
-    from jeit.simulate.touch_sounds import calibration_taps
+    from jeit.simulate import calibration_taps
 
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.1
     sound = calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 13, 13))
@@ -42,7 +42,7 @@ def heard(skin, places, bursts: int):
     import jax
 
     from jeit.acoustic import Taps, tap_intensities
-    from jeit.simulate.touch_sounds import calibration_taps
+    from jeit.simulate import calibration_taps
 
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.1
     sound = calibration_taps(skin, jax.random.key(2), places, repeats=bursts)
@@ -57,12 +57,12 @@ def errors(calibration, skin, places, bursts: int, pad: int):
     """Distances (P,) in metres of what each method finds, the share of 95 % ellipses of the likelihood that hold the
     truth, and the root mean square error that the Cramér-Rao bound allows."""
     from jeit.acoustic import Intensities, Localiser, cramer_rao
-    from jeit.acoustic.localisation.locate import prepare
+    from jeit.acoustic.localisation.locate import microphones_in_use
 
     power, floor, freedom, usable = heard(skin, places, bursts)
     order = np.arange(pad) % len(places)  # one shape for all: compiled once
     measured = Intensities(np.arange(pad), power[order], floor=floor, freedom=freedom, usable=usable[order])
-    microphone_array, use, _ = prepare(measured, calibration)
+    microphone_array, use, _ = microphones_in_use(measured, calibration)
     found = {name: Localiser.create(microphone_array, method=name)(measured.power, use) for name in METHODS}
     off = {name: np.asarray(one.position)[: len(places)] - places for name, one in found.items()}
     best = found["likelihood"]
@@ -94,7 +94,9 @@ def main() -> int:
 
     from jeit.layout import grid
     from jeit.plot import plot_error_curve
-    from jeit.simulate.sounding_skin import SoundingSkin, expected_power, microphone_grid, noise_power
+    from jeit.simulate import SoundingSkin, microphone_grid
+    from jeit.simulate.acoustic.microphones import MicrophoneModel
+    from jeit.simulate.acoustic.propagation import expected_power, noise_power
 
     places = grid(0.15, 0.15, 13, 13)
     key = jax.random.key(0)
@@ -113,7 +115,7 @@ def main() -> int:
     curve: dict[str, list] = {"paper's loss": [], "likelihood": []}
     rows, bounds = [], []
     for ratio in RATIOS:
-        noisy = SoundingSkin(key, snr_db=ratio - loudest)
+        noisy = SoundingSkin(key, model=MicrophoneModel(snr_db=ratio - loudest))
         off, cover, least = errors(calibration, noisy, places, 1, 256)
         roots = [np.sqrt(np.mean(off[name] ** 2)) for name in METHODS]
         bounds.append(least)

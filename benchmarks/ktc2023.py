@@ -13,7 +13,8 @@ import numpy as np
 import scipy.io
 
 from jeit.data import read
-from jeit.image import Raster, challenge_score, segment
+from jeit.image import Raster, segment
+from jeit.image.score import challenge_score
 from jeit.imaging.preparation import prepare_difference
 from jeit.inverse import TotalVariation, reconstruct
 from jeit.inverse.nonlinear import GaussNewton

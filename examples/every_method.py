@@ -9,6 +9,7 @@ from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, one_step, plo
 from jeit.inverse import Gaussian, TotalVariation, back_projection, greit, posterior
 from jeit.inverse.nonlinear import GaussNewton
 from jeit.mesh import centroids, measures
+from jeit.plot import ColourScale
 
 
 def body(mesh):
@@ -47,13 +48,12 @@ def main() -> float:
     axes = figure.subplots(2, 4).ravel()
     for ax, (name, image) in zip(axes, images.items(), strict=False):
         change = np.asarray(image) - 1
-        plot_image(model.mesh, change, limit=1.0, title=name, colour_bar=False, ax=ax)
+        plot_image(model.mesh, change, scale=ColourScale(limit=1.0, bar=False), title=name, ax=ax)
     deviation = posterior(smooth).standard_deviation()
     plot_image(
         model.mesh,
         deviation,
-        difference=False,
-        quantity="Standard deviation",
+        scale=ColourScale(difference=False, quantity="Standard deviation"),
         title="Gauss-Newton, uncertainty",
         ax=axes[-1],
     )

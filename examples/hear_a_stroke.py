@@ -4,11 +4,12 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from jeit.acoustic import Localiser, Recording, Taps, brightness, calibrate_microphones, intensities, locate, overlay
+from jeit.acoustic import Localiser, Recording, Taps, calibrate_microphones, intensities, locate
 from jeit.acoustic import track as follow
+from jeit.acoustic.localisation.overlay import brightness, overlay
 from jeit.layout import grid
 from jeit.plot import plot_track
-from jeit.simulate import SoundingSkin, calibration_taps, pat, stroke, tickle
+from jeit.simulate import Burst, SoundingSkin, calibration_taps, pat, stroke, tickle
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
 KEYS = jax.random.split(jax.random.key(1), 4)
@@ -23,7 +24,7 @@ def main() -> float:
 
     touches = {
         "pat": pat(skin, KEYS[1], (0.03, 0.02), duration=LASTS),
-        "tickle": tickle(skin, KEYS[2], (-0.04, 0.03), strength=1.5, duration=LASTS),
+        "tickle": tickle(skin, KEYS[2], (-0.04, 0.03), burst=Burst(1.5, 0.04), duration=LASTS),
         "stroke": stroke(skin, KEYS[3], [(-0.07, -0.06), (0.0, 0.06), (0.07, -0.05)], strength=1.5, duration=LASTS),
     }
     samples = np.concatenate([touch.samples for touch in touches.values()], axis=1)

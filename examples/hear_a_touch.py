@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 
 from jeit.acoustic import Localiser, Recording, Taps, calibrate_microphones, intensities
 from jeit.layout import grid
-from jeit.plot import plot_loss_map
-from jeit.simulate import SoundingSkin, calibration_taps, tap
+from jeit.plot import Marks, plot_loss_map
+from jeit.simulate import Burst, SoundingSkin, calibration_taps, tap
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
 TITLES = {"consistency": "Intensity consistency (Park 2022)", "likelihood": "Likelihood"}
@@ -20,7 +20,7 @@ def main() -> float:
     microphone_array = calibrate_microphones(known).calibration.microphone_array
 
     truth = np.array([0.031, -0.022])
-    light = tap(skin, jax.random.key(2), truth, strength=0.7, duration=0.5)
+    light = tap(skin, jax.random.key(2), truth, burst=Burst(0.7), duration=0.5)
     heard = intensities(Recording(light.samples, light.rate))
     loudest = heard.power[[heard.power.sum(axis=1).argmax()]]
 
@@ -31,9 +31,9 @@ def main() -> float:
         found, maps = localiser.with_maps(loudest)
         place, spread = np.asarray(found.position[0]), found.covariance[0]
         error[method] = float(np.hypot(*(place - truth)))
-        marks = {"received": loudest[0], "truth": truth, "estimate": place, "covariance": spread}
+        marks = Marks(truth, estimate=place, covariance=spread)
         title = f"{title}: {1e3 * error[method]:.1f} mm off"
-        plot_loss_map(maps[0], microphone_array, **marks, method=method, title=title, ax=ax)
+        plot_loss_map(maps[0], microphone_array, received=loudest[0], marks=marks, method=method, title=title, ax=ax)
     figure.savefig("hear_a_touch.png", dpi=120)
     return error["likelihood"]
 

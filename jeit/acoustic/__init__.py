@@ -1,36 +1,21 @@
 """Passive acoustic tomography: an array of microphones under a skin hears a touch, and says where it is.
 
 `read_taps` and `calibrate_microphones` give the decay model of every microphone, kept in a `Calibration`;
-`read_recording`, `locate` and `track` turn a recording into places and strokes. Beneath them: `Localiser`, which is
-batched and differentiable, decay models, intensities, two sources at once, and the Cramér-Rao bound.
+`read_recording` and `locate_touches` turn a recording into places and strokes, step by step through `intensities`,
+`locate` and `track`. Beneath them: `Localiser`, which is batched and differentiable, and the Cramér-Rao bound.
+
+Rooms: `signal` (recordings, faults, intensities), `calibration` (fits to taps), `localisation` (objectives, minima,
+maps, two sources). Beside them: `decay`, the decay models; `surface`, on which sources are; `noise`.
 """
 
-from jeit.acoustic.calibration.calibrate import CalibrationFit as CalibrationFit
 from jeit.acoustic.calibration.calibrate import calibrate_microphones as calibrate_microphones
 from jeit.acoustic.calibration.calibration import Calibration as Calibration
-from jeit.acoustic.decay import AbstractDecay as AbstractDecay
-from jeit.acoustic.decay import AttenuatedInverseSquare as AttenuatedInverseSquare
-from jeit.acoustic.decay import Exponential as Exponential
-from jeit.acoustic.decay import InverseSquare as InverseSquare
-from jeit.acoustic.localisation.bound import cramer_rao as cramer_rao
+from jeit.acoustic.localisation.cramer_rao import cramer_rao as cramer_rao
 from jeit.acoustic.localisation.localiser import Localiser as Localiser
-from jeit.acoustic.localisation.localiser import SourceEstimate as SourceEstimate
-from jeit.acoustic.localisation.locate import Locations as Locations
 from jeit.acoustic.localisation.locate import locate as locate
-from jeit.acoustic.localisation.locate import prepare as prepare
-from jeit.acoustic.localisation.measure import measure as measure
-from jeit.acoustic.localisation.overlay import brightness as brightness
-from jeit.acoustic.localisation.overlay import fade as fade
-from jeit.acoustic.localisation.overlay import overlay as overlay
-from jeit.acoustic.localisation.setup_changes import SetupChanges as SetupChanges
-from jeit.acoustic.localisation.setup_changes import find_setup_changes as find_setup_changes
-from jeit.acoustic.localisation.two_sources import TwoSources as TwoSources
-from jeit.acoustic.localisation.two_sources import locate_two as locate_two
 from jeit.acoustic.microphones import MicrophoneArray as MicrophoneArray
-from jeit.acoustic.noise import IntensityNoise as IntensityNoise
 from jeit.acoustic.signal.intensity import IntensitySettings as IntensitySettings
 from jeit.acoustic.signal.intensity import intensities as intensities
-from jeit.acoustic.signal.intensity import noise_floor as noise_floor
 from jeit.acoustic.signal.intensity import tap_intensities as tap_intensities
 from jeit.acoustic.signal.recording import Intensities as Intensities
 from jeit.acoustic.signal.recording import Recording as Recording
@@ -39,7 +24,6 @@ from jeit.acoustic.signal.recording import read_recording as read_recording
 from jeit.acoustic.signal.recording import read_taps as read_taps
 from jeit.acoustic.signal.recording import write_recording as write_recording
 from jeit.acoustic.signal.recording import write_taps as write_taps
-from jeit.acoustic.surface import make_surface as make_surface
-from jeit.acoustic.track import Touch as Touch
-from jeit.acoustic.track import Track as Track
+from jeit.acoustic.touches import LocatedTouches as LocatedTouches
+from jeit.acoustic.touches import locate_touches as locate_touches
 from jeit.acoustic.track import track as track

@@ -197,7 +197,8 @@ DECAYS: dict[str, type[AbstractDecay]] = {
 
 
 def find_decay(name: str | type[AbstractDecay]) -> type[AbstractDecay]:
-    """The class of a decay model by its name ("inverse-square", "exponential", "attenuated"), or as given."""
+    """The class of a decay model by its name ("inverse-square", "exponential", "attenuated"), or as given; `ValueError`
+    where there is none of that name."""
     if isinstance(name, type) and issubclass(name, AbstractDecay):
         return name
     if name not in DECAYS:

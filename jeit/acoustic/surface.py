@@ -107,7 +107,7 @@ def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -
     return _curved(vertices, np.unique(known, axis=0))
 
 
-def box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
+def bounding_box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
     """Lower left and upper right corner of the outline's box in the chart, metres."""
     vertices = surface.outline.vertices
     return jnp.min(vertices, axis=0), jnp.max(vertices, axis=0)
@@ -122,23 +122,23 @@ def in_space(
     return place.T, jnp.einsum("kaf,klf,lbf->fab", slopes, covariance, slopes)
 
 
-def size(surface: AbstractSurface) -> Float[Array, ""]:
+def longer_side(surface: AbstractSurface) -> Float[Array, ""]:
     """The longer side of the outline's box, metres."""
-    low, high = box(surface)
+    low, high = bounding_box(surface)
     return jnp.max(high - low)
 
 
 def chart_grid(surface: AbstractSurface, columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Middles of columns × rows pixels that fill the outline's box, (2, rows, columns), bottom row first; and which of
     them lie inside the outline, (rows, columns)."""
-    (left, bottom), (right, top) = (np.asarray(corner) for corner in box(surface))
+    (left, bottom), (right, top) = (np.asarray(corner) for corner in bounding_box(surface))
     x = left + (right - left) * (np.arange(columns) + 0.5) / columns
     y = bottom + (top - bottom) * (np.arange(rows) + 0.5) / rows
     grid = np.stack(np.meshgrid(x, y))
     return grid, np.asarray(_contains(surface.outline, jnp.asarray(np.moveaxis(grid, 0, -1))))
 
 
-def sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[Array, "2 K"]]:
+def outline_sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[Array, "2 K"]]:
     """Where each side of the outline, and of its holes, starts and ends, in the chart."""
     loops = (surface.outline.vertices, *surface.outline.holes)
     start, end = (jnp.concatenate([jnp.roll(loop, -shift, axis=0) for loop in loops]) for shift in (0, 1))

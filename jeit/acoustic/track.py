@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.stats import chi2
 
-from jeit.acoustic.localisation.locate import Locations
+from jeit.acoustic.localisation.locations import Locations
 from jeit_solvers import solve_small
 
 # Densities tried: from a finger that rests to one that is flung about (m²/s³).

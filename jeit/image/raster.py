@@ -48,7 +48,7 @@ class Raster(eqx.Module):
         if mesh.dimension == 3:
             z = (low[2] + high[2]) / 2 if height is None else float(height)
             grid = np.column_stack([grid, np.full(len(grid), z)])
-        cell = locate(points, cells, grid).reshape(shape)
+        cell = find_cells(points, cells, grid).reshape(shape)
         return cls(jnp.asarray(cell, jnp.int32), (x_min, x_max, y_min, y_max))
 
     @property
@@ -75,7 +75,7 @@ def _sample(cell, image):
     return jnp.where(cell >= 0, image[..., jnp.maximum(cell, 0)], jnp.nan)
 
 
-def locate(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> np.ndarray:
+def find_cells(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Index of the cell that holds each position (q, d), -1 where none does.
 
     Tries the cells with the nearest centroids first and widens the search for what is left.

@@ -6,22 +6,17 @@ in metres in the arguments and in millimetres in the pictures.
 
 from jeit.plot.acoustic.localisation_error import plot_error_curve as plot_error_curve
 from jeit.plot.acoustic.localisation_error import plot_pairs as plot_pairs
-from jeit.plot.acoustic.receptive_fields import plot_loss_map as plot_loss_map
+from jeit.plot.acoustic.loss_map import Marks as Marks
+from jeit.plot.acoustic.loss_map import plot_loss_map as plot_loss_map
 from jeit.plot.acoustic.receptive_fields import plot_receptive_fields as plot_receptive_fields
 from jeit.plot.acoustic.track import plot_track as plot_track
+from jeit.plot.colour_scale import ColourScale as ColourScale
 from jeit.plot.design.sensitivity_map import plot_sensitivity_histograms as plot_sensitivity_histograms
 from jeit.plot.design.sensitivity_map import plot_sensitivity_map as plot_sensitivity_map
-from jeit.plot.design.taxels import plot_similarity as plot_similarity
 from jeit.plot.design.taxels import plot_taxel_areas as plot_taxel_areas
 from jeit.plot.design.taxels import plot_taxels as plot_taxels
 from jeit.plot.design.travel import plot_travel as plot_travel
 from jeit.plot.imaging.choice import plot_choice as plot_choice
-from jeit.plot.imaging.electrodes import draw_electrodes as draw_electrodes
 from jeit.plot.imaging.figures_of_merit import plot_figures_of_merit as plot_figures_of_merit
 from jeit.plot.imaging.image import plot_image as plot_image
-from jeit.plot.imaging.image import plot_raster as plot_raster
-from jeit.plot.imaging.inclusions import draw_inclusions as draw_inclusions
-from jeit.plot.imaging.labels import draw_labels as draw_labels
 from jeit.plot.imaging.mesh import plot_mesh as plot_mesh
-from jeit.plot.imaging.sensitivity import plot_sensitivity as plot_sensitivity
-from jeit.plot.imaging.voltages import plot_voltages as plot_voltages

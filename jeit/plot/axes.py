@@ -1,4 +1,4 @@
-"""Axes for plane pictures: no ticks but a scale bar, colour bars, units with the prefix that suits."""
+"""Axes: of plane pictures, no ticks but a scale bar and a colour bar; of graphs, no more lines than needed."""
 
 import math
 
@@ -12,6 +12,9 @@ SOFT = "#8b9098"
 # Red is more conductive, blue more resistive; white is no change.
 DIVERGING = "RdBu_r"
 SEQUENTIAL = "viridis"
+# Of series drawn side by side: up to six methods.
+SERIES_COLOURS = ("#1f6fb4", "#d1495b", "#2a9d6f", "#8a5cb8", "#d98a1c", "#5b6470")
+SERIES_MARKERS = ("o", "s", "^", "D", "v", "P")
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 
 
@@ -38,6 +41,19 @@ def extent_of(points: np.ndarray) -> tuple[float, float, float, float]:
     """(x_min, x_max, y_min, y_max) of points (n, 2 or 3)."""
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     return (low[0], high[0], low[1], high[1])
+
+
+def soften_axes(ax: Axes) -> None:
+    """Of a graph: lines at the left and below only, in grey, and labels of the ticks in ink."""
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color(SOFT)
+    ax.tick_params(color=SOFT, labelcolor=INK, which="both")
+
+
+def draw_horizontal_grid(ax: Axes) -> None:
+    """Faint lines behind what is drawn, to read heights by."""
+    ax.grid(axis="y", color="#e6e8eb", linewidth=0.6)
+    ax.set_axisbelow(True)
 
 
 def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:

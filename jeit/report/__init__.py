@@ -1,5 +1,7 @@
-"""Everything that is written to a folder: images, tracks, choices of a hyperparameter, layouts, studies."""
+"""Everything that is written to a folder: images, tracks, calibrations, choices of a rule, layouts, studies."""
 
+from jeit.report.calibration import draw_calibration as draw_calibration
+from jeit.report.calibration import write_calibration as write_calibration
 from jeit.report.choice import draw_choice as draw_choice
 from jeit.report.choice import report_choice as report_choice
 from jeit.report.choice import write_choice as write_choice

@@ -24,7 +24,7 @@ def draw_choice(result: ComparedRules):
     """The image of every rule above the curves that they were chosen by, as a matplotlib `Figure`."""
     from matplotlib.figure import Figure
 
-    from jeit.plot import plot_choice, plot_image
+    from jeit.plot import ColourScale, plot_choice, plot_image
     from jeit.plot.imaging.choice import COLOURS
 
     outcomes = result.outcomes
@@ -33,7 +33,9 @@ def draw_choice(result: ComparedRules):
     factor, unit = (1e3, "mS") if result.prepared.mesh.dimension == 2 else (1.0, "S/m")
     columns = np.atleast_1d(upper.subplots(1, len(outcomes)))
     for ax, (name, outcome) in zip(columns, outcomes.items(), strict=True):
-        plot_image(result.prepared.mesh, outcome.change, inclusions=outcome.inclusions, colour_bar=False, ax=ax)
+        plot_image(
+            result.prepared.mesh, outcome.change, inclusions=outcome.inclusions, scale=ColourScale(bar=False), ax=ax
+        )
         largest = factor * float(jnp.abs(outcome.change).max())
         ax.set_title(name, color=COLOURS[name], fontsize=11, pad=0)
         ax.text(1, 0, f"± {largest:.3g} {unit}", transform=ax.transAxes, ha="right", va="bottom", fontsize=9)

@@ -49,7 +49,9 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     """The picture of a result, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
-    from jeit.plot import draw_labels, plot_image
+    from jeit.plot.colour_scale import CHANGE, ColourScale
+    from jeit.plot.imaging.image import plot_image
+    from jeit.plot.imaging.labels import draw_labels
 
     figure = Figure(figsize=(6.4, 5.6), layout="constrained")
     # Iterative images reach from a hundredth to a hundred times the background: on the logarithm's scale both show.
@@ -59,8 +61,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         result.calibration.model.electrodes,
         inclusions=result.inclusions if result.labels is None else (),
         title=result.measurement.name,
-        quantity="log₁₀ of conductivity over background" if result.iterative else None,
-        unit="" if result.iterative else None,
+        scale=ColourScale(quantity="log₁₀ of conductivity over background", unit="") if result.iterative else CHANGE,
         ax=figure.subplots(),
     )
     if truth is not None:

@@ -9,59 +9,44 @@ from typing import Any
 
 import numpy as np
 
-from jeit.acoustic import (
-    Calibration,
-    Intensities,
-    Localiser,
-    Locations,
-    Track,
-    brightness,
-    fade,
-    prepare,
-)
+from jeit.acoustic import Localiser, LocatedTouches
+from jeit.acoustic.localisation.locate import microphones_in_use
+from jeit.acoustic.localisation.locations import FrameStatus, Locations
+from jeit.acoustic.localisation.overlay import brightness, fade
+from jeit.acoustic.track import Track
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 # Maps of so many pixels a side, so many frames at once.
 _PIXELS, _FRAMES = 100, 256
 
 
-def write_track(
-    folder: str | Path,
-    locations: Locations,
-    track: Track,
-    calibration: Calibration,
-    heard: Intensities,
-    *,
-    method: str = "likelihood",
-) -> None:
-    """Write `track.csv`, `report.json` and `track.png` into `folder`, made if need be.
+def write_track(found: LocatedTouches, folder: str | Path) -> None:
+    """Write `track.csv`, `report.json` and `track.png` of what `locate_touches` found into `folder`, made if need be.
 
     The table has a line for every frame: `time_s`; the place found, `x_m`, `y_m`, its standard deviations `std_x_m`,
     `std_y_m` and `covariance` (m², of x and y); `strength`, in units of intensity; `status`; then the smoothed place,
     `track_x_m`, `track_y_m`, `track_std_x_m`, `track_std_y_m`, and the number of the `touch` from 1. In space, columns
-    for z follow. Empty where there is nothing.
+    for z follow. Empty where there is nothing. Raises `OSError` where nothing can be written.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / "track.csv", "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
-        table.writerow(_columns(locations.position.shape[1]))
-        table.writerows(_rows(locations, track))
-    content = report_track(locations, track, calibration, method=method)
-    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+        table.writerow(_columns(found.locations.position.shape[1]))
+        table.writerows(_rows(found.locations, found.track))
+    text = json.dumps(report_track(found), indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "report.json").write_text(text + "\n", "utf-8")
-    draw_track(locations, track, calibration, heard, method=method).savefig(folder / "track.png", dpi=150)
+    draw_track(found).savefig(folder / "track.png", dpi=150)
 
 
-def report_track(
-    locations: Locations, track: Track, calibration: Calibration, *, method: str = "likelihood"
-) -> dict[str, Any]:
+def report_track(found: LocatedTouches) -> dict[str, Any]:
     """All that was found, as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    locations, track, calibration = found.locations, found.track, found.calibration
     touches = []
     for number, touch in enumerate(track.touches, 1):
         frames = slice(touch.first, touch.last + 1)
         strength = locations.strength[frames]
-        kinds = [str(kind) for kind in locations.status[frames] if kind != "no touch"]
+        kinds = [str(kind) for kind in locations.status[frames] if kind != FrameStatus.NO_TOUCH]
         touches.append(
             {
                 "touch": number,
@@ -73,7 +58,7 @@ def report_track(
                 "greatest_strength": _number(np.nanmax(strength)),
             }
         )
-    second = np.flatnonzero(locations.status == "two touches")
+    second = np.flatnonzero(locations.status == FrameStatus.TWO_TOUCHES)
     microphones = []
     for number, (fault, used) in enumerate(zip(locations.faults, locations.used.T, strict=True)):
         share = float(used.mean())
@@ -81,7 +66,7 @@ def report_track(
     return {
         "recording": locations.name,
         "calibration": calibration.name,
-        "method": method,
+        "method": found.method,
         "decay": calibration.microphone_array.decay.name,
         "frames": len(locations.times),
         "duration_s": _number(locations.times[-1] - locations.times[0]),
@@ -104,37 +89,37 @@ def report_track(
     }
 
 
-def draw_track(
-    locations: Locations, track: Track, calibration: Calibration, heard: Intensities, *, method: str = "likelihood"
-):
+def draw_track(found: LocatedTouches):
     """The picture, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.plot import plot_track
 
     figure = Figure(figsize=(6.6, 5.8), layout="constrained")
-    image, extent = _picture(locations, calibration, heard, method)
-    plot_track(track, locations, calibration, overlay=image, extent=extent, title=locations.name, ax=figure.subplots())
+    title = found.locations.name
+    plot_track(
+        found.track, found.locations, found.calibration, overlay=_overlay(found), title=title, ax=figure.subplots()
+    )
     return figure
 
 
-def _picture(locations: Locations, calibration: Calibration, heard: Intensities, method: str):
-    """The maps of all located frames, the older the fainter, and their extent in the chart; None without a touch."""
-    located = np.flatnonzero(locations.located & (locations.status != "two touches"))
+def _overlay(found: LocatedTouches) -> np.ndarray | None:
+    """The maps of all located frames, the older the fainter (rows, columns); None without a touch."""
+    locations, heard = found.locations, found.intensities
+    located = np.flatnonzero(locations.located & (locations.status != FrameStatus.TWO_TOUCHES))
     if not located.size:
-        return None, None
-    microphone_array, use, _ = prepare(heard, calibration)
-    localiser = Localiser.create(microphone_array, method=method, map_shape=(_PIXELS, _PIXELS))
+        return None
+    microphone_array, use, _ = microphones_in_use(heard, found.calibration)
+    localiser = Localiser.create(microphone_array, method=found.method, map_shape=(_PIXELS, _PIXELS))
     times = locations.times[located]
     time_constant = max(0.3, 0.5 * float(times[-1] - times[0]))
     image = np.zeros((_PIXELS, _PIXELS))
     for start in range(0, located.size, _FRAMES):
         # Always as many frames, so that one program serves all.
         some = located[np.minimum(np.arange(start, start + _FRAMES), located.size - 1)]
-        bright = brightness(localiser.maps(heard.power[some], use[some]), method=method)
+        bright = brightness(localiser.maps(heard.power[some], use[some]), method=found.method)
         image = np.maximum(image, fade(bright, locations.times[some], at=times[-1], time_constant=time_constant))
-    left, right, bottom, top = microphone_array.surface.outline.extent
-    return image, (left, right, bottom, top)
+    return image
 
 
 def _columns(d: int) -> list[str]:

@@ -1,16 +1,16 @@
-"""What is not measured: skins that are pressed, skins that sound, and the touches on them."""
+"""What is not measured: skins that are pressed, skins that sound, and the touches on them.
 
+What a sounding skin is made of (its layer, microphones and readout) is in `jeit.simulate.acoustic`.
+"""
+
+from jeit.simulate.acoustic.bursts import Burst as Burst
+from jeit.simulate.acoustic.calibration_taps import calibration_taps as calibration_taps
+from jeit.simulate.acoustic.microphones import microphone_grid as microphone_grid
+from jeit.simulate.acoustic.sound import quiet as quiet
+from jeit.simulate.acoustic.sounding_skin import SoundingSkin as SoundingSkin
+from jeit.simulate.acoustic.touches import pat as pat
+from jeit.simulate.acoustic.touches import stroke as stroke
+from jeit.simulate.acoustic.touches import tap as tap
+from jeit.simulate.acoustic.touches import tickle as tickle
 from jeit.simulate.round_skin import RoundSkin as RoundSkin
-from jeit.simulate.round_skin import pressed_conductivity as pressed_conductivity
 from jeit.simulate.round_skin import simulate_press as simulate_press
-from jeit.simulate.sounding_skin import SoundingSkin as SoundingSkin
-from jeit.simulate.sounding_skin import microphone_grid as microphone_grid
-from jeit.simulate.touch_sounds import CalibrationTaps as CalibrationTaps
-from jeit.simulate.touch_sounds import SimulatedSound as SimulatedSound
-from jeit.simulate.touch_sounds import calibration_taps as calibration_taps
-from jeit.simulate.touch_sounds import pat as pat
-from jeit.simulate.touch_sounds import quiet as quiet
-from jeit.simulate.touch_sounds import stroke as stroke
-from jeit.simulate.touch_sounds import superpose as superpose
-from jeit.simulate.touch_sounds import tap as tap
-from jeit.simulate.touch_sounds import tickle as tickle

@@ -4,8 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.acoustic import IntensityNoise, InverseSquare, Localiser, MicrophoneArray, make_surface
+from jeit.acoustic import Localiser, MicrophoneArray
+from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.localisation.localiser import METHODS
+from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.surface import make_surface
 from jeit.layout import grid
 
 both = pytest.mark.parametrize("method", METHODS)

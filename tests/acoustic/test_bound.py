@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from microphone_arrays import MICROPHONES, array, hear, inside, variance
 
-from jeit.acoustic import cramer_rao, make_surface
+from jeit.acoustic import cramer_rao
 from jeit.acoustic.microphones import MicrophoneArray
+from jeit.acoustic.surface import make_surface
 
 PLACES, STRENGTH = inside(6), np.array([0.05, 0.3, 1.0, 3.0, 10.0, 100.0])
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from microphone_arrays import MICROPHONES, OUTLINE, listen
 
-from jeit.acoustic import InverseSquare, Taps, calibrate_microphones
-from jeit.acoustic.decay import DECAYS
+from jeit.acoustic import Taps, calibrate_microphones
+from jeit.acoustic.decay import DECAYS, InverseSquare
 from jeit.layout import grid
 
 PLACES = grid(0.18, 0.18, 13, 13)

@@ -8,15 +8,10 @@ import numpy as np
 import pytest
 from microphone_arrays import MICROPHONES, OUTLINE, array
 
-from jeit.acoustic import (
-    AttenuatedInverseSquare,
-    Calibration,
-    Exponential,
-    IntensitySettings,
-    MicrophoneArray,
-    make_surface,
-)
+from jeit.acoustic import Calibration, IntensitySettings, MicrophoneArray
+from jeit.acoustic.decay import AttenuatedInverseSquare, Exponential
 from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.surface import make_surface
 from jeit.mesh import Polygon
 
 HOLE = [[0.01, 0.01], [0.01, 0.03], [0.03, 0.03], [0.03, 0.01]]

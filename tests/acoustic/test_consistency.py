@@ -7,8 +7,10 @@ import pytest
 from microphone_arrays import array, hear, inside, noisy, same_shape
 from scipy.optimize import minimize
 
-from jeit.acoustic import AttenuatedInverseSquare, Exponential, Localiser, MicrophoneArray, make_surface
+from jeit.acoustic import Localiser, MicrophoneArray
+from jeit.acoustic.decay import AttenuatedInverseSquare, Exponential
 from jeit.acoustic.localisation.consistency import Consistency
+from jeit.acoustic.surface import make_surface
 
 FRAMES = 12
 

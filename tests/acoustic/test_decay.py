@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.acoustic import AttenuatedInverseSquare, Exponential, InverseSquare
-from jeit.acoustic.decay import DECAYS, find_decay
+from jeit.acoustic.decay import DECAYS, AttenuatedInverseSquare, Exponential, InverseSquare, find_decay
 
 A, B, LENGTH = np.array([2e-3, 5e-4]), np.array([1e-3, 3e-4]), np.array([0.05, 0.02])
 DISTANCE = np.array([[0.0, 0.01, 0.2], [0.0, 0.03, 0.1]])

@@ -6,14 +6,8 @@ import numpy as np
 import pytest
 from microphone_arrays import array, hear, inside, noisy
 
-from jeit.acoustic import (
-    Calibration,
-    Intensities,
-    Locations,
-    cramer_rao,
-    locate,
-)
-from jeit.acoustic.localisation.locate import STATUSES
+from jeit.acoustic import Calibration, Intensities, cramer_rao, locate
+from jeit.acoustic.localisation.locations import FrameStatus, Locations
 
 FRAMES = 64
 FLOOR, FREEDOM = 0.01, 50.0
@@ -358,7 +352,7 @@ def test_frames_do_not_see_each_other(known, touches):
 
 
 def test_every_status_is_documented():
-    for status in STATUSES:
+    for status in FrameStatus:
         assert f'"{status}"' in Locations.__doc__
 
 

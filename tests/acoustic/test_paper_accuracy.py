@@ -6,8 +6,7 @@ import pytest
 
 from jeit.acoustic import Intensities, Taps, calibrate_microphones, locate, tap_intensities
 from jeit.layout import grid
-from jeit.simulate.sounding_skin import SoundingSkin
-from jeit.simulate.touch_sounds import calibration_taps
+from jeit.simulate import SoundingSkin, calibration_taps
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
 BURSTS = 10

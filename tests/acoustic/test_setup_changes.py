@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from microphone_arrays import array, hear, inside, noisy
 
-from jeit.acoustic import find_setup_changes
+from jeit.acoustic.localisation.setup_changes import find_setup_changes
 
 # Large programs; test_locate has an exchange in the quick suite.
 pytestmark = pytest.mark.slow

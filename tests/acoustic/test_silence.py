@@ -7,21 +7,14 @@ import numpy as np
 import pytest
 from microphone_arrays import MICROPHONES, OUTLINE
 
-from jeit.acoustic import (
-    Calibration,
-    IntensityNoise,
-    IntensitySettings,
-    InverseSquare,
-    MicrophoneArray,
-    Recording,
-    intensities,
-    locate,
-    make_surface,
-    measure,
-)
+from jeit.acoustic import Calibration, IntensitySettings, MicrophoneArray, Recording, intensities, locate
+from jeit.acoustic.decay import InverseSquare
+from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
+from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.surface import make_surface
 from jeit.layout import grid
-from jeit.simulate.sounding_skin import SoundingSkin, expected_power, transfer
-from jeit.simulate.touch_sounds import quiet
+from jeit.simulate import SoundingSkin, quiet
+from jeit.simulate.acoustic.propagation import expected_power, transfer
 
 PLACE = np.array([0.02, -0.03])
 
@@ -88,7 +81,9 @@ def test_a_touch_without_pauses(vibration, silent, heard_before):
     assert np.isin(found.status, ["touch", "ambiguous"]).all()
     # Nine microphones 7 cm apart, and a model that knows nothing of echoes.
     assert np.median(np.linalg.norm(found.position - PLACE, axis=1)) < 0.012
-    np.testing.assert_allclose(measure(vibration, heard_before, silence=silent).floor, intensities(silent).floor)
+    np.testing.assert_allclose(
+        calibrated_intensities(vibration, heard_before, silence=silent).floor, intensities(silent).floor
+    )
 
 
 def test_a_floor_is_compared_with_its_own_kind(skin, vibration, silent, heard_before):

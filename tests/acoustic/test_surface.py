@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from microphone_arrays import OUTLINE
 
-from jeit.acoustic import make_surface
-from jeit.acoustic.surface import CurvedSurface, Plane, box, chart_grid, in_space, sides, size
+from jeit.acoustic.surface import (
+    CurvedSurface,
+    Plane,
+    bounding_box,
+    chart_grid,
+    in_space,
+    longer_side,
+    make_surface,
+    outline_sides,
+)
 from jeit.mesh import Disk, Polygon, Rectangle
 
 RADIUS = 0.15
@@ -59,8 +67,8 @@ def test_a_plane_is_its_own_chart(outline):
     assert plane.dimension == 2
     np.testing.assert_array_equal(plane.place(middle()), middle())
     np.testing.assert_array_equal(plane.project(middle()), middle())
-    np.testing.assert_allclose(np.stack(box(plane)), [[-0.1, -0.1], [0.1, 0.1]])
-    assert float(size(plane)) == pytest.approx(0.2)
+    np.testing.assert_allclose(np.stack(bounding_box(plane)), [[-0.1, -0.1], [0.1, 0.1]])
+    assert float(longer_side(plane)) == pytest.approx(0.2)
 
 
 def test_a_disk_is_nearly_round():
@@ -82,7 +90,7 @@ def test_pixels_fill_the_box_bottom_row_first():
 
 def test_sides_are_those_of_the_outline_and_of_its_holes():
     hole = np.array([[-0.05, -0.02], [-0.05, 0.05], [0.05, 0.05]])
-    start, end = sides(make_surface(Polygon(OUTLINE, [hole])))
+    start, end = outline_sides(make_surface(Polygon(OUTLINE, [hole])))
     assert start.shape == end.shape == (2, 7)
     legs = 0.07 + 0.1 + np.hypot(0.1, 0.07)
     assert float(jnp.linalg.norm(end - start, axis=0).sum()) == pytest.approx(0.8 + legs, rel=1e-12)

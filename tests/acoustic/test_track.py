@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from jeit.acoustic import Locations, track
+from jeit.acoustic import track
+from jeit.acoustic.localisation.locations import Locations
 
 NUMBER = 60
 

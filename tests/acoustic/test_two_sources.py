@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from microphone_arrays import array, hear, inside, noisy, variance
 
-from jeit.acoustic import locate_two
+from jeit.acoustic.localisation.two_sources import locate_two
 
 FRAMES = 64
 FIELDS = ("position", "covariance", "strength", "misfit", "freedom", "converged")

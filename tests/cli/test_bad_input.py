@@ -17,7 +17,9 @@ from jeit.image import Raster, find_inclusions
 from jeit.imaging import ImagingSettings, image_difference
 from jeit.inverse import Gaussian, back_projection, calibrate, one_step
 from jeit.mesh import Disk, Mesh, Polygon, Rectangle, Refine, box, disk
-from jeit.plot import plot_image, plot_raster, plot_voltages
+from jeit.plot import plot_image
+from jeit.plot.imaging.image import plot_raster
+from jeit.plot.imaging.voltages import plot_voltages
 from jeit.simulate.round_skin import RoundSkin, simulate_press
 
 SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])

@@ -9,9 +9,19 @@ import pytest
 from pages import run_page
 from scipy.io import wavfile
 
-from jeit.acoustic import Calibration, measure, read_recording, write_recording
+from jeit.acoustic import (
+    Calibration,
+    IntensitySettings,
+    calibrate_microphones,
+    locate_touches,
+    read_recording,
+    read_taps,
+    write_recording,
+)
+from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
 from jeit.cli import main
 from jeit.layout import grid
+from jeit.report import write_calibration, write_track
 
 OUTLINE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
 MICROPHONES = grid(0.14, 0.14, 3, 3)
@@ -102,9 +112,34 @@ def test_samples_to_a_track(name, folder, tmp_path):
         assert (np.abs(off) < 5 * np.array([float(row[f"std_{axis}_m"]) for row in late])).all()
 
 
+def test_python_functions_do_what_the_commands_do(folder, tmp_path):
+    """The same files, but for the picture's compression: calibration, table and report."""
+    fit = calibrate_microphones(read_taps(folder / "taps.npz"))
+    write_calibration(fit, tmp_path / "made" / "cal.json")
+    assert (tmp_path / "made" / "cal.json").read_text("utf-8") == (folder / "cal.json").read_text("utf-8")
+    assert (tmp_path / "made" / "cal.png").stat().st_size > 10_000
+    steps = []
+    found = locate_touches(read_recording(folder / "recording.npz"), fit.calibration, progress=steps.append)
+    assert steps == ["measure intensities", "locate", "track"]
+    write_track(found, tmp_path / "python")
+    assert (
+        main(["locate", str(folder / "recording.npz"), "-c", str(folder / "cal.json"), "-o", str(tmp_path), "-q"]) == 0
+    )
+    assert rows(tmp_path / "python") == rows(tmp_path)
+    reports = [json.loads((place / "report.json").read_text("utf-8")) for place in (tmp_path / "python", tmp_path)]
+    assert reports[0] == reports[1]
+    for options, message in (({"gap": 0.0}, "gap must be"), ({"gap": 0.01}, "gap: frames are 0.05 s apart")):
+        with pytest.raises(ValueError, match=message):
+            locate_touches(found.intensities, fit.calibration, **options)
+    with pytest.raises(ValueError, match="intensity: band and window are for samples"):
+        locate_touches(found.intensities, fit.calibration, intensity=IntensitySettings())
+    with pytest.raises(ValueError, match="intensity: band and window are for taps"):
+        calibrate_microphones(read_taps(folder / "taps.npz"), intensity=IntensitySettings())
+
+
 def test_intensities_of_samples_are_smoothed_as_those_are(folder, tmp_path):
     """Written to a file, with their overlap: the same track, and as sure of it."""
-    heard = measure(read_recording(folder / "touch.npz"), Calibration.load(folder / "sound.json"))
+    heard = calibrated_intensities(read_recording(folder / "touch.npz"), Calibration.load(folder / "sound.json"))
     assert heard.overlap == 4
     write_recording(tmp_path / "heard.npz", heard)
     for name, output in ((folder / "touch.npz", "samples"), (tmp_path / "heard.npz", "intensities")):

@@ -11,7 +11,11 @@ from jeit.forward import ForwardModel
 from jeit.image import Inclusion
 from jeit.layout import ring
 from jeit.mesh import Polygon, centroids, disk, layer, rectangle
-from jeit.plot import draw_electrodes, plot_image, plot_mesh, plot_raster, plot_sensitivity, plot_voltages
+from jeit.plot import ColourScale, plot_image, plot_mesh
+from jeit.plot.imaging.electrodes import draw_electrodes
+from jeit.plot.imaging.image import plot_raster
+from jeit.plot.imaging.sensitivity import plot_sensitivity
+from jeit.plot.imaging.voltages import plot_voltages
 from jeit.protocol import adjacent
 
 RADIUS = 0.05
@@ -54,7 +58,7 @@ def test_differences_are_centred_at_zero(mesh, electrodes, ax):
 
 def test_conductivity_is_sequential_and_spans_its_range(mesh, ax):
     values = np.linspace(1.0, 3.0, mesh.num_points)
-    plot_image(mesh, values, difference=False, unit="S/m", ax=ax)
+    plot_image(mesh, values, scale=ColourScale(difference=False, unit="S/m"), ax=ax)
     drawn = [c for c in ax.collections if c.get_array() is not None]
     assert drawn[0].get_clim() == pytest.approx((1, 3))
     assert colour_bar_label(ax) == "Conductivity (S/m)"

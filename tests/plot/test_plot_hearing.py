@@ -8,19 +8,15 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from jeit.acoustic import (
-    Calibration,
-    CalibrationFit,
-    IntensityNoise,
-    InverseSquare,
-    Locations,
-    MicrophoneArray,
-    Touch,
-    Track,
-    make_surface,
-)
+from jeit.acoustic import Calibration, MicrophoneArray
+from jeit.acoustic.calibration.calibrate import CalibrationFit
+from jeit.acoustic.decay import InverseSquare
+from jeit.acoustic.localisation.locations import Locations
+from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.surface import make_surface
+from jeit.acoustic.track import Touch, Track
 from jeit.layout import grid
-from jeit.plot import plot_error_curve, plot_loss_map, plot_pairs, plot_receptive_fields, plot_track
+from jeit.plot import Marks, plot_error_curve, plot_loss_map, plot_pairs, plot_receptive_fields, plot_track
 from jeit.plot.acoustic.surface_view import FOUND
 
 OUTLINE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
@@ -175,8 +171,8 @@ def test_a_loss_map_lies_bottom_row_first_and_is_least_at_the_source(ax):
     values = np.full((20, 40), 50.0)
     values[0, 0], values[5, 30] = np.nan, 2.0
     place, spread = np.array([0.05, -0.04]), np.diag([4e-6, 1e-6])
-    marks = {"truth": [0.052, -0.041], "estimate": place, "covariance": spread}
-    assert plot_loss_map(values, known.microphone_array, received=np.linspace(0, 1, 9), **marks, ax=ax) is ax
+    marks = Marks([0.052, -0.041], estimate=place, covariance=spread)
+    assert plot_loss_map(values, known.microphone_array, received=np.linspace(0, 1, 9), marks=marks, ax=ax) is ax
     (drawn,) = ax.images
     assert list(drawn.get_extent()) == pytest.approx([-0.1, 0.1, -0.1, 0.1])
     assert drawn.origin == "lower"
@@ -217,14 +213,14 @@ def test_the_papers_loss_is_in_decibels(ax):
         ("method must be", {"method": "loudest"}),
         ("received has shape", {"received": np.ones(8)}),
         ("microphones has shape", {"microphones": np.ones((9, 3))}),
-        ("truth has shape", {"truth": [0.0, 0.0, 0.0]}),
-        ("estimate has shape", {"estimate": 0.0}),
-        ("covariance needs an estimate", {"covariance": np.eye(2)}),
-        ("covariance has shape", {"covariance": np.eye(3), "estimate": [0.0, 0.0]}),
+        ("truth has shape", {"marks": Marks(truth=[0.0, 0.0, 0.0])}),
+        ("estimate has shape", {"marks": Marks(estimate=0.0)}),
+        ("covariance needs an estimate", {"marks": Marks(covariance=np.eye(2))}),
+        ("covariance has shape", {"marks": Marks(estimate=[0.0, 0.0], covariance=np.eye(3))}),
     ],
 )
 def test_loss_maps_refuse_what_makes_no_sense(match, change, ax):
-    arguments = {"values": np.ones((3, 3)), "skin": calibration().microphone_array, "ax": ax} | change
+    arguments = {"values": np.ones((3, 3)), "surface": calibration().microphone_array, "ax": ax} | change
     with pytest.raises(ValueError, match=match):
         plot_loss_map(**arguments)
 
@@ -358,13 +354,13 @@ def test_the_ellipse_lies_in_the_plane_of_the_skin(ax):
     [
         ("overlay has shape", {"overlay": np.zeros((3, 4, 4))}),
         ("truth has shape", {"truth": np.zeros((4, 3))}),
-        ("locations: 20 frames of 9 microphones", {"skin": calibration(16)}),
+        ("locations: 20 frames of 9 microphones", {"array": calibration(16)}),
         ("locations", {"locations": recorded(stroke(19))[1]}),
     ],
 )
 def test_tracks_refuse_what_does_not_match(match, change, ax):
     track, locations = recorded(stroke())
-    arguments = {"track": track, "locations": locations, "skin": calibration(), "ax": ax} | change
+    arguments = {"track": track, "locations": locations, "array": calibration(), "ax": ax} | change
     with pytest.raises(ValueError, match=match):
         plot_track(**arguments)
 

@@ -11,7 +11,8 @@ from matplotlib.tri import TriContourSet
 
 from jeit.design.taxels import Taxels
 from jeit.layout import grid
-from jeit.plot import plot_similarity, plot_taxel_areas, plot_taxels
+from jeit.plot import plot_taxel_areas, plot_taxels
+from jeit.plot.design.taxels import plot_similarity
 from jeit_solvers import KMeans
 
 ELECTRODES = grid(0.08, 0.08, 2, 2)

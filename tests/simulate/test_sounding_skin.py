@@ -5,19 +5,27 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from jeit.simulate.sounding_skin import (
+from jeit.simulate import (
+    Burst,
     SoundingSkin,
-    expected_power,
+    calibration_taps,
     microphone_grid,
-    noise_power,
-    nominal_power,
-    transfer,
+    pat,
+    quiet,
+    stroke,
+    tap,
+    tickle,
 )
-from jeit.simulate.touch_sounds import calibration_taps, pat, quiet, stroke, superpose, tap, tickle
+from jeit.simulate.acoustic.layer import Elastomer, ElastomerLayer
+from jeit.simulate.acoustic.microphones import MicrophoneModel, Readout
+from jeit.simulate.acoustic.propagation import expected_power, noise_power, nominal_power, transfer
+from jeit.simulate.acoustic.sound import superpose
 
 KEY = jax.random.key(0)
 # No spread from microphone to microphone, and no coupling: what is left has closed forms.
-ALIKE = {"gain_spread_db": 0.0, "depth_spread": 0.0, "noise_spread_db": 0.0, "coupling_db": -np.inf}
+SPREADS = {"gain_spread_db": 0.0, "depth_spread": 0.0, "noise_spread_db": 0.0}
+ALIKE = {"model": MicrophoneModel(**SPREADS), "readout": Readout(coupling_db=-np.inf)}
+UNBOUNDED = ElastomerLayer(reflection=0.0)
 CENTRE = [(0.0, 0.0)]
 
 
@@ -36,13 +44,14 @@ def test_microphones_lie_on_a_grid_of_40_mm(skin):
     assert place.shape == (25, 2)
     np.testing.assert_allclose(np.unique(place.round(12)), [-0.08, -0.04, 0, 0.04, 0.08])
     np.testing.assert_allclose(place[1] - place[0], [0.04, 0], atol=1e-15)
-    assert skin.wave_speed == pytest.approx(10)
+    assert skin.layer.material.wave_speed == pytest.approx(10)
     # 2 dB of spread in power; the standard deviation of 25 draws scatters by 14 %.
     assert 20 * np.std(np.log10(np.asarray(skin.gain))) == pytest.approx(2, rel=0.45)
 
 
 def test_without_loss_and_echoes_power_is_the_spreading():
-    lossless = SoundingSkin(KEY, CENTRE, attenuation=0.0, reflection=0.0, **ALIKE)
+    layer = ElastomerLayer(material=Elastomer(attenuation=0.0), reflection=0.0)
+    lossless = SoundingSkin(KEY, CENTRE, layer=layer, **ALIKE)
     distance = np.array([0.0, 0.01, 0.03, 0.09])
     length, thickness = np.hypot(distance, 0.01), 0.01
     expected = (0.01 / length) ** 2 * (1 + length / thickness) / 2
@@ -58,8 +67,8 @@ def test_edges_and_corners_answer_with_images_of_the_source():
     edges = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
     corners = np.array([(1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0)])
     for reflection in (1.0, 0.5, -1.0):
-        walled = {"width": 2.0, "height": 2.0, "reflection": reflection, "attenuation": 20.0}
-        large = SoundingSkin(KEY, np.concatenate([edges, corners]), **walled, **ALIKE)
+        walled = ElastomerLayer(2.0, 2.0, material=Elastomer(attenuation=20.0), reflection=reflection)
+        large = SoundingSkin(KEY, np.concatenate([edges, corners]), layer=walled, **ALIKE)
         power = np.diagonal(expected_power(large, 0.97 * np.concatenate([edges, corners])))
         direct = nominal_power(large, np.repeat([0.03, 0.03 * np.sqrt(2)], 4))
         expected = direct * np.repeat([(1 + reflection) ** 2, (1 + reflection) ** 4], 4)
@@ -68,7 +77,9 @@ def test_edges_and_corners_answer_with_images_of_the_source():
 
 def test_sound_is_delayed_as_its_loss_demands():
     # For a loss ∝ f, α = α0 f / f0, Kramers and Kronig give the slowness 1 / speed - α0 ln(f / f0) / (π² f0).
-    dispersive = SoundingSkin(KEY, CENTRE, reflection=0.0, attenuation_exponent=1.0, multiplexed=False, **ALIKE)
+    layer = ElastomerLayer(material=Elastomer(attenuation_exponent=1.0), reflection=0.0)
+    readout = Readout(coupling_db=-np.inf, multiplexed=False)
+    dispersive = SoundingSkin(KEY, CENTRE, layer=layer, model=ALIKE["model"], readout=readout)
     frequencies, length = np.linspace(1, 900, 900), np.hypot(0.04, 0.01)
     phase = np.unwrap(np.angle(transfer(dispersive, frequencies, np.array([0.04, 0.0]))[0]))
     slowness = 1 / 10 - 4 * np.log(frequencies / 100) / (np.pi**2 * 100)
@@ -80,12 +91,12 @@ def test_a_microphone_hears_as_far_as_its_reach():
     snr = expected_power(alike, [(0.055, 0.0), (0.0, -0.055)])[:, 0] / noise_power(alike)
     # 0 dB, but for the edges' echoes, which are weak so far from them.
     np.testing.assert_allclose(10 * np.log10(snr), 0, atol=0.4)
-    louder = SoundingSkin(KEY, CENTRE, snr_db=10.0, **ALIKE)
+    louder = SoundingSkin(KEY, CENTRE, **ALIKE | {"model": MicrophoneModel(snr_db=10.0, **SPREADS)})
     np.testing.assert_allclose(noise_power(alike) / noise_power(louder), 10, rtol=1e-12)
 
 
 def test_power_falls_with_distance():
-    alike = SoundingSkin(KEY, CENTRE, reflection=0.0, **ALIKE)
+    alike = SoundingSkin(KEY, CENTRE, layer=UNBOUNDED, **ALIKE)
     power = expected_power(alike, np.stack([np.linspace(0, 0.1, 40), np.zeros(40)], axis=-1))[:, 0]
     assert (np.diff(power) < 0).all()
     assert power[-1] < power[0] / 30
@@ -131,7 +142,7 @@ def test_drawn_bursts_have_the_expected_power(small):
 def test_pieces_of_a_calibration_do_not_show(small, monkeypatch):
     places = [(0.0, 0.01), (0.03, 0.02), (-0.08, 0.0)]
     whole = calibration_taps(small, KEY, places, repeats=2, duration=0.1)
-    monkeypatch.setattr("jeit.simulate.touch_sounds.PIECE", 12_000)
+    monkeypatch.setattr("jeit.simulate.acoustic.calibration_taps.PIECE", 12_000)
     # Two pieces of two places, the last one twice.
     parts = calibration_taps(small, KEY, places, repeats=2, duration=0.1)
     np.testing.assert_allclose(parts.samples, whole.samples, rtol=1e-9, atol=1e-12)
@@ -140,7 +151,7 @@ def test_pieces_of_a_calibration_do_not_show(small, monkeypatch):
 @pytest.mark.parametrize("multiplexed", [True, False])
 def test_blocks_add_up_to_the_transfer_function(multiplexed):
     # Whatever the source's spectrum was, two channels differ by the ratio of their transfer functions.
-    made = SoundingSkin(KEY, microphone_grid(2), multiplexed=multiplexed)
+    made = SoundingSkin(KEY, microphone_grid(2), readout=Readout(multiplexed=multiplexed))
     place = (0.03, -0.06)
     recording = tap(made, KEY, place, repeats=2, duration=0.5, noise=False)
     spectrum = np.fft.rfft(recording.samples)
@@ -169,7 +180,8 @@ def test_a_row_of_taps_is_as_loud_and_as_late_as_it_should_be():
 @pytest.mark.parametrize(("multiplexed", "step", "rate"), [(True, 25e-6, 10e3), (False, 0.0, 40e3)])
 def test_the_multiplexer_samples_one_after_another(multiplexed, step, rate):
     # Six microphones in one place hear the same sound; later samples are earlier sound.
-    together = SoundingSkin(KEY, [(0.0, 0.02)] * 6, multiplexed=multiplexed, **ALIKE)
+    readout = Readout(coupling_db=-np.inf, multiplexed=multiplexed)
+    together = SoundingSkin(KEY, [(0.0, 0.02)] * 6, model=ALIKE["model"], readout=readout)
     recording = tap(together, KEY, (0.01, 0.0), noise=False)
     assert recording.rate == pytest.approx(rate)
     spectrum = np.fft.rfft(recording.samples)
@@ -188,7 +200,8 @@ def test_coupling_leaks_from_the_slot_before():
     frequencies, place = np.array([100.0, 700.0]), np.array([0.05, 0.03])
     grid = microphone_grid(3)[:6]
     alone, coupled = (
-        np.asarray(transfer(SoundingSkin(KEY, grid, coupling_db=db), frequencies, place)) for db in (-np.inf, -20.0)
+        np.asarray(transfer(SoundingSkin(KEY, grid, readout=Readout(coupling_db=db)), frequencies, place))
+        for db in (-np.inf, -20.0)
     )
     # The second multiplexer holds microphones 4 and 5 and two open slots, the last of which comes before 4.
     before = np.array([3, 0, 1, 2, 4, 4])
@@ -222,7 +235,8 @@ def test_keys_decide_everything(small):
         np.testing.assert_array_equal(made(KEY), made(KEY))
         assert np.abs(made(KEY) - made(jax.random.key(1))).max() > 0
     # A draw does not depend on what else the skin is.
-    np.testing.assert_array_equal(SoundingSkin(KEY).gain, SoundingSkin(KEY, snr_db=20.0, reflection=0.0).gain)
+    other = SoundingSkin(KEY, layer=UNBOUNDED, model=MicrophoneModel(snr_db=20.0))
+    np.testing.assert_array_equal(SoundingSkin(KEY).gain, other.gain)
 
 
 def test_touches_add_and_noise_is_added_once(small):
@@ -232,7 +246,7 @@ def test_touches_add_and_noise_is_added_once(small):
     noise = superpose(small, KEY, one, two) - together
     # 860 Hz for a second: 2.4 %.
     np.testing.assert_allclose((noise**2).mean(axis=1), noise_power(small), rtol=0.12)
-    louder = pat(small, jax.random.key(1), (0.05, 0.05), strength=4.0, noise=False)
+    louder = pat(small, jax.random.key(1), (0.05, 0.05), burst=Burst(4.0, 0.08), noise=False)
     np.testing.assert_allclose(louder.samples, 2 * one.samples, rtol=1e-9, atol=1e-12)
     noisy = pat(small, jax.random.key(1), (0.05, 0.05))
     assert np.corrcoef((noisy.samples - one.samples)[0], one.samples[0])[0, 1] < 0.1
@@ -243,7 +257,7 @@ def test_touches_add_and_noise_is_added_once(small):
 
 
 def test_the_loudest_microphone_follows_a_stroke():
-    clear = SoundingSkin(KEY, snr_db=20.0, **ALIKE)
+    clear = SoundingSkin(KEY, **ALIKE | {"model": MicrophoneModel(snr_db=20.0, **SPREADS)})
     recording = stroke(clear, KEY, [(-0.09, -0.04), (0.0, -0.04), (0.0, 0.09)])
     place, right = np.asarray(clear.microphones), 0
     starts = np.arange(500, 9000, 500)
@@ -282,24 +296,27 @@ def test_pats_and_tickles_are_where_and_when_they_say(small):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("make", "message"),
     [
-        ({"width": -0.2}, "width must be a positive"),
-        ({"depth": 0.0}, "depth must be a positive"),
-        ({"reach": np.nan}, "reach must be a positive"),
-        ({"attenuation": -1.0}, "attenuation must be zero or positive"),
-        ({"reflection": 1.5}, "reflection: an edge"),
-        ({"coupling_db": 3.0}, "coupling_db"),
-        ({"snr_db": np.inf}, "snr_db"),
-        ({"band": (900.0, 60.0)}, "band: give"),
-        ({"band": (60.0, 4000.0)}, "below 3536 Hz"),
-        ({"microphones": [(40.0, 0.0)]}, "microphones: row 0.*millimetres"),
-        ({"microphones": np.zeros((3, 3))}, r"microphones: give \(x, y\)"),
+        (lambda: ElastomerLayer(width=-0.2), "width must be a positive"),
+        (lambda: MicrophoneModel(depth=0.0), "depth must be a positive"),
+        (lambda: MicrophoneModel(reach=np.nan), "reach must be a positive"),
+        (lambda: Elastomer(attenuation=-1.0), "attenuation must be zero or positive"),
+        (lambda: ElastomerLayer(reflection=1.5), "reflection: an edge"),
+        (lambda: Readout(coupling_db=3.0), "coupling_db"),
+        (lambda: MicrophoneModel(snr_db=np.inf), "snr_db"),
+        (lambda: SoundingSkin(KEY, spectral_slope=np.nan), "spectral_slope must be finite"),
+        (lambda: Elastomer(attenuation_exponent=3.0), "attenuation_exponent must be"),
+        (lambda: MicrophoneModel(gain_spread_db=-1.0), "gain_spread_db must be zero or positive"),
+        (lambda: Readout(band=(900.0, 60.0)), "band: give"),
+        (lambda: Readout(band=(60.0, 4000.0)), "below 3536 Hz"),
+        (lambda: SoundingSkin(KEY, [(40.0, 0.0)]), "microphones: row 0.*millimetres"),
+        (lambda: SoundingSkin(KEY, np.zeros((3, 3))), r"microphones: give \(x, y\)"),
     ],
 )
-def test_impossible_skins_are_refused(options, message):
+def test_impossible_skins_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
-        SoundingSkin(KEY, **options)
+        make()
 
 
 @pytest.mark.parametrize(
@@ -308,9 +325,9 @@ def test_impossible_skins_are_refused(options, message):
         (lambda skin: tap(skin, KEY, (0.11, 0.0)), "position: row 0.*off the skin"),
         (lambda skin: tap(skin, KEY, (np.nan, 0.0)), "position: row 0 is not finite"),
         (lambda skin: tap(skin, KEY, (0.0, 0.0, 0.0)), "position: give"),
-        (lambda skin: tap(skin, KEY, (0.0, 0.0), strength=0.0), "strength must be"),
+        (lambda skin: tap(skin, KEY, (0.0, 0.0), burst=Burst(strength=0.0)), "strength must be"),
         (lambda skin: tap(skin, KEY, (0.0, 0.0), repeats=0), "repeats"),
-        (lambda skin: tap(skin, KEY, (0.0, 0.0), length=0.2), "does not fit"),
+        (lambda skin: tap(skin, KEY, (0.0, 0.0), burst=Burst(length=0.2)), "does not fit"),
         (lambda skin: pat(skin, KEY, (0.0, 0.0), interval=-1.0), "interval must be"),
         (lambda skin: tickle(skin, KEY, (0.0, 0.0), radius=0.0), "radius must be"),
         (lambda skin: stroke(skin, KEY, [(0.0, 0.0), (0.2, 0.0)]), "path: row 1"),

@@ -1,7 +1,7 @@
 """Calibration: decay models and noise of every microphone, from taps at known places and of unknown strength.
 
-Rounds of robust least squares fit them; here it is judged which microphones they are good for. Taps that no microphone
-agrees with are left out, and said.
+Robust least squares fit them; here it is judged which microphones they are good for. Taps that no microphone agrees
+with are left out, and said.
 """
 
 import equinox as eqx
@@ -10,7 +10,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.acoustic.calibration.calibration import Calibration
-from jeit.acoustic.calibration.robust_fit import ABOVE, BELOW, FREE, SHARED, TapFit, first_fit, standard_errors, without
+from jeit.acoustic.calibration.robust_least_squares import (
+    ABOVE,
+    BELOW,
+    FREE,
+    SHARED,
+    TapFit,
+    fit_taps,
+    refit_without,
+    standard_errors,
+)
 from jeit.acoustic.decay import AbstractDecay, find_decay
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.noise import IntensityNoise, below_nothing
@@ -56,10 +65,15 @@ def calibrate_microphones(
     """Fit the decay model of every microphone to `taps`.
 
     `decay`: "inverse-square", a / (r² + b), the paper's; "exponential", a exp(−r / l); or "attenuated",
-    a exp(−r / l) / (r² + b). `intensity`: band and window, for taps that come as samples. Raises `ValueError` where
-    fewer than three microphones can be calibrated, and where most do not hear what is said to be tapped.
+    a exp(−r / l) / (r² + b). `intensity`: band and window, for taps that come as samples.
+
+    What `jeit calibrate-microphones` does; `jeit.report.write_calibration` writes what it writes. Raises `ValueError`
+    where fewer than three microphones can be calibrated, where most do not hear what is said to be tapped, for another
+    `decay`, and for `intensity` where the taps are intensities.
     """
     kind = find_decay(decay)
+    if intensity is not None and taps.samples is None:
+        raise ValueError("intensity: band and window are for taps that come as samples; these are intensities.")
     surface = make_surface(taps.outline, taps.positions)
     settings = None
     if taps.samples is None:
@@ -76,13 +90,13 @@ def calibrate_microphones(
     distance = np.linalg.norm(difference, axis=-1)
     enough = _check(kind, distance.T, np.where(usable, power, np.nan).T, faults)
     squared, power = np.sum(difference**2, axis=-1).T, np.where(usable, power, np.nan).T
-    fit = first_fit(kind, taps.microphones, squared, power, noise, known_noise)
+    fit = fit_taps(kind, taps.microphones, squared, power, noise, known_noise)
     tried = fit.use.T
     reasons, explained = _judge(fit, faults)
     bad = np.array([bool(reason) for reason in reasons])
     # What some are left out for may show in others only without them.
     while bad.any() and (~fit.dropped & ~bad).sum() >= 3:
-        fit = without(fit, bad)
+        fit = refit_without(fit, bad)
         again, explained = _judge(fit, ("",) * len(bad), explained)
         bad = np.array([bool(reason) for reason in again]) & ~fit.dropped
         reasons = tuple(new if worse else old for new, old, worse in zip(again, reasons, bad, strict=True))

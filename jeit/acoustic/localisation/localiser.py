@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic.localisation.consistency import Consistency
 from jeit.acoustic.localisation.likelihood import Likelihood
-from jeit.acoustic.localisation.minimise import descend, differentiable
-from jeit.acoustic.localisation.raster import Pixels, valleys
+from jeit.acoustic.localisation.minima import differentiable_minima, find_minima
+from jeit.acoustic.localisation.pixels import Pixels, valleys
 from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.surface import box, in_space, size
+from jeit.acoustic.surface import bounding_box, in_space, longer_side
 from jeit_solvers import inverse_small
 
 METHODS = {"likelihood": Likelihood, "consistency": Consistency}
@@ -71,7 +71,7 @@ class Localiser(eqx.Module):
         """
         if method not in METHODS:
             raise ValueError(f"method must be one of {', '.join(METHODS)}; it is {method!r}.")
-        low, high = box(microphone_array.surface)
+        low, high = bounding_box(microphone_array.surface)
         sides_of_box = np.asarray(high - low)
         spacing = np.sqrt(np.prod(sides_of_box) / _COARSE)
         counts = [max(3, round(side / spacing)) for side in sides_of_box]
@@ -183,12 +183,12 @@ def _refine(localiser: Localiser, power, use, first, second, worth) -> SourceEst
     fixed = jax.lax.stop_gradient(microphone_array)
     still = METHODS[localiser.method].create(jax.lax.stop_gradient(power), use, fixed)
     # Where one pixel of many was the start there is no second valley to try.
-    unknowns, excess, rival, converged, side = descend(
+    unknowns, excess, rival, converged, side = find_minima(
         still, first, second, worth if localiser.pixels is None else None
     )
     likelihood = Likelihood.create(power, use, microphone_array)
     objective = likelihood if localiser.method == "likelihood" else Consistency.create(power, use, microphone_array)
-    unknowns = differentiable(objective, unknowns, side, size(fixed.surface))
+    unknowns = differentiable_minima(objective, unknowns, side, longer_side(fixed.surface))
     return _describe(objective, likelihood, unknowns, excess, rival, converged)
 
 

@@ -3,12 +3,12 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
 from scipy.stats import chi2
 
 from jeit.acoustic.calibration.calibration import Calibration
+from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
 from jeit.acoustic.localisation.localiser import Localiser, SourceEstimate
-from jeit.acoustic.localisation.measure import measure
+from jeit.acoustic.localisation.locations import FrameStatus, Locations
 from jeit.acoustic.localisation.setup_changes import find_setup_changes
 from jeit.acoustic.localisation.two_sources import locate_two
 from jeit.acoustic.microphones import MicrophoneArray
@@ -16,9 +16,8 @@ from jeit.acoustic.noise import IntensityNoise, below_nothing
 from jeit.acoustic.signal.faults import describe_faults
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
-from jeit.acoustic.surface import size
+from jeit.acoustic.surface import longer_side
 
-STATUSES = ("touch", "no touch", "outside", "two touches", "ambiguous", "misfit", "unusable")
 # Chance that a silent frame is taken for a touch; that a frame one source explains is said not to be.
 _FALSE_ALARM, _FALSE_MISFIT = 1e-6, 1e-4
 # Standard deviations of unknown distribution that a false alarm needs.
@@ -37,48 +36,6 @@ _DYNAMIC_RANGE = 1e-6
 _SAME_UNIT = 1e4
 
 
-class Locations(eqx.Module):
-    """What was found of F frames of M microphones.
-
-    - `times`: (F,) seconds; `status`: (F,) one of `STATUSES`.
-    - `position`: (F, d) metres; `covariance`: (F, d, d) m²; `strength`: (F,). NaN where there is no touch.
-    - `misfit`: (F,) chi-square of what one source leaves unexplained, with `freedom`: (F,) degrees.
-    - `used`: (F, M) which microphones were looked at. `faults`: M strings, what is wrong with one ("" if nothing).
-    - `second`: (F, d) and `second_strength`: (F,), of the weaker of two touches, NaN elsewhere.
-    - `overlap`: windows that share a sample, whose errors are alike.
-    - `notes`: what to know of all of it.
-
-    Status: "touch"; "no touch", nothing is above the floor; "outside", the intensities say a place beyond the outline,
-    and the place given is the best on it; "two touches", one source does not explain the frame but two do; "misfit",
-    neither does, and the covariance is widened accordingly; "ambiguous", two places explain the frame about as well;
-    "unusable", fewer than three microphones could be used.
-    """
-
-    times: Float[np.ndarray, " F"]
-    position: Float[np.ndarray, "F d"]
-    covariance: Float[np.ndarray, "F d d"]
-    strength: Float[np.ndarray, " F"]
-    status: np.ndarray
-    misfit: Float[np.ndarray, " F"]
-    freedom: Int[np.ndarray, " F"]
-    used: Bool[np.ndarray, "F M"]
-    second: Float[np.ndarray, "F d"]
-    second_strength: Float[np.ndarray, " F"]
-    overlap: float = eqx.field(static=True)
-    faults: tuple[str, ...] = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
-    name: str = eqx.field(static=True)
-
-    @property
-    def located(self) -> Bool[np.ndarray, " F"]:
-        """Frames that have a position."""
-        return np.asarray(np.isfinite(self.position).all(axis=1))
-
-    def counts(self) -> dict[str, int]:
-        """How many frames there are of each status."""
-        return {status: int((self.status == status).sum()) for status in STATUSES if (self.status == status).any()}
-
-
 def locate(
     recording: Recording | Intensities,
     calibration: Calibration,
@@ -92,18 +49,18 @@ def locate(
 
     `method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster that is
     searched, (200, 200) in the paper; a coarse grid unless given (both are refined). `intensity`: band and window for
-    samples, those of the calibration unless given; `silence`: the array untouched, as of `measure`. Raises
-    `ValueError` for a recording of another number of microphones, and where fewer than three can be used.
+    samples, those of the calibration unless given; `silence`: the array untouched, as of `calibrated_intensities`.
+    Raises `ValueError` for a recording of another number of microphones, and where fewer than three can be used.
     """
-    heard = measure(recording, calibration, intensity, silence=silence)
-    microphone_array, use, faults = prepare(heard, calibration)
+    heard = calibrated_intensities(recording, calibration, intensity, silence=silence)
+    microphone_array, use, faults = microphones_in_use(heard, calibration)
     touched = use.any(axis=1) & _above_floor(heard, microphone_array.noise, use)
     enough = use.sum(axis=1) >= 3
     solve = touched & enough
     localiser = Localiser.create(microphone_array, method=method, map_shape=map_shape)
     frames, d = len(heard.times), calibration.microphone_array.microphones.shape[1]
-    status = np.where(touched, "touch", "no touch").astype(object)
-    status[~enough] = "unusable"
+    status = np.where(touched, FrameStatus.TOUCH, FrameStatus.NO_TOUCH).astype(object)
+    status[~enough] = FrameStatus.UNUSABLE
     result = {
         "position": np.full((frames, d), np.nan),
         "covariance": np.full((frames, d, d), np.nan),
@@ -128,8 +85,8 @@ def locate(
         _explain(status, result, heard.power, use, microphone_array)
         excess = np.zeros(frames)
         excess[solve] = np.asarray(judge.excess)[:number]
-        status[(status == "misfit") & (excess > _OUTSIDE)] = "outside"
-        _bound(status, result, float(size(microphone_array.surface)))
+        status[(status == FrameStatus.MISFIT) & (excess > _OUTSIDE)] = FrameStatus.OUTSIDE
+        _bound(status, result, float(longer_side(microphone_array.surface)))
         notes += _notes(status, heard, use, microphone_array)
     return Locations(
         np.asarray(heard.times),
@@ -147,11 +104,12 @@ def _judge(judge: SourceEstimate, found: SourceEstimate) -> np.ndarray:
     """The status of frames with a touch, but for two touches."""
     misfit, freedom = np.asarray(judge.misfit), np.asarray(judge.freedom)
     excess = np.asarray(judge.excess)
-    status = np.where(np.asarray(judge.rival) < _RIVAL, "ambiguous", "touch").astype(object)
-    status[_unexplained(misfit, freedom)] = "misfit"
+    rivalled = np.asarray(judge.rival) < _RIVAL
+    status = np.where(rivalled, FrameStatus.AMBIGUOUS, FrameStatus.TOUCH).astype(object)
+    status[_unexplained(misfit, freedom)] = FrameStatus.MISFIT
     # A source beyond the outline explains what none on it does, but for two sources, which nothing explains.
-    status[(excess > _OUTSIDE) & ~_unexplained(misfit - excess, freedom)] = "outside"
-    status[~np.isfinite(np.asarray(found.position)).all(axis=1)] = "unusable"
+    status[(excess > _OUTSIDE) & ~_unexplained(misfit - excess, freedom)] = FrameStatus.OUTSIDE
+    status[~np.isfinite(np.asarray(found.position)).all(axis=1)] = FrameStatus.UNUSABLE
     return status
 
 
@@ -162,7 +120,7 @@ def _unexplained(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
 
 def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, microphone_array: MicrophoneArray) -> None:
     """Try two sources where one does not explain the frame; widen the covariance where neither does."""
-    tried = np.flatnonzero((status == "misfit") & (use.sum(axis=1) > 6))
+    tried = np.flatnonzero((status == FrameStatus.MISFIT) & (use.sum(axis=1) > 6))
     if tried.size:
         two = locate_two(microphone_array, *_padded(power[tried], use[tried]))
         misfit, freedom = np.asarray(two.misfit)[: tried.size], np.asarray(two.freedom)[: tried.size]
@@ -170,13 +128,13 @@ def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, micr
         much_better = (misfit < _BOTH * result["misfit"][tried]) & (misfit < _STILL_FAIR * freedom)
         both = (~_unexplained(misfit, freedom) | much_better) & (weaker > _WEAKEST * stronger)
         chosen, index = tried[both], np.flatnonzero(both)
-        status[chosen] = "two touches"
+        status[chosen] = FrameStatus.TWO_TOUCHES
         result["misfit"][chosen], result["freedom"][chosen] = misfit[both], freedom[both]
         position, strength = np.asarray(two.position)[index], np.asarray(two.strength)[index]
         result["position"][chosen], result["second"][chosen] = position[:, 0], position[:, 1]
         result["strength"][chosen], result["second_strength"][chosen] = strength.T
         result["covariance"][chosen] = np.asarray(two.covariance)[index, 0]
-    left = np.flatnonzero(status == "misfit")
+    left = np.flatnonzero(status == FrameStatus.MISFIT)
     wide = result["misfit"][left] / np.maximum(result["freedom"][left], 1)
     result["covariance"][left] *= np.maximum(wide, 1.0)[:, None, None]
 
@@ -187,7 +145,8 @@ def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> N
     finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
     width = np.zeros(len(status))
     width[finite] = np.sqrt(np.abs(np.linalg.eigvalsh(result["covariance"][finite])).max(axis=1))
-    status[located & (status == "touch") & (~finite | (width > reach / 4))] = "ambiguous"
+    vague = located & (status == FrameStatus.TOUCH) & (~finite | (width > reach / 4))
+    status[vague] = FrameStatus.AMBIGUOUS
     boundless = located & (~finite | (width > reach))
     result["covariance"][boundless] = (reach / 2) ** 2 * np.eye(result["covariance"].shape[1])
 
@@ -195,8 +154,8 @@ def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> N
 def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, microphone_array: MicrophoneArray) -> list[str]:
     """What the user should know beyond the status of frames."""
     notes = []
-    placed = ~np.isin(status, ["no touch", "unusable"])
-    odd = np.isin(status, ["misfit", "outside", "two touches"])
+    placed = ~np.isin(status, [FrameStatus.NO_TOUCH, FrameStatus.UNUSABLE])
+    odd = np.isin(status, [FrameStatus.MISFIT, FrameStatus.OUTSIDE, FrameStatus.TWO_TOUCHES])
     if odd.sum() > _ODD * placed.sum():
         exchanged, altered = find_setup_changes(microphone_array, heard.power[placed], use[placed])
         notes += [
@@ -209,7 +168,7 @@ def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, microphone_a
             "The places are not corrected: make its channel NaN and locate again, or calibrate anew."
             for one in altered
         ]
-        if not exchanged and not altered and (status == "misfit").sum() > 2 * _ODD * placed.sum():
+        if not exchanged and not altered and (status == FrameStatus.MISFIT).sum() > 2 * _ODD * placed.sum():
             notes.append("most touches fit no single source: is this the calibration of this array?")
     return notes
 
@@ -233,7 +192,9 @@ def _unit(strength: np.ndarray, heard: Intensities, use: np.ndarray, calibration
     return [f"what is heard is {ratio:.3g} times as loud as the calibration's noise: {asked}"] if low else []
 
 
-def prepare(heard: Intensities, calibration: Calibration) -> tuple[MicrophoneArray, np.ndarray, tuple[str, ...]]:
+def microphones_in_use(
+    heard: Intensities, calibration: Calibration
+) -> tuple[MicrophoneArray, np.ndarray, tuple[str, ...]]:
     """The microphones with the noise of these intensities, which are to be used (F, M), and what is wrong with others.
 
     Raises `ValueError` if fewer than three microphones are left.

@@ -8,9 +8,9 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.acoustic.localisation.likelihood import Likelihood
-from jeit.acoustic.localisation.raster import Pixels
+from jeit.acoustic.localisation.pixels import Pixels
 from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.surface import box, in_space, size
+from jeit.acoustic.surface import bounding_box, in_space, longer_side
 from jeit_solvers import inverse_small, minimise_small
 
 # Places of which all pairs are screened, and pairs that are tried.
@@ -37,7 +37,7 @@ def locate_two(microphone_array: MicrophoneArray, power: ArrayLike, use: ArrayLi
     """
     power = jnp.asarray(power, float)
     use = jnp.isfinite(power) if use is None else jnp.isfinite(power) & jnp.asarray(use, bool)
-    low, high = (np.asarray(corner) for corner in box(microphone_array.surface))
+    low, high = (np.asarray(corner) for corner in bounding_box(microphone_array.surface))
     spacing = np.sqrt(np.prod(high - low) / _PLACES)
     columns, rows = (max(3, round(side / spacing)) for side in high - low)
     pixels = Pixels.create(microphone_array.surface, columns, rows)
@@ -53,8 +53,8 @@ def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -
         lambda frame: _best_pairs(frame[0], frame[1], response, pixels, microphone_array), (power.T, use.T)
     )
     start = starts.transpose(2, 1, 0).reshape(6, -1)  # (6, starts · F)
-    low, high = box(microphone_array.surface)
-    reach = size(microphone_array.surface)
+    low, high = bounding_box(microphone_array.surface)
+    reach = longer_side(microphone_array.surface)
     far = jnp.full(1, jnp.inf)
     found = minimise_small(
         lambda x, data: Likelihood(data[0], data[1], data[2], microphone_array).expand(x),

@@ -65,7 +65,7 @@ def short(values: np.ndarray) -> str:
 
 
 def real(value, label: str, axes: str) -> np.ndarray:
-    """Real numbers with the axes named: float32 as it is, all else as float64."""
+    """Real numbers with the axes named, float32 as it is, all else as float64; `ValueError` for anything else."""
     try:
         array = np.asarray(value)
     except ValueError:
@@ -80,7 +80,7 @@ def real(value, label: str, axes: str) -> np.ndarray:
 
 
 def number(value, label: str) -> float:
-    """One real number, also when it is an array of one."""
+    """One real number, also when it is an array of one; `ValueError` for anything else."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiu" or array.size != 1:
         raise ValueError(f"{label} must be one real number; it is {array.dtype} of shape {array.shape}.")
@@ -88,7 +88,7 @@ def number(value, label: str) -> float:
 
 
 def sampling_rate(value) -> float:
-    """A rate in Hz that touch could be heard at."""
+    """A rate in Hz that touch could be heard at; `ValueError` for anything else."""
     rate = number(value, "rate")
     if not np.isfinite(rate) or rate < LOWEST_RATE:
         raise ValueError(
@@ -99,7 +99,7 @@ def sampling_rate(value) -> float:
 
 
 def check_full_scale(value) -> float | None:
-    """The largest |sample| possible, or None."""
+    """The largest |sample| possible, or None; `ValueError` for what is not positive and finite."""
     full_scale = None if value is None else number(value, "full_scale")
     if full_scale is not None and not 0 < full_scale < np.inf:
         raise ValueError(f"full_scale must be the largest sample possible, positive and finite; it is {full_scale:g}.")
@@ -107,7 +107,7 @@ def check_full_scale(value) -> float | None:
 
 
 def coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
-    """Points (n, 2) or (n, 3), with as many coordinates as `dimension` = (2,) or (3,) says."""
+    """Points (n, 2) or (n, 3), metres, with as many coordinates as `dimension` = (2,) or (3,); else `ValueError`."""
     points = real(value, label, "points, 2 or 3").astype(float)
     if points.shape[1] not in (2, 3) or points.shape[1:] != dimension:
         raise ValueError(

@@ -107,7 +107,8 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     windows overlap; `freedom` counts what they share exactly, for white noise. It does not know that the windows were
     chosen: of a tap that is not heard at all, the loudest windows of noise are taken, somewhat above the floor.
 
-    Taps that already hold intensities are returned as they are, with a floor of zero and infinite freedom.
+    Taps that already hold intensities are returned as they are, with a floor of zero and infinite freedom. Raises
+    `ValueError` for what is no `Taps`, and where band, window and samples do not fit each other.
     """
     if not isinstance(taps, Taps):
         raise ValueError(f"taps must be Taps, as read_taps gives; they are {type(taps).__name__}.")
@@ -158,6 +159,9 @@ def noise_floor(
 
     Noise that is much louder at one end of the band scatters more than ν of white noise says, and its floor comes out
     low: for power as 1/f from 50 to 1000 Hz by 8 %, as 1/f² by a third.
+
+    Raises `ValueError` for shapes that disagree, usable windows that are not finite, and a share or freedom out of
+    range.
     """
     power, usable = np.asarray(power, float), np.asarray(usable)
     if power.ndim != 2 or usable.shape != power.shape or usable.dtype != bool:

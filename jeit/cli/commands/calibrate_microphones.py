@@ -5,11 +5,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.options import BandHigh, BandLow, Hop, Quiet, Window, intensity_settings, make_folder
+from jeit.cli.options import BandHigh, BandLow, Hop, Quiet, Window, intensity_settings, make_folder, naming_options
 
 if TYPE_CHECKING:
-    from jeit.acoustic import CalibrationFit
+    from jeit.acoustic.calibration.calibrate import CalibrationFit
 
+_OPTIONS = {"decay": "--decay", "path": "--output", "intensity": "--low, --high, --window and --hop"}
 # A relative error of the models that taps at places slightly wrong give.
 _MUCH = 0.3
 
@@ -39,46 +40,35 @@ def calibrate_microphones(
     quiet: Quiet = False,
 ) -> None:
     """Calibrate an array of microphones from taps at known places; writes the calibration and a picture of it."""
-    from matplotlib.figure import Figure
     from rich.console import Console
 
     from jeit.acoustic import calibrate_microphones as calibrate
     from jeit.acoustic import read_taps
     from jeit.acoustic.decay import find_decay
     from jeit.cli.console import Steps
-    from jeit.plot import plot_receptive_fields
+    from jeit.report import write_calibration
+    from jeit.report.calibration import calibration_files
 
-    find_decay(decay)
     settings = intensity_settings(low, high, window, hop)
-    if output.is_dir():
-        raise ValueError(f"--output {output} is a folder; give a file, such as {output / 'calibration.json'}.")
-    picture = output.with_suffix(".png")
-    if picture == output:
-        raise ValueError(f"--output {output}: the calibration is JSON; give another name, such as {output.stem}.json.")
-    make_folder(output.parent, (output.name, picture.name))
     console = Console(highlight=False)
-    with Steps(console, quiet=quiet) as step:
-        step("read")
-        touched = read_taps(taps)
-        if settings is not None and touched.samples is None:
-            raise ValueError(
-                "--low, --high, --window and --hop are for taps that come as samples; these are intensities."
-            )
-        step("fit")
-        fit = calibrate(touched, decay=decay, intensity=settings)
-        step("write")
-        fit.calibration.save(output)
-        figure = Figure(figsize=(9.6, 8.4), layout="constrained")
-        plot_receptive_fields(fit, title=touched.name, ax=figure.subplots())
-        figure.savefig(picture, dpi=130)
+    with naming_options(_OPTIONS):
+        kind = find_decay(decay)
+        files = calibration_files(output)
+        make_folder(output.parent, tuple(file.name for file in files))
+        with Steps(console, quiet=quiet) as step:
+            step("read")
+            touched = read_taps(taps)
+            step("fit")
+            fit = calibrate(touched, decay=kind, intensity=settings)
+            step("write")
+            write_calibration(fit, output)
     if not quiet:
         _show(console, fit)
-        console.print(f"[dim]Written:[/dim] {output}, {picture.name}", soft_wrap=True)
+        console.print(f"[dim]Written:[/dim] {output}, {files[1].name}", soft_wrap=True)
 
 
 def _show(console, fit: "CalibrationFit") -> None:
     import numpy as np
-    from rich.table import Table
 
     from jeit.cli.console import pairs
 
@@ -103,6 +93,19 @@ def _show(console, fit: "CalibrationFit") -> None:
     console.print()
     console.print(pairs(calibration.name, rows))
     console.print()
+    console.print(_parameters(fit))
+    refused = [(f"microphone {k}", f"not usable: {why}") for k, why in enumerate(calibration.reasons) if why]
+    if refused:
+        console.print()
+        console.print(pairs("Left out", refused))
+
+
+def _parameters(fit: "CalibrationFit"):
+    """A table of the decay models of all usable microphones."""
+    from rich.table import Table
+
+    calibration = fit.calibration
+    decay, noise = calibration.microphone_array.decay, calibration.microphone_array.noise
     factors, units = {"a": 1.0, "b": 1e6, "length": 1e3}, {"a": "m²", "b": "mm²", "length": "mm"}
     if decay.name == "exponential":
         units["a"] = "1"
@@ -110,10 +113,8 @@ def _show(console, fit: "CalibrationFit") -> None:
     table = Table("", *columns, "error %", "explained %", box=None, padding=(0, 1))
     for column in table.columns[1:]:
         column.justify = "right"
-    refused = []
     for k, reason in enumerate(calibration.reasons):
         if reason:
-            refused.append((f"microphone {k}", f"not usable: {reason}"))
             continue
         cells = []
         for i, name in enumerate(decay.parameters):
@@ -124,7 +125,4 @@ def _show(console, fit: "CalibrationFit") -> None:
             ]
         cells += [f"{100 * float(noise.relative[k]):.1f}", f"{100 * float(fit.explained[k]):.1f}"]
         table.add_row(str(k), *cells)
-    console.print(table)
-    if refused:
-        console.print()
-        console.print(pairs("Left out", refused))
+    return table

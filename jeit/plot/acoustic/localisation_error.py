@@ -8,11 +8,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
 
-from jeit.plot.acoustic.surface_view import FOUND, Skin, draw_legend, draw_skin, view_of
-from jeit.plot.axes import INK, SOFT, axes_or_new
+from jeit.plot.acoustic.surface_view import FOUND, AnySurface, draw_legend, draw_surface, view_of
+from jeit.plot.axes import INK, SERIES_COLOURS, SERIES_MARKERS, axes_or_new, draw_horizontal_grid, soften_axes
 
-_COLOURS = ("#1f6fb4", "#d1495b", "#2a9d6f", "#8a5cb8", "#d98a1c", "#5b6470")
-_MARKERS = ("o", "s", "^", "D", "v", "P")
 _STATISTICS = {
     "median": lambda errors: np.nanmedian(errors, axis=1),
     "mean": lambda errors: np.nanmean(errors, axis=1),
@@ -24,24 +22,25 @@ def plot_pairs(
     true: ArrayLike,
     found: ArrayLike,
     microphones: ArrayLike,
-    skin: Skin,
+    surface: AnySurface,
     *,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw true places (P, d) and those `found` (P, d), pair by pair, over `microphones` (M, d); all in metres.
 
-    `skin`: its outline, a surface, `MicrophoneArray` or a `Calibration`. Places that were not found, NaN, are hollow.
-    The title is mean ± standard deviation of the error unless given. Raises `ValueError` for shapes that disagree.
+    `surface`: its outline, a surface, `MicrophoneArray` or a `Calibration`. Places that were not found, NaN, are
+    hollow. The title is mean ± standard deviation of the error unless given. Raises `ValueError` for shapes that
+    disagree.
     """
-    view = view_of(skin, microphones)
+    view = view_of(surface, microphones)
     place, guess = view.chart(true, "true"), view.chart(found, "found")
     if place.shape != guess.shape:
         raise ValueError(f"true has {len(place)} places and found {len(guess)}; give them pair by pair.")
     there = np.isfinite(guess).all(axis=1)
     error = 1e3 * np.linalg.norm(np.asarray(found, float) - np.asarray(true, float), axis=1)[there]
     ax = axes_or_new(ax)
-    handles = draw_skin(ax, view)
+    handles = draw_surface(ax, view)
     ax.add_collection(
         LineCollection(list(np.stack([place, guess], axis=1)[there]), colors=INK, linewidths=0.9, zorder=3)
     )
@@ -80,8 +79,8 @@ def plot_error_curve(
     if x.ndim != 1 or not x.size or not np.isfinite(x).all() or (logarithmic and not (x > 0).all()):
         positive = "positive " if logarithmic else ""
         raise ValueError(f"values has shape {x.shape}; give (K,) finite {positive}numbers, one for each row of errors.")
-    if not 1 <= len(errors) <= len(_COLOURS):
-        raise ValueError(f"errors has {len(errors)} methods; give 1 to {len(_COLOURS)}, {{name: errors}}.")
+    if not 1 <= len(errors) <= len(SERIES_COLOURS):
+        raise ValueError(f"errors has {len(errors)} methods; give 1 to {len(SERIES_COLOURS)}, {{name: errors}}.")
     if statistic not in _STATISTICS:
         raise ValueError(f"statistic must be one of {', '.join(_STATISTICS)}; it is {statistic!r}.")
     each = {name: _rows(array, f"errors['{name}']", x.size) for name, array in errors.items()}
@@ -89,17 +88,9 @@ def plot_error_curve(
     order = np.argsort(x)
     ax = axes_or_new(ax, (5.8, 4.2))
     ax.set_yscale("log")
-    for (name, rows), colour, marker in zip(each.items(), _COLOURS, _MARKERS, strict=False):
-        ax.plot(
-            x[order],
-            _STATISTICS[statistic](rows)[order],
-            color=colour,
-            marker=marker,
-            markersize=5,
-            linewidth=1.8,
-            label=name,
-            zorder=3,
-        )
+    for (name, rows), colour, marker in zip(each.items(), SERIES_COLOURS, SERIES_MARKERS, strict=False):
+        line = {"color": colour, "marker": marker, "markersize": 5, "linewidth": 1.8, "zorder": 3}
+        ax.plot(x[order], _STATISTICS[statistic](rows)[order], label=name, **line)
         if rows.shape[1] > 1:
             low, high = np.nanquantile(rows, [0.25, 0.75], axis=1)
             ax.fill_between(x[order], low[order], high[order], color=colour, alpha=0.18, linewidth=0, zorder=2)
@@ -109,6 +100,13 @@ def plot_error_curve(
     ax.set_xlabel(quantity, color=INK)
     ax.set_ylabel({"rms": "RMS error (mm)"}.get(statistic, f"{statistic.capitalize()} error (mm)"), color=INK)
     ax.set_title(title or "")
+    _mark_axes(ax, x, logarithmic)
+    ax.legend(frameon=False)
+    return ax
+
+
+def _mark_axes(ax: Axes, x: np.ndarray, logarithmic: bool) -> None:
+    """Ticks and lines of a curve of errors against `x`."""
     if logarithmic:
         ax.set_xscale("log", base=2)
         ax.set_xticks(x)
@@ -119,13 +117,8 @@ def plot_error_curve(
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     ax.yaxis.set_minor_formatter(NullFormatter())
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.spines[["left", "bottom"]].set_color(SOFT)
-    ax.tick_params(color=SOFT, labelcolor=INK, which="both")
-    ax.grid(axis="y", color="#e6e8eb", linewidth=0.6)
-    ax.set_axisbelow(True)
-    ax.legend(frameon=False)
-    return ax
+    soften_axes(ax)
+    draw_horizontal_grid(ax)
 
 
 def _rows(errors: ArrayLike, name: str, number: int) -> np.ndarray:

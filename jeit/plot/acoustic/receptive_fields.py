@@ -1,4 +1,4 @@
-"""Microphones under a skin: what each of them receives from where, and the map of one touch."""
+"""Receptive fields: what each microphone receives of taps, against their distance."""
 
 import textwrap
 from typing import Any
@@ -6,35 +6,16 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 from numpy.typing import ArrayLike
 
-from jeit.acoustic import CalibrationFit
-from jeit.plot.acoustic.surface_view import (
-    FOUND,
-    HALO,
-    MICROPHONE,
-    Skin,
-    draw_ellipse,
-    draw_legend,
-    draw_skin,
-    outline_of,
-    view_of,
-)
-from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, draw_colour_bar
+from jeit.acoustic.calibration.calibrate import CalibrationFit
+from jeit.plot.acoustic.surface_view import FOUND, HALO
+from jeit.plot.axes import INK, SOFT, axes_or_new, soften_axes
 
 _TAP = "#8fb4d9"
-# Decibels over which the size of a microphone's circle says how much it received.
-_RANGE = 30.0
-# A map is drawn up to so many standard deviations, or decibels, above its least.
-_MOST = {"likelihood": 15.0, "consistency": 40.0}
-_MAP_LABELS = {
-    "likelihood": "Standard deviations worse than the best place",
-    "consistency": "Loss above the least (dB)",
-}
 
 
 def plot_receptive_fields(
@@ -65,9 +46,10 @@ def plot_receptive_fields(
     relative = fit.power / _strengths(fit)[:, None]
     noise = np.asarray(fit.calibration.microphone_array.noise.deviation) / np.nanmedian(fit.strength)
     seen = relative[:, chosen][np.isfinite(relative[:, chosen]) & (relative[:, chosen] > 0)]
-    told = curve[chosen][fit.calibration.usable[chosen]] if fit.calibration.usable[chosen].any() else curve[chosen]
-    low = min(told.min(), np.quantile(seen, 0.02) if seen.size else np.inf) / 1.5
-    high = max(told.max(), np.quantile(seen, 0.999) if seen.size else 0.0) * 1.8
+    usable = fit.calibration.usable[chosen]
+    curves = curve[chosen][usable] if usable.any() else curve[chosen]
+    low = min(curves.min(), np.quantile(seen, 0.02) if seen.size else np.inf) / 1.5
+    high = max(curves.max(), np.quantile(seen, 0.999) if seen.size else 0.0) * 1.8
     wide, tall = 1 / columns, 1 / rows
     for place, index in enumerate(chosen):
         row, column = divmod(place, columns)
@@ -76,115 +58,42 @@ def plot_receptive_fields(
         panel.set_xlim(0, 1e3 * distance[-1])
         panel.set_ylim(low, high)
         panel.tick_params(labelleft=column == 0, labelbottom=place + columns >= chosen.size)
-    label: dict[str, Any] = {"textcoords": "offset points", "color": INK, "annotation_clip": False}
-    ax.annotate("Distance (mm)", (0.5, 0), (0, -22), xycoords="axes fraction", ha="center", va="top", **label)
-    ax.annotate(
-        "Intensity / strength of the tap",
-        (0, 0.5),
-        (-34, 0),
-        xycoords="axes fraction",
-        ha="right",
-        va="center",
-        rotation=90,
-        **label,
-    )
+    _label(ax, fit, noise_shown=bool(noise[chosen].max() > low))
+    return ax
+
+
+def _label(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
+    """What the axes of all panels say, and the legend above them."""
+    label: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": INK}
+    label["annotation_clip"] = False
+    ax.annotate("Distance (mm)", (0.5, 0), (0, -22), ha="center", va="top", **label)
+    ax.annotate("Intensity / strength of the tap", (0, 0.5), (-34, 0), ha="right", va="center", rotation=90, **label)
     handles = [
         Line2D([], [], marker="o", linestyle="none", color=_TAP, markersize=4, label="tap"),
         Line2D([], [], color=INK, linewidth=1.6, label=f"fit, {type(fit.calibration.microphone_array.decay).name}"),
     ]
-    if noise[chosen].max() > low:
+    if noise_shown:
         handles.append(Line2D([], [], color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), label="noise, 1 σ"))
     if fit.outlier.any():
-        handles.append(
-            Line2D([], [], marker="o", linestyle="none", color=FOUND, fillstyle="none", markersize=4, label="left out")
-        )
-    ax.legend(
-        handles=handles,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.0),
-        ncols=4,
-        frameon=False,
-        fontsize=9.5,
-        borderpad=0,
-    )
-    return ax
-
-
-def plot_loss_map(
-    values: ArrayLike,
-    skin: Skin,
-    *,
-    microphones: ArrayLike | None = None,
-    received: ArrayLike | None = None,
-    truth: ArrayLike | None = None,
-    estimate: ArrayLike | None = None,
-    covariance: ArrayLike | None = None,
-    method: str = "likelihood",
-    title: str | None = None,
-    colour_bar: bool = True,
-    ax: Axes | None = None,
-) -> Axes:
-    """Draw the map of one frame, as `Localiser.with_maps` makes it: brightest where the touch most probably is.
-
-    `values` (rows, columns), bottom row first, over the box of the skin's outline, NaN outside it. `skin`: a
-    `Calibration`, `MicrophoneArray`, a surface, or an outline. `microphones` (M, d): metres, those of the array unless
-    given; their circles are the larger the more they have `received` (M,), intensities. `truth` and `estimate`: places
-    (d,), metres; `covariance` (d, d) of the estimate, m², for an ellipse that holds 95 %. `method`: "likelihood" maps
-    are drawn as √(2 (map − least)), standard deviations in which a place is worse than the best; the paper's loss,
-    "consistency", in decibels above its least. Raises `ValueError` for other methods and shapes.
-    """
-    pixels = np.asarray(values, float)
-    if pixels.ndim != 2 or not np.isfinite(pixels).any():
-        raise ValueError(f"values has shape {pixels.shape}; give (rows, columns) with at least one finite value.")
-    if method not in _MAP_LABELS:
-        raise ValueError(f"method must be one of {', '.join(_MAP_LABELS)}; it is {method!r}.")
-    view = view_of(skin, microphones)
-    number = len(view.microphones)
-    level = None if received is None else np.asarray(received, float)
-    if level is not None and level.shape != (number,):
-        raise ValueError(f"received has shape {level.shape}; give one for each of the {number} microphones.")
-    if covariance is not None and estimate is None:
-        raise ValueError("covariance needs an estimate: the place that it is the covariance of.")
-    known = None if truth is None else view.chart_point(truth, "truth")
-    found = None if estimate is None else view.chart_point(estimate, "estimate")
-    spread = None if covariance is None else view.chart_covariance(covariance, np.asarray(estimate, float))
-    ax = axes_or_new(ax)
-    shown = _above_least(pixels, method)
-    most = min(float(np.nanmax(shown)), _MOST[method]) or 1.0
-    colours = colormaps[SEQUENTIAL + "_r"].copy()
-    colours.colorbar_extend = "max" if np.nanmax(shown) > most else "neither"  # pyright: ignore[reportAttributeAccessIssue]
-    drawn = ax.imshow(shown, extent=view.extent, origin="lower", interpolation="nearest", cmap=colours, clim=(0, most))
-    drawn.set_clip_path(outline_of(view), ax.transData)
-    handles = draw_skin(ax, view, microphones=level is None and number > 0)
-    if level is not None:
-        handles.append(_draw_levels(ax, view.microphones, level))
-    if spread is not None and found is not None:
-        draw_ellipse(ax, found, spread)
-    mark: dict[str, Any] = {"linestyle": "none", "zorder": 5, "path_effects": HALO}
-    if known is not None:
-        handles += ax.plot(*known, marker="+", color=INK, markersize=13, markeredgewidth=1.8, label="truth", **mark)
-    if found is not None:
-        label = "estimate" if spread is None else "estimate, 95 %"
-        handles += ax.plot(*found, marker="o", color=FOUND, markersize=5.5, label=label, **mark)
-    draw_legend(ax, handles)
-    ax.set_title(title or "")
-    if colour_bar:
-        draw_colour_bar(ax, drawn, _MAP_LABELS[method])
-    return ax
+        ring: dict[str, Any] = {"marker": "o", "linestyle": "none", "fillstyle": "none", "markersize": 4}
+        handles.append(Line2D([], [], color=FOUND, label="left out", **ring))
+    place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 4}
+    ax.legend(handles=handles, frameon=False, fontsize=9.5, borderpad=0, **place)
 
 
 def _strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
     """Of every tap: those left out of the fit have none, and get the median of what the microphones say."""
     squares = jnp.asarray(fit.distance.T**2)
     response = np.asarray(fit.calibration.microphone_array.decay.response(squares)).T
-    told = np.where((fit.power > 0) & fit.calibration.usable, fit.power / response, np.nan)
-    heard = np.isfinite(told).any(axis=1)
-    median = np.full(len(told), np.nan)
-    median[heard] = np.nanmedian(told[heard], axis=1)
+    strength = np.where((fit.power > 0) & fit.calibration.usable, fit.power / response, np.nan)
+    heard = np.isfinite(strength).any(axis=1)
+    median = np.full(len(strength), np.nan)
+    median[heard] = np.nanmedian(strength[heard], axis=1)
     return np.where(np.isfinite(fit.strength), fit.strength, median)
 
 
 def _draw_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, columns: int) -> None:
+    """One panel: taps, curve and noise of a microphone; `lines`: distances (m), the curve there, and the noise."""
     distance, curve, noise = lines
     reason = fit.calibration.reasons[index]
     shown = np.isfinite(relative) & (relative > 0)
@@ -206,43 +115,14 @@ def _draw_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, c
     panel.text(0.05, 0.97, str(index), ha="left", fontsize=fontsize, fontweight="bold", color=INK, **text)
     if reason:
         short = textwrap.shorten(reason.split(" (")[0], 60, placeholder=" …")
-        told = textwrap.fill(short, 24 if columns <= 5 else 18)
-        panel.text(0.97, 0.97, told, ha="right", fontsize=fontsize - 1, color=FOUND, **text)
+        wrapped = textwrap.fill(short, 24 if columns <= 5 else 18)
+        panel.text(0.97, 0.97, wrapped, ha="right", fontsize=fontsize - 1, color=FOUND, **text)
     elif columns <= 6:
         half = distance[np.argmin(np.abs(curve / curve[0] - 0.5))]
         panel.text(0.97, 0.97, f"½ at {1e3 * half:.0f} mm", ha="right", fontsize=fontsize - 1, color=INK, **text)
-    panel.spines[["top", "right"]].set_visible(False)
-    panel.spines[["left", "bottom"]].set_color(SOFT)
-    panel.tick_params(length=2.5, color=SOFT, labelcolor=INK, labelsize=fontsize - 0.5, which="both")
+    soften_axes(panel)
+    panel.tick_params(length=2.5, labelsize=fontsize - 0.5, which="both")
     panel.xaxis.set_major_locator(MaxNLocator(4 if columns <= 5 else 3, steps=[1, 2, 5, 10], prune="upper"))
     panel.yaxis.set_major_locator(LogLocator(numticks=4))
     panel.yaxis.set_minor_locator(NullLocator())
     panel.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _above_least(pixels: np.ndarray, method: str) -> np.ndarray:
-    least = np.nanmin(pixels)
-    if method == "likelihood":
-        return np.sqrt(2 * (pixels - least))
-    # The loss may vanish, in the noiseless case: nothing is drawn more than 120 dB under its greatest.
-    bottom = max(least, 1e-12 * np.nanmax(pixels), np.finfo(float).tiny)
-    return 10 * np.log10(np.maximum(pixels, bottom) / bottom)
-
-
-def _draw_levels(ax: Axes, place: np.ndarray, received: np.ndarray) -> Line2D:
-    """Microphones, their circles' areas in proportion to how many decibels they are above the least shown."""
-    positive = np.isfinite(received) & (received > 0)
-    loudest = received[positive].max(initial=1e-300)
-    level = 10 * np.log10(np.where(positive, received, 1e-300) / loudest)
-    area = 8 + 150 * np.clip(1 + level / _RANGE, 0, 1)
-    ax.scatter(*place.T, s=area, facecolor="white", edgecolor=MICROPHONE, linewidth=1.2, alpha=0.9, zorder=3)
-    return Line2D(
-        [],
-        [],
-        marker="o",
-        linestyle="none",
-        markersize=8,
-        markerfacecolor="white",
-        markeredgecolor=MICROPHONE,
-        label="microphone, by level",
-    )

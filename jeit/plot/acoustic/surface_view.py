@@ -1,4 +1,4 @@
-"""What pictures of touches share: the skin seen from above, its microphones, where a touch is and how surely."""
+"""What pictures of touches share: the surface seen from above, its microphones, where a touch is and how surely."""
 
 from typing import NamedTuple
 
@@ -13,8 +13,8 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
-from jeit.acoustic import Calibration, MicrophoneArray, make_surface
-from jeit.acoustic.surface import AbstractSurface, box
+from jeit.acoustic import Calibration, MicrophoneArray
+from jeit.acoustic.surface import AbstractSurface, bounding_box, make_surface
 from jeit.mesh import Domain
 from jeit.plot.axes import INK, SOFT, bare, draw_scale_bar, extent_of
 
@@ -23,11 +23,11 @@ HALO = (withStroke(linewidth=2.5, foreground="white"),)
 # Radius, in standard deviations, of the ellipse that holds 95 % of a normal distribution in the plane.
 _REACH = float(np.sqrt(chi2.ppf(0.95, 2)))
 
-Skin = Calibration | MicrophoneArray | AbstractSurface | Domain | ArrayLike
+AnySurface = Calibration | MicrophoneArray | AbstractSurface | Domain | ArrayLike
 
 
 class View(NamedTuple):
-    """A skin seen along the normal of its chart: `surface`, `microphones` (M, 2) in the chart, which are `usable`."""
+    """A surface seen along its chart's normal: `surface`, `microphones` (M, 2) in the chart, which are `usable`."""
 
     surface: AbstractSurface
     microphones: np.ndarray
@@ -36,7 +36,7 @@ class View(NamedTuple):
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """(x_min, x_max, y_min, y_max) of the outline, metres."""
-        (left, bottom), (right, top) = (np.asarray(corner) for corner in box(self.surface))
+        (left, bottom), (right, top) = (np.asarray(corner) for corner in bounding_box(self.surface))
         return float(left), float(right), float(bottom), float(top)
 
     def chart(self, points: ArrayLike, name: str) -> np.ndarray:
@@ -44,14 +44,17 @@ class View(NamedTuple):
         return chart_of(self.surface, points, name)
 
     def chart_point(self, point: ArrayLike, name: str) -> np.ndarray:
-        """The same of one point (d,)."""
+        """Chart coordinates (2,) of one `point` (d,), metres; raises `ValueError` that names the argument."""
         place = np.asarray(point, float)
         if place.shape != (self.surface.dimension,):
             raise ValueError(f"{name} has shape {place.shape}; give one place ({self.surface.dimension},) in metres.")
         return self.chart(place[None], name)[0]
 
     def chart_covariance(self, covariance: ArrayLike, point: ArrayLike, name: str = "covariance") -> np.ndarray:
-        """Covariance (2, 2) in the chart of a `covariance` (d, d) at `point` (d,)."""
+        """Covariance (2, 2), m², in the chart of a `covariance` (d, d), m², at `point` (d,), metres.
+
+        Raises `ValueError` for another shape, by `name`.
+        """
         spread, d = np.asarray(covariance, float), self.surface.dimension
         if spread.shape != (d, d):
             raise ValueError(f"{name} has shape {spread.shape}; give ({d}, {d}) in m².")
@@ -59,18 +62,18 @@ class View(NamedTuple):
         return np.asarray(slopes @ spread @ slopes.T)
 
 
-def view_of(skin: Skin, microphones: ArrayLike | None = None, usable: ArrayLike | None = None) -> View:
+def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: ArrayLike | None = None) -> View:
     """The view of a calibration, an array, a surface or an outline; `microphones` (M, d) where it does not know them.
 
     Raises `ValueError` for shapes that disagree.
     """
-    if isinstance(skin, Calibration):
-        usable = skin.usable if usable is None else usable
-        skin = skin.microphone_array
-    if isinstance(skin, MicrophoneArray):
-        microphones = skin.microphones if microphones is None else microphones
-        skin = skin.surface
-    surface = skin if isinstance(skin, AbstractSurface) else make_surface(skin)
+    if isinstance(surface, Calibration):
+        usable = surface.usable if usable is None else usable
+        surface = surface.microphone_array
+    if isinstance(surface, MicrophoneArray):
+        microphones = surface.microphones if microphones is None else microphones
+        surface = surface.surface
+    surface = surface if isinstance(surface, AbstractSurface) else make_surface(surface)
     place = np.zeros((0, 2)) if microphones is None else chart_of(surface, microphones, "microphones")
     good = np.ones(len(place), bool) if usable is None else np.asarray(usable, bool)
     if good.shape != (len(place),):
@@ -79,7 +82,7 @@ def view_of(skin: Skin, microphones: ArrayLike | None = None, usable: ArrayLike 
 
 
 def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarray:
-    """Chart coordinates (n, 2) of `points` (n, d)."""
+    """Chart coordinates (n, 2) of `points` (n, d), metres; raises `ValueError` that names the argument."""
     place = np.asarray(points, float)
     if place.ndim != 2 or place.shape[1] != surface.dimension:
         raise ValueError(f"{name} has shape {place.shape}; give (n, {surface.dimension}) in metres.")
@@ -93,12 +96,12 @@ def outline_of(view: View) -> Path:
     return Path.make_compound_path(*(Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in loops))
 
 
-def draw_skin(ax: Axes, view: View, *, microphones: bool = True, faint: bool = False) -> list[Line2D]:
+def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool = False) -> list[Line2D]:
     """Outline and scale bar, and the microphones, those of no use crossed; what of it a legend should name."""
     ax.add_patch(
         PathPatch(outline_of(view), facecolor="none", edgecolor=INK, linewidth=0.9, joinstyle="round", zorder=2)
     )
-    # Microphones may stand beside the skin.
+    # Microphones may stand beside the surface.
     shown = np.concatenate([np.reshape(view.extent, (2, 2)).T, view.microphones])
     x_min, x_max, y_min, y_max = extent_of(shown)
     room = 0.06 * max(x_max - x_min, y_max - y_min)

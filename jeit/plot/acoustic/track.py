@@ -10,25 +10,31 @@ from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
-from jeit.acoustic import Calibration, Locations, MicrophoneArray, Touch, Track
-from jeit.plot.acoustic.surface_view import View, draw_ellipse, draw_legend, draw_skin, outline_of, view_of
+from jeit.acoustic import Calibration, MicrophoneArray
+from jeit.acoustic.localisation.locations import FrameStatus, Locations
+from jeit.acoustic.track import Touch, Track
+from jeit.plot.acoustic.surface_view import View, draw_ellipse, draw_legend, draw_surface, outline_of, view_of
 from jeit.plot.axes import INK, SOFT, axes_or_new, draw_colour_bar
 
 _GLOW = LinearSegmentedColormap.from_list("glow", ["#ffffff", "#bccddf", "#6a8aae"])
 _TIME = LinearSegmentedColormap.from_list("time", ["#0d0887", "#7e03a8", "#cc4778", "#f89540", "#fbd724"])
 # Frames that are no plain touch, each with its marker.
-_ODD = {"two touches": "D", "outside": "^", "misfit": "X", "ambiguous": "P"}
-# A touch that has moved by less than so many standard deviations, or this part of the skin, has stayed where it was.
+_ODD = {
+    FrameStatus.TWO_TOUCHES: "D",
+    FrameStatus.OUTSIDE: "^",
+    FrameStatus.MISFIT: "X",
+    FrameStatus.AMBIGUOUS: "P",
+}
+# A touch that has moved by less than so many standard deviations, or this part of the surface, has stayed where it was.
 _MOVED, _LEAST = 4.0, 0.05
 
 
 def plot_track(
     track: Track,
     locations: Locations,
-    skin: Calibration | MicrophoneArray,
+    array: Calibration | MicrophoneArray,
     *,
     overlay: ArrayLike | None = None,
-    extent: tuple[float, float, float, float] | None = None,
     truth: ArrayLike | None = None,
     title: str | None = None,
     colour_bar: bool = True,
@@ -36,19 +42,19 @@ def plot_track(
 ) -> Axes:
     """Draw the path of every touch, coloured by time, with its onset and offset; dots are the frames it comes from.
 
-    `skin`: the `Calibration`, whose unusable microphones are crossed, as are those not used at all in `locations`; or
-    `MicrophoneArray`. `overlay` (rows, columns), bottom row first: what was heard, 0 to 1, as the last of
-    `jeit.acoustic.localisation.overlay`; it fills `extent` (x_min, x_max, y_min, y_max), metres, the box of the
-    outline unless given. `truth` (N, d), metres: a path known otherwise. A touch that has stayed where it was is drawn
-    as a dot with an ellipse that holds 95 %. Frames that are no plain touch are marked, and named where there are any.
-    On a curved surface everything is in its chart. Raises `ValueError` for shapes that disagree.
+    `array`: the `Calibration`, whose unusable microphones are crossed, as are those not used at all in `locations`; or
+    `MicrophoneArray`. `overlay` (rows, columns), bottom row first, over the box of the outline: what was heard, 0 to 1,
+    as the last of `jeit.acoustic.localisation.overlay`. `truth` (N, d), metres: a path known otherwise. A touch that
+    has stayed where it was is drawn as a dot with an ellipse that holds 95 %. Frames that are no plain touch are
+    marked, and named where there are any. On a curved surface everything is in its chart. Raises `ValueError` for
+    shapes that disagree.
     """
-    view = view_of(skin)
+    view = view_of(array)
     number = len(view.microphones)
     if locations.used.shape != (len(track.times), number) or track.position.shape != locations.position.shape:
         raise ValueError(
             f"locations: {locations.used.shape[0]} frames of {locations.used.shape[1]} microphones do not go with a "
-            f"track of {len(track.times)} frames and a skin of {number} microphones."
+            f"track of {len(track.times)} frames and an array of {number} microphones."
         )
     image = None if overlay is None else np.asarray(overlay, float)
     if image is not None and image.ndim != 2:
@@ -56,45 +62,37 @@ def plot_track(
     if len(track.times):
         view = view._replace(usable=view.usable & locations.used.any(axis=0))
     known = None if truth is None else view.chart(truth, "truth")
-    path, places = view.chart(track.position, "track"), view.chart(locations.position, "locations")
+    path = view.chart(track.position, "track")
     ax = axes_or_new(ax)
     if image is not None:
-        box = view.extent if extent is None else extent
-        shown = np.nan_to_num(image)
-        drawn = ax.imshow(shown, extent=box, origin="lower", interpolation="bilinear", cmap=_GLOW, clim=(0, 1))
+        style: dict[str, Any] = {"interpolation": "bilinear", "cmap": _GLOW, "clim": (0, 1)}
+        drawn = ax.imshow(np.nan_to_num(image), extent=view.extent, origin="lower", **style)
         drawn.set_clip_path(outline_of(view), ax.transData)
-    handles = draw_skin(ax, view, faint=True)
+    handles = draw_surface(ax, view, faint=True)
     ax.set_title(title or "")
     if known is not None:
         handles += ax.plot(*known.T, color=INK, linewidth=0.9, linestyle=(0, (4, 3)), zorder=3.6, label="truth")
     if not track.touches:
-        left, right, bottom, top = view.extent
-        words = "no touch" if (locations.status != "unusable").any() else "no usable frame"
-        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-        text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 15, "color": INK, "zorder": 5}
-        ax.text((left + right) / 2, (bottom + top) / 2, words, bbox=box, **text)
+        _say_that_there_is_none(ax, view, locations)
         draw_legend(ax, handles)
         return ax
     first, last = track.touches[0].onset, track.touches[-1].offset
     times = ScalarMappable(Normalize(first, last if last > first else first + 1e-3), _TIME)
     for touch in track.touches:
         handles += _draw_touch(ax, view, track, touch, path, times, named={handle.get_label() for handle in handles})
-    plain = locations.located & ~np.isin(locations.status, list(_ODD))
-    believed, doubted = plain & ~track.rejected, locations.located & track.rejected
-    dots = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
-    ax.scatter(*places[believed].T, color=times.to_rgba(track.times[believed]), **dots)
-    if doubted.any():
-        # Around the marker of a frame that is no plain touch.
-        rings: dict[str, Any] = {"s": np.where(plain, 16, 60)[doubted], "linewidths": 0.8, "facecolors": "none"}
-        rings |= {"zorder": 3.7, "edgecolors": times.to_rgba(track.times[doubted])}
-        ax.scatter(*places[doubted].T, **rings)
-        ring: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markeredgecolor": SOFT}
-        handles.append(Line2D([], [], marker="o", markersize=4, label=f"not believed ({doubted.sum()})", **ring))
-    handles += _draw_odd(ax, view, locations, places, times)
+    handles += _draw_frames(ax, view, track, locations, times)
     draw_legend(ax, handles)
     if colour_bar and last > first:
         draw_colour_bar(ax, times, "Time (s)")
     return ax
+
+
+def _say_that_there_is_none(ax: Axes, view: View, locations: Locations) -> None:
+    left, right, bottom, top = view.extent
+    words = "no touch" if (locations.status != FrameStatus.UNUSABLE).any() else "no usable frame"
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
+    text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 15, "color": INK, "zorder": 5}
+    ax.text((left + right) / 2, (bottom + top) / 2, words, bbox=box, **text)
 
 
 def _draw_touch(ax: Axes, view: View, track: Track, touch: Touch, path, times: ScalarMappable, named: set) -> list:
@@ -122,6 +120,24 @@ def _draw_touch(ax: Axes, view: View, track: Track, touch: Touch, path, times: S
         end = ax.plot(*place, marker=marker, markersize=7.5, markerfacecolor="white", **mark, label=name)
         ends += [] if name in named else end
     return ends
+
+
+def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, times: ScalarMappable) -> list:
+    """Where each frame alone was located: dots, rings round those that the track rejects, and frames that are odd."""
+    places = view.chart(locations.position, "locations")
+    plain = locations.located & ~np.isin(locations.status, list(_ODD))
+    believed, doubted = plain & ~track.rejected, locations.located & track.rejected
+    handles = []
+    dots = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
+    ax.scatter(*places[believed].T, color=times.to_rgba(track.times[believed]), **dots)
+    if doubted.any():
+        # Around the marker of a frame that is no plain touch.
+        rings: dict[str, Any] = {"s": np.where(plain, 16, 60)[doubted], "linewidths": 0.8, "facecolors": "none"}
+        rings |= {"zorder": 3.7, "edgecolors": times.to_rgba(track.times[doubted])}
+        ax.scatter(*places[doubted].T, **rings)
+        ring: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markeredgecolor": SOFT}
+        handles.append(Line2D([], [], marker="o", markersize=4, label=f"not believed ({doubted.sum()})", **ring))
+    return handles + _draw_odd(ax, view, locations, places, times)
 
 
 def _draw_odd(ax: Axes, view: View, locations: Locations, places: np.ndarray, times: ScalarMappable) -> list:

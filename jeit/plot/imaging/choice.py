@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from jeit.inverse.hyperparameter.choice import Choice
-from jeit.plot.axes import INK, SOFT, axes_or_new
+from jeit.plot.axes import INK, SOFT, axes_or_new, soften_axes
 
 # A colour for each rule; numbers that were given, and rules not known here, are drawn in the colour of ink.
 COLOURS = {
@@ -141,9 +141,7 @@ def _colour(choice: Choice) -> str:
 
 
 def _tidy(ax: Axes, ticks: int = 6) -> None:
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.spines[["left", "bottom"]].set_color(SOFT)
-    ax.tick_params(color=SOFT, labelcolor=INK)
+    soften_axes(ax)
     for axis, number in ((ax.xaxis, 8), (ax.yaxis, ticks)):
         if axis.get_scale() == "log":
             axis.set_major_locator(LogLocator(numticks=number))

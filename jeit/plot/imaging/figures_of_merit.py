@@ -6,11 +6,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from jeit.image import FiguresOfMerit
-from jeit.plot.axes import INK, SOFT, axes_or_new
+from jeit.image.figures_of_merit import FiguresOfMerit
+from jeit.plot.axes import INK, SERIES_COLOURS, SERIES_MARKERS, SOFT, axes_or_new, draw_horizontal_grid, soften_axes
 
-_COLOURS = ("#1f6fb4", "#d1495b", "#2a9d6f", "#8a5cb8", "#d98a1c", "#5b6470")
-_MARKERS = ("o", "s", "^", "D", "v", "P")
 # Field, title, unit on the axis, factor to that unit, and the value that a perfect image would have, if there is one.
 _PANELS = (
     ("amplitude_response", "Amplitude response", "image / truth", 1.0, 1.0),
@@ -31,8 +29,10 @@ def plot_figures_of_merit(
     are what a perfect image has. The five plots are insets of the axes returned. Raises `ValueError` for no figures,
     more than six reconstructions, or figures of a single image.
     """
-    if not 1 <= len(figures) <= len(_COLOURS):
-        raise ValueError(f"figures has {len(figures)} reconstructions; give 1 to {len(_COLOURS)}, {{name: figures}}.")
+    if not 1 <= len(figures) <= len(SERIES_COLOURS):
+        raise ValueError(
+            f"figures has {len(figures)} reconstructions; give 1 to {len(SERIES_COLOURS)}, {{name: figures}}."
+        )
     for name, merit in figures.items():
         if not isinstance(merit, FiguresOfMerit) or np.ndim(merit.distance) != 1:
             raise ValueError(f"figures['{name}'] must be what figures_of_merit gives for many targets (T,).")
@@ -45,7 +45,7 @@ def plot_figures_of_merit(
         panel = ax.inset_axes((0.36 * column, 0.55 * (1 - row), 0.28, 0.43))
         if perfect is not None:
             panel.axhline(factor * perfect, color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
-        for merit, colour, marker in zip(figures.values(), _COLOURS, _MARKERS, strict=False):
+        for merit, colour, marker in zip(figures.values(), SERIES_COLOURS, SERIES_MARKERS, strict=False):
             distance, value = 1e3 * np.asarray(merit.distance), factor * np.asarray(getattr(merit, field))
             shown = np.isfinite(value)
             place, mean = _means(distance[shown], value[shown], 1e-3 * reach)
@@ -54,7 +54,7 @@ def plot_figures_of_merit(
         _dress(panel, heading, unit, reach)
         if number >= 2:  # the lowest of its column
             panel.set_xlabel("Target's distance from the centre (mm)", fontsize=9, color=INK)
-    styles = zip(figures, _COLOURS, _MARKERS, strict=False)
+    styles = zip(figures, SERIES_COLOURS, SERIES_MARKERS, strict=False)
     lines = [Line2D([], [], color=colour, marker=marker, markersize=5, label=name) for name, colour, marker in styles]
     lines.append(Line2D([], [], color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), label="perfect image"))
     ax.legend(handles=lines, frameon=False, loc="center", bbox_to_anchor=(0.72, 0, 0.28, 0.43), fontsize=11)
@@ -73,8 +73,6 @@ def _dress(panel: Axes, heading: str, unit: str, reach: float) -> None:
     panel.set_xlim(0, reach)
     low, high = panel.get_ylim()
     panel.set_ylim(min(low, 0), high)  # from zero: what varies little should look so
-    panel.spines[["top", "right"]].set_visible(False)
-    panel.spines[["left", "bottom"]].set_color(SOFT)
-    panel.tick_params(length=3, color=SOFT, labelcolor=INK, labelsize=9)
-    panel.grid(axis="y", color="#e6e8eb", linewidth=0.6)
-    panel.set_axisbelow(True)
+    soften_axes(panel)
+    panel.tick_params(length=3, labelsize=9)
+    draw_horizontal_grid(panel)

@@ -5,6 +5,7 @@ from matplotlib.axes import Axes
 
 from jeit.forward import ForwardModel
 from jeit.mesh import measures
+from jeit.plot.colour_scale import ColourScale
 from jeit.plot.imaging.image import plot_image
 
 
@@ -14,7 +15,8 @@ def plot_sensitivity(
     """Draw ‖∂v/∂σ_e‖ / |e| of every cell, over all channels and relative to the largest, in decibels.
 
     Divided by the cell's area (3-D: volume), so that it does not show the mesh. `conductivity` as in
-    `model.voltages`, scalar or per cell. `height` as in `plot_image`.
+    `model.voltages`, scalar or per cell, in S (3-D: S/m); `height` as in `plot_image`. Raises `ValueError` for a
+    conductivity per node.
     """
     jacobian = np.asarray(model.jacobian(conductivity))
     if jacobian.shape[1] != model.mesh.num_cells:
@@ -23,15 +25,12 @@ def plot_sensitivity(
     decibels = 20 * np.log10(np.maximum(density / density.max(), 1e-12))
     # Beside the ends of electrodes the field is singular: the scale begins where 1 % of the cells are brighter.
     ceiling = np.quantile(decibels, 0.99)
+    quantity = "Sensitivity per area (dB)" if model.mesh.dimension == 2 else "Sensitivity per volume (dB)"
     return plot_image(
         model.mesh,
         np.minimum(decibels, ceiling) - ceiling,
         model.electrodes,
-        difference=False,
-        unit="",
-        limit=0.0,
-        quantity="Sensitivity per area (dB)" if model.mesh.dimension == 2 else "Sensitivity per volume (dB)",
-        colour_map="magma",
+        scale=ColourScale(difference=False, quantity=quantity, unit="", limit=0.0, colour_map="magma"),
         title=title,
         height=height,
         ax=ax,

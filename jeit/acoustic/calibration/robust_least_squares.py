@@ -1,4 +1,4 @@
-"""Rounds of robust least squares: decay models of all microphones, strengths of all taps, and the noise of both.
+"""Iteratively reweighted least squares: decay models of all microphones, strengths of all taps, the noise of both.
 
 First each microphone alone, the strengths given, and the strengths, the models given, in turn. Then all together, what
 the residuals say of the noise, and new weights, until nothing changes. Every step takes a `TapFit` and returns another.
@@ -26,7 +26,7 @@ from jeit.acoustic.calibration.tap_noise import additive_deviations, relative_er
 from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise, below_nothing
 
-_ALTERNATIONS, _ROUNDS = 6, 12
+_ALTERNATIONS, _REWEIGHTINGS = 6, 12
 # Student's t with so many degrees of freedom weighs residuals.
 _TAIL = 5.0
 # A tap whose mean square residual is so many times the median tap's is left out.
@@ -103,7 +103,7 @@ class TapFit(eqx.Module):
         return np.asarray(self.problem().expected(self.values, self.strength)[0])
 
 
-def first_fit(
+def fit_taps(
     kind: type[AbstractDecay],
     microphones: Float[np.ndarray, "M d"],
     squared: Float[np.ndarray, "M T"],
@@ -151,7 +151,7 @@ def first_fit(
     return _share_shapes(_refine(fit))
 
 
-def without(fit: TapFit, bad: Bool[np.ndarray, " M"]) -> TapFit:
+def refit_without(fit: TapFit, bad: Bool[np.ndarray, " M"]) -> TapFit:
     """Once more, without the microphones that were found to be of no use."""
     return _refine(replace(fit, dropped=fit.dropped | bad))
 
@@ -172,7 +172,7 @@ def standard_errors(fit: TapFit) -> Float[np.ndarray, "K M"]:
 
 def _refine(fit: TapFit) -> TapFit:
     """All microphones together, and what their residuals say, until nothing changes."""
-    for _ in range(_ROUNDS):
+    for _ in range(_REWEIGHTINGS):
         before, free = fit.values, fit.free
         values, strength = fit_together(fit.problem(), before, fit.strength, jnp.asarray(free))
         fit = _keep_between(replace(fit, values=values, strength=strength))

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jeit.acoustic.surface import box, sides, size
+from jeit.acoustic.surface import bounding_box, longer_side, outline_sides
 from jeit_solvers import Minimum, definite_small, hessian_small, minimise_small, solve_small
 
 # Places screened along the outline.
@@ -21,7 +21,7 @@ _TRIAL_STEPS, _PROMISING, _MOST_STEPS = 8, 8.0, 30
 _TOLERANCE = 1e-12
 
 
-def descend(objective, first, second, worth):
+def find_minima(objective, first, second, worth):
     """From both starts (2, F), the second only where that is worth it: unknowns (n, F), by how much the outline costs
     more than what lies beyond, by how much the rival valley does, whether converged, and the (start, end) of the side
     of the outline on which frames were held, NaN for those inside."""
@@ -38,7 +38,7 @@ def descend(objective, first, second, worth):
         other = _minimise(objective, tried.x, ~worth)
         other_value = jnp.where(worth & jnp.isfinite(other.value), other.value, jnp.inf)
         other_within = surface.outline.contains(other.x[:2].T)
-        apart = jnp.linalg.norm(other.x[:2] - unknowns[:2], axis=0) > _SAME_VALLEY * size(surface)
+        apart = jnp.linalg.norm(other.x[:2] - unknowns[:2], axis=0) > _SAME_VALLEY * longer_side(surface)
         rival = jnp.where(apart & worth & within & other_within, jnp.abs(other_value - value), jnp.inf)
         least = jnp.minimum(value, other_value)
         # Of two valleys of which one lies beyond the outline, the other is taken; the outline itself may yet be better.
@@ -73,9 +73,9 @@ def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimu
     The last of many steps are taken with exact Hessians; the first `max_steps`, where so many are asked for, are not.
     """
     surface = objective.microphone_array.surface
-    low, high = box(surface)
+    low, high = bounding_box(surface)
     rest = jnp.full(start.shape[0] - 2, jnp.inf)
-    reach = size(surface)
+    reach = longer_side(surface)
 
     def of(frames):
         return type(objective)(*frames, objective.microphone_array)
@@ -107,7 +107,7 @@ def _on_edge(objective, skip) -> tuple[Minimum, Array]:
 
     Not of the frames to `skip` (F,).
     """
-    start, end = sides(objective.microphone_array.surface)
+    start, end = outline_sides(objective.microphone_array.surface)
     length = jnp.linalg.norm(end - start, axis=0)
     # Places at equal steps along the whole outline, as (side, share of the side).
     stops = jnp.concatenate([jnp.zeros(1), jnp.cumsum(length)])
@@ -150,7 +150,7 @@ def _on_edge(objective, skip) -> tuple[Minimum, Array]:
     return Minimum(unknowns_of(found.x, origin, along), found.value, found.converged, found.steps), side
 
 
-def differentiable(objective, unknowns, side, reach):
+def differentiable_minima(objective, unknowns, side, reach):
     """The minimum as a function of everything in `objective`: one Newton step from it, x − H⁻¹ ∇cost, is zero in value
     and, H and x being constants, −H⁻¹ ∂∇cost in derivative, as the implicit function theorem has it."""
     at = jax.lax.stop_gradient(unknowns)

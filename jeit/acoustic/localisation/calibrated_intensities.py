@@ -13,7 +13,7 @@ from jeit.acoustic.signal.recording import Intensities, Recording
 _SAME_FLOOR = 4.0
 
 
-def measure(
+def calibrated_intensities(
     recording: Recording | Intensities,
     calibration: Calibration,
     intensity: IntensitySettings | None = None,

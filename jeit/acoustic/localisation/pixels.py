@@ -22,7 +22,7 @@ class Pixels(eqx.Module):
 
     @classmethod
     def create(cls, surface, columns: int, rows: int) -> "Pixels":
-        """Of so many pixels; bottom row first."""
+        """Of so many pixels; bottom row first. Raises `ValueError` where none of them lies inside the outline."""
         grid, within = chart_grid(surface, columns, rows)
         if not within.any():
             raise ValueError(f"shape: none of {columns} × {rows} pixels has its middle inside the outline; take more.")

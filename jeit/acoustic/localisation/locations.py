@@ -1,0 +1,61 @@
+"""What is found of the frames of a recording: places, and what each frame is."""
+
+from enum import StrEnum
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+class FrameStatus(StrEnum):
+    """What a frame is; see `Locations`."""
+
+    TOUCH = "touch"
+    NO_TOUCH = "no touch"
+    OUTSIDE = "outside"
+    TWO_TOUCHES = "two touches"
+    AMBIGUOUS = "ambiguous"
+    MISFIT = "misfit"
+    UNUSABLE = "unusable"
+
+
+class Locations(eqx.Module):
+    """What was found of F frames of M microphones.
+
+    - `times`: (F,) seconds; `status`: (F,) a `FrameStatus` each.
+    - `position`: (F, d) metres; `covariance`: (F, d, d) m²; `strength`: (F,). NaN where there is no touch.
+    - `misfit`: (F,) chi-square of what one source leaves unexplained, with `freedom`: (F,) degrees.
+    - `used`: (F, M) which microphones were looked at. `faults`: M strings, what is wrong with one ("" if nothing).
+    - `second`: (F, d) and `second_strength`: (F,), of the weaker of two touches, NaN elsewhere.
+    - `overlap`: windows that share a sample, whose errors are alike.
+    - `notes`: what to know of all of it.
+
+    Status: "touch"; "no touch", nothing is above the floor; "outside", the intensities say a place beyond the outline,
+    and the place given is the best on it; "two touches", one source does not explain the frame but two do; "misfit",
+    neither does, and the covariance is widened accordingly; "ambiguous", two places explain the frame about as well;
+    "unusable", fewer than three microphones could be used.
+    """
+
+    times: Float[np.ndarray, " F"]
+    position: Float[np.ndarray, "F d"]
+    covariance: Float[np.ndarray, "F d d"]
+    strength: Float[np.ndarray, " F"]
+    status: np.ndarray
+    misfit: Float[np.ndarray, " F"]
+    freedom: Int[np.ndarray, " F"]
+    used: Bool[np.ndarray, "F M"]
+    second: Float[np.ndarray, "F d"]
+    second_strength: Float[np.ndarray, " F"]
+    overlap: float = eqx.field(static=True)
+    faults: tuple[str, ...] = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+
+    @property
+    def located(self) -> Bool[np.ndarray, " F"]:
+        """Frames that have a position."""
+        return np.asarray(np.isfinite(self.position).all(axis=1))
+
+    def counts(self) -> dict[str, int]:
+        """How many frames there are of each status."""
+        return {str(status): int((self.status == status).sum()) for status in FrameStatus if status in self.status}

@@ -1,0 +1,36 @@
+"""What is left of a calibration of microphones on disk: the calibration, and a picture of how well it fits."""
+
+from pathlib import Path
+
+from jeit.acoustic.calibration.calibrate import CalibrationFit
+
+
+def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
+    """Write the calibration to `path` (JSON, which `Calibration.load` reads) and a picture of it beside, with suffix
+    `.png`; the folder is made if need be. Raises `ValueError` for a path that is a folder, or that of the picture."""
+    path, picture = calibration_files(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    fit.calibration.save(path)
+    draw_calibration(fit).savefig(picture, dpi=130)
+
+
+def calibration_files(path: str | Path) -> tuple[Path, Path]:
+    """The calibration file that `write_calibration` writes for `path`, and its picture; what it raises."""
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"path {path} is a folder; give a file, such as {path / 'calibration.json'}.")
+    picture = path.with_suffix(".png")
+    if picture == path:
+        raise ValueError(f"path {path}: the calibration is JSON; give another name, such as {path.stem}.json.")
+    return path, picture
+
+
+def draw_calibration(fit: CalibrationFit):
+    """The receptive fields of all microphones, as a matplotlib `Figure` that needs no display."""
+    from matplotlib.figure import Figure
+
+    from jeit.plot import plot_receptive_fields
+
+    figure = Figure(figsize=(9.6, 8.4), layout="constrained")
+    plot_receptive_fields(fit, title=fit.calibration.name, ax=figure.subplots())
+    return figure
