@@ -14,7 +14,7 @@ from pyeit.eit.jac import JAC
 from pyeit.eit.protocol import PyEITProtocol
 from pyeit.mesh import PyEITMesh
 
-from benchmarks.problem import GAUSS_NEWTON, STEPS
+from benchmarks.problems.disk import GAUSS_NEWTON, STEPS
 
 # Of fifteen settings tried (its three methods, weights from 1e-4 to 1e4, falling and constant, its example's among
 # them), the one whose images come nearest to the truth; its misfit is within 5 % of the lowest.

@@ -9,13 +9,13 @@ import sys
 import venv
 from pathlib import Path
 
-REQUIREMENTS = Path(__file__).with_name("requirements-pyeit.txt")
+REQUIREMENTS = Path(__file__).parents[1] / "opponents" / "requirements" / "pyeit.txt"
 
 
 def python(*, create: bool = True) -> Path | None:
     """Interpreter of the environment in `.cache/` under the repository; None if it is missing or cannot be made."""
     key = hashlib.sha256(REQUIREMENTS.read_bytes() + sys.version.encode()).hexdigest()[:12]
-    folder = REQUIREMENTS.parents[1] / ".cache" / f"pyeit-{key}"
+    folder = REQUIREMENTS.parents[2] / ".cache" / f"pyeit-{key}"
     interpreter = folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
     complete = folder / "complete"
     if complete.exists():

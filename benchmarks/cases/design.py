@@ -1,4 +1,4 @@
-"""Maps of touched skins, jeit beside SciPy and scikit-learn in one run: `python -m benchmarks.design` (8 minutes).
+"""Maps of touched skins, jeit beside SciPy and scikit-learn in one run: `python -m benchmarks.cases.design`.
 
 Exact maps of 48 × 48 touches on a sheet and on a layer, beside one SuperLU factorisation per touch (a few touches of
 each map, times their number); linear maps of many layouts in one batch and one by one; k-means of the same vectors. And
@@ -14,10 +14,10 @@ import time
 
 import numpy as np
 
-from benchmarks import machine
-from benchmarks.contest import CORES, ROOT
-from benchmarks.report import duration, markdown, write_between_markers
-from benchmarks.scipy_touches import PlainTouches
+from benchmarks.harness import machine
+from benchmarks.harness.contest import CORES, ROOT
+from benchmarks.harness.report import duration, markdown, write_between_markers
+from benchmarks.opponents.scipy_touches import PlainTouches
 
 HEADER = ["task", "nodes", "jeit", "opponent", "times jeit's", "compile", "agreement"]
 FASTER, SAME = 30.0, 1e-8
@@ -140,7 +140,7 @@ def clusters(rounds: int):
 
 def main() -> int:
     """Run, print the table and the checks; fail if jeit and SciPy disagree."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.design", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.cases.design", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="a smoke run, figures not judged")
     parser.add_argument("--write-readme", action="store_true", help="put the table into benchmarks/README.md")
     options = parser.parse_args()

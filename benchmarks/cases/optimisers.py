@@ -1,4 +1,4 @@
-"""Nonlinear least-squares solvers on the same inverse problems: `python -m benchmarks.optimisers` (about 10 minutes).
+"""Nonlinear least-squares solvers on the same inverse problems: `python -m benchmarks.cases.optimisers`.
 
 jeit's Gauss-Newton and Levenberg-Marquardt, which solve each step in the smaller of the spaces of data and of images,
 beside the same methods as optimistix and jaxopt have them, given the residuals of data and prior stacked on each other,
@@ -13,9 +13,9 @@ import sys
 import time
 import warnings
 
-from benchmarks import machine
-from benchmarks.contest import CORES
-from benchmarks.report import duration, markdown
+from benchmarks.harness import machine
+from benchmarks.harness.contest import CORES
+from benchmarks.harness.report import duration, markdown
 
 MOST_STEPS, MOST_BOUNDED_STEPS, TOLERANCE = 200, 2000, 1e-6
 # Above the least objective, in parts of it, within which a solver counts as having found it.
@@ -28,7 +28,7 @@ def problems(num_points: int):
     import jax.numpy as jnp
     import numpy as np
 
-    from benchmarks.realtime import bodies, simulate
+    from benchmarks.cases.realtime import bodies, simulate
     from jeit.inverse import Gaussian, Noser, reconstruct
 
     for name, (make, reach) in bodies().items():
@@ -137,7 +137,7 @@ def measure(solve, inversion, rounds: int):
 
 def main() -> int:
     """Run, print a table for every problem, and return 1 if one of jeit's solvers misses the least objective."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.optimisers", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.cases.optimisers", description=__doc__)
     parser.add_argument("--nodes", type=int, default=500)
     parser.add_argument("--rounds", type=int, default=7)
     options = parser.parse_args()

@@ -1,4 +1,4 @@
-"""The sparse direct solver alone beside SuperLU: `python -m benchmarks.solver` from the root of the repository.
+"""The sparse direct solver alone beside SuperLU: `python -m benchmarks.cases.solver` from the root of the repository.
 
 One task: factorise a finite-element matrix whose values have just been assembled, and solve for 16 right-hand sides, in
 double precision. Turns are interleaved, and the least time of all turns counts, because other work on the machine only
@@ -19,8 +19,8 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 import jeit
-from benchmarks import machine
-from benchmarks.report import markdown
+from benchmarks.harness import machine
+from benchmarks.harness.report import markdown
 from jeit.mesh import box, disk, gradients, layer, measures
 from jeit_solvers import SparsityPattern, analyse, factorise, in_turn, solve
 
@@ -169,7 +169,7 @@ def interleaved(contestants: dict[str, Callable[[], Any]], rounds: int, budget: 
 
 
 def _parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.solver", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.cases.solver", description=__doc__)
     parser.add_argument("--nodes", type=int, nargs="+", default=[1150, 5000, 20000], help="sizes of the disks")
     parser.add_argument("--rounds", type=int, default=200, help="turns of each contestant, time permitting")
     parser.add_argument("--without-solids", action="store_true", help="leave out the box and the layer")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from benchmarks.contest import Figures
-from benchmarks.match import Match
+from benchmarks.cases.forward.match import Match
+from benchmarks.harness.contest import Figures
 
 
 def duration(seconds: float) -> str:

@@ -1,4 +1,4 @@
-"""Localising touches by sound, jeit beside plain NumPy and SciPy in one run: `python -m benchmarks.hearing` (1 minute).
+"""Localising touches by sound, jeit beside plain NumPy and SciPy in one run: `python -m benchmarks.cases.hearing`.
 
 25 microphones, 200 × 200 pixels, frames with the noise of the simulated skin. Both minimise the paper's loss, so their
 maps and places must be the same. Then what only jeit does: the likelihood, and a recording of 25 channels at 40 kHz
@@ -14,10 +14,10 @@ import time
 
 import numpy as np
 
-from benchmarks import machine
-from benchmarks.contest import CORES, ROOT
-from benchmarks.report import duration, markdown, write_between_markers
-from benchmarks.scipy_hearing import PlainLocaliser
+from benchmarks.harness import machine
+from benchmarks.harness.contest import CORES, ROOT
+from benchmarks.harness.report import duration, markdown, write_between_markers
+from benchmarks.opponents.scipy_localiser import PlainLocaliser
 
 HEADER = ["task", "jeit, a frame", "frames a second", "NumPy and SciPy", "times jeit's", "compile", "agreement"]
 FASTER, WITH_MAPS, WITHOUT_MAPS, RECORDING = 20.0, 500.0, 20_000.0, 0.2
@@ -168,7 +168,7 @@ def _check(asked: str, measured: float, least: float, unit: str) -> list[str]:
 
 def main() -> int:
     """Run, print the table and the checks; 1 if a figure is missed, or jeit and SciPy disagree."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.hearing", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.cases.hearing", description=__doc__)
     parser.add_argument("--frames", type=int, default=32, help="of those with maps")
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--quick", action="store_true", help="a smoke run, figures not judged")

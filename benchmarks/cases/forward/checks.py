@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from benchmarks.contest import Figures
-from benchmarks.match import Match
-from benchmarks.report import duration
+from benchmarks.cases.forward.match import Match
+from benchmarks.harness.contest import Figures
+from benchmarks.harness.report import duration
 
 JACOBIAN = "voltages and Jacobian"
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.problem import GAUSS_NEWTON, STEPS
+from benchmarks.problems.disk import GAUSS_NEWTON, STEPS
 from jeit.electrodes import BoundaryElectrodes, NodeElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import Imager, Noser, one_step

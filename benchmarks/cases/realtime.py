@@ -1,4 +1,4 @@
-"""Frames a second: `python -m benchmarks.realtime`. A touch moves over two sensors, streamed frame by frame.
+"""Frames a second: `python -m benchmarks.cases.realtime`. A touch moves over two sensors, streamed frame by frame.
 
 The sheet of Silvera Tawil et al. 2011 (320 × 200 mm, 16 electrodes round it and one in its centre, 224 voltages) and a
 disk of 16 electrodes (208 voltages). Frames are simulated on finer meshes, with noise. For each: the latency of every
@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from benchmarks import machine
+from benchmarks.harness import machine
 
 CORES, NOISE = 2, 1e-3
 BUDGET_MS, LINEAR_MS = 16.7, 0.1
@@ -126,7 +126,7 @@ def breakdown(imager) -> list[tuple[str, float, float]]:
 
 def main() -> int:
     """Run, print the tables, and return 1 if a figure is missed."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.realtime", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.cases.realtime", description=__doc__)
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--nodes", type=int, default=1193)
     options = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Five Gauss-Newton iterations, jeit's beside pyEIT's and SciPy's, in one run: `python -m benchmarks.gauss_newton`.
+"""Five Gauss-Newton iterations, jeit beside pyEIT and SciPy: `python -m benchmarks.cases.gauss_newton`.
 
 From the homogeneous background to noisy voltages of a disk with 16 electrodes. With complete electrodes, jeit and SciPy
 minimise the same function, so their images must be the same. pyEIT has point electrodes and a regularisation of its
@@ -15,10 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import machine, problem, pyeit_environment
-from benchmarks.accuracy import difference
-from benchmarks.contest import CORES, ROOT, Contestant, Figures, compete
-from benchmarks.report import cell, duration, markdown, ratio, write_between_markers
+from benchmarks.harness import environment as pyeit_environment
+from benchmarks.harness import machine
+from benchmarks.harness.contest import CORES, ROOT, Contestant, Figures, compete
+from benchmarks.harness.report import cell, duration, markdown, ratio, write_between_markers
+from benchmarks.problems import disk as problem
+from benchmarks.problems.accuracy import difference
 
 HEADER = ["nodes", "electrodes", "contestant", "one image", "times jeit's", "compile", "misfit", "error of image"]
 # Times faster than pyEIT asked for, up to so many nodes; and than SciPy.
@@ -29,7 +31,7 @@ AGREEMENT = 1e-6
 
 def pose(num_points: int, model: str):
     """The problem's arrays, and jeit's model, by which the voltages are simulated and every misfit is taken."""
-    from benchmarks.jeit_contestant import JeitContestant
+    from benchmarks.opponents.jeit_forward import JeitContestant
 
     arrays = problem.make(num_points, 16, model)
     simulator = JeitContestant(arrays)
@@ -88,7 +90,7 @@ def _root_mean_square(values) -> float:
 
 def main() -> int:
     """Run, print the table and the checks, and return 1 if a figure is missed."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.gauss_newton", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.cases.gauss_newton", description=__doc__)
     parser.add_argument("--nodes", type=int, nargs="+", default=[1150, 5000])
     parser.add_argument("--rounds", type=int, default=15, help="turns each contestant has")
     parser.add_argument("--time-limit", type=float, default=1200.0, help="seconds for one image, then it has given up")

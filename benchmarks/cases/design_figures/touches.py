@@ -1,4 +1,4 @@
-"""The paper's two layouts on a layer, touched all over: what `benchmarks.design_figures` tells of them.
+"""The paper's two layouts on a layer, touched all over: what `benchmarks.cases.design_figures` tells of them.
 
 Text S4 and Figs. S11 and S12 of Park et al., Science Robotics 7, eabm7187 (2022).
 """
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from benchmarks.report import markdown
+from benchmarks.harness.report import markdown
 
 if TYPE_CHECKING:
     from jaxtyping import Array

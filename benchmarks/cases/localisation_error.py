@@ -1,4 +1,4 @@
-"""How well touches are located by sound: `python -m benchmarks.hearing_error` (about 3 minutes).
+"""How well touches are located by sound: `python -m benchmarks.cases.localisation_error` (about 3 minutes).
 
 The simulated skin of 200 × 200 mm, which is not the model that is fitted, calibrated on a 13 × 13 grid of taps 15 mm
 apart (three at each place) and tested on another, 12.5 mm apart: the paper's experiment (ten bursts of a vibrator a
@@ -12,9 +12,9 @@ import argparse
 
 import numpy as np
 
-from benchmarks import machine
-from benchmarks.contest import CORES, ROOT
-from benchmarks.report import markdown, write_between_markers
+from benchmarks.harness import machine
+from benchmarks.harness.contest import CORES, ROOT
+from benchmarks.harness.report import markdown, write_between_markers
 
 RATIOS = (0, 5, 10, 15, 20, 25, 30, 35, 40)
 # What is asked: mean and standard deviation of the paper's loss, metres, and by how much likelihood must be better.
@@ -84,7 +84,7 @@ def spread(values) -> str:
 
 def main() -> int:
     """Run, print the tables, draw the curve, and return 1 if a figure is missed."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.hearing_error", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.cases.localisation_error", description=__doc__)
     parser.add_argument("--picture", default="hearing-error.png", help="where to draw the curve")
     parser.add_argument("--write-readme", action="store_true", help="tables into benchmarks/README.md, curve into docs")
     options = parser.parse_args()

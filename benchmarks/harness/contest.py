@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 # After its last task a pool of BLAS threads spins for a while: let it fall asleep before the next one's turn.
 REST = 0.06
 TURN = 0.1
@@ -58,7 +58,7 @@ class Contestant:
         for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
             environment[variable] = str(CORES)
         self._process = subprocess.Popen(
-            [interpreter, "-m", "benchmarks.worker", name, str(problem)],
+            [interpreter, "-m", "benchmarks.harness.worker", name, str(problem)],
             cwd=ROOT,
             env=environment,
             stdin=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""The Kuopio Tomography Challenge 2023 on its four training targets: `python -m benchmarks.ktc2023 [FOLDER]`.
+"""The Kuopio Tomography Challenge 2023 on its four training targets: `python -m benchmarks.cases.ktc2023 [FOLDER]`.
 
 Difficulty level l leaves out electrodes 1 to 2(l - 1), as injectors and as meters; the seven levels are made from the
 complete data by masking. One setting for all: total variation, jeit's defaults.
@@ -12,12 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.io
 
+from benchmarks.harness.machine import heading
 from jeit.data import read
 from jeit.image import Raster, challenge_score, segment
 from jeit.imaging.preparation import prepare_difference
 from jeit.inverse import TotalVariation, reconstruct
-
-from .machine import heading
 
 LEVELS = range(1, 8)
 TARGETS = range(1, 5)

@@ -1,4 +1,4 @@
-"""Every figure of docs/design.md's "The paper's comparison": `python -m benchmarks.design_figures` (12 minutes).
+"""Every figure of docs/design.md's "The paper's comparison": `python -m benchmarks.cases.design_figures` (12 minutes).
 
 The paper's two layouts touched all over, for several margins, thicknesses and kinds of touch; optimised layouts; and
 measurements chosen from all that could be made.
@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import argparse
 
-from benchmarks import design_layouts, design_touches, machine
-from benchmarks.contest import CORES, ROOT
-from benchmarks.design_touches import LAYOUTS, Setting
-from benchmarks.report import write_between_markers
+from benchmarks.cases.design_figures import layouts as design_layouts
+from benchmarks.cases.design_figures import touches as design_touches
+from benchmarks.cases.design_figures.touches import LAYOUTS, Setting
+from benchmarks.harness import machine
+from benchmarks.harness.contest import CORES, ROOT
+from benchmarks.harness.report import write_between_markers
 
 PICTURE = ROOT / "docs" / "images" / "design-thickness.png"
 
@@ -48,7 +50,7 @@ def joined(tables: dict[str, str]) -> str:
 
 def main() -> int:
     """Run and print the tables; write them and the picture into the documentation if asked."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.design_figures", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.cases.design_figures", description=__doc__)
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--quick", action="store_true", help="a smoke run on coarse meshes, figures not judged")
     which.add_argument("--write-docs", action="store_true", help="tables and picture into docs/")

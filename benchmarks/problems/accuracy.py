@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks import problem as problems
+from benchmarks.problems import disk as problems
 from jeit.forward.exact import ConductingDisk, arc_transfer_impedance, point_transfer_impedance
 
 

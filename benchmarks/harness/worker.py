@@ -1,7 +1,7 @@
 """One contestant in a process of its own: takes commands on standard input, answers on standard output, in JSON lines.
 
-Run as `python -m benchmarks.worker CONTESTANT PROBLEM.npz`. Contestants live in processes so that pyEIT can have its
-own environment, so that memory is each one's own, and so that turns can be interleaved whoever's turn it is.
+Run as `python -m benchmarks.harness.worker CONTESTANT PROBLEM.npz`. Contestants live in processes so that pyEIT can have
+its own environment, so that memory is each one's own, and so that turns can be interleaved whoever's turn it is.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.problem import load
+from benchmarks.problems.disk import load
 
 CONTESTANTS = {
-    "jeit": ("benchmarks.jeit_contestant", "JeitContestant", ()),
-    "scipy plain": ("benchmarks.scipy_contestant", "ScipyContestant", ("plain",)),
-    "scipy tuned": ("benchmarks.scipy_contestant", "ScipyContestant", ("tuned",)),
-    "pyeit": ("benchmarks.pyeit_contestant", "PyeitContestant", ()),
+    "jeit": ("benchmarks.opponents.jeit_forward", "JeitContestant", ()),
+    "scipy plain": ("benchmarks.opponents.scipy_forward", "ScipyContestant", ("plain",)),
+    "scipy tuned": ("benchmarks.opponents.scipy_forward", "ScipyContestant", ("tuned",)),
+    "pyeit": ("benchmarks.opponents.pyeit", "PyeitContestant", ()),
 }
 
 

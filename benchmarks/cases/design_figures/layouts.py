@@ -1,10 +1,10 @@
-"""Optimised layouts and chosen measurements: what `benchmarks.design_figures` tells of them."""
+"""Optimised layouts and chosen measurements: what `benchmarks.cases.design_figures` tells of them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.report import markdown
+from benchmarks.harness.report import markdown
 
 CONDUCTANCE = 2e-3
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from benchmarks.problem import GAUSS_NEWTON, STEPS
-from benchmarks.scipy_baseline import ScipyBaseline
-from benchmarks.scipy_newton import ScipyNewton
+from benchmarks.opponents.scipy_baseline import ScipyBaseline
+from benchmarks.opponents.scipy_newton import ScipyNewton
+from benchmarks.problems.disk import GAUSS_NEWTON, STEPS
 
 
 class ScipyContestant:

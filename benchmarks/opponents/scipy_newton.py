@@ -20,7 +20,7 @@ import numpy as np
 import scipy.linalg
 from scipy.linalg.blas import dgemm, dgemv, dsyrk
 
-from benchmarks.scipy_baseline import ScipyBaseline
+from benchmarks.opponents.scipy_baseline import ScipyBaseline
 
 
 class ScipyNewton:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import problem as problems
-from benchmarks.accuracy import difference, exact_voltages
-from benchmarks.contest import Contestant, Figures, GaveUpError, compete
-from benchmarks.machine import available_memory
+from benchmarks.harness.contest import Contestant, Figures, GaveUpError, compete
+from benchmarks.harness.machine import available_memory
+from benchmarks.problems import disk as problems
+from benchmarks.problems.accuracy import difference, exact_voltages
 
 TASKS = ("voltages", "voltages and Jacobian", "linear image", "1000 linear images", "64 conductivities", "64 Jacobians")
 # Above this size 64 Jacobians, or pyEIT's dense inverse with its copies, do not fit in this part of free memory.
