@@ -1,8 +1,114 @@
-"""`python -m benchmarks`: the forward contest."""
+"""The benchmarks' one command: `python -m benchmarks [CASE …]` from the root of the repository.
 
+Without a case it lists them. See `README.md` in this folder for what is measured and how.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
 import sys
+import time
+from pathlib import Path
 
-from benchmarks.cases.forward import main
+from benchmarks.cases import NAMES, load
+from benchmarks.harness import machine, report
+from benchmarks.harness.case import MISSED, Options, Result
+from benchmarks.harness.run_case import CaseFailedError, run_apart
+from benchmarks.harness.tables import duration
+from benchmarks.harness.timing import say
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    """Options of the command."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Lists the cases, or runs some.")
+    parser.add_argument("cases", nargs="*", metavar="CASE", help="which to run")
+    parser.add_argument("--all", action="store_true", help="run every case")
+    parser.add_argument("--write", action="store_true", help="into RESULTS.md, the README's table and docs/")
+    parser.add_argument("--quick", action="store_true", help="smoke runs on small problems, figures not judged")
+    parser.add_argument("--output", type=Path, metavar="FOLDER", help="draw the cases' pictures there")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write every result to this file")
+    parser.add_argument("--without-pyeit", action="store_true", help="leave out pyEIT, which takes minutes")
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="measured data (default ../shared/data)")
+    parser.add_argument("--nodes", type=int, nargs="+", default=(), help="other sizes of meshes")
+    parser.add_argument("--electrodes", type=int, nargs="+", default=(), help="other numbers of electrodes")
+    parser.add_argument("--rounds", type=int, help="turns each contestant has at each task")
+    parser.add_argument("--time-limit", type=float, metavar="S", help="for one call, then a contestant has given up")
+    options = parser.parse_args(arguments)
+    unknown = [name for name in options.cases if name not in NAMES]
+    if unknown:
+        parser.error(f"there is no case {', '.join(unknown)}; there are {', '.join(NAMES)}")
+    if options.all and options.cases:
+        parser.error("give either --all or the names of cases")
+    special = options.quick or options.nodes or options.electrodes or options.rounds or options.without_pyeit
+    if options.write and special:
+        parser.error(
+            "--write keeps full runs only: leave out --quick, --nodes, --electrodes, --rounds, --without-pyeit"
+        )
+    if options.write and not (options.all or options.cases):
+        parser.error("--write needs the names of cases, or --all")
+    return options
+
+
+def list_cases() -> None:
+    """Print every case with its description."""
+    for name in NAMES:
+        case = load(name)
+        print(f"{name:20}{case.description} ({case.minutes:g} min)")
+
+
+def run(name: str, options: argparse.Namespace) -> Result:
+    """Run one case, print its report, and write it where it is kept if asked."""
+    case = load(name)
+    pictures = machine.ROOT / "docs" / "images" if options.write and case.pictures else None
+    told = Options(
+        quick=options.quick,
+        without_pyeit=options.without_pyeit,
+        output=options.output.resolve() if options.output else pictures,
+        data=options.data.resolve() if options.data else None,
+        nodes=tuple(options.nodes),
+        electrodes=tuple(options.electrodes),
+        rounds=options.rounds,
+        time_limit=options.time_limit,
+    )
+    if told.output is not None:
+        told.output.mkdir(parents=True, exist_ok=True)
+    say(f"== {name}: {case.description}")
+    heading = machine.heading()
+    result = run_apart(name, told)
+    print(f"\n## {name}\n\n{report.text(result, heading)}\n", flush=True)
+    if options.write and not result.wrong:
+        for line in report.write(case, result, heading, NAMES):
+            say(line)
+    return result
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run what is asked; 1 if a case fails, if results disagree or, in a full run, if a figure is missed."""
+    options = parse(arguments)
+    if not (options.all or options.cases):
+        list_cases()
+        return 0
+    machine.use_cores()
+    results, failures, start = {}, [], time.perf_counter()
+    for name in NAMES if options.all else options.cases:
+        try:
+            results[name] = run(name, options)
+        except CaseFailedError as error:
+            failures.append(str(error))
+            say(str(error))
+    for name, result in results.items():
+        failures += [f"{name}: {line}" for line in result.wrong]
+        failures += [f"{name}: missed: {one.asked}: {one.measured}" for one in result.asked if one.verdict == MISSED]
+    if options.json:
+        plain = {name: result.as_dict() for name, result in results.items()}
+        options.json.write_text(json.dumps({"heading": machine.heading(), "cases": plain}, indent=1), encoding="utf-8")
+    spent = ", ".join(f"{name} {duration(result.seconds)}" for name, result in results.items())
+    say(f"{duration(time.perf_counter() - start)} in all: {spent}")
+    for line in failures:
+        say(line)
+    return int(bool(failures))
+
 
 if __name__ == "__main__":
     sys.exit(main())

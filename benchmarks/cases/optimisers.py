@@ -1,4 +1,4 @@
-"""Nonlinear least-squares solvers on the same inverse problems: `python -m benchmarks.cases.optimisers`.
+"""Nonlinear least-squares solvers on the same inverse problems: jeit's, optimistix's and jaxopt's.
 
 jeit's Gauss-Newton and Levenberg-Marquardt, which solve each step in the smaller of the spaces of data and of images,
 beside the same methods as optimistix and jaxopt have them, given the residuals of data and prior stacked on each other,
@@ -8,34 +8,73 @@ bounded ones 2,000). What they reach is compared with jeit's minimum to rounding
 
 from __future__ import annotations
 
-import argparse
-import sys
-import time
 import warnings
 
-from benchmarks.harness import machine
-from benchmarks.harness.contest import CORES
-from benchmarks.harness.report import duration, markdown
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from benchmarks.harness.case import Asked, Case, Options, Result, Table, judged
+from benchmarks.harness.tables import duration, times
+from benchmarks.harness.timing import say, timed
+from benchmarks.problems.touched_sensors import bodies, simulate
+from jeit.inverse import Gaussian, Noser, reconstruct
+from jeit.inverse.nonlinear.bounded import minimise_between
+from jeit_solvers import Descent
 
 MOST_STEPS, MOST_BOUNDED_STEPS, TOLERANCE = 200, 2000, 1e-6
 # Above the least objective, in parts of it, within which a solver counts as having found it.
 REACHED = 1e-3
+NODES, ROUNDS, BUDGET = 500, 5, 4.0
 HEADER = ["solver", "iterations", "objective above the least", "misfit", "time", "times jeit's", "compile"]
 
 
-def problems(num_points: int):
+def run(options: Options) -> Result:
+    """Every solver on every problem."""
+    nodes = (options.nodes or (150 if options.quick else NODES,))[0]
+    tables, asked = [], []
+    for name, inversion, minimum in problems(nodes, quick=options.quick):
+        say(name)
+        rows, checks = _contest(name, inversion, minimum, options)
+        tables.append(Table(HEADER, rows, name))
+        asked += checks
+    return Result(tables, asked)
+
+
+def _contest(name: str, inversion, minimum, options: Options) -> tuple[list[list[str]], list[Asked]]:
+    """The table's rows of one problem, and whether jeit's solvers find the least objective."""
+    least, rows, asked, own = float(inversion.cost(minimum)), [], [], float("nan")
+    chosen = list(solvers().items())[:3] if options.quick else solvers().items()
+    for label, solve in chosen:
+        compiled = eqx.filter_jit(solve)
+        try:
+            spent, compiling, answer = timed(lambda f=compiled: f(inversion), options.rounds or ROUNDS, BUDGET)
+        except Exception as error:
+            # Another library's failure is its row's, and does not lose the others.
+            rows.append([label, "", f"failed: {type(error).__name__}", "", "", "", ""])
+            continue
+        coefficients, iterations = answer
+        own = spent if label == "jeit Gauss-Newton" else own
+        above = float(inversion.cost(coefficients)) / least - 1
+        squares = jnp.sum(inversion.data.whiten(inversion.residual(coefficients)) ** 2)
+        misfit = float(jnp.sqrt(squares / len(inversion.data.voltages)))
+        reached = f"{above:.0e}" if np.isfinite(above) else "failed"
+        figures = [str(int(iterations)), reached, f"{misfit:.3f}", duration(spent), times(spent / own)]
+        rows.append([label, *figures, duration(compiling)])
+        say(" | ".join(rows[-1]))
+        if label.startswith("jeit"):
+            asked.append(judged(f"{name}: {label}: ≤ {REACHED:g} above the least", reached, above < REACHED))
+    return rows, asked
+
+
+def problems(num_points: int, *, quick: bool = False):
     """Name, inversion and its minimum: a touch halves the conductivity, simulated on a finer mesh with 0.1 % noise."""
-    import jax.numpy as jnp
-    import numpy as np
-
-    from benchmarks.cases.realtime import bodies, simulate
-    from jeit.inverse import Gaussian, Noser, reconstruct
-
-    for name, (make, reach) in bodies().items():
+    for name, (make, reach) in list(bodies().items())[: 1 if quick else None]:
         model = make(num_points)
         frames, _ = simulate(make(2 * num_points), reach, 8)
         noise = 1e-2 * np.abs(frames[1]) + 1e-3 * np.abs(frames[1]).max()
-        for prior in (Gaussian(0.03), Noser()):
+        for prior in (Gaussian(0.03),) if quick else (Gaussian(0.03), Noser()):
             best = reconstruct(
                 model, jnp.asarray(frames[1]), 1.0, prior=prior, hyperparameter=3.0, noise=noise, rtol=1e-13
             )
@@ -49,12 +88,6 @@ def problems(num_points: int):
 
 def solvers():
     """Name: function of an inversion that gives coefficients and iterations, to be compiled."""
-    import jax.numpy as jnp
-    import optimistix as optx
-
-    from jeit.inverse.nonlinear.bounded import minimise_between
-    from jeit_solvers import Descent
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         import jaxopt
@@ -114,59 +147,4 @@ def solvers():
     }
 
 
-def measure(solve, inversion, rounds: int):
-    """Coefficients, iterations, seconds of one run (median) and of compiling."""
-    import statistics
-
-    import equinox as eqx
-    import jax
-
-    compiled = eqx.filter_jit(solve)
-    start = time.perf_counter()
-    coefficients, iterations = jax.block_until_ready(compiled(inversion))
-    first, seconds = time.perf_counter() - start, []
-    for _ in range(rounds):
-        start = time.perf_counter()
-        jax.block_until_ready(compiled(inversion))
-        seconds.append(time.perf_counter() - start)
-        if sum(seconds) > 10:
-            break
-    spent = statistics.median(seconds)
-    return coefficients, int(iterations), spent, max(first - spent, 0.0)
-
-
-def main() -> int:
-    """Run, print a table for every problem, and return 1 if one of jeit's solvers misses the least objective."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.cases.optimisers", description=__doc__)
-    parser.add_argument("--nodes", type=int, default=500)
-    parser.add_argument("--rounds", type=int, default=7)
-    options = parser.parse_args()
-    machine.use_cores(CORES)
-    print("\n".join(f"- {line}" for line in machine.heading()))
-    import jax.numpy as jnp
-    import numpy as np
-
-    missed = []
-    for name, inversion, minimum in problems(options.nodes):
-        least = float(inversion.cost(minimum))
-        rows, own = [], float("nan")
-        for label, solve in solvers().items():
-            print(f"{name}: {label} …", file=sys.stderr, flush=True)
-            coefficients, iterations, spent, compiling = measure(solve, inversion, options.rounds)
-            own = spent if label == "jeit Gauss-Newton" else own
-            above = float(inversion.cost(coefficients)) / least - 1
-            data = inversion.data
-            squares = jnp.sum(data.whiten(inversion.residual(coefficients)) ** 2)
-            misfit = float(jnp.sqrt(squares / len(data.voltages)))
-            if label.startswith("jeit") and not above < REACHED:
-                missed.append(f"{name}: {label}")
-            reached = f"{above:.0e}" if np.isfinite(above) else "failed"
-            figures = [str(iterations), reached, f"{misfit:.3f}", duration(spent), f"{spent / own:.1f}×"]
-            rows.append([label, *figures, duration(compiling)])
-        print(f"\n{name}\n\n{markdown(HEADER, rows)}", flush=True)
-    print("\nmissed: " + ("; ".join(missed) or "nothing"))
-    return bool(missed)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+CASE = Case("optimisers", "nonlinear least-squares solvers on one problem: jeit, optimistix, jaxopt", run, 4)

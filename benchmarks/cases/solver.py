@@ -1,180 +1,131 @@
-"""The sparse direct solver alone beside SuperLU: `python -m benchmarks.cases.solver` from the root of the repository.
+"""The sparse direct solver alone beside SuperLU and CHOLMOD (sparsax).
 
 One task: factorise a finite-element matrix whose values have just been assembled, and solve for 16 right-hand sides, in
-double precision. Turns are interleaved, and the least time of all turns counts, because other work on the machine only
-ever adds to it. SuperLU has every ordering SciPy offers, its symmetric mode, and its best ordering found once and kept,
-with panels of one column; the best of all these counts.
+double precision; and the same for a batch of matrices of one pattern. Every repeat takes another matrix. What is made
+once for a pattern (orderings, plans) is not timed; compilation is apart.
 """
 
 from __future__ import annotations
 
-import argparse
-import time
-from collections.abc import Callable
-from typing import Any
+import sys
+import tempfile
+from contextlib import ExitStack
+from importlib.metadata import version
+from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from scipy.sparse.linalg import splu
 
-import jeit
-from benchmarks.harness import machine
-from benchmarks.harness.report import markdown
-from jeit.mesh import box, disk, gradients, layer, measures
-from jeit_solvers import SparsityPattern, analyse, factorise, in_turn, solve
+from benchmarks.harness import environment
+from benchmarks.harness.case import Case, Headline, Options, Result, Table
+from benchmarks.harness.contest import Contestant, Figures, GaveUpError, compete, results_in
+from benchmarks.harness.tables import cell, duration, markdown, megabytes, ratio
+from benchmarks.harness.timing import say
+from benchmarks.problems import matrices
 
-NUM_RIGHT_HAND_SIDES = 16
-BATCH = 64
-SYMMETRIC: dict[str, Any] = {"options": {"SymmetricMode": True}, "diag_pivot_thresh": 0.0}
-HEADER = [
-    "mesh",
-    "nodes",
-    "plan s",
-    "compile s",
-    "factor ms",
-    "solve ms",
-    "both ms",
-    "SuperLU ms",
-    "its ordering",
-    "times faster",
-    "residual",
-    "SuperLU's",
-    "factor MB",
-    "SuperLU's MB",
-    f"each of {BATCH} ms",
-]
+MINE, BOTH = "jeit's solver", "factorise and solve"
+OPPONENTS = ("SuperLU", "sparsax")
+TASKS = (BOTH, "batch", "factorise", "solve")
+DISKS = (1150, 5000, 20_000)
+# A direct solver that leaves more of a right-hand side than this has failed.
+ACCURATE = 1e-10
+HEADER = ["mesh", "nodes", "task", "jeit", "SuperLU", "", "sparsax", "", "compile: jeit / sparsax"]
+HEADER += ["residual: jeit / SuperLU / sparsax", "peak memory: jeit / SuperLU / sparsax"]
+PLANS = ["mesh", "nodes", "jeit's plan", "factor: jeit / SuperLU", "SuperLU's ordering", "CHOLMOD's kind"]
 
 
-def main() -> None:
-    """Measure every mesh and print the table."""
-    options = _parse()
-    machine.use_cores(2)
-    meshes = {f"disk {count}": disk(1.0, num_points=count) for count in options.nodes}
-    if not options.without_solids:
-        meshes["box"] = box(1.0, 1.0, 1.0, num_points=10_000)
-        meshes["layer"] = layer(disk(1.0, num_points=3000), 0.1, 4)
-    print("\n".join(machine.heading()))
-    print(markdown(HEADER, [measure(name, mesh, options.rounds) for name, mesh in meshes.items()]))
+def run(options: Options) -> Result:
+    """Every mesh, one after the other."""
+    jax = [f"{name}=={version(name)}" for name in ("jax", "jaxlib")]
+    python = environment.python("sparsax", *jax, create=not options.quick)
+    interpreters = {MINE: sys.executable, "SuperLU": sys.executable, "sparsax": python}
+    disks = options.nodes or ((300,) if options.quick else DISKS)
+    rows, plans, notes, wrong, headlines = [], [], [], [], {}
+    for name, mesh in matrices.meshes(disks, solids=not (options.quick or options.nodes)).items():
+        problem = matrices.make(mesh)
+        say(f"{name}, {len(problem['points'])} nodes …")
+        with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+            path = Path(folder, "problem.npz")
+            np.savez(path, allow_pickle=False, **problem)
+            playing, reasons = _enter(stack, interpreters, path, options.time_limit or 120.0)
+            rounds = options.rounds or (2 if options.quick else 15)
+            found, bad, figures = _play(problem, playing, reasons, rounds, 0.5 if options.quick else 2.0, Path(folder))
+        rows += [[name, str(len(problem["points"])), *row] for row in found]
+        say(markdown(HEADER, rows[-len(found) :]))
+        wrong += [f"{name}: {line}" for line in bad]
+        plans.append([name, str(len(problem["points"])), *_plan({one.name: one.details for one in playing})])
+        notes += [f"{one.name}: {one.description.split(', ')[0]}" for one in playing]
+        notes += [f"{opponent} left out: {reason}" for opponent, reason in reasons.items()]
+        headlines[len(problem["points"]), name] = _headline(name, len(problem["points"]), figures, found[0])
+    near = min(headlines, key=lambda key: (not key[1].startswith("disk"), abs(key[0] - 5000)))
+    tables = [Table(HEADER, rows), Table(PLANS, plans, "Made once for each pattern")]
+    return Result(tables, [], list(dict.fromkeys(notes)), headlines[near], wrong)
 
 
-def measure(name: str, mesh: jeit.Mesh, rounds: int) -> list[str]:
-    """One row of the table."""
-    start = time.perf_counter()
-    pattern = SparsityPattern.from_elements([mesh.cells, mesh.facets], mesh.num_points)
-    plan = analyse(pattern, mesh.points)
-    plan_seconds = time.perf_counter() - start
-    values = assemble(mesh, pattern)
-    load = jax.random.normal(jax.random.key(0), (mesh.num_points, NUM_RIGHT_HAND_SIDES))
-    factor_only, solve_only, both = jax.jit(factorise), jax.jit(solve), jax.jit(factorise_and_solve)
-    start = time.perf_counter()
-    solution = np.asarray(both(plan, values, load))
-    compile_seconds = time.perf_counter() - start
-    factor = factor_only(plan, values)
-
-    matrix = pattern.to_scipy(values).tocsc()
-    right = np.asarray(load)
-    opponents = superlu_variants(matrix)
-    contestants: dict[str, Callable[[], Any]] = {
-        "factor": lambda: factor_only(plan, values),
-        "solve": lambda: solve_only(plan, factor, load),
-        "both": lambda: both(plan, values, load),
-        **{ordering: lambda f=f: f(right)[0] for ordering, f in opponents.items()},
-    }
-    small = mesh.num_points < 3000
-    if small:
-        batch = values * jnp.linspace(1.0, 2.0, BATCH)[:, None]
-        many = jax.jit(jax.vmap(in_turn(factorise_and_solve), in_axes=(None, 0, None)))
-        contestants["batch"] = lambda: many(plan, batch, load)
-    least = interleaved(contestants, rounds)
-    ordering = min(opponents, key=least.__getitem__)
-    other_solution, other_entries = opponents[ordering](right)
-
-    def residual(solution: np.ndarray) -> float:
-        return float(np.linalg.norm(matrix @ solution - right) / np.linalg.norm(right))
-
-    return [
-        name,
-        f"{mesh.num_points}",
-        f"{plan_seconds:.2f}",
-        f"{compile_seconds:.1f}",
-        *(f"{1e3 * least[part]:.2f}" for part in ("factor", "solve", "both")),
-        f"{1e3 * least[ordering]:.2f}",
-        ordering,
-        f"{least[ordering] / least['both']:.1f}",
-        f"{residual(solution):.0e}",
-        f"{residual(other_solution):.0e}",
-        f"{8 * plan.num_factor_entries / 1e6:.1f}",
-        f"{12 * other_entries / 1e6:.1f}",
-        f"{1e3 * least['batch'] / BATCH:.2f}" if small else "",
-    ]
+def _enter(stack: ExitStack, interpreters: dict[str, str | None], path: Path, limit: float):
+    """The contestants that run, and why others do not."""
+    playing, reasons = [], {}
+    for name, python in interpreters.items():
+        if python is None:
+            reasons[name] = "not installed"
+            continue
+        try:
+            playing.append(stack.enter_context(Contestant(name, path, limit, python)))
+        except GaveUpError as reason:
+            reasons[name] = str(reason)
+    if MINE not in {one.name for one in playing}:
+        raise RuntimeError(f"jeit itself does not run: {reasons[MINE]}")
+    return playing, reasons
 
 
-def factorise_and_solve(plan, values, load):
-    """The task."""
-    return solve(plan, factorise(plan, values), load)
+def _play(problem, playing: list[Contestant], reasons: dict[str, str], rounds: int, budget: float, folder: Path):
+    """The table's rows, what is wrong, and the figures of a matrix alone."""
+    rows, wrong, alone = [], [], {}
+    for task in TASKS:
+        share = len(problem["values"]) if task == "batch" else 1
+        solved = task != "factorise"
+        figures = compete(playing, task, rounds=rounds, budget=budget, folder=folder if solved else None)
+        figures |= {name: Figures(remark=reason) for name, reason in reasons.items()}
+        able = [name for name, one in figures.items() if solved and not one.remark]
+        left = {name: _residual(problem, folder / f"{name}.npz") for name in able}
+        wrong += [f"{task}: {name} leaves {worst:.0e}" for name, worst in left.items() if not worst < ACCURATE]
+        mine = figures[MINE]
+        row = [f"{share} at once, each" if share > 1 else task, cell(mine, share)]
+        for name in OPPONENTS:
+            row += [cell(figures.get(name), share), ratio(figures.get(name), mine)]
+        row.append(" / ".join(duration(figures[name].compile) for name in (MINE, "sparsax") if name in figures))
+        row.append(" / ".join(f"{left[name]:.0e}" if name in left else "–" for name in (MINE, *OPPONENTS)))
+        rows.append([*row, megabytes(*(figures.get(name) for name in (MINE, *OPPONENTS)))])
+        alone = figures if task == BOTH else alone
+    return rows, wrong, alone
 
 
-def assemble(mesh: jeit.Mesh, pattern: SparsityPattern) -> jax.Array:
-    """Stiffness matrix of a random conductivity, from 0.1 to 10, and a resistive layer all over the boundary."""
-    conductivity = 10.0 ** jax.random.uniform(jax.random.key(1), (mesh.num_cells,), minval=-1.0, maxval=1.0)
-    slopes = gradients(mesh)
-    stiffness = jnp.einsum("mid,mjd,m->mij", slopes, slopes, measures(mesh) * conductivity)
-    nodes = mesh.facets.shape[1]
-    boundary = jnp.ones((len(mesh.facets), nodes, nodes)) + jnp.eye(nodes)
-    return pattern.assemble(stiffness, boundary / len(mesh.facets))
+def _residual(problem, path: Path) -> float:
+    """The worst of the first and the last solution of what a contestant has left; of one alone, its own."""
+    solutions = results_in(path)[0]
+    if solutions.ndim == 2:
+        return matrices.residual(problem, 0, solutions)
+    return max(matrices.residual(problem, number, solutions[number]) for number in (0, len(solutions) - 1))
 
 
-def superlu_variants(matrix) -> dict[str, Callable[[np.ndarray], tuple[np.ndarray, int]]]:
-    """Ways to have SuperLU do the task; each returns the solution and the number of entries in its factors."""
-
-    def run(right: np.ndarray, **options: Any) -> tuple[np.ndarray, int]:
-        factor = splu(matrix, **options)
-        return factor.solve(right), factor.nnz
-
-    variants: dict[str, Callable[[np.ndarray], tuple[np.ndarray, int]]] = {
-        "COLAMD": lambda right: run(right, permc_spec="COLAMD"),
-        "MMD_ATA": lambda right: run(right, permc_spec="MMD_ATA"),
-        "MMD_AT_PLUS_A": lambda right: run(right, permc_spec="MMD_AT_PLUS_A"),
-        "symmetric": lambda right: run(right, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC),
-    }
-    order = np.argsort(splu(matrix, permc_spec="MMD_AT_PLUS_A", **SYMMETRIC).perm_c)
-    # The values would arrive in this order, as they arrive in jeit's own.
-    permuted = matrix[order][:, order].tocsc()
-
-    def kept_order(right: np.ndarray) -> tuple[np.ndarray, int]:
-        factor = splu(permuted, permc_spec="NATURAL", panel_size=1, **SYMMETRIC)
-        solution = np.empty_like(right)
-        solution[order] = factor.solve(right[order])
-        return solution, factor.nnz
-
-    variants["symmetric, kept"] = kept_order
-    return variants
+def _plan(details: dict[str, dict]) -> list[str]:
+    """What was made once for the pattern."""
+    superlu, cholmod = details.get("SuperLU", {}), details.get("sparsax", {})
+    sizes = [f"{one['factor MB']:.1f} MB" if one else "–" for one in (details[MINE], superlu)]
+    made = [duration(details[MINE]["plan"]), " / ".join(sizes)]
+    return [*made, superlu.get("ordering", "–"), cholmod.get("ordering", "–")]
 
 
-def interleaved(contestants: dict[str, Callable[[], Any]], rounds: int, budget: float = 20.0) -> dict[str, float]:
-    """Least time in seconds of each contestant, one turn each in every round; slow ones sit out later rounds."""
-    least, spent = dict.fromkeys(contestants, np.inf), dict.fromkeys(contestants, 0.0)
-    for number in range(rounds + 1):
-        for name, task in contestants.items():
-            if number > 3 and spent[name] > budget / len(contestants):
-                continue
-            start = time.perf_counter()
-            jax.block_until_ready(task())
-            seconds = time.perf_counter() - start
-            spent[name] += seconds
-            if number:  # the first round compiles
-                least[name] = min(least[name], seconds)
-    return least
+def _headline(mesh: str, nodes: int, figures: dict[str, Figures], row: list[str]) -> Headline:
+    """A matrix alone beside the fastest opponent."""
+    others = {name: one for name, one in figures.items() if name in OPPONENTS and one.seconds and not one.remark}
+    job = f"sparse factorisation and 16 solves, {mesh.split()[0]}, {nodes:,} nodes"
+    if not others:
+        return Headline(job, cell(figures[MINE]))
+    name, best = min(others.items(), key=lambda pair: pair[1].median)
+    residuals = dict(zip((MINE, *OPPONENTS), row[-2].split(" / "), strict=True))
+    told = f"residual {residuals[MINE]} against {residuals[name]}"
+    label = "CHOLMOD (sparsax)" if name == "sparsax" else name
+    return Headline(job, cell(figures[MINE]), f"{label}: {cell(best)}", ratio(best, figures[MINE]), told)
 
 
-def _parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.cases.solver", description=__doc__)
-    parser.add_argument("--nodes", type=int, nargs="+", default=[1150, 5000, 20000], help="sizes of the disks")
-    parser.add_argument("--rounds", type=int, default=200, help="turns of each contestant, time permitting")
-    parser.add_argument("--without-solids", action="store_true", help="leave out the box and the layer")
-    return parser.parse_args()
-
-
-if __name__ == "__main__":
-    main()
+CASE = Case("solver", "sparse factorisation and 16 solves, alone and in batches: beside SuperLU and CHOLMOD", run, 5)

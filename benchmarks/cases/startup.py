@@ -10,6 +10,24 @@ import tempfile
 import time
 from pathlib import Path
 
+from benchmarks.harness.case import NOT_MEASURED, Asked, Case, Options, Result, Table, judged
+from benchmarks.harness.tables import duration
+
+IMPORT, DEMO = 2.0, 15.0
+
+
+def run(options: Options) -> Result:
+    """Both, in fresh processes; a quick run leaves out the demonstration."""
+    importing = import_seconds(2 if options.quick else 5)
+    demo = None if options.quick else demo_seconds()
+    asked = f"first picture of `jeit demo` within {DEMO:g} s of a cold start"
+    checks = [
+        judged(f"`import jeit` < {IMPORT:g} s", duration(importing), importing < IMPORT),
+        Asked(asked, "–", NOT_MEASURED) if demo is None else judged(asked, duration(demo), demo < DEMO),
+    ]
+    rows = [["import jeit", duration(importing)], ["jeit demo, first picture", "–" if demo is None else duration(demo)]]
+    return Result([Table(["cold start", "time"], rows)], checks)
+
 
 def import_seconds(repeats: int = 5) -> float:
     """Median time of `import jeit` in a fresh interpreter, in seconds."""
@@ -43,3 +61,6 @@ def demo_seconds(limit: float = 120.0) -> float | None:
         finally:
             process.kill()
             process.wait()
+
+
+CASE = Case("startup", "cold starts: `import jeit`, and the first picture of `jeit demo`", run, 0.5)

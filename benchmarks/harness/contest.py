@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-import os
 import queue
 import statistics
 import subprocess
+import sys
 import threading
 import time
 from dataclasses import dataclass, field
@@ -14,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[2]
+from benchmarks.harness.machine import ROOT, same_for_all
+
 # After its last task a pool of BLAS threads spins for a while: let it fall asleep before the next one's turn.
 REST = 0.06
 TURN = 0.1
-CORES = 2
 # A call this long, in seconds, is timed alone and not warmed up for.
 SLOW = 1.0
 # A first call this long, in seconds, is not compilation, and is not repeated.
@@ -31,7 +32,10 @@ class GaveUpError(Exception):
 
 @dataclass
 class Figures:
-    """What one contestant needed for one task."""
+    """What one contestant needed for one task: seconds of each call, of the first one, and peak memory in MB.
+
+    `remark`: why there are none.
+    """
 
     seconds: list[float] = field(default_factory=list)
     first: float = 0.0
@@ -50,26 +54,24 @@ class Figures:
 
 
 class Contestant:
-    """A worker process and a limit on the time of each of its answers."""
+    """A worker process and a limit, in seconds, on the time of each of its answers."""
 
-    def __init__(self, name: str, problem: Path, limit: float, interpreter: str):
+    def __init__(self, name: str, problem: Path, limit: float, interpreter: str = sys.executable):
         self.name, self.limit = name, limit
-        environment = dict(os.environ)
-        for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-            environment[variable] = str(CORES)
         self._process = subprocess.Popen(
             [interpreter, "-m", "benchmarks.harness.worker", name, str(problem)],
             cwd=ROOT,
-            env=environment,
+            env=same_for_all(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         )
         self._answers: queue.Queue[str] = queue.Queue()
-        threading.Thread(target=self._listen, daemon=True).start()
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
         self._receive(max(limit, 120))
-        description = self.ask(do="describe")
-        self.tasks, self.description = description["tasks"], description["description"]
+        described = self.ask(do="describe")
+        self.tasks, self.description, self.details = (described[key] for key in ("tasks", "description", "details"))
 
     def _listen(self):
         for line in self._process.stdout:  # pyright: ignore[reportOptionalIterable]
@@ -91,15 +93,17 @@ class Contestant:
         """Send a command, wait for its answer. Raises `GaveUpError`."""
         if self._process.poll() is not None:
             raise GaveUpError("not running")
-        self._process.stdin.write(json.dumps(command) + "\n")  # pyright: ignore[reportOptionalMemberAccess]
-        self._process.stdin.flush()  # pyright: ignore[reportOptionalMemberAccess]
+        try:
+            self._process.stdin.write(json.dumps(command) + "\n")  # pyright: ignore[reportOptionalMemberAccess]
+            self._process.stdin.flush()  # pyright: ignore[reportOptionalMemberAccess]
+        except OSError:
+            raise GaveUpError("out of memory or crashed") from None
         return self._receive(self.limit)
 
     def save(self, task: str, path: Path) -> list[np.ndarray]:
         """Results of a task for the first conductivity."""
         self.ask(do="save", task=task, path=str(path))
-        with np.load(path) as arrays:
-            results = [arrays[name] for name in arrays.files]
+        results = results_in(path)
         path.unlink()
         return results
 
@@ -107,6 +111,10 @@ class Contestant:
         """End the process."""
         self._process.kill()
         self._process.wait()
+        self._listener.join()
+        for pipe in (self._process.stdin, self._process.stdout):
+            with contextlib.suppress(OSError):
+                pipe.close()  # pyright: ignore[reportOptionalMemberAccess]
 
     def __enter__(self):
         return self
@@ -115,12 +123,10 @@ class Contestant:
         self.close()
 
 
-def _probe(name, result, contestants, task) -> float:
-    """About how long a repeat takes, in seconds, once what is compiled is compiled."""
-    if result.first > LONG:
-        return result.first
-    contestant = next(one for one in contestants if one.name == name)
-    return contestant.ask(do="time", task=task, round=0, calls=1, warm=result.first < SLOW)["seconds"][0]
+def results_in(path: Path) -> list[np.ndarray]:
+    """The arrays that a contestant has left."""
+    with np.load(path) as arrays:
+        return [arrays[name] for name in arrays.files]
 
 
 def compete(
@@ -132,27 +138,16 @@ def compete(
     seconds a contestant may use in all; a slow one gets fewer rounds, at least one (its first, if that is very long).
     `folder`: where to leave the results of the first conductivity, NAME.npz.
     """
-    figures = {}
-    saved = {} if folder is None else {one.name: {"path": str(folder / f"{one.name}.npz")} for one in contestants}
-    for contestant in contestants:
-        if task not in contestant.tasks:
-            continue
-        figures[contestant.name] = result = Figures()
-        try:
-            result.first = contestant.ask(do="first", task=task, **saved.get(contestant.name, {}))["seconds"]
-            if result.first > LONG:
-                result.seconds = [result.first]
-        except GaveUpError as reason:
-            result.remark = str(reason)
-    expected = {name: _probe(name, result, contestants, task) for name, result in figures.items() if not result.remark}
+    playing = [one for one in contestants if task in one.tasks]
+    figures = {one.name: _begin(one, task, folder) for one in playing}
+    expected = {one.name: _probe(one, task, figures[one.name]) for one in playing}
     for turn in range(rounds):
-        for contestant in contestants:
-            name = contestant.name
-            result = figures.get(name)
-            if result is None or result.remark or (result.seconds and sum(result.seconds) > budget):
+        for contestant in playing:
+            result = figures[contestant.name]
+            if result.remark or (result.seconds and sum(result.seconds) > budget):
                 continue
-            slow = expected[name] > SLOW
-            calls = 1 if slow else int(np.clip(TURN / expected[name], 1, 25))
+            slow = expected[contestant.name] > SLOW
+            calls = 1 if slow else int(np.clip(TURN / expected[contestant.name], 1, 25))
             time.sleep(REST)
             try:
                 taken = contestant.ask(do="time", task=task, round=turn * calls, calls=calls, warm=not slow)
@@ -160,11 +155,32 @@ def compete(
                 result.remark = str(reason)
                 continue
             result.seconds += taken["seconds"]
-    for contestant in contestants:
-        result = figures.get(contestant.name)
-        if result is not None and not result.remark and result.median < 20:
-            try:
-                result.peak = contestant.ask(do="memory", task=task)["peak"]
-            except GaveUpError as reason:
-                result.remark = str(reason)
     return figures
+
+
+def _begin(contestant: Contestant, task: str, folder: Path | None) -> Figures:
+    """Figures with the time of the first call, whose results are left in the folder."""
+    saved = {} if folder is None else {"path": str(folder / f"{contestant.name}.npz")}
+    try:
+        first = contestant.ask(do="first", task=task, **saved)["seconds"]
+    except GaveUpError as reason:
+        return Figures(remark=str(reason))
+    return Figures([first] if first > LONG else [], first)
+
+
+def _probe(contestant: Contestant, task: str, result: Figures) -> float:
+    """About how long a repeat takes, in seconds, once what is compiled is compiled; notes its peak memory.
+
+    A slow one counts as a repeat already.
+    """
+    if result.remark or result.seconds:
+        return result.first
+    try:
+        probe = contestant.ask(do="probe", task=task)
+    except GaveUpError as reason:
+        result.remark = str(reason)
+        return result.first
+    result.peak = probe["peak"]
+    if probe["seconds"] > SLOW:
+        result.seconds = [probe["seconds"]]
+    return probe["seconds"]

@@ -1,103 +1,98 @@
-"""The table, as Markdown, and its place in the README."""
+"""A case's result as text, and where it is kept: `RESULTS.md`, the README's table, a page of the documentation."""
 
 from __future__ import annotations
 
-import math
+import json
+import os
+import re
 from pathlib import Path
 
-from benchmarks.cases.forward.match import Match
-from benchmarks.harness.contest import Figures
+from benchmarks.harness.case import Case, Headline, Result
+from benchmarks.harness.machine import ROOT
+from benchmarks.harness.tables import duration, markdown, write_between_markers
+
+RESULTS = ROOT / "benchmarks" / "RESULTS.md"
+MOST_ROWS = 8
+TITLE = (
+    "# Results\n\nMade by `python -m benchmarks --all --write`; do not edit. How it is measured: [README](README.md)."
+)
 
 
-def duration(seconds: float) -> str:
-    """A time with three figures and a fitting unit."""
-    if math.isnan(seconds):
-        return "–"
-    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-        if seconds >= size:
-            value = seconds / size
-            return f"{value:.{max(0, 2 - math.floor(math.log10(value)))}f} {unit}"
-    return "0 s"
+def tables(result: Result) -> str:
+    """All tables of a case, each under its title."""
+    parts = []
+    for one in result.tables:
+        parts += [part for part in (one.title and f"**{one.title}**", one.caption) if part]
+        parts.append(markdown(one.header, one.rows))
+    return "\n\n".join(parts)
 
 
-def cell(figures: Figures | None) -> str:
-    """Median time of a contestant, or why there is none."""
-    if figures is None:
-        return "–"
-    return figures.remark if figures.remark or not figures.seconds else duration(figures.median)
+def text(result: Result, heading: list[str]) -> str:
+    """What was measured, on what, and what was asked."""
+    spent = f"{duration(result.seconds)} in all"
+    if result.peak_memory is not None:
+        spent += f"; the case's own process took {result.peak_memory:.0f} MB at most"
+    parts = ["\n".join(f"- {line}" for line in dict.fromkeys([*heading, spent, *result.notes])), tables(result)]
+    if result.asked:
+        parts.append(
+            markdown(["asked", "measured", ""], [[one.asked, one.measured, one.verdict] for one in result.asked])
+        )
+    parts += [f"**Wrong:** {line}" for line in result.wrong]
+    return "\n\n".join(parts)
 
 
-def ratio(figures: Figures | None, reference: Figures) -> str:
-    """How many times longer than the reference."""
-    if figures is None or figures.remark or not figures.seconds or not reference.seconds:
-        return ""
-    value = figures.median / reference.median
-    return f"{value:.0f}×" if value >= 20 else f"{value:.1f}×"
+def section(case: Case, result: Result, heading: list[str]) -> str:
+    """A case's part of `RESULTS.md`, with its row of the README in a comment."""
+    parts = [f"## {case.name}", f"{case.description[:1].upper()}{case.description[1:]}.", text(result, heading)]
+    if result.headline is not None:
+        parts.insert(1, f"<!-- headline {json.dumps(vars(result.headline), ensure_ascii=False)} -->")
+    return "\n\n".join(parts)
 
 
-HEADER = [
-    "task",
-    "nodes",
-    "electrodes",
-    "model",
-    "jeit",
-    "SciPy",
-    "",
-    "SciPy, tuned",
-    "",
-    "pyEIT",
-    "",
-    "jeit compile",
-    "peak memory: jeit / SciPy or pyEIT",
-    "difference from opponent",
-    "error of voltages",
-]
+def sections(path: Path) -> dict[str, str]:
+    """Name of a case: its part of the file."""
+    if not path.exists():
+        return {}
+    found = re.split(r"^(?=## )", path.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+    return {one.split("\n", 1)[0][3:].strip(): one.strip() for one in found}
 
 
-def table(matches: list[Match]) -> str:
-    """All figures: one row for each task and problem."""
-    tasks = list(dict.fromkeys(task for match in matches for task in match.figures))
-    rows = []
-    for task in tasks:
-        for match in matches:
-            if task in match.figures:
-                rows.append(_row(task, match))
-    return markdown(HEADER, rows)
+def headlines(known: dict[str, str]) -> dict[str, Headline]:
+    """The README's rows that the sections hold."""
+    found = {name: re.search(r"<!-- headline (.*) -->", one) for name, one in known.items()}
+    return {name: Headline(**json.loads(row.group(1))) for name, row in found.items() if row is not None}
 
 
-def _row(task: str, match: Match) -> list[str]:
-    figures = match.figures[task]
-    mine = figures["jeit"]
-    row = [task, str(match.num_points), str(match.num_electrodes), match.model, cell(mine)]
-    for name in ("scipy plain", "scipy tuned", "pyeit"):
-        row += [cell(figures.get(name)), ratio(figures.get(name), mine)]
-    opponent = figures.get("scipy plain") or figures.get("pyeit")
-    peaks = " / ".join("–" if one is None or one.peak is None else f"{one.peak:.0f} MB" for one in (mine, opponent))
-    accuracy = [(key[len(task) :].strip(), value) for key, value in match.accuracy.items() if _belongs(key, task)]
-    differences = ", ".join(f"{label} {value:.0e}".strip() for label, value in accuracy) or "–"
-    error = f"{100 * match.error:.2g} %" if task == "voltages" else ""
-    return [*row, duration(mine.compile), peaks, differences, error]
+def keep(path: Path, name: str, new: str, order: tuple[str, ...]) -> dict[str, str]:
+    """Put one case's section into the file, and leave the others as they are; all sections.
+
+    The file is replaced at once, so that a run that is stopped leaves the old one or the new one.
+    """
+    known = sections(path) | {name: new}
+    known = {one: known[one] for one in order if one in known}
+    draft = path.with_suffix(".tmp")
+    draft.write_text("\n\n".join([TITLE, *known.values()]) + "\n", encoding="utf-8")
+    os.replace(draft, path)
+    return known
 
 
-def _belongs(key: str, task: str) -> bool:
-    return key in (task, f"{task} v", f"{task} J")
+def readme_table(known: dict[str, str]) -> str:
+    """At most eight rows for the README."""
+    rows = list(headlines(known).values())[:MOST_ROWS]
+    header = ["job", "jeit", "best opponent", "times jeit's", "accuracy"]
+    return markdown(header, [[one.job, one.jeit, one.opponent, one.ratio, one.accuracy] for one in rows])
 
 
-def markdown(header: list[str], rows: list[list[str]]) -> str:
-    """A Markdown table, padded so that it reads as plain text too."""
-    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
-    lines = [header, ["-" * width for width in widths], *rows]
-    return "\n".join(
-        "| " + " | ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)) + " |" for line in lines
-    )
-
-
-def write_between_markers(path: Path, text: str, name: str = "benchmark") -> None:
-    """Replace what stands between the markers of this name in a file. Raises `ValueError` if it has no markers."""
-    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-    content = path.read_text(encoding="utf-8")
-    if content.count(begin) != 1 or content.count(end) != 1:
-        raise ValueError(f"{path.name} needs the lines {begin} and {end}, once each, where the table is to go.")
-    before, rest = content.split(begin)
-    _, after = rest.split(end)
-    path.write_text(f"{before}{begin}\n{text}\n{end}{after}", encoding="utf-8")
+def write(case: Case, result: Result, heading: list[str], order: tuple[str, ...], root: Path = ROOT) -> list[str]:
+    """Write the case's section, the README's table, and the case's page if it has one; what could not be written."""
+    known = keep(root / "benchmarks" / RESULTS.name, case.name, section(case, result, heading), order)
+    pages = [("README.md", "benchmark", readme_table(known))]
+    if case.page is not None:
+        pages.append((*case.page, tables(result)))
+    failed = []
+    for page, marker, content in pages:
+        try:
+            write_between_markers(root / page, content, marker)
+        except (OSError, ValueError) as error:
+            failed.append(f"{page} is left as it was: {error}")
+    return failed

@@ -1,12 +1,12 @@
 """One contestant in a process of its own: takes commands on standard input, answers on standard output, in JSON lines.
 
-Run as `python -m benchmarks.harness.worker CONTESTANT PROBLEM.npz`. Contestants live in processes so that pyEIT can have
-its own environment, so that memory is each one's own, and so that turns can be interleaved whoever's turn it is.
+Run as `python -m benchmarks.harness.worker CONTESTANT PROBLEM.npz`. Contestants live in processes so that pyEIT and
+sparsax can have their own environments, so that memory is each one's own, and so that turns can be interleaved
+whoever's turn it is.
 """
 
 from __future__ import annotations
 
-import gc
 import importlib
 import json
 import os
@@ -17,32 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.problems.disk import load
-
-CONTESTANTS = {
-    "jeit": ("benchmarks.opponents.jeit_forward", "JeitContestant", ()),
-    "scipy plain": ("benchmarks.opponents.scipy_forward", "ScipyContestant", ("plain",)),
-    "scipy tuned": ("benchmarks.opponents.scipy_forward", "ScipyContestant", ("tuned",)),
-    "pyeit": ("benchmarks.opponents.pyeit", "PyeitContestant", ()),
-}
-
-
-def peak_memory() -> float | None:
-    """Peak resident memory of this process in MB since `reset_peak_memory` (Linux), else None."""
-    try:
-        status = Path("/proc/self/status").read_text()
-    except OSError:
-        return None
-    return next((int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmHWM")), None)
-
-
-def reset_peak_memory() -> None:
-    """Start counting peak memory anew, where the system can."""
-    gc.collect()
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return
+from benchmarks.harness.memory import peak_memory, reset_peak_memory
+from benchmarks.opponents import CONTESTANTS
 
 
 def store(contestant, task: str, results, path: str) -> None:
@@ -54,10 +30,11 @@ def store(contestant, task: str, results, path: str) -> None:
 
 
 def answer(contestant, command: dict) -> dict:
-    """Carry out one command: `describe`, `first`, `time`, `memory` or `save`."""
+    """Carry out one command: `describe`, `first`, `time`, `probe` (a call's time and peak memory) or `save`."""
     match command["do"]:
         case "describe":
-            return {"tasks": list(contestant.tasks), "description": contestant.description, "peak": peak_memory()}
+            details = getattr(contestant, "details", {})
+            return {"tasks": list(contestant.tasks), "description": contestant.description, "details": details}
         case "first":
             start = time.perf_counter()
             results = contestant.tasks[command["task"]](0)
@@ -65,19 +42,20 @@ def answer(contestant, command: dict) -> dict:
             if "path" in command:
                 store(contestant, command["task"], results, command["path"])
             return {"seconds": seconds}
+        case "probe":
+            reset_peak_memory()
+            start = time.perf_counter()
+            contestant.tasks[command["task"]](1)
+            return {"seconds": time.perf_counter() - start, "peak": peak_memory()}
         case "time":
             run, seconds = contestant.tasks[command["task"]], []
             if command["warm"]:
                 run(command["round"])
             for call in range(command["calls"]):
                 start = time.perf_counter()
-                run(command["round"] + call)
+                run(command["round"] + call + 1)
                 seconds.append(time.perf_counter() - start)
             return {"seconds": seconds}
-        case "memory":
-            reset_peak_memory()
-            contestant.tasks[command["task"]](0)
-            return {"peak": peak_memory()}
         case "save":
             store(contestant, command["task"], contestant.tasks[command["task"]](0), command["path"])
             return {}
@@ -92,7 +70,9 @@ def main() -> None:
     os.dup2(2, 1)
     try:
         module, kind, arguments = CONTESTANTS[name]
-        contestant = getattr(importlib.import_module(module), kind)(load(Path(path)), *arguments)
+        with np.load(Path(path)) as arrays:
+            problem = {key: arrays[key] for key in arrays.files}
+        contestant = getattr(importlib.import_module(module), kind)(problem, *arguments)
         print(json.dumps({"ready": True}), file=channel, flush=True)
         for line in sys.stdin:
             print(json.dumps(answer(contestant, json.loads(line))), file=channel, flush=True)

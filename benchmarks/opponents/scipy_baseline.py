@@ -13,14 +13,16 @@ Two strengths:
 
 from __future__ import annotations
 
-import time
 from typing import Any, Literal
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
 from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from benchmarks.harness.timing import least_times
+from benchmarks.opponents.scipy_contact import contact_integrals
+from benchmarks.opponents.scipy_permuted import Permuted
 
 SYMMETRIC = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
 ORDERINGS: dict[str, dict[str, Any]] = {
@@ -228,80 +230,22 @@ class ScipyBaseline:
         candidates = {name: _superlu(options) for name, options in ORDERINGS.items()}
         if self.tuned:
             permutation = np.argsort(scipy.sparse.linalg.splu(matrix, **SYMMETRIC).perm_c)
-            candidates["MMD_AT_PLUS_A found once, panels of 1"] = _Permuted(matrix, permutation).superlu
-            banded = _Permuted(matrix, reverse_cuthill_mckee(matrix, symmetric_mode=True))
+            candidates["MMD_AT_PLUS_A found once, panels of 1"] = Permuted(matrix, permutation).superlu
+            banded = Permuted(matrix, reverse_cuthill_mckee(matrix, symmetric_mode=True))
             if banded.bandwidth < 200:
                 candidates["banded Cholesky (pbtrf), reverse Cuthill-McKee"] = banded.cholesky
-        self.timings = _time_each({k: (lambda f=f: f(matrix)(self._load)) for k, f in candidates.items()})
+        self.timings = least_times({k: (lambda f=f: f(matrix)(self._load)) for k, f in candidates.items()})
         self.ordering = min(self.timings, key=self.timings.__getitem__)
         self._factor = candidates[self.ordering]
 
     def _choose_product(self, conductivity):
         gradients = self._gradients(self._solve(conductivity)[1])
-        timings = _time_each({way.__name__: (lambda way=way: way(gradients)) for way in self.ways})
+        timings = least_times({way.__name__: (lambda way=way: way(gradients)) for way in self.ways})
         self.product = min(self.ways, key=lambda way: timings[way.__name__])
-
-
-class _Permuted:
-    """A matrix of fixed pattern in a given order, factorised with the order already known."""
-
-    def __init__(self, matrix, permutation):
-        self.permutation = permutation
-        # Carrying the places of the values through the permutation tells where each value goes.
-        places = scipy.sparse.csc_matrix(
-            (np.arange(1, matrix.nnz + 1, dtype=float), matrix.indices, matrix.indptr), matrix.shape
-        )
-        permuted = places[permutation][:, permutation].tocsc()
-        permuted.sort_indices()
-        self.places = permuted.data.astype(np.intp) - 1
-        self.indices, self.indptr, self.shape = permuted.indices, permuted.indptr, matrix.shape
-        column = np.repeat(np.arange(matrix.shape[1]), np.diff(self.indptr))
-        offset = self.indices - column
-        self.bandwidth = int(offset.max())
-        lower = offset >= 0
-        self.band_source, self.band_row, self.band_column = self.places[lower], offset[lower], column[lower]
-
-    def superlu(self, matrix):
-        permuted = scipy.sparse.csc_matrix((matrix.data[self.places], self.indices, self.indptr), self.shape)
-        factor = scipy.sparse.linalg.splu(
-            permuted,
-            permc_spec="NATURAL",
-            diag_pivot_thresh=0.0,
-            panel_size=1,
-            options={"SymmetricMode": True},
-        )
-        return self._solver(factor.solve)
-
-    def cholesky(self, matrix):
-        band = np.zeros((self.bandwidth + 1, self.shape[0]), order="F")
-        band[self.band_row, self.band_column] = matrix.data[self.band_source]
-        factor = scipy.linalg.cholesky_banded(band, overwrite_ab=True, lower=True, check_finite=False)
-        return self._solver(
-            lambda right: scipy.linalg.cho_solve_banded((factor, True), right, overwrite_b=True, check_finite=False)
-        )
-
-    def _solver(self, solve):
-        def permuted_solve(load):
-            solution = np.empty_like(load)
-            solution[self.permutation] = solve(np.asfortranarray(load[self.permutation]))
-            return solution
-
-        return permuted_solve
 
 
 def _superlu(options):
     return lambda matrix: scipy.sparse.linalg.splu(matrix, **options).solve
-
-
-def _time_each(functions, repeats: int = 15) -> dict[str, float]:
-    """Least time in seconds of each function, the repeats interleaved."""
-    least = dict.fromkeys(functions, np.inf)
-    for _ in range(repeats):
-        for name, function in functions.items():
-            start = time.perf_counter()
-            function()
-            least[name] = min(least[name], time.perf_counter() - start)
-    return least
 
 
 def _distinct(rows, known):
@@ -321,46 +265,3 @@ def _distinct(rows, known):
         which.append(same[0])
         scale.append(factors[same[0]])
     return np.array(directions), np.array(which), np.array(scale)
-
-
-def contact_integrals(points, cells, position, width, contact_impedance):
-    """Contact mass (n, n) sparse, load (n, L) and admittance (L,) of arcs on the boundary polygon.
-
-    Over the covered piece [a, b] of an edge with ends i, j: ∫φ_iφ_j/z, ∫φ_i/z and (b - a)/z, summed over edges.
-    """
-    edges = _boundary(cells)
-    length = np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1)
-    start = np.concatenate([[0.0], np.cumsum(length)[:-1]])
-    perimeter = length.sum()
-    tail, along = points[edges[:, 0]], points[edges[:, 1]] - points[edges[:, 0]]
-    rows, columns, values = [], [], []
-    load, area = np.zeros((len(points), len(position))), np.zeros(len(position))
-    for electrode, (centre, extent, impedance) in enumerate(zip(position, width, contact_impedance, strict=True)):
-        fraction = np.clip(np.einsum("bd,bd->b", centre - tail, along) / length**2, 0, 1)
-        nearest = np.argmin(np.linalg.norm(centre - tail - fraction[:, None] * along, axis=1))
-        middle = start[nearest] + fraction[nearest] * length[nearest]
-        for turn in (-perimeter, 0.0, perimeter):
-            low = np.clip(middle + turn - extent / 2 - start, 0, length)
-            high = np.clip(middle + turn + extent / 2 - start, 0, length)
-            for b in np.flatnonzero(high > low):
-                # Gauss points integrate the products of two linear functions exactly.
-                t = (low[b] + high[b]) / 2 + (high[b] - low[b]) / 2 * np.array([-1, 1]) / np.sqrt(3)
-                phi = np.stack([1 - t / length[b], t / length[b]]) * np.sqrt((high[b] - low[b]) / 2)
-                rows.append(np.repeat(edges[b], 2))
-                columns.append(np.tile(edges[b], 2))
-                values.append((phi @ phi.T / impedance).ravel())
-                load[edges[b], electrode] += phi.sum(axis=1) * np.sqrt((high[b] - low[b]) / 2) / impedance
-                area[electrode] += (high[b] - low[b]) / impedance
-    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    return scipy.sparse.coo_matrix(entries, (len(points), len(points))).tocsr(), load, area
-
-
-def _boundary(cells):
-    """Boundary edges (b, 2) in the order in which they follow each other."""
-    edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
-    there = {(int(a), int(b)) for a, b in edges}
-    following = {a: b for a, b in there if (b, a) not in there}
-    loop = [min(following)]
-    while following[loop[-1]] != loop[0]:
-        loop.append(following[loop[-1]])
-    return np.stack([loop, np.roll(loop, -1)], axis=1)

@@ -14,12 +14,13 @@ algebra goes through SciPy's BLAS: NumPy brings a second one, and the threads of
 
 from __future__ import annotations
 
-import time
+from functools import partial
 
 import numpy as np
 import scipy.linalg
 from scipy.linalg.blas import dgemm, dgemv, dsyrk
 
+from benchmarks.harness.timing import least_times
 from benchmarks.opponents.scipy_baseline import ScipyBaseline
 
 
@@ -87,22 +88,24 @@ class ScipyNewton:
         matrix[np.diag_indices_from(matrix)] += 1
         return _solve(matrix, dgemv(1.0, jacobian, dgemv(1.0, jacobian, coefficients, trans=1) - residual))
 
-    def _choose(self, frame, repeats: int = 10):
+    def _choose(self, frame):
         """Time whole iterations in either space, then with every way of forming J, and keep the fastest."""
-        self._step, self._product = self._in_data_space, self.baseline.product
-        spaces = {step: self._least_time(frame, 2, step=step) for step in (self._in_data_space, self._in_image_space)}
-        self._step = min(spaces, key=spaces.__getitem__)
-        ways = {way: self._least_time(frame, repeats, product=way) for way in self.baseline.ways}
-        self._product = min(ways, key=ways.__getitem__)
+        start = np.zeros(self.baseline.num_cells)
 
-    def _least_time(self, frame, repeats: int, step=None, product=None) -> float:
-        self._step, self.baseline.product = step or self._step, product or self._product
-        start, times = np.zeros(self.baseline.num_cells), []
-        for _ in range(repeats):
-            begin = time.perf_counter()
+        def iterate(step, product) -> None:
+            self._step, self.baseline.product = step, product
             self._iterate(frame, start)
-            times.append(time.perf_counter() - begin)
-        return min(times)
+
+        def fastest(ways: dict, repeats: int):
+            spent = least_times(ways, repeats)
+            return min(spent, key=spent.__getitem__)
+
+        steps = {step.__name__: step for step in (self._in_data_space, self._in_image_space)}
+        products = {product.__name__: product for product in self.baseline.ways}
+        first = self.baseline.product
+        step = steps[fastest({name: partial(iterate, one, first) for name, one in steps.items()}, 2)]
+        self._product = products[fastest({name: partial(iterate, step, one) for name, one in products.items()}, 10)]
+        self._step = step
 
 
 def _solve(matrix, right):

@@ -14,10 +14,7 @@ def difference(result: np.ndarray, reference: np.ndarray) -> float:
 
 
 def exact_voltages(problem: dict[str, np.ndarray]) -> np.ndarray:
-    """Voltages (M,) of the homogeneous disk: point electrodes where they are, or arcs equally spaced on the circle.
-
-    The solutions are those the tests hold the forward model to.
-    """
+    """Voltages (M,) of the homogeneous disk: point electrodes where they are, or arcs equally spaced on the circle."""
     disk = ConductingDisk(radius=problems.RADIUS, conductivity=float(problem["background"]))
     if "nodes" in problem:
         x, y = problem["points"][problem["nodes"]].T

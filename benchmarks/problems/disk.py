@@ -87,9 +87,3 @@ def _smooth_conductivities(centroids, count, random):
 def save(problem: dict[str, np.ndarray], path: Path) -> None:
     """Write the arrays for the workers."""
     np.savez(path, allow_pickle=False, **problem)
-
-
-def load(path: Path) -> dict[str, np.ndarray]:
-    """Read what `save` wrote."""
-    with np.load(path) as arrays:
-        return {name: arrays[name] for name in arrays.files}

@@ -1,15 +1,15 @@
-"""Optimised layouts and chosen measurements: what `benchmarks.cases.design_figures` tells of them."""
+"""Optimised layouts and chosen measurements: what the case tells of them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.harness.report import markdown
+from benchmarks.harness.case import Table
 
 CONDUCTANCE = 2e-3
 
 
-def optimised(nodes: tuple[int, int], columns: tuple[int, int], starts: int, steps: int) -> str:
+def optimised(nodes: tuple[int, int], columns: tuple[int, int], starts: int, steps: int) -> Table:
     """Layouts before and after, on a sheet of 2 mS, judged on a finer mesh (nodes and touches along a side of each)."""
     import jax
 
@@ -53,10 +53,10 @@ def optimised(nodes: tuple[int, int], columns: tuple[int, int], starts: int, ste
         f"steps), confirmed on {model.mesh.num_points:,} nodes with {columns[1]} × {columns[1]}; best by its score: "
         f"start {1 + int(np.argmax(found.values))}."
     )
-    return f"{caption}\n\n{markdown(header, rows)}"
+    return Table(header, rows, "Optimised layouts", caption)
 
 
-def selected(name: str, number: int, cell_sizes: tuple[float, float], correlations, noises, count: int) -> str:
+def selected(name: str, number: int, cell_sizes: tuple[float, float], correlations, noises, count: int) -> Table:
     """So many of a layout's pairs: what is kept, for priors' correlation lengths in metres and noises relative to each
     voltage; cell sizes of the sheet and under electrodes, metres; of `count` random choices the median."""
     import jax
@@ -96,4 +96,5 @@ def selected(name: str, number: int, cell_sizes: tuple[float, float], correlatio
             rows.append([f"{1e3 * correlation:g}", f"{noise:.0e}", f"{float(chosen.total):.0f}", *shares])
     header = ["correlation, mm", "noise, of each voltage", "all pairs, nats"]
     header += [f"{number} chosen keep", f"bound of any {number}", f"median of {count:,} random", f"{number} nearest"]
-    return f"Of {protocol.num_measurements} pairs, on a sheet of {mesh.num_points:,} nodes.\n\n{markdown(header, rows)}"
+    caption = f"Of {protocol.num_measurements} pairs, on a sheet of {mesh.num_points:,} nodes."
+    return Table(header, rows, "Chosen measurements", caption)

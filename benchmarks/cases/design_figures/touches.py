@@ -1,4 +1,4 @@
-"""The paper's two layouts on a layer, touched all over: what `benchmarks.cases.design_figures` tells of them.
+"""The paper's two layouts on a layer, touched all over: what the case tells of them.
 
 Text S4 and Figs. S11 and S12 of Park et al., Science Robotics 7, eabm7187 (2022).
 """
@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from benchmarks.harness.report import markdown
+from benchmarks.harness.case import Table
+from benchmarks.harness.timing import say
 
 if TYPE_CHECKING:
     from jaxtyping import Array
@@ -96,7 +97,7 @@ def blind(told: dict) -> str:
     return f"{100 * told['blind_spot_fraction']:.1f} %"
 
 
-def comparison_table(setting: Setting, changed: dict[str, Array]) -> str:
+def comparison_table(setting: Setting, changed: dict[str, Array]) -> Table:
     """Both layouts for several margins, and with all pairs, beside the paper."""
     from jeit.design import comparison
 
@@ -110,16 +111,16 @@ def comparison_table(setting: Setting, changed: dict[str, Array]) -> str:
         rows.append([*row, area(one), f"{one['two_point_mm']:.0f}", area(other), largest(other)])
     header = ["touched no nearer to the edge than", "pairs", "blind spot, boundary", "below the 1st percentile"]
     header += ["taxels, inner, cm²", "two-point, inner, mm", "taxels, boundary, cm²", "largest, cm²"]
-    return markdown(header, rows)
+    return Table(header, rows, "Margins and pairs")
 
 
-def thickness_table(setting: Setting, step) -> tuple[str, dict[float, list[SkinResponse]]]:
+def thickness_table(setting: Setting) -> tuple[Table, dict[float, list[SkinResponse]]]:
     """Both layouts on layers of several thicknesses, and what they feel."""
     from jeit.design import comparison
 
     rows, studied = [], {}
     for thickness, num_layers in (*setting.study, *setting.check):
-        step(f"{1e3 * thickness:g} mm, {num_layers} layers")
+        say(f"{1e3 * thickness:g} mm, {num_layers} layers")
         mesh = setting.study_cell, num_layers
         both = [felt(name, setting, changes(name, setting.places, mesh, thickness)) for name in LAYOUTS]
         studied.setdefault(thickness, both)
@@ -129,10 +130,10 @@ def thickness_table(setting: Setting, step) -> tuple[str, dict[float, list[SkinR
             row += [f"{told['sensitivity_uniformity']:.2f}", blind(told), area(told), largest(told)]
             rows.append([*row, f"{told['two_point_mm']:.0f}"])
     header = ["thickness, mm", "layers of cells", "layout", "least Θ, mV", "mean Θ, mV", "uniformity", "blind spot"]
-    return markdown([*header, "taxels, cm²", "largest, cm²", "two-point, mm"], rows), studied
+    return Table([*header, "taxels, cm²", "largest, cm²", "two-point, mm"], rows, "Thickness"), studied
 
 
-def kinds_table(setting: Setting, changed: dict[str, Array], step) -> str:
+def kinds_table(setting: Setting, changed: dict[str, Array]) -> Table:
     """Both layouts for a bell and a hemisphere, insulating and conducting ten times as well as the skin."""
     from jeit.design import Bell, Hemisphere, comparison
 
@@ -140,7 +141,7 @@ def kinds_table(setting: Setting, changed: dict[str, Array], step) -> str:
     for shape in setting.shapes:
         indentation = Bell() if shape == "bell" else Hemisphere()
         for kind, contrast in (("insulating", 0.0), ("conductive", 10.0)):
-            step(f"{kind} {shape}")
+            say(f"{kind} {shape}")
             both = []
             for name in LAYOUTS:
                 known = changed[name] if shape == "bell" and not contrast else None
@@ -154,7 +155,7 @@ def kinds_table(setting: Setting, changed: dict[str, Array], step) -> str:
             rows.append([*row, area(other), largest(other)])
     header = ["touch", "least Θ, inner, mV", "least Θ, boundary, mV", "blind spot, boundary", "blind spot, inner"]
     header += ["taxels, inner, cm²", "two-point, inner, mm", "taxels, boundary, cm²", "largest, cm²"]
-    return markdown(header, rows)
+    return Table(header, rows, "Kinds of touch")
 
 
 def draw_thickness(studied: dict[float, list[SkinResponse]], path) -> None:

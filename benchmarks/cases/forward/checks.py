@@ -2,31 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 from benchmarks.cases.forward.match import Match
+from benchmarks.harness.case import NOT_MEASURED, Asked, judged
 from benchmarks.harness.contest import Figures
-from benchmarks.harness.report import duration
+from benchmarks.harness.tables import duration
 
 JACOBIAN = "voltages and Jacobian"
 
 
-@dataclass
-class Check:
-    """One figure: what is asked, what was measured, and `met`, `missed` or `not measured`."""
-
-    asked: str
-    measured: str
-    verdict: str
-
-
-def checks(matches: list[Match], import_seconds: float, demo_seconds: float | None) -> list[Check]:
+def checks(matches: list[Match]) -> list[Asked]:
     """All checks that can be made with what was measured."""
-    found = [*_against_pyeit(matches), *_against_scipy(matches), *_images(matches), *_batches(matches)]
-    found.append(_limit("`import jeit` < 2 s", import_seconds, 2.0))
-    asked = "first picture of `jeit demo` within 15 s of a cold start"
-    found.append(Check(asked, "–", "not measured") if demo_seconds is None else _limit(asked, demo_seconds, 15.0))
-    return found
+    return [*_against_pyeit(matches), *_against_scipy(matches), *_images(matches), *_batches(matches)]
 
 
 def _figures(match: Match, task: str, name: str) -> Figures | None:
@@ -34,33 +22,25 @@ def _figures(match: Match, task: str, name: str) -> Figures | None:
     return figures if figures is not None and figures.seconds and not figures.remark else None
 
 
-def _verdict(met: bool) -> str:
-    return "met" if met else "missed"
-
-
-def _limit(asked: str, seconds: float, limit: float) -> Check:
-    return Check(asked, duration(seconds), _verdict(seconds < limit))
-
-
-def _at_least(asked: str, match: Match, task: str, opponent: str, times: float) -> Check | None:
+def _at_least(asked: str, match: Match, task: str, opponent: str, times: float) -> Asked | None:
     mine, other = _figures(match, task, "jeit"), _figures(match, task, opponent)
     if mine is None or other is None:
         return None
     ratio = other.median / mine.median
-    return Check(asked, f"{ratio:.1f}×", _verdict(ratio >= times))
+    return judged(asked, f"{ratio:.1f}×", ratio >= times)
 
 
-def _against_pyeit(matches: list[Match]):
+def _against_pyeit(matches: list[Match]) -> Iterator[Asked]:
     for match in matches:
         if match.model != "point" or match.num_electrodes != 16:
             continue
         times = 100 if match.num_points < 2000 else 50
         asked = f"{JACOBIAN}, 16 electrodes, {match.num_points} nodes: ≥ {times}× pyEIT"
         check = _at_least(asked, match, JACOBIAN, "pyeit", times)
-        yield check or Check(asked, "pyEIT cannot", "not measured")
+        yield check or Asked(asked, _reason(match), NOT_MEASURED)
 
 
-def _against_scipy(matches: list[Match]):
+def _against_scipy(matches: list[Match]) -> Iterator[Asked]:
     for match in matches:
         if match.model != "complete" or match.num_electrodes != 16:
             continue
@@ -74,7 +54,7 @@ def _against_scipy(matches: list[Match]):
             yield check
 
 
-def _images(matches: list[Match]):
+def _images(matches: list[Match]) -> Iterator[Asked]:
     for match in matches:
         if match.model != "complete" or match.num_electrodes != 16 or match.num_points > 2000:
             continue
@@ -85,10 +65,10 @@ def _images(matches: list[Match]):
             mine = _figures(match, task, "jeit")
             if mine is not None:
                 asked = f"{text} ({match.num_cells} cells, {match.num_channels} channels)"
-                yield _limit(asked, mine.median, limit)
+                yield judged(asked, duration(mine.median), mine.median < limit)
 
 
-def _batches(matches: list[Match]):
+def _batches(matches: list[Match]) -> Iterator[Asked]:
     for match in matches:
         for batch, alone in (("64 conductivities", "voltages"), ("64 Jacobians", JACOBIAN)):
             many, one = _figures(match, batch, "jeit"), _figures(match, alone, "jeit")
@@ -96,8 +76,13 @@ def _batches(matches: list[Match]):
                 continue
             each = many.median / 64
             # 5 % is what the medians of two such series differ by on a quiet machine.
-            yield Check(
+            yield judged(
                 f"{batch}, {match.num_points} nodes: per item no more than one alone ({alone})",
                 f"{duration(each)} against {duration(one.median)}",
-                _verdict(each <= 1.05 * one.median),
+                each <= 1.05 * one.median,
             )
+
+
+def _reason(match: Match) -> str:
+    figures = match.figures[JACOBIAN].get("pyeit")
+    return "pyEIT left out" if figures is None else f"pyEIT cannot: {figures.remark}"

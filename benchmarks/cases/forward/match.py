@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.harness.contest import Contestant, Figures, GaveUpError, compete
-from benchmarks.harness.machine import available_memory
+from benchmarks.harness.contest import Contestant, Figures, GaveUpError, compete, results_in
+from benchmarks.harness.memory import available_memory
 from benchmarks.problems import disk as problems
 from benchmarks.problems.accuracy import difference, exact_voltages
 
@@ -51,15 +51,6 @@ class Match:
         """Whether every result is the same as the opponent's, to rounding."""
         return all(value < AGREEMENT for value in self.accuracy.values())
 
-    def as_dict(self) -> dict:
-        """Everything, for JSON."""
-        data = {name: value for name, value in vars(self).items() if name != "figures"}
-        data["figures"] = {
-            task: {name: vars(one) | {"median": one.median} for name, one in figures.items()}
-            for task, figures in self.figures.items()
-        }
-        return data
-
 
 def play(
     num_points: int, num_electrodes: int, model: str, settings: Settings, before: list[Match], folder: Path
@@ -94,18 +85,28 @@ def play(
             problem["reconstruction"] = jeit.save("reconstruction matrix", folder / "matrix.npz")[0]
             problems.save(problem, path)
         others = [enter(name, python) for name, python in opponents.items()]
-        contestants = [jeit, *[other for other in others if other is not None]]
-        for task in settings.tasks:
-            if (model == "point" and task not in TASKS[:2]) or not _fits(match, task):
-                continue
-            foreseen = _foresee(match, task, settings, before)
-            playing = [one for one in contestants if one.name not in foreseen]
-            match.figures[task] = compete(playing, task, rounds=settings.rounds, budget=settings.budget) | foreseen
-            _compare(match, task, playing, folder)
+        _play_tasks(match, [jeit, *[other for other in others if other is not None]], settings, before, folder)
         for task, seconds in first.items():
             match.figures[task]["jeit"].first = seconds
         match.error = difference(jeit.save("homogeneous", folder / "result.npz")[0], exact_voltages(problem))
     return match
+
+
+def _play_tasks(
+    match: Match, contestants: list[Contestant], settings: Settings, before: list[Match], folder: Path
+) -> None:
+    """Figures of every task that fits, and how far jeit's results are from the first opponent's."""
+    for task in settings.tasks:
+        if (match.model == "point" and task not in TASKS[:2]) or not _fits(match, task):
+            continue
+        foreseen = _foresee(match, task, settings, before)
+        playing = [one for one in contestants if one.name not in foreseen and task in one.tasks]
+        left = folder if len(playing) > 1 else None
+        figures = compete(playing, task, rounds=settings.rounds, budget=settings.budget, folder=left)
+        match.figures[task] = figures | foreseen
+        able = [one.name for one in playing if not figures[one.name].remark]
+        if left is not None and len(able) > 1:
+            _compare(match, task, [results_in(folder / f"{name}.npz") for name in able[:2]])
 
 
 def _fits(match: Match, task: str) -> bool:
@@ -130,12 +131,8 @@ def _foresee(match: Match, task: str, settings: Settings, before: list[Match]) -
     return {}
 
 
-def _compare(match: Match, task: str, playing: list[Contestant], folder: Path) -> None:
+def _compare(match: Match, task: str, results: list[list[np.ndarray]]) -> None:
     """Relative differences between jeit's results and the first opponent's."""
-    able = [one for one in playing if task in one.tasks and not match.figures[task][one.name].remark]
-    if len(able) < 2:
-        return
-    results = [one.save(task, folder / "result.npz") for one in able[:2]]
     for name, mine, other in zip(("v", "J"), *results, strict=False):
         label = name if task in TASKS[:2] else ""
         match.accuracy[f"{task} {label}".strip()] = difference(np.asarray(mine), np.asarray(other))
