@@ -9,11 +9,14 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
 
 from benchmarks.cases import NAMES, load
 from benchmarks.harness import machine, report
-from benchmarks.harness.case import MISSED, Options, Result
+from benchmarks.harness.case import MISSED, Case, Options, Result
 from benchmarks.harness.run_case import CaseFailedError, run_apart
 from benchmarks.harness.tables import duration
 from benchmarks.harness.timing import say
@@ -50,16 +53,28 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     return options
 
 
+def find(name: str) -> Case:
+    """The case of this name. Raises `CaseFailedError` if its file cannot be imported."""
+    try:
+        return load(name)
+    except ImportError as error:
+        raise CaseFailedError(f"{name} cannot be imported: {error}") from error
+
+
 def list_cases() -> None:
     """Print every case with its description."""
     for name in NAMES:
-        case = load(name)
+        try:
+            case = find(name)
+        except CaseFailedError as error:
+            print(f"{name:20}{error}")
+            continue
         print(f"{name:20}{case.description} ({case.minutes:g} min)")
 
 
-def run(name: str, options: argparse.Namespace) -> Result:
-    """Run one case, print its report, and write it where it is kept if asked."""
-    case = load(name)
+def measure(name: str, options: argparse.Namespace) -> tuple[Result, list[str]]:
+    """One case's result, and what it was measured on. Raises `CaseFailedError`."""
+    case = find(name)
     pictures = machine.ROOT / "docs" / "images" if options.write and case.pictures else None
     told = Options(
         quick=options.quick,
@@ -75,12 +90,36 @@ def run(name: str, options: argparse.Namespace) -> Result:
         told.output.mkdir(parents=True, exist_ok=True)
     say(f"== {name}: {case.description}")
     heading = machine.heading()
-    result = run_apart(name, told)
+    return run_apart(name, told), heading
+
+
+def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[tuple[str, Callable]]:
+    """Each case, as it is done, and a function that gives what `measure` does.
+
+    First those that tell times, one after the other; then the others, as many beside each other as there are cores.
+    """
+    studies = []
+    for name in names:
+        try:
+            timed = find(name).timed
+        except CaseFailedError:
+            timed = True
+        if timed:
+            yield name, partial(measure, name, options)
+        else:
+            studies.append(name)
+    with ThreadPoolExecutor(machine.CORES) as pool:
+        futures = {pool.submit(measure, name, options): name for name in studies}
+        for future in as_completed(futures):
+            yield futures[future], future.result
+
+
+def keep(name: str, result: Result, heading: list[str], options: argparse.Namespace) -> None:
+    """Print a case's report, and write it where it is kept if asked; not what is wrong."""
     print(f"\n## {name}\n\n{report.text(result, heading)}\n", flush=True)
     if options.write and not result.wrong:
-        for line in report.write(case, result, heading, NAMES):
+        for line in report.write(load(name), result, heading, NAMES):
             say(line)
-    return result
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -90,13 +129,16 @@ def main(arguments: list[str] | None = None) -> int:
         list_cases()
         return 0
     machine.use_cores()
-    results, failures, start = {}, [], time.perf_counter()
-    for name in NAMES if options.all else options.cases:
+    results: dict[str, Result] = {}
+    failures, start = [], time.perf_counter()
+    for name, answer in measure_all(NAMES if options.all else options.cases, options):
         try:
-            results[name] = run(name, options)
+            results[name], heading = answer()
         except CaseFailedError as error:
             failures.append(str(error))
             say(str(error))
+            continue
+        keep(name, results[name], heading, options)
     for name, result in results.items():
         failures += [f"{name}: {line}" for line in result.wrong]
         failures += [f"{name}: missed: {one.asked}: {one.measured}" for one in result.asked if one.verdict == MISSED]

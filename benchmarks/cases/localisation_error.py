@@ -158,5 +158,10 @@ def _asked(off: dict) -> Asked:
 
 
 CASE = Case(
-    "localisation_error", "how well touches are located by sound, beside the Cramér-Rao bound", run, 3, pictures=True
+    "localisation_error",
+    "how well touches are located by sound, beside the Cramér-Rao bound",
+    run,
+    3,
+    pictures=True,
+    timed=False,
 )

@@ -102,7 +102,8 @@ class Case:
     """A name, a line about it, and the function that measures it.
 
     `minutes`: about how long it takes on two quiet cores. `page`: a page of the documentation, and the name of the
-    markers in it between which its tables go too. `pictures`: whether it draws any.
+    markers in it between which its tables go too. `pictures`: whether it draws any. `timed`: whether its figures are
+    times; one whose figures are not may run beside another.
     """
 
     name: str
@@ -111,3 +112,4 @@ class Case:
     minutes: float
     page: tuple[str, str] | None = None
     pictures: bool = False
+    timed: bool = True

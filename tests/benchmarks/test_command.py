@@ -51,8 +51,10 @@ def test_a_case_that_fails_does_not_lose_the_others(monkeypatch, capsys):
 
     monkeypatch.setattr(command, "run_apart", apart)
     monkeypatch.setattr(command.machine, "use_cores", lambda: None)
-    assert command.main(["solver", "startup"]) == 1
-    assert ran == ["solver", "startup"]
+    assert command.main(["ktc2023", "solver", "design_figures", "startup"]) == 1
+    # Those that tell times come first and alone.
+    assert ran[:2] == ["solver", "startup"]
+    assert set(ran[2:]) == {"ktc2023", "design_figures"}
     told = capsys.readouterr()
     assert "| startup |" in told.out
     assert "solver ended" in told.err

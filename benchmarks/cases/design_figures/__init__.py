@@ -45,4 +45,5 @@ CASE = Case(
     12,
     page=("docs/design.md", "figures"),
     pictures=True,
+    timed=False,
 )
