@@ -55,6 +55,8 @@ def run(options: Options) -> Result:
         for row in rows[-2:]:
             say(" | ".join(row))
         asked += _asked(name, linear, found, error)
+        if options.quick:
+            continue
         rows_of_parts = [[part, f"{spent:.2f}", f"{least:.2f}"] for part, spent, least in breakdown(imager)]
         parts.append(Table(["part", "ms", "ms at the speed of a large product"], rows_of_parts, label))
         job = f"a streamed frame, four Gauss-Newton iterations, {model.mesh.num_points:,} nodes"
