@@ -1,7 +1,6 @@
-"""The speed benchmark, in one command: `python -m benchmarks` from the root of the repository.
+"""The benchmarks' one command: `python -m benchmarks [CASE …]` from the root of the repository.
 
-jeit beside pyEIT and SciPy on the same meshes, protocols and conductivities, in one run, turns interleaved.
-See `README.md` in this folder for what is measured and how.
+Without a case it lists them. See `README.md` in this folder for what is measured and how.
 """
 
 from __future__ import annotations
@@ -9,84 +8,148 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import tempfile
 import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
 
-from benchmarks import machine, pyeit_environment, startup
-from benchmarks.checks import checks
-from benchmarks.contest import CORES, ROOT
-from benchmarks.match import TASKS, Match, Settings, play
-from benchmarks.report import markdown, table, write_between_markers
+from benchmarks.cases import NAMES, load
+from benchmarks.harness import machine, report
+from benchmarks.harness.case import MISSED, Case, Options, Result
+from benchmarks.harness.run_case import CaseFailedError, run_apart
+from benchmarks.harness.tables import duration
+from benchmarks.harness.timing import say
 
 
-def parse() -> argparse.Namespace:
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     """Options of the command."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="See benchmarks/README.md.")
-    parser.add_argument("--nodes", type=int, nargs="+", default=[1150, 5000, 20000], help="sizes of the meshes")
-    parser.add_argument("--electrodes", type=int, nargs="+", default=[16, 32])
-    parser.add_argument("--rounds", type=int, default=15, help="turns each contestant has at each task")
-    parser.add_argument("--budget", type=float, default=20.0, help="seconds a contestant may use for a task")
-    parser.add_argument("--time-limit", type=float, default=120.0, help="seconds for one call, then it has given up")
-    parser.add_argument("--without-pyeit", action="store_true")
-    parser.add_argument("--quick", action="store_true", help="a smoke run in less than a minute: one small mesh")
-    parser.add_argument("--json", type=Path, help="also write every figure to this file")
-    parser.add_argument("--write-readme", action="store_true", help="put the table between the README's markers")
-    return parser.parse_args()
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Lists the cases, or runs some.")
+    parser.add_argument("cases", nargs="*", metavar="CASE", help="which to run")
+    parser.add_argument("--all", action="store_true", help="run every case")
+    parser.add_argument("--write", action="store_true", help="into RESULTS.md, the README's table and docs/")
+    parser.add_argument("--quick", action="store_true", help="smoke runs on small problems, figures not judged")
+    parser.add_argument("--output", type=Path, metavar="FOLDER", help="draw the cases' pictures there")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write every result to this file")
+    parser.add_argument("--without-pyeit", action="store_true", help="leave out pyEIT, which takes minutes")
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="measured data (default ../shared/data)")
+    parser.add_argument("--nodes", type=int, nargs="+", default=(), help="other sizes of meshes")
+    parser.add_argument("--electrodes", type=int, nargs="+", default=(), help="other numbers of electrodes")
+    parser.add_argument("--rounds", type=int, help="turns each contestant has at each task")
+    parser.add_argument("--time-limit", type=float, metavar="S", help="for one call, then a contestant has given up")
+    options = parser.parse_args(arguments)
+    unknown = [name for name in options.cases if name not in NAMES]
+    if unknown:
+        parser.error(f"there is no case {', '.join(unknown)}; there are {', '.join(NAMES)}")
+    if options.all and options.cases:
+        parser.error("give either --all or the names of cases")
+    special = options.quick or options.nodes or options.electrodes or options.rounds or options.without_pyeit
+    if options.write and special:
+        parser.error(
+            "--write keeps full runs only: leave out --quick, --nodes, --electrodes, --rounds, --without-pyeit"
+        )
+    if options.write and not (options.all or options.cases):
+        parser.error("--write needs the names of cases, or --all")
+    return options
 
 
-def main() -> int:
-    """Run, print the report, and return 1 if contestants disagree or, in a full run, a figure is missed."""
-    options = parse()
-    machine.use_cores(CORES)
-    heading = machine.heading()
-    if options.quick:
-        options.nodes, options.electrodes, options.rounds, options.budget = [200], [16], 2, 2.0
-    python = None if options.without_pyeit else pyeit_environment.python(create=not options.quick)
-    settings = Settings(
+def find(name: str) -> Case:
+    """The case of this name. Raises `CaseFailedError` if its file cannot be imported."""
+    try:
+        return load(name)
+    except ImportError as error:
+        raise CaseFailedError(f"{name} cannot be imported: {error}") from error
+
+
+def list_cases() -> None:
+    """Print every case with its description."""
+    for name in NAMES:
+        try:
+            case = find(name)
+        except CaseFailedError as error:
+            print(f"{name:20}{error}")
+            continue
+        print(f"{name:20}{case.description} ({case.minutes:g} min)")
+
+
+def measure(name: str, options: argparse.Namespace) -> tuple[Result, list[str]]:
+    """One case's result, and what it was measured on. Raises `CaseFailedError`."""
+    case = find(name)
+    pictures = machine.ROOT / "docs" / "images" if options.write and case.pictures else None
+    told = Options(
+        quick=options.quick,
+        without_pyeit=options.without_pyeit,
+        output=options.output.resolve() if options.output else pictures,
+        data=options.data.resolve() if options.data else None,
+        nodes=tuple(options.nodes),
+        electrodes=tuple(options.electrodes),
         rounds=options.rounds,
-        budget=options.budget,
-        limit=options.time_limit,
-        pyeit_python=None if python is None else str(python),
-        tasks=TASKS[:-1] if options.quick else TASKS,
+        time_limit=options.time_limit,
     )
-    start = time.perf_counter()
-    matches: list[Match] = []
-    with tempfile.TemporaryDirectory() as folder:
-        for num_electrodes in options.electrodes:
-            for num_points in options.nodes:
-                for model in ("complete", "point"):
-                    say(f"{num_points} nodes, {num_electrodes} electrodes, {model} electrode model …")
-                    matches.append(play(num_points, num_electrodes, model, settings, matches, Path(folder)))
-                    # A run that is stopped has said what it knew.
-                    say(table(matches[-1:]))
-    say("cold starts …")
-    import_seconds = startup.import_seconds(2 if options.quick else 5)
-    demo_seconds = None if options.quick else startup.demo_seconds()
-    outcome = checks(matches, import_seconds, demo_seconds)
-    text = "\n\n".join(
-        [
-            "\n".join(f"- {line}" for line in [*heading, *sorted({line for m in matches for line in m.descriptions})]),
-            table(matches),
-            markdown(["asked", "measured", ""], [[c.asked, c.measured, c.verdict] for c in outcome]),
-        ]
-    )
-    print(text)
-    say(f"{time.perf_counter() - start:.0f} s in all")
+    if told.output is not None:
+        told.output.mkdir(parents=True, exist_ok=True)
+    say(f"== {name}: {case.description}")
+    heading = machine.heading()
+    return run_apart(name, told), heading
+
+
+def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[tuple[str, Callable]]:
+    """Each case, as it is done, and a function that gives what `measure` does.
+
+    First those that tell times, one after the other; then the others, as many beside each other as there are cores.
+    """
+    studies = []
+    for name in names:
+        try:
+            timed = find(name).timed
+        except CaseFailedError:
+            timed = True
+        if timed:
+            yield name, partial(measure, name, options)
+        else:
+            studies.append(name)
+    with ThreadPoolExecutor(machine.CORES) as pool:
+        futures = {pool.submit(measure, name, options): name for name in studies}
+        for future in as_completed(futures):
+            yield futures[future], future.result
+
+
+def keep(name: str, result: Result, heading: list[str], options: argparse.Namespace) -> None:
+    """Print a case's report, and write it where it is kept if asked; not what is wrong."""
+    print(f"\n## {name}\n\n{report.text(result, heading)}\n", flush=True)
+    if options.write and not result.wrong:
+        for line in report.write(load(name), result, heading, NAMES):
+            say(line)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run what is asked; 1 if a case fails, if results disagree or, in a full run, if a figure is missed."""
+    options = parse(arguments)
+    if not (options.all or options.cases):
+        list_cases()
+        return 0
+    machine.use_cores()
+    results: dict[str, Result] = {}
+    failures, start = [], time.perf_counter()
+    for name, answer in measure_all(NAMES if options.all else options.cases, options):
+        try:
+            results[name], heading = answer()
+        except CaseFailedError as error:
+            failures.append(str(error))
+            say(str(error))
+            continue
+        keep(name, results[name], heading, options)
+    for name, result in results.items():
+        failures += [f"{name}: {line}" for line in result.wrong]
+        failures += [f"{name}: missed: {one.asked}: {one.measured}" for one in result.asked if one.verdict == MISSED]
     if options.json:
-        options.json.write_text(json.dumps({"heading": heading, "matches": [m.as_dict() for m in matches]}, indent=1))
-    if options.write_readme:
-        write_between_markers(ROOT / "README.md", text)
-    wrong = [m for m in matches if not m.agreed]
-    for match in wrong:
-        say(f"DISAGREEMENT: {match.num_points} nodes, {match.num_electrodes} electrodes: {match.accuracy}")
-    missed = [check for check in outcome if check.verdict == "missed"]
-    return 1 if wrong or (missed and not options.quick) else 0
-
-
-def say(text: str) -> None:
-    """Progress, apart from the report."""
-    print(text, file=sys.stderr, flush=True)
+        plain = {name: result.as_dict() for name, result in results.items()}
+        options.json.write_text(json.dumps({"heading": machine.heading(), "cases": plain}, indent=1), encoding="utf-8")
+    spent = ", ".join(f"{name} {duration(result.seconds)}" for name, result in results.items())
+    say(f"{duration(time.perf_counter() - start)} in all: {spent}")
+    for line in failures:
+        say(line)
+    return int(bool(failures))
 
 
 if __name__ == "__main__":

@@ -141,7 +141,7 @@ def test_kit4_gauss_newton_converges_on_every_file(data_folder):
 @pytest.mark.slow
 def test_ktc2023_segmentation(data_folder):
     """Level 1 of the challenge's training targets; the asked mean of 0.85."""
-    from benchmarks.ktc2023 import scores
+    from benchmarks.cases.ktc2023 import scores
 
     table = scores(data_folder / "ktc2023", levels=(1,), report=lambda line: None)
     assert table.mean() >= 0.85

@@ -1,0 +1,29 @@
+"""What is measured: one case to a file, each with its `CASE`. To add one, write a file and name it here."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from benchmarks.harness.case import Case
+
+# In the order in which they run and are reported: times first, then studies of accuracy, which take longest.
+NAMES = (
+    "forward",
+    "solver",
+    "gauss_newton",
+    "optimisers",
+    "realtime",
+    "hearing",
+    "design",
+    "startup",
+    "localisation_error",
+    "ktc2023",
+    "design_figures",
+)
+
+
+def load(name: str) -> Case:
+    """The case of this name. Raises `ValueError` for a name that there is not."""
+    if name not in NAMES:
+        raise ValueError(f"There is no case {name!r}; there are {', '.join(NAMES)}.")
+    return import_module(f"benchmarks.cases.{name}").CASE

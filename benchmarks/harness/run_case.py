@@ -1,0 +1,59 @@
+"""One case in a process of its own: `python -m benchmarks.harness.run_case NAME OPTIONS.pickle RESULT.json`.
+
+So that memory is each case's own, nothing is compiled before, and a case that crashes does not take the others along.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks.harness.case import MET, MISSED, NOT_JUDGED, Options, Result
+from benchmarks.harness.machine import ROOT, same_for_all
+from benchmarks.harness.memory import peak_memory
+
+
+class CaseFailedError(Exception):
+    """A case ended without a result."""
+
+
+def run_apart(name: str, options: Options) -> Result:
+    """The case's result, from a process of its own. Raises `CaseFailedError` if it ends without one."""
+    with tempfile.TemporaryDirectory() as folder:
+        told, answer = Path(folder, "options"), Path(folder, "result")
+        told.write_bytes(pickle.dumps(options))
+        command = [sys.executable, "-m", "benchmarks.harness.run_case", name, str(told), str(answer)]
+        ended = subprocess.run(command, cwd=ROOT, env=same_for_all(), check=False)
+        if ended.returncode != 0 or not answer.is_file():
+            raise CaseFailedError(f"{name} ended with exit code {ended.returncode}; see the messages above.")
+        return Result.from_dict(json.loads(answer.read_text(encoding="utf-8")))
+
+
+def run_here(name: str, options: Options) -> Result:
+    """The case's result, with its seconds and this process's peak memory. A quick run's figures are not judged."""
+    from benchmarks.cases import load
+
+    start = time.perf_counter()
+    result = load(name).run(options)
+    result.seconds = time.perf_counter() - start
+    result.peak_memory = peak_memory()
+    for one in result.asked:
+        if options.quick and one.verdict in (MET, MISSED):
+            one.verdict = NOT_JUDGED
+    return result
+
+
+def main() -> None:
+    """Run the case that the command line names, and leave its result."""
+    name, told, answer = sys.argv[1:]
+    result = run_here(name, pickle.loads(Path(told).read_bytes()))
+    Path(answer).write_text(json.dumps(result.as_dict()), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""Figures as text, and tables of them as Markdown."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from benchmarks.harness.contest import Figures
+
+
+def duration(seconds: float) -> str:
+    """A time with three figures and a fitting unit."""
+    if math.isnan(seconds):
+        return "–"
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= size:
+            value = seconds / size
+            return f"{value:.{max(0, 2 - math.floor(math.log10(value)))}f} {unit}"
+    return "0 s"
+
+
+def times(value: float) -> str:
+    """How many times longer."""
+    return f"{value:.0f}×" if value >= 20 else f"{value:.1f}×" if value >= 0.95 else f"{value:.2f}×"
+
+
+def cell(figures: Figures | None, share: int = 1) -> str:
+    """Median time of a contestant, of each of `share` alike, or why there is none."""
+    if figures is None:
+        return "–"
+    return figures.remark if figures.remark or not figures.seconds else duration(figures.median / share)
+
+
+def ratio(figures: Figures | None, reference: Figures) -> str:
+    """How many times longer than the reference."""
+    if figures is None or figures.remark or not figures.seconds or not reference.seconds:
+        return ""
+    return times(figures.median / reference.median)
+
+
+def megabytes(*figures: Figures | None) -> str:
+    """Peak memory of each, parted by strokes."""
+    return " / ".join("–" if one is None or one.peak is None else f"{one.peak:.0f} MB" for one in figures)
+
+
+def markdown(header: list[str], rows: list[list[str]]) -> str:
+    """A Markdown table, padded so that it reads as plain text too."""
+    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
+    lines = [header, ["-" * width for width in widths], *rows]
+    return "\n".join(
+        "| " + " | ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)) + " |" for line in lines
+    )
+
+
+def write_between_markers(path: Path, text: str, name: str = "benchmark") -> None:
+    """Replace what stands between the markers of this name in a file. Raises `ValueError` if it has no markers."""
+    begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+    content = path.read_text(encoding="utf-8")
+    if content.count(begin) != 1 or content.count(end) != 1:
+        raise ValueError(f"{path.name} needs the lines {begin} and {end}, once each, where the table is to go.")
+    before, rest = content.split(begin)
+    _, after = rest.split(end)
+    path.write_text(f"{before}{begin}\n{text}\n{end}{after}", encoding="utf-8")

@@ -1,0 +1,57 @@
+"""Times of functions within one process: the first call apart from later ones, of which the median counts."""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+
+class Timed(NamedTuple):
+    """Median seconds of a call, what the first call took beyond it (compilation), and the last call's answer."""
+
+    median: float
+    compile: float
+    answer: Any
+
+
+def timed(function: Callable[[], Any], rounds: int, budget: float = float("inf")) -> Timed:
+    """Call once, then `rounds` times, or fewer (at least once) if those take more than `budget` seconds.
+
+    What JAX computes is waited for.
+    """
+    import jax
+
+    spent: list[float] = []
+    answer = None
+    for _ in range(rounds + 1):
+        start = time.perf_counter()
+        answer = jax.block_until_ready(function())
+        spent.append(time.perf_counter() - start)
+        if len(spent) > 1 and sum(spent[1:]) > budget:
+            break
+    middle = statistics.median(spent[1:])
+    return Timed(middle, max(spent[0] - middle, 0.0), answer)
+
+
+def least_times(functions: dict[str, Callable[[], Any]], repeats: int = 15, budget: float = 4.0) -> dict[str, float]:
+    """Least time in seconds of each function, the repeats interleaved, no more of them than fit in `budget` seconds.
+
+    For choosing the fastest of several ways, not for figures.
+    """
+    least, start = dict.fromkeys(functions, float("inf")), time.perf_counter()
+    for _ in range(repeats):
+        for name, function in functions.items():
+            begin = time.perf_counter()
+            function()
+            least[name] = min(least[name], time.perf_counter() - begin)
+        if time.perf_counter() - start > budget:
+            break
+    return least
+
+
+def say(text: str) -> None:
+    """Progress, apart from the report."""
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,81 @@
+"""The benchmarks' one command: the list, what it refuses, and that a case that fails does not lose the others."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from benchmarks import __main__ as command
+from benchmarks.cases import NAMES, load
+from benchmarks.harness.case import MISSED, Asked, Options, Result, Table
+from benchmarks.harness.run_case import CaseFailedError, run_apart, run_here
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_cases_are_listed_with_a_line_each(capsys):
+    assert command.main([]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == list(NAMES)
+    for name in NAMES:
+        case = load(name)
+        assert case.name == name
+        assert "\n" not in case.description
+        assert case.minutes > 0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["nonsense"],
+        ["--write"],
+        ["--all", "--write", "--quick"],
+        ["--all", "startup"],
+        ["startup", "--nodes", "9", "--write"],
+    ],
+)
+def test_refuses_what_cannot_be_kept(arguments, capsys):
+    with pytest.raises(SystemExit):
+        command.main(arguments)
+    assert "error" in capsys.readouterr().err
+
+
+def test_a_case_that_fails_does_not_lose_the_others(monkeypatch, capsys):
+    ran = []
+
+    def apart(name, options):
+        ran.append(name)
+        if name == "solver":
+            raise CaseFailedError("solver ended with exit code 1")
+        return Result([Table(["what"], [[name]])], [Asked("as quick as that", "slower", MISSED)])
+
+    monkeypatch.setattr(command, "run_apart", apart)
+    monkeypatch.setattr(command.machine, "use_cores", lambda: None)
+    assert command.main(["ktc2023", "solver", "design_figures", "startup"]) == 1
+    # Those that tell times come first and alone.
+    assert ran[:2] == ["solver", "startup"]
+    assert set(ran[2:]) == {"ktc2023", "design_figures"}
+    told = capsys.readouterr()
+    assert "| startup |" in told.out
+    assert "solver ended" in told.err
+    assert "startup: missed: as quick as that: slower" in told.err
+
+
+def test_a_quick_case_is_measured_and_not_judged():
+    result = run_here("startup", Options(quick=True))
+    assert [one.verdict for one in result.asked] == ["not judged", "not measured"]
+    assert result.seconds > 0
+    assert Result.from_dict(result.as_dict()) == result
+
+
+def test_a_case_in_a_process_of_its_own_may_fail():
+    with pytest.raises(CaseFailedError, match="nonsense ended with exit code 1"):
+        run_apart("nonsense", Options(quick=True))
+
+
+def test_nothing_reaches_into_the_tests():
+    for path in (ROOT / "benchmarks").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not [name for name in names if name.split(".")[0] == "tests"], path
