@@ -53,7 +53,7 @@ class AbstractElectrodes(eqx.Module):
     """Base of all electrodes: something that turns itself and a mesh into contact integrals."""
 
     contact_impedance: eqx.AbstractVar[Float[Array, " L"]]
-    """(L,) ohm·m² (ohm·m for arcs on the edge of a sheet). Point electrodes have none, and raise `ValueError`."""
+    """(L,) ohm·m² (ohm·m for arcs on the edge of a sheet). Point electrodes have none: `AttributeError`."""
 
     @property
     @abc.abstractmethod
@@ -143,8 +143,8 @@ class AbstractPointElectrodes(AbstractElectrodes):
 
     @property
     def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Raises `ValueError`: there is none."""
-        raise ValueError(f"{type(self).__name__} have no contact impedance.")
+        """Raises `AttributeError`: there is none."""
+        raise AttributeError(f"{type(self).__name__} have no contact impedance.")
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractElectrodes:
         """Raises `ValueError`: there is none."""

@@ -35,8 +35,8 @@ class IntegratedElectrodes(AbstractElectrodes):
 
     @property
     def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Raises `ValueError`: it is in the integrals."""
-        raise ValueError("IntegratedElectrodes hold integrals only; ask the electrodes that they were made of.")
+        """Raises `AttributeError`: it is in the integrals."""
+        raise AttributeError("IntegratedElectrodes hold integrals only; ask the electrodes that they were made of.")
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractElectrodes:
         """Raises `ValueError`: it is in the integrals."""
