@@ -22,29 +22,43 @@ def commands(app: Any, path: str = "jeit") -> Iterator[tuple[str, Callable]]:
         yield from commands(one.typer_instance, f"{path} {one.name or one.typer_instance.info.name}")
 
 
-def _row(name: str, annotation: Any, default: Any) -> str:
-    kind, info = get_args(annotation)[:2]
-    plain = next((one for one in (get_args(kind) or (kind,)) if one is not NoneType), str)
-    value = info.metavar or _VALUES.get(getattr(plain, "__name__", ""), name.upper())
+def _plain(annotation: Any) -> Any:
+    """The type of a parameter, without None."""
+    kind = get_args(annotation)[0]
+    return next((one for one in (get_args(kind) or (kind,)) if one is not NoneType), str)
+
+
+def _options(name: str, annotation: Any) -> tuple[str, ...]:
+    """What an option may be called; nothing for an argument."""
+    info = get_args(annotation)[1]
     if type(info).__name__ == "ArgumentInfo":
-        shown = f"`{info.metavar or name.upper()}`"
-    else:
-        # In an annotation Typer takes the first of the names given for the default.
-        first = (info.default,) if isinstance(info.default, str) else ()
-        options = (*first, *(info.param_decls or ())) or (f"--{name.replace('_', '-')}",)
-        shown = ", ".join(f"`{option}`" if plain is bool else f"`{option} {value}`" for option in options)
-    told = (
-        "required"
-        if default is inspect.Parameter.empty
-        else ""
-        if default is None or default is False
-        else f"`{default}`"
-    )
-    return (
-        "| "
-        + " | ".join(" ".join(str(cell or "").split()).replace("|", "\\|") for cell in (shown, info.help, told))
-        + " |"
-    )
+        return ()
+    # In an annotation Typer takes the first of the names given for the default.
+    first = (info.default,) if isinstance(info.default, str) else ()
+    return (*first, *(info.param_decls or ())) or (f"--{name.replace('_', '-')}",)
+
+
+def _annotations(function: Callable) -> dict[str, Any]:
+    hints = get_type_hints(function, include_extras=True)
+    return {
+        name: hints[name] for name in inspect.signature(function).parameters if hasattr(hints[name], "__metadata__")
+    }
+
+
+def parameters(function: Callable) -> tuple[dict[str, bool], int]:
+    """The names of a command's options, each with whether it takes a value; and how many arguments there are."""
+    annotations = _annotations(function)
+    options = {one: _plain(kind) is not bool for name, kind in annotations.items() for one in _options(name, kind)}
+    return options, sum(not _options(name, kind) for name, kind in annotations.items())
+
+
+def _row(name: str, annotation: Any, default: Any) -> str:
+    info, plain, options = get_args(annotation)[1], _plain(annotation), _options(name, annotation)
+    value = info.metavar or _VALUES.get(getattr(plain, "__name__", ""), name.upper())
+    shown = ", ".join(f"`{option}`" if plain is bool else f"`{option} {value}`" for option in options)
+    told = "required" if default is inspect.Parameter.empty else "" if default is None or default is False else default
+    cells = (shown or f"`{info.metavar or name.upper()}`", info.help, told)
+    return "| " + " | ".join(" ".join(str(cell).split()).replace("|", "\\|") for cell in cells) + " |"
 
 
 def page() -> str:
@@ -53,13 +67,8 @@ def page() -> str:
 
     lines = [_HEAD]
     for path, function in commands(app):
-        hints = get_type_hints(function, include_extras=True)
-        parameters = inspect.signature(function).parameters
-        rows = [
-            _row(name, hints[name], one.default)
-            for name, one in parameters.items()
-            if hasattr(hints[name], "__metadata__")
-        ]
+        defaults = inspect.signature(function).parameters
+        rows = [_row(name, kind, defaults[name].default) for name, kind in _annotations(function).items()]
         head = ["| argument or option | what it is | default |", "|---|---|---|"]
         lines += [f"## {path}", "", inspect.getdoc(function) or "", "", *head, *rows, ""]
     return "\n".join(lines)

@@ -57,7 +57,10 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 def measurement_from(
     path: Path, described: Description, frames: np.ndarray, protocol: Protocol | None, mask: np.ndarray | None
 ) -> Measurement:
-    """Screen frames (F, M) in file units under a description. `protocol` is the file's own, if it has one."""
+    """Screen frames (F, M) in file units under a description. `protocol` is the file's own, if it has one.
+
+    Raises `ValueError` where neither has a protocol, for another number of frames than are named, and as `screen` does.
+    """
     protocol = protocol or described.protocol(path)
     if protocol is None:
         raise ValueError(
@@ -83,7 +86,10 @@ def measurement_from(
 
 
 def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:
-    """Frames (F, M), in file units, of a table laid out as described."""
+    """Frames (F, M), in file units, of a table laid out as described.
+
+    Raises `ValueError` if pairs of real and imaginary rows or columns do not come out even.
+    """
     frames = table.T if table.ndim == 2 and layout.frames_in == "columns" else np.atleast_2d(table)
     if layout.complex_pairs:
         if len(frames) % 2:
