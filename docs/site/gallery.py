@@ -2,7 +2,8 @@
 
 `python docs/site/gallery.py` makes the pictures that are not there yet (minutes); as a hook of mkdocs this does so too,
 and adds the page. Pictures are kept in `.cache/gallery`, each under a name that changes with the example, with any file
-of jeit and with the versions of the libraries beneath: no picture outlives the code that made it.
+of jeit and with the versions of the libraries beneath: no picture outlives the code that made it. While
+pages are written, JEIT_GALLERY=kept takes what is kept, of older code too.
 """
 
 import ast
@@ -64,8 +65,9 @@ def keep(example: Path, folder: Path) -> Path:
 def make(example: Path) -> Path:
     """The picture of an example, made by running it if it is not kept. Raises `RuntimeError` if the example fails."""
     kept = picture(example)
-    if kept.is_file():
-        return kept
+    older = sorted(CACHE.glob(f"{example.stem}-*.png")) if os.environ.get("JEIT_GALLERY") == "kept" else []
+    if kept.is_file() or older:
+        return kept if kept.is_file() else older[-1]
     print(f"gallery: {example.name}", file=sys.stderr, flush=True)
     paths = [str(ROOT), str(ROOT / "solvers"), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "MPLBACKEND": "Agg", "PYTHONPATH": os.pathsep.join(filter(None, paths))}

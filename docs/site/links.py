@@ -1,6 +1,7 @@
 """Links that guides do not write: names in code style lead to the reference, files outside `docs/` to their pages."""
 
 import re
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -14,17 +15,22 @@ OUTSIDE = {
     "benchmarks/RESULTS.md": "results.md",
 }
 _CODE = re.compile(r"<(a|h\d|pre|autoref)\b.*?</\1>|<code>([A-Za-z_][\w.]*)((?:\([^<]*\))?)</code>", re.DOTALL)
-_LINK = re.compile(r"\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
+_LINK = re.compile(r"(?<!!)\[([^\]\n]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
 
 
 @cache
 def _targets() -> dict[str, str]:
-    """What a name in code style may be short for: its home, where only one room exports a name that is so called."""
+    """What a name in code style may be short for: its home, where one thing alone is so called.
+
+    What rooms export comes first; of the rest only names that are no common words.
+    """
     rooms = [package for package in reference.packages() if package.path not in ("jeit", "jeit.cli")]
-    homes = {
-        name: {one.exports[name].home for one in rooms if name in one.exports} for r in rooms for name in r.exports
-    }
-    short = {name: homes_of.pop() for name, homes_of in homes.items() if len(homes_of) == 1}
+    exported = {(one.last, one.home) for room in rooms for one in room.exports.values()}
+    rest = {(home.rpartition(".")[2], home) for home in reference.described()}
+    short: dict[str, str] = {}
+    for names in ({one for one in rest if not one[0].islower() or "_" in one[0]}, exported):
+        times = Counter(name for name, _ in names)
+        short |= {name: home for name, home in names if times[name] == 1}
     whole = {f"{one.path}.{name}": entry.home for one in reference.packages() for name, entry in one.exports.items()}
     return {**{home: home for home in reference.described()}, **whole, **short}
 
@@ -39,19 +45,31 @@ def on_files(files, config):
     return files
 
 
+def on_config(config):
+    """Put the pages that stand outside `docs/` into the menu, those that there are."""
+    there = [page for path, page in OUTSIDE.items() if (ROOT / path).is_file() and page != "changelog.md"]
+    for entry in config.nav:
+        if isinstance(entry, dict) and "Benchmarks" in entry:
+            entry["Benchmarks"] = there
+    return config
+
+
 def on_page_markdown(markdown, page, config, files):
-    """Lead links to files outside `docs/` to the pages of the site that show them."""
+    """Lead links to files outside `docs/` to the pages that show them; where none does, leave the link's words."""
     inside = {page: path for path, page in OUTSIDE.items()}
-    here = ROOT / inside.get(page.file.src_uri, f"docs/{page.file.src_uri}")
+    uri = page.file.src_uri
+    here = ROOT / inside.get(uri, f"docs/{uri}")
 
     def moved(match: re.Match) -> str:
-        path = (here.parent / match[1]).resolve()
+        words, anchor, path = match[1], match[3] or "", (here.parent / match[2]).resolve()
         told = path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else ""
-        if told.startswith("docs/") and page.file.src_uri in inside:
-            return f"]({told.removeprefix('docs/')}{match[2] or ''})"
-        return f"]({OUTSIDE[told]}{match[2] or ''})" if told in OUTSIDE else match[0]
+        if told.startswith("docs/"):
+            return f"[{words}]({told.removeprefix('docs/')}{anchor})" if uri in inside else match[0]
+        if told in OUTSIDE and path.is_file():
+            return f"[{words}]({OUTSIDE[told]}{anchor})"
+        return words if path.exists() else match[0]
 
-    return markdown if page.file.src_uri.startswith("api/") else _LINK.sub(moved, markdown)
+    return markdown if uri.startswith("api/") else _LINK.sub(moved, markdown)
 
 
 def on_page_content(html, page, config, files):

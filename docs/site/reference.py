@@ -51,15 +51,18 @@ def _first_sentence(text: str | None) -> str:
 
 
 def _defined(path: Path) -> Iterator[tuple[str, str]]:
-    """Public names that a module defines at its top, each with its docstring, or a constant's comment above it."""
+    """Public names that a module defines at its top, each with its docstring, or what stands by a constant."""
     lines = path.read_text("utf-8").split("\n")
-    for node in ast.parse("\n".join(lines)).body:
+    body = ast.parse("\n".join(lines)).body
+    for node, after in zip(body, [*body[1:], None], strict=True):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             found = [(node.name, ast.get_docstring(node) or "")]
         elif isinstance(node, ast.Assign | ast.AnnAssign):
             targets = node.targets if isinstance(node, ast.Assign) else [node.target]
             above = lines[node.lineno - 2] if node.lineno > 1 else ""
             said = above.lstrip("# ") if above.startswith("# ") else ""
+            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+                said = str(after.value.value)
             found = [(target.id, said) for target in targets if isinstance(target, ast.Name)]
         else:
             continue
