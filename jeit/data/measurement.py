@@ -134,7 +134,7 @@ class Measurement(eqx.Module):
     def masked(self, usable, reason: str) -> "Measurement":
         """The same measurement with fewer usable channels.
 
-        `usable` is boolean, (M,) or (F, M); `reason` goes into the notes. Raises `ValueError` for another shape.
+        `usable` is boolean, (M,) or (F, M); `reason` goes into the notes.
         """
         extra = jnp.asarray(usable)
         if extra.dtype != bool or extra.shape not in ((self.num_channels,), self.mask.shape):

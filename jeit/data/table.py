@@ -57,10 +57,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 def measurement_from(
     path: Path, described: Description, frames: np.ndarray, protocol: Protocol | None, mask: np.ndarray | None
 ) -> Measurement:
-    """Screen frames (F, M) in file units under a description. `protocol` is the file's own, if it has one.
-
-    Raises `ValueError` where neither has a protocol, for another number of frames than are named, and as `screen` does.
-    """
+    """Screen frames (F, M) in file units under a description. `protocol` is the file's own, if it has one."""
     protocol = protocol or described.protocol(path)
     if protocol is None:
         raise ValueError(
@@ -86,10 +83,7 @@ def measurement_from(
 
 
 def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:
-    """Frames (F, M), in file units, of a table laid out as described.
-
-    Raises `ValueError` if pairs of real and imaginary rows or columns do not come out even.
-    """
+    """Frames (F, M), in file units, of a table laid out as described."""
     frames = table.T if table.ndim == 2 and layout.frames_in == "columns" else np.atleast_2d(table)
     if layout.complex_pairs:
         if len(frames) % 2:

@@ -11,7 +11,7 @@ from jeit.mesh import Mesh, gradients, measures
 
 
 def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
-    """Conductivity per cell, (m,) or tensor (m, d, d), from a per-cell, per-node or tensor conductivity, S/m (2-D: S).
+    """Conductivity per cell, (m,) or tensor (m, d, d), from a per-cell, per-node or tensor conductivity.
 
     A conductivity given per node is linear in each cell; as P1 gradients are constant there, its mean over the
     cell's nodes is exact.

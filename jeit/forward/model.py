@@ -49,10 +49,7 @@ class ForwardModel(eqx.Module):
         self.system = System.create(mesh, electrodes, solver)
 
     def with_electrodes(self, electrodes: AbstractElectrodes) -> "ForwardModel":
-        """The same model with other electrodes of the same kind; their number may not change. Works under jit.
-
-        Raises `ValueError` for another kind or number, and for electrodes that the mesh cannot hold.
-        """
+        """The same model with other electrodes of the same kind; their number may not change. Works under jit."""
         if type(electrodes) is not type(self.electrodes):
             raise ValueError(
                 f"with_electrodes needs {type(self.electrodes).__name__}, not {type(electrodes).__name__}; make a new "
@@ -62,7 +59,7 @@ class ForwardModel(eqx.Module):
         return eqx.tree_at(lambda model: model.electrodes, self, electrodes)
 
     def with_protocol(self, protocol: Protocol) -> "ForwardModel":
-        """The same model with another protocol. Raises `ValueError` if it is for another number of electrodes."""
+        """The same model with another protocol for the same electrodes."""
         _check(self.mesh, self.electrodes, protocol)
         return eqx.tree_at(lambda model: model.protocol, self, protocol)
 
@@ -86,10 +83,7 @@ class ForwardModel(eqx.Module):
         return self.voltages_and_jacobian(conductivity)[1]
 
     def voltages_and_jacobian(self, conductivity) -> tuple[Inexact[Array, " M"], Inexact[Array, "M m"]]:
-        """`voltages` and `jacobian` from one factorisation and one solve per electrode.
-
-        `conductivity` as in `jacobian`. Raises `ValueError` for tensors, and as `voltages` does.
-        """
+        """`voltages` and `jacobian` from one factorisation and one solve per electrode."""
         conductivity = check_conductivity(self.mesh, conductivity)
         if conductivity.ndim == 3:
             raise ValueError(

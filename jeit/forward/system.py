@@ -34,10 +34,7 @@ class System(eqx.Module):
 
     @classmethod
     def create(cls, mesh: Mesh, electrodes: AbstractElectrodes, solver: str | lx.AbstractLinearSolver = "auto"):
-        """`solver`: "auto" (by predicted work and memory), "cholesky", "cg", or any lineax solver.
-
-        Raises `ValueError` for another name.
-        """
+        """`solver`: "auto" (by predicted work and memory), "cholesky", "cg", or any lineax solver."""
         groups = [np.asarray(nodes) for nodes in (mesh.cells, *electrodes.contact_nodes(mesh))]
         pattern = SparsityPattern.from_elements(groups, size=mesh.num_points)
         if isinstance(solver, str):

@@ -26,8 +26,7 @@ from jeit_solvers import NearInverse, Strips, near_inverse, symmetric_inverse
 def transfer_impedance(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
     """Transfer impedance Z (L, L) in ohms: electrode potentials U = Z I for currents I that sum to zero.
 
-    Rows and columns of Z sum to zero, i.e. the mean electrode potential is the reference. Symmetric. `conductivity` per
-    cell (m,), per node (n,) or as tensors (m, d, d), S/m (2-D: S).
+    Rows and columns of Z sum to zero, i.e. the mean electrode potential is the reference. Symmetric.
     """
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
@@ -49,8 +48,7 @@ def _transfer_impedance_jvp(primals, tangents):
 def electrode_fields(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
     """Potentials F (n, L) for a unit current into each electrode, leaving evenly through all; and Z (L, L).
 
-    Volts per ampere; `conductivity` as in `transfer_impedance`. Differentiable by the implicit rule of the linear
-    solve (one more solve per direction).
+    Volts per ampere. Differentiable by the implicit rule of the linear solve (one more solve per direction).
     """
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
@@ -69,8 +67,7 @@ def fields_and_inverse(
     """F at places of strips of the nodes, and K⁻¹ between them, up to `reach` strips apart, ohms, but for a constant.
 
     K is the matrix of the electrode model with all electrodes floating: the potential at one node for a unit current
-    into another. What it leaves open, a constant, no change of conductivity sees. `conductivity` as in
-    `transfer_impedance`.
+    into another. What it leaves open, a constant, no change of conductivity sees.
     """
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)

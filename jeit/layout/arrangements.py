@@ -39,8 +39,7 @@ def perimeter(domain: Domain, num_electrodes: int, *, start: float = 0.0) -> np.
     """Positions evenly spaced along the edge of an outline, counter-clockwise: (L, 2) metres.
 
     `start`: arc length of the first electrode in metres, counted as in `domain.boundary` (a rectangle begins at its
-    lower left corner; half a pitch keeps electrodes off the corners when L is a multiple of four). Raises `ValueError`
-    for fewer than two electrodes.
+    lower left corner; half a pitch keeps electrodes off the corners when L is a multiple of four).
     """
     _check_count(num_electrodes, 2)
     arc_length = start + domain.perimeter * np.arange(num_electrodes) / num_electrodes
@@ -50,10 +49,7 @@ def perimeter(domain: Domain, num_electrodes: int, *, start: float = 0.0) -> np.
 def grid(
     width: float, height: float, columns: int, rows: int, *, centre: tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
-    """A regular grid of rows × columns positions that spans width × height metres, row by row from the lower left.
-
-    Raises `ValueError` for a size or a number that is not positive.
-    """
+    """A regular grid of rows × columns positions that spans width × height metres, row by row from the lower left."""
     _check_count(columns, 1)
     _check_count(rows, 1)
     if not (width > 0 or columns == 1) or not (height > 0 or rows == 1):

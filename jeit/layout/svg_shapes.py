@@ -11,7 +11,7 @@ ROUND = ("circle", "ellipse")
 
 
 def transform_of(element: ElementTree.Element) -> np.ndarray:
-    """The matrix (2, 3) of an element's transform. Raises `ValueError` for a transform that is not known."""
+    """The matrix (2, 3) of an element's transform."""
     text, found = element.get("transform", "").strip(), np.eye(2, 3)
     if re.fullmatch(r"(\w+\s*\([^()]*\)[\s,]*)*", text) is None:
         raise ValueError(f"transform of {described(element)} is {text!r}, not a list of transforms.")
@@ -64,7 +64,7 @@ def number_of(element: ElementTree.Element, name: str, text: str | None) -> floa
 
 
 def disc_of(element: ElementTree.Element, to: np.ndarray) -> tuple[float, float, float]:
-    """Centre and radius of a circle in metres, y up. Raises `ValueError` if the element is none, as it is drawn."""
+    """Centre and radius of a circle in metres, y up."""
     if tag_of(element) not in ROUND:
         raise ValueError(f"{described(element)} stands where a circle should: electrodes are circles.")
     x, y = (number_of(element, name, element.get(name, "0")) for name in ("cx", "cy"))

@@ -24,7 +24,6 @@ from jeit.forward.exact.disk import ConductingDisk
 def disc_contact_resistance(conductivity: complex, radius: float, contact_impedance: complex) -> complex:
     """U − u on the disc's edge, in volts, per ampere fed into the disc: λ I_0(b/λ) / (2πσb I_1(b/λ)).
 
-    λ = √(σz) of sheet conductivity σ in S and contact impedance z in ohm·m²; b is the radius in metres.
     As b/λ → 0 this is z/(πb²), a contact fed uniformly; as b/λ → ∞ it is that of a ring of width λ.
     """
     transfer_length = np.sqrt(conductivity * contact_impedance)

@@ -28,8 +28,7 @@ def draw_electrodes(
     """Draw `electrodes` seen from above, and their numbers, counted from `first`, beside them.
 
     Arcs are drawn along the boundary of `mesh`, discs and patches at their size, points as dots. Numbers stand outside
-    the outline for electrodes on the edge of a 2-D mesh, on the electrode elsewhere. Raises `ValueError` for a kind of
-    electrode that it does not know.
+    the outline for electrodes on the edge of a 2-D mesh, on the electrode elsewhere.
     """
     ax = axes_or_new(ax)
     if isinstance(electrodes, CombinedElectrodes):

@@ -106,8 +106,7 @@ def plot_raster(
     """Draw a raster (rows, columns), row 0 at the top, NaN left blank; arguments as in `plot_image`.
 
     `extent`: (x_min, x_max, y_min, y_max) in metres. `mesh`: the mesh it was sampled from, for its
-    outline and the `electrodes`. Raises `ValueError` for a raster without a finite value, and for electrodes without
-    a mesh.
+    outline and the `electrodes`.
     """
     pixels = np.asarray(raster)
     shown = pixels[np.isfinite(pixels)]

@@ -15,7 +15,6 @@ def plot_sensitivity(
 
     Divided by the cell's area (3-D: volume), so that it does not show the mesh. `conductivity` as in
     `model.voltages`, scalar or per cell. `height` as in `plot_image`.
-    Raises `ValueError` for a conductivity per node.
     """
     jacobian = np.asarray(model.jacobian(conductivity))
     if jacobian.shape[1] != model.mesh.num_cells:
