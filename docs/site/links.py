@@ -32,7 +32,8 @@ def _targets() -> dict[str, str]:
         times = Counter(name for name, _ in names)
         short |= {name: home for name, home in names if times[name] == 1}
     whole = {f"{one.path}.{name}": entry.home for one in reference.packages() for name, entry in one.exports.items()}
-    return {**{home: home for home in reference.described()}, **whole, **short}
+    paths = [*reference.described(), *(package.path for package in reference.packages())]
+    return {**whole, **{path: path for path in paths}, **short}
 
 
 def on_files(files, config):

@@ -141,7 +141,7 @@ def described() -> dict[str, str]:
 
 def page(package: Package) -> str:
     """The page of a room, as Markdown for mkdocstrings."""
-    lines = [f"# {package.path}", "", package.docstring, ""]
+    lines = [f"# {package.path} {{ #{package.path} }}", "", package.docstring, ""]
     own = [name for name in package.exports.values() if described()[name.home] == package.path]
     if package.exports:
         lines += ["| name | what it is |", "|---|---|"]
@@ -149,7 +149,10 @@ def page(package: Package) -> str:
         lines += [""]
     for name, one in package.exports.items():
         if one in own:
-            lines += [f"[](){{#{package.path}.{name}}}", "", f"::: {one.home}", ""]
+            rooms = {other.path for other in packages()}
+            anchor = f"{package.path}.{name}"  # how users import it; a room may have that name itself
+            lines += [] if anchor in rooms | {one.home} else [f"[](){{#{anchor}}}", ""]
+            lines += [f"::: {one.home}", ""]
     below = [one for one in packages() if one.path.rpartition(".")[0] == package.path]
     if below:
         lines += ["## Rooms", "", "| room | what is in it |", "|---|---|"]
@@ -161,7 +164,7 @@ def page(package: Package) -> str:
         rest = [one for one in names.values() if described()[one.home] == package.path and one not in own]
         if rest:
             docstring = ast.get_docstring(ast.parse(_file(module).read_text("utf-8"))) or ""
-            lines += [f"## {module}", "", docstring, ""]
+            lines += [f"## {module} {{ #{module} }}", "", docstring, ""]
             for one in rest:
                 lines += [f"::: {one.home}", "    options:", "      heading_level: 3", ""]
     return "\n".join(lines)
