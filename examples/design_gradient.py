@@ -1,10 +1,11 @@
-"""The gradient of a voltage with respect to where the electrodes are, checked by moving one of them."""
+"""The gradient of a voltage in where electrodes are, checked by moving one of them; see `design_gradient.png`."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, ring
+from jeit.plot import plot_mesh
 
 
 def main() -> float:
@@ -19,6 +20,11 @@ def main() -> float:
     gradient = jax.grad(first_voltage)(position)
     step = 1e-6 * jnp.zeros_like(position).at[0, 0].set(1.0)  # one micrometre, electrode 1, along x
     difference = (first_voltage(position + step) - first_voltage(position - step)) / 2e-6
+
+    ax = plot_mesh(mesh, model.electrodes, title="Where to move electrodes for a greater first voltage")
+    arrows = 0.012 * gradient / jnp.linalg.norm(gradient, axis=1).max()  # metres, the longest 12 mm
+    ax.quiver(*position.T, *arrows.T, angles="xy", scale_units="xy", scale=1, color="#157f3b", width=0.008, zorder=5)
+    ax.figure.savefig("design_gradient.png")
     return float(abs(gradient[0, 0] / difference - 1))
 
 

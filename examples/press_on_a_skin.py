@@ -1,4 +1,4 @@
-"""A press on a simulated skin, imaged in a few lines: run it, and see `press_on_a_skin.png`."""
+"""A press on a simulated skin, imaged in a few lines; see `press_on_a_skin.png`."""
 
 import jax
 import numpy as np

@@ -3,10 +3,8 @@
 import csv
 import json
 
-import matplotlib
 import numpy as np
 import pytest
-from pages import run_page
 from scipy.io import wavfile
 
 from jeit.acoustic import (
@@ -210,20 +208,6 @@ def test_exchanged_microphones_are_named(folder, tmp_path):
     )
     notes = " ".join(json.loads((tmp_path / "report.json").read_text("utf-8"))["notes"])
     assert "2 and 6" in notes
-
-
-@pytest.mark.slow
-def test_the_documentation_runs(tmp_path, monkeypatch):
-    """Every block of Python of the page, one after the other."""
-    matplotlib.use("Agg")
-    monkeypatch.chdir(tmp_path)
-    names = run_page("hearing.md")
-    assert len(names["path"].touches) == 3
-    assert (
-        names["jacobian"].shape
-        == names["power"].shape[:1] + names["fit"].calibration.microphone_array.microphones.shape
-    )
-    assert (tmp_path / "track.png").stat().st_size > 10_000
 
 
 def _bad_files(folder):

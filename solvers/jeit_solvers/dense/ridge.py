@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from jeit_solvers.dense.cholesky import inverse_cholesky
 
+# The cost at a point, and a function of the damping that gives a step from there with its slope and curvature.
 QuadraticModel = tuple[Float[Array, ""], Callable[[Any], tuple[Float[Array, " n"], Float[Array, ""], Float[Array, ""]]]]
 
 

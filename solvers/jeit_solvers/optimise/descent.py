@@ -56,7 +56,7 @@ class Descent(optx.AbstractLeastSquaresSolver):
     norm: Callable[..., Any] = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """The first point to try is the start."""
+        """The first point to try is the start. Raises `ValueError` if the options lack `expand`."""
         if "expand" not in options:
             raise ValueError("Descent needs options={'expand': function}; see its documentation.")
         zero, number = jnp.zeros((), y.dtype), jnp.zeros((), int)

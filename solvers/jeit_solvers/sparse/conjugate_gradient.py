@@ -19,6 +19,8 @@ class ConjugateGradient(lineax.AbstractLinearSolver[SparseSymmetric]):
     Reports `RESULTS.max_steps_reached` if it runs out of steps, `RESULTS.breakdown` if it meets a direction p with
     p^T A p <= 0, which a positive definite matrix does not have. Complex symmetric systems are solved by the conjugate
     orthogonal variant, with p^T in place of p^* (van der Vorst and Melissen, IEEE Trans. Magn. 26, 1990).
+
+    Raises `ValueError` for a tolerance that is not between 0 and 1, and for less than one step.
     """
 
     tolerance: float = 1e-10
@@ -61,6 +63,7 @@ class ConjugateGradient(lineax.AbstractLinearSolver[SparseSymmetric]):
         return SparseSymmetric(state.values.conj(), state.pattern), options
 
     def assume_full_rank(self) -> bool:
+        """Yes: a positive definite matrix has full rank."""
         return True
 
 

@@ -41,7 +41,7 @@ class IndexStore:
         return slot
 
     def pack(self) -> Int[Array, " total"]:
-        """All arrays in one."""
+        """All arrays in one. Raises `ValueError` if there are more indices than 32 bits can count."""
         if self._total > np.iinfo(np.int32).max:
             raise ValueError(
                 f"The plan needs {self._total} indices, more than 32-bit integers can count: the matrix fills in too "

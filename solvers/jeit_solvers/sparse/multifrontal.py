@@ -47,6 +47,7 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
 
     Real values must make a positive definite matrix. Complex ones make a complex *symmetric* matrix, whose real part
     must be positive definite (an admittivity). If they do not, the factor is NaN and `positive_definite` is false.
+    Raises `ValueError` for values of another shape.
     """
     if values.shape != (plan.num_entries,):
         raise ValueError(
@@ -82,7 +83,7 @@ def _factorise(layout: IndexLayout, indices: Int[Array, " total"], values: Inexa
 
 
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-    """x with A x = b, for one right-hand side (n,) or several (n, k) at once."""
+    """x with A x = b, for one right-hand side (n,) or several (n, k) at once; raises `ValueError` for other shapes."""
     vectors = _columns(plan, right_hand_sides, "solve")
     numeric = differentiable_batches(partial(_solve, plan.layout), _batch_of_solves)
     return numeric(plan.indices, factor, vectors).reshape(right_hand_sides.shape)
@@ -111,7 +112,7 @@ def half_solve(
 ) -> Inexact[Array, "rows k"]:
     """Y = L^-1 P b, rows in the order of elimination and with rows of zeros for padding: Y^T Y = b^T A^-1 b.
 
-    Half the work of `solve`, if products with the inverse are all that is wanted.
+    Half the work of `solve`, if products with the inverse are all that is wanted. Raises `ValueError` for other shapes.
     """
     reduced = _forward(plan.layout, plan.indices, factor, _columns(plan, right_hand_sides, "half_solve"))
     return jnp.concatenate([rows.reshape(-1, rows.shape[-1]) for rows in reduced])

@@ -13,7 +13,8 @@ class SparseSymmetric(lineax.AbstractLinearOperator):
     """The symmetric (n, n) matrix with the given values (nnz,) in a sparsity pattern.
 
     Real matrices are taken to be positive definite, as the solvers of this package need them. Complex ones are
-    symmetric, not Hermitian. Differentiable in `values`.
+    symmetric, not Hermitian. Differentiable in `values`. Raises `ValueError` for values of another shape than the
+    pattern's, or not floating point.
     """
 
     values: Inexact[Array, " nnz"]
@@ -32,18 +33,23 @@ class SparseSymmetric(lineax.AbstractLinearOperator):
         self.pattern = pattern
 
     def mv(self, vector: Inexact[Array, " n"]) -> Inexact[Array, " n"]:
+        """The product with a vector (n,)."""
         return self.pattern.multiply(self.values, vector)
 
     def as_matrix(self) -> Inexact[Array, "n n"]:
+        """The matrix with all its zeros, (n, n)."""
         return self.pattern.to_dense(self.values)
 
     def transpose(self) -> "SparseSymmetric":
+        """The matrix itself: it is symmetric."""
         return self
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
+        """Shape and kind of number of a vector to multiply."""
         return jax.ShapeDtypeStruct((self.pattern.size,), self.values.dtype)
 
     def out_structure(self) -> jax.ShapeDtypeStruct:
+        """Shape and kind of number of a product; the same, for the matrix is square."""
         return self.in_structure()
 
 

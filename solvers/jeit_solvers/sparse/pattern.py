@@ -171,6 +171,7 @@ class SparsityPattern(eqx.Module):
         One argument for each group the pattern was made from, in their order: symmetric matrices (m, k, k), of which
         only the lower triangles are read; or just these, packed as (k (k + 1) / 2, m), rows in the order of
         `numpy.tril_indices(k)`; or None, for a group that adds nothing this time. Real or complex.
+        Raises `ValueError` for another number of arguments, or if all are None.
         """
         if len(element_matrices) != len(self._assembly):
             raise ValueError(

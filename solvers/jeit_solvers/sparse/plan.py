@@ -85,7 +85,10 @@ def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationP
 
 
 def elimination_tree(pattern: SparsityPattern, coordinates: Any = None) -> EliminationTree:
-    """The tree that `analyse` makes a plan of; cheap, and enough to tell what the plan would cost."""
+    """The tree that `analyse` makes a plan of; cheap, and enough to tell what the plan would cost.
+
+    Raises `ValueError` for coordinates of another shape than (n, d), or not finite.
+    """
     if coordinates is not None:
         coordinates = np.asarray(coordinates, dtype=float)
         if coordinates.ndim != 2 or coordinates.shape[0] != pattern.size or coordinates.shape[1] < 1:

@@ -23,7 +23,7 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
     reason: str = eqx.field(static=True, default="chosen by the user")
 
     def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> Factor:
-        """Factorise the operator's matrix."""
+        """Factorise the operator's matrix. Raises `ValueError` if its pattern is not the plan's."""
         del options
         operator = require_sparse_symmetric(operator, "SparseCholesky")
         if (operator.pattern.size, operator.pattern.num_entries) != (self.plan.size, self.plan.num_entries):
@@ -50,4 +50,5 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
         return jax.tree.map(lambda block: block.conj(), state), options
 
     def assume_full_rank(self) -> bool:
+        """Yes: a positive definite matrix has full rank."""
         return True

@@ -1,8 +1,9 @@
-"""Every example runs, and its figure holds."""
+"""Every example runs, its figure holds, and its picture is kept for the gallery, which need not run it again."""
 
 import importlib.util
 from pathlib import Path
 
+import gallery
 import matplotlib
 import pytest
 
@@ -29,3 +30,4 @@ def test_example(name, tmp_path, monkeypatch):
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
     assert module.main() < MOST[name]
+    assert gallery.keep(FOLDER / f"{name}.py", tmp_path).stat().st_size > 10_000

@@ -1,0 +1,198 @@
+"""The API reference: a page for every room and sub-room, with every public name, found by reading the source.
+
+A name is public where neither it nor a module it is in begins with an underscore. A room's page has what its
+`__init__` exports, then what else its modules define; a constant is shown where a room exports it. Each name is
+described once: where it is exported, in the outermost of the rooms that do; else beside its module.
+As a hook of mkdocs this adds the pages and their places in the menu; nothing is written into `docs/`.
+"""
+
+import ast
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+TOPS = {"jeit": ROOT / "jeit", "jeit_solvers": ROOT / "solvers" / "jeit_solvers"}
+# The command line is described command by command, on a page of its own.
+_EXPORTS_ONLY = ("jeit.cli",)
+
+
+@dataclass(frozen=True)
+class Name:
+    """A public name: where it is defined, and the first sentence said of it."""
+
+    home: str
+    summary: str
+
+    @property
+    def last(self) -> str:
+        return self.home.rpartition(".")[2]
+
+
+@dataclass(frozen=True)
+class Package:
+    """A room, a sub-room, or the whole library: its names as `exports`, and those of its public `modules`."""
+
+    path: str
+    docstring: str
+    exports: dict[str, Name]
+    modules: dict[str, dict[str, Name]]
+
+    @property
+    def page(self) -> str:
+        """Where its page stands in the site."""
+        return f"api/{'/'.join(self.path.split('.'))}/index.md"
+
+
+def _first_sentence(text: str | None) -> str:
+    first = " ".join((text or "").split("\n\n")[0].split())
+    return (first.split(". ")[0].rstrip(".") if first else "").replace("|", "\\|")
+
+
+def _defined(path: Path) -> Iterator[tuple[str, str]]:
+    """Public names that a module defines at its top, each with its docstring, or what stands by a constant."""
+    lines = path.read_text("utf-8").split("\n")
+    body = ast.parse("\n".join(lines)).body
+    for node, after in zip(body, [*body[1:], None], strict=True):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            found = [(node.name, ast.get_docstring(node) or "")]
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            above = lines[node.lineno - 2] if node.lineno > 1 else ""
+            said = above.lstrip("# ") if above.startswith("# ") else ""
+            if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
+                said = str(after.value.value)
+            found = [(target.id, said) for target in targets if isinstance(target, ast.Name)]
+        else:
+            continue
+        yield from ((name, text) for name, text in found if not name.startswith("_"))
+
+
+def _imported(path: Path, top: str) -> Iterator[tuple[str, str]]:
+    """(name, module) of all that an `__init__` takes from its own library."""
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == top:
+            for alias in node.names:
+                name = alias.asname or alias.name
+                if not name.startswith("_"):
+                    yield name, f"{node.module}.{alias.name}"
+
+
+def _file(module: str) -> Path:
+    top, *parts = module.split(".")
+    path = TOPS[top].joinpath(*parts)
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+@cache
+def _home(dotted: str) -> Name:
+    """Where a name is defined that may have been imported from an `__init__` on the way."""
+    module, _, name = dotted.rpartition(".")
+    path = _file(module)
+    for found, text in _defined(path):
+        if found == name:
+            return Name(dotted, _first_sentence(text))
+    for found, source in _imported(path, module.split(".")[0]):
+        if found == name:
+            return _home(source)
+    raise ValueError(f"{dotted}: {path} neither defines nor imports '{name}'.")
+
+
+@cache
+def packages() -> tuple[Package, ...]:
+    """Every room and sub-room that is public, the library itself first, and what it has to show."""
+    found = []
+    for top, folder in TOPS.items():
+        for init in sorted(folder.rglob("__init__.py")):
+            parts = init.parent.relative_to(folder).parts
+            if any(part.startswith("_") for part in parts):
+                continue
+            path = ".".join((top, *parts))
+            modules = {}
+            for file in sorted(init.parent.glob("*.py")):
+                if not file.stem.startswith("_") and path not in _EXPORTS_ONLY:
+                    module = f"{path}.{file.stem}"
+                    names = [name for name, _ in _defined(file) if not name.isupper()]
+                    modules[module] = {name: _home(f"{module}.{name}") for name in names}
+            exports = {name: _home(source) for name, source in sorted(_imported(init, top), key=lambda one: one[0])}
+            exports |= {name: _home(f"{path}.{name}") for name, _ in _defined(init)}
+            inside_cli = any(path.startswith(f"{room}.") for room in _EXPORTS_ONLY)
+            if not inside_cli:
+                docstring = ast.get_docstring(ast.parse(init.read_text("utf-8"))) or ""
+                found.append(Package(path, docstring, exports, modules))
+    return tuple(found)
+
+
+@cache
+def described() -> dict[str, str]:
+    """The room or sub-room on whose page each public name is described, by where the name is defined."""
+    where: dict[str, str] = {}
+    rooms = [package for package in packages() if package.path != "jeit"]
+    for package in sorted(rooms, key=lambda one: one.path.count(".")):
+        for name in package.exports.values():
+            where.setdefault(name.home, package.path)
+    for package in rooms:
+        for names in package.modules.values():
+            for name in names.values():
+                where.setdefault(name.home, package.path)
+    return where
+
+
+def page(package: Package) -> str:
+    """The page of a room, as Markdown for mkdocstrings."""
+    lines = [f"# {package.path} {{ #{package.path} }}", "", package.docstring, ""]
+    own = [name for name in package.exports.values() if described()[name.home] == package.path]
+    if package.exports:
+        lines += ["| name | what it is |", "|---|---|"]
+        lines += [f"| [`{name}`][{one.home}] | {one.summary} |" for name, one in package.exports.items()]
+        lines += [""]
+    for name, one in package.exports.items():
+        if one in own:
+            rooms = {other.path for other in packages()}
+            anchor = f"{package.path}.{name}"  # how users import it; a room may have that name itself
+            lines += [] if anchor in rooms | {one.home} else [f"[](){{#{anchor}}}", ""]
+            lines += [f"::: {one.home}", ""]
+    below = [one for one in packages() if one.path.rpartition(".")[0] == package.path]
+    if below:
+        lines += ["## Rooms", "", "| room | what is in it |", "|---|---|"]
+        for one in below:
+            link = "/".join(one.path.split(".")[package.path.count(".") + 1 :])
+            lines += [f"| [`{one.path}`]({link}/index.md) | {_first_sentence(one.docstring)} |"]
+        lines += [""]
+    for module, names in package.modules.items():
+        rest = [one for one in names.values() if described()[one.home] == package.path and one not in own]
+        if rest:
+            docstring = ast.get_docstring(ast.parse(_file(module).read_text("utf-8"))) or ""
+            lines += [f"## {module} {{ #{module} }}", "", docstring, ""]
+            for one in rest:
+                lines += [f"::: {one.home}", "    options:", "      heading_level: 3", ""]
+    return "\n".join(lines)
+
+
+def menu() -> list:
+    """The reference's part of the menu: libraries, rooms, sub-rooms."""
+    entries: list = []
+    nested: dict[str, list] = {}
+    for package in packages():
+        above, _, last = package.path.rpartition(".")
+        nested[package.path] = [package.page]
+        (nested[above] if above in nested and above != "jeit" else entries).append({last: nested[package.path]})
+    return entries
+
+
+def on_config(config):
+    """Hang the reference into the menu, under the entry that is called so."""
+    for entry in config.nav:
+        if isinstance(entry, dict) and "API reference" in entry:
+            entry["API reference"] = menu()
+    return config
+
+
+def on_files(files, config):
+    """Add the reference's pages."""
+    from mkdocs.structure.files import File
+
+    for package in packages():
+        files.append(File.generated(config, package.page, content=page(package)))
+    return files

@@ -1,0 +1,46 @@
+"""The page on architecture speaks of the house as it stands."""
+
+import re
+from pathlib import Path
+
+import pytest
+from test_layers import ROOMS
+
+ROOT = Path(__file__).resolve().parents[2]
+TEXT = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+# Priors, solvers and outlines are on the move.
+HELD = TEXT.partition("**A prior.**")[0] + TEXT.partition("**A reader of")[2].partition("**Something else.**")[0]
+
+
+def test_the_table_says_what_each_room_may_import():
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*?) *\|$", TEXT, re.MULTILINE))
+    assert set(rows) == set(ROOMS)
+    for number, (room, told) in enumerate(rows.items()):
+        below = list(rows)[:number] if told == "all of the above" else re.findall(r"`(\w+)`", told)
+        assert set(below) == ROOMS[room], room
+
+
+def test_the_drawing_has_every_room():
+    drawing = TEXT.partition("```text")[2].partition("```")[0]
+    assert [room for room in ROOMS if not re.search(rf"│ {room}\b", drawing)] == []
+
+
+@pytest.mark.parametrize("path", sorted(set(re.findall(r"`((?:jeit|solvers|tests|examples)/[\w/.]+)`", HELD))))
+def test_files_are_there(path):
+    assert (ROOT / path).exists()
+
+
+def test_names_are_there():
+    """What a file is said to hold is in it."""
+    said = re.findall(r"`([A-Za-z_]+)`(?: says| there)?,? in\s+`(jeit/[\w/]+\.py)`", HELD)
+    said += [(name, path) for path, name in re.findall(r"\*\*`(jeit/[\w/]+\.py)`\*\*, `(\w+)`", HELD)]
+    said += re.findall(r"`([A-Z_]+)` (?:in|of)\s+`(jeit/[\w/]+\.py)`", HELD)
+    assert len(said) >= 4
+    assert [
+        (name, path) for name, path in said if not re.search(rf"\b{name}\b", (ROOT / path).read_text("utf-8"))
+    ] == []
+
+
+def test_five_files():
+    walk = TEXT.partition("## One measured frame, five files")[2].partition("```")[0]
+    assert len(re.findall(r"^\d\. \*\*`jeit/", walk, re.MULTILINE)) == 5

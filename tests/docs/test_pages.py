@@ -1,0 +1,150 @@
+"""What the README and the guides tell a reader to type: Python is run, commands are parsed, links lead somewhere."""
+
+import inspect
+import re
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import command_line
+import matplotlib
+import pytest
+from matplotlib import pyplot
+
+from jeit.cli.app import app
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+COMMANDS = {tuple(path.split()): function for path, function in command_line.commands(app)}
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    """The fenced blocks of a page in one of the languages; "" for those that name none."""
+    found = re.findall(r"^```(\w*)\n(.*?)^```", page.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    return [text for language, text in found if language in languages]
+
+
+def commands(page: Path) -> list[str]:
+    """Every line of a page that calls jeit: whole lines of its blocks, and what its prose has in code style."""
+    lines = [line for block in blocks(page, "", "bash", "sh", "console") for line in block.splitlines()]
+    prose = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+    lines += [" ".join(text.split()) for text in re.findall(r"`(jeit [^`]+)`", prose)]
+    return [line.partition("#")[0].strip() for line in lines if re.match(r"\S*jeit ", line)]
+
+
+def fault(line: str) -> str | None:
+    """What is wrong with a call of jeit: a command or an option that there is not, or too many arguments."""
+    words = shlex.split(line)[1:]
+    if words and words[0].startswith("-"):
+        return None if words == ["--version"] or words == ["--help"] else f"no option {words[0]}"
+    path = max((path for path in COMMANDS if tuple(words[: len(path) - 1]) == path[1:]), key=len, default=None)
+    if path is None:
+        groups = {command[1] for command in COMMANDS if len(command) == 3}
+        return None if len(words) == 1 and words[0] in groups else f"no command {words[0]}"
+    options, places = command_line.parameters(COMMANDS[path])
+    left, given = list(words[len(path) - 1 :]), 0
+    while left:
+        word = left.pop(0)
+        if word != "-" and word.startswith("-") and word != "--help":
+            name, equals, _ = word.partition("=")
+            if name not in options:
+                return f"{' '.join(path)} has no option {name}"
+            if options[name] and not equals and left:
+                left.pop(0)
+        elif word != "--help":
+            given += 1
+    return f"{' '.join(path)} takes {places} arguments, not {given}" if given > places else None
+
+
+def _design(names: dict, folder: Path, printed: list[str]) -> None:
+    assert (folder / "sensitivity.png").stat().st_size > 10_000
+    assert names["found"].scores.worst > 1.3 * names["scores"].worst
+    assert names["protocol"].num_measurements == 94
+    assert len(printed) == 5
+    assert "least Θ 19.5 mV, A 0.056" in printed
+
+
+def _hearing(names: dict, folder: Path, printed: list[str]) -> None:
+    assert len(names["path"].touches) == 3
+    microphones = names["fit"].calibration.microphone_array.microphones
+    assert names["jacobian"].shape == names["power"].shape[:1] + microphones.shape
+    assert (folder / "track.png").stat().st_size > 10_000
+
+
+def _reconstruction(names: dict, folder: Path, printed: list[str]) -> None:
+    assert names["result"].status == "converged"
+    assert 1.8e-3 < float(names["result"].conductivity.max()) < 5e-3  # S; the inclusion has 3 mS
+
+
+def _readme(names: dict, folder: Path, printed: list[str]) -> None:
+    assert (folder / "press.png").stat().st_size > 10_000
+    assert names["sensitivity"].position.shape == (208, 16, 2)
+
+
+HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
+    "README.md": _readme,
+    "design.md": _design,
+    "hearing.md": _hearing,
+    "reconstruction.md": _reconstruction,
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
+def test_a_page_runs(page, tmp_path, monkeypatch, capsys, request):
+    """Every block of Python of a page, one after the other, in an empty folder; then what its text promises."""
+    measured = re.findall(r"[\w/.-]+\.mat\b", "".join(blocks(page, "python")))
+    if measured:
+        folder = request.getfixturevalue("data_folder")  # skips where there is none, and says so
+        for name in measured:
+            (tmp_path / name).symlink_to(next(folder.rglob(Path(name).name)))
+    matplotlib.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    for block in blocks(page, "python"):
+        exec(compile(block, page.name, "exec"), names)
+    HOLDS.get(page.name, lambda *_: None)(names, tmp_path, capsys.readouterr().out.splitlines())
+    pyplot.close("all")
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
+def test_commands_are_there(page):
+    assert [(line, fault(line)) for line in commands(page) if fault(line)] == []
+
+
+@pytest.mark.parametrize(
+    ("line", "wrong"),
+    [
+        ("jeit rebuild a.mat", "no command rebuild"),
+        ("jeit reconstruct a.mat --refrence b.mat -o out", "has no option --refrence"),
+        ("jeit reconstruct a.mat b.mat -o out", "takes 1 arguments, not 2"),
+        ("jeit layout compare a b c -o out", "takes 2 arguments, not 3"),
+    ],
+)
+def test_a_wrong_command_is_found(line, wrong):
+    assert wrong in (fault(line) or "")
+
+
+def test_every_command_is_told_of():
+    """Every command stands in the README or a guide, and its own page says every option."""
+    told = " ".join(line for page in PAGES for line in commands(page))
+    assert [path for path in COMMANDS if " ".join(path[:2]) not in told] == []
+    for function in COMMANDS.values():
+        for option in command_line.parameters(function)[0]:
+            assert f"`{option}" in command_line.page(), f"{option} of {function.__name__}"
+        assert inspect.getdoc(function)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    """Links to files lead to files of the repository."""
+    links = re.findall(r"\]\((?!\w+:|#)([^)#\s]+)", page.read_text("utf-8"))
+    assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+def test_readme_is_short():
+    text = (ROOT / "README.md").read_bytes()
+    assert len(text) <= 7000
+    assert text.count(b"<!-- main-command -->") == text.count(b"<!-- test-command -->") == 1
+    rows = text.partition(b"<!-- benchmark:begin -->")[2].partition(b"<!-- benchmark:end -->")[0]
+    assert rows.count(b"\n|") <= 2 + 8
