@@ -2,15 +2,16 @@
 
 The names used most, and where the rest is:
 
-- `read`, `Measurement`: measured files (`jeit.data`);
-- `image_difference`, `ImagingSettings`: from two frames to a picture, in one call (`jeit.imaging`, `jeit.report`);
-- `Disk`, `Rectangle`, `Polygon`, `Mesh`: outlines and their meshes (`jeit.mesh`);
+- `read`: measured files (`jeit.data`);
+- `image_difference`: from two frames to a picture, in one call (`jeit.imaging`, `jeit.report`);
+- `Disk`: outlines and their meshes (`jeit.mesh`);
 - `BoundaryElectrodes`, `ring`: electrodes (`jeit.electrodes`) and where to put them (`jeit.layout`);
 - `adjacent`: what is driven and measured (`jeit.protocol`);
 - `ForwardModel`: conductivity to voltages and Jacobian (`jeit.forward`);
 - `calibrate`, `one_step`, `reconstruct`: linear and nonlinear imaging (`jeit.inverse`);
-- `Raster`, `find_inclusions`: what an image shows (`jeit.image`);
-- microphones under a skin, and where it was touched: `jeit.acoustic`;
+- `find_inclusions`: what an image shows (`jeit.image`);
+- layouts of electrodes compared and improved: `jeit.design`; microphones under a skin: `jeit.acoustic`; what is not
+  measured: `jeit.simulate`;
 - `plot_image`: pictures (`jeit.plot`).
 
 Importing jeit turns on JAX's 64-bit mode, unless JAX_ENABLE_X64 is set. Rooms are imported when first used.
@@ -23,22 +24,16 @@ from typing import TYPE_CHECKING
 import jax
 
 if TYPE_CHECKING:
-    from jeit.data import Measurement as Measurement
     from jeit.data import read as read
     from jeit.electrodes import BoundaryElectrodes as BoundaryElectrodes
     from jeit.forward import ForwardModel as ForwardModel
-    from jeit.image import Raster as Raster
     from jeit.image import find_inclusions as find_inclusions
-    from jeit.imaging import ImagingSettings as ImagingSettings
     from jeit.imaging import image_difference as image_difference
     from jeit.inverse import calibrate as calibrate
     from jeit.inverse import one_step as one_step
     from jeit.inverse import reconstruct as reconstruct
     from jeit.layout import ring as ring
     from jeit.mesh import Disk as Disk
-    from jeit.mesh import Mesh as Mesh
-    from jeit.mesh import Polygon as Polygon
-    from jeit.mesh import Rectangle as Rectangle
     from jeit.plot import plot_image as plot_image
     from jeit.protocol import adjacent as adjacent
 
@@ -67,12 +62,6 @@ _HOMES = {
     "BoundaryElectrodes": "electrodes",
     "Disk": "mesh",
     "ForwardModel": "forward",
-    "ImagingSettings": "imaging",
-    "Measurement": "data",
-    "Mesh": "mesh",
-    "Polygon": "mesh",
-    "Raster": "image",
-    "Rectangle": "mesh",
     "adjacent": "protocol",
     "calibrate": "inverse",
     "find_inclusions": "image",

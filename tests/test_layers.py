@@ -49,14 +49,12 @@ def imported(path: Path) -> set[str]:
 
 
 def on_import(path: Path) -> set[str]:
-    """The same of what is imported when the file is: not within functions, nor for type checkers alone."""
+    """The same of what is imported when the file is, or for type checkers: not within functions."""
     names, left = set(), list(ast.parse(path.read_text("utf-8")).body)
     while left:
         node = left.pop()
         if isinstance(node, ast.ImportFrom):
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
-        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            left += node.orelse
         elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             left += [child for child in ast.iter_child_nodes(node) if isinstance(child, ast.stmt)]
     return names

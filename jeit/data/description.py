@@ -111,7 +111,10 @@ class Description:
     protocol_section: dict[str, Any] = field(repr=False)
 
     def protocol(self, path: Path) -> Protocol | None:
-        """The protocol of the file at `path` (whose name may hold the current), or None if not described."""
+        """The protocol of the file at `path` (whose name may hold the current), or None if not described.
+
+        Raises `ValueError`, with file and section named, if what is described makes no protocol.
+        """
         if not self.protocol_section:
             return None
         return _protocol(self.protocol_section, self.electrodes, path, self.origin)

@@ -68,7 +68,8 @@ def compare_on_data(
 
     `rules`: names in `jeit.inverse.RULES`, all unless given. Of `settings` the prior, the mesh and the calibration are
     used; the images are one-step's. Other arguments and errors as in `jeit.imaging.image_difference`; a rule that
-    cannot work on these data is `refused`, unless it is the only one asked for.
+    cannot work on these data is `refused`, unless it is the only one asked for. Raises `ValueError` for a rule that
+    there is not, and as they do.
     """
     settings = ImagingSettings() if settings is None else settings
     names = list(dict.fromkeys(RULES if rules is None else rules))

@@ -104,7 +104,8 @@ def image_difference(
     )
     calibration, mesh = prepared.calibration, prepared.mesh
     with clock("image"):
-        reconstruction, change = METHODS[settings.method].image(prepared, settings)
+        method = METHODS[settings.method]
+        reconstruction, change = method.image(prepared, settings.prior, settings.hyperparameter)
         largest = float(jnp.abs(change).max())
         if not largest > 1e-9 * float(calibration.conductivity):
             raise ValueError(

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 from jaxtyping import Array, Float
 
@@ -20,24 +19,25 @@ from jeit.inverse.prior.priors import AbstractPrior
 from jeit.mesh import Domain
 from jeit_solvers import Status
 
-if TYPE_CHECKING:
-    from jeit.imaging.settings import ImagingSettings
-
 Imaged = tuple[LinearReconstruction | Reconstruction, Float[Array, " m"]]
 """A reconstruction, and the change of conductivity per cell that it finds, S/m (2-D: S)."""
+NamedPrior = str | AbstractPrior
+"""A prior, or the name of one."""
+NamedWeight = float | str | None
+"""λ, or the name of the rule that chooses it; None for methods that have no use for one."""
 
 
 @dataclass(frozen=True)
 class Method:
     """How to image a difference.
 
-    - `image`: the function that does it.
+    - `image`: the function that does it, given the prior and λ of the settings.
     - `takes_prior`: whether of the prior in the settings; `prior`, what it is called where the method has its own.
     - `hyperparameter`: λ unless given. `takes_hyperparameter`: whether it has any use for one; `number`: one that
       serves, where λ cannot be chosen by a rule.
     """
 
-    image: Callable[[PreparedDifference, "ImagingSettings"], Imaged]
+    image: Callable[[PreparedDifference, NamedPrior, NamedWeight], Imaged]
     takes_prior: bool = False
     prior: str | None = None
     hyperparameter: float | str | None = None
@@ -45,7 +45,7 @@ class Method:
     number: float | None = None
 
 
-def prior_for(prior: str | AbstractPrior, domain: Domain) -> AbstractPrior:
+def prior_for(prior: NamedPrior, domain: Domain) -> AbstractPrior:
     """The prior itself, or the one of that name in `jeit.inverse.prior.defaults.PRIORS`, made for the body's size."""
     if not isinstance(prior, str):
         return prior
@@ -66,19 +66,18 @@ def rule_for(name: str, prepared: PreparedDifference) -> Rule:
     return partial(discrepancy, noise=prepared.noise)
 
 
-def _weight(prepared: PreparedDifference, settings: "ImagingSettings") -> float | Rule:
-    """λ as the settings have it, with the rule in place of its name."""
-    value = settings.hyperparameter
-    assert value is not None
-    return rule_for(value, prepared) if isinstance(value, str) else value
+def _weight(prepared: PreparedDifference, hyperparameter: NamedWeight) -> float | Rule:
+    """λ, with the rule in place of its name."""
+    assert hyperparameter is not None
+    return rule_for(hyperparameter, prepared) if isinstance(hyperparameter, str) else hyperparameter
 
 
-def _one_step(prepared: PreparedDifference, settings: "ImagingSettings") -> Imaged:
+def _one_step(prepared: PreparedDifference, prior: NamedPrior, hyperparameter: NamedWeight) -> Imaged:
     found = one_step(
         prepared.model,
         prepared.calibration.conductivity,
-        prior=prior_for(settings.prior, prepared.domain),
-        hyperparameter=_weight(prepared, settings),
+        prior=prior_for(prior, prepared.domain),
+        hyperparameter=_weight(prepared, hyperparameter),
         difference=prepared.difference,
         noise=prepared.deviation,
         mask=prepared.mask,
@@ -86,9 +85,10 @@ def _one_step(prepared: PreparedDifference, settings: "ImagingSettings") -> Imag
     return found, found.image(prepared.difference)
 
 
-def _back_projection(prepared: PreparedDifference, settings: "ImagingSettings", *, filtered: bool) -> Imaged:
-    value = settings.hyperparameter
-    given = {"hyperparameter": value} if isinstance(value, (int, float)) else {}
+def _back_projection(
+    prepared: PreparedDifference, prior: NamedPrior, hyperparameter: NamedWeight, *, filtered: bool
+) -> Imaged:
+    given = {"hyperparameter": hyperparameter} if isinstance(hyperparameter, (int, float)) else {}
     conductivity = prepared.calibration.conductivity
     found = back_projection(prepared.model, conductivity, filtered=filtered, mask=prepared.mask, **given)
     return found, found.image(prepared.difference)
@@ -96,22 +96,24 @@ def _back_projection(prepared: PreparedDifference, settings: "ImagingSettings", 
 
 def _iterated(
     prepared: PreparedDifference,
-    settings: "ImagingSettings",
+    prior: NamedPrior,
+    hyperparameter: NamedWeight,
     *,
     solver: AbstractSolver,
-    prior: AbstractPrior | None = None,
+    own: AbstractPrior | None = None,
 ) -> Imaged:
     """The conductivity whose voltages differ from the model's own as the frame differs from its reference.
 
-    So what the model gets wrong alike with and without objects is left out. Raises `ValueError` if the solver fails.
+    So what the model gets wrong alike with and without objects is left out. `own`: the method's own prior, in place of
+    that asked for. Raises `ValueError` if the solver fails.
     """
     model, background = prepared.model, prepared.calibration.conductivity
     found = reconstruct(
         model,
         model.voltages(background) + prepared.difference,
         background,
-        prior=prior_for(settings.prior, prepared.domain) if prior is None else prior,
-        hyperparameter=_weight(prepared, settings),
+        prior=prior_for(prior, prepared.domain) if own is None else own,
+        hyperparameter=_weight(prepared, hyperparameter),
         noise=prepared.deviation,
         mask=prepared.mask,
         solver=solver,
@@ -131,7 +133,7 @@ METHODS: dict[str, Method] = {
         partial(_iterated, solver=_LEVENBERG_MARQUARDT), takes_prior=True, hyperparameter=ITERATED
     ),
     "total-variation": Method(
-        partial(_iterated, solver=_GAUSS_NEWTON, prior=TotalVariation()),
+        partial(_iterated, solver=_GAUSS_NEWTON, own=TotalVariation()),
         prior="total variation",
         hyperparameter=EDGE_PRICE,
         number=EDGE_PRICE,

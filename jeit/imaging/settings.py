@@ -28,6 +28,8 @@ class ImagingSettings:
     - `raster_shape`: (rows, columns) of the raster.
     - `level`, `least_peak`: see `jeit.image.find_inclusions`.
     - `segment`: whether to cut the image up into background, resistive and conductive, see `jeit.image.segment`.
+
+    Raises `ValueError`, naming the setting, for what there is not or what does not go together.
     """
 
     method: str = "one-step"

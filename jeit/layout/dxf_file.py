@@ -16,7 +16,10 @@ _COLOURS = {_OUTLINE: 1, _ELECTRODES: 5, _LABELS: 8}
 
 
 def write_dxf(layout: Layout, path: Path) -> None:
-    """Write a drawing in millimetres, of the format of AutoCAD 2007: the first that holds labels in any script."""
+    """Write a drawing in millimetres, of the format of AutoCAD 2007: the first that holds labels in any script.
+
+    Raises `ImportError` where the extra `cad` is not installed.
+    """
     ezdxf = _import()
     drawing = ezdxf.new("R2007")
     drawing.units = ezdxf.units.MM

@@ -37,6 +37,7 @@ def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]
 
 
 def version_of(package: str) -> str | None:
+    """The version of an installed package; None if it is not."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

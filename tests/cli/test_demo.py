@@ -50,7 +50,7 @@ def test_help_and_version(run):
 def test_help_tells_the_defaults(run):
     _, output, _ = run("reconstruct", "--help")
     told = " ".join(output.replace("│", " ").split())
-    settings = jeit.ImagingSettings()
+    settings = jeit.imaging.ImagingSettings()
     for value in (settings.method, settings.prior, settings.hyperparameter):
         assert f"{value} (default)" in told
     assert f"(default {settings.num_points})" in told

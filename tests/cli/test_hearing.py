@@ -146,6 +146,7 @@ def test_intensities_of_samples_are_smoothed_as_those_are(folder, tmp_path):
     assert rows(tmp_path / "samples") == rows(tmp_path / "intensities")
 
 
+@pytest.mark.slow
 def test_two_touches_are_both_printed(folder, tmp_path, capsys):
     """The second beside the first, though for a moment it is the stronger."""
     places = np.array([[0.05, 0.04], [-0.04, -2e-5]])
@@ -160,6 +161,7 @@ def test_two_touches_are_both_printed(folder, tmp_path, capsys):
     assert "12 two" in line
 
 
+@pytest.mark.slow
 def test_a_touch_without_pauses(folder, tmp_path, capsys):
     """Silence to a recording by itself, which is said; found with a recording of silence."""
     random = np.random.default_rng(6)

@@ -12,7 +12,11 @@ FEW = ("--num-points", 250)
 
 @pytest.mark.parametrize(
     "method",
-    [pytest.param("gauss-newton", marks=pytest.mark.slow), "levenberg-marquardt", "total-variation"],
+    [
+        pytest.param("gauss-newton", marks=pytest.mark.slow),
+        pytest.param("levenberg-marquardt", marks=pytest.mark.slow),
+        "total-variation",
+    ],
 )
 def test_iterative_images(method, tank, run, tmp_path):
     output = tmp_path / "out"

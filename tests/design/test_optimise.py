@@ -117,6 +117,7 @@ def test_symmetry_and_sizes():
     assert distances(centres).min() >= 0.015
 
 
+@pytest.mark.slow
 def test_contact_impedance_and_thickness_are_varied():
     """Within their ranges, for the better; and the scores told are those of such a skin, built anew."""
     found = optimise(contact_impedance=(2e-5, 5e-4), thickness=(6e-3, 2e-2), steps=5)

@@ -211,6 +211,7 @@ def test_bad_arguments_are_refused(call, complaint):
         call(CASES[0].candidates)
 
 
+@pytest.mark.slow
 def test_the_paper_measures_94_of_496_pairs():
     """Park et al. 2022: 32 electrodes inside 200 × 200 mm.
 

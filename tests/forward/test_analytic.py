@@ -106,7 +106,11 @@ LEVELS = [
 
 
 @pytest.mark.parametrize("levels", LEVELS)
-@pytest.mark.parametrize("physics", [HOMOGENEOUS, INCLUSION, LOSSY], ids=["homogeneous", "inclusion", "complex"])
+@pytest.mark.parametrize(
+    "physics",
+    [HOMOGENEOUS, INCLUSION, pytest.param(LOSSY, marks=pytest.mark.slow)],
+    ids=["homogeneous", "inclusion", "complex"],
+)
 def test_arcs_converge_to_the_series(levels, physics):
     exact = exact_arc_voltages(physics)
     errors = [overall(arc_voltages(physics, ring_mesh(rings)), exact) for rings in levels]

@@ -127,6 +127,7 @@ def test_lower_bound_of_zero(link, model, frame):
     assert (np.asarray(result.conductivity) > 0).all()
 
 
+@pytest.mark.slow
 def test_gradient_of_the_cost(model, frame):
     """What the bounded solvers descend along, by finite differences."""
     result = reconstruct(

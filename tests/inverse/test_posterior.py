@@ -53,6 +53,7 @@ def test_against_dense_algebra(prior, model, noise):
     assert deviation == pytest.approx(np.sqrt(row @ covariance @ row), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_credible_intervals_and_samples(model, noise):
     options = {"prior": Gaussian(LENGTH), "noise": noise, "hyperparameter": 3.0}
     options["parametrisation"] = Parametrisation(unknowns=[Background(0.2)])

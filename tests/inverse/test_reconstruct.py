@@ -115,6 +115,7 @@ def test_derivative_of_the_misfit(model, frame):
     assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2, abs=0.1)
 
 
+@pytest.mark.slow
 def test_solvers_of_optimistix_find_the_same(model, frame):
     voltages, noise = frame
     options = {"prior": Gaussian(0.05), "noise": noise, "hyperparameter": 100.0}

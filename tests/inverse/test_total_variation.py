@@ -76,6 +76,7 @@ def test_an_edge_is_sharper_than_with_any_smooth_prior(model, frame):
     assert area @ np.asarray(sharp.conductivity)[inside] / area.sum() == pytest.approx(0.5, rel=0.1)
 
 
+@pytest.mark.slow
 def test_both_solvers_find_the_same(model, frame):
     options = {"prior": TotalVariation(), "noise": frame[1], "hyperparameter": 100.0}
     first, second = (

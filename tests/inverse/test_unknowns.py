@@ -105,6 +105,7 @@ def test_background_and_scale(model):
     np.testing.assert_allclose(doubled.model.protocol.drive, 2 * known.protocol.drive, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_derivative_with_all_unknowns(model):
     """Products with the Jacobian against autodiff, and Taylor's second order."""
     model = model_of(600, driven=True)

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from jeit.layout import Layout, grid, named_layout, read_layout, write_layout
-from jeit.layout.layout import BUILT_IN
+from jeit.layout.names import BUILT_IN
 from jeit.mesh import Disk, Polygon, Rectangle, rectangle
 
 OUTLINE = Polygon(

@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from jeit.acoustic import make_surface
+from jeit.acoustic.surface import make_surface
 from jeit.data import Measurement, impossible_signs, write_table
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel

@@ -46,6 +46,7 @@ class Candidates(eqx.Module):
 
         For any number of candidates: all drives with all measurements. Where S leaves out small parts of the variance
         (a prior's `basis`), it leaves out what precise measurements would tell of them, which flatters few of them.
+        Raises `ValueError` for shapes or values that do not go together.
         """
         jacobian, factor, noise, weights = _check(jacobian, factor, noise, weights, ("cells", "coefficients"))
         return cls(jacobian @ factor / noise[:, None], factor.T @ (weights[:, None] * factor))

@@ -101,14 +101,18 @@ def information_bound(
     returned; more `iterations` tighten it. Close where many candidates tell much the same; loose where noise is so low
     that each tells something new, for then parts of all of them would tell more than any few.
 
-    Boyd and Vandenberghe, Convex Optimization (2004), section 7.5.
+    Boyd and Vandenberghe, Convex Optimization (2004), section 7.5. Raises `ValueError` for a `number` that is not from
+    1 to that of the candidates, or another criterion.
     """
     _check_number(candidates, number, criterion)
     return _bound(candidates, number, criterion, iterations)
 
 
 def random_selections(key: Array, num_candidates: int, number: int, count: int) -> Int[Array, "count N"]:
-    """`count` sets of `number` different candidates each, all equally likely: (count, number)."""
+    """`count` sets of `number` different candidates each, all equally likely: (count, number).
+
+    Raises `ValueError` for a `number` that is not from 1 to that of the candidates.
+    """
     if not 1 <= number <= num_candidates:
         raise ValueError(f"number must be from 1 to the {num_candidates} candidates; it is {number}.")
     orders = jax.vmap(lambda one: jax.random.permutation(one, num_candidates))(jax.random.split(key, count))
@@ -125,7 +129,10 @@ def nearest_pairs(centres, number: int) -> Int[np.ndarray, " N"]:
 
 
 def farthest_pairs(centres, number: int) -> Int[np.ndarray, " N"]:
-    """The `number` longest pairs, as in `nearest_pairs`: a pattern that drives current through the whole skin."""
+    """The `number` longest pairs, as in `nearest_pairs`: a pattern that drives current through the whole skin.
+
+    Raises `ValueError` for a number that is not from 1 to L(L - 1)/2.
+    """
     return _by_length(centres, number, -1)
 
 

@@ -10,7 +10,10 @@ from jeit.mesh import Domain
 
 class Constraints(eqx.Module):
     """Discs wholly inside `outline` and wholly outside every domain of `keep_out`, their centres `minimum_spacing`
-    metres apart or more, and no two of them overlapping."""
+    metres apart or more, and no two of them overlapping.
+
+    Raises `ValueError` for a spacing below zero.
+    """
 
     outline: Domain
     minimum_spacing: float

@@ -52,7 +52,10 @@ def touch_grid(outline: Domain, columns: int = PLACES, rows: int = PLACES) -> To
 
 
 def touches_away_from_the_edge(outline: Domain, margin: float, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
-    """The places of `touch_grid` whose touches reach over no edge: farther than `margin` (metres) from the outline."""
+    """The places of `touch_grid` whose touches reach over no edge: farther than `margin` (metres) from the outline.
+
+    Raises `ValueError` if no place is so far from the edge.
+    """
     grid = touch_grid(outline, columns, rows)
     offsets = margin * np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 16, endpoint=False)])
     kept = np.all([np.asarray(outline.contains(grid.places + offset)) for offset in offsets], axis=0)

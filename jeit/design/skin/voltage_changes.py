@@ -47,6 +47,7 @@ def touch_changes(
     had been solved anew for every touch, to 1e-8 of the largest. Raises `ValueError` for touches of another mesh and
     for exact changes under `jit`, `grad` or `vmap`, and `RuntimeError` where exact changes are not found: by conductors
     of contrast above some 1e6, whose limit is reached long before, and where a touch cuts an electrode off.
+    `conductivity` as in `ForwardModel.voltages`, real and scalar, S/m (2-D: S).
     """
     conductivity = check_conductivity(model.mesh, conductivity)
     if conductivity.ndim == 3 or jnp.iscomplexobj(conductivity):

@@ -25,8 +25,9 @@ def choose_hyperparameter(
     """The λ that `one_step` would use with the same arguments, and what it was chosen by, without the image.
 
     `rule`: a name in `jeit.inverse.RULES`, or a rule: one of `jeit.inverse.hyperparameter` with a setting of its own,
-    `functools.partial(noise_figure, target=0.5)`, or your own, a function of (spectrum, data, mesh) to a `Choice`.
-    The choice can be given to `one_step` as its hyperparameter. Raises `ValueError` for arguments that do not fit.
+    `functools.partial(noise_figure, target=0.5)`, or your own, a function of (spectrum, data, mesh) to a `Choice`. The
+    choice can be given to `one_step` as its hyperparameter. Raises `ValueError` for arguments that do not fit.
+    `conductivity`: the background, S/m (2-D: S).
     """
     if not (isinstance(rule, str) or callable(rule)):
         raise ValueError(f"rule: give one of {', '.join(RULES)}, not {rule!r}; a number needs no choosing.")

@@ -18,8 +18,8 @@ def best_resolution(
     Without noise the least λ would always be sharpest, so the images of the targets are noisy: each target is strong
     enough to make the root mean square of its data `signal_to_noise` times the noise. Looks at no data, so that λ
     belongs to the system and not to the frame: what Graham and Adler, Physiol. Meas. 27 (2006) S65-S79, find by
-    calibration on a small target in a tank. Criterion: the mean of `blur_radius` over the targets, relative to the
-    size of the body.
+    calibration on a small target in a tank. Criterion: the mean of `blur_radius` over the targets, relative to the size
+    of the body. Raises `ValueError` without a mesh, and for settings that are not positive.
     """
     if mesh is None:
         raise ValueError("The rule 'best-resolution' measures areas: give the mesh that the spectrum belongs to.")

@@ -23,7 +23,8 @@ Rule = Callable[[Spectrum, Float[Array, " M"] | None, Mesh | None], Choice]
 def generalised_cross_validation(spectrum: Spectrum, data, mesh: Mesh | None = None) -> Choice:
     """λ that predicts each channel best from the others: least M‖r‖²/(tr(I - H))². Golub, Heath and Wahba 1979.
 
-    Criterion: that score, the mean squared error of prediction in units of the noise's variance.
+    Criterion: that score, the mean squared error of prediction in units of the noise's variance. Raises `ValueError`
+    without data.
     """
     candidates, data = spectrum.candidates(), _needed(data, "gcv")
     residual, penalty = spectrum.curves(data, candidates)
@@ -35,7 +36,8 @@ def discrepancy(spectrum: Spectrum, data, mesh: Mesh | None = None, *, noise: fl
     """Largest λ whose residual is no more than the noise: ‖r‖² = r noise², r being the number of components.
 
     Criterion: ‖r‖/√r, the residual in standard deviations. `noise`: the standard deviation that the whitened data
-    really have, 1 where the channels' noise was given as it is. Morozov, Soviet Math. Dokl. 7 (1966) 414-417.
+    really have, 1 where the channels' noise was given as it is. Morozov, Soviet Math. Dokl. 7 (1966) 414-417. Raises
+    `ValueError` without data.
     """
     candidates, data = spectrum.candidates(), _needed(data, "discrepancy")
     components = np.asarray(spectrum.basis).T @ data
@@ -58,7 +60,7 @@ def discrepancy(spectrum: Spectrum, data, mesh: Mesh | None = None, *, noise: fl
 def l_curve(spectrum: Spectrum, data, mesh: Mesh | None = None) -> Choice:
     """λ at the corner of greatest curvature of log ‖r‖ against log √(xᵀQx). Hansen, SIAM Review 34 (1992) 561-580.
 
-    Criterion: that curvature, positive where the curve bends towards the origin.
+    Criterion: that curvature, positive where the curve bends towards the origin. Raises `ValueError` without data.
     """
     candidates, data = spectrum.candidates(), _needed(data, "l-curve")
     residual, penalty = spectrum.curves(data, candidates)
@@ -101,7 +103,10 @@ RULES: dict[str, Rule] = {
 
 
 def choose(spectrum: Spectrum, hyperparameter: float | str | Rule | Choice, data, mesh: Mesh | None = None) -> Choice:
-    """λ and how it came about, from a number, the name of a rule, a rule, or a choice made before."""
+    """λ and how it came about, from a number, the name of a rule, a rule, or a choice made before.
+
+    Raises `ValueError` for the name of no rule, and for a number that is not positive and finite.
+    """
     if isinstance(hyperparameter, Choice):
         return hyperparameter
     if isinstance(hyperparameter, str):

@@ -22,10 +22,10 @@ def back_projection(
     (Barber and Brown, J. Phys. E 17 (1984) 723-733). The result is scaled so that a uniform change of conductivity
     is imaged as itself.
 
-    `filtered`: back-project filtered data F v instead, where F minimises ‖JBFv - v‖² + λ²‖JB‖²‖Fv‖², so that the
-    image, seen through the Jacobian J, gives back the data: sharper, and noisier; `hyperparameter` is λ. `mask`: True
-    for the channels to use. Raises `ValueError` for protocols whose channels have more than two electrodes, where no
-    band is defined.
+    `filtered`: back-project filtered data F v instead, where F minimises ‖JBFv - v‖² + λ²‖JB‖²‖Fv‖², so that the image,
+    seen through the Jacobian J, gives back the data: sharper, and noisier; `hyperparameter` is λ. `mask`: True for the
+    channels to use. Raises `ValueError` for protocols whose channels have more than two electrodes, where no band is
+    defined. `conductivity`: the background, S/m (2-D: S).
     """
     protocol = model.protocol
     used = np.ones(protocol.num_measurements, bool) if mask is None else np.asarray(mask, bool)

@@ -55,20 +55,20 @@ def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[
 
 
 def check_prior(prior) -> None:
-    """That it is one of jeit's, or made like them."""
+    """That it is one of jeit's, or made like them. Raises `ValueError` otherwise."""
     if not isinstance(prior, AbstractPrior):
         raise ValueError(f"prior must be one of those in jeit.inverse, such as Noser(), not {prior!r}.")
 
 
 def check_steps(name: str, steps) -> int:
-    """A whole number from 1."""
+    """A whole number from 1. Raises `ValueError` otherwise."""
     if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
         raise ValueError(f"{name} must be a whole number from 1; it is {steps!r}.")
     return int(steps)
 
 
 def check_tolerance(name: str, tolerance) -> float:
-    """A number from 0 up to, but not including, 1."""
+    """A number from 0 up to, but not including, 1. Raises `ValueError` otherwise."""
     if not isinstance(tolerance, (int, float, np.number)) or not 0 <= tolerance < 1:
         raise ValueError(f"{name} must be a number from 0 and less than 1; it is {tolerance!r}.")
     return float(tolerance)

@@ -26,7 +26,10 @@ class AbstractLink(eqx.Module):
 
     @abc.abstractmethod
     def estimate(self, conductivity: Float[Array, " m"]) -> Float[Array, " m"]:
-        """x(σ), the inverse of `conductivity`. Raises `ValueError` for conductivities that no x gives."""
+        """x(σ), the inverse of `conductivity`. Raises `ValueError` for conductivities that no x gives.
+
+        σ in S/m (2-D: S).
+        """
 
     def ends(self, lower: float, upper: float, reference: Float[Array, " m"]) -> tuple[float, float]:
         """The estimates that two bounds on σ stand for, in an image about `reference`. Raises `ValueError` for a link
@@ -46,7 +49,7 @@ class Linear(AbstractLink):
         return jnp.ones_like(estimate)
 
     def estimate(self, conductivity):
-        """σ."""
+        """σ. In S/m (2-D: S)."""
         return conductivity
 
     def ends(self, lower, upper, reference):
@@ -66,7 +69,7 @@ class Log(AbstractLink):
         return jnp.exp(estimate)
 
     def estimate(self, conductivity):
-        """log(σ)."""
+        """log(σ). σ in S/m (2-D: S). Raises `ValueError` unless it is positive."""
         _check_inside(conductivity, 0, np.inf)
         return jnp.log(conductivity)
 
@@ -77,7 +80,10 @@ class Log(AbstractLink):
 
 
 class Bounded(AbstractLink):
-    """σ = lower + (upper - lower) / (1 + exp(-x)): strictly between `lower` and `upper`, S/m (2-D: S)."""
+    """σ = lower + (upper - lower) / (1 + exp(-x)): strictly between `lower` and `upper`, S/m (2-D: S).
+
+    Raises `ValueError` unless 0 ≤ lower < upper, finite.
+    """
 
     lower: float
     upper: float
@@ -96,7 +102,7 @@ class Bounded(AbstractLink):
         return (self.upper - self.lower) * share * (1 - share)
 
     def estimate(self, conductivity):
-        """The logit of σ's place between the bounds."""
+        """The logit of σ's place between the bounds. Raises `ValueError` outside them."""
         _check_inside(conductivity, self.lower, self.upper)
         share = (conductivity - self.lower) / (self.upper - self.lower)
         return jnp.log(share) - jnp.log1p(-share)

@@ -104,7 +104,8 @@ class GaussNewton(AbstractSolver):
 class LevenbergMarquardt(AbstractSolver):
     """Levenberg-Marquardt: Gauss-Newton steps, damped while they lead too far.
 
-    `max_steps`, `rtol`: as for `GaussNewton`. `damping`: that of the first step, relative to the prior.
+    `max_steps`, `rtol`: as for `GaussNewton`. `damping`: that of the first step, relative to the prior. Raises
+    `ValueError` for settings that make no step.
     """
 
     name: ClassVar[str] = "levenberg-marquardt"

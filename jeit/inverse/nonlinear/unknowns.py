@@ -92,7 +92,10 @@ class ElectrodePosition(AbstractUnknown):
 
 
 class Background(AbstractUnknown):
-    """One value added to the image everywhere, on the link's scale (Log: the logarithm of a factor)."""
+    """One value added to the image everywhere, on the link's scale (Log: the logarithm of a factor).
+
+    Raises `ValueError` for a deviation that is not positive.
+    """
 
     deviation: Float[Array, " 1"]
 
@@ -105,7 +108,10 @@ class Background(AbstractUnknown):
 
 
 class Scale(AbstractUnknown):
-    """The logarithm of a factor on all voltages: a current or a gain that is not known."""
+    """The logarithm of a factor on all voltages: a current or a gain that is not known.
+
+    Raises `ValueError` for a deviation that is not positive.
+    """
 
     deviation: Float[Array, " 1"]
 

@@ -142,7 +142,10 @@ class Regions(eqx.Module):
 
 
 def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
-    """Labels for `Regions`: the pixels of a grid (rows, columns) over the mesh that hold the centre of any cell."""
+    """Labels for `Regions`: the pixels of a grid (rows, columns) over the mesh that hold the centre of any cell.
+
+    Raises `ValueError` for a shape that is not two whole numbers from 1.
+    """
     sides = np.asarray(shape)
     if sides.shape != (2,) or sides.dtype.kind not in "iu" or sides.min() < 1:
         raise ValueError(f"shape must be (rows, columns), both whole numbers from 1; it is {shape}.")

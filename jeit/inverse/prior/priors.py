@@ -161,7 +161,8 @@ class Laplace(AbstractPrior):
 class Gaussian(AbstractPrior):
     """Gaussian smoothness: a random field with covariance Γ = exp(-|x_i - x_j|² / 2 length²) between cell centres.
 
-    Does not depend on the mesh. `length`: correlation length in metres.
+    Does not depend on the mesh. `length`: correlation length in metres. Raises `ValueError` for a length that is not
+    positive.
     """
 
     length: float

@@ -29,7 +29,8 @@ class TotalVariation(AbstractPrior):
     """The prior of `reconstruct` for images of few pieces.
 
     `smoothing` β: jumps below it, on the link's scale (`Log()`: relative), cost by their square. Its energy is not
-    quadratic, so linear images and the rules that choose λ have no use for it: λ is a number, 300 unless given.
+    quadratic, so linear images and the rules that choose λ have no use for it: λ is a number, 300 unless given. Raises
+    `ValueError` for a smoothing that is not positive.
     """
 
     smoothing: float = 0.01

@@ -63,7 +63,7 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     compiled before the first frame is asked for. A frame is refused, and the stream goes on, when it has another number
     of channels or is not real, when fewer than half of the channels can be used, when all read zero (the current source
     has failed), or when it differs from an undisturbed frame by more than half of it. A dead electrode's channels are
-    left out, and named.
+    left out, and named. Raises `ValueError` for an array of frames that is not (frames, channels).
     """
     if isinstance(frames, (np.ndarray, jax.Array)) and frames.ndim != 2:
         raise ValueError(f"frames has shape {frames.shape}; give (frames, channels), or for one frame [frame].")

@@ -91,7 +91,10 @@ class SizeField:
     """Wanted edge length at any point for a given background cell size."""
 
     def __init__(self, curves: list[Curve], refine: Refinement, held: np.ndarray, spacing: np.ndarray):
-        """`held` (k, 2) are nodes that must be there and `spacing` (k,) the room each has."""
+        """`held` (k, 2) are nodes that must be there and `spacing` (k,) the room each has.
+
+        Raises `ValueError` for what is no `Refine`.
+        """
         self._terms: list[tuple[Callable[[np.ndarray], np.ndarray], Refine]] = []
         self._own: Size | None = None
         if callable(refine):
