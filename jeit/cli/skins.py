@@ -53,7 +53,7 @@ def read(name: str, width: float, height: float) -> "Layout":
 
 def check_layer(thickness: float, conductivity: float) -> None:
     """Raise `ValueError` unless --thickness-mm is more than a touch is deep and --conductivity one that a skin has."""
-    from jeit.design.skin.defaults import DEPTH
+    from jeit.design.defaults import DEPTH
 
     if not 1e3 * DEPTH < thickness < float("inf"):
         raise ValueError(

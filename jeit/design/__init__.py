@@ -5,7 +5,7 @@ layouts: moved by gradients, within an outline and with minimum spacing; and the
 Studies of many layouts, which survive a crash. Here is what a designer uses; the rest, such as the classes of what is
 found, is in the modules.
 
-Names are imported when first used: the command line shows defaults (`jeit.design.skin.defaults`) without waiting.
+Names are imported when first used: the command line shows defaults (`jeit.design.defaults`) without waiting.
 """
 
 import importlib

@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jeit.design.defaults import CONTRAST, MARGIN, PLACES
 from jeit.design.response import SkinResponse, number_of_taxels, skin_response
-from jeit.design.skin.defaults import CONTRAST, MARGIN, PLACES
 from jeit.design.skin.skin import Skin
 from jeit.design.skin.touch_grid import touches_away_from_the_edge
 from jeit.layout import Layout

@@ -3,8 +3,8 @@
 import equinox as eqx
 from jaxtyping import Array
 
+from jeit.design.defaults import NUM_TAXELS, THRESHOLD
 from jeit.design.sensitivity import SensitivityMap
-from jeit.design.skin.defaults import NUM_TAXELS, THRESHOLD
 from jeit.design.skin.skin import Skin
 from jeit.design.skin.touch_grid import TouchGrid
 from jeit.design.skin.touched_cells import TouchedCells

@@ -22,8 +22,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jeit.design.defaults import TEMPERATURE
 from jeit.design.sensitivity import uniformity
-from jeit.design.skin.defaults import TEMPERATURE
 from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity

@@ -6,7 +6,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jeit.design.skin.defaults import CONTRAST
+from jeit.design.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation, Bell
 from jeit.design.skin.touch_grid import TouchGrid
 from jeit.design.skin.touched_cells import touched_cells

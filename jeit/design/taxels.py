@@ -9,7 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.design.skin.defaults import NUM_TAXELS, THRESHOLD
+from jeit.design.defaults import NUM_TAXELS, THRESHOLD
 from jeit_solvers import KMeans, kmeans
 
 

@@ -4,14 +4,11 @@
 inclusions; `frames` does it frame after frame.
 """
 
-from jeit.imaging.choice import ComparedRules as ComparedRules
-from jeit.imaging.choice import RuleOutcome as RuleOutcome
-from jeit.imaging.choice import compare_on_data as compare_on_data
+from jeit.imaging.compared_rules import ComparedRules as ComparedRules
+from jeit.imaging.compared_rules import RuleOutcome as RuleOutcome
+from jeit.imaging.compared_rules import compare_on_data as compare_on_data
 from jeit.imaging.difference import ImagedDifference as ImagedDifference
 from jeit.imaging.difference import image_difference as image_difference
-from jeit.imaging.frames import StreamSettings as StreamSettings
-from jeit.imaging.frames import frames_of as frames_of
-from jeit.imaging.frames import prepare_imager as prepare_imager
 from jeit.imaging.method import METHODS as METHODS
 from jeit.imaging.preparation import PreparedDifference as PreparedDifference
 from jeit.imaging.preparation import calibrated_model as calibrated_model
@@ -20,3 +17,6 @@ from jeit.imaging.preparation import prepare_difference as prepare_difference
 from jeit.imaging.preparation import select_frames as select_frames
 from jeit.imaging.settings import CONTACTS as CONTACTS
 from jeit.imaging.settings import ImagingSettings as ImagingSettings
+from jeit.imaging.stream import StreamSettings as StreamSettings
+from jeit.imaging.stream import frames_of as frames_of
+from jeit.imaging.stream import prepare_imager as prepare_imager

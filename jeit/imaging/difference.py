@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from jeit.data import Measurement
-from jeit.data.checks import FrameQuality
+from jeit.data.imageable import FrameQuality
 from jeit.image import Inclusion, Raster, find_inclusions, segment
 from jeit.imaging.method import METHODS
 from jeit.imaging.preparation import Clock, prepare_difference

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jeit.data import Measurement, check_imageable
-from jeit.data.checks import FrameQuality
+from jeit.data.imageable import FrameQuality
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import calibrate, relative_noise

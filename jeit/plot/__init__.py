@@ -16,7 +16,7 @@ from jeit.plot.design.sensitivity_map import plot_sensitivity_map as plot_sensit
 from jeit.plot.design.taxels import plot_taxel_areas as plot_taxel_areas
 from jeit.plot.design.taxels import plot_taxels as plot_taxels
 from jeit.plot.design.travel import plot_travel as plot_travel
-from jeit.plot.imaging.choice import plot_choice as plot_choice
 from jeit.plot.imaging.figures_of_merit import plot_figures_of_merit as plot_figures_of_merit
+from jeit.plot.imaging.hyperparameter import plot_choice as plot_choice
 from jeit.plot.imaging.image import plot_image as plot_image
 from jeit.plot.imaging.mesh import plot_mesh as plot_mesh

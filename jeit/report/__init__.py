@@ -2,9 +2,9 @@
 
 from jeit.report.calibration import draw_calibration as draw_calibration
 from jeit.report.calibration import write_calibration as write_calibration
-from jeit.report.choice import draw_choice as draw_choice
-from jeit.report.choice import report_choice as report_choice
-from jeit.report.choice import write_choice as write_choice
+from jeit.report.compared_rules import draw_choice as draw_choice
+from jeit.report.compared_rules import report_choice as report_choice
+from jeit.report.compared_rules import write_choice as write_choice
 from jeit.report.image import draw_image as draw_image
 from jeit.report.image import report_image as report_image
 from jeit.report.image import write_image as write_image

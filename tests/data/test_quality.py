@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jeit import data, protocol
-from jeit.data.checks import assess
+from jeit.data.imageable import assess
 from jeit.data.quality import channel_reciprocity_error, expected_signs
 
 

@@ -4,9 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.design import Skin, sensitivity_map, skin_response, touches_away_from_the_edge
+from jeit.design import Skin, defaults, sensitivity_map, skin_response, touches_away_from_the_edge
 from jeit.design.comparison import comparison
-from jeit.design.skin import defaults
 from jeit.design.skin.protocol import skin_protocol
 from jeit.layout import Layout, grid
 from jeit.mesh import Polygon, Rectangle

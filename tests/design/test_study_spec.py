@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jeit.design import Bell, Hemisphere
-from jeit.design.skin import defaults
+from jeit.design import Bell, Hemisphere, defaults
 from jeit.design.skin.protocol import skin_protocol
 from jeit.design.study import read_study
 from jeit.electrodes import FaceDiscs

@@ -7,11 +7,11 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from jeit.inverse import RULES
-from jeit.inverse.hyperparameter.choice import Choice
+from jeit.inverse.hyperparameter.chosen import Choice
 from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import disk
 from jeit.plot import plot_choice
-from jeit.plot.imaging.choice import COLOURS
+from jeit.plot.imaging.hyperparameter import COLOURS
 
 
 @pytest.fixture(scope="module")

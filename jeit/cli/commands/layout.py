@@ -8,7 +8,7 @@ import typer
 from jeit.cli import skins
 from jeit.cli.commands.layout_optimise import optimise
 from jeit.cli.options import Quiet, check_at_least, check_positive, check_within, make_folder, naming_options
-from jeit.design.skin import defaults
+from jeit.design import defaults
 
 if TYPE_CHECKING:
     from jeit.design.comparison import LayoutComparison

@@ -50,7 +50,7 @@ def stream(
 
     from jeit.cli.console import Steps, scaled
     from jeit.data import read
-    from jeit.imaging.frames import StreamSettings, frames_of, parse_frames, prepare_imager
+    from jeit.imaging.stream import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as images_of
     from jeit.inverse.nonlinear.solvers import solver_named
     from jeit.report import write_stream

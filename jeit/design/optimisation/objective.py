@@ -4,9 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jeit.design.defaults import CONTRAST, CORRELATION, NOISE, TEMPERATURE
 from jeit.design.optimisation.variables import Varied
 from jeit.design.scores import Score, Scores, TouchPrior, layout_scores
-from jeit.design.skin.defaults import CONTRAST, CORRELATION, NOISE, TEMPERATURE
 from jeit.design.skin.indentation import AbstractIndentation
 from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.design.skin.skin import Skin

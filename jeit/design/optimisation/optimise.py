@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit.design.defaults import STEPS
 from jeit.design.optimisation.constraints import Constraints
 from jeit.design.optimisation.design_space import DesignSpace, varied_of
 from jeit.design.optimisation.objective import Objective
 from jeit.design.optimisation.search import Record, descend
 from jeit.design.optimisation.variables import Variables, Varied
 from jeit.design.scores import Scores
-from jeit.design.skin.defaults import STEPS
 from jeit.design.skin.skin import Skin
 from jeit.layout import Layout
 from jeit.mesh import Domain

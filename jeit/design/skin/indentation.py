@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jeit.design.skin.defaults import BALL_DIAMETER, DEPTH, DEVIATION
+from jeit.design.defaults import BALL_DIAMETER, DEPTH, DEVIATION
 from jeit.mesh.outline.domain import check_length
 
 

@@ -4,8 +4,8 @@ from typing import Literal
 
 import numpy as np
 
+from jeit.design.defaults import CURRENT, NUM_PAIRS, PROTOCOL
 from jeit.design.measurements.selection import nearest_pairs
-from jeit.design.skin.defaults import CURRENT, NUM_PAIRS, PROTOCOL
 from jeit.layout import Layout
 from jeit.protocol import Protocol, adjacent, opposite, two_terminal
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jeit.design.skin.defaults import CONTRAST
+from jeit.design.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
 from jeit.design.skin.touched_cells import TouchedCells, touched_cells
 from jeit.mesh import Mesh, centroids

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit.design.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
 from jeit.design.skin.cell_size import check_cell_size
-from jeit.design.skin.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
 from jeit.design.skin.indentation import AbstractIndentation, Bell
 from jeit.design.skin.protocol import skin_protocol
 from jeit.design.skin.sheet_touches import SheetTouches, sheet_touches

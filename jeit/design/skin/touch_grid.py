@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jeit.design.skin.defaults import PLACES
+from jeit.design.defaults import PLACES
 from jeit.mesh import Domain
 
 

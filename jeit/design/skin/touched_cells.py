@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
-from jeit.design.skin.defaults import CONTRAST
+from jeit.design.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
 from jeit.electrodes.window import smooth_step
 from jeit.mesh import Mesh, centroids

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from jeit.design.skin import defaults
+from jeit.design import defaults
 from jeit.design.skin.protocol import PROTOCOLS
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.design.skin.defaults import CONTACT_IMPEDANCE
+from jeit.design.defaults import CONTACT_IMPEDANCE
 from jeit.layout import Layout, named_layout, read_layout
 from jeit.layout.names import DIAMETER, same_outline
 from jeit.mesh import Rectangle

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jeit.design.skin import defaults
+from jeit.design import defaults
 from jeit.design.skin.cell_size import check_cell_size
 from jeit.design.skin.indentation import AbstractIndentation, Bell, Hemisphere
 from jeit.design.skin.protocol import ProtocolName, skin_protocol
@@ -182,7 +182,7 @@ def read_study(path: str | Path) -> Study:
         wanted = ["minimum", "mean", "uniformity", "blind_spot", "taxels"]    # num_taxels, threshold, seed
         # of sheets also "information", "mean_variance", "largest_variance", "localisation_error": correlation_mm
 
-    Only `electrodes.layouts` must be there; defaults are those of `jeit.design.skin.defaults`. Files are looked for
+    Only `electrodes.layouts` must be there; defaults are those of `jeit.design.defaults`. Files are looked for
     beside the study's. Raises `FileNotFoundError` if there is no such file and `ValueError`, naming the key and what to
     do, for keys that are not known or have no effect beside the others, values out of range (such as metres for
     millimetres), electrodes that overlap, impossible spacings, and layouts that do not have the electrodes that a

@@ -12,7 +12,7 @@ import scipy.optimize
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jeit.inverse.hyperparameter.choice import Choice
+from jeit.inverse.hyperparameter.chosen import Choice
 from jeit.inverse.hyperparameter.point_spread import best_resolution
 from jeit.inverse.spectrum import Spectrum as Spectrum
 from jeit.mesh import Mesh

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import Data, IndependentChannels
-from jeit.inverse.hyperparameter.choice import Choice
+from jeit.inverse.hyperparameter.chosen import Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise, check_prior
 from jeit.inverse.nonlinear.informed import informed

@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jeit.imaging.choice import ComparedRules
+from jeit.imaging.compared_rules import ComparedRules
 from jeit.report.describe import describe_measurement, plain
 
 
@@ -25,7 +25,7 @@ def draw_choice(result: ComparedRules):
     from matplotlib.figure import Figure
 
     from jeit.plot import ColourScale, plot_choice, plot_image
-    from jeit.plot.imaging.choice import COLOURS
+    from jeit.plot.imaging.hyperparameter import COLOURS
 
     outcomes = result.outcomes
     figure = Figure(figsize=(max(2.1 * len(outcomes), 8.4), 7.4), layout="constrained")
