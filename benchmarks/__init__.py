@@ -1,1 +1,1 @@
-"""Benchmarks: jeit beside pyEIT and plain SciPy, time and accuracy in one table. Run `python -m benchmarks`."""
+"""Benchmarks: jeit beside others, time and accuracy in one table. `python -m benchmarks` lists the cases."""

@@ -82,8 +82,8 @@ def exact_map(kind: str, cell_size: float, places: int, sample: int, rounds: int
     """Touches all over one skin; SciPy's, as a few of them take, if `sample` is not 0."""
     model, conductivity, options = skin(kind, cell_size)
     grid = touch_grid(Rectangle(SIDE, SIDE), places, places)
-    presses = touched_cells(model.mesh, Bell(), grid.places, **options)
-    spent = timed(lambda: touch_changes(model, conductivity, presses), rounds)
+    touched = touched_cells(model.mesh, Bell(), grid.places, **options)
+    spent = timed(lambda: touch_changes(model, conductivity, touched), rounds)
     nodes, number = model.mesh.num_points, len(grid.places)
     if not sample:
         return ExactMap(nodes, number, spent, None, None)
@@ -91,7 +91,7 @@ def exact_map(kind: str, cell_size: float, places: int, sample: int, rounds: int
     each, worst = [], 0.0
     for k in np.linspace(0, number - 1, sample).astype(int):
         start = time.perf_counter()
-        expected = plain.change(np.asarray(presses.cells[k]), np.asarray(presses.change[k]))
+        expected = plain.change(np.asarray(touched.cells[k]), np.asarray(touched.change[k]))
         each.append(time.perf_counter() - start)
         worst = max(worst, float(np.abs(found[k] - expected).max() / np.abs(expected).max()))
     return ExactMap(nodes, number, spent, statistics.median(each) * number, worst)
@@ -100,12 +100,12 @@ def exact_map(kind: str, cell_size: float, places: int, sample: int, rounds: int
 def many_layouts(numbers: tuple[int, ...], rounds: int) -> tuple[list[list[str]], list[tuple[int, float]]]:
     """Rows: linear maps of so many layouts in one batch, and one after the other; and seconds of each batch."""
     model, conductivity, options = skin("sheet", 6.3e-3)
-    presses = touched_cells(model.mesh, Bell(), touch_grid(Rectangle(SIDE, SIDE), 24, 24).places, **options)
+    touched = touched_cells(model.mesh, Bell(), touch_grid(Rectangle(SIDE, SIDE), 24, 24).places, **options)
     sigma = jnp.asarray(conductivity)
 
     def theta(move):
         electrodes = eqx.tree_at(lambda e: e.position, model.electrodes, model.electrodes.position + move)
-        changes = touch_changes(eqx.tree_at(lambda m: m.electrodes, model, electrodes), sigma, presses, linear=True)
+        changes = touch_changes(eqx.tree_at(lambda m: m.electrodes, model, electrodes), sigma, touched, linear=True)
         return jnp.linalg.norm(changes, axis=1)
 
     batch, one = jax.jit(lambda moves: jax.lax.map(theta, moves)), jax.jit(theta)
@@ -132,9 +132,9 @@ def clusters(rounds: int, quick: bool) -> list[str]:
     """A row: 90 clusters of the changes of 2,304 touches by 94 voltages, beside scikit-learn on one thread."""
     model, conductivity, options = skin("sheet", 7e-3 if quick else 5e-3)
     grid, number = touch_grid(Rectangle(SIDE, SIDE), *((12, 12) if quick else (48, 48))), 10 if quick else 90
-    presses = touched_cells(model.mesh, Bell(), grid.places, **options)
+    touched = touched_cells(model.mesh, Bell(), grid.places, **options)
     chosen = np.sort(nearest_pairs(named_layout("park-inner").centres, 94))
-    vectors = np.asarray(touch_changes(model, conductivity, presses, linear=True))[:, chosen]
+    vectors = np.asarray(touch_changes(model, conductivity, touched, linear=True))[:, chosen]
     spent = timed(lambda: kmeans(vectors, number, jax.random.key(0)), rounds)
     draws = 1 if quick else 3
     theirs, inertia = scikit_learn.kmeans(vectors, number, rounds, draws)

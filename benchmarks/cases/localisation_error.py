@@ -99,7 +99,7 @@ def ratio_table(skin, calibration, ratios, pad: int) -> tuple[Table, dict[str, l
     curve: dict[str, list[float]] = {"paper's loss": [], "likelihood": []}
     rows, bounds = [], []
     for ratio in ratios:
-        noisy = SoundingSkin(jax.random.key(0), model=MicrophoneModel(snr_db=ratio - loudest))
+        noisy = SoundingSkin(jax.random.key(0), microphone_model=MicrophoneModel(snr_db=ratio - loudest))
         off, cover, least = errors(calibration, noisy, places, 1, pad)
         roots = [float(np.sqrt(np.mean(off[name] ** 2))) for name in METHODS]
         bounds.append(least)

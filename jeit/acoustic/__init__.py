@@ -5,7 +5,8 @@
 `locate` and `track`. Beneath them: `Localiser`, which is batched and differentiable, and the Cramér-Rao bound.
 
 Rooms: `signal` (recordings, faults, intensities), `calibration` (fits to taps), `localisation` (objectives, minima,
-maps, two sources). Beside them: `decay`, the decay models; `surface`, on which sources are; `noise`.
+maps, two sources). Beside them: `decay`, the decay models; `microphones`, the array; `surface`, on which
+sources are; `noise`; `track`, places in time; `touches`, all of it in one call.
 """
 
 from jeit.acoustic.calibration.calibrate import calibrate_microphones as calibrate_microphones

@@ -26,7 +26,7 @@ Conductivity = Annotated[float, typer.Option("--conductivity", help="Of the skin
 _LEAST_CONDUCTIVITY, _MOST_CONDUCTIVITY = 1e-9, 1e9
 
 
-def read(name: str, width: float, height: float) -> "Layout":
+def read_with_outline(name: str, width: float, height: float) -> "Layout":
     """A layout with its skin, by name or from a file; the skin is width × height (mm) where neither says it.
 
     Raises `ValueError` for fewer than three electrodes.

@@ -36,8 +36,8 @@ def reciprocity_error(measurement: Measurement) -> float | None:
     """Relative departure from reciprocity: ‖T - Tᵀ‖ / ‖T‖ with T the transfer between drives.
 
     T_ij is what drive pattern i would read while drive j flows, combined from the measured channels (see
-    `jeit.protocol.transfer_between_drives`); it is symmetric for every body, so that what is left is noise,
-    drift and gain error, or a wrong protocol. Independent noise of relative size ε gives about √2 ε.
+    `jeit.protocol.reciprocity.transfer_between_drives`); it is symmetric for every body, so that what is left is
+    noise, drift and gain error, or a wrong protocol. Independent noise of relative size ε gives about √2 ε.
 
     Returns None when the protocol ties no two usable channels together.
     """

@@ -55,7 +55,7 @@ def improve_layout(
     num_points: int = NUM_POINTS,
     progress: Callable[[str], None] | None = None,
     callback: Callable[[int, np.ndarray], None] | None = None,
-    **skin,
+    **material,
 ) -> ImprovedLayout:
     """Move the electrodes of `layout` until its worst sensitivity and mean variance are as good as they get; as
     `jeit layout optimise`.
@@ -69,22 +69,22 @@ def improve_layout(
     - `steps`, `starts`, `callback`: as in `optimise_layout`; `seed`: of the random starts.
     - `num_points`: nodes of the mesh to optimise on, about; results are confirmed on four times as many.
     - `progress`: called with the name of each step as it begins.
-    - `skin`: thickness, conductivity and contact impedance, as in `Skin.create`.
+    - `material`: thickness, conductivity and contact impedance, as in `Skin.create`.
 
     Raises `ValueError` where no layout satisfies what is asked, and as `Skin.create` and `optimise_layout` do.
     """
     tell = progress or (lambda step: None)
     space = DesignSpace(minimum_spacing=MINIMUM_SPACING) if space is None else space
     tell("mesh")
-    sheet, objective = _setting(layout, num_points, _PLACES, noise, skin)
+    sheet, objective = _setting(layout, num_points, _PLACES, noise, material)
     tell("optimise")
     key = jax.random.key(seed)
     found = optimise_layout(sheet, objective, space, steps=steps, starts=starts, key=key, callback=callback)
     if found.status == "infeasible":
         raise ValueError(f"no layout found: {found.reason}")
     tell("confirm")
-    finer, objective = _setting(layout, _FINER * num_points, _MORE_PLACES, noise, skin)
-    moved = finer.with_layout(found.layout, skin.get("contact_impedance"))
+    finer, objective = _setting(layout, _FINER * num_points, _MORE_PLACES, noise, material)
+    moved = finer.with_layout(found.layout, material.get("contact_impedance"))
     before, after = objective.scores(finer), objective.scores(moved)
     return ImprovedLayout(layout, sheet, found, before, after, space, noise, seed, num_points)
 

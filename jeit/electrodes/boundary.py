@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from jeit.electrodes.electrodes import (
     AbstractMovableElectrodes,
     Contact,
-    Pen,
+    ElectrodePen,
     as_electrode_values,
     as_positions,
     check_dimension,
@@ -45,7 +45,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         """Positions and widths."""
         return {"position": self.position, "width": self.width}
 
-    def draw(self, mesh: Mesh, pen: Pen) -> None:
+    def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Arcs of the boundary of `mesh`."""
         for place, width in zip(np.asarray(self.position), np.asarray(self.width), strict=True):
             pen.lines([_arc(mesh, place, width)], place)

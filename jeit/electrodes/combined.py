@@ -7,7 +7,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.electrodes.electrodes import AbstractCompleteElectrodes, AbstractElectrodes, Contact, Pen, as_electrode_values
+from jeit.electrodes.electrodes import (
+    AbstractCompleteElectrodes,
+    AbstractElectrodes,
+    Contact,
+    ElectrodePen,
+    as_electrode_values,
+)
 from jeit.mesh import Mesh, Refine
 
 
@@ -48,7 +54,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         """Every part's own description."""
         return {"parts": [part.describe() for part in self.parts]}
 
-    def draw(self, mesh: Mesh, pen: Pen) -> None:
+    def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """All parts, one after the other."""
         for part in self.parts:
             part.draw(mesh, pen)

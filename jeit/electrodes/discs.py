@@ -10,7 +10,7 @@ from jeit.electrodes.electrodes import (
     AbstractMovableElectrodes,
     AbstractPlacedElectrodes,
     Contact,
-    Pen,
+    ElectrodePen,
     as_electrode_values,
     as_positions,
     check_dimension,
@@ -31,7 +31,7 @@ class AbstractDiscs(AbstractPlacedElectrodes):
         """Positions and radii."""
         return {"position": self.position, "radius": self.radius}
 
-    def draw(self, mesh: Mesh, pen: Pen) -> None:
+    def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Discs."""
         for place, radius in zip(np.asarray(self.position), np.asarray(self.radius), strict=True):
             pen.disc(place, radius)

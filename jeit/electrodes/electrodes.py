@@ -33,7 +33,7 @@ class Contact(eqx.Module):
     load: Float[Array, "n L"]
 
 
-class Pen(Protocol):
+class ElectrodePen(Protocol):
     """What electrodes are drawn with, as seen from above: one stroke each, round its middle (d,), all in metres."""
 
     def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
@@ -89,7 +89,7 @@ class AbstractElectrodes(eqx.Module):
         """Where they are and how large: names and values of the fields that say so, metres."""
 
     @abc.abstractmethod
-    def draw(self, mesh: Mesh, pen: Pen) -> None:
+    def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw every electrode on `mesh` in one stroke, in their order, as seen from above."""
 
     @abc.abstractmethod

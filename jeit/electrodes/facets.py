@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from jeit.electrodes.electrodes import (
     AbstractCompleteElectrodes,
     Contact,
-    Pen,
+    ElectrodePen,
     as_electrode_values,
     is_concrete,
     replace_contact_impedance,
@@ -63,7 +63,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         """Nothing but in facets of a mesh."""
         return {}
 
-    def draw(self, mesh: Mesh, pen: Pen) -> None:
+    def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """The facets of a plane mesh; dots in their middle on a solid one."""
         ends, covers = np.asarray(mesh.points)[np.asarray(mesh.facets)], np.asarray(self.covers)
         middles = covers.T @ ends.mean(axis=1) / covers.sum(axis=0)[:, None]

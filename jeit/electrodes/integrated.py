@@ -6,7 +6,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.electrodes.electrodes import AbstractElectrodes, Contact, Pen
+from jeit.electrodes.electrodes import AbstractElectrodes, Contact, ElectrodePen
 from jeit.mesh import Mesh, Refine
 
 
@@ -46,7 +46,7 @@ class IntegratedElectrodes(AbstractElectrodes):
         """Nothing is known any more."""
         return {}
 
-    def draw(self, mesh: Mesh, pen: Pen) -> None:
+    def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Raises `ValueError`: where they are is not known any more."""
         raise ValueError("IntegratedElectrodes do not say where they are; draw the electrodes that they were made of.")
 

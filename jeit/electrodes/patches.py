@@ -9,7 +9,7 @@ from jeit.electrodes.discs import facet_normals
 from jeit.electrodes.electrodes import (
     AbstractPlacedElectrodes,
     Contact,
-    Pen,
+    ElectrodePen,
     as_electrode_values,
     as_positions,
     check_dimension,
@@ -49,7 +49,7 @@ class FacePatches(AbstractPlacedElectrodes):
         """Positions, widths and heights."""
         return {"position": self.position, "width": self.width, "height": self.height}
 
-    def draw(self, mesh: Mesh, pen: Pen) -> None:
+    def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Rectangles where all lie on one horizontal face, dots elsewhere."""
         places = np.asarray(self.position)
         flat = np.ptp(places[:, 2]) < 1e-9

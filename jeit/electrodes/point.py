@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.electrodes.electrodes import AbstractPointElectrodes, Contact, Pen, as_positions, is_concrete
+from jeit.electrodes.electrodes import AbstractPointElectrodes, Contact, ElectrodePen, as_positions, is_concrete
 from jeit.mesh import Mesh, Refine, gradients
 
 
@@ -33,7 +33,7 @@ class PointElectrodes(AbstractPointElectrodes):
         """Positions."""
         return {"position": self.position}
 
-    def draw(self, mesh: Mesh, pen: Pen) -> None:
+    def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Dots."""
         for place in np.asarray(self.position):
             pen.dot(place)
@@ -96,7 +96,7 @@ class NodeElectrodes(AbstractPointElectrodes):
         """Nothing but nodes of a mesh."""
         return {}
 
-    def draw(self, mesh: Mesh, pen: Pen) -> None:
+    def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Dots."""
         for place in np.asarray(mesh.points)[np.asarray(self.nodes)]:
             pen.dot(place)

@@ -32,7 +32,7 @@ class Method:
     """How to image a difference.
 
     - `image`: the function that does it, given the prior and λ of the settings.
-    - `takes_prior`: whether of the prior in the settings; `prior`, what it is called where the method has its own.
+    - `takes_prior`: whether it uses the prior of the settings; `prior`, what it is called where the method has its own.
     - `hyperparameter`: λ unless given. `takes_hyperparameter`: whether it has any use for one; `number`: one that
       serves, where λ cannot be chosen by a rule.
     """

@@ -118,7 +118,8 @@ def calibrated_model(
     num_points: int = 2000,
     clock: Clock | None = None,
 ) -> tuple[Calibration, str]:
-    """A forward model on a new mesh, calibrated on a frame of the undisturbed body; and how its contact was.
+    """A forward model on a new mesh, calibrated on a frame of the undisturbed body; and which `contact` was
+    fitted.
 
     `contact`: "each", "common" or "fixed"; decided by the protocol, and by what converges, unless given. Raises
     `ValueError` if the calibration fails.

@@ -1,6 +1,7 @@
 """Inverse problems: calibration, priors, linear and nonlinear images, and the rules that choose a hyperparameter.
 
-Solvers, links and further unknowns are in `jeit.inverse.nonlinear`; what results are made of, where it is computed.
+Solvers, links and further unknowns are in `jeit.inverse.nonlinear`; the classes of results are in the modules that
+compute them.
 """
 
 from jeit.inverse.calibration import calibrate as calibrate

@@ -1,4 +1,5 @@
-"""Everything that is written to a folder: images, tracks, calibrations, choices of a rule, layouts, studies."""
+"""What is told of results, and all that is written to a folder: measurements, images, streams, compared rules,
+calibrations of microphones, tracks, layouts, studies."""
 
 from jeit.report.calibration import draw_calibration as draw_calibration
 from jeit.report.calibration import write_calibration as write_calibration

@@ -25,6 +25,7 @@ def draw_choice(result: ComparedRules):
     from matplotlib.figure import Figure
 
     from jeit.plot import ColourScale, plot_choice, plot_image
+    from jeit.plot.axes import INK
     from jeit.plot.imaging.hyperparameter import COLOURS
 
     outcomes = result.outcomes
@@ -37,7 +38,7 @@ def draw_choice(result: ComparedRules):
             result.prepared.mesh, outcome.change, inclusions=outcome.inclusions, scale=ColourScale(bar=False), ax=ax
         )
         largest = factor * float(jnp.abs(outcome.change).max())
-        ax.set_title(name, color=COLOURS[name], fontsize=11, pad=0)
+        ax.set_title(name, color=COLOURS.get(name, INK), fontsize=11, pad=0)
         ax.text(1, 0, f"± {largest:.3g} {unit}", transform=ax.transAxes, ha="right", va="bottom", fontsize=9)
     choices = {name: outcome.choice for name, outcome in outcomes.items()}
     plot_choice(choices, title=result.prepared.measurement.name, ax=lower.subplots())

@@ -11,7 +11,7 @@ import numpy as np
 
 from jeit.acoustic import Localiser, LocatedTouches
 from jeit.acoustic.localisation.locate import microphones_in_use
-from jeit.acoustic.localisation.locations import FrameStatus, Locations
+from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.overlay import brightness, fade
 from jeit.acoustic.track import Track
 
@@ -46,7 +46,7 @@ def report_track(found: LocatedTouches) -> dict[str, Any]:
     for number, touch in enumerate(track.touches, 1):
         frames = slice(touch.first, touch.last + 1)
         strength = locations.strength[frames]
-        kinds = [str(kind) for kind in locations.status[frames] if kind != FrameStatus.NO_TOUCH]
+        kinds = [str(kind) for kind in locations.status[frames] if kind != LocationStatus.NO_TOUCH]
         touches.append(
             {
                 "touch": number,
@@ -58,7 +58,7 @@ def report_track(found: LocatedTouches) -> dict[str, Any]:
                 "greatest_strength": _number(np.nanmax(strength)),
             }
         )
-    second = np.flatnonzero(locations.status == FrameStatus.TWO_TOUCHES)
+    second = np.flatnonzero(locations.status == LocationStatus.TWO_TOUCHES)
     microphones = []
     for number, (fault, used) in enumerate(zip(locations.faults, locations.used.T, strict=True)):
         share = float(used.mean())
@@ -106,7 +106,7 @@ def draw_track(found: LocatedTouches):
 def _overlay(found: LocatedTouches) -> np.ndarray | None:
     """The maps of all located frames, the older the fainter (rows, columns); None without a touch."""
     locations, heard = found.locations, found.intensities
-    located = np.flatnonzero(locations.located & (locations.status != FrameStatus.TWO_TOUCHES))
+    located = np.flatnonzero(locations.located & (locations.status != LocationStatus.TWO_TOUCHES))
     if not located.size:
         return None
     microphone_array, use, _ = microphones_in_use(heard, found.calibration)

@@ -1,4 +1,5 @@
-"""What is not measured: skins that are pressed, skins that sound, and the touches on them.
+"""Simulated skins and touches, where nothing is measured: skins that are pressed, skins that sound, and the
+touches on them.
 
 What a sounding skin is made of (its layer, microphones and readout) is in `jeit.simulate.acoustic`.
 """

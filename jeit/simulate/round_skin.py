@@ -1,7 +1,6 @@
 """Simulated skins: what a round piezoresistive skin would read while it is pressed.
 
 No openly licensed measurement of a tactile skin exists; this stands in where one is needed, and says so in its notes.
-It uses the forward model, which the readers do not, and is therefore not re-exported by `jeit.data`.
 """
 
 import equinox as eqx

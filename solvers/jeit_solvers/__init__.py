@@ -1,8 +1,11 @@
-"""Numerics with no physics in it: sparse symmetric positive definite systems, solved in pure JAX.
+"""Numerics with no physics in it, in pure JAX.
 
-A direct solver (nested dissection, multifrontal Cholesky in batches of dense fronts) and conjugate gradients, both for
-`SparseSymmetric` operators and behind `lineax.linear_solve`; and the functions beneath it, for when every microsecond
-counts. See `analyse`, `factorise` and `solve`.
+- `sparse`: symmetric systems by a direct solver (nested dissection, multifrontal Cholesky in batches of dense fronts)
+  or conjugate gradients, for `SparseSymmetric` operators and behind `lineax.linear_solve`; and the functions beneath,
+  for when every microsecond counts: `analyse`, `factorise`, `solve`;
+- `dense`: small systems that batch;
+- `optimise`: descent along quadratic models, many small problems at once, problems between bounds, and `Status`;
+- `kmeans`; `over_cores` and `in_turn`, which share work out.
 """
 
 from jeit_solvers.batching import in_turn

@@ -7,7 +7,7 @@ import pytest
 from microphone_arrays import array, hear, inside, noisy
 
 from jeit.acoustic import Calibration, Intensities, cramer_rao, locate
-from jeit.acoustic.localisation.locations import FrameStatus, Locations
+from jeit.acoustic.localisation.locations import Locations, LocationStatus
 
 FRAMES = 64
 FLOOR, FREEDOM = 0.01, 50.0
@@ -352,7 +352,7 @@ def test_frames_do_not_see_each_other(known, touches):
 
 
 def test_every_status_is_documented():
-    for status in FrameStatus:
+    for status in LocationStatus:
         assert f'"{status}"' in Locations.__doc__
 
 

@@ -24,7 +24,7 @@ from jeit.simulate.acoustic.sound import superpose
 KEY = jax.random.key(0)
 # No spread from microphone to microphone, and no coupling: what is left has closed forms.
 SPREADS = {"gain_spread_db": 0.0, "depth_spread": 0.0, "noise_spread_db": 0.0}
-ALIKE = {"model": MicrophoneModel(**SPREADS), "readout": Readout(coupling_db=-np.inf)}
+ALIKE = {"microphone_model": MicrophoneModel(**SPREADS), "readout": Readout(coupling_db=-np.inf)}
 UNBOUNDED = ElastomerLayer(reflection=0.0)
 CENTRE = [(0.0, 0.0)]
 
@@ -79,7 +79,7 @@ def test_sound_is_delayed_as_its_loss_demands():
     # For a loss ∝ f, α = α0 f / f0, Kramers and Kronig give the slowness 1 / speed - α0 ln(f / f0) / (π² f0).
     layer = ElastomerLayer(material=Elastomer(attenuation_exponent=1.0), reflection=0.0)
     readout = Readout(coupling_db=-np.inf, multiplexed=False)
-    dispersive = SoundingSkin(KEY, CENTRE, layer=layer, model=ALIKE["model"], readout=readout)
+    dispersive = SoundingSkin(KEY, CENTRE, layer=layer, microphone_model=ALIKE["microphone_model"], readout=readout)
     frequencies, length = np.linspace(1, 900, 900), np.hypot(0.04, 0.01)
     phase = np.unwrap(np.angle(transfer(dispersive, frequencies, np.array([0.04, 0.0]))[0]))
     slowness = 1 / 10 - 4 * np.log(frequencies / 100) / (np.pi**2 * 100)
@@ -91,7 +91,7 @@ def test_a_microphone_hears_as_far_as_its_reach():
     snr = expected_power(alike, [(0.055, 0.0), (0.0, -0.055)])[:, 0] / noise_power(alike)
     # 0 dB, but for the edges' echoes, which are weak so far from them.
     np.testing.assert_allclose(10 * np.log10(snr), 0, atol=0.4)
-    louder = SoundingSkin(KEY, CENTRE, **ALIKE | {"model": MicrophoneModel(snr_db=10.0, **SPREADS)})
+    louder = SoundingSkin(KEY, CENTRE, **ALIKE | {"microphone_model": MicrophoneModel(snr_db=10.0, **SPREADS)})
     np.testing.assert_allclose(noise_power(alike) / noise_power(louder), 10, rtol=1e-12)
 
 
@@ -181,7 +181,7 @@ def test_a_row_of_taps_is_as_loud_and_as_late_as_it_should_be():
 def test_the_multiplexer_samples_one_after_another(multiplexed, step, rate):
     # Six microphones in one place hear the same sound; later samples are earlier sound.
     readout = Readout(coupling_db=-np.inf, multiplexed=multiplexed)
-    together = SoundingSkin(KEY, [(0.0, 0.02)] * 6, model=ALIKE["model"], readout=readout)
+    together = SoundingSkin(KEY, [(0.0, 0.02)] * 6, microphone_model=ALIKE["microphone_model"], readout=readout)
     recording = tap(together, KEY, (0.01, 0.0), noise=False)
     assert recording.rate == pytest.approx(rate)
     spectrum = np.fft.rfft(recording.samples)
@@ -235,7 +235,7 @@ def test_keys_decide_everything(small):
         np.testing.assert_array_equal(made(KEY), made(KEY))
         assert np.abs(made(KEY) - made(jax.random.key(1))).max() > 0
     # A draw does not depend on what else the skin is.
-    other = SoundingSkin(KEY, layer=UNBOUNDED, model=MicrophoneModel(snr_db=20.0))
+    other = SoundingSkin(KEY, layer=UNBOUNDED, microphone_model=MicrophoneModel(snr_db=20.0))
     np.testing.assert_array_equal(SoundingSkin(KEY).gain, other.gain)
 
 
@@ -257,7 +257,7 @@ def test_touches_add_and_noise_is_added_once(small):
 
 
 def test_the_loudest_microphone_follows_a_stroke():
-    clear = SoundingSkin(KEY, **ALIKE | {"model": MicrophoneModel(snr_db=20.0, **SPREADS)})
+    clear = SoundingSkin(KEY, **ALIKE | {"microphone_model": MicrophoneModel(snr_db=20.0, **SPREADS)})
     recording = stroke(clear, KEY, [(-0.09, -0.04), (0.0, -0.04), (0.0, 0.09)])
     place, right = np.asarray(clear.microphones), 0
     starts = np.arange(500, 9000, 500)

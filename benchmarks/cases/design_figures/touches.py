@@ -65,7 +65,9 @@ def changes(
     return sensitivity_map(model, 1.0, grid, indentation=indentation, contrast=contrast).changes
 
 
-def felt(name: str, setting: Setting, changed: Array, margin: float = MARGIN, pairs: int = PAIRS) -> SkinResponse:
+def response_of(
+    name: str, setting: Setting, changed: Array, margin: float = MARGIN, pairs: int = PAIRS
+) -> SkinResponse:
     """What the layout feels farther than `margin` from the edge with the nearest `pairs`, given all changes."""
     import jax
 
@@ -107,7 +109,7 @@ def comparison_table(setting: Setting, changed: dict[str, Array]) -> Table:
 
     rows = [["Park et al. 2022", "94", "33 %", "", "12.6 ± 1.4", "41", "30.5 ± 27.3", "112"]]
     for margin, pairs in [*((margin, PAIRS) for margin in setting.margins), (MARGIN, 496)]:
-        inner, boundary = (felt(name, setting, changed[name], margin, pairs) for name in LAYOUTS)
+        inner, boundary = (response_of(name, setting, changed[name], margin, pairs) for name in LAYOUTS)
         one, other = comparison(inner, boundary)
         percentile = np.percentile(np.asarray(inner.sensitivity.values), 1)
         below = f"{100 * float(boundary.sensitivity.blind_spot(percentile)):.1f} %"
@@ -126,7 +128,7 @@ def thickness_table(setting: Setting) -> tuple[Table, dict[float, list[SkinRespo
     for thickness, num_layers in (*setting.study, *setting.check):
         say(f"{1e3 * thickness:g} mm, {num_layers} layers")
         mesh = setting.study_cell, num_layers
-        both = [felt(name, setting, changes(name, setting.places, mesh, thickness)) for name in LAYOUTS]
+        both = [response_of(name, setting, changes(name, setting.places, mesh, thickness)) for name in LAYOUTS]
         studied.setdefault(thickness, both)
         for name, told in zip(LAYOUTS, comparison(*both), strict=True):
             row = [f"{1e3 * thickness:g}", str(num_layers), name]
@@ -153,7 +155,7 @@ def kinds_table(setting: Setting, changed: dict[str, Array]) -> Table:
                 if known is None:
                     options = {"indentation": indentation, "contrast": contrast}
                     known = changes(name, setting.places, setting.mesh, **options)
-                both.append(felt(name, setting, known))
+                both.append(response_of(name, setting, known))
             one, other = comparison(*both)
             least = [f"{1e3 * told['sensitivity_min_V']:.3g}" for told in (one, other)]
             row = [f"{kind} {shape}", *least, blind(other), blind(one), area(one), f"{one['two_point_mm']:.0f}"]

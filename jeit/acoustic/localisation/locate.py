@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
 from jeit.acoustic.localisation.localiser import Localiser, SourceEstimate
-from jeit.acoustic.localisation.locations import FrameStatus, Locations
+from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.setup_changes import find_setup_changes
 from jeit.acoustic.localisation.two_sources import locate_two
 from jeit.acoustic.microphones import MicrophoneArray
@@ -59,8 +59,8 @@ def locate(
     solve = touched & enough
     localiser = Localiser.create(microphone_array, method=method, map_shape=map_shape)
     frames, d = len(heard.times), calibration.microphone_array.microphones.shape[1]
-    status = np.where(touched, FrameStatus.TOUCH, FrameStatus.NO_TOUCH).astype(object)
-    status[~enough] = FrameStatus.UNUSABLE
+    status = np.where(touched, LocationStatus.TOUCH, LocationStatus.NO_TOUCH).astype(object)
+    status[~enough] = LocationStatus.UNUSABLE
     result = {
         "position": np.full((frames, d), np.nan),
         "covariance": np.full((frames, d, d), np.nan),
@@ -85,7 +85,7 @@ def locate(
         _explain(status, result, heard.power, use, microphone_array)
         excess = np.zeros(frames)
         excess[solve] = np.asarray(judge.excess)[:number]
-        status[(status == FrameStatus.MISFIT) & (excess > _OUTSIDE)] = FrameStatus.OUTSIDE
+        status[(status == LocationStatus.MISFIT) & (excess > _OUTSIDE)] = LocationStatus.OUTSIDE
         _bound(status, result, float(longer_side(microphone_array.surface)))
         notes += _notes(status, heard, use, microphone_array)
     return Locations(
@@ -105,11 +105,11 @@ def _judge(judge: SourceEstimate, found: SourceEstimate) -> np.ndarray:
     misfit, freedom = np.asarray(judge.misfit), np.asarray(judge.freedom)
     excess = np.asarray(judge.excess)
     rivalled = np.asarray(judge.rival) < _RIVAL
-    status = np.where(rivalled, FrameStatus.AMBIGUOUS, FrameStatus.TOUCH).astype(object)
-    status[_unexplained(misfit, freedom)] = FrameStatus.MISFIT
+    status = np.where(rivalled, LocationStatus.AMBIGUOUS, LocationStatus.TOUCH).astype(object)
+    status[_unexplained(misfit, freedom)] = LocationStatus.MISFIT
     # A source beyond the outline explains what none on it does, but for two sources, which nothing explains.
-    status[(excess > _OUTSIDE) & ~_unexplained(misfit - excess, freedom)] = FrameStatus.OUTSIDE
-    status[~np.isfinite(np.asarray(found.position)).all(axis=1)] = FrameStatus.UNUSABLE
+    status[(excess > _OUTSIDE) & ~_unexplained(misfit - excess, freedom)] = LocationStatus.OUTSIDE
+    status[~np.isfinite(np.asarray(found.position)).all(axis=1)] = LocationStatus.UNUSABLE
     return status
 
 
@@ -120,7 +120,7 @@ def _unexplained(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
 
 def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, microphone_array: MicrophoneArray) -> None:
     """Try two sources where one does not explain the frame; widen the covariance where neither does."""
-    tried = np.flatnonzero((status == FrameStatus.MISFIT) & (use.sum(axis=1) > 6))
+    tried = np.flatnonzero((status == LocationStatus.MISFIT) & (use.sum(axis=1) > 6))
     if tried.size:
         two = locate_two(microphone_array, *_padded(power[tried], use[tried]))
         misfit, freedom = np.asarray(two.misfit)[: tried.size], np.asarray(two.freedom)[: tried.size]
@@ -128,13 +128,13 @@ def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, micr
         much_better = (misfit < _BOTH * result["misfit"][tried]) & (misfit < _STILL_FAIR * freedom)
         both = (~_unexplained(misfit, freedom) | much_better) & (weaker > _WEAKEST * stronger)
         chosen, index = tried[both], np.flatnonzero(both)
-        status[chosen] = FrameStatus.TWO_TOUCHES
+        status[chosen] = LocationStatus.TWO_TOUCHES
         result["misfit"][chosen], result["freedom"][chosen] = misfit[both], freedom[both]
         position, strength = np.asarray(two.position)[index], np.asarray(two.strength)[index]
         result["position"][chosen], result["second"][chosen] = position[:, 0], position[:, 1]
         result["strength"][chosen], result["second_strength"][chosen] = strength.T
         result["covariance"][chosen] = np.asarray(two.covariance)[index, 0]
-    left = np.flatnonzero(status == FrameStatus.MISFIT)
+    left = np.flatnonzero(status == LocationStatus.MISFIT)
     wide = result["misfit"][left] / np.maximum(result["freedom"][left], 1)
     result["covariance"][left] *= np.maximum(wide, 1.0)[:, None, None]
 
@@ -145,8 +145,8 @@ def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> N
     finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
     width = np.zeros(len(status))
     width[finite] = np.sqrt(np.abs(np.linalg.eigvalsh(result["covariance"][finite])).max(axis=1))
-    vague = located & (status == FrameStatus.TOUCH) & (~finite | (width > reach / 4))
-    status[vague] = FrameStatus.AMBIGUOUS
+    vague = located & (status == LocationStatus.TOUCH) & (~finite | (width > reach / 4))
+    status[vague] = LocationStatus.AMBIGUOUS
     boundless = located & (~finite | (width > reach))
     result["covariance"][boundless] = (reach / 2) ** 2 * np.eye(result["covariance"].shape[1])
 
@@ -154,8 +154,8 @@ def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> N
 def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, microphone_array: MicrophoneArray) -> list[str]:
     """What the user should know beyond the status of frames."""
     notes = []
-    placed = ~np.isin(status, [FrameStatus.NO_TOUCH, FrameStatus.UNUSABLE])
-    odd = np.isin(status, [FrameStatus.MISFIT, FrameStatus.OUTSIDE, FrameStatus.TWO_TOUCHES])
+    placed = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
+    odd = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])
     if odd.sum() > _ODD * placed.sum():
         exchanged, altered = find_setup_changes(microphone_array, heard.power[placed], use[placed])
         notes += [
@@ -168,7 +168,7 @@ def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, microphone_a
             "The places are not corrected: make its channel NaN and locate again, or calibrate anew."
             for one in altered
         ]
-        if not exchanged and not altered and (status == FrameStatus.MISFIT).sum() > 2 * _ODD * placed.sum():
+        if not exchanged and not altered and (status == LocationStatus.MISFIT).sum() > 2 * _ODD * placed.sum():
             notes.append("most touches fit no single source: is this the calibration of this array?")
     return notes
 

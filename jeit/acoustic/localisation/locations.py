@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 
-class FrameStatus(StrEnum):
+class LocationStatus(StrEnum):
     """What a frame is; see `Locations`."""
 
     TOUCH = "touch"
@@ -22,7 +22,7 @@ class FrameStatus(StrEnum):
 class Locations(eqx.Module):
     """What was found of F frames of M microphones.
 
-    - `times`: (F,) seconds; `status`: (F,) a `FrameStatus` each.
+    - `times`: (F,) seconds; `status`: (F,) a `LocationStatus` each.
     - `position`: (F, d) metres; `covariance`: (F, d, d) m²; `strength`: (F,). NaN where there is no touch.
     - `misfit`: (F,) chi-square of what one source leaves unexplained, with `freedom`: (F,) degrees.
     - `used`: (F, M) which microphones were looked at. `faults`: M strings, what is wrong with one ("" if nothing).
@@ -58,4 +58,4 @@ class Locations(eqx.Module):
 
     def counts(self) -> dict[str, int]:
         """How many frames there are of each status."""
-        return {str(status): int((self.status == status).sum()) for status in FrameStatus if status in self.status}
+        return {str(status): int((self.status == status).sum()) for status in LocationStatus if status in self.status}

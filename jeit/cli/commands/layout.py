@@ -98,7 +98,7 @@ def compare(
     check_at_least({"--pairs": (pairs, 0), "--taxels": (taxels, 1), "--seed": (seed, 0)})
     if not 0 <= margin < float("inf"):
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
-    both = [skins.read(name, width, height) for name in (first, second)]
+    both = [skins.read_with_outline(name, width, height) for name in (first, second)]
     check_same_outline(*both)
     make_folder(output, _FILES)
     console = Console(highlight=False)

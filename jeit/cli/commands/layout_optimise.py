@@ -89,7 +89,7 @@ def optimise(
     if not 0 <= minimum_spacing < float("inf"):
         raise ValueError(f"--minimum-spacing-mm must not be negative; it is {minimum_spacing:g}.")
     check_within("--num-points", num_points, _LEAST_NODES, _MOST_NODES)
-    start = skins.read(layout, width, height)
+    start = skins.read_with_outline(layout, width, height)
     free = [_region(text, start.known_outline) for text in keep_out or ()]
     make_folder(output, RESULTS)
     space = DesignSpace(minimum_spacing=1e-3 * minimum_spacing, keep_out=free, symmetry=symmetry, sizes=sizes)

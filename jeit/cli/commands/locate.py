@@ -116,7 +116,7 @@ def _rows(found: "LocatedTouches") -> Iterator[tuple[str, ...]]:
     """Of every touch, and of the one beside it where there are two at once."""
     import numpy as np
 
-    from jeit.acoustic.localisation.locations import FrameStatus
+    from jeit.acoustic.localisation.locations import LocationStatus
 
     locations, track = found.locations, found.track
     for number, touch in enumerate(track.touches, 1):
@@ -127,16 +127,16 @@ def _rows(found: "LocatedTouches") -> Iterator[tuple[str, ...]]:
             where = [f"{along[0]:z.1f} → {along[-1]:z.1f}" for along in place.T]
         else:
             where = [f"{along.mean():z.1f}" for along in place.T]
-        kinds = [kind for kind in locations.status[frames] if kind != FrameStatus.NO_TOUCH]
+        kinds = [kind for kind in locations.status[frames] if kind != LocationStatus.NO_TOUCH]
         counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
         when = (f"{touch.onset:.3f}", f"{touch.offset:.3f}")
         yield str(number), *when, *where, f"{off:.1f}", f"{1e3 * touch.length:.0f}", counts
-        both = touch.first + np.flatnonzero(locations.status[frames] == FrameStatus.TWO_TOUCHES)
+        both = touch.first + np.flatnonzero(locations.status[frames] == LocationStatus.TWO_TOUCHES)
         if both.size:
             # Which of the two is the stronger may change: the other is the one farther from the track.
             pair = np.stack([locations.position[both], locations.second[both]])
             apart = np.linalg.norm(pair - track.position[both], axis=-1)
             other = 1e3 * pair[apart.argmax(axis=0), np.arange(both.size), :2].mean(axis=0)
             when = (f"{locations.times[both[0]]:.3f}", f"{locations.times[both[-1]]:.3f}")
-            beside = f"{both.size} {FrameStatus.TWO_TOUCHES}"
+            beside = f"{both.size} {LocationStatus.TWO_TOUCHES}"
             yield f"{number}, other", *when, *(f"{along:z.1f}" for along in other), "", "", beside

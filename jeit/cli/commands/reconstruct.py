@@ -60,7 +60,10 @@ def reconstruct(
     frame: Frame = None,
     quiet: Quiet = False,
 ) -> None:
-    """Image what changed between REFERENCE and DATA; writes image.png, image.npz and report.json."""
+    """Image what changed between REFERENCE and DATA; writes image.png, image.npz and report.json.
+
+    In Python: `jeit.image_difference` and `jeit.report.write_image`; `jeit.reconstruct` makes absolute images.
+    """
     from rich.console import Console
 
     from jeit.cli.console import Steps

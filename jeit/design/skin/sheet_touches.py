@@ -49,7 +49,7 @@ def sheet_touches(
     `ValueError` as `touched_cells` does, and for a mesh that is no sheet.
     """
     if mesh.dimension != 2:
-        raise ValueError(f"mesh is {mesh.dimension}-D; scores are of the equivalent sheet, with a 2-D mesh.")
+        raise ValueError(f"mesh is {mesh.dimension}-D; these touches are of the equivalent sheet, with a 2-D mesh.")
     touched = touched_cells(mesh, indentation, places, thickness=thickness, contrast=contrast)
 
     def change(place, middle):

@@ -168,7 +168,7 @@ class Skin(eqx.Module):
     def sheet_touches(
         self, places, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
     ) -> SheetTouches:
-        """The same of a sheet, with derivatives in the places. Raises `ValueError` as `jeit.design.sheet_touches`."""
+        """The same of a sheet, with derivatives in the places. Raises `ValueError` as `sheet_touches` does."""
         indentation = Bell() if indentation is None else indentation
         return sheet_touches(self.model.mesh, indentation, places, thickness=float(self.thickness), contrast=contrast)
 

@@ -1,7 +1,7 @@
 """Studies: a TOML file describes a sweep over layouts, skins and protocols, which runs in chunks and survives a crash.
 
-`read_study` checks the file, `run_study` solves what is not finished, `open_results` opens it in xarray, and
-`write_study_report` makes one page of it. Needs the extra `cluster`: zarr, xarray and dask.distributed.
+`read_study` checks the file, `run_study` solves what is not finished, `open_results` opens it in xarray;
+`jeit.report.write_study_report` makes one page of it. Needs the extra `cluster`: zarr, xarray and dask.distributed.
 """
 
 from jeit.design.study.run import Progress as Progress

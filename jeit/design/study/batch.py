@@ -28,8 +28,10 @@ from jeit.protocol import Protocol
 
 
 class _Shared(eqx.Module):
-    """What points of one shape have in common; `touched` on a skin of `thickness` metres, the same as `touches`, which
-    are None, as the `prior` is, unless a score needs them."""
+    """What points of one shape have in common: the model, and the cells `touched` on a skin of `thickness` metres.
+
+    `touches`, the same with their derivatives in the places, and the `prior` are None unless a score needs them.
+    """
 
     model: ForwardModel
     touched: TouchedCells

@@ -1,4 +1,4 @@
-"""Which λ is taken where none is given: the one home of these numbers."""
+"""Which λ is taken where none is given; GREIT and filtered back-projection have scales of their own."""
 
 RULE = "noise-figure"
 """The rule that chooses λ of linear images, and of nonlinear problems linearised at the background."""

@@ -1,6 +1,6 @@
 """Solvers of the nonlinear problem, as small objects that say how many steps they take and what they can do.
 
-`SOLVERS` has them by the names of the command line, and `solver_named` is where a name becomes an object.
+`SOLVERS` has them by name, and `solver_named` is where a name becomes an object.
 """
 
 import abc
@@ -37,7 +37,8 @@ class Solved(NamedTuple):
 
 
 class AbstractSolver(eqx.Module):
-    """Base of all solvers of `reconstruct`. A new one is a class with `minimise`, and an entry in `SOLVERS`."""
+    """Base of all solvers of `reconstruct` and `Imager`. A new one is a class with `minimise`,
+    and an entry in `SOLVERS`."""
 
     name: ClassVar[str]
 
@@ -218,7 +219,7 @@ class OneStep(AbstractSolver):
 SOLVERS: dict[str, type[AbstractSolver]] = {
     one.name: one for one in (OneStep, GaussNewton, LevenbergMarquardt, LBFGSB, ProjectedGradient)
 }
-"""Solvers by the names of the command line."""
+"""Solvers by name."""
 
 
 def solver_named(name: str, argument: str = "solver") -> AbstractSolver:

@@ -1,4 +1,4 @@
-"""Which prior is taken where none is given, and quadratic priors by name."""
+"""Quadratic priors by the names of the command line, and the smooth one that images of tanks and streams take."""
 
 from collections.abc import Callable
 

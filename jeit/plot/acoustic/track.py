@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
 from jeit.acoustic import Calibration, MicrophoneArray
-from jeit.acoustic.localisation.locations import FrameStatus, Locations
+from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.track import Touch, Track
 from jeit.plot.acoustic.surface_view import View, draw_ellipse, draw_legend, draw_surface, outline_of, view_of
 from jeit.plot.axes import INK, SOFT, axes_or_new, draw_colour_bar
@@ -20,10 +20,10 @@ _GLOW = LinearSegmentedColormap.from_list("glow", ["#ffffff", "#bccddf", "#6a8aa
 _TIME = LinearSegmentedColormap.from_list("time", ["#0d0887", "#7e03a8", "#cc4778", "#f89540", "#fbd724"])
 # Frames that are no plain touch, each with its marker.
 _ODD = {
-    FrameStatus.TWO_TOUCHES: "D",
-    FrameStatus.OUTSIDE: "^",
-    FrameStatus.MISFIT: "X",
-    FrameStatus.AMBIGUOUS: "P",
+    LocationStatus.TWO_TOUCHES: "D",
+    LocationStatus.OUTSIDE: "^",
+    LocationStatus.MISFIT: "X",
+    LocationStatus.AMBIGUOUS: "P",
 }
 # A touch that has moved by less than so many standard deviations, or this part of the surface, has stayed where it was.
 _MOVED, _LEAST = 4.0, 0.05
@@ -89,7 +89,7 @@ def plot_track(
 
 def _say_that_there_is_none(ax: Axes, view: View, locations: Locations) -> None:
     left, right, bottom, top = view.extent
-    words = "no touch" if (locations.status != FrameStatus.UNUSABLE).any() else "no usable frame"
+    words = "no touch" if (locations.status != LocationStatus.UNUSABLE).any() else "no usable frame"
     box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
     text: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 15, "color": INK, "zorder": 5}
     ax.text((left + right) / 2, (bottom + top) / 2, words, bbox=box, **text)

@@ -49,7 +49,9 @@ def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Floa
     squared = (across[:, None] - skin.microphones[:, 0, None, None]) ** 2
     squared += (along - skin.microphones[:, 1, None, None]) ** 2
     length = jnp.sqrt(squared + skin.microphone_depth[:, None, None] ** 2).reshape(-1, 9)
-    amplitude = jnp.outer(weight, weight).reshape(9) * layer.spreading(length, skin.model.depth) * skin.gain[:, None]
+    amplitude = (
+        jnp.outer(weight, weight).reshape(9) * layer.spreading(length, skin.microphone_model.depth) * skin.gain[:, None]
+    )
     decay = layer.material.loss(frequencies) + 1j * layer.material.wavenumber(frequencies)
     received = jnp.sum(amplitude[..., None] * jnp.exp(-length[..., None] * decay), axis=1)
     if not skin.readout.multiplexed:
@@ -84,19 +86,19 @@ def _expected_power(skin, points, frequencies, step):
 
 def nominal_power(skin: SoundingSkin, distances) -> Float[np.ndarray, " K"]:
     """Mean square (K,) that a nominal microphone receives from horizontal `distances` (K,), metres, no edge near."""
-    return np.asarray(_nominal_power(skin, jnp.hypot(jnp.asarray(distances, float), skin.model.depth)))
+    return np.asarray(_nominal_power(skin, jnp.hypot(jnp.asarray(distances, float), skin.microphone_model.depth)))
 
 
 @jax.jit
 def _nominal_power(skin, length):
     frequencies = jnp.linspace(skin.readout.band[0] / 1.5, skin.readout.band[1] * 1.5, 2001)
     decay = jnp.exp(-2 * skin.layer.material.loss(frequencies) * length[..., None])
-    return skin.layer.spreading(length, skin.model.depth) ** 2 * jnp.trapezoid(
+    return skin.layer.spreading(length, skin.microphone_model.depth) ** 2 * jnp.trapezoid(
         source_density(skin, frequencies) * decay, frequencies
     )
 
 
 def noise_power(skin: SoundingSkin) -> Float[np.ndarray, " M"]:
     """Mean square (M,) of each channel's own noise, all of it in the band; see `MicrophoneModel`."""
-    nominal = nominal_power(skin, skin.model.reach) * 10 ** (-skin.model.snr_db / 10)
+    nominal = nominal_power(skin, skin.microphone_model.reach) * 10 ** (-skin.microphone_model.snr_db / 10)
     return nominal * np.asarray(skin.noise_factor)

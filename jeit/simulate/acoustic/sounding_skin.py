@@ -27,7 +27,8 @@ class SoundingSkin(eqx.Module):
 
     - `microphones` (M, 2), metres; `microphone_depth` (M,) metres under the surface; `gain` (M,), in amplitude;
       `noise_factor` (M,), power of each microphone's own noise relative to the nominal one.
-    - `layer`: its shape and material. `model`: what the nominal microphone is like. `readout`: how all are read.
+    - `layer`: its shape and material. `microphone_model`: what the nominal microphone is like.
+      `readout`: how all are read.
     - `spectral_slope`: the power density of a touch falls as frequency to minus this (1: 3 dB per octave).
     """
 
@@ -36,7 +37,7 @@ class SoundingSkin(eqx.Module):
     gain: Float[Array, " M"]
     noise_factor: Float[Array, " M"]
     layer: ElastomerLayer
-    model: MicrophoneModel
+    microphone_model: MicrophoneModel
     readout: Readout
     spectral_slope: float
 
@@ -46,16 +47,17 @@ class SoundingSkin(eqx.Module):
         microphones: ArrayLike | None = None,
         *,
         layer: ElastomerLayer | None = None,
-        model: MicrophoneModel | None = None,
+        microphone_model: MicrophoneModel | None = None,
         readout: Readout | None = None,
         spectral_slope: float = 1.0,
     ):
-        """`key` draws by how much the microphones differ, as `model` has it: the same key gives the same microphones,
-        whatever the other arguments. `microphones`: (M, 2) metres; a grid of 5 × 5 unless given. `layer`, `model` and
-        `readout`: those of the paper's device unless given. Raises `ValueError` for microphones off the layer.
+        """`key` draws by how much the microphones differ, as `microphone_model` has it: the same key gives the same
+        microphones, whatever the other arguments. `microphones`: (M, 2) metres; a grid of 5 × 5 unless given.
+        `layer`, `microphone_model` and `readout`: those of the paper's device unless given. Raises `ValueError` for
+        microphones off the layer.
         """
         self.layer = ElastomerLayer() if layer is None else layer
-        self.model = MicrophoneModel() if model is None else model
+        self.microphone_model = MicrophoneModel() if microphone_model is None else microphone_model
         self.readout = Readout() if readout is None else readout
         if not np.isfinite(spectral_slope):
             raise ValueError(f"spectral_slope must be finite; it is {spectral_slope}.")
@@ -65,9 +67,11 @@ class SoundingSkin(eqx.Module):
         place = self.layer.check_inside("microphones", place)
         draws = np.asarray(jax.random.normal(key, (3, len(place))))
         self.microphones = jnp.asarray(place)
-        self.microphone_depth = jnp.asarray(self.model.depth * np.exp(self.model.depth_spread * draws[0]))
-        self.gain = jnp.asarray(10 ** (self.model.gain_spread_db * draws[1] / 20))
-        self.noise_factor = jnp.asarray(10 ** (self.model.noise_spread_db * draws[2] / 10))
+        self.microphone_depth = jnp.asarray(
+            self.microphone_model.depth * np.exp(self.microphone_model.depth_spread * draws[0])
+        )
+        self.gain = jnp.asarray(10 ** (self.microphone_model.gain_spread_db * draws[1] / 20))
+        self.noise_factor = jnp.asarray(10 ** (self.microphone_model.noise_spread_db * draws[2] / 10))
 
     @property
     def num_microphones(self) -> int:
