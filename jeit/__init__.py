@@ -83,7 +83,9 @@ def __getattr__(name: str):
         from importlib.metadata import version
 
         return version("jeit")
-    raise AttributeError(f"module 'jeit' has no attribute '{name}'")
+    raise AttributeError(
+        f"module 'jeit' has no attribute '{name}'; if version 0.1 had it, CHANGELOG.md says where it is now"
+    )
 
 
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -62,7 +62,9 @@ _HOMES = {
 def __getattr__(name: str):
     if name in _HOMES:
         return getattr(importlib.import_module(f"jeit.design.{_HOMES[name]}"), name)
-    raise AttributeError(f"module 'jeit.design' has no attribute '{name}'")
+    raise AttributeError(
+        f"module 'jeit.design' has no attribute '{name}'; if version 0.1 had it, CHANGELOG.md says where it is now"
+    )
 
 
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -8,7 +8,7 @@ import numpy as np
 
 from jeit.design.defaults import CONTRAST, MARGIN, PLACES
 from jeit.design.response import SkinResponse, number_of_taxels, skin_response
-from jeit.design.skin.skin import Skin
+from jeit.design.skin.skin import Skin, check_skin
 from jeit.design.skin.touch_grid import touches_away_from_the_edge
 from jeit.layout import Layout
 
@@ -57,6 +57,8 @@ def compare_layouts(
     Raises `ValueError`, before either is touched, for skins of different outlines, a margin that leaves no place, and
     as `skin_response` does.
     """
+    check_skin("first", first)
+    check_skin("second", second)
     check_same_outline(first.layout, second.layout)
     tell = progress or (lambda step: None)
     ready = []

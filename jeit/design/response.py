@@ -5,7 +5,7 @@ from jaxtyping import Array
 
 from jeit.design.defaults import NUM_TAXELS, THRESHOLD
 from jeit.design.sensitivity import SensitivityMap
-from jeit.design.skin.skin import Skin
+from jeit.design.skin.skin import Skin, check_skin
 from jeit.design.skin.touch_grid import TouchGrid
 from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.taxels import Taxels, find_taxels
@@ -42,6 +42,9 @@ def skin_response(
     Raises `ValueError` for more taxels than places, touches of other places, and as `Skin.touched_cells` and
     `Skin.voltage_changes` do.
     """
+    check_skin("skin", skin)
+    if not isinstance(grid, TouchGrid):
+        raise ValueError(f"grid must be a TouchGrid, as of touch_grid(skin.outline); it is {type(grid).__name__}.")
     number = number_of_taxels(grid, num_taxels)
     touched = skin.touched_cells(grid.places) if touched is None else touched
     if len(touched.places) != len(grid.places):

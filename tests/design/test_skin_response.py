@@ -4,7 +4,16 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.design import Skin, defaults, sensitivity_map, skin_response, touches_away_from_the_edge
+from jeit.design import (
+    Objective,
+    Skin,
+    compare_layouts,
+    defaults,
+    optimise_layout,
+    sensitivity_map,
+    skin_response,
+    touches_away_from_the_edge,
+)
 from jeit.design.comparison import comparison
 from jeit.design.skin.protocol import skin_protocol
 from jeit.layout import Layout, grid
@@ -80,3 +89,20 @@ def test_the_same_mesh_with_other_electrodes():
 def test_a_drawing_of_a_rectangle_is_meshed_as_one():
     drawn = Layout(LAYOUT.centres, 8e-3, outline=Polygon(OUTLINE.vertices))
     assert isinstance(Skin.create(drawn, num_layers=0, cell_size=6e-3).outline, Rectangle)
+
+
+@pytest.mark.parametrize(
+    ("call", "complaint"),
+    [
+        (lambda skin: Skin.create("grid-2x2"), "layout must be a Layout"),
+        (lambda skin: skin_response(skin.layout, GRID, key=None), "skin must be a Skin"),
+        (lambda skin: skin_response(skin, GRID.places, key=None), "grid must be a TouchGrid"),
+        (lambda skin: compare_layouts(skin.layout, skin), "first must be a Skin"),
+        (lambda skin: optimise_layout(skin.layout, None), "skin must be a Skin"),
+        (lambda skin: optimise_layout(skin, "minimum"), "objective must be Objective"),
+        (lambda skin: Objective(None, None, score="minimum"), "score must be a function"),
+    ],
+)
+def test_things_of_another_kind_are_refused(call, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        call(Skin.create(LAYOUT, num_layers=0, cell_size=8e-3))

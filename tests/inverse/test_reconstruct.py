@@ -261,6 +261,12 @@ def test_data_that_no_body_explains_show_in_the_misfit(model, frame):
     assert result.misfit > 100
 
 
+@pytest.mark.parametrize("given", [Log(), {"link": Log()}])
+def test_what_is_no_parametrisation_is_refused(model, frame, given):
+    with pytest.raises(ValueError, match="such as Parametrisation"):
+        reconstruct(model, frame[0], 1.0, parametrisation=given)
+
+
 def test_a_start_from_another_problem_is_refused(model, frame):
     options = {"noise": frame[1], "hyperparameter": 100.0}
     other = reconstruct(model, frame[0], 1.0, prior=Gaussian(0.05), **options)

@@ -9,7 +9,7 @@ from jeit.design.optimisation.variables import Varied
 from jeit.design.scores import Score, Scores, TouchPrior, layout_scores
 from jeit.design.skin.indentation import AbstractIndentation
 from jeit.design.skin.sheet_touches import SheetTouches
-from jeit.design.skin.skin import Skin
+from jeit.design.skin.skin import Skin, check_skin
 from jeit.electrodes import SheetDiscs
 
 
@@ -22,7 +22,8 @@ class Objective(eqx.Module):
     """`score` of the `Scores` of a layout, to be made large.
 
     **Fields**: `touches`, of the skin, as of `Skin.sheet_touches`; `prior`, `noise` (volts) and `temperature` as in
-    `layout_scores`; `score`, a function of `Scores` with differences of order 1, as logarithms have.
+    `layout_scores`; `score`, a function of `Scores` with differences of order 1, as logarithms have. Raises
+    `ValueError` for a score that is no function.
     """
 
     touches: SheetTouches
@@ -30,6 +31,10 @@ class Objective(eqx.Module):
     noise: Float[Array, "..."] = eqx.field(default=NOISE, converter=lambda noise: jnp.asarray(noise, float))
     score: Score = eqx.field(default=balanced, static=True)
     temperature: float = TEMPERATURE
+
+    def __check_init__(self):
+        if not callable(self.score):
+            raise ValueError(f"score must be a function of Scores, such as balanced; it is {self.score!r}.")
 
     @classmethod
     def create(
@@ -45,6 +50,7 @@ class Objective(eqx.Module):
         """Of touches of a `skin` at `places` (n, 2), metres, as in `Skin.sheet_touches`, whose amplitudes are
         correlated over `correlation` metres; `options`: `noise`, `score`, `temperature`. Raises `ValueError` as
         `Skin.sheet_touches` and `TouchPrior.create` do."""
+        check_skin("skin", skin)
         touches = skin.sheet_touches(places, indentation, contrast=contrast)
         return cls(touches, TouchPrior.create(places, correlation=correlation), **options)
 

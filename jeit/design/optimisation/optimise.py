@@ -21,7 +21,7 @@ from jeit.design.optimisation.objective import Objective
 from jeit.design.optimisation.search import Record, descend
 from jeit.design.optimisation.variables import Variables, Varied
 from jeit.design.scores import Scores
-from jeit.design.skin.skin import Skin
+from jeit.design.skin.skin import Skin, check_skin
 from jeit.layout import Layout
 from jeit.mesh import Domain
 
@@ -97,7 +97,7 @@ def optimise_layout(
     cannot be.
     """
     space = DesignSpace() if space is None else space
-    _check(skin, objective, steps, starts, key)
+    _check(skin, objective, space, steps, starts, key)
     constraints = space.constraints(skin)
     variables = space.variables(skin, constraints, objective.touches.depth)
     _check_outline(constraints.outline, skin)
@@ -259,7 +259,11 @@ def _varied(variables: Variables, values) -> Varied:
     return jax.vmap(variables.varied)(values)
 
 
-def _check(skin: Skin, objective: Objective, steps: int, starts: int, key) -> None:
+def _check(skin: Skin, objective: Objective, space: DesignSpace, steps: int, starts: int, key) -> None:
+    check_skin("skin", skin)
+    for name, given, kind in (("objective", objective, Objective), ("space", space, DesignSpace)):
+        if not isinstance(given, kind):
+            raise ValueError(f"{name} must be {kind.__name__}(…); it is {given!r:.60}.")
     if skin.num_layers:
         raise ValueError("skin is a layer; layouts are optimised on a sheet: Skin.create(…, num_layers=0).")
     if not np.isclose(float(objective.touches.thickness), float(skin.thickness), rtol=1e-9):

@@ -100,6 +100,8 @@ class Skin(eqx.Module):
         Raises `ValueError` for a layout without an outline, cells too small for any mesh, and electrodes too small for
         them.
         """
+        if not isinstance(layout, Layout):
+            raise ValueError(f"layout must be a Layout, such as named_layout('park-inner'); it is {layout!r:.60}.")
         outline = plain_outline(layout.known_outline)
         if cell_size is None and num_points is None:
             cell_size = CELL_SIZE
@@ -175,6 +177,12 @@ class Skin(eqx.Module):
     def voltage_changes(self, touched: TouchedCells, *, linear: bool = False) -> Float[Array, "n M"]:
         """Changes (n, M) of its voltages by touches, volts: exact, or linear; errors and limits of `touch_changes`."""
         return touch_changes(self.model, self.model_conductivity, touched, linear=linear)
+
+
+def check_skin(name: str, given) -> None:
+    """Raise `ValueError`, about the argument `name`, for what is no `Skin`."""
+    if not isinstance(given, Skin):
+        raise ValueError(f"{name} must be a Skin, as of Skin.create(named_layout('park-inner')); it is {given!r:.60}.")
 
 
 def model_conductivity(conductivity, thickness, num_layers: int):

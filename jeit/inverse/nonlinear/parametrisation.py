@@ -22,6 +22,17 @@ def _tuple(unknowns) -> tuple[AbstractUnknown, ...]:
     return tuple(unknowns)
 
 
+def as_parametrisation(given: "Parametrisation | None") -> "Parametrisation":
+    """What is given, or all the defaults. Raises `ValueError` for something else."""
+    if given is None:
+        return Parametrisation()
+    if not isinstance(given, Parametrisation):
+        raise ValueError(
+            f"parametrisation must be a Parametrisation, such as Parametrisation(link=Log()); it is {given!r}."
+        )
+    return given
+
+
 class Parametrisation(eqx.Module):
     """What is estimated of a body.
 

@@ -12,7 +12,7 @@ from jeit.inverse.hyperparameter.chosen import Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise, check_prior
 from jeit.inverse.nonlinear.informed import informed
-from jeit.inverse.nonlinear.parametrisation import Parametrisation
+from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametrisation
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.solvers import LBFGSB, SOLVERS, AbstractSolver, GaussNewton, as_solver
 from jeit.inverse.prior.priors import AbstractPrior, Noser
@@ -94,7 +94,7 @@ def reconstruct(
     measured, used = check_frame(model, voltages, mask)
     prior = Noser() if prior is None else prior
     check_prior(prior)
-    parametrisation = Parametrisation() if parametrisation is None else parametrisation
+    parametrisation = as_parametrisation(parametrisation)
     parametrisation.check_model(model)
     background = check_background(model, background)
     deviation = check_noise(noise, measured, used)

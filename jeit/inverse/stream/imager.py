@@ -21,7 +21,7 @@ from jeit.inverse.channels import IndependentChannels, Weighing
 from jeit.inverse.hyperparameter.rules import Rule
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise, check_prior
 from jeit.inverse.nonlinear.informed import informed
-from jeit.inverse.nonlinear.parametrisation import Parametrisation
+from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametrisation
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.reconstruct import pose
 from jeit.inverse.nonlinear.solvers import AbstractSolver, GaussNewton, as_solver, expand, residual
@@ -119,7 +119,7 @@ class Imager(eqx.Module):
         chosen = as_solver(GaussNewton() if solver is None else solver).for_frames(_STEPS, _RTOL)
         prior = smooth_prior(float(np.ptp(np.asarray(model.mesh.points), axis=0).max())) if prior is None else prior
         check_prior(prior)
-        parametrisation = Parametrisation() if parametrisation is None else parametrisation
+        parametrisation = as_parametrisation(parametrisation)
         _check_together(chosen, prior, parametrisation, memory)
         background = check_background(model, background)
         predicted = model.voltages(background)
