@@ -99,8 +99,8 @@ def _solved(
             yield number, solve_chunk(study, number, solved)
         return
     distributed = require("distributed")
-    [shared] = client.scatter([study], broadcast=True)
-    futures = {client.submit(solve_chunk, shared, number, pure=False, retries=2): number for number in numbers}
+    # The study goes with every chunk: scattered, it would be lost with a worker that alone has it.
+    futures = {client.submit(solve_chunk, study, number, pure=False, retries=2): number for number in numbers}
     try:
         for future, results in distributed.as_completed(futures, with_results=True):
             yield futures[future], results
