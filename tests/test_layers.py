@@ -135,6 +135,15 @@ def test_a_circle_is_found(tmp_path):
     assert {"jeit.mesh.hen", "jeit.mesh.egg"} <= set(circle(modules(tmp_path / "jeit")))
 
 
+@pytest.mark.parametrize("top", ["jeit", "solvers/jeit_solvers"])
+def test_no_name_for_everybody_hides_a_module(top):
+    """`import jeit.mesh.quality` would give the function `quality`, if a module had its name."""
+    house = modules(ROOT / top)
+    pages = {name: path for name, path in house.items() if path.name == "__init__.py"}
+    given = {f"{name}.{full.rpartition('.')[2]}" for name, path in pages.items() for full in on_import(path)}
+    assert sorted(given & set(house)) == []
+
+
 def test_no_two_test_files_have_one_name():
     """pytest imports them by name, and can collect only one of the two."""
     names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]

@@ -27,4 +27,4 @@ from jeit.acoustic.signal.recording import write_recording as write_recording
 from jeit.acoustic.signal.recording import write_taps as write_taps
 from jeit.acoustic.touches import LocatedTouches as LocatedTouches
 from jeit.acoustic.touches import locate_touches as locate_touches
-from jeit.acoustic.track import track as track
+from jeit.acoustic.tracking import track as track

@@ -11,7 +11,7 @@ from jeit.acoustic.localisation.locate import locate
 from jeit.acoustic.localisation.locations import Locations
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
-from jeit.acoustic.track import Track, track
+from jeit.acoustic.tracking import Track, track
 
 # Pixels of the map on which the paper's loss is searched.
 _PAPERS_MAP = (200, 200)

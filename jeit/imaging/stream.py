@@ -12,7 +12,7 @@ from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import GaussNewton
 from jeit.inverse.nonlinear.solvers import AbstractSolver, as_solver
-from jeit.inverse.stream.imager import check_memory
+from jeit.inverse.streaming.imager import check_memory
 
 
 @dataclass(frozen=True)

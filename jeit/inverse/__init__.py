@@ -19,6 +19,6 @@ from jeit.inverse.prior.priors import Laplace as Laplace
 from jeit.inverse.prior.priors import Noser as Noser
 from jeit.inverse.prior.priors import Tikhonov as Tikhonov
 from jeit.inverse.prior.total_variation import TotalVariation as TotalVariation
-from jeit.inverse.stream.imager import Imager as Imager
-from jeit.inverse.stream.stream import stream as stream
+from jeit.inverse.streaming.imager import Imager as Imager
+from jeit.inverse.streaming.stream import stream as stream
 from jeit.inverse.uncertainty import posterior as posterior

@@ -4,13 +4,13 @@ Outlines without a mesh: `Disk`, `Rectangle`, `Polygon`. Plane meshes: `disk`, `
 where a `Refine` asks. Solids: `layer`, `box`, `cylinder`. From elsewhere: `Mesh.create`, `read`, `from_gmsh`.
 """
 
+from jeit.mesh.cell_quality import quality
 from jeit.mesh.files import read, write
 from jeit.mesh.generate.refine import Refine
 from jeit.mesh.geometry import centroids, gradients, measures
 from jeit.mesh.gmsh import from_gmsh
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Disk, Domain, Polygon, Rectangle
-from jeit.mesh.quality import quality
 from jeit.mesh.shapes import disk, polygon, rectangle
 from jeit.mesh.solids import box, cylinder, layer
 

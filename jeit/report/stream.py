@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.inverse.calibration import Calibration
-from jeit.inverse.stream.stream import FrameImage
+from jeit.inverse.streaming.stream import FrameImage
 from jeit.mesh import centroids
 
 _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")

@@ -13,7 +13,7 @@ from jeit.acoustic import Localiser, LocatedTouches
 from jeit.acoustic.localisation.locate import microphones_in_use
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.overlay import brightness, fade
-from jeit.acoustic.track import Track
+from jeit.acoustic.tracking import Track
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 # Maps of so many pixels a side, so many frames at once.

@@ -9,9 +9,10 @@
 """
 
 from jeit_solvers.batching import in_turn
+from jeit_solvers.clustering import KMeans, kmeans
+from jeit_solvers.cores import over_cores
 from jeit_solvers.dense.cholesky import symmetric_inverse
 from jeit_solvers.dense.ridge import QuadraticModel, ridge_model, ridge_step, solve_definite
-from jeit_solvers.kmeans import KMeans, kmeans
 from jeit_solvers.optimise.bounded import BoundedMinimum, lbfgsb, projected_gradient, scipy_lbfgsb
 from jeit_solvers.optimise.descent import Descent
 from jeit_solvers.optimise.small_problems import (
@@ -24,7 +25,6 @@ from jeit_solvers.optimise.small_problems import (
     symmetric_small,
 )
 from jeit_solvers.optimise.status import Status, ended
-from jeit_solvers.over_cores import over_cores
 from jeit_solvers.sparse.choose import choose_solver
 from jeit_solvers.sparse.conjugate_gradient import ConjugateGradient
 from jeit_solvers.sparse.multifrontal import Factor, factorise, half_solve, quadratic_form, solve

@@ -14,7 +14,7 @@ from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.localisation.locations import Locations
 from jeit.acoustic.noise import IntensityNoise
 from jeit.acoustic.surface import make_surface
-from jeit.acoustic.track import Touch, Track
+from jeit.acoustic.tracking import Touch, Track
 from jeit.layout import grid
 from jeit.plot import Marks, plot_error_curve, plot_loss_map, plot_pairs, plot_receptive_fields, plot_track
 from jeit.plot.acoustic.surface_view import FOUND

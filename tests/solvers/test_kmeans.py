@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jeit_solvers import kmeans
-from jeit_solvers.kmeans import _lloyd
+from jeit_solvers.clustering import _lloyd
 
 
 def blobs(seed=0, count=30, number=400, d=24):

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from jeit.image.figures_of_merit import FiguresOfMerit
+from jeit.image.merit import FiguresOfMerit
 from jeit.plot.axes import INK, SERIES_COLOURS, SERIES_MARKERS, SOFT, axes_or_new, draw_horizontal_grid, soften_axes
 
 # Field, title, unit on the axis, factor to that unit, and the value that a perfect image would have, if there is one.

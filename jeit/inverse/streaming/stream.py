@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jeit.inverse.stream.imager import Imager
+from jeit.inverse.streaming.imager import Imager
 from jeit_solvers import Status
 
 # A frame that differs by more than this, relative to an undisturbed one, is another sensor's, or a fault.
