@@ -1,7 +1,7 @@
 """From two frames to a picture in one call, `image_difference`, and what every rule for λ would choose on the way.
 
 `settings` says how to image, `preparation` checks, meshes and calibrates, `method` images, `difference` looks for
-inclusions; `frames` does it frame after frame.
+inclusions; `stream` does it frame after frame.
 """
 
 from jeit.imaging.compared_rules import ComparedRules as ComparedRules

@@ -12,8 +12,9 @@ from jaxtyping import Array, Float
 
 from jeit.data import Measurement
 from jeit.image import Inclusion, find_inclusions
+from jeit.imaging.clock import Clock
 from jeit.imaging.method import prior_for, rule_for
-from jeit.imaging.preparation import Clock, PreparedDifference, prepare_difference
+from jeit.imaging.preparation import PreparedDifference, prepare_difference
 from jeit.imaging.settings import ImagingSettings
 from jeit.inverse import RULES
 from jeit.inverse.hyperparameter.chosen import Choice
@@ -88,7 +89,7 @@ def compare_on_data(
             prepared.model,
             prepared.calibration.conductivity,
             prior=prior_for(settings.prior, prepared.domain),
-            noise=prepared.deviation,
+            noise=prepared.relative_noise,
             mask=prepared.mask,
         )
         data = linear.whiten(prepared.difference)

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float, UInt8
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
 from jeit.image import Inclusion, Raster, find_inclusions, segment
+from jeit.imaging.clock import Clock
 from jeit.imaging.method import METHODS
-from jeit.imaging.preparation import Clock, prepare_difference
+from jeit.imaging.preparation import prepare_difference
 from jeit.imaging.settings import ImagingSettings
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.linear.one_step import LinearReconstruction

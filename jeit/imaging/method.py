@@ -79,7 +79,7 @@ def _one_step(prepared: PreparedDifference, prior: NamedPrior, hyperparameter: N
         prior=prior_for(prior, prepared.domain),
         hyperparameter=_weight(prepared, hyperparameter),
         difference=prepared.difference,
-        noise=prepared.deviation,
+        noise=prepared.relative_noise,
         mask=prepared.mask,
     )
     return found, found.image(prepared.difference)
@@ -114,7 +114,7 @@ def _iterated(
         background,
         prior=prior_for(prior, prepared.domain) if own is None else own,
         hyperparameter=_weight(prepared, hyperparameter),
-        noise=prepared.deviation,
+        noise=prepared.relative_noise,
         mask=prepared.mask,
         solver=solver,
     )

@@ -1,8 +1,5 @@
 """What comes before any image of measured data: two frames checked, a mesh, and a model calibrated on the reference."""
 
-import time
-from collections.abc import Callable
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import jax
@@ -14,26 +11,11 @@ from jeit.data import Measurement, check_imageable
 from jeit.data.imageable import FrameQuality
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
+from jeit.imaging.clock import Clock
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.mesh import Domain, Mesh
 from jeit_solvers import Status
-
-
-class Clock:
-    """Tells `progress` of each step and keeps the seconds that it took, in `seconds`."""
-
-    def __init__(self, progress: Callable[[str], None] | None):
-        self.progress = progress
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, step: str):
-        if self.progress is not None:
-            self.progress(step)
-        start = time.perf_counter()
-        yield
-        self.seconds[step] = time.perf_counter() - start
 
 
 @dataclass(frozen=True)
@@ -68,17 +50,17 @@ class PreparedDifference:
         return self.calibration.model.mesh
 
     @property
-    def deviation(self) -> Float[Array, " M"]:
+    def relative_noise(self) -> Float[Array, " M"]:
         """How far channels are trusted relative to each other: `relative_noise` of the reference, volts."""
         return relative_noise(self.reference.voltages[0], self.mask)
 
     @property
     def noise(self) -> float | None:
-        """Standard deviation of the noise found in the difference, in units of `deviation`; None if not known."""
+        """Standard deviation of the noise found in the difference, in units of `relative_noise`; None if not known."""
         found = self.quality.difference_noise
         if found is None:
             return None
-        return found.standard_deviation / float(jnp.sqrt(jnp.mean(self.deviation[self.mask] ** 2)))
+        return found.standard_deviation / float(jnp.sqrt(jnp.mean(self.relative_noise[self.mask] ** 2)))
 
 
 def prepare_difference(

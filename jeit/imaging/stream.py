@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.data import Measurement
-from jeit.imaging.preparation import Clock, body_of, calibrated_model, select_frames
+from jeit.imaging.clock import Clock
+from jeit.imaging.preparation import body_of, calibrated_model, select_frames
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import GaussNewton

@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from jeit.acoustic.localisation.locate import microphones_in_use
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.overlay import brightness, fade
 from jeit.acoustic.tracking import Track
+from jeit.report.describe import plain, version_of
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 # Maps of so many pixels a side, so many frames at once.
@@ -52,10 +52,10 @@ def report_track(found: LocatedTouches) -> dict[str, Any]:
                 "touch": number,
                 "onset_s": touch.onset,
                 "offset_s": touch.offset,
-                "path_length_m": _number(touch.length),
-                "mean_position_m": _numbers(np.nanmean(track.position[frames], axis=0)),
+                "path_length_m": touch.length,
+                "mean_position_m": np.nanmean(track.position[frames], axis=0),
                 "status": {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)},
-                "greatest_strength": _number(np.nanmax(strength)),
+                "greatest_strength": np.nanmax(strength),
             }
         )
     second = np.flatnonzero(locations.status == LocationStatus.TWO_TOUCHES)
@@ -63,30 +63,36 @@ def report_track(found: LocatedTouches) -> dict[str, Any]:
     for number, (fault, used) in enumerate(zip(locations.faults, locations.used.T, strict=True)):
         share = float(used.mean())
         microphones.append({"microphone": number, "used_share": share, "fault": fault or None})
-    return {
-        "recording": locations.name,
-        "calibration": calibration.name,
-        "method": found.method,
-        "decay": calibration.microphone_array.decay.name,
-        "frames": len(locations.times),
-        "duration_s": _number(locations.times[-1] - locations.times[0]),
-        "status": locations.counts(),
-        "touches": touches,
-        "rejected_frames": int(track.rejected.sum()),
-        "median_standard_deviation_m": _number(_median_deviation(locations)),
-        "two_touches": [
-            {
-                "time_s": float(locations.times[frame]),
-                "positions_m": [_numbers(locations.position[frame]), _numbers(locations.second[frame])],
-                "strengths": [_number(locations.strength[frame]), _number(locations.second_strength[frame])],
-            }
-            for frame in second
-        ],
-        "microphones": microphones,
-        "notes": list(locations.notes),
-        "units": {"length": "m", "time": "s", "strength": "intensity of a typical microphone right under the source"},
-        "versions": {name: metadata.version(name) for name in _PACKAGES},
-    }
+    return plain(
+        {
+            "recording": locations.name,
+            "calibration": calibration.name,
+            "method": found.method,
+            "decay": calibration.microphone_array.decay.name,
+            "frames": len(locations.times),
+            "duration_s": locations.times[-1] - locations.times[0],
+            "status": locations.counts(),
+            "touches": touches,
+            "rejected_frames": int(track.rejected.sum()),
+            "median_standard_deviation_m": _median_deviation(locations),
+            "two_touches": [
+                {
+                    "time_s": float(locations.times[frame]),
+                    "positions_m": [locations.position[frame], locations.second[frame]],
+                    "strengths": [locations.strength[frame], locations.second_strength[frame]],
+                }
+                for frame in second
+            ],
+            "microphones": microphones,
+            "notes": list(locations.notes),
+            "units": {
+                "length": "m",
+                "time": "s",
+                "strength": "intensity of a typical microphone right under the source",
+            },
+            "versions": {name: version_of(name) for name in _PACKAGES},
+        }
+    )
 
 
 def draw_track(found: LocatedTouches):
@@ -165,11 +171,3 @@ def _text(value) -> str:
 
 def _texts(values) -> list[str]:
     return [_text(value) for value in values]
-
-
-def _number(value) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
-def _numbers(values) -> list[float | None]:
-    return [_number(value) for value in values]

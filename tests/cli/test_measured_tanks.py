@@ -127,7 +127,7 @@ def test_kit4_gauss_newton_converges_on_every_file(data_folder):
         difference = read(folder / f"datamat_{case}.mat").filled()[0] - reference.filled()[0]
         result = reconstruct(
             model, model.voltages(background) + difference, background, prior=Gaussian(0.085 * 2 * KIT4_RADIUS),
-            hyperparameter=5.0, noise=prepared.deviation, mask=prepared.mask, solver=GaussNewton(rtol=1e-4),
+            hyperparameter=5.0, noise=prepared.relative_noise, mask=prepared.mask, solver=GaussNewton(rtol=1e-4),
         )  # fmt: skip
         assert result.status == "converged"
         assert result.iterations <= 10

@@ -1,0 +1,21 @@
+"""Says what is being done, and keeps how long it took."""
+
+import time
+from collections.abc import Callable
+from contextlib import contextmanager
+
+
+class Clock:
+    """Tells `progress` of each step and keeps the seconds that it took, in `seconds`."""
+
+    def __init__(self, progress: Callable[[str], None] | None):
+        self.progress = progress
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, step: str):
+        if self.progress is not None:
+            self.progress(step)
+        start = time.perf_counter()
+        yield
+        self.seconds[step] = time.perf_counter() - start
