@@ -1,4 +1,9 @@
 """The forward problem: P1 assembly, the electrode model, and `ForwardModel` with its derivative rule."""
 
-from jeit.forward.model import ForwardModel as ForwardModel
-from jeit.forward.transfer import transfer_impedance as transfer_impedance
+from jeit.forward.model import ForwardModel
+from jeit.forward.transfer import transfer_impedance
+
+__all__ = [
+    "ForwardModel",
+    "transfer_impedance",
+]
