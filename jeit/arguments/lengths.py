@@ -1,0 +1,21 @@
+"""Lengths, which are in metres."""
+
+from typing import Any
+
+import numpy as np
+
+from jeit.arguments.kinds import told
+
+IN_MILLIMETRES = "were millimetres given for metres?"
+"""What is asked where a length is larger than it can be."""
+
+
+def check_metres(name: str, value: Any, most: float = np.inf, limit: str = "") -> None:
+    """Raise `ValueError`, about the argument `name`, for what is no positive length in metres, and for one of more than
+    `most` metres; `limit` says in words what is so long."""
+    number = np.asarray(value)
+    real = number.shape == () and number.dtype.kind in "iuf"
+    if not (real and np.isfinite(number) and number > 0):
+        raise ValueError(f"{name} must be a positive length in metres; it is {told(value)}.")
+    if number > most:
+        raise ValueError(f"{name} is {1e3 * number:g} mm, more than {limit}, {1e3 * most:g} mm; {IN_MILLIMETRES}")

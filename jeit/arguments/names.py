@@ -1,0 +1,23 @@
+"""Names of what there is, and which of them was meant."""
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+from jeit.arguments.kinds import told
+
+
+def check_name(argument: str, given: Any, names: Iterable[str], otherwise: str = "") -> None:
+    """Raise `ValueError`, about `argument`, for what is none of `names`; `otherwise` says what else could be given."""
+    known = list(names)
+    listed = f"{', '.join(known)}{otherwise}"
+    if not isinstance(given, str):
+        raise ValueError(f"{argument} must be one of {listed}; it is {told(given)}.")
+    if given not in known:
+        raise ValueError(f"{argument}: there is no {told(given)}{did_you_mean(given, known)}; give one of {listed}.")
+
+
+def did_you_mean(given: Any, names: Iterable[str]) -> str:
+    """The name nearest to what was given, as a question in brackets; nothing where none is near."""
+    close = difflib.get_close_matches(given, list(names), n=1) if isinstance(given, str) else ()
+    return f" (did you mean {close[0]!r}?)" if close else ""
