@@ -1,4 +1,4 @@
-"""Contents pages: what a room's `__init__` takes from its modules is in its `__all__`, and none of it is a module."""
+"""Contents pages: what an `__init__` takes from its own modules is in its `__all__`, and no module is."""
 
 import importlib
 import sys
@@ -19,8 +19,7 @@ PACKAGES = {
 def faults(name: str, path: Path) -> list[str]:
     """What is wrong with the contents of a package."""
     package = importlib.import_module(name)
-    top = name.partition(".")[0]
-    taken = {one.rpartition(".")[2] for one in on_import(path) if one.partition(".")[0] == top}
+    taken = {one.rpartition(".")[2] for one in on_import(path) if one.startswith(f"{name}.")}
     said = set(getattr(package, "__all__", ()))
     found = [f"{one} is not in __all__" for one in sorted(taken - said)]
     found += [f"{one} is not there" for one in sorted(said) if not hasattr(package, one)]

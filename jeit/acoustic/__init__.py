@@ -27,6 +27,9 @@ from jeit.acoustic.signal.recording import (
 )
 from jeit.acoustic.touches import LocatedTouches, locate_touches
 from jeit.acoustic.tracking import track
+from jeit.arguments.moved import tell_old_names as _tell_old_names
+
+_tell_old_names(__name__)
 
 __all__ = [
     "Calibration",

@@ -11,6 +11,7 @@
 Where to put them: `jeit.layout`.
 """
 
+from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.electrodes.boundary import BoundaryElectrodes
 from jeit.electrodes.combined import CombinedElectrodes
 from jeit.electrodes.discs import FaceDiscs, SheetDiscs
@@ -18,6 +19,8 @@ from jeit.electrodes.electrodes import AbstractElectrodes
 from jeit.electrodes.facets import FacetElectrodes, electrodes_from_nodes, plates
 from jeit.electrodes.patches import FacePatches
 from jeit.electrodes.point import NodeElectrodes, PointElectrodes
+
+_tell_old_names(__name__)
 
 __all__ = [
     "AbstractElectrodes",

@@ -4,6 +4,7 @@
 inclusions; `frames` does it frame after frame.
 """
 
+from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.imaging.compared_rules import ComparedRules, RuleOutcome, compare_on_data
 from jeit.imaging.difference import ImagedDifference, image_difference
 from jeit.imaging.method import METHODS
@@ -16,6 +17,8 @@ from jeit.imaging.preparation import (
 )
 from jeit.imaging.settings import CONTACTS, ImagingSettings
 from jeit.imaging.stream import StreamSettings, frames_of, prepare_imager
+
+_tell_old_names(__name__)
 
 __all__ = [
     "CONTACTS",

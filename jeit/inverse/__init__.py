@@ -4,6 +4,7 @@ Solvers, links and further unknowns are in `jeit.inverse.nonlinear`; the classes
 compute them.
 """
 
+from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.inverse.calibration import calibrate
 from jeit.inverse.hyperparameter.comparison import choose_hyperparameter, compare_rules
 from jeit.inverse.hyperparameter.rules import RULES
@@ -18,6 +19,8 @@ from jeit.inverse.prior.total_variation import TotalVariation
 from jeit.inverse.streaming.imager import Imager
 from jeit.inverse.streaming.stream import stream
 from jeit.inverse.uncertainty import posterior
+
+_tell_old_names(__name__)
 
 __all__ = [
     "RULES",

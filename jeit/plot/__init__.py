@@ -4,6 +4,7 @@ Every function takes `ax`, makes a figure of its own where none is given, and re
 in metres in the arguments and in millimetres in the pictures.
 """
 
+from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.plot.acoustic.localisation_error import plot_error_curve, plot_pairs
 from jeit.plot.acoustic.loss_map import Marks, plot_loss_map
 from jeit.plot.acoustic.receptive_fields import plot_receptive_fields
@@ -16,6 +17,8 @@ from jeit.plot.imaging.figures_of_merit import plot_figures_of_merit
 from jeit.plot.imaging.hyperparameter import plot_choice
 from jeit.plot.imaging.image import plot_image
 from jeit.plot.imaging.mesh import plot_mesh
+
+_tell_old_names(__name__)
 
 __all__ = [
     "ColourScale",

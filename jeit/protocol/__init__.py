@@ -1,5 +1,6 @@
 """Protocols: which currents are driven and which voltages are read, as matrices with names and units."""
 
+from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.protocol.matrices import from_channels, from_matrices
 from jeit.protocol.patterns import (
     adjacent,
@@ -12,6 +13,8 @@ from jeit.protocol.patterns import (
     two_terminal,
 )
 from jeit.protocol.protocol import Protocol
+
+_tell_old_names(__name__)
 
 __all__ = [
     "Protocol",

@@ -1,6 +1,7 @@
 """What is told of results, and all that is written to a folder: measurements, images, streams, compared rules,
 calibrations of microphones, tracks, layouts, studies."""
 
+from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.report.calibration import draw_calibration, write_calibration
 from jeit.report.compared_rules import draw_choice, report_choice, write_choice
 from jeit.report.image import draw_image, report_image, write_image
@@ -10,6 +11,8 @@ from jeit.report.measurement import report_measurement
 from jeit.report.stream import write_stream
 from jeit.report.study import write_study_report
 from jeit.report.track import draw_track, report_track, write_track
+
+_tell_old_names(__name__)
 
 __all__ = [
     "draw_calibration",

@@ -4,6 +4,7 @@ touches on them.
 What a sounding skin is made of (its layer, microphones and readout) is in `jeit.simulate.acoustic`.
 """
 
+from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.simulate.acoustic.bursts import Burst
 from jeit.simulate.acoustic.calibration_taps import calibration_taps
 from jeit.simulate.acoustic.microphones import microphone_grid
@@ -11,6 +12,8 @@ from jeit.simulate.acoustic.sound import quiet
 from jeit.simulate.acoustic.sounding_skin import SoundingSkin
 from jeit.simulate.acoustic.touches import pat, stroke, tap, tickle
 from jeit.simulate.round_skin import RoundSkin, simulate_press
+
+_tell_old_names(__name__)
 
 __all__ = [
     "Burst",

@@ -4,9 +4,12 @@
 `jeit.report.write_study_report` makes one page of it. Needs the extra `cluster`: zarr, xarray and dask.distributed.
 """
 
+from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.design.study.run import Progress, run_study, study_progress
 from jeit.design.study.spec import Point, Study, read_study
 from jeit.design.study.store import open_results
+
+_tell_old_names(__name__)
 
 __all__ = [
     "Point",
