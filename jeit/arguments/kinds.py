@@ -18,7 +18,7 @@ def check_kind(name: str, given: Any, kind: type | tuple[type, ...], wanted: str
 def told(given: Any) -> str:
     """What was given, in a few words: 'laplace', nan, a list, an array of float64 of shape (3,)."""
     if isinstance(given, (np.generic, np.ndarray, jax.Array)):
-        if given.shape == () and given.dtype.kind in "biufc":
+        if given.shape == () and getattr(given.dtype, "kind", "key") in "biufc":
             return repr(np.asarray(given).item())
         return f"an array of {given.dtype} of shape {given.shape}"
     if isinstance(given, _PLAIN):

@@ -27,6 +27,7 @@ from jeit.mesh import Disk
         (Disk, "the class Disk itself"),
         (np.zeros((3, 2)), "an array of float64 of shape (3, 2)"),
         (jnp.zeros(3, bool), "an array of bool of shape (3,)"),
+        (jax.random.key(0), "an array of key<fry> of shape ()"),
     ],
 )
 def test_what_was_given(given, said):
