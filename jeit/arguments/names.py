@@ -10,11 +10,9 @@ from jeit.arguments.kinds import told
 def check_name(argument: str, given: Any, names: Iterable[str], otherwise: str = "") -> None:
     """Raise `ValueError`, about `argument`, for what is none of `names`; `otherwise` says what else could be given."""
     known = list(names)
-    listed = f"{', '.join(known)}{otherwise}"
-    if not isinstance(given, str):
-        raise ValueError(f"{argument} must be one of {listed}; it is {told(given)}.")
-    if given not in known:
-        raise ValueError(f"{argument}: there is no {told(given)}{did_you_mean(given, known)}; give one of {listed}.")
+    if not (isinstance(given, str) and given in known):
+        said = f"it is {told(given)}{did_you_mean(given, known)}"
+        raise ValueError(f"{argument} must be one of {', '.join(known)}{otherwise}; {said}.")
 
 
 def did_you_mean(given: Any, names: Iterable[str]) -> str:

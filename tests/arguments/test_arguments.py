@@ -77,11 +77,9 @@ def test_no_keys(key, said):
 def test_names():
     names = {"gcv": 1, "l-curve": 2}
     check_name("rule", "gcv", names)
-    with pytest.raises(
-        ValueError, match=r"^rule: there is no 'gvc' \(did you mean 'gcv'\?\); give one of gcv, l-curve\.$"
-    ):
+    with pytest.raises(ValueError, match=r"^rule must be one of gcv, l-curve; it is 'gvc' \(did you mean 'gcv'\?\)\.$"):
         check_name("rule", "gvc", names)
-    with pytest.raises(ValueError, match=r"there is no 'luck'; give one of gcv, l-curve, or a number\.$"):
+    with pytest.raises(ValueError, match=r"^rule must be one of gcv, l-curve, or a number; it is 'luck'\.$"):
         check_name("rule", "luck", names, ", or a number")
     with pytest.raises(ValueError, match=r"^rule must be one of gcv, l-curve; it is a list\.$"):
         check_name("rule", ["gcv"], names)
