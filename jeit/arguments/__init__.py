@@ -5,7 +5,7 @@ light: nothing of the library is imported here.
 """
 
 from jeit.arguments.keys import check_key
-from jeit.arguments.kinds import check_kind, told
+from jeit.arguments.kinds import check_kind, is_number, told
 from jeit.arguments.lengths import IN_MILLIMETRES, check_metres
 from jeit.arguments.names import check_name, did_you_mean
 
@@ -16,5 +16,6 @@ __all__ = [
     "check_metres",
     "check_name",
     "did_you_mean",
+    "is_number",
     "told",
 ]

@@ -1,5 +1,7 @@
 """Things of another kind than is asked for."""
 
+import math
+from numbers import Real
 from typing import Any
 
 import jax
@@ -15,16 +17,28 @@ def check_kind(name: str, given: Any, kind: type | tuple[type, ...], wanted: str
         raise ValueError(f"{name} must be {wanted}; it is {told(given)}.")
 
 
+def is_number(given: Any) -> bool:
+    """Whether it is one real number, and finite; an array of no dimensions is one, a truth value is not."""
+    number = _scalar(given)
+    return isinstance(number, Real) and not isinstance(number, bool) and math.isfinite(number)
+
+
 def told(given: Any) -> str:
     """What was given, in a few words: 'laplace', nan, a list, an array of float64 of shape (3,)."""
-    if isinstance(given, (np.generic, np.ndarray, jax.Array)):
-        if given.shape == () and getattr(given.dtype, "kind", "key") in "biufc":
-            return repr(np.asarray(given).item())
-        return f"an array of {given.dtype} of shape {given.shape}"
-    if isinstance(given, _PLAIN):
-        text = repr(given)
+    thing = _scalar(given)
+    if isinstance(thing, (np.ndarray, jax.Array)):
+        return f"an array of {thing.dtype} of shape {thing.shape}"
+    if isinstance(thing, _PLAIN):
+        text = repr(thing)
         return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
-    if isinstance(given, type):
-        return f"the class {given.__name__} itself"
-    name = type(given).__name__
+    if isinstance(thing, type):
+        return f"the class {thing.__name__} itself"
+    name = type(thing).__name__
     return f"{'an' if name[0] in 'AEIOU' else 'a'} {name}"
+
+
+def _scalar(given: Any) -> Any:
+    """An array of no dimensions as the number that it holds, all else as it is; random keys hold none."""
+    if isinstance(given, (np.generic, np.ndarray, jax.Array)) and given.shape == () and hasattr(given.dtype, "kind"):
+        return np.asarray(given).item()
+    return given

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from jeit.arguments.kinds import told
+from jeit.arguments.kinds import is_number, told
 
 IN_MILLIMETRES = "were millimetres given for metres?"
 """What is asked where a length is larger than it can be."""
@@ -13,9 +13,7 @@ IN_MILLIMETRES = "were millimetres given for metres?"
 def check_metres(name: str, value: Any, most: float = np.inf, limit: str = "") -> None:
     """Raise `ValueError`, about the argument `name`, for what is no positive length in metres, and for one of more than
     `most` metres; `limit` says in words what is so long."""
-    number = np.asarray(value)
-    real = number.shape == () and number.dtype.kind in "iuf"
-    if not (real and np.isfinite(number) and number > 0):
+    if not (is_number(value) and value > 0):
         raise ValueError(f"{name} must be a positive length in metres; it is {told(value)}.")
-    if number > most:
-        raise ValueError(f"{name} is {1e3 * number:g} mm, more than {limit}, {1e3 * most:g} mm; {IN_MILLIMETRES}")
+    if value > most:
+        raise ValueError(f"{name} is {1e3 * float(value):g} mm, more than {limit}, {1e3 * most:g} mm; {IN_MILLIMETRES}")

@@ -16,6 +16,8 @@ def check_name(argument: str, given: Any, names: Iterable[str], otherwise: str =
 
 
 def did_you_mean(given: Any, names: Iterable[str]) -> str:
-    """The name nearest to what was given, as a question in brackets; nothing where none is near."""
-    close = difflib.get_close_matches(given, list(names), n=1) if isinstance(given, str) else ()
+    """The name nearest to what was given, or that begins so, as a question in brackets; nothing where none is near."""
+    known, word = list(names), given.lower() if isinstance(given, str) else ""
+    begun = [name for name in known if word and name.startswith(word)]
+    close = difflib.get_close_matches(word, known, n=1) or begun
     return f" (did you mean {close[0]!r}?)" if close else ""

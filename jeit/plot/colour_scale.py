@@ -5,7 +5,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 
-from jeit.arguments import check_kind, told
+from jeit.arguments import check_kind, is_number, told
 from jeit.plot.axes import DIVERGING, SEQUENTIAL, draw_colour_bar, prefixed
 
 
@@ -34,8 +34,7 @@ class ColourScale(eqx.Module):
     bar: bool = True
 
     def __check_init__(self):
-        number = np.asarray(0.0 if self.limit is None else self.limit)
-        if number.dtype.kind not in "iuf" or number.shape != () or not (np.isfinite(number) and number >= 0):
+        if self.limit is not None and not (is_number(self.limit) and self.limit >= 0):
             raise ValueError(f"limit must be finite and positive, in the values' unit; it is {told(self.limit)}.")
 
     def of(self, values: np.ndarray, unit: str) -> "FittedScale":

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.arguments import check_key, check_kind, check_metres, check_name, told
+from jeit.arguments import check_key, check_kind, check_metres, check_name, did_you_mean, is_number, told
 from jeit.mesh import Disk
 
 
@@ -32,6 +32,18 @@ from jeit.mesh import Disk
 )
 def test_what_was_given(given, said):
     assert told(given) == said
+
+
+@pytest.mark.parametrize("given", [0, -1.5, np.float32(2), np.asarray(1), jnp.asarray(0.5)])
+def test_numbers(given):
+    assert is_number(given)
+
+
+@pytest.mark.parametrize(
+    "given", [True, "1", None, [1.0], np.ones(1), 1j, math.nan, math.inf, {}, jax.random.key(0), jnp.ones(2)]
+)
+def test_no_numbers(given):
+    assert not is_number(given)
 
 
 def test_kinds():
@@ -83,6 +95,23 @@ def test_names():
         check_name("rule", "luck", names, ", or a number")
     with pytest.raises(ValueError, match=r"^rule must be one of gcv, l-curve; it is a list\.$"):
         check_name("rule", ["gcv"], names)
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("GCV", "gcv"),
+        ("gauss", "gauss-newton"),
+        ("l_curve", "l-curve"),
+        ("luck", ""),
+        ("", ""),
+        (None, ""),
+        (["gcv"], ""),
+    ],
+)
+def test_what_was_meant(given, meant):
+    said = did_you_mean(given, ["gcv", "l-curve", "gauss-newton"])
+    assert said == (f" (did you mean '{meant}'?)" if meant else "")
 
 
 def test_metres():

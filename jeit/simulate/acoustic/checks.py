@@ -1,22 +1,15 @@
 """Checks of the numbers that a simulated acoustic skin and its touches are given."""
 
-import numpy as np
-
-from jeit.arguments import told
+from jeit.arguments import is_number, told
 
 
 def check_positive(name: str, value: float) -> None:
     """Raises `ValueError` for what is not a finite number above zero."""
-    if not (_is_finite(value) and value > 0):
+    if not (is_number(value) and value > 0):
         raise ValueError(f"{name} must be a positive number in SI units; it is {told(value)}.")
 
 
 def check_not_negative(name: str, value: float) -> None:
     """Raises `ValueError` for what is not a finite number from zero up."""
-    if not (_is_finite(value) and value >= 0):
+    if not (is_number(value) and value >= 0):
         raise ValueError(f"{name} must be zero or positive; it is {told(value)}.")
-
-
-def _is_finite(value) -> bool:
-    number = np.asarray(value)
-    return number.shape == () and number.dtype.kind in "iuf" and bool(np.isfinite(number))
