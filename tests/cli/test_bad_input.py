@@ -143,6 +143,8 @@ COMPUTING = {
     "press beyond the edge": (lambda m: simulate_press(RoundSkin(), None, (20.0, 0.0)), "beyond the skin"),  # pyright: ignore[reportArgumentType]
     "press of no size": (lambda m: simulate_press(RoundSkin(), None, (0, 0), radius=0), "positive size"),  # pyright: ignore[reportArgumentType]
     "unknown method": (lambda m: ImagingSettings(method="two-step"), "one-step, back-projection"),
+    "nearly a format": (lambda m: read(__file__, "kit"), "format must be one of .* \\(did you mean 'kit4'"),
+    "nearly a choice": (lambda m: pr.opposite(8, drives="distnct"), "got 'distnct' \\(did you mean 'distinct'"),
     "nearly a method": (lambda m: ImagingSettings(method="gaus-newton"), "did you mean 'gauss-newton'"),
     "nearly a prior": (lambda m: ImagingSettings(prior="laplas"), "did you mean 'laplace'"),
     "nearly a rule": (lambda m: ImagingSettings(hyperparameter="gvc"), "did you mean 'gcv'"),
@@ -253,7 +255,7 @@ COMMANDS = {
     "not text": (lambda t: spoilt(t, "V", "V") and raw(t, "rest.csv", b"\xff\xfe\x00"), "not a text file"),
     "damaged mat": (lambda t: raw(t, "a.mat", b"MATLAB 5.0" + b"\0" * 200), "not a readable .mat"),
     "mat of another kind": (lambda t: matlab(t, x=1.0), "no known kind; it holds x"),
-    "unknown format": (lambda t: good(t, "--format", "xls"), "no format 'xls'"),
+    "unknown format": (lambda t: good(t, "--format", "xls"), "it is 'xls'"),
     "another format": (lambda t: good(t, "--format", "kit4"), "not a readable .mat"),
     "no such description": (lambda t: good(t, "--description", "absent.toml"), "there is no such file"),
     "no description": (lambda t: with_data(t, t.touched, description=None), "nothing says what they mean"),
