@@ -44,13 +44,19 @@ Hop = Annotated[
 
 @contextmanager
 def naming_options(options: dict[str, str]) -> Iterator[None]:
-    """Errors that begin with the name of one of these arguments begin with that of its option instead."""
+    """Errors that begin with the name of one of these arguments begin with that of its option instead.
+
+    An option in millimetres says so in its name: whether they were given for metres is not asked.
+    """
+    from jeit.arguments import IN_MILLIMETRES
+
     try:
         yield
     except ValueError as error:
         said = str(error)
         for argument, option in options.items():
             if said.startswith((f"{argument} ", f"{argument}:")):
+                said = said.replace(f"; {IN_MILLIMETRES}", ".") if option.endswith("-mm") else said
                 raise ValueError(option + said.removeprefix(argument)) from error
         raise
 
