@@ -1,12 +1,10 @@
 """What a search makes large: a score of a sheet's layout."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jeit.arguments import check_kind
+from jeit.arguments import check_kind, told
 from jeit.design.defaults import CONTRAST, CORRELATION, NOISE, TEMPERATURE
 from jeit.design.optimisation.variables import Varied
 from jeit.design.scores import Score, Scores, TouchPrior, layout_scores
@@ -36,7 +34,8 @@ class Objective(eqx.Module):
     temperature: float = TEMPERATURE
 
     def __check_init__(self):
-        check_kind("score", self.score, Callable, "a function of Scores, such as balanced")
+        if not callable(self.score):
+            raise ValueError(f"score must be a function of Scores, such as balanced; it is {told(self.score)}.")
         check_kind("touches", self.touches, SheetTouches, "SheetTouches, as of skin.sheet_touches(places)")
         check_kind("prior", self.prior, TouchPrior, "a TouchPrior, as of TouchPrior.create(places, correlation=0.05)")
 
