@@ -83,9 +83,9 @@ def __getattr__(name: str):
         from importlib.metadata import version
 
         return version("jeit")
-    raise AttributeError(
-        f"module 'jeit' has no attribute '{name}'; if version 0.1 had it, CHANGELOG.md says where it is now"
-    )
+    from jeit.arguments.moved import missing
+
+    raise missing(__name__, name)
 
 
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -10,14 +10,15 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # The rooms, each with those beneath it that it may import. All may import jeit_solvers, which knows none of them.
 ROOMS: dict[str, set[str]] = {}
-ROOMS["mesh"] = set()
-ROOMS["electrodes"] = {"mesh"}
-ROOMS["layout"] = {"mesh", "electrodes"}
-ROOMS["protocol"] = set()
-ROOMS["forward"] = {"mesh", "electrodes", "protocol"}
+ROOMS["arguments"] = set()
+ROOMS["mesh"] = {"arguments"}
+ROOMS["electrodes"] = {"arguments", "mesh"}
+ROOMS["layout"] = {*ROOMS["electrodes"], "electrodes"}
+ROOMS["protocol"] = {"arguments"}
+ROOMS["forward"] = {*ROOMS["electrodes"], "electrodes", "protocol"}
 ROOMS["inverse"] = {*ROOMS["forward"], "forward"}
-ROOMS["image"] = {"mesh"}
-ROOMS["acoustic"] = {"mesh"}
+ROOMS["image"] = {"arguments", "mesh"}
+ROOMS["acoustic"] = {"arguments", "mesh"}
 ROOMS["design"] = {*ROOMS["inverse"], "layout", "inverse"}
 ROOMS["data"] = {*ROOMS["forward"], "layout", "forward"}
 ROOMS["simulate"] = {*ROOMS["design"], "design", "data", "acoustic"}

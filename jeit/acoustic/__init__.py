@@ -9,22 +9,46 @@ maps, two sources). Beside them: `decay`, the decay models; `microphones`, the a
 sources are; `noise`; `track`, places in time; `touches`, all of it in one call.
 """
 
-from jeit.acoustic.calibration.calibrate import calibrate_microphones as calibrate_microphones
-from jeit.acoustic.calibration.calibration import Calibration as Calibration
-from jeit.acoustic.localisation.cramer_rao import cramer_rao as cramer_rao
-from jeit.acoustic.localisation.localiser import Localiser as Localiser
-from jeit.acoustic.localisation.locate import locate as locate
-from jeit.acoustic.microphones import MicrophoneArray as MicrophoneArray
-from jeit.acoustic.signal.intensity import IntensitySettings as IntensitySettings
-from jeit.acoustic.signal.intensity import intensities as intensities
-from jeit.acoustic.signal.intensity import tap_intensities as tap_intensities
-from jeit.acoustic.signal.recording import Intensities as Intensities
-from jeit.acoustic.signal.recording import Recording as Recording
-from jeit.acoustic.signal.recording import Taps as Taps
-from jeit.acoustic.signal.recording import read_recording as read_recording
-from jeit.acoustic.signal.recording import read_taps as read_taps
-from jeit.acoustic.signal.recording import write_recording as write_recording
-from jeit.acoustic.signal.recording import write_taps as write_taps
-from jeit.acoustic.touches import LocatedTouches as LocatedTouches
-from jeit.acoustic.touches import locate_touches as locate_touches
-from jeit.acoustic.tracking import track as track
+from jeit.acoustic.calibration.calibrate import calibrate_microphones
+from jeit.acoustic.calibration.calibration import Calibration
+from jeit.acoustic.localisation.cramer_rao import cramer_rao
+from jeit.acoustic.localisation.localiser import Localiser
+from jeit.acoustic.localisation.locate import locate
+from jeit.acoustic.microphones import MicrophoneArray
+from jeit.acoustic.signal.intensity import IntensitySettings, intensities, tap_intensities
+from jeit.acoustic.signal.recording import (
+    Intensities,
+    Recording,
+    Taps,
+    read_recording,
+    read_taps,
+    write_recording,
+    write_taps,
+)
+from jeit.acoustic.touches import LocatedTouches, locate_touches
+from jeit.acoustic.tracking import track
+from jeit.arguments.moved import tell_old_names as _tell_old_names
+
+_tell_old_names(__name__)
+
+__all__ = [
+    "Calibration",
+    "Intensities",
+    "IntensitySettings",
+    "Localiser",
+    "LocatedTouches",
+    "MicrophoneArray",
+    "Recording",
+    "Taps",
+    "calibrate_microphones",
+    "cramer_rao",
+    "intensities",
+    "locate",
+    "locate_touches",
+    "read_recording",
+    "read_taps",
+    "tap_intensities",
+    "track",
+    "write_recording",
+    "write_taps",
+]

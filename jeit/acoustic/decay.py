@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jeit.acoustic.noise import column
+from jeit.arguments import check_name
 
 # Metres²: r = √r² has no derivative at r = 0; a hundredth of a micrometre rounds off the tip.
 _TIP = 1e-16
@@ -201,6 +202,5 @@ def find_decay(name: str | type[AbstractDecay]) -> type[AbstractDecay]:
     where there is none of that name."""
     if isinstance(name, type) and issubclass(name, AbstractDecay):
         return name
-    if name not in DECAYS:
-        raise ValueError(f"decay must be one of {', '.join(DECAYS)}, or a class like theirs; it is {name!r}.")
-    return DECAYS[name]
+    check_name("decay", name, DECAYS, ", or a class like theirs")
+    return DECAYS[str(name)]

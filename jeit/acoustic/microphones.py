@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.noise import IntensityNoise
 from jeit.acoustic.surface import AbstractSurface
+from jeit.arguments import check_kind
 
 
 class MicrophoneArray(eqx.Module):
@@ -30,3 +31,9 @@ class MicrophoneArray(eqx.Module):
         sent = [jnp.exp(one[2]) * self.response(one[:2]) for one in each]
         received = sum(sent[1:], sent[0])
         return jnp.log(received + self.noise.floor[:, None]), self.noise.level_variance(received)
+
+
+def check_array(microphone_array: MicrophoneArray) -> None:
+    """Raises `ValueError` for what is no `MicrophoneArray`."""
+    wanted = "a MicrophoneArray, such as calibration.microphone_array"
+    check_kind("microphone_array", microphone_array, MicrophoneArray, wanted)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from jeit.arguments import told
 from jeit.mesh import Domain, Polygon
 
 # Knots of the spline: more make every evaluation slower and the surface no smoother.
@@ -96,7 +97,11 @@ def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -
     if isinstance(outline, Domain):
         edge, *holes = outline.loops()
         return Plane(Polygon(edge, holes))
-    vertices = np.asarray(outline, float)
+    try:
+        vertices = np.asarray(outline, float)
+    except (TypeError, ValueError):
+        wanted = "an outline, such as Disk(0.1), or vertices (K, 2) or (K, 3) in metres"
+        raise ValueError(f"outline must be {wanted}; it is {told(outline)}.") from None
     if vertices.ndim != 2 or vertices.shape[1] not in (2, 3) or len(vertices) < 3:
         raise ValueError(f"outline: give at least three vertices (K, 2) or (K, 3) in metres; got {vertices.shape}.")
     if vertices.shape[1] == 2:

@@ -49,7 +49,7 @@ def locate_touches(
     than `gap`, `intensity` or `silence` for a recording of intensities, and values out of range.
     """
     said = progress or (lambda step: None)
-    if intensity is not None and not isinstance(recording, Recording):
+    if intensity is not None and isinstance(recording, Intensities):
         raise ValueError("intensity: band and window are for samples; this recording holds intensities.")
     if not (np.isfinite(gap) and gap > 0):
         raise ValueError(f"gap must be positive, in seconds; it is {gap}.")

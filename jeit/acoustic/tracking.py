@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.stats import chi2
 
 from jeit.acoustic.localisation.locations import Locations
+from jeit.arguments import check_kind
 from jeit_solvers import solve_small
 
 # Densities tried: from a finger that rests to one that is flung about (m²/s³).
@@ -50,8 +51,10 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
 
     `gap`: seconds without a place after which a touch has ended. `acceleration`: spectral density q of the random
     acceleration (m²/s³), the likeliest of a range unless given. Errors of windows that share a sample are alike:
-    covariances are taken `locations.overlap` times as wide. Raises `ValueError` for what is not positive.
+    covariances are taken `locations.overlap` times as wide. Raises `ValueError` for what is not positive, and for what
+    are no locations.
     """
+    check_kind("locations", locations, Locations, "Locations, as of locate(recording, calibration)")
     if not (np.isfinite(gap) and gap > 0):
         raise ValueError(f"gap must be positive, in seconds; it is {gap}.")
     if acceleration is not None and not (np.isfinite(acceleration) and acceleration > 0):

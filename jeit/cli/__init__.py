@@ -3,4 +3,8 @@
 The commands import what they need when they run, so that `jeit --help` answers at once.
 """
 
-from jeit.cli.app import main as main
+from jeit.cli.app import main
+
+__all__ = [
+    "main",
+]

@@ -1,6 +1,5 @@
 """Options and arguments that several commands share."""
 
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,13 +43,19 @@ Hop = Annotated[
 
 @contextmanager
 def naming_options(options: dict[str, str]) -> Iterator[None]:
-    """Errors that begin with the name of one of these arguments begin with that of its option instead."""
+    """Errors that begin with the name of one of these arguments begin with that of its option instead.
+
+    An option in millimetres says so in its name: whether they were given for metres is not asked.
+    """
+    from jeit.arguments import IN_MILLIMETRES
+
     try:
         yield
     except ValueError as error:
         said = str(error)
         for argument, option in options.items():
             if said.startswith((f"{argument} ", f"{argument}:")):
+                said = said.replace(f"; {IN_MILLIMETRES}", ".") if option.endswith("-mm") else said
                 raise ValueError(option + said.removeprefix(argument)) from error
         raise
 
@@ -89,18 +94,10 @@ def intensity_settings(low: float | None, high: float | None, window: float | No
 
 def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json")) -> None:
     """Make the folder for results of these names before any work is done. Raises `ValueError` if it cannot be one."""
-    if output.exists() and not output.is_dir():
-        raise ValueError(f"--output {output} is a file; give a folder for the results.")
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=output):
-            pass
-        taken = [name for name in names if (output / name).is_dir()]
-    except OSError as error:
-        reason = error.strerror or error
-        raise ValueError(f"--output {output} cannot be written to ({reason}); give another folder.") from None
-    if taken:
-        raise ValueError(f"--output {output}: there is a folder named {taken[0]} in it; give another.")
+    from jeit.report.folder import results_folder
+
+    with naming_options({"folder": "--output"}):
+        results_folder(output, names)
 
 
 def number_or_name(text: str, number: type = float):

@@ -4,12 +4,25 @@
 whether a frame can be imaged against a reference.
 """
 
-from jeit.data.description import load_description as load_description
-from jeit.data.export import write_table as write_table
-from jeit.data.imageable import check_imageable as check_imageable
-from jeit.data.measurement import Measurement as Measurement
-from jeit.data.quality import estimate_noise as estimate_noise
-from jeit.data.quality import impossible_signs as impossible_signs
-from jeit.data.quality import reciprocity_error as reciprocity_error
-from jeit.data.registry import read as read
-from jeit.data.screening import screen as screen
+from jeit.arguments.moved import tell_old_names as _tell_old_names
+from jeit.data.description import load_description
+from jeit.data.export import write_table
+from jeit.data.imageable import check_imageable
+from jeit.data.measurement import Measurement
+from jeit.data.quality import estimate_noise, impossible_signs, reciprocity_error
+from jeit.data.registry import read
+from jeit.data.screening import screen
+
+_tell_old_names(__name__)
+
+__all__ = [
+    "Measurement",
+    "check_imageable",
+    "estimate_noise",
+    "impossible_signs",
+    "load_description",
+    "read",
+    "reciprocity_error",
+    "screen",
+    "write_table",
+]

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from jeit import protocol as protocols
+from jeit.arguments import did_you_mean
 from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Domain
@@ -181,7 +182,8 @@ def _need(section: dict, key: str, origin: str, where: str) -> Any:
 
 def _choice(value: Any, choices, origin: str, where: str) -> Any:
     if value not in choices:
-        raise ValueError(f"{origin}: {where} must be one of {', '.join(map(str, choices))}; got {value!r}.")
+        meant = did_you_mean(value, map(str, choices))
+        raise ValueError(f"{origin}: {where} must be one of {', '.join(map(str, choices))}; got {value!r}{meant}.")
     return value
 
 

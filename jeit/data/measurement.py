@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Inexact
 
+from jeit.arguments import did_you_mean
 from jeit.electrodes.electrodes import is_concrete
 from jeit.mesh import Domain
 from jeit.protocol import Protocol
@@ -101,7 +102,8 @@ class Measurement(eqx.Module):
         if isinstance(which, str):
             if which not in self.frame_names:
                 known = ", ".join(self.frame_names) or "none: give a number"
-                raise ValueError(f"'{self.name}' has no frame named {which!r}. Named frames: {known}.")
+                meant = did_you_mean(which, self.frame_names)
+                raise ValueError(f"'{self.name}' has no frame named {which!r}{meant}. Named frames: {known}.")
             which = self.frame_names.index(which)
         if not -self.num_frames <= which < self.num_frames:
             raise ValueError(f"'{self.name}' has frames 0 to {self.num_frames - 1}; there is no frame {which}.")

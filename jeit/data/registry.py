@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from jeit.arguments import check_name
 from jeit.data import _matlab, eidors, kit4, ktc2023, table
 from jeit.data.measurement import Measurement
 
@@ -52,8 +53,7 @@ def read(path: str | Path, format: str | None = None, description: str | Path | 
     if file.stat().st_size == 0:
         raise ValueError(f"{file.name} is empty.")
     name = _recognise(file, description) if format is None else format
-    if name not in FORMATS:
-        raise ValueError(f"There is no format {name!r}. Formats: {', '.join(FORMATS)}.")
+    check_name("format", name, FORMATS)
     chosen = FORMATS[name]
     if chosen.described:
         return chosen.read(file, description=description)

@@ -62,9 +62,9 @@ _HOMES = {
 def __getattr__(name: str):
     if name in _HOMES:
         return getattr(importlib.import_module(f"jeit.design.{_HOMES[name]}"), name)
-    raise AttributeError(
-        f"module 'jeit.design' has no attribute '{name}'; if version 0.1 had it, CHANGELOG.md says where it is now"
-    )
+    from jeit.arguments.moved import missing
+
+    raise missing(__name__, name)
 
 
 __all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]

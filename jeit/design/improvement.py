@@ -14,6 +14,7 @@ from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin
 from jeit.design.skin.touch_grid import touch_grid
 from jeit.layout import Layout
+from jeit.layout.layout import check_layout
 from jeit.protocol import two_terminal
 
 # Of the mesh that results are confirmed on, times those of the one optimised on; and of places along a side.
@@ -73,6 +74,7 @@ def improve_layout(
 
     Raises `ValueError` where no layout satisfies what is asked, and as `Skin.create` and `optimise_layout` do.
     """
+    check_layout("layout", layout)
     tell = progress or (lambda step: None)
     space = DesignSpace(minimum_spacing=MINIMUM_SPACING) if space is None else space
     tell("mesh")

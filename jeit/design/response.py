@@ -3,10 +3,11 @@
 import equinox as eqx
 from jaxtyping import Array
 
+from jeit.arguments import check_key
 from jeit.design.defaults import NUM_TAXELS, THRESHOLD
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.skin import Skin, check_skin
-from jeit.design.skin.touch_grid import TouchGrid
+from jeit.design.skin.touch_grid import TouchGrid, check_grid
 from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.taxels import Taxels, find_taxels
 from jeit.layout import Layout
@@ -43,8 +44,8 @@ def skin_response(
     `Skin.voltage_changes` do.
     """
     check_skin("skin", skin)
-    if not isinstance(grid, TouchGrid):
-        raise ValueError(f"grid must be a TouchGrid, as of touch_grid(skin.outline); it is {type(grid).__name__}.")
+    check_grid(grid)
+    check_key(key)
     number = number_of_taxels(grid, num_taxels)
     touched = skin.touched_cells(grid.places) if touched is None else touched
     if len(touched.places) != len(grid.places):

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 from jeit.design.defaults import TEMPERATURE
 from jeit.design.sensitivity import uniformity
 from jeit.design.skin.sheet_touches import SheetTouches
+from jeit.design.skin.touch_grid import check_places
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity
 from jeit_solvers.dense.cholesky import inverse_cholesky
@@ -46,13 +47,13 @@ class TouchPrior(eqx.Module):
         """deviation² exp(-d² / 2 correlation²) between places (n, 2) at a distance d, metres.
 
         What holds less than a millionth of the largest variance is left out. Raises `ValueError` for a correlation or
-        deviation that is not positive.
+        deviation that is not positive, and for what are no places.
         """
         if not (0 < correlation < np.inf and 0 < deviation < np.inf):
             raise ValueError(
                 f"correlation (metres) and deviation must be positive; they are {correlation!r} and {deviation!r}."
             )
-        place = np.asarray(places, float)
+        place = check_places(places)
         squared = np.sum((place[:, None] - place) ** 2, axis=-1)
         values, vectors = np.linalg.eigh(deviation**2 * np.exp(-squared / (2 * correlation**2)))
         kept = values > 1e-6 * values[-1]

@@ -8,10 +8,11 @@ from jaxtyping import Array, Float
 
 from jeit.design.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation, Bell
-from jeit.design.skin.touch_grid import TouchGrid
+from jeit.design.skin.touch_grid import TouchGrid, check_grid
 from jeit.design.skin.touched_cells import touched_cells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
+from jeit.forward.model import check_model
 
 
 def uniformity(sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
@@ -82,5 +83,7 @@ def sensitivity_map(
     `indentation`: the unit deformation of Park et al. 2022 unless given. `thickness` (a sheet's) and `contrast` as in
     `touched_cells`; `linear` as in `touch_changes`. Raises `ValueError` as they do.
     """
+    check_model(model)
+    check_grid(grid)
     touched = touched_cells(model.mesh, indentation or Bell(), grid.places, thickness=thickness, contrast=contrast)
     return SensitivityMap(grid, touch_changes(model, conductivity, touched, linear=linear))

@@ -9,6 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jeit.arguments import check_key
 from jeit.design.defaults import NUM_TAXELS, THRESHOLD
 from jeit_solvers import KMeans, kmeans
 
@@ -124,6 +125,7 @@ def find_taxels(
     Raises `ValueError` for shapes that disagree, changes that are not finite or all zero, and lengths and areas whose
     units do not fit together.
     """
+    check_key(key)
     _check(changes, places, cell_area, num_taxels, threshold)
     change, place = jnp.asarray(changes, float), jnp.asarray(places, float)
     unit = _unit(change)

@@ -11,14 +11,27 @@
 Where to put them: `jeit.layout`.
 """
 
-from jeit.electrodes.boundary import BoundaryElectrodes as BoundaryElectrodes
-from jeit.electrodes.combined import CombinedElectrodes as CombinedElectrodes
-from jeit.electrodes.discs import FaceDiscs as FaceDiscs
-from jeit.electrodes.discs import SheetDiscs as SheetDiscs
-from jeit.electrodes.electrodes import AbstractElectrodes as AbstractElectrodes
-from jeit.electrodes.facets import FacetElectrodes as FacetElectrodes
-from jeit.electrodes.facets import electrodes_from_nodes as electrodes_from_nodes
-from jeit.electrodes.facets import plates as plates
-from jeit.electrodes.patches import FacePatches as FacePatches
-from jeit.electrodes.point import NodeElectrodes as NodeElectrodes
-from jeit.electrodes.point import PointElectrodes as PointElectrodes
+from jeit.arguments.moved import tell_old_names as _tell_old_names
+from jeit.electrodes.boundary import BoundaryElectrodes
+from jeit.electrodes.combined import CombinedElectrodes
+from jeit.electrodes.discs import FaceDiscs, SheetDiscs
+from jeit.electrodes.electrodes import AbstractElectrodes
+from jeit.electrodes.facets import FacetElectrodes, electrodes_from_nodes, plates
+from jeit.electrodes.patches import FacePatches
+from jeit.electrodes.point import NodeElectrodes, PointElectrodes
+
+_tell_old_names(__name__)
+
+__all__ = [
+    "AbstractElectrodes",
+    "BoundaryElectrodes",
+    "CombinedElectrodes",
+    "FaceDiscs",
+    "FacePatches",
+    "FacetElectrodes",
+    "NodeElectrodes",
+    "PointElectrodes",
+    "SheetDiscs",
+    "electrodes_from_nodes",
+    "plates",
+]

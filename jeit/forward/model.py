@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import lineax as lx
 from jaxtyping import Array, Inexact
 
+from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward.assembly import check_conductivity, field_gradients
 from jeit.forward.system import System
@@ -103,6 +104,11 @@ class ForwardModel(eqx.Module):
                 "model.voltages."
             )
         return _voltages_and_jacobian(self, conductivity)
+
+
+def check_model(model: ForwardModel) -> None:
+    """Raise `ValueError` for what is no `ForwardModel`."""
+    check_kind("model", model, ForwardModel, "a ForwardModel(mesh, electrodes, protocol)")
 
 
 def _check(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol) -> None:

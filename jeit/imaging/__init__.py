@@ -4,19 +4,37 @@
 inclusions; `stream` does it frame after frame.
 """
 
-from jeit.imaging.compared_rules import ComparedRules as ComparedRules
-from jeit.imaging.compared_rules import RuleOutcome as RuleOutcome
-from jeit.imaging.compared_rules import compare_on_data as compare_on_data
-from jeit.imaging.difference import ImagedDifference as ImagedDifference
-from jeit.imaging.difference import image_difference as image_difference
-from jeit.imaging.method import METHODS as METHODS
-from jeit.imaging.preparation import PreparedDifference as PreparedDifference
-from jeit.imaging.preparation import calibrated_model as calibrated_model
-from jeit.imaging.preparation import imaging_mesh as imaging_mesh
-from jeit.imaging.preparation import prepare_difference as prepare_difference
-from jeit.imaging.preparation import select_frames as select_frames
-from jeit.imaging.settings import CONTACTS as CONTACTS
-from jeit.imaging.settings import ImagingSettings as ImagingSettings
-from jeit.imaging.stream import StreamSettings as StreamSettings
-from jeit.imaging.stream import frames_of as frames_of
-from jeit.imaging.stream import prepare_imager as prepare_imager
+from jeit.arguments.moved import tell_old_names as _tell_old_names
+from jeit.imaging.compared_rules import ComparedRules, RuleOutcome, compare_on_data
+from jeit.imaging.difference import ImagedDifference, image_difference
+from jeit.imaging.method import METHODS
+from jeit.imaging.preparation import (
+    PreparedDifference,
+    calibrated_model,
+    imaging_mesh,
+    prepare_difference,
+    select_frames,
+)
+from jeit.imaging.settings import CONTACTS, ImagingSettings
+from jeit.imaging.stream import StreamSettings, frames_of, prepare_imager
+
+_tell_old_names(__name__)
+
+__all__ = [
+    "CONTACTS",
+    "METHODS",
+    "ComparedRules",
+    "ImagedDifference",
+    "ImagingSettings",
+    "PreparedDifference",
+    "RuleOutcome",
+    "StreamSettings",
+    "calibrated_model",
+    "compare_on_data",
+    "frames_of",
+    "image_difference",
+    "imaging_mesh",
+    "prepare_difference",
+    "prepare_imager",
+    "select_frames",
+]

@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jeit.arguments import check_name
 from jeit.data import Measurement
 from jeit.image import Inclusion, find_inclusions
 from jeit.imaging.clock import Clock
 from jeit.imaging.method import prior_for, rule_for
 from jeit.imaging.preparation import PreparedDifference, prepare_difference
-from jeit.imaging.settings import ImagingSettings
+from jeit.imaging.settings import ImagingSettings, as_settings
 from jeit.inverse import RULES
 from jeit.inverse.hyperparameter.chosen import Choice
 from jeit.inverse.hyperparameter.rules import choose
@@ -72,11 +73,10 @@ def compare_on_data(
     cannot work on these data is `refused`, unless it is the only one asked for. Raises `ValueError` for a rule that
     there is not, and as they do.
     """
-    settings = ImagingSettings() if settings is None else settings
+    settings = as_settings(settings)
     names = list(dict.fromkeys(RULES if rules is None else rules))
     for name in names:
-        if name not in RULES:
-            raise ValueError(f"rules: there is no '{name}'; give some of {', '.join(RULES)}.")
+        check_name("rules", name, RULES)
     if not names:
         raise ValueError(f"rules: none is named; give some of {', '.join(RULES)}.")
     clock = Clock(progress)

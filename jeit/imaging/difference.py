@@ -17,7 +17,7 @@ from jeit.image import Inclusion, Raster, find_inclusions, segment
 from jeit.imaging.clock import Clock
 from jeit.imaging.method import METHODS
 from jeit.imaging.preparation import prepare_difference
-from jeit.imaging.settings import ImagingSettings
+from jeit.imaging.settings import ImagingSettings, as_settings
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
@@ -91,9 +91,10 @@ def image_difference(
     `reference`: the undisturbed body (the mean of its frames is used); None if `measurement` carries its own, a
     frame named "reference". `frame`: which frame to image, by number from 0 or by name; the first unless given.
     `progress` is called with the name of each step as it begins. Raises `ValueError` for data that cannot be
-    imaged (see `jeit.data.check_imageable`), that do not say where the electrodes are, or that are complex.
+    imaged (see `jeit.data.check_imageable`), that do not say where the electrodes are, or that are complex, and for
+    things of another kind, such as a path that is not read yet.
     """
-    settings = ImagingSettings() if settings is None else settings
+    settings = as_settings(settings)
     clock = Clock(progress)
     prepared = prepare_difference(
         measurement,

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jeit.arguments import check_kind
 from jeit.data import Measurement, check_imageable
 from jeit.data.imageable import FrameQuality
 from jeit.electrodes import AbstractElectrodes
@@ -130,8 +131,11 @@ def select_frames(
     """The frame to image and the reference to image it against, one frame each.
 
     A frame named "reference" in `measurement` is never imaged unless asked for, and is what the others are compared
-    with when no `reference` is given. Raises `ValueError` when there is no reference, or no such frame.
+    with when no `reference` is given. Raises `ValueError` when there is no reference, no such frame, or no measurement.
     """
+    check_measurement("measurement", measurement)
+    if reference is not None:
+        check_measurement("reference", reference)
     if reference is None:
         objects, reference = measurement.split_reference()
     elif "reference" in measurement.frame_names and measurement.num_frames > 1:
@@ -142,6 +146,11 @@ def select_frames(
         _, reference = reference.split_reference()
     one = objects.frame(0) if frame is None else measurement.frame(frame)
     return one, reference.mean_frame()
+
+
+def check_measurement(name: str, given: Measurement) -> None:
+    """Raise `ValueError`, about the argument `name`, for what is no `Measurement`, such as the path of one."""
+    check_kind(name, given, Measurement, "a Measurement, as of jeit.read(path)")
 
 
 def imaging_mesh(domain: Domain, electrodes: AbstractElectrodes, num_points: int) -> Mesh:

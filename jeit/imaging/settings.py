@@ -1,9 +1,9 @@
 """How to image: the method, the prior, λ, the mesh. The defaults here are jeit's, for Python and command line alike."""
 
 from dataclasses import dataclass
+from numbers import Integral
 
-import numpy as np
-
+from jeit.arguments import check_kind, check_name, is_number, told
 from jeit.imaging.method import METHODS
 from jeit.inverse import RULES
 from jeit.inverse.prior.defaults import PRIORS
@@ -43,29 +43,28 @@ class ImagingSettings:
     segment: bool = False
 
     def __post_init__(self):
-        if self.method not in METHODS:
-            raise ValueError(f"method: there is no '{self.method}'; give one of {', '.join(METHODS)}.")
-        known = self.prior in PRIORS if isinstance(self.prior, str) else isinstance(self.prior, AbstractPrior)
-        if not known:
-            raise ValueError(f"prior: there is no {self.prior!r}; give one of {', '.join(PRIORS)}, or a prior.")
-        if isinstance(self.prior, AbstractPrior) and not self.prior.is_quadratic:
+        check_name("method", self.method, METHODS)
+        if not isinstance(self.prior, AbstractPrior):
+            check_name("prior", self.prior, PRIORS, ", or an object such as Noser()")
+        elif not self.prior.is_quadratic:
             raise ValueError("prior: total variation is a method of its own; give method='total-variation'.")
         if self.hyperparameter is None:
             object.__setattr__(self, "hyperparameter", METHODS[self.method].hyperparameter)
         elif isinstance(self.hyperparameter, str):
-            if self.hyperparameter not in RULES:
-                raise ValueError(
-                    f"hyperparameter: '{self.hyperparameter}' is neither a number nor a rule; the rules are "
-                    f"{', '.join(RULES)}."
-                )
+            check_name("hyperparameter", self.hyperparameter, RULES, ", or a number")
             if (number := METHODS[self.method].number) is not None:
                 name = self.method.replace("-", " ").replace("back ", "back-")
                 raise ValueError(f"hyperparameter: {name} takes a number such as {number:g}, not a rule.")
-        elif isinstance(self.hyperparameter, bool) or not (
-            np.isfinite(self.hyperparameter) and self.hyperparameter > 0
-        ):
-            raise ValueError(f"hyperparameter must be a positive number or a rule; it is {self.hyperparameter}.")
-        if self.contact is not None and self.contact not in CONTACTS:
-            raise ValueError(f"contact: there is no '{self.contact}'; give one of {', '.join(CONTACTS)}.")
-        if not 50 <= self.num_points <= 100_000:
-            raise ValueError(f"num_points: give 50 to 100,000 nodes of the mesh; it is {self.num_points}.")
+        elif not (is_number(self.hyperparameter) and self.hyperparameter > 0):
+            raise ValueError(f"hyperparameter must be a positive number or a rule; it is {told(self.hyperparameter)}.")
+        if self.contact is not None:
+            check_name("contact", self.contact, CONTACTS)
+        if not (isinstance(self.num_points, Integral) and 50 <= self.num_points <= 100_000):
+            raise ValueError(f"num_points: give 50 to 100,000 nodes of the mesh; it is {told(self.num_points)}.")
+
+
+def as_settings(given: ImagingSettings | None) -> ImagingSettings:
+    """What is given, or all the defaults. Raises `ValueError` for something else."""
+    settings = ImagingSettings() if given is None else given
+    check_kind("settings", settings, ImagingSettings, "ImagingSettings, such as ImagingSettings(method='gauss-newton')")
+    return settings

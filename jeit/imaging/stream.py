@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from jeit.arguments import check_kind
 from jeit.data import Measurement
 from jeit.imaging.clock import Clock
-from jeit.imaging.preparation import body_of, calibrated_model, select_frames
+from jeit.imaging.preparation import body_of, calibrated_model, check_measurement, select_frames
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import GaussNewton
@@ -53,6 +54,8 @@ def prepare_imager(
     called with the name of each step as it begins. Raises `ValueError` for another protocol, and as `image_difference`.
     """
     settings = StreamSettings() if settings is None else settings
+    check_kind("settings", settings, StreamSettings, "StreamSettings, such as StreamSettings(solver='linear')")
+    check_measurement("reference", reference)
     measured = reference if measurement is None else measurement
     _, base = select_frames(measured, reference)
     if not base.protocol.same_patterns(measured.protocol):

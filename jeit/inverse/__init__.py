@@ -4,21 +4,41 @@ Solvers, links and further unknowns are in `jeit.inverse.nonlinear`; the classes
 compute them.
 """
 
-from jeit.inverse.calibration import calibrate as calibrate
-from jeit.inverse.hyperparameter.comparison import choose_hyperparameter as choose_hyperparameter
-from jeit.inverse.hyperparameter.comparison import compare_rules as compare_rules
-from jeit.inverse.hyperparameter.rules import RULES as RULES
-from jeit.inverse.linear.back_projection import back_projection as back_projection
-from jeit.inverse.linear.greit import greit as greit
-from jeit.inverse.linear.one_step import one_step as one_step
-from jeit.inverse.noise import relative_noise as relative_noise
-from jeit.inverse.nonlinear.parametrisation import Parametrisation as Parametrisation
-from jeit.inverse.nonlinear.reconstruct import reconstruct as reconstruct
-from jeit.inverse.prior.priors import Gaussian as Gaussian
-from jeit.inverse.prior.priors import Laplace as Laplace
-from jeit.inverse.prior.priors import Noser as Noser
-from jeit.inverse.prior.priors import Tikhonov as Tikhonov
-from jeit.inverse.prior.total_variation import TotalVariation as TotalVariation
-from jeit.inverse.streaming.imager import Imager as Imager
-from jeit.inverse.streaming.stream import stream as stream
-from jeit.inverse.uncertainty import posterior as posterior
+from jeit.arguments.moved import tell_old_names as _tell_old_names
+from jeit.inverse.calibration import calibrate
+from jeit.inverse.hyperparameter.comparison import choose_hyperparameter, compare_rules
+from jeit.inverse.hyperparameter.rules import RULES
+from jeit.inverse.linear.back_projection import back_projection
+from jeit.inverse.linear.greit import greit
+from jeit.inverse.linear.one_step import one_step
+from jeit.inverse.noise import relative_noise
+from jeit.inverse.nonlinear.parametrisation import Parametrisation
+from jeit.inverse.nonlinear.reconstruct import reconstruct
+from jeit.inverse.prior.priors import Gaussian, Laplace, Noser, Tikhonov
+from jeit.inverse.prior.total_variation import TotalVariation
+from jeit.inverse.streaming.imager import Imager
+from jeit.inverse.streaming.stream import stream
+from jeit.inverse.uncertainty import posterior
+
+_tell_old_names(__name__)
+
+__all__ = [
+    "RULES",
+    "Gaussian",
+    "Imager",
+    "Laplace",
+    "Noser",
+    "Parametrisation",
+    "Tikhonov",
+    "TotalVariation",
+    "back_projection",
+    "calibrate",
+    "choose_hyperparameter",
+    "compare_rules",
+    "greit",
+    "one_step",
+    "posterior",
+    "reconstruct",
+    "relative_noise",
+    "stream",
+]

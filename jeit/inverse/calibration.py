@@ -6,7 +6,9 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
+from jeit.arguments import check_name
 from jeit.forward import ForwardModel
+from jeit.forward.model import check_model
 from jeit_solvers import Status, ended
 
 _REASONS = {
@@ -48,6 +50,7 @@ def calibrate(
     stay positive; the start is the model's impedance with the conductivity that scales the prediction best (voltages
     are proportional to 1/σ at fixed z·σ). Raises `ValueError` for a frame of another shape or without signal.
     """
+    check_model(model)
     if jnp.iscomplexobj(voltages):
         raise ValueError("voltages are complex; calibrate on their real part or magnitude.")
     measured = jnp.asarray(voltages, float)
@@ -57,8 +60,7 @@ def calibrate(
         raise ValueError(
             f"voltages has shape {measured.shape} and mask {used.shape}; protocol '{model.protocol.name}' has {shape}."
         )
-    if contact not in ("common", "each", "fixed"):
-        raise ValueError(f"contact must be 'common', 'each' or 'fixed', not '{contact}'.")
+    check_name("contact", contact, ("common", "each", "fixed"))
     measured = jnp.where(used, measured, 0)
     size = jnp.linalg.norm(measured)
     if not np.isfinite(size) or size == 0:

@@ -8,6 +8,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit.forward import ForwardModel
+from jeit.forward.model import check_model
+from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.priors import AbstractPrior, Noser
 from jeit.inverse.spectrum import Spectrum
 
@@ -37,8 +39,8 @@ class Linearisation(eqx.Module):
     ) -> "Linearisation":
         """At `conductivity`; arguments as in `one_step`. Raises `ValueError` for those that do not fit."""
         prior = Noser() if prior is None else prior
-        if not isinstance(prior, AbstractPrior):
-            raise ValueError(f"prior must be one of those in jeit.inverse, such as Noser(), not {prior!r}.")
+        check_model(model)
+        check_prior(prior)
         if not prior.is_quadratic:
             raise ValueError(
                 f"prior: {type(prior).__name__} is not quadratic, so there is no linear image with it, nor a rule for "

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from jeit.arguments import check_key, check_kind
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.mesh import measures
@@ -80,7 +81,9 @@ class Posterior(eqx.Module):
         return found
 
     def sample(self, key: PRNGKeyArray, number: int) -> Float[Array, "number m"]:
-        """Conductivities (number, m) drawn from the posterior, S/m (2-D: S)."""
+        """Conductivities (number, m) drawn from the posterior, S/m (2-D: S). Raises `ValueError` for what is
+        no key."""
+        check_key(key)
         return _sample(self, key, number)
 
 
@@ -90,8 +93,9 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
     Its standard deviations are as honest as the noise, the prior and the forward model are: with λ = 1 and a prior of
     the right variance they hold at their nominal rate; λ = 2 says that the image varies half as much. Raises
     `ValueError` for total variation and bounded solvers, whose posterior is not near a Gaussian, and for a
-    reconstruction that has failed.
+    reconstruction that has failed, or is none.
     """
+    check_kind("reconstruction", reconstruction, Reconstruction, "what reconstruct has returned")
     if not reconstruction.inversion.penalty.is_standard_normal:
         raise ValueError(
             "posterior: only for smooth priors (Tikhonov, Noser, Laplace, Gaussian) and unbounded solvers; total "

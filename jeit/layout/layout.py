@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit.arguments import check_kind
 from jeit.electrodes.discs import SheetDiscs
 from jeit.electrodes.electrodes import as_electrode_values, as_positions, is_concrete
 from jeit.mesh import Domain
@@ -159,3 +160,8 @@ def _check_labels(labels: Sequence[str] | None, number: int) -> tuple[str, ...]:
     if repeated:
         raise ValueError(f"labels: {repeated[0]!r} is the label of several electrodes; give each its own.")
     return tuple(labels)
+
+
+def check_layout(name: str, given: Layout) -> None:
+    """Raise `ValueError`, about the argument `name`, for what is no `Layout`, such as the name of one."""
+    check_kind(name, given, Layout, "a Layout, as of named_layout('park-inner') or read_layout(path)")

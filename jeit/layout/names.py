@@ -1,12 +1,12 @@
 """The layouts that have a name: two of the literature's, and regular ones made for any skin."""
 
-import difflib
 import math
 import re
 from functools import lru_cache
 
 import numpy as np
 
+from jeit.arguments import did_you_mean
 from jeit.layout.arrangements import grid, perimeter, quasi_uniform
 from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Rectangle
@@ -54,8 +54,9 @@ def named_layout(name: str, outline: Domain | None = None, *, diameter: float = 
             raise ValueError(f"name: {name!r} has {number} electrodes; give {_MOST} or fewer.")
         centres = _inner(outline, number, diameter) if made[1] == "inner" else _around(name, outline, diameter, number)
     else:
+        meant = did_you_mean(name, [*_PARK, *NAMES[2:]])
         raise ValueError(
-            f"name: there is no layout {name!r}{_meant(name)}; take {', '.join(BUILT_IN)} (or another grid-CxR), "
+            f"name: there is no layout {name!r}{meant}; take {', '.join(BUILT_IN)} (or another grid-CxR), "
             "perimeter-N, inner-N, or a file's."
         )
     return Layout(centres, diameter, outline=outline, name=name)
@@ -127,8 +128,3 @@ def _inner(outline: Domain, number: int, diameter: float) -> np.ndarray:
 @lru_cache(maxsize=256)
 def _spread(outline: Rectangle, number: int, diameter: float) -> np.ndarray:
     return quasi_uniform(outline, number, margin=diameter / 2)
-
-
-def _meant(name) -> str:
-    close = difflib.get_close_matches(name, [*_PARK, *NAMES[2:]], n=1) if isinstance(name, str) else ()
-    return f" (did you mean {close[0]!r}?)" if close else ""

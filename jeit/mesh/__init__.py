@@ -4,6 +4,7 @@ Outlines without a mesh: `Disk`, `Rectangle`, `Polygon`. Plane meshes: `disk`, `
 where a `Refine` asks. Solids: `layer`, `box`, `cylinder`. From elsewhere: `Mesh.create`, `read`, `from_gmsh`.
 """
 
+from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.mesh.cell_quality import quality
 from jeit.mesh.files import read, write
 from jeit.mesh.generate.refine import Refine
@@ -13,6 +14,8 @@ from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Disk, Domain, Polygon, Rectangle
 from jeit.mesh.shapes import disk, polygon, rectangle
 from jeit.mesh.solids import box, cylinder, layer
+
+_tell_old_names(__name__)
 
 __all__ = [
     "Disk",

@@ -5,6 +5,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 
+from jeit.arguments import check_kind, is_number, told
 from jeit.plot.axes import DIVERGING, SEQUENTIAL, draw_colour_bar, prefixed
 
 
@@ -33,8 +34,8 @@ class ColourScale(eqx.Module):
     bar: bool = True
 
     def __check_init__(self):
-        if self.limit is not None and not (np.isfinite(self.limit) and self.limit >= 0):
-            raise ValueError(f"limit must be finite and positive, in the values' unit; it is {self.limit}.")
+        if self.limit is not None and not (is_number(self.limit) and self.limit >= 0):
+            raise ValueError(f"limit must be finite and positive, in the values' unit; it is {told(self.limit)}.")
 
     def of(self, values: np.ndarray, unit: str) -> "FittedScale":
         """The scale for `values` (any shape), without NaN, whose unit is `unit` unless this scale has one.
@@ -72,6 +73,11 @@ class FittedScale(eqx.Module):
         """The colour bar of what was drawn beside `ax`, where the scale has one."""
         if self.scale.bar:
             draw_colour_bar(ax, drawn, self.label, signed=self.scale.difference)
+
+
+def check_scale(scale: ColourScale) -> None:
+    """Raises `ValueError` for what is no `ColourScale`."""
+    check_kind("scale", scale, ColourScale, "a ColourScale, such as ColourScale(colour_map='viridis')")
 
 
 CHANGE = ColourScale()

@@ -3,6 +3,8 @@
 import jax.core
 import numpy as np
 
+from jeit.arguments import did_you_mean
+
 
 def is_traced(*values) -> bool:
     """True inside jit, vmap or grad, where values cannot be looked at."""
@@ -121,4 +123,5 @@ def check_pairs(pairs, num_electrodes: int, what: str) -> np.ndarray:
 def check_choice(value, choices: tuple[str, ...], where: str, name: str) -> None:
     """Raise `ValueError` unless the argument `name` is one of `choices`."""
     if value not in choices:
-        raise ValueError(f"{where}: {name} must be one of {', '.join(map(repr, choices))}; got {value!r}.")
+        meant = did_you_mean(value, choices)
+        raise ValueError(f"{where}: {name} must be one of {', '.join(map(repr, choices))}; got {value!r}{meant}.")

@@ -3,13 +3,15 @@
 from pathlib import Path
 
 from jeit.acoustic.calibration.calibrate import CalibrationFit
+from jeit.report.folder import results_folder
 
 
 def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
     """Write the calibration to `path` (JSON, which `Calibration.load` reads) and a picture of it beside, with suffix
-    `.png`; the folder is made if need be. Raises `ValueError` for a path that is a folder, or that of the picture."""
+    `.png`; the folder is made if need be. Raises `ValueError` for a path that is a folder, in no folder, or that of the
+    picture."""
     path, picture = calibration_files(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    results_folder(path.parent, (path.name, picture.name))
     fit.calibration.save(path)
     draw_calibration(fit).savefig(picture, dpi=130)
 

@@ -9,12 +9,15 @@ import numpy as np
 
 from jeit.imaging.compared_rules import ComparedRules
 from jeit.report.describe import describe_measurement, plain
+from jeit.report.folder import results_folder
 
 
 def write_choice(result: ComparedRules, folder: str | Path) -> None:
-    """Write `choice.png` and `choice.json` into `folder`, made if need be."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write `choice.png` and `choice.json` into `folder`, made if need be.
+
+    Raises `ValueError` for what cannot be one.
+    """
+    folder = results_folder(folder, ("choice.png", "choice.json"))
     draw_choice(result).savefig(folder / "choice.png", dpi=120)
     text = json.dumps(report_choice(result), indent=1, ensure_ascii=False, allow_nan=False)
     (folder / "choice.json").write_text(text + "\n", "utf-8")

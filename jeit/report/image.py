@@ -14,6 +14,7 @@ from jeit.imaging.settings import ImagingSettings
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.protocol import Protocol
 from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain, version_of
+from jeit.report.folder import results_folder
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix", "matplotlib")
 
@@ -25,10 +26,9 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
     top, column 0 at the left; `extent` (x_min, x_max, y_min, y_max) in metres; `conductivity` (m,), the same change per
     cell; `background`, the conductivity it is a change of; `points` (n, d) and `cells` (m, d + 1); and `labels` (rows,
     columns), if the image was segmented: 0 background, 1 resistive, 2 conductive. `truth`: a known position (x, y) in
-    metres, marked in the picture.
+    metres, marked in the picture. Raises `ValueError` for what cannot be a folder.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = results_folder(folder, ("image.png", "image.npz", "report.json"))
     draw_image(result, truth=truth).savefig(folder / "image.png", dpi=150)
     arrays: dict[str, Any] = {
         "raster": np.asarray(result.raster),

@@ -6,15 +6,18 @@ from typing import Any
 
 from jeit.design.comparison import LayoutComparison
 from jeit.report.describe import plain
+from jeit.report.folder import results_folder
 
 # Letters of a name in the picture.
 _LONGEST = 32
 
 
 def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> None:
-    """Write `comparison.png` and `report.json` into `folder`, made if need be."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write `comparison.png` and `report.json` into `folder`, made if need be.
+
+    Raises `ValueError` for what cannot be one.
+    """
+    folder = results_folder(folder, ("comparison.png", "report.json"))
     text = json.dumps(report_layout_comparison(result), indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "report.json").write_text(text + "\n", "utf-8")
     draw_layout_comparison(result).savefig(folder / "comparison.png", dpi=130, bbox_inches="tight")

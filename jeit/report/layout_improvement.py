@@ -9,12 +9,15 @@ from jeit.design.scores import Scores
 from jeit.layout import write_layout
 from jeit.mesh import Disk, Domain, Rectangle
 from jeit.report.describe import describe_domain, plain
+from jeit.report.folder import results_folder
 
 
 def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
-    """Write `layout.csv`, `layout.svg`, `travel.png` and `report.json` into `folder`, made if need be."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write `layout.csv`, `layout.svg`, `travel.png` and `report.json` into `folder`, made if need be.
+
+    Raises `ValueError` for what cannot be one.
+    """
+    folder = results_folder(folder, ("layout.csv", "layout.svg", "travel.png", "report.json"))
     write_layout(result.layout, folder / "layout.csv")
     write_layout(result.layout, folder / "layout.svg")
     draw_improved_layout(result).savefig(folder / "travel.png", dpi=150)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.streaming.stream import FrameImage
 from jeit.mesh import centroids
+from jeit.report.folder import results_folder
 
 _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
 
@@ -39,10 +40,9 @@ def write_stream(
     The table has the place in metres and the height, S (3-D: S/m), of each image's strongest change. The NPZ holds
     `conductivity` (frames, cells), NaN for frames that were refused, `background`, `points` and `cells`. `progress` is
     called with every image. An earlier stream's images are taken away first. Raises `ValueError`, with the `name` of
-    the stream, if no frame came.
+    the stream, if no frame came, and for what cannot be a folder.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = results_folder(folder, ("frames.csv", "images.npz"))
     (folder / "images.npz").unlink(missing_ok=True)  # would not go with these frames
     mesh, background = calibration.model.mesh, float(calibration.conductivity)
     centre = np.asarray(centroids(mesh))[:, :2]

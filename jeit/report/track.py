@@ -14,6 +14,7 @@ from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.overlay import brightness, fade
 from jeit.acoustic.tracking import Track
 from jeit.report.describe import plain, version_of
+from jeit.report.folder import results_folder
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 # Maps of so many pixels a side, so many frames at once.
@@ -26,10 +27,10 @@ def write_track(found: LocatedTouches, folder: str | Path) -> None:
     The table has a line for every frame: `time_s`; the place found, `x_m`, `y_m`, its standard deviations `std_x_m`,
     `std_y_m` and `covariance` (m², of x and y); `strength`, in units of intensity; `status`; then the smoothed place,
     `track_x_m`, `track_y_m`, `track_std_x_m`, `track_std_y_m`, and the number of the `touch` from 1. In space, columns
-    for z follow. Empty where there is nothing. Raises `OSError` where nothing can be written.
+    for z follow. Empty where there is nothing. Raises `ValueError` for what cannot be a
+    folder.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = results_folder(folder, ("track.csv", "report.json", "track.png"))
     with open(folder / "track.csv", "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(_columns(found.locations.position.shape[1]))

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit.arguments import check_key, check_kind
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.electrodes import BoundaryElectrodes
@@ -74,9 +75,10 @@ def simulate_press(
 
     `key`: of the random noise (`jax.random.key`). `position` (x, y) of the press and `radius` of its contact, metres.
     `strength`: greatest relative change of conductivity. `noise`: standard deviation of the noise in each voltage,
-    relative to their root mean square (1e-4: 80 dB). Raises `ValueError` for a press beyond the edge, or values that
-    are not positive.
+    relative to their root mean square (1e-4: 80 dB). Raises `ValueError` for a press beyond the edge, values that are
+    not positive, and what is no skin or key.
     """
+    check_kind("skin", skin, RoundSkin, "a RoundSkin, such as RoundSkin(radius=0.05)")
     where = np.asarray(position, float)
     if where.shape != (2,) or not np.isfinite(where).all():
         raise ValueError(f"position: give (x, y) in metres, not {position!r}.")
@@ -91,6 +93,7 @@ def simulate_press(
         raise ValueError(f"strength: the relative change must be above -1 and not zero; it is {strength}.")
     if not (np.isfinite(noise) and noise >= 0):
         raise ValueError(f"noise must be zero or positive, relative to the voltages; it is {noise}.")
+    check_key(key)
     model = skin.model()
     points = centroids(model.mesh)
     rest = jnp.full(model.mesh.num_cells, skin.conductivity)

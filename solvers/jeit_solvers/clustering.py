@@ -71,8 +71,8 @@ def kmeans(
         raise ValueError(f"num_clusters is {num_clusters}, but there are only {number} points to part.")
     if not isinstance(tolerance, Tracer) and not 0 <= tolerance < 1:
         raise ValueError(f"tolerance must be a share of the inertia, from 0 and less than 1; it is {tolerance!r}.")
-    if isinstance(key, int):
-        raise ValueError(f"key is the number {key}; make a key of it, jax.random.key({key}).")
+    if not isinstance(key, (jax.Array, np.ndarray)):
+        raise ValueError(f"key is {key!r}; give a key of jax.random, such as jax.random.key(0).")
     if not isinstance(points, Tracer) and not (finite := np.isfinite(points).all(axis=1)).all():
         raise ValueError(f"points: {(~finite).sum()} of {number} are NaN or infinite; leave them out.")
     return _kmeans(jnp.asarray(points, float), key, (max_steps, jnp.asarray(tolerance)), num_clusters, restarts)

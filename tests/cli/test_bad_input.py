@@ -14,8 +14,8 @@ from jeit import protocol as pr
 from jeit.data import read
 from jeit.forward import ForwardModel
 from jeit.image import Raster, find_inclusions
-from jeit.imaging import ImagingSettings, image_difference
-from jeit.inverse import Gaussian, back_projection, calibrate, one_step
+from jeit.imaging import ImagingSettings, StreamSettings, compare_on_data, image_difference, prepare_imager
+from jeit.inverse import Gaussian, Noser, back_projection, calibrate, one_step, posterior, reconstruct, stream
 from jeit.mesh import Disk, Mesh, Polygon, Rectangle, Refine, box, disk
 from jeit.plot import plot_image
 from jeit.plot.imaging.image import plot_raster
@@ -114,9 +114,9 @@ COMPUTING = {
     "unknown solver": (lambda m: ForwardModel(m.mesh, m.electrodes, m.protocol, solver="magic"), "magic"),
     "reference of another length": (lambda m: calibrate(m, np.ones(3)), "shape"),
     "reference of zeros": (lambda m: calibrate(m, np.zeros(40)), "no finite, non-zero"),
-    "unknown contact": (lambda m: calibrate(m, np.ones(40), contact="good"), "'common', 'each' or 'fixed'"),
+    "unknown contact": (lambda m: calibrate(m, np.ones(40), contact="good"), "one of common, each, fixed"),
     "mask of nothing": (lambda m: one_step(m, 1.0, mask=np.zeros(40, bool)), "at least one True"),
-    "unknown rule": (lambda m: one_step(m, 1.0, hyperparameter="luck"), "no rule 'luck'"),
+    "unknown rule": (lambda m: one_step(m, 1.0, hyperparameter="luck"), "or a number; it is 'luck'"),
     "rule without data": (lambda m: one_step(m, 1.0, hyperparameter="gcv"), "give difference"),
     "negative hyperparameter": (lambda m: one_step(m, 1.0, hyperparameter=-1.0), "must be positive"),
     "noise of zero": (lambda m: one_step(m, 1.0, noise=0.0), "noise must be positive"),
@@ -134,7 +134,7 @@ COMPUTING = {
     "image of complex values": (lambda m: find_inclusions(m.mesh, 1j * np.ones(m.mesh.num_cells)), "complex"),
     "level of two": (lambda m: find_inclusions(m.mesh, np.ones(m.mesh.num_cells), level=2.0), "between 0 and 1"),
     "linear image of a complex body": (lambda m: one_step(m, 1.0 + 0.1j), "complex"),
-    "prior by name": (lambda m: one_step(m, 1.0, prior="noser"), "such as Noser"),  # pyright: ignore[reportArgumentType]
+    "prior by name": (lambda m: one_step(m, 1.0, prior="noser"), r"jeit.inverse: Noser\(\), .* it is 'noser'"),  # pyright: ignore[reportArgumentType]
     "frame with NaN": (lambda m: back_projection(m, 1.0).image(np.full(40, np.nan)), "zeros in masked channels"),
     "complex reference": (lambda m: calibrate(m, (1 + 0.1j) * m.voltages(1.0)), "real part or magnitude"),
     "reference turned round": (lambda m: calibrate(m, -m.voltages(1.0)), "opposite sign"),
@@ -143,6 +143,35 @@ COMPUTING = {
     "press beyond the edge": (lambda m: simulate_press(RoundSkin(), None, (20.0, 0.0)), "beyond the skin"),  # pyright: ignore[reportArgumentType]
     "press of no size": (lambda m: simulate_press(RoundSkin(), None, (0, 0), radius=0), "positive size"),  # pyright: ignore[reportArgumentType]
     "unknown method": (lambda m: ImagingSettings(method="two-step"), "one-step, back-projection"),
+    "nearly a format": (lambda m: read(__file__, "kit"), "format must be one of .* \\(did you mean 'kit4'"),
+    "nearly a choice": (lambda m: pr.opposite(8, drives="distnct"), "got 'distnct' \\(did you mean 'distinct'"),
+    "nearly a method": (lambda m: ImagingSettings(method="gaus-newton"), "did you mean 'gauss-newton'"),
+    "nearly a prior": (lambda m: ImagingSettings(prior="laplas"), "did you mean 'laplace'"),
+    "nearly a rule": (lambda m: ImagingSettings(hyperparameter="gvc"), "did you mean 'gcv'"),
+    "nearly a contact": (lambda m: ImagingSettings(contact="comon"), "did you mean 'common'"),
+    "several hyperparameters": (lambda m: ImagingSettings(hyperparameter=[1.0]), "it is a list"),  # pyright: ignore[reportArgumentType]
+    "nodes in words": (lambda m: ImagingSettings(num_points="many"), "100,000 nodes .* it is 'many'"),  # pyright: ignore[reportArgumentType]
+    "a path for a measurement": (
+        lambda m: image_difference("a.mat"),
+        r"measurement must be .*read\(path\); it is 'a.mat'",
+    ),  # pyright: ignore[reportArgumentType]
+    "settings of a stream": (
+        lambda m: image_difference(m, m, StreamSettings()),
+        "settings must be ImagingSettings, such",
+    ),  # pyright: ignore[reportArgumentType]
+    "a method for settings": (lambda m: compare_on_data(m, m, "one-step"), "must be ImagingSettings.* 'one-step'"),  # pyright: ignore[reportArgumentType]
+    "a path for a reference": (lambda m: prepare_imager("a.csv"), "^reference must be a Measurement.* 'a.csv'"),  # pyright: ignore[reportArgumentType]
+    "settings of an image": (lambda m: prepare_imager(m, ImagingSettings()), "StreamSettings.* is an ImagingSettings"),  # pyright: ignore[reportArgumentType]
+    "memory in words": (lambda m: StreamSettings(memory="long"), "number of frames.* it is 'long'"),  # pyright: ignore[reportArgumentType]
+    "what prepare_imager gives": (lambda m: stream((m, m), []), r"imager must be an Imager, .*\[0\]; it is a tuple"),  # pyright: ignore[reportArgumentType]
+    "a model by name": (lambda m: one_step("tank", 1.0), "model must be a ForwardModel.* it is 'tank'"),  # pyright: ignore[reportArgumentType]
+    "a mesh to calibrate": (lambda m: calibrate(m.mesh, np.ones(40)), "model must be a ForwardModel.* it is a Mesh"),  # pyright: ignore[reportArgumentType]
+    "prior as a class": (lambda m: one_step(m, 1.0, prior=Noser), "prior must be .* it is the class Noser itself"),  # pyright: ignore[reportArgumentType]
+    "prior of reconstruct": (
+        lambda m: reconstruct(m, np.ones(40), 1.0, prior="gaussian"),  # pyright: ignore[reportArgumentType]
+        r"Gaussian\(length in metres\), .* it is 'gaussian'",
+    ),
+    "posterior of a model": (lambda m: posterior(m), "reconstruction must be .* it is a ForwardModel"),  # pyright: ignore[reportArgumentType]
     "mesh of three nodes": (lambda m: ImagingSettings(num_points=3), "50 to 100,000"),
 }
 
@@ -226,7 +255,7 @@ COMMANDS = {
     "not text": (lambda t: spoilt(t, "V", "V") and raw(t, "rest.csv", b"\xff\xfe\x00"), "not a text file"),
     "damaged mat": (lambda t: raw(t, "a.mat", b"MATLAB 5.0" + b"\0" * 200), "not a readable .mat"),
     "mat of another kind": (lambda t: matlab(t, x=1.0), "no known kind; it holds x"),
-    "unknown format": (lambda t: good(t, "--format", "xls"), "no format 'xls'"),
+    "unknown format": (lambda t: good(t, "--format", "xls"), "it is 'xls'"),
     "another format": (lambda t: good(t, "--format", "kit4"), "not a readable .mat"),
     "no such description": (lambda t: good(t, "--description", "absent.toml"), "there is no such file"),
     "no description": (lambda t: with_data(t, t.touched, description=None), "nothing says what they mean"),

@@ -78,6 +78,7 @@ def test_bad_input_is_refused(tmp_path):
     ("options", "said"),
     [
         (["--thickness-mm", 0.01], "--thickness-mm must be more than the 2.5 mm"),
+        (["--thickness-mm", 500], "--thickness-mm is 500 mm, more than the skin is wide, "),
         (["--conductivity", "nan"], "--conductivity must be from"),
         (["--contact-impedance", -1], "--contact-impedance must be positive"),
         (["--minimum-spacing-mm", -3], "--minimum-spacing-mm must not be negative; it is -3"),

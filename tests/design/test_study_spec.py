@@ -216,6 +216,10 @@ REFUSED = {
         one(rest="[scores]\ncorrelation_mm = 0.015"),
         r"correlation_mm is 0\.015.*metres\? Then write 15\.",
     ),
+    "thick": (
+        one(rest="[skin]\nwidth_mm = 100\nheight_mm = 80\nthickness_mm = 150"),
+        r"skin\.thickness_mm is 150, more than the skin is wide: 100 mm",
+    ),
     "deep": (one(rest="[skin]\nthickness_mm = 2"), r"touch\.depth_mm is 2\.5, and the skin 2 mm thick; press less"),
     "deep, hemisphere": (
         one(rest='[touch]\nindentation = "hemisphere"\ndiameter_mm = 4'),

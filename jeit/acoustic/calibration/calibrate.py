@@ -24,9 +24,10 @@ from jeit.acoustic.decay import AbstractDecay, find_decay
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.noise import IntensityNoise, below_nothing
 from jeit.acoustic.signal.faults import describe_faults, intensity_faults
-from jeit.acoustic.signal.intensity import IntensitySettings, tap_intensities
+from jeit.acoustic.signal.intensity import IntensitySettings, check_settings, tap_intensities
 from jeit.acoustic.signal.recording import Taps
 from jeit.acoustic.surface import make_surface
+from jeit.arguments import check_kind
 
 # A microphone is of no use whose model explains less of its levels' variance, or is known no better (relative error).
 _LEAST_EXPLAINED, _MOST_ERROR = 0.3, 1.0
@@ -69,8 +70,10 @@ def calibrate_microphones(
 
     What `jeit calibrate-microphones` does; `jeit.report.write_calibration` writes what it writes. Raises `ValueError`
     where fewer than three microphones can be calibrated, where most do not hear what is said to be tapped, for another
-    `decay`, and for `intensity` where the taps are intensities.
+    `decay`, for `intensity` where the taps are intensities, and for things of another kind.
     """
+    check_kind("taps", taps, Taps, "Taps, as of read_taps(path)")
+    check_settings("intensity", intensity)
     kind = find_decay(decay)
     if intensity is not None and taps.samples is None:
         raise ValueError("intensity: band and window are for taps that come as samples; these are intensities.")

@@ -6,8 +6,9 @@ import numpy as np
 
 from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.signal.faults import describe_faults
-from jeit.acoustic.signal.intensity import IntensitySettings, intensities
+from jeit.acoustic.signal.intensity import IntensitySettings, check_settings, intensities
 from jeit.acoustic.signal.recording import Intensities, Recording
+from jeit.arguments import check_kind
 
 # A noise floor so many times as high is another one.
 _SAME_FLOOR = 4.0
@@ -24,11 +25,15 @@ def calibrated_intensities(
 
     `silence`: samples of the same array at the same gain, untouched. The noise floor is theirs then, which a recording
     without pauses needs; otherwise it comes from the quietest windows of the recording itself. Raises `ValueError` for
-    another number of microphones, and for a silence that is louder than the recording's quietest windows.
+    another number of microphones, for a silence that is louder than the recording's quietest windows, and for things of
+    another kind.
     """
-    for one in (recording, silence):
-        if one is None:
-            continue
+    given = {"recording": recording} if silence is None else {"recording": recording, "silence": silence}
+    for name, one in given.items():
+        check_kind(name, one, (Recording, Intensities), "a Recording or Intensities, as of read_recording(path)")
+    check_kind("calibration", calibration, Calibration, "a Calibration, as of Calibration.load(path)")
+    check_settings("intensity", intensity)
+    for one in given.values():
         number = one.samples.shape[0] if isinstance(one, Recording) else one.power.shape[1]
         if number != calibration.num_microphones:
             raise ValueError(

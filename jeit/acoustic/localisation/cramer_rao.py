@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jeit.acoustic.localisation.likelihood import Likelihood
-from jeit.acoustic.microphones import MicrophoneArray
+from jeit.acoustic.microphones import MicrophoneArray, check_array
 from jeit.acoustic.surface import in_space
 from jeit_solvers import inverse_small
 
@@ -19,8 +19,9 @@ def cramer_rao(
     """Least covariance (m²) with which sources of unknown `strength` at `position` (m) can be located.
 
     The inverse of Fisher's matrix of place and log strength, under the noise model of `microphone_array`. `use`: (M,)
-    which microphones there are, all unless given.
+    which microphones there are, all unless given. Raises `ValueError` for what is no array.
     """
+    check_array(microphone_array)
     position = jnp.asarray(position, float)
     chart = microphone_array.surface.project(position.T)
     number = chart.shape[1]

@@ -16,8 +16,9 @@ from jeit.acoustic.localisation.consistency import Consistency
 from jeit.acoustic.localisation.likelihood import Likelihood
 from jeit.acoustic.localisation.minima import differentiable_minima, find_minima
 from jeit.acoustic.localisation.pixels import Pixels, valleys
-from jeit.acoustic.microphones import MicrophoneArray
+from jeit.acoustic.microphones import MicrophoneArray, check_array
 from jeit.acoustic.surface import bounding_box, in_space, longer_side
+from jeit.arguments import check_name
 from jeit_solvers import inverse_small
 
 METHODS = {"likelihood": Likelihood, "consistency": Consistency}
@@ -69,8 +70,8 @@ class Localiser(eqx.Module):
         which every frame's whole map is worked out and where the descent starts, (200, 200) in the paper; a coarse grid
         of 400 places and no maps unless given. Raises `ValueError` for another method, or a shape that makes no sense.
         """
-        if method not in METHODS:
-            raise ValueError(f"method must be one of {', '.join(METHODS)}; it is {method!r}.")
+        check_array(microphone_array)
+        check_name("method", method, METHODS)
         low, high = bounding_box(microphone_array.surface)
         sides_of_box = np.asarray(high - low)
         spacing = np.sqrt(np.prod(sides_of_box) / _COARSE)

@@ -14,6 +14,7 @@ from scipy.special import gammainc, gammaincinv
 from jeit.acoustic.signal._band_power import band_power, make_grid, shared_noise, white_freedom
 from jeit.acoustic.signal.faults import intensity_faults, sample_faults, window_faults
 from jeit.acoustic.signal.recording import Intensities, Recording, Taps
+from jeit.arguments import check_kind
 
 # A tap is heard in the windows that reach this part of its loudest.
 _HEARD = 0.5
@@ -47,6 +48,12 @@ class IntensitySettings(eqx.Module):
             raise ValueError(f"window is {self.window} s, longer than any touch; give seconds (0.05, not 50 ms).")
 
 
+def check_settings(name: str, settings: IntensitySettings | None) -> None:
+    """Raises `ValueError`, about the argument `name`, for what are neither settings nor None."""
+    if settings is not None:
+        check_kind(name, settings, IntensitySettings, "IntensitySettings, such as IntensitySettings(window=0.05)")
+
+
 class TapIntensities(NamedTuple):
     """What `tap_intensities` found: intensities of T taps at M microphones.
 
@@ -72,8 +79,8 @@ def intensities(
     at least must be free of touch; give `floor` where it is known, from a recording of silence, or where the touch
     never pauses. Raises `ValueError` where band, window and recording do not fit each other.
     """
-    if not isinstance(recording, Recording):
-        raise ValueError(f"recording must be a Recording of samples; it is {type(recording).__name__}.")
+    check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
+    check_settings("settings", settings)
     samples, rate = recording.samples, recording.rate
     grid = make_grid(settings or IntensitySettings(), rate, samples.shape[-1], recording.name)
     found = [
@@ -110,8 +117,8 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     Taps that already hold intensities are returned as they are, with a floor of zero and infinite freedom. Raises
     `ValueError` for what is no `Taps`, and where band, window and samples do not fit each other.
     """
-    if not isinstance(taps, Taps):
-        raise ValueError(f"taps must be Taps, as read_taps gives; they are {type(taps).__name__}.")
+    check_kind("taps", taps, Taps, "Taps, as of read_taps(path)")
+    check_settings("settings", settings)
     if taps.samples is None or taps.rate is None:
         assert taps.power is not None
         usable, faults = intensity_faults(taps.power)

@@ -18,6 +18,7 @@ RESULTS = ("layout.csv", "layout.svg", "travel.png", "report.json")
 _LEAST_NODES, _MOST_NODES = 4, 250_000
 # Options by the names that their values have further down.
 _OPTIONS = {
+    "thickness": "--thickness-mm",
     "contact_impedance": "--contact-impedance",
     "num_points": "--num-points",
     "symmetry": "--symmetry",

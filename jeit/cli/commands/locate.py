@@ -53,11 +53,11 @@ def locate(
 
     from jeit.acoustic import Calibration, locate_touches, read_recording
     from jeit.acoustic.localisation.localiser import METHODS
+    from jeit.arguments import check_name
     from jeit.cli.console import Steps
     from jeit.report import write_track
 
-    if method not in METHODS:
-        raise ValueError(f"--method must be one of {', '.join(METHODS)}; it is '{method}'.")
+    check_name("--method", method, METHODS)
     if not 0 < gap < float("inf"):
         raise ValueError(f"--gap must be positive, in seconds; it is {gap}.")
     settings = intensity_settings(low, high, window, hop)

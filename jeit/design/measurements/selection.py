@@ -20,6 +20,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
+from jeit.arguments import check_key
 from jeit.design.measurements.candidates import Candidates
 from jeit_solvers.dense.cholesky import inverse_cholesky
 
@@ -115,6 +116,7 @@ def random_selections(key: Array, num_candidates: int, number: int, count: int) 
     """
     if not 1 <= number <= num_candidates:
         raise ValueError(f"number must be from 1 to the {num_candidates} candidates; it is {number}.")
+    check_key(key)
     orders = jax.vmap(lambda one: jax.random.permutation(one, num_candidates))(jax.random.split(key, count))
     return orders[:, :number]
 

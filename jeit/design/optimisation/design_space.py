@@ -6,9 +6,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jeit.arguments import check_kind, check_metres, is_number, told
 from jeit.design.optimisation.constraints import Constraints
 from jeit.design.optimisation.variables import Symmetry, Variables, Varied
-from jeit.design.skin.skin import Skin
+from jeit.design.skin.skin import Skin, longer_side
 from jeit.mesh import Domain
 
 
@@ -46,11 +47,15 @@ class DesignSpace(eqx.Module):
         contact_impedance: tuple[float, float] | None = None,
         thickness: tuple[float, float] | None = None,
     ):
-        """Raises `ValueError` where `keep_out` is no list of domains; the rest is judged with a skin."""
-        if isinstance(keep_out, Domain) or not all(isinstance(one, Domain) for one in keep_out):
-            raise ValueError(
-                f"keep_out must be a list of domains, such as [Disk(0.01, (0.02, 0.0))]; it is {keep_out!r}."
-            )
+        """Raises `ValueError` for an outline, spacing or regions of another kind; the rest is judged with a skin."""
+        if outline is not None:
+            check_kind("outline", outline, Domain, "an outline, such as Rectangle(0.2, 0.2)")
+        if not is_number(minimum_spacing):
+            raise ValueError(f"minimum_spacing must be a length in metres; it is {told(minimum_spacing)}.")
+        wanted = "a list of domains, such as [Disk(0.01, (0.02, 0.0))]"
+        check_kind("keep_out", keep_out, Sequence, wanted)
+        for one in keep_out:
+            check_kind("keep_out", one, Domain, wanted)
         self.outline, self.minimum_spacing, self.keep_out = outline, float(minimum_spacing), tuple(keep_out)
         self.symmetry, self.sizes = symmetry, sizes
         self.contact_impedance, self.thickness = contact_impedance, thickness
@@ -85,8 +90,6 @@ def varied_of(skin: Skin) -> Varied:
 
 
 def _check_thickness(thickness: tuple[float, float], depth: float, outline: Domain) -> None:
-    low_x, high_x, low_y, high_y = outline.extent
     if np.min(thickness) <= depth:
         raise ValueError(f"thickness: the touches are {1e3 * depth:.3g} mm deep; let the sheet be thicker.")
-    if np.max(thickness) > max(high_x - low_x, high_y - low_y):
-        raise ValueError(f"thickness is {thickness!r} metres, more than the skin is wide; are they millimetres?")
+    check_metres("thickness", np.max(thickness), longer_side(outline), "the skin is wide")

@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jeit.arguments import check_kind, told
 from jeit.design.defaults import CONTRAST, CORRELATION, NOISE, TEMPERATURE
 from jeit.design.optimisation.variables import Varied
 from jeit.design.scores import Score, Scores, TouchPrior, layout_scores
@@ -23,7 +24,7 @@ class Objective(eqx.Module):
 
     **Fields**: `touches`, of the skin, as of `Skin.sheet_touches`; `prior`, `noise` (volts) and `temperature` as in
     `layout_scores`; `score`, a function of `Scores` with differences of order 1, as logarithms have. Raises
-    `ValueError` for a score that is no function.
+    `ValueError` for a score that is no function, and for touches or a prior of another kind.
     """
 
     touches: SheetTouches
@@ -34,7 +35,9 @@ class Objective(eqx.Module):
 
     def __check_init__(self):
         if not callable(self.score):
-            raise ValueError(f"score must be a function of Scores, such as balanced; it is {self.score!r}.")
+            raise ValueError(f"score must be a function of Scores, such as balanced; it is {told(self.score)}.")
+        check_kind("touches", self.touches, SheetTouches, "SheetTouches, as of skin.sheet_touches(places)")
+        check_kind("prior", self.prior, TouchPrior, "a TouchPrior, as of TouchPrior.create(places, correlation=0.05)")
 
     @classmethod
     def create(

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit.arguments import check_key, check_kind
 from jeit.design.defaults import STEPS
 from jeit.design.optimisation.constraints import Constraints
 from jeit.design.optimisation.design_space import DesignSpace, varied_of
@@ -261,9 +262,8 @@ def _varied(variables: Variables, values) -> Varied:
 
 def _check(skin: Skin, objective: Objective, space: DesignSpace, steps: int, starts: int, key) -> None:
     check_skin("skin", skin)
-    for name, given, kind in (("objective", objective, Objective), ("space", space, DesignSpace)):
-        if not isinstance(given, kind):
-            raise ValueError(f"{name} must be {kind.__name__}(…); it is {given!r:.60}.")
+    check_kind("objective", objective, Objective, "an Objective, as of Objective.create(skin, places)")
+    check_kind("space", space, DesignSpace, "a DesignSpace, such as DesignSpace(minimum_spacing=0.01)")
     if skin.num_layers:
         raise ValueError("skin is a layer; layouts are optimised on a sheet: Skin.create(…, num_layers=0).")
     if not np.isclose(float(objective.touches.thickness), float(skin.thickness), rtol=1e-9):
@@ -274,8 +274,8 @@ def _check(skin: Skin, objective: Objective, space: DesignSpace, steps: int, sta
     for name, number in (("steps", steps), ("starts", starts)):
         if not isinstance(number, int) or number < 1:
             raise ValueError(f"{name} must be a whole number from 1; it is {number!r}.")
-    if starts > 1 and key is None:
-        raise ValueError("key: random starts need one, such as jax.random.key(0).")
+    if starts > 1 or key is not None:
+        check_key(key, "key, which random starts need,")
 
 
 def _check_outline(outline: Domain, skin: Skin) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.optimize import linear_sum_assignment
 
+from jeit.arguments import check_name
 from jeit.mesh import Domain
 
 Symmetry = Literal["mirror-x", "mirror-y", "rotate-2", "rotate-4"]
@@ -78,8 +79,8 @@ class Variables(eqx.Module):
         cls, outline: Domain, given: Varied, *, symmetry=None, sizes=False, contacts=None, thickness=None
     ) -> "Variables":
         """The variables of what is `given`. Raises `ValueError` for what cannot be."""
-        if symmetry not in _IMAGES:
-            raise ValueError(f"symmetry must be None or one of {', '.join(filter(None, _IMAGES))}; it is {symmetry!r}.")
+        if symmetry is not None:
+            check_name("symmetry", symmetry, filter(None, _IMAGES), ", or None")
         centres, radii = np.asarray(given.centres), np.asarray(given.radii)
         images = np.array(_IMAGES[symmetry], float).reshape(-1, 2, 2)
         x_min, x_max, y_min, y_max = outline.extent

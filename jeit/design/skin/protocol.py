@@ -4,9 +4,11 @@ from typing import Literal
 
 import numpy as np
 
+from jeit.arguments import check_name
 from jeit.design.defaults import CURRENT, NUM_PAIRS, PROTOCOL
 from jeit.design.measurements.selection import nearest_pairs
 from jeit.layout import Layout
+from jeit.layout.layout import check_layout
 from jeit.protocol import Protocol, adjacent, opposite, two_terminal
 
 ProtocolName = Literal["adjacent", "opposite", "two-terminal"]
@@ -22,8 +24,8 @@ def skin_protocol(
     unless given, as in Park et al. 2022, or all if there are fewer. Raises `ValueError` for another name, more pairs
     than there are, pairs of another protocol, and as the protocols do.
     """
-    if name not in PROTOCOLS:
-        raise ValueError(f"protocol: there is no {name!r}; take {', '.join(PROTOCOLS)}.")
+    check_layout("layout", layout)
+    check_name("protocol", name, PROTOCOLS)
     if name != "two-terminal":
         if num_pairs:
             raise ValueError(f"num_pairs is {num_pairs}, and only 'two-terminal' has pairs, not {name!r}.")

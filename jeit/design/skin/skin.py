@@ -1,12 +1,11 @@
 """`Skin`: a layout of electrodes in a conducting sheet, or on the bottom of a layer; checked, meshed, and touched."""
 
-import math
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit.arguments import IN_MILLIMETRES, check_kind, check_metres
 from jeit.design.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
 from jeit.design.skin.cell_size import check_cell_size
 from jeit.design.skin.indentation import AbstractIndentation, Bell
@@ -18,6 +17,7 @@ from jeit.electrodes import FaceDiscs, SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import check_conductivity
 from jeit.layout import Layout
+from jeit.layout.layout import check_layout
 from jeit.mesh import Domain, Mesh, Rectangle, layer
 from jeit.protocol import Protocol
 
@@ -71,8 +71,7 @@ class Skin(eqx.Module):
                 f"layout has {layout.num_electrodes} electrodes and the model {model.electrodes.num_electrodes}; their "
                 "number cannot change."
             )
-        if not 0 < thickness < math.inf:
-            raise ValueError(f"thickness must be positive, in metres; it is {thickness!r}.")
+        check_metres("thickness", thickness)
         self.layout, self.model, self.thickness = layout, model, thickness
         self.num_layers, self.cell_size = num_layers, cell_size
         checked = check_conductivity(model.mesh, conductivity)
@@ -97,12 +96,12 @@ class Skin(eqx.Module):
         given, and 1e-4 where it does not say. `num_layers` of cells, 0 for a sheet. `cell_size`, metres (4.5e-3), or
         `num_points`, about, of the plane mesh. `protocol`: that of `skin_protocol(layout)` unless given.
 
-        Raises `ValueError` for a layout without an outline, cells too small for any mesh, and electrodes too small for
-        them.
+        Raises `ValueError` for a layout without an outline, a skin thicker than wide, cells too small for any mesh, and
+        electrodes too small for them.
         """
-        if not isinstance(layout, Layout):
-            raise ValueError(f"layout must be a Layout, such as named_layout('park-inner'); it is {layout!r:.60}.")
+        check_layout("layout", layout)
         outline = plain_outline(layout.known_outline)
+        check_metres("thickness", thickness, longer_side(outline), "the skin is wide")
         if cell_size is None and num_points is None:
             cell_size = CELL_SIZE
         if cell_size is not None:
@@ -181,8 +180,13 @@ class Skin(eqx.Module):
 
 def check_skin(name: str, given) -> None:
     """Raise `ValueError`, about the argument `name`, for what is no `Skin`."""
-    if not isinstance(given, Skin):
-        raise ValueError(f"{name} must be a Skin, as of Skin.create(named_layout('park-inner')); it is {given!r:.60}.")
+    check_kind(name, given, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
+
+
+def longer_side(outline: Domain) -> float:
+    """Of the box of an outline, metres: how wide a skin is."""
+    low_x, high_x, low_y, high_y = outline.extent
+    return float(max(high_x - low_x, high_y - low_y))
 
 
 def model_conductivity(conductivity, thickness, num_layers: int):
@@ -214,11 +218,13 @@ def skin_electrodes(layout: Layout, num_layers: int, contact_impedance=None) -> 
 
 
 def _check_cells(layout: Layout, cell_size: float, outline: Domain, num_layers: int) -> None:
+    check_metres("cell_size", cell_size)
     most = _COARSEST * _smallest(layout)
-    if not 0 < 1e3 * cell_size <= (1 + 1e-9) * most:
+    if 1e3 * cell_size > (1 + 1e-9) * most:
+        end = f"; {IN_MILLIMETRES}" if cell_size > longer_side(outline) else "."
         raise ValueError(
             f"cell_size is {1e3 * cell_size:g} mm; give no more than {most:.3g} mm, as electrodes of '{layout.name}' "
-            f"are {_smallest(layout):.3g} mm across."
+            f"are {_smallest(layout):.3g} mm across{end}"
         )
     check_cell_size("cell_size", cell_size, float(outline.area), num_layers)
 

@@ -4,6 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jeit.arguments import check_kind, told
 from jeit.design.defaults import PLACES
 from jeit.mesh import Domain
 
@@ -36,8 +37,9 @@ class TouchGrid(eqx.Module):
 def touch_grid(outline: Domain, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
     """Rectangles over the bounding box of `outline`, those whose middle lies inside; 48 × 48 as in Park et al. 2022.
 
-    Raises `ValueError` for fewer than one row or column.
+    Raises `ValueError` for fewer than one row or column, and for what is no outline.
     """
+    check_kind("outline", outline, Domain, "an outline, such as skin.outline or Rectangle(0.2, 0.2)")
     if columns < 1 or rows < 1:
         raise ValueError(
             f"a grid needs one column and one row at least; {columns} columns and {rows} rows were asked for."
@@ -62,3 +64,23 @@ def touches_away_from_the_edge(outline: Domain, margin: float, columns: int = PL
     if not kept.any():
         raise ValueError(f"margin is {1e3 * margin:g} mm: no place of the skin is so far from its edge; give less.")
     return TouchGrid(grid.places[kept], grid.rows[kept], grid.columns[kept], grid.shape, grid.pitch)
+
+
+def check_grid(grid: TouchGrid) -> None:
+    """Raise `ValueError` for what is no `TouchGrid`, such as its places."""
+    check_kind("grid", grid, TouchGrid, "a TouchGrid, as of touch_grid(skin.outline)")
+
+
+def check_places(places) -> Float[np.ndarray, "n 2"]:
+    """Places (n, 2), metres, as an array. Raises `ValueError` for what are none, such as a whole `TouchGrid`."""
+    wanted = "places must be (n, 2), one or more, in metres, such as touch_grid(skin.outline).places"
+    try:
+        found = np.asarray(places, float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{wanted}; it is {told(places)}.") from None
+    if found.ndim != 2 or found.shape[1] != 2 or not len(found):
+        raise ValueError(f"{wanted}; they have shape {found.shape}.")
+    lost = np.flatnonzero(~np.isfinite(found).all(axis=1))
+    if lost.size:
+        raise ValueError(f"places: {lost.size} of {len(found)} are not finite, the first is number {lost[0]}.")
+    return found

@@ -6,8 +6,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
+from jeit.arguments import check_kind
 from jeit.design.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
+from jeit.design.skin.touch_grid import check_places
 from jeit.electrodes.window import smooth_step
 from jeit.mesh import Mesh, centroids
 
@@ -50,7 +52,8 @@ def touched_cells(
     indentation as deep as the skin, and where `thickness` is missing or superfluous.
     """
     middle = np.asarray(centroids(mesh))
-    places = _check_places(places)
+    places = check_places(places)
+    check_kind("indentation", indentation, AbstractIndentation, "an indentation, such as Bell() or Hemisphere()")
     _check_values(contrast, edge)
     layer = mesh.dimension == 3
     deepest = float(np.max(indentation.depth_at(jnp.zeros(()))))
@@ -99,16 +102,6 @@ def _padded(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     padded = np.zeros(there.shape, np.int32)
     padded[there] = np.concatenate(rows)
     return padded, there
-
-
-def _check_places(places) -> np.ndarray:
-    places = np.asarray(places, float)
-    if places.ndim != 2 or places.shape[1] != 2 or not len(places):
-        raise ValueError(f"places must be (n, 2), one or more, in metres; they have shape {places.shape}.")
-    lost = np.flatnonzero(~np.isfinite(places).all(axis=1))
-    if lost.size:
-        raise ValueError(f"places: {lost.size} of {len(places)} are not finite, the first is number {lost[0]}.")
-    return places
 
 
 def _check_values(contrast: float, edge: float) -> None:

@@ -19,11 +19,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jeit.arguments import check_kind
 from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.skin.touched_nodes import touched_nodes
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity, stiffness
-from jeit.forward.model import select_channels
+from jeit.forward.model import check_model, select_channels
 from jeit.forward.transfer import fields_and_inverse
 from jeit_solvers import over_cores
 
@@ -49,6 +50,8 @@ def touch_changes(
     of contrast above some 1e6, whose limit is reached long before, and where a touch cuts an electrode off.
     `conductivity` as in `ForwardModel.voltages`, real and scalar, S/m (2-D: S).
     """
+    check_model(model)
+    check_kind("touched", touched, TouchedCells, "TouchedCells, as of skin.touched_cells(places)")
     conductivity = check_conductivity(model.mesh, conductivity)
     if conductivity.ndim == 3 or jnp.iscomplexobj(conductivity):
         raise ValueError("touches need a real, scalar conductivity.")

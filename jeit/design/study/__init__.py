@@ -4,10 +4,19 @@
 `jeit.report.write_study_report` makes one page of it. Needs the extra `cluster`: zarr, xarray and dask.distributed.
 """
 
-from jeit.design.study.run import Progress as Progress
-from jeit.design.study.run import run_study as run_study
-from jeit.design.study.run import study_progress as study_progress
-from jeit.design.study.spec import Point as Point
-from jeit.design.study.spec import Study as Study
-from jeit.design.study.spec import read_study as read_study
-from jeit.design.study.store import open_results as open_results
+from jeit.arguments.moved import tell_old_names as _tell_old_names
+from jeit.design.study.run import Progress, run_study, study_progress
+from jeit.design.study.spec import Point, Study, read_study
+from jeit.design.study.store import open_results
+
+_tell_old_names(__name__)
+
+__all__ = [
+    "Point",
+    "Progress",
+    "Study",
+    "open_results",
+    "read_study",
+    "run_study",
+    "study_progress",
+]

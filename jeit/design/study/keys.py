@@ -1,10 +1,10 @@
 """The keys of a study file: what each may hold, and how a wrong one is told."""
 
-import difflib
 import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+from jeit.arguments import did_you_mean
 from jeit.design import defaults
 from jeit.design.skin.protocol import PROTOCOLS
 
@@ -58,7 +58,7 @@ class Words(NamedTuple):
                 raise ValueError(f"{where} must be text in quotes{' or a list of it' * self.swept}; it has {item!r}.")
             if self.choices and item not in self.choices:
                 raise ValueError(
-                    f"{where} has no {item!r}{_meant(item, self.choices)}; take {', '.join(self.choices)}."
+                    f"{where} has no {item!r}{did_you_mean(item, self.choices)}; take {', '.join(self.choices)}."
                 )
         return items
 
@@ -180,7 +180,9 @@ def _refuse_unknown(prefix: str, table: dict[str, Any], known: Iterable[str]) ->
     known = list(known)
     for name in table:
         if name not in known:
-            raise ValueError(f"{prefix}{name} is no key of a study{_meant(name, known)}; there are {', '.join(known)}.")
+            raise ValueError(
+                f"{prefix}{name} is no key of a study{did_you_mean(name, known)}; there are {', '.join(known)}."
+            )
 
 
 def _refuse_idle(table: dict[str, Any], values: dict[str, Any]) -> None:
@@ -204,8 +206,3 @@ def _items(where: str, value: Any, swept: bool) -> list:
     if any(value.count(item) > 1 for item in value):
         raise ValueError(f"{where} lists a value twice; give each once.")
     return value
-
-
-def _meant(word: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(word, list(known), n=1)
-    return f" (did you mean {close[0]!r}?)" if close else ""

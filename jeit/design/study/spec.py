@@ -15,7 +15,7 @@ from jeit.design import defaults
 from jeit.design.skin.cell_size import check_cell_size
 from jeit.design.skin.indentation import AbstractIndentation, Bell, Hemisphere
 from jeit.design.skin.protocol import ProtocolName, skin_protocol
-from jeit.design.skin.skin import skin_electrodes
+from jeit.design.skin.skin import longer_side, skin_electrodes
 from jeit.design.study.keys import OPTIMALITY, read_keys
 from jeit.design.study.layouts import is_file, study_layout
 from jeit.electrodes import FaceDiscs, SheetDiscs
@@ -288,6 +288,9 @@ def _check(study: Study) -> None:
                 f"mesh.cell_mm is {1e3 * point.cell_size:g}, too coarse for electrodes {1e3 * smallest:.3g} mm across; "
                 f"{1e3 * smallest / 2:.3g} would do."
             )
+        if point.thickness > longer_side(study.outline):
+            wide = f"{1e3 * longer_side(study.outline):g}"
+            raise ValueError(f"skin.thickness_mm is {1e3 * point.thickness:g}, more than the skin is wide: {wide} mm.")
         check_cell_size("mesh.cell_mm", point.cell_size, study.outline.area, point.layers)
 
 

@@ -12,6 +12,7 @@ import scipy.optimize
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from jeit.arguments import check_name
 from jeit.inverse.hyperparameter.chosen import Choice
 from jeit.inverse.hyperparameter.point_spread import best_resolution
 from jeit.inverse.spectrum import Spectrum as Spectrum
@@ -110,8 +111,7 @@ def choose(spectrum: Spectrum, hyperparameter: float | str | Rule | Choice, data
     if isinstance(hyperparameter, Choice):
         return hyperparameter
     if isinstance(hyperparameter, str):
-        if hyperparameter not in RULES:
-            raise ValueError(f"hyperparameter: no rule '{hyperparameter}'; give a number or one of {', '.join(RULES)}.")
+        check_name("hyperparameter", hyperparameter, RULES, ", or a number")
         return RULES[hyperparameter](spectrum, data, mesh)
     if callable(hyperparameter):
         return hyperparameter(spectrum, data, mesh)

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from jeit.forward import ForwardModel
+from jeit.forward.model import check_model
 from jeit.inverse.linear.one_step import LinearReconstruction
 
 
@@ -27,6 +28,7 @@ def back_projection(
     channels to use. Raises `ValueError` for protocols whose channels have more than two electrodes, where no band is
     defined. `conductivity`: the background, S/m (2-D: S).
     """
+    check_model(model)
     protocol = model.protocol
     used = np.ones(protocol.num_measurements, bool) if mask is None else np.asarray(mask, bool)
     if used.shape != (protocol.num_measurements,) or not used.any():

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.spatial import KDTree
 
 from jeit.forward import ForwardModel
+from jeit.forward.model import check_model
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.linearisation import used_channels
 from jeit.mesh import Mesh, centroids, measures
@@ -53,6 +54,7 @@ def greit(
 
     Raises `ValueError` for solids, for arguments that do not fit, and for a noise figure that no λ reaches.
     """
+    check_model(model)
     mesh = model.mesh
     if mesh.dimension != 2:
         raise ValueError("GREIT is for plane bodies, and this mesh is 3-D; use one_step, which takes either.")

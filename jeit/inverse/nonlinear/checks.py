@@ -5,12 +5,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.forward import ForwardModel
+from jeit.forward.model import check_model
 from jeit.inverse.noise import relative_noise
-from jeit.inverse.prior.priors import AbstractPrior
 
 
 def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
     """Voltages as an array with zeros for what is left out, and which channels are used; raises `ValueError`."""
+    check_model(model)
     if jnp.iscomplexobj(voltages):
         raise ValueError("voltages are complex; reconstruct from their real part or magnitude.")
     shape = (model.protocol.num_measurements,)
@@ -52,12 +53,6 @@ def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[
     if not (np.isfinite(deviation)[used] & (np.asarray(deviation)[used] > 0)).all():
         raise ValueError("noise must be positive and finite for every channel in use.")
     return jnp.where(used, deviation, 1)
-
-
-def check_prior(prior) -> None:
-    """That it is one of jeit's, or made like them. Raises `ValueError` otherwise."""
-    if not isinstance(prior, AbstractPrior):
-        raise ValueError(f"prior must be one of those in jeit.inverse, such as Noser(), not {prior!r}.")
 
 
 def check_steps(name: str, steps) -> int:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jeit.arguments import check_kind
 from jeit.forward import ForwardModel
 from jeit.inverse.nonlinear.links import AbstractLink, Log
 from jeit.inverse.nonlinear.unknowns import AbstractUnknown
@@ -26,10 +27,7 @@ def as_parametrisation(given: "Parametrisation | None") -> "Parametrisation":
     """What is given, or all the defaults. Raises `ValueError` for something else."""
     if given is None:
         return Parametrisation()
-    if not isinstance(given, Parametrisation):
-        raise ValueError(
-            f"parametrisation must be a Parametrisation, such as Parametrisation(link=Log()); it is {given!r}."
-        )
+    check_kind("parametrisation", given, Parametrisation, "a Parametrisation, such as Parametrisation(link=Log())")
     return given
 
 
@@ -56,8 +54,7 @@ class Parametrisation(eqx.Module):
     informative: float | None = None
 
     def __check_init__(self):
-        if not isinstance(self.link, AbstractLink):
-            raise ValueError(f"link must be one of those in jeit.inverse.nonlinear, such as Log(), not {self.link!r}.")
+        check_kind("link", self.link, AbstractLink, "one of those in jeit.inverse.nonlinear, such as Log()")
         values = np.asarray((0.0, np.inf) if self.bounds is None else self.bounds)
         if values.shape != (2,) or values.dtype.kind not in "iuf" or not 0 <= values[0] < values[1]:
             raise ValueError(f"bounds: give two numbers, 0 ≤ lower < upper, S/m (2-D: S); they are {self.bounds!r}.")

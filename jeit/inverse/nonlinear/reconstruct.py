@@ -10,11 +10,12 @@ from jeit.forward import ForwardModel
 from jeit.inverse.channels import Data, IndependentChannels
 from jeit.inverse.hyperparameter.chosen import Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
-from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise, check_prior
+from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
 from jeit.inverse.nonlinear.informed import informed
 from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametrisation
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.solvers import LBFGSB, SOLVERS, AbstractSolver, GaussNewton, as_solver
+from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.priors import AbstractPrior, Noser
 from jeit.inverse.spectrum import Spectrum
 from jeit_solvers import Status

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from jeit.arguments import check_kind, check_name
 from jeit.inverse.nonlinear.checks import check_steps, check_tolerance
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit_solvers import BoundedMinimum, Descent, Status, ended, lbfgsb, projected_gradient
@@ -224,8 +225,7 @@ SOLVERS: dict[str, type[AbstractSolver]] = {
 
 def solver_named(name: str, argument: str = "solver") -> AbstractSolver:
     """The solver of that name in `SOLVERS`, with its defaults. Raises `ValueError`, about `argument`, for others."""
-    if name not in SOLVERS:
-        raise ValueError(f"{argument}: there is no '{name}'; give one of {', '.join(SOLVERS)}.")
+    check_name(argument, name, SOLVERS)
     return SOLVERS[name]()
 
 
@@ -235,11 +235,9 @@ def as_solver(solver: "AbstractSolver | optx.AbstractLeastSquaresSolver | str") 
         return solver_named(solver)
     if isinstance(solver, optx.AbstractLeastSquaresSolver):
         return LeastSquares(solver)
-    if not isinstance(solver, AbstractSolver):
-        raise ValueError(
-            f"solver must be one of jeit.inverse.nonlinear, such as GaussNewton(), the name of one "
-            f"({', '.join(SOLVERS)}), or a least-squares solver of optimistix; it is {solver!r}."
-        )
+    names = ", ".join(SOLVERS)
+    wanted = f"one of jeit.inverse.nonlinear, such as GaussNewton(), a name ({names}), or optimistix's least squares"
+    check_kind("solver", solver, AbstractSolver, wanted)
     return solver
 
 

@@ -15,16 +15,18 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from jeit.arguments import is_number, told
 from jeit.electrodes.integrated import IntegratedElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import IndependentChannels, Weighing
 from jeit.inverse.hyperparameter.rules import Rule
-from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise, check_prior
+from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
 from jeit.inverse.nonlinear.informed import informed
 from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametrisation
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.reconstruct import pose
 from jeit.inverse.nonlinear.solvers import AbstractSolver, GaussNewton, as_solver, expand, residual
+from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.defaults import smooth_prior
 from jeit.inverse.prior.priors import AbstractPrior
 
@@ -36,8 +38,8 @@ _BLIND = 1e5
 
 def check_memory(memory) -> None:
     """Raises `ValueError` for what is no number of frames."""
-    if not (np.isfinite(memory) and memory >= 0):
-        raise ValueError(f"memory must be a number of frames, or 0 for none; it is {memory}.")
+    if not (is_number(memory) and memory >= 0):
+        raise ValueError(f"memory must be a number of frames, or 0 for none; it is {told(memory)}.")
 
 
 class FrameEstimate(eqx.Module):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jeit.arguments import check_kind
 from jeit.inverse.streaming.imager import Imager
 from jeit_solvers import Status
 
@@ -63,10 +64,17 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     compiled before the first frame is asked for. A frame is refused, and the stream goes on, when it has another number
     of channels or is not real, when fewer than half of the channels can be used, when all read zero (the current source
     has failed), or when it differs from an undisturbed frame by more than half of it. A dead electrode's channels are
-    left out, and named. Raises `ValueError` for an array of frames that is not (frames, channels).
+    left out, and named. Raises `ValueError` for what is no imager, for what are no frames, and for an array of frames
+    that is not (frames, channels).
     """
+    check_kind("imager", imager, Imager, "an Imager, as of Imager.create or prepare_imager(reference)[0]")
+    check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
     if isinstance(frames, (np.ndarray, jax.Array)) and frames.ndim != 2:
         raise ValueError(f"frames has shape {frames.shape}; give (frames, channels), or for one frame [frame].")
+    return _images(imager, frames)
+
+
+def _images(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     session = _Session(imager)
     for number, frame in enumerate(frames):
         yield session.image(number, frame)

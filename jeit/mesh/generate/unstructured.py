@@ -6,12 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from numbers import Integral, Real
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
+from jeit.arguments import check_metres
 from jeit.mesh import loops
 from jeit.mesh.generate import _triangulate
 from jeit.mesh.generate._delaunay import Front, doubled_areas, triangulate
@@ -41,8 +42,8 @@ class Target:
         """Check the two arguments of a shape; raises `ValueError` if both are given or one is out of range."""
         if num_points is not None and cell_size is not None:
             raise ValueError("num_points, cell_size: give one of the two, not both.")
-        if cell_size is not None and not (isinstance(cell_size, Real) and 0 < cell_size < np.inf):
-            raise ValueError(f"cell_size: expected a positive length in metres, got {cell_size!r}.")
+        if cell_size is not None:
+            check_metres("cell_size", cell_size)
         number = DEFAULT_NUM_POINTS if num_points is None else check_count("num_points", num_points, 4)
         check_total(number, "num_points")
         return Target(number, cell_size, num_points is not None)

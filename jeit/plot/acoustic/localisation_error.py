@@ -8,6 +8,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import ArrayLike
 
+from jeit.arguments import check_kind, check_name
 from jeit.plot.acoustic.surface_view import FOUND, AnySurface, draw_legend, draw_surface, view_of
 from jeit.plot.axes import INK, SERIES_COLOURS, SERIES_MARKERS, axes_or_new, draw_horizontal_grid, soften_axes
 
@@ -79,10 +80,10 @@ def plot_error_curve(
     if x.ndim != 1 or not x.size or not np.isfinite(x).all() or (logarithmic and not (x > 0).all()):
         positive = "positive " if logarithmic else ""
         raise ValueError(f"values has shape {x.shape}; give (K,) finite {positive}numbers, one for each row of errors.")
+    check_kind("errors", errors, Mapping, "{name: errors}")
     if not 1 <= len(errors) <= len(SERIES_COLOURS):
         raise ValueError(f"errors has {len(errors)} methods; give 1 to {len(SERIES_COLOURS)}, {{name: errors}}.")
-    if statistic not in _STATISTICS:
-        raise ValueError(f"statistic must be one of {', '.join(_STATISTICS)}; it is {statistic!r}.")
+    check_name("statistic", statistic, _STATISTICS)
     each = {name: _rows(array, f"errors['{name}']", x.size) for name, array in errors.items()}
     least = None if bound is None else _STATISTICS[statistic](_rows(bound, "bound", x.size))
     order = np.argsort(x)

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
+from jeit.arguments import check_kind, check_name
 from jeit.plot.acoustic.surface_view import (
     FOUND,
     HALO,
@@ -60,13 +61,15 @@ def plot_loss_map(
     given; their circles are the larger the more they have `received` (M,), intensities. `marks`: places to
     mark, the truth and an estimate. `method`: "likelihood" maps
     are drawn as √(2 (map − least)), standard deviations in which a place is worse than the best; the paper's loss,
-    "consistency", in decibels above its least. Raises `ValueError` for other methods and shapes.
+    "consistency", in decibels above its least. Raises `ValueError` for other methods and shapes, and for marks that are
+    none.
     """
+    if marks is not None:
+        check_kind("marks", marks, Marks, "Marks, such as Marks(truth=(0.02, 0.01))")
     pixels = np.asarray(values, float)
     if pixels.ndim != 2 or not np.isfinite(pixels).any():
         raise ValueError(f"values has shape {pixels.shape}; give (rows, columns) with at least one finite value.")
-    if method not in _MAP_LABELS:
-        raise ValueError(f"method must be one of {', '.join(_MAP_LABELS)}; it is {method!r}.")
+    check_name("method", method, _MAP_LABELS)
     view = view_of(surface, microphones)
     number = len(view.microphones)
     level = None if received is None else np.asarray(received, float)

@@ -12,6 +12,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocato
 from numpy.typing import ArrayLike
 
 from jeit.acoustic.calibration.calibrate import CalibrationFit
+from jeit.arguments import check_kind
 from jeit.plot.acoustic.surface_view import FOUND, HALO
 from jeit.plot.axes import INK, SOFT, axes_or_new, soften_axes
 
@@ -27,8 +28,9 @@ def plot_receptive_fields(
     messages. Red circles are taps that the fit has left out, and a microphone of no use says why. The dashed line is
     the noise, one standard deviation, of a tap of median strength; the number beside the index is the distance at which
     a microphone receives half of what it does right under the tap. The panels are insets of the axes returned. Raises
-    `ValueError` for microphones that there are not.
+    `ValueError` for microphones that there are not, and for what is no fit.
     """
+    check_kind("fit", fit, CalibrationFit, "a CalibrationFit, as of calibrate_microphones")
     number = fit.power.shape[1]
     chosen = np.arange(number) if microphones is None else np.atleast_1d(np.asarray(microphones))
     if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or not chosen.size:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from jeit.acoustic import Calibration, MicrophoneArray
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.tracking import Touch, Track
+from jeit.arguments import check_kind
 from jeit.plot.acoustic.surface_view import View, draw_ellipse, draw_legend, draw_surface, outline_of, view_of
 from jeit.plot.axes import INK, SOFT, axes_or_new, draw_colour_bar
 
@@ -47,8 +48,10 @@ def plot_track(
     as the last of `jeit.acoustic.localisation.overlay`. `truth` (N, d), metres: a path known otherwise. A touch that
     has stayed where it was is drawn as a dot with an ellipse that holds 95 %. Frames that are no plain touch are
     marked, and named where there are any. On a curved surface everything is in its chart. Raises `ValueError` for
-    shapes that disagree.
+    shapes that disagree, and for things of another kind.
     """
+    check_kind("track", track, Track, "a Track, as of jeit.acoustic.track(locations)")
+    check_kind("locations", locations, Locations, "Locations, as of jeit.acoustic.locate")
     view = view_of(array)
     number = len(view.microphones)
     if locations.used.shape != (len(track.times), number) or track.position.shape != locations.position.shape:

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
+from jeit.arguments import check_kind
 from jeit.design.sensitivity import SensitivityMap
 from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar
 
@@ -20,7 +21,11 @@ def plot_sensitivity_map(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw Θ in millivolts over the skin. `electrodes`: positions (L, 2), metres; `limit`: volts at the bar's end."""
+    """Draw Θ in millivolts over the skin. `electrodes`: positions (L, 2), metres; `limit`: volts at the bar's end.
+
+    Raises `ValueError` for what is no sensitivity map.
+    """
+    _check_map("theta", theta)
     ax = axes_or_new(ax)
     grid = theta.grid
     rows, columns = grid.shape
@@ -45,7 +50,13 @@ def plot_sensitivity_map(
 def plot_sensitivity_histograms(
     maps: Mapping[str, SensitivityMap], *, bins: int = 40, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the share of the area at each sensitivity, of maps {name: map}; the first one's minimum is marked."""
+    """Draw the share of the area at each sensitivity, of maps {name: map}; the first one's minimum is marked.
+
+    Raises `ValueError` for what are none.
+    """
+    check_kind("maps", maps, Mapping, "{name: map}")
+    for name, theta in maps.items():
+        _check_map(f"maps['{name}']", theta)
     ax = axes_or_new(ax)
     top = max(float(np.max(np.asarray(theta.values))) for theta in maps.values())
     edges = np.linspace(0, top, bins + 1)
@@ -59,3 +70,7 @@ def plot_sensitivity_histograms(
     if title:
         ax.set_title(title)
     return ax
+
+
+def _check_map(name: str, theta: SensitivityMap) -> None:
+    check_kind(name, theta, SensitivityMap, "a SensitivityMap, as of jeit.design.sensitivity_map")

@@ -9,6 +9,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.tri import Triangulation
 from numpy.typing import ArrayLike
 
+from jeit.arguments import check_kind, check_name
 from jeit.design.taxels import Taxels
 from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar, extent_of
 
@@ -34,8 +35,7 @@ def plot_taxels(
     `electrodes`: positions (L, 2) or (L, 3), metres. `limit`: value at the end of the colour bar, in m² for "area".
     Raises `ValueError` for other colours, and batches.
     """
-    if colour not in _QUANTITIES:
-        raise ValueError(f"colour must be one of {', '.join(_QUANTITIES)}; it is {colour!r}.")
+    check_name("colour", colour, _QUANTITIES)
     _check_single(taxels)
     labels = np.asarray(taxels.labels)
     ax = axes_or_new(ax)
@@ -62,7 +62,7 @@ def plot_taxel_areas(
     `bins`: as many, of the same width for all, from 0 to the largest area. The legend gives mean ± standard deviation.
     Raises `ValueError` for batches, no layouts and more than six.
     """
-    layouts = {"taxels": taxels} if isinstance(taxels, Taxels) else dict(taxels)
+    layouts = dict(taxels) if isinstance(taxels, Mapping) else {"taxels": taxels}
     if not 1 <= len(layouts) <= len(_COLOURS):
         raise ValueError(f"taxels are of {len(layouts)} layouts; give 1 to {len(_COLOURS)}, {{name: taxels}}.")
     for one in layouts.values():
@@ -114,6 +114,7 @@ def plot_similarity(
 
 
 def _check_single(taxels: Taxels) -> None:
+    check_kind("taxels", taxels, Taxels, "Taxels, as of find_taxels")
     if taxels.similarity.ndim != 2:
         raise ValueError(
             f"taxels are of a batch of {taxels.similarity.shape[0]} layouts; draw one of them, "

@@ -6,6 +6,7 @@ from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.patches import Circle, PathPatch
 from matplotlib.path import Path
 
+from jeit.arguments import check_kind
 from jeit.design.optimisation.optimise import Optimisation
 from jeit.mesh import Domain
 from jeit.plot.axes import INK, SOFT, axes_or_new, bare, draw_scale_bar
@@ -25,8 +26,9 @@ def plot_travel(
     """Draw the way of every electrode of one of the starts: hollow where it began, filled where it ended.
 
     `start`: which, from 0; `keep_out`: regions to be hatched. The title gives the mean way in millimetres unless one is
-    given. Raises `ValueError` for a start that is not there.
+    given. Raises `ValueError` for a start that is not there, and for what is no `Optimisation`.
     """
+    check_kind("optimisation", optimisation, Optimisation, "an Optimisation, as of optimise_layout")
     number = len(optimisation.centres)
     if not isinstance(start, (int, np.integer)) or not 0 <= start < number:
         raise ValueError(f"start must be from 0 to {number - 1}, of one of the {number} starts; it is {start!r}.")

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from jeit.arguments import check_kind
 from jeit.image.merit import FiguresOfMerit
 from jeit.plot.axes import INK, SERIES_COLOURS, SERIES_MARKERS, SOFT, axes_or_new, draw_horizontal_grid, soften_axes
 
@@ -29,6 +30,7 @@ def plot_figures_of_merit(
     are what a perfect image has. The five plots are insets of the axes returned. Raises `ValueError` for no figures,
     more than six reconstructions, or figures of a single image.
     """
+    check_kind("figures", figures, Mapping, "{name: figures}, as of jeit.image.figures_of_merit")
     if not 1 <= len(figures) <= len(SERIES_COLOURS):
         raise ValueError(
             f"figures has {len(figures)} reconstructions; give 1 to {len(SERIES_COLOURS)}, {{name: figures}}."

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
+from jeit.arguments import check_kind
 from jeit.inverse.hyperparameter.chosen import Choice
 from jeit.plot.axes import INK, SOFT, axes_or_new, soften_axes
 
@@ -33,8 +34,12 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
     One `Choice`: for "l-curve" the L-curve, ‖residual‖ against ‖image‖ with the corner marked; for other rules their
     criterion against λ. Several, by name, as from `jeit.inverse.compare_rules`: the L-curve with all of them marked,
     where there were data, and the criterion of each; these plots are insets of the axes returned. A choice at the edge
-    of its grid is drawn hollow. Raises `ValueError` where there is nothing to draw: for numbers that were given.
+    of its grid is drawn hollow. Raises `ValueError` where there is nothing to draw: for numbers that were given,
+    and for what is no choice.
     """
+    several = list(choices.values()) if isinstance(choices, Mapping) else [choices]
+    for one in several:
+        check_kind("choices", one, Choice, "a Choice, or several, {name: choice}, as of compare_rules")
     if isinstance(choices, Choice):
         if choices.criterion.size == 0:
             raise ValueError("choices: a hyperparameter that was given has no curve; draw one that a rule chose.")
@@ -47,7 +52,6 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
             ax.set_title(title or _headline(choices), color=_colour(choices), fontsize=11, loc="left")
             ax.set_xlabel("Hyperparameter λ")
         return ax
-    several = list(choices.values())
     rules = [choice for choice in several if choice.criterion.size]
     if not rules:
         raise ValueError("choices: there is no choice of a rule among them, so there is no curve to draw.")

@@ -12,10 +12,10 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.image import Inclusion, Raster
 from jeit.mesh import Mesh
 from jeit.plot.axes import axes_or_new, bare, draw_scale_bar, extent_of
-from jeit.plot.colour_scale import CHANGE, ColourScale
+from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.inclusions import draw_inclusions
-from jeit.plot.imaging.mesh import draw_outline
+from jeit.plot.imaging.mesh import check_body, draw_outline
 
 
 def plot_image(
@@ -34,8 +34,11 @@ def plot_image(
     `electrodes` are drawn at their place and width, and numbered. `inclusions`: marked. `scale`: how values become
     colours; values are changes of conductivity in S (3-D: S/m) unless it says otherwise, as `ColourScale(difference=
     False)` does for conductivity itself. `height`: z in metres of the slice through a 3-D mesh, half way up unless
-    given. Raises `ValueError` for values of another shape, complex or not finite, and a height beside the mesh.
+    given. Raises `ValueError` for values of another shape, complex or not finite, a height beside the mesh, and things
+    of another kind.
     """
+    check_body(mesh, electrodes)
+    check_scale(scale)
     image = np.asarray(values)
     if image.shape not in ((mesh.num_cells,), (mesh.num_points,)):
         raise ValueError(
@@ -81,8 +84,12 @@ def plot_raster(
     """Draw a raster (rows, columns), row 0 at the top, NaN left blank; arguments as in `plot_image`.
 
     `extent`: (x_min, x_max, y_min, y_max) in metres. `mesh`: the mesh it was sampled from, for its outline and the
-    `electrodes`. Raises `ValueError` for a raster without a finite value, and for electrodes without their mesh.
+    `electrodes`. Raises `ValueError` for a raster without a finite value, for electrodes without their mesh, and for
+    things of another kind.
     """
+    check_scale(scale)
+    if mesh is not None:
+        check_body(mesh, electrodes)
     pixels = np.asarray(raster)
     shown = pixels[np.isfinite(pixels)]
     if pixels.ndim != 2 or shown.size == 0:

@@ -4,6 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
+from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
 from jeit.plot.axes import INK, SOFT, axes_or_new, bare, draw_scale_bar, extent_of
@@ -13,7 +14,11 @@ from jeit.plot.imaging.electrodes import draw_electrodes
 def plot_mesh(
     mesh: Mesh, electrodes: AbstractElectrodes | None = None, *, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw a 2-D mesh with its outline, and `electrodes` numbered; of a 3-D mesh its surface, seen from above."""
+    """Draw a 2-D mesh with its outline, and `electrodes` numbered; of a 3-D mesh its surface, seen from above.
+
+    Raises `ValueError` for what is neither.
+    """
+    check_body(mesh, electrodes)
     ax = axes_or_new(ax)
     points = np.asarray(mesh.points)
     triangles = np.asarray(mesh.cells if mesh.dimension == 2 else mesh.facets)
@@ -27,6 +32,13 @@ def plot_mesh(
     draw_scale_bar(ax, extent)
     ax.set_title(f"{mesh.num_points:,} nodes, {mesh.num_cells:,} cells" if title is None else title)
     return ax
+
+
+def check_body(mesh: Mesh, electrodes: AbstractElectrodes | None) -> None:
+    """Raises `ValueError` for what is no mesh, and for what are no electrodes, if any are given."""
+    check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
+    if electrodes is not None:
+        check_kind("electrodes", electrodes, AbstractElectrodes, "those of jeit.electrodes, such as BoundaryElectrodes")
 
 
 def draw_outline(mesh: Mesh, ax: Axes) -> None:

@@ -1,3 +1,7 @@
 """A study as one HTML page, and its pictures."""
 
-from jeit.report.study.report import write_study_report as write_study_report
+from jeit.report.study.report import write_study_report
+
+__all__ = [
+    "write_study_report",
+]

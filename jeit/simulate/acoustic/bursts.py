@@ -4,6 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jeit.arguments import check_kind
 from jeit.simulate.acoustic.checks import check_positive
 
 # When the first burst begins, seconds: time for its ringing.
@@ -43,6 +44,12 @@ class Burst(eqx.Module):
         shape = after * np.exp(-after / rise) / np.sqrt(rise**3 / 4 / self.length)
         # Bursts that overlap are independent noises: their powers add.
         return np.sqrt(((strengths[:, None] * shape) ** 2).sum(axis=0))
+
+
+def check_burst(burst: Burst, duration: float) -> None:
+    """Raises `ValueError` for what is no `Burst`, and unless a recording of `duration` seconds holds one of it."""
+    check_kind("burst", burst, Burst, "a Burst, such as Burst(strength=2.0)")
+    burst.check_fits(duration)
 
 
 # A vibrator with a rubber tip, the palm of a hand, and fingers that tickle.

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.simulate.acoustic.bursts import ONSET, VIBRATOR, Burst
+from jeit.simulate.acoustic.bursts import ONSET, VIBRATOR, Burst, check_burst
 from jeit.simulate.acoustic.checks import check_not_negative
 from jeit.simulate.acoustic.propagation import noise_power, transfer
-from jeit.simulate.acoustic.sounding_skin import SoundingSkin
+from jeit.simulate.acoustic.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.simulate.acoustic.synthesis import (
     RINGING,
     bin_frequencies,
@@ -51,11 +51,12 @@ def calibration_taps(
     Strengths are log-normal about that of `burst` with standard deviation `strength_spread` in the logarithm, as a
     hand's or a vibrator's are: whoever calibrates does not know them. Otherwise as `tap`, which says what is raised.
     """
+    check_skin_and_key(skin, key)
     places = skin.layer.check_inside("positions", positions)
     if repeats < 1:
         raise ValueError(f"repeats: give at least one tap for each position, not {repeats}.")
     check_not_negative("strength_spread", strength_spread)
-    burst.check_fits(duration)
+    check_burst(burst, duration)
     times = sample_times(skin, duration)
     loudness, rest = jax.random.split(key)
     strengths = burst.strength * np.exp(

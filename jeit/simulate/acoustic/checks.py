@@ -1,15 +1,15 @@
 """Checks of the numbers that a simulated acoustic skin and its touches are given."""
 
-import numpy as np
+from jeit.arguments import is_number, told
 
 
 def check_positive(name: str, value: float) -> None:
     """Raises `ValueError` for what is not a finite number above zero."""
-    if not (np.isfinite(value) and value > 0):
-        raise ValueError(f"{name} must be a positive number in SI units; it is {value}.")
+    if not (is_number(value) and value > 0):
+        raise ValueError(f"{name} must be a positive number in SI units; it is {told(value)}.")
 
 
 def check_not_negative(name: str, value: float) -> None:
     """Raises `ValueError` for what is not a finite number from zero up."""
-    if not (np.isfinite(value) and value >= 0):
-        raise ValueError(f"{name} must be zero or positive; it is {value}.")
+    if not (is_number(value) and value >= 0):
+        raise ValueError(f"{name} must be zero or positive; it is {told(value)}.")

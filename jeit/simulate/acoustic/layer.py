@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit.arguments import check_kind, check_metres
+from jeit.layout.layout import LARGEST
 from jeit.simulate.acoustic.checks import check_not_negative, check_positive
 
 
@@ -69,8 +71,10 @@ class ElastomerLayer(eqx.Module):
     reflection: float = 0.2
 
     def __check_init__(self):
-        for name in ("width", "height", "thickness"):
-            check_positive(name, getattr(self, name))
+        for name in ("width", "height"):
+            check_metres(name, getattr(self, name), LARGEST, "the longest skin known")
+        check_metres("thickness", self.thickness, max(self.width, self.height), "the layer is wide")
+        check_kind("material", self.material, Elastomer, "an Elastomer, such as Elastomer(shear_modulus=1e5)")
         if not -1 <= self.reflection <= 1:
             raise ValueError(f"reflection: an edge returns at most what reaches it, -1 to 1; it is {self.reflection}.")
 
@@ -89,7 +93,10 @@ class ElastomerLayer(eqx.Module):
 
     def check_inside(self, name: str, points) -> Float[np.ndarray, "P 2"]:
         """`points` (P, 2), metres, as floats; raises `ValueError` that says `name` unless all are on the layer."""
-        place = np.asarray(points, float)
+        try:
+            place = np.asarray(points, float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{name}: give (x, y) in metres for each; {error}.") from None
         if place.ndim != 2 or place.shape[1] != 2 or len(place) == 0:
             raise ValueError(f"{name}: give (x, y) in metres for each, shape (P, 2), not {place.shape}.")
         if not np.isfinite(place).all():

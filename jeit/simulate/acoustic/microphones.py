@@ -3,7 +3,9 @@
 import equinox as eqx
 import numpy as np
 
-from jeit.simulate.acoustic.checks import check_not_negative, check_positive
+from jeit.arguments import check_metres
+from jeit.layout.layout import LARGEST
+from jeit.simulate.acoustic.checks import check_not_negative
 
 # Text S3: eight 4:1 multiplexers step together every 25 µs, so each microphone is sampled every 100 µs.
 STEP = 25e-6
@@ -34,7 +36,7 @@ class MicrophoneModel(eqx.Module):
 
     def __check_init__(self):
         for name in ("depth", "reach"):
-            check_positive(name, getattr(self, name))
+            check_metres(name, getattr(self, name), LARGEST, "the longest skin known")
         for name in ("gain_spread_db", "depth_spread", "noise_spread_db"):
             check_not_negative(name, getattr(self, name))
         if not np.isfinite(self.snr_db):

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jeit.simulate.acoustic.checks import check_positive
 from jeit.simulate.acoustic.propagation import transfer
-from jeit.simulate.acoustic.sounding_skin import SoundingSkin
+from jeit.simulate.acoustic.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.simulate.acoustic.synthesis import (
     RINGING,
     bin_frequencies,
@@ -53,6 +53,7 @@ class SimulatedSound(eqx.Module):
 
 def quiet(skin: SoundingSkin, key: Array, *, duration: float = 1.0) -> SimulatedSound:
     """The microphones' own noise and nothing else, for `duration` seconds. Raises `ValueError` where that is none."""
+    check_skin_and_key(skin, key)
     check_positive("duration", duration)
     times = sample_times(skin, duration)
     samples = microphone_noise(skin, key, len(times))
@@ -64,6 +65,7 @@ def superpose(skin: SoundingSkin, key: Array | None, *recordings: SimulatedSound
 
     The recordings must be of one skin and length and made with `noise=False`, or noise would count twice: `ValueError`.
     """
+    check_skin_and_key(skin, jax.random.key(0) if key is None else key)
     if not recordings:
         raise ValueError("recordings: give at least one.")
     if any(recording.noisy for recording in recordings):

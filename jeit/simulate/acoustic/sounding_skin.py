@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from jeit.arguments import check_key, check_kind
 from jeit.simulate.acoustic.layer import ElastomerLayer
 from jeit.simulate.acoustic.microphones import MicrophoneModel, Readout, microphone_grid
 
@@ -54,11 +55,17 @@ class SoundingSkin(eqx.Module):
         """`key` draws by how much the microphones differ, as `microphone_model` has it: the same key gives the same
         microphones, whatever the other arguments. `microphones`: (M, 2) metres; a grid of 5 × 5 unless given.
         `layer`, `microphone_model` and `readout`: those of the paper's device unless given. Raises `ValueError` for
-        microphones off the layer.
+        microphones off the layer, and for things of another kind.
         """
+        check_key(key)
         self.layer = ElastomerLayer() if layer is None else layer
         self.microphone_model = MicrophoneModel() if microphone_model is None else microphone_model
         self.readout = Readout() if readout is None else readout
+        check_kind("layer", self.layer, ElastomerLayer, "an ElastomerLayer, such as ElastomerLayer(0.2, 0.2, 0.01)")
+        check_kind(
+            "microphone_model", self.microphone_model, MicrophoneModel, "a MicrophoneModel, such as MicrophoneModel()"
+        )
+        check_kind("readout", self.readout, Readout, "a Readout, such as Readout(multiplexed=False)")
         if not np.isfinite(spectral_slope):
             raise ValueError(f"spectral_slope must be finite; it is {spectral_slope}.")
         self.spectral_slope = spectral_slope
@@ -87,3 +94,9 @@ class SoundingSkin(eqx.Module):
     def stagger(self) -> np.ndarray:
         """How much later than the first each microphone is sampled, (M,) seconds."""
         return self.readout.stagger(self.num_microphones)
+
+
+def check_skin_and_key(skin: SoundingSkin, key: Array) -> None:
+    """Raises `ValueError` for what is no `SoundingSkin`, and for what is no random key."""
+    check_kind("skin", skin, SoundingSkin, "a SoundingSkin, such as SoundingSkin(jax.random.key(0))")
+    check_key(key)

@@ -9,10 +9,10 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jeit.simulate.acoustic.bursts import FIRM, LIGHT, ONSET, VIBRATOR, Burst
+from jeit.simulate.acoustic.bursts import FIRM, LIGHT, ONSET, VIBRATOR, Burst, check_burst
 from jeit.simulate.acoustic.checks import check_positive
 from jeit.simulate.acoustic.sound import HOP, SimulatedSound, block_times, record
-from jeit.simulate.acoustic.sounding_skin import SoundingSkin
+from jeit.simulate.acoustic.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.simulate.acoustic.synthesis import sample_times
 
 # Friction turns force times speed into heat and sound: a stroke's power goes as its speed, its amplitude as the root.
@@ -35,10 +35,11 @@ def tap(
     `duration` of the recording in seconds, made longer where the bursts need it. `noise`: whether to add the
     microphones' own. Raises `ValueError` for a position off the skin, and for what is not positive or does not fit.
     """
+    check_skin_and_key(skin, key)
     check_positive("frequency", frequency)
     if repeats < 1:
         raise ValueError(f"repeats: give at least one tap, not {repeats}.")
-    burst.check_fits(duration)
+    check_burst(burst, duration)
     onsets = ONSET + np.arange(repeats) / frequency
     times = sample_times(skin, max(duration, onsets[-1] + burst.length + 0.03))
     envelope = burst.envelope(times, onsets, np.full(repeats, burst.strength))
@@ -79,10 +80,11 @@ def tickle(
     the place before it. Strengths are log-normal about that of `burst` with standard deviation 0.3 in the logarithm,
     the times random by a quarter of the interval. Raises `ValueError` as `tap` does.
     """
+    check_skin_and_key(skin, key)
     middle = _place(skin, position)[0]
     check_positive("radius", radius)
     check_positive("taps_per_second", taps_per_second)
-    burst.check_fits(duration)
+    check_burst(burst, duration)
     times = sample_times(skin, duration)
     count = max(1, int((duration - ONSET - burst.length) * taps_per_second))
     where, jitter, loudness, rest = jax.random.split(key, 4)
@@ -115,6 +117,7 @@ def stroke(
     positions (N, 2). `strength`: root mean square at 0.1 m/s; it goes as the square root of the speed. Raises
     `ValueError` for paths that leave the skin, or stand still.
     """
+    check_skin_and_key(skin, key)
     check_positive("strength", strength)
     check_positive("duration", duration)
     times = sample_times(skin, duration)
@@ -139,4 +142,4 @@ def _polyline(skin: SoundingSkin, corners, duration: float) -> Callable[[np.ndar
 
 
 def _place(skin: SoundingSkin, position) -> np.ndarray:
-    return skin.layer.check_inside("position", np.asarray(position, float)[None])
+    return skin.layer.check_inside("position", [position])

@@ -1,0 +1,21 @@
+"""What is said of arguments that cannot be right: another kind of thing, a name there is not, a length in millimetres.
+
+One sentence each, before anything is compiled: which argument, what was given, what to give. Beneath all rooms, and
+light: nothing of the library is imported here.
+"""
+
+from jeit.arguments.keys import check_key
+from jeit.arguments.kinds import check_kind, is_number, told
+from jeit.arguments.lengths import IN_MILLIMETRES, check_metres
+from jeit.arguments.names import check_name, did_you_mean
+
+__all__ = [
+    "IN_MILLIMETRES",
+    "check_key",
+    "check_kind",
+    "check_metres",
+    "check_name",
+    "did_you_mean",
+    "is_number",
+    "told",
+]

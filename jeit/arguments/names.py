@@ -1,0 +1,23 @@
+"""Names of what there is, and which of them was meant."""
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+from jeit.arguments.kinds import told
+
+
+def check_name(argument: str, given: Any, names: Iterable[str], otherwise: str = "") -> None:
+    """Raise `ValueError`, about `argument`, for what is none of `names`; `otherwise` says what else could be given."""
+    known = list(names)
+    if not (isinstance(given, str) and given in known):
+        said = f"it is {told(given)}{did_you_mean(given, known)}"
+        raise ValueError(f"{argument} must be one of {', '.join(known)}{otherwise}; {said}.")
+
+
+def did_you_mean(given: Any, names: Iterable[str]) -> str:
+    """The name nearest to what was given, or that begins so, as a question in brackets; nothing where none is near."""
+    known, word = list(names), given.lower() if isinstance(given, str) else ""
+    begun = [name for name in known if word and name.startswith(word)]
+    close = difflib.get_close_matches(word, known, n=1) or begun
+    return f" (did you mean {close[0]!r}?)" if close else ""

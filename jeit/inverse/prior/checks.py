@@ -1,0 +1,13 @@
+"""What is asked of a prior."""
+
+from typing import Any
+
+from jeit.arguments import check_kind
+from jeit.inverse.prior.priors import AbstractPrior
+
+_WANTED = "an object of jeit.inverse: Noser(), Gaussian(length in metres), Laplace(), Tikhonov(), TotalVariation()"
+
+
+def check_prior(prior: Any) -> None:
+    """Raise `ValueError` for what is no prior: names of priors are the command line's and `ImagingSettings`' only."""
+    check_kind("prior", prior, AbstractPrior, _WANTED)

@@ -1,0 +1,130 @@
+"""What is said of arguments that cannot be right, and that those which can be pass."""
+
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.arguments import check_key, check_kind, check_metres, check_name, did_you_mean, is_number, told
+from jeit.mesh import Disk
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("laplace", "'laplace'"),
+        ("a" * 100, f"'{'a' * 58}…"),
+        (None, "None"),
+        (float("nan"), "nan"),
+        (np.float64(0.5), "0.5"),
+        (jnp.asarray(3), "3"),
+        ([1, 2], "a list"),
+        (Disk(0.05), "a Disk"),
+        (OSError(), "an OSError"),
+        (Disk, "the class Disk itself"),
+        (np.zeros((3, 2)), "an array of float64 of shape (3, 2)"),
+        (jnp.zeros(3, bool), "an array of bool of shape (3,)"),
+        (jax.random.key(0), "an array of key<fry> of shape ()"),
+    ],
+)
+def test_what_was_given(given, said):
+    assert told(given) == said
+
+
+@pytest.mark.parametrize("given", [0, -1.5, np.float32(2), np.asarray(1), jnp.asarray(0.5)])
+def test_numbers(given):
+    assert is_number(given)
+
+
+@pytest.mark.parametrize(
+    "given", [True, "1", None, [1.0], np.ones(1), 1j, math.nan, math.inf, {}, jax.random.key(0), jnp.ones(2)]
+)
+def test_no_numbers(given):
+    assert not is_number(given)
+
+
+def test_kinds():
+    check_kind("outline", Disk(0.05), Disk, "a Disk")
+    check_kind("path", "a", (str, Path), "a path")
+    with pytest.raises(ValueError, match=r"^outline must be a Disk, such as Disk\(0\.05\); it is 'disk'\.$"):
+        check_kind("outline", "disk", Disk, "a Disk, such as Disk(0.05)")
+
+
+@pytest.mark.parametrize(
+    "key", [jax.random.key(0), jax.random.PRNGKey(0), np.asarray(jax.random.PRNGKey(1)), jax.random.key(0, impl="rbg")]
+)
+def test_keys_pass(key):
+    check_key(key)
+    jax.random.normal(key)
+
+
+def test_keys_that_are_traced_pass():
+    def draw(key):
+        check_key(key)
+        return jax.random.normal(key)
+
+    keys = jax.random.split(jax.random.key(0), 3)
+    assert jax.jit(jax.vmap(draw))(keys).shape == (3,)
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        (None, r"such as jax.random.key\(0\); it is None"),
+        (7, r"such as jax.random.key\(7\); it is 7"),
+        (True, r"such as jax.random.key\(0\); it is True"),
+        ("seed", "it is 'seed'"),
+        (np.zeros(2), r"an array of float64 of shape \(2,\)"),
+        (jax.random.split(jax.random.key(0)), r"an array of key<fry> of shape \(2,\)"),
+    ],
+)
+def test_no_keys(key, said):
+    with pytest.raises(ValueError, match=f"^seed must be one random key, .*{said}"):
+        check_key(key, "seed")
+
+
+def test_names():
+    names = {"gcv": 1, "l-curve": 2}
+    check_name("rule", "gcv", names)
+    with pytest.raises(ValueError, match=r"^rule must be one of gcv, l-curve; it is 'gvc' \(did you mean 'gcv'\?\)\.$"):
+        check_name("rule", "gvc", names)
+    with pytest.raises(ValueError, match=r"^rule must be one of gcv, l-curve, or a number; it is 'luck'\.$"):
+        check_name("rule", "luck", names, ", or a number")
+    with pytest.raises(ValueError, match=r"^rule must be one of gcv, l-curve; it is a list\.$"):
+        check_name("rule", ["gcv"], names)
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        ("GCV", "gcv"),
+        ("gauss", "gauss-newton"),
+        ("l_curve", "l-curve"),
+        ("luck", ""),
+        ("", ""),
+        (None, ""),
+        (["gcv"], ""),
+    ],
+)
+def test_what_was_meant(given, meant):
+    said = did_you_mean(given, ["gcv", "l-curve", "gauss-newton"])
+    assert said == (f" (did you mean '{meant}'?)" if meant else "")
+
+
+def test_metres():
+    check_metres("thickness", 0.2, 0.2, "the skin is wide")
+    check_metres("thickness", jnp.asarray(0.01))
+    with pytest.raises(
+        ValueError,
+        match=r"^thickness is 10000 mm, more than the skin is wide, 200 mm; were millimetres given for metres\?",
+    ):
+        check_metres("thickness", 10, 0.2, "the skin is wide")
+
+
+@pytest.mark.parametrize("value", [0, -0.01, math.nan, math.inf, "0.01", None, [0.01], True, np.zeros(2)])
+def test_no_lengths(value):
+    with pytest.raises(ValueError, match=r"^thickness must be a positive length in metres; it is "):
+        check_metres("thickness", value)
