@@ -149,7 +149,16 @@ def test_too_few_steps_are_said_so(model, frame):
     voltages, noise = frame
     result = reconstruct(model, voltages, 1.0, prior=Gaussian(0.02), noise=noise, solver=GaussNewton(max_steps=2))
     assert result.status == "step limit"
-    assert "2 trial steps" in result.reason
+    assert result.iterations == 2
+    assert "after 2 iterations;" in result.reason
+
+
+@pytest.mark.parametrize("solver", [GaussNewton(), LevenbergMarquardt()])
+def test_voltages_of_the_background_are_at_the_minimum(model, solver):
+    """Its objective is nothing, so that no step is small beside it."""
+    result = reconstruct(model, model.voltages(1.0), 1.0, prior=Gaussian(0.02), hyperparameter=3.0, solver=solver)
+    assert result.status == "converged"
+    assert result.iterations <= 1
 
 
 @pytest.mark.parametrize(

@@ -268,8 +268,40 @@ def test_a_frame_that_needs_more_steps_is_said_so(model, frames, options):
     imager = Imager.create(model, 1.0, solver=GaussNewton(max_steps=1, rtol=1e-9), **options)
     image = next(iter(stream(imager, frames)))
     assert image.status == "step limit"
-    assert "More than 1 iterations" in image.reason
+    assert "after 1 iteration:" in image.reason
     assert image.imaged
+
+
+def test_steps_that_led_too_far_are_told_from_iterations(model, options):
+    """From a press that conducts a hundredfold back to rest in three steps, of which some are shortened."""
+    pressed, rest = (model.voltages(jnp.where(near(model, PLACES[0]), value, 1.0)) for value in (100.0, 1.0))
+    weak = {**options, "hyperparameter": 1.0, "solver": GaussNewton(max_steps=3, rtol=1e-9)}
+    image = list(stream(Imager.create(model, 1.0, **weak), [pressed, rest]))[1]
+    assert image.status == "step limit"
+    assert image.iterations == 1
+    assert "after 1 iteration and 2 steps that led too far:" in image.reason
+
+
+@pytest.mark.parametrize("kind", [GaussNewton, LevenbergMarquardt])
+def test_an_undisturbed_frame_is_at_its_minimum(kind, model, frames, options):
+    """Its objective goes to nothing, so that no step is small beside it."""
+    rest = model.voltages(1.0)
+    imager = Imager.create(model, 1.0, solver=kind(), **options)
+    images = list(stream(imager, [rest, frames[0], rest, rest]))
+    assert [str(one.status) for one in images] == ["imaged"] * 4
+    for one in images[2:]:
+        np.testing.assert_allclose(one.conductivity, 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", [GaussNewton, LevenbergMarquardt])
+def test_a_change_far_below_the_noise_is_still_imaged(kind, model, options):
+    """What ends the iteration does not keep it from its first step."""
+    label = near(model, PLACES[0])
+    small, smaller = (
+        next(iter(stream(Imager.create(model, 1.0, solver=kind(), **options), [frame]))).conductivity - 1
+        for frame in (model.voltages(jnp.where(label, 1 - change, 1.0)) for change in (1e-3, 1e-5))
+    )
+    np.testing.assert_allclose(100 * smaller, small, atol=0.02 * np.abs(small).max())
 
 
 @pytest.mark.parametrize(

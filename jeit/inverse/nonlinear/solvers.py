@@ -21,7 +21,7 @@ _Value = TypeVar("_Value")
 _MAX_STEPS = 30
 _REASONS = {
     Status.CONVERGED: "The next step would change the objective by less than the tolerance.",
-    Status.STEP_LIMIT: "Stopped after {} trial steps; raise max_steps, or the hyperparameter.",
+    Status.STEP_LIMIT: "Stopped after {}; raise max_steps, or the hyperparameter.",
     Status.STALLED: "No shorter step lowered the objective; the model is at odds with the data.",
 }
 
@@ -70,16 +70,18 @@ class AbstractSolver(eqx.Module):
         )
 
     def descent(self, max_steps: int, rtol: float) -> Descent:
-        """Its steps, for optimistix; the arguments hold where it has none of its own. Raises `ValueError` if it takes
-        other steps."""
+        """Its steps, for optimistix; the arguments hold where it has none of its own. Keeps the cost of the start and
+        of `max_steps` steps. Raises `ValueError` if it takes other steps."""
         raise ValueError(f"solver: {self.name} does not descend along quadratic models.")
 
 
 class GaussNewton(AbstractSolver):
     """Gauss-Newton steps with a backtracking line search; total variation by lagged diffusivity.
 
-    `max_steps`: 30 unless given, for an `Imager` 4. `rtol`: the relative change of the objective that ends the
-    iteration, 1e-6 unless given, with total variation 1e-4, for an `Imager` 1e-3.
+    `max_steps`: 30 unless given, for an `Imager` 4; a step that leads too far counts, and so does the shorter one tried
+    in its place. `rtol`: the iteration ends when the next step would change the objective by less than rtol times
+    itself, or times ½, what one voltage costs that is a standard deviation off; 1e-6 unless given, with total variation
+    1e-4, for an `Imager` 1e-3.
     """
 
     name: ClassVar[str] = "gauss-newton"
@@ -99,7 +101,7 @@ class GaussNewton(AbstractSolver):
 
     def descent(self, max_steps, rtol):
         """Without damping."""
-        return Descent(history=_first(self.max_steps, max_steps), rtol=_first(self.rtol, rtol))
+        return _steps(_first(self.max_steps, max_steps), _first(self.rtol, rtol))
 
 
 class LevenbergMarquardt(AbstractSolver):
@@ -129,8 +131,7 @@ class LevenbergMarquardt(AbstractSolver):
 
     def descent(self, max_steps, rtol):
         """With damping."""
-        steps, tolerance = _first(self.max_steps, max_steps), _first(self.rtol, rtol)
-        return Descent(history=steps, rtol=tolerance, damping=self.damping)
+        return _steps(_first(self.max_steps, max_steps), _first(self.rtol, rtol), self.damping)
 
 
 class LBFGSB(AbstractSolver):
@@ -192,9 +193,8 @@ class LeastSquares(AbstractSolver):
         """Of the residuals of data and prior together."""
         solution = _least_squares(inversion, start, self.solver, self.max_steps, {})
         costs = jnp.stack([_cost(inversion, start), _cost(inversion, solution.value)])
-        status = ended(solution.result)
-        reason = _REASONS[status].format(self.max_steps)
-        return Solved(solution.value, int(solution.stats["num_steps"]), costs, status, reason)
+        status, iterations = ended(solution.result), int(solution.stats["num_steps"])
+        return Solved(solution.value, iterations, costs, status, _REASONS[status].format(counted(iterations)))
 
 
 class OneStep(AbstractSolver):
@@ -243,6 +243,14 @@ def as_solver(solver: "AbstractSolver | optx.AbstractLeastSquaresSolver | str") 
     return solver
 
 
+def counted(iterations: int, shortened: int = 0) -> str:
+    """In words, how many iterations there were, and how many steps that had to be shortened."""
+    said = f"{iterations} iteration{'s' * (iterations != 1)}"
+    if not shortened:
+        return said
+    return f"{said} and {shortened} step{'s' * (shortened != 1)} that led too far"
+
+
 def expand(coefficients: Float[Array, " n"], inversion: Inversion):
     """Cost and step of a problem at these coefficients: the option `expand` of `jeit_solvers.Descent`."""
     return inversion.quadratic_model(coefficients)
@@ -269,11 +277,19 @@ def _least_squares(inversion: Inversion, start, solver, max_steps: int, options:
     return optx.least_squares(residual, solver, start, inversion, options=options, max_steps=max_steps, throw=False)
 
 
+def _steps(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
+    """As many steps, with room for the start. `atol` ends it where the objective itself goes to nothing, as that of an
+    undisturbed frame does, and no change is small beside it."""
+    return Descent(rtol=rtol, atol=0.5 * rtol, damping=damping, history=max_steps + 1)
+
+
 def _descend(descent: Descent, inversion: Inversion, start) -> Solved:
     solution = _least_squares(inversion, start, descent, descent.history, {"expand": expand})
-    accepted, status = int(solution.state.num_accepted), ended(solution.result)
-    reason = _REASONS[status].format(descent.history)
-    return Solved(solution.value, max(accepted - 1, 0), solution.state.history[:accepted], status, reason)
+    state, status = solution.state, ended(solution.result)
+    accepted = int(state.num_accepted)
+    iterations = max(accepted - 1, 0)
+    reason = _REASONS[status].format(counted(iterations, int(state.num_steps) - 1 - iterations))
+    return Solved(solution.value, iterations, state.history[:accepted], status, reason)
 
 
 def _between(minimise, inversion: Inversion, start, box, max_steps: int, tolerance: float) -> Solved:
@@ -284,8 +300,10 @@ def _between(minimise, inversion: Inversion, start, box, max_steps: int, toleran
     if found.converged:
         reason = "No step between the bounds would change the image much."
         return Solved(found.x, int(found.steps), costs, Status.CONVERGED, reason)
-    reason = _REASONS[Status.STEP_LIMIT].format(int(found.steps))
-    return Solved(found.x, int(found.steps), costs, Status.STEP_LIMIT, reason)
+    iterations = int(found.steps)
+    return Solved(
+        found.x, iterations, costs, Status.STEP_LIMIT, _REASONS[Status.STEP_LIMIT].format(counted(iterations))
+    )
 
 
 @eqx.filter_jit

@@ -160,7 +160,7 @@ class Imager(eqx.Module):
     @property
     def steps(self) -> int:
         """Most iterations that a frame is given."""
-        return 1 if self.solver.is_linear else self.solver.descent(_STEPS, _RTOL).history
+        return 1 if self.solver.is_linear else self.solver.descent(_STEPS, _RTOL).history - 1
 
     def weighing(self, usable: Bool[Array, " M"]) -> Weighing:
         """How to combine frames of which only the `usable` channels count."""
@@ -232,7 +232,7 @@ def _estimate(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate
         inversion = eqx.tree_at(lambda i: i.reference, inversion, inversion.estimate(expected))
     descent = imager.solver.descent(_STEPS, _RTOL)
     solution = optx.least_squares(
-        residual, descent, start, inversion, options={"expand": expand}, max_steps=descent.history, throw=False
+        residual, descent, start, inversion, options={"expand": expand}, max_steps=imager.steps, throw=False
     )
     # The last step leads to a point not looked at yet. It takes voltages, but no Jacobian, to see if it is better.
     state = solution.state

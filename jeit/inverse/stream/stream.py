@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jeit.inverse.nonlinear.solvers import counted
 from jeit.inverse.stream.imager import Imager
 from jeit_solvers import Status
 
@@ -108,7 +109,8 @@ class _Session:
         self.last = filled
         if not converged and status == FrameStatus.IMAGED:
             status = FrameStatus.STEP_LIMIT
-            reason = f"More than {self.imager.steps} iterations are needed for this frame."
+            done = counted(iterations, self.imager.steps - iterations)
+            reason = f"Stopped after {done}: this frame needs more than a frame is given."
         return FrameImage(number, conductivity, status, reason, usable, misfit, iterations, time.perf_counter() - begin)
 
     def _weigh(self, usable) -> None:
