@@ -229,7 +229,7 @@ COMMANDS = {
     "unknown format": (lambda t: good(t, "--format", "xls"), "no format 'xls'"),
     "another format": (lambda t: good(t, "--format", "kit4"), "not a readable .mat"),
     "no such description": (lambda t: good(t, "--description", "absent.toml"), "there is no such file"),
-    "no description": (lambda t: with_data(t, t.touched, description=None), "nothing says what they mean"),
+    "no description": (lambda t: with_data(t, t.touched, description=None)[:2], "nothing says what they mean"),
     "description is no TOML": (lambda t: spoilt(t, "[geometry]", "[geometry"), "not valid TOML"),
     "unknown key": (lambda t: spoilt(t, "radius", "diameter"), "no 'diameter'"),
     "negative radius": (lambda t: spoilt(t, "radius = 0.1", "radius = -0.1"), "positive length"),

@@ -91,8 +91,8 @@ def reconstruct(
     console = Console(highlight=False)
     with Steps(console, quiet=quiet) as step:
         step("read")
-        measurement = read(data, format, description)
         base = None if reference is None else read(reference, format, description)
+        measurement = read(data, format, description, like=base)
         chosen = None if frame is None else number_or_name(frame, int)
         result = image_difference(measurement, base, settings, frame=chosen, progress=step)
         step("write")

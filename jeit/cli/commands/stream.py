@@ -68,7 +68,7 @@ def stream(
     with Steps(console, quiet=quiet) as step:
         step("read")
         empty = read(reference, format, description)
-        measured = empty if data == "-" else read(Path(data), format, description)
+        measured = empty if data == "-" else read(Path(data), format, description, like=empty)
         imager, calibration = prepare_imager(empty, settings, measurement=measured, progress=step)
 
     def show(one) -> None:

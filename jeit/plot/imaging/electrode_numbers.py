@@ -8,7 +8,7 @@ from matplotlib.patheffects import withStroke
 from jeit.mesh import Mesh
 from jeit.plot.axes import INK
 
-# How far from its electrode's middle a number stands, and how near the edge an electrode lies on it, over the body's size.
+# Over the size of the body: how far a number stands from its electrode, and how near the edge one lies that is on it.
 _AWAY, _ON_EDGE = 0.058, 0.02
 # Free outside the outline, over that distance, or else the number stands inside.
 _ROOM = 1.6
