@@ -202,5 +202,6 @@ def find_decay(name: str | type[AbstractDecay]) -> type[AbstractDecay]:
     if isinstance(name, type) and issubclass(name, AbstractDecay):
         return name
     if name not in DECAYS:
-        raise ValueError(f"decay must be one of {', '.join(DECAYS)}, or a class like theirs; it is {name!r}.")
+        also = "" if isinstance(name, str) else ", or a class like theirs"
+        raise ValueError(f"decay must be one of {', '.join(DECAYS)}{also}; it is {name!r}.")
     return DECAYS[name]

@@ -110,8 +110,8 @@ def image_difference(
         if not largest > 1e-9 * float(calibration.conductivity):
             raise ValueError(
                 f"'{prepared.measurement.name}': the image is empty, no change reaches a billionth of the background. "
-                f"The hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give a "
-                "smaller one, or a rule."
+                f"The hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give "
+                "another, or a rule."
             )
     with clock("raster and inclusions"):
         grid = Raster.create(mesh, shape=settings.raster_shape)

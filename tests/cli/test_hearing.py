@@ -173,8 +173,10 @@ def test_a_touch_without_pauses(folder, tmp_path, capsys):
     command = ["locate", str(tmp_path / "shaken.npz"), "-c", str(folder / "sound.json"), "-o", str(tmp_path)]
     assert main(command) == 0
     assert {row["status"] for row in rows(tmp_path)} == {"no touch"}
-    assert "never pauses" in " ".join(capsys.readouterr().out.split())
-    assert "--silence" in json.loads((tmp_path / "report.json").read_text("utf-8"))["notes"][0]
+    told = " ".join(capsys.readouterr().out.split())
+    assert "never pauses" in told
+    assert "untouched (--silence)" in told
+    assert "silence=" in json.loads((tmp_path / "report.json").read_text("utf-8"))["notes"][0]
     assert main([*command, "--silence", str(tmp_path / "hush.npz"), "-q"]) == 0
     found = np.array([[float(row["x_m"]), float(row["y_m"])] for row in rows(tmp_path)])
     assert np.abs(found - [0.03, 0.02]).max() < 0.003

@@ -262,5 +262,5 @@ def test_constraints_that_cannot_be_met_are_reported():
     found = optimise(keep_out=(Rectangle(0.096, 0.096),), steps=1)
     assert found.status == "infeasible"
     assert found.shortfall[0] > 1e-3
-    assert "minimum_spacing lacks" in found.reason  # all are pressed into a corner
+    assert "minimum_spacing= lacks" in found.reason  # all are pressed into a corner
     assert found.layout is START

@@ -10,7 +10,7 @@ from jeit.cli.options import BandHigh, BandLow, Hop, Quiet, Window, intensity_se
 if TYPE_CHECKING:
     from jeit.acoustic.calibration.calibrate import CalibrationFit
 
-_OPTIONS = {"decay": "--decay", "path": "--output", "intensity": "--low, --high, --window and --hop"}
+_OPTIONS = {"path": "--output", "intensity": "--low, --high, --window and --hop"}
 # A relative error of the models that taps at places slightly wrong give.
 _MUCH = 0.3
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.options import Quiet
+from jeit.cli.options import Quiet, naming_options
 
 if TYPE_CHECKING:
     from jeit.design.study import Progress, Study
@@ -86,7 +86,8 @@ def report(file: File, output: Output = None, page: Page = None) -> None:
 def _read(file: Path, output: Path | None) -> "tuple[Study, Path]":
     from jeit.design.study import read_study
 
-    return read_study(file), output or file.with_suffix(".zarr")
+    with naming_options({"path": "STUDY.toml"}):
+        return read_study(file), output or file.with_suffix(".zarr")
 
 
 def _page(file: Path, store: Path, page: Path | None) -> Path:

@@ -168,9 +168,8 @@ class _Search(eqx.Module):
             nearest = int(lacking.argmin())
             parts = self.constraints.shortfalls(jnp.asarray(ends.centres[nearest]), jnp.asarray(ends.radii[nearest]))
             worst = max(parts, key=lambda name: float(jnp.max(parts[name], initial=-jnp.inf)))
-            reason = (
-                f"no start satisfies the constraints: {worst} lacks {1e3 * lacking.min():.3g} mm at best; ask for less."
-            )
+            least = 1e3 * lacking.min()
+            reason = f"no start satisfies the constraints: {worst}= lacks {least:.3g} mm at best; ask for less."
             return None, "infeasible", reason
         best = int(np.where(good, values, -np.inf).argmax())
         if fits and values[best] <= start_value + _ROUNDING * abs(start_value):
