@@ -47,25 +47,34 @@ class ImagingSettings:
             raise ValueError(f"method: there is no '{self.method}'; give one of {', '.join(METHODS)}.")
         known = self.prior in PRIORS if isinstance(self.prior, str) else isinstance(self.prior, AbstractPrior)
         if not known:
-            raise ValueError(f"prior: there is no {self.prior!r}; give one of {', '.join(PRIORS)}, or a prior.")
+            also = "" if isinstance(self.prior, str) else ", or a prior of jeit.inverse"
+            raise ValueError(f"prior: there is no {self.prior!r}; give one of {', '.join(PRIORS)}{also}.")
         if isinstance(self.prior, AbstractPrior) and not self.prior.is_quadratic:
             raise ValueError("prior: total variation is a method of its own; give method='total-variation'.")
         if self.hyperparameter is None:
             object.__setattr__(self, "hyperparameter", METHODS[self.method].hyperparameter)
-        elif isinstance(self.hyperparameter, str):
-            if self.hyperparameter not in RULES:
-                raise ValueError(
-                    f"hyperparameter: '{self.hyperparameter}' is neither a number nor a rule; the rules are "
-                    f"{', '.join(RULES)}."
-                )
-            if (number := METHODS[self.method].number) is not None:
+        else:
+            check_hyperparameter(self.hyperparameter)
+            if isinstance(self.hyperparameter, str) and (number := METHODS[self.method].number) is not None:
                 name = self.method.replace("-", " ").replace("back ", "back-")
                 raise ValueError(f"hyperparameter: {name} takes a number such as {number:g}, not a rule.")
-        elif isinstance(self.hyperparameter, bool) or not (
-            np.isfinite(self.hyperparameter) and self.hyperparameter > 0
-        ):
-            raise ValueError(f"hyperparameter must be a positive number or a rule; it is {self.hyperparameter}.")
-        if self.contact is not None and self.contact not in CONTACTS:
-            raise ValueError(f"contact: there is no '{self.contact}'; give one of {', '.join(CONTACTS)}.")
-        if not 50 <= self.num_points <= 100_000:
-            raise ValueError(f"num_points: give 50 to 100,000 nodes of the mesh; it is {self.num_points}.")
+        check_body(self.contact, self.num_points)
+
+
+def check_body(contact: str | None, num_points: int) -> None:
+    """Raises `ValueError` for a calibration that there is not, and for meshes too coarse or too fine."""
+    if contact is not None and contact not in CONTACTS:
+        raise ValueError(f"contact: there is no '{contact}'; give one of {', '.join(CONTACTS)}.")
+    if not 50 <= num_points <= 100_000:
+        raise ValueError(f"num_points: give 50 to 100,000 nodes of the mesh; it is {num_points}.")
+
+
+def check_hyperparameter(hyperparameter: float | str) -> None:
+    """Raises `ValueError` for what is neither a positive number nor a rule."""
+    if isinstance(hyperparameter, str):
+        if hyperparameter not in RULES:
+            raise ValueError(
+                f"hyperparameter: '{hyperparameter}' is neither a number nor a rule; the rules are {', '.join(RULES)}."
+            )
+    elif isinstance(hyperparameter, bool) or not (np.isfinite(hyperparameter) and hyperparameter > 0):
+        raise ValueError(f"hyperparameter must be a positive number or a rule; it is {hyperparameter}.")

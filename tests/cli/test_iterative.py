@@ -7,6 +7,10 @@ import json
 import numpy as np
 import pytest
 
+from jeit.data import read, write_table
+from jeit.imaging import StreamSettings
+from jeit.inverse.stream.imager import FRAME_STEPS
+
 FEW = ("--num-points", 250)
 
 
@@ -58,7 +62,7 @@ def rows_of(folder):
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("method", ["linear", "gauss-newton"])
+@pytest.mark.parametrize("method", ["one-step", "gauss-newton"])
 def test_a_stream_from_a_file(method, tank, run, tmp_path):
     bad = tank.touched.copy()
     bad[3] = np.nan
@@ -84,22 +88,52 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
     gap = ",".join([first, "", *others[1:]])
     monkeypatch.setattr("sys.stdin", io.StringIO(f"{good}\n\nrubbish\n{good.replace(' ', ',')}\n1 2 3\n{gap}\n"))
     status, _, error = run(
-        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "linear",
+        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "one-step",
         "--quiet", *FEW,
     )  # fmt: skip
     assert (status, error) == (0, "")
     assert [row["status"] for row in rows_of(tmp_path / "out")] == [
         "imaged", "refused", "imaged", "refused", "partial",
     ]  # fmt: skip
+    # One whose frames are all refused says why, and fails; what it leaves has the reasons.
+    monkeypatch.setattr("sys.stdin", io.StringIO("1 2 3\nrubbish\n"))
+    status, _, error = run(
+        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "one-step",
+        "--quiet", *FEW,
+    )  # fmt: skip
+    assert (status, error.count("\n")) == (1, 1)
+    assert "none of 2 frames could be imaged" in error
+    assert "not 40 real voltages" in error
+    assert [row["status"] for row in rows_of(tmp_path / "out")] == ["refused", "refused"]
     # A stream that fails leaves no images of an earlier one behind.
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     assert (tmp_path / "out" / "images.npz").exists()
     status, _, error = run(
-        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "linear",
+        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "one-step",
         "--quiet", *FEW,
     )  # fmt: skip
     assert (status, "no frame" in error) == (1, True)
     assert not (tmp_path / "out" / "images.npz").exists()
+
+
+def test_a_stream_borrows_the_description_of_its_reference(tank, run, tmp_path):
+    """Of an NPZ written by jeit, whose description lies beside it; the frames lie elsewhere, with none."""
+    write_table(read(tank.folder / "rest.csv"), tmp_path / "empty.npz")
+    (tmp_path / "live").mkdir()
+    np.savetxt(tmp_path / "live" / "frames.csv", tank.touched[None], delimiter=",")
+    options = ("--reference", tmp_path / "empty.npz", "--output", tmp_path / "out", "--method", "one-step", *FEW)
+    status, text, error = run("stream", tmp_path / "live" / "frames.csv", *options)
+    assert (status, error) == (0, "")
+    assert "1 frame: 1 imaged" in text
+
+
+def test_the_help_of_a_stream_tells_the_defaults(run):
+    settings = StreamSettings()
+    told = " ".join(run("stream", "--help")[1].replace("│", " ").split())
+    assert f"{settings.solver.name} (default)" in told
+    assert f"(default {settings.num_points})" in told
+    assert f"{settings.memory:g} (default)" in told
+    assert f"(default {FRAME_STEPS})" in told
 
 
 @pytest.mark.parametrize(
@@ -108,9 +142,15 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
         (("reconstruct", "--method", "newton"), "gauss-newton"),
         (("reconstruct", "--method", "total-variation", "--prior", "noser"), "--prior"),
         (("reconstruct", "--method", "total-variation", "--hyperparameter", "gcv"), "takes a number"),
-        (("stream", "--method", "one-step"), "gauss-newton"),
-        (("stream", "--steps", "0"), "steps"),
-        (("stream", "--hyperparameter", "magic"), "magic"),
+        (
+            ("stream", "--method", "magic"),
+            "--method: there is no 'magic'; give one of one-step, gauss-newton, levenberg",
+        ),
+        (("stream", "--method", "l-bfgs-b"), "--method: l-bfgs-b does not image frames in a bounded time"),
+        (("stream", "--steps", "0"), "--steps must be"),
+        (("stream", "--memory", "-1"), "--memory must be"),
+        (("stream", "--hyperparameter", "magic"), "--hyperparameter: 'magic'"),
+        (("stream", "--contact", "firm"), "--contact: there is no 'firm'"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(arguments, words, tank, run, tmp_path):

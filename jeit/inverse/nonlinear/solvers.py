@@ -1,6 +1,6 @@
 """Solvers of the nonlinear problem, as small objects that say how many steps they take and what they can do.
 
-`SOLVERS` has them by name, and `solver_named` is where a name becomes an object.
+`SOLVERS` has them by name, and `as_solver` is where a name becomes an object.
 """
 
 import abc
@@ -65,8 +65,7 @@ class AbstractSolver(eqx.Module):
         """Itself with these settings where it has none of its own, for an `Imager`. Raises `ValueError` if it is not
         one that images a frame in a bounded time."""
         raise ValueError(
-            f"solver: {self.name} does not image frames in a bounded time; take linear, gauss-newton or "
-            "levenberg-marquardt."
+            f"solver: {self.name} does not image frames in a bounded time; take one of {', '.join(frame_solvers())}."
         )
 
     def descent(self, max_steps: int, rtol: float) -> Descent:
@@ -200,7 +199,7 @@ class LeastSquares(AbstractSolver):
 class OneStep(AbstractSolver):
     """The linear image, one Gauss-Newton step from the background: for an `Imager`."""
 
-    name: ClassVar[str] = "linear"
+    name: ClassVar[str] = "one-step"
 
     @property
     def is_linear(self):
@@ -222,23 +221,27 @@ SOLVERS: dict[str, type[AbstractSolver]] = {
 """Solvers by name."""
 
 
-def solver_named(name: str, argument: str = "solver") -> AbstractSolver:
-    """The solver of that name in `SOLVERS`, with its defaults. Raises `ValueError`, about `argument`, for others."""
-    if name not in SOLVERS:
-        raise ValueError(f"{argument}: there is no '{name}'; give one of {', '.join(SOLVERS)}.")
-    return SOLVERS[name]()
+def frame_solvers() -> tuple[str, ...]:
+    """Names of those that image frames in a bounded time, for an `Imager`."""
+    return tuple(name for name, one in SOLVERS.items() if one.for_frames is not AbstractSolver.for_frames)
 
 
-def as_solver(solver: "AbstractSolver | optx.AbstractLeastSquaresSolver | str") -> AbstractSolver:
-    """A solver itself, or the one meant by a name or by a solver of optimistix. Raises `ValueError` for others."""
+def as_solver(
+    solver: "AbstractSolver | optx.AbstractLeastSquaresSolver | str", *, frames: bool = False
+) -> AbstractSolver:
+    """A solver itself, or the one meant by a name in `SOLVERS` or by a solver of optimistix. Raises `ValueError` for
+    others, and says which there are: of frames, or else of reconstructions."""
+    names = frame_solvers() if frames else tuple(name for name, one in SOLVERS.items() if not one().is_linear)
     if isinstance(solver, str):
-        return solver_named(solver)
+        if solver not in SOLVERS:
+            raise ValueError(f"solver: there is no '{solver}'; give one of {', '.join(names)}.")
+        return SOLVERS[solver]()
     if isinstance(solver, optx.AbstractLeastSquaresSolver):
         return LeastSquares(solver)
     if not isinstance(solver, AbstractSolver):
         raise ValueError(
             f"solver must be one of jeit.inverse.nonlinear, such as GaussNewton(), the name of one "
-            f"({', '.join(SOLVERS)}), or a least-squares solver of optimistix; it is {solver!r}."
+            f"({', '.join(names)}), or a least-squares solver of optimistix; it is {solver!r}."
         )
     return solver
 

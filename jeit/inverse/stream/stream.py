@@ -178,7 +178,10 @@ class _Session:
                 return values, none, FrameStatus.REFUSED, reason
         if count < np.count_nonzero(self.mask):
             missing = np.count_nonzero(self.mask) - count
-            return values, usable, FrameStatus.PARTIAL, f"{missing} channels have no reading and are left out."
+            lacking = (
+                "1 channel has no reading and is" if missing == 1 else f"{missing} channels have no reading and are"
+            )
+            return values, usable, FrameStatus.PARTIAL, f"{lacking} left out."
         return values, usable, FrameStatus.IMAGED, ""
 
     def _without_dead_electrode(self, difference, usable):
