@@ -113,11 +113,13 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         },
         "hyperparameter": {
             "value": float(reconstruction.hyperparameter),
-            "chosen_by": reconstruction.rule,
+            "chosen_by": result.chosen_by,
             "note": (reconstruction.choice.note or None) if reconstruction.choice is not None else None,
         },
         "inclusions": [_inclusion(result, one) for one in result.inclusions],
-        "inclusion_settings": {"level": settings.level, "least_peak": settings.least_peak},
+        "inclusion_settings": {"level": settings.level, "least_peak": settings.least_peak}
+        if result.labels is None
+        else {"found_in": "labels"},
         "timings": {**result.timings, "unit": "s"},
         "versions": {name: version_of(name) for name in _PACKAGES},
     }
