@@ -89,10 +89,11 @@ def measurement_from(
         raise ValueError(
             f'{described.origin}: no protocol: add a [protocol] section with kind = "adjacent" or another.'
         )
-    names = described.layout.frame_names
-    if names and len(names) != len(np.atleast_2d(frames)):
+    names, number = described.layout.frame_names, len(np.atleast_2d(frames))
+    if names and len(names) != number:
         raise ValueError(
-            f"{described.origin}: [data] names {len(names)} frames, but {path.name} holds {len(np.atleast_2d(frames))}."
+            f"{described.origin}: [data] frame_names must be as many as the frames of {path.name}, {number}; they are "
+            f"{len(names)}."
         )
     return screen(
         frames * described.layout.scale,
@@ -148,8 +149,7 @@ def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
             ) from None
         if len(rows[-1]) != len(rows[0]):
             raise ValueError(
-                f"{path.name}, line {number} has {len(rows[-1])} numbers, the first {len(rows[0])}. Is the "
-                "file cut off?"
+                f"{path.name}, line {number} has length {len(rows[-1])}, the first {len(rows[0])}. Is the file cut off?"
             )
     if not rows:
         raise ValueError(f"{path.name} holds no numbers.")

@@ -253,7 +253,7 @@ COMMANDS = {
     ),
     "unknown unit": (lambda t: spoilt(t, 'unit = "V"', 'unit = "dB"'), "unit must be one of V"),
     "header not skipped": (lambda t: with_data(t, "a,b\n1,2"), "line 1"),
-    "ragged rows": (lambda t: with_data(t, "1,2,3\n1,2"), "line 2 has 2 numbers"),
+    "ragged rows": (lambda t: with_data(t, "1,2,3\n1,2"), "line 2 has length 2"),
     "too few channels": (lambda t: with_data(t, t.touched[:-1]), "40 channels"),
     "transposed": (lambda t: with_data(t, t.touched[:, None]), "transposed"),
     "all zero": (lambda t: with_data(t, 0 * t.touched), "every usable voltage is zero"),

@@ -73,7 +73,7 @@ def test_optimised_layout_is_better_by_far(found):
     assert found.scores.soft_worst > 2 * before.soft_worst
     assert found.scores.mean_variance < 0.7 * before.mean_variance
     assert found.status in ("converged", "step limit")
-    assert "3 satisfy" in found.reason
+    assert "satisfied by 3" in found.reason
 
 
 def test_all_starts_satisfy_all_constraints(found):

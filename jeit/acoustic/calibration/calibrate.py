@@ -142,8 +142,8 @@ def _check(kind: type[AbstractDecay], distance, power, faults) -> Bool[np.ndarra
     enough = places >= needed
     if enough.sum() < 3:
         raise ValueError(
-            f"only {enough.sum()} microphones heard taps from {needed} distances or more, and three are needed to "
-            f"calibrate a decay model of {len(kind.parameters)} parameters: tap all over the skin. "
+            f"only {enough.sum()} of {len(enough)} microphones heard taps from {needed} distances or more, and three "
+            f"are needed to calibrate a decay model of {len(kind.parameters)} parameters: tap all over the skin. "
             f"{describe_faults(faults)}".strip()
         )
     return enough
@@ -172,7 +172,7 @@ def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[
         if fit.held[k] == ABOVE:
             reasons.append("what it hears does not fall with distance")
         elif heard < needed:
-            reasons.append(f"it heard {heard} taps only, {needed} are needed")
+            reasons.append(f"it heard {heard} of the taps only, and {needed} are needed")
         elif not share[k] >= _LEAST_EXPLAINED:
             reasons.append(f"its model explains {100 * max(share[k], 0):.0f} % of what it heard")
         elif relative[k] > _UNLIKE * max(typical, _WELL):

@@ -120,7 +120,7 @@ def show(console, result: "ImagedDifference") -> None:
         ("difference", f"{percent(result.quality.difference)} of the reference"),
         ("noise in it", "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"),
         ("method", f"{result.settings.method}, hyperparameter {chosen}"),
-        ("mesh", f"{result.mesh.num_points:,} nodes, {result.mesh.num_cells:,} cells"),
+        ("mesh", f"{counted(result.mesh.num_points, 'node')}, {counted(result.mesh.num_cells, 'cell')}"),
     ]
     if calibration.status != Status.CONVERGED:
         rows.insert(1, ("calibration", f"{calibration.status}. {calibration.reason}"))

@@ -59,12 +59,13 @@ def resume(
 @study.command()
 def status(file: File, output: Output = None) -> None:
     """Say how far a study is."""
+    from jeit.cli.console import counted
     from jeit.design.study import study_progress
 
     sweep, store = _read(file, output)
     if not store.exists():
-        chunks = len(sweep.chunks)
-        typer.echo(f"{sweep.name}: not begun; {len(sweep.points)} points in {chunks} chunks.")
+        points, chunks = counted(len(sweep.points), "point"), counted(len(sweep.chunks), "chunk")
+        typer.echo(f"{sweep.name}: not begun; {points} in {chunks}.")
         return
     now = study_progress(sweep, store)
     typer.echo(

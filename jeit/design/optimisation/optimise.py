@@ -174,7 +174,7 @@ class _Search(eqx.Module):
         best = int(np.where(good, values, -np.inf).argmax())
         if fits and values[best] <= start_value + _ROUNDING * abs(start_value):
             return None, status, "no start is better than the layout given."
-        reason = f"start {best + 1} of {len(values)} is best; {good.sum()} satisfy the constraints."
+        reason = f"start {best + 1} of {len(values)} is best; the constraints are satisfied by {good.sum()}."
         if not fits:
             reason += (
                 " The layout given does not satisfy what is asked, and was changed until it did before the first step."
