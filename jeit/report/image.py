@@ -152,6 +152,7 @@ def _calibration(result: ImagedDifference) -> dict[str, Any]:
         "contact_impedance": None if electrodes.is_point else electrodes.contact_impedance,
         "contact_impedance_unit": "ohm·m" if result.mesh.dimension == 2 else "ohm·m²",
         "relative_misfit": float(calibration.misfit),
+        "note": calibration.note or None,
         "iterations": calibration.iterations,
         "status": str(calibration.status),
         "reason": calibration.reason or None,

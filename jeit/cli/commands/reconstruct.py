@@ -122,6 +122,8 @@ def show(console, result: "ImagedDifference") -> None:
         ("method", f"{result.settings.method}, hyperparameter {chosen}"),
         ("mesh", f"{counted(result.mesh.num_points, 'node')}, {counted(result.mesh.num_cells, 'cell')}"),
     ]
+    if calibration.note:
+        rows.insert(1, ("note", calibration.note))
     if calibration.status != Status.CONVERGED:
         rows.insert(1, ("calibration", f"{calibration.status}. {calibration.reason}"))
     if reconstruction.choice is not None and reconstruction.choice.note:
