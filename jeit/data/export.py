@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,14 +37,15 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
     lines += ["", "[protocol]", *_assignments(_protocol(protocol))]
     component = "complex" if np.iscomplexobj(measurement.voltages) else "real"
     lines += ["", "[data]", *_assignments({"frames_in": "rows", "component": component})]
+    arrays: dict[str, Any] = {part: np.asarray(getattr(protocol, part)) for part in PROTOCOL_ARRAYS}
     np.savez_compressed(
         file,
         voltages=np.asarray(measurement.voltages),
         mask=np.asarray(measurement.mask),
         frame_names=np.array(measurement.frame_names, str),
         notes=np.array(measurement.notes, str),
-        **{part: np.asarray(getattr(protocol, part)) for part in PROTOCOL_ARRAYS},
         protocol_name=np.asarray(protocol.name),
+        **arrays,
     )
     description = file.with_suffix(".toml")
     description.write_text("\n".join(lines) + "\n", "utf-8")

@@ -43,12 +43,15 @@ def read(path: Path, description: str | Path | None = None, like: Measurement | 
     when there is no description, or when file and description disagree.
     """
     which = find_description(path) if description is None else description
-    if which is None and like is None:
+    if which is not None:
+        described = load_description(which)
+    elif like is not None:
+        described = _borrowed(like)
+    else:
         raise ValueError(
             f"description: {path.name} is a table of numbers, and nothing says what they mean. Put a description "
             f"beside it, {path.with_suffix('.toml').name} (geometry, electrodes, protocol), or name one."
         )
-    described = _borrowed(like) if which is None and like is not None else load_description(which)
     if path.suffix.lower() in (".npz", ".npy"):
         arrays = _from_numpy(path)
         table, mask, protocol = _voltages(arrays, described.layout, path), arrays.get("mask"), None

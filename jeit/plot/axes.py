@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.ticker import MaxNLocator
-from matplotlib.transforms import offset_copy
+from matplotlib.transforms import ScaledTranslation
 
 INK = "#26292e"
 SOFT = "#8b9098"
@@ -75,7 +75,7 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
     x, y = x_min - 0.06 * size, y_min - 0.125 * size
     ax.plot([x, x + length], [y, y], color=INK, linewidth=2.5, solid_capstyle="butt")
     millimetres = 1e3 * length
-    below = offset_copy(ax.transData, ax.get_figure(), y=-3, units="points")
+    below = ax.transData + ScaledTranslation(0, -3 / 72, ax.figure.dpi_scale_trans)
     ax.text(x, y, f"{millimetres:g} mm", transform=below, ha="left", va="top", color=INK, fontsize=9)
 
 

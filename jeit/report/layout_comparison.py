@@ -39,6 +39,7 @@ def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
 
 def draw_layout_comparison(result: LayoutComparison):
     """Maps of sensitivity and of taxels of both, on one scale, and their histograms, as a matplotlib `Figure`."""
+    from matplotlib.artist import Artist
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch, PathPatch
@@ -69,14 +70,12 @@ def draw_layout_comparison(result: LayoutComparison):
             bare(ax, outline.extent, numbered=False)
     plot_sensitivity_histograms({name: one.sensitivity for name, one in zip(names, both, strict=True)}, ax=axes[0, 2])
     plot_taxel_areas({name: one.taxels for name, one in zip(names, both, strict=True)}, ax=axes[1, 2])
-    disc = {"marker": "o", "linestyle": "none", "markerfacecolor": "white", "markeredgecolor": INK}
-    handles = [
-        Line2D([], [], label="electrode", **disc),
-        Patch(facecolor="white", edgecolor=INK, linewidth=0.9, label=f"not touched: {1e3 * result.margin:.3g} mm wide"),
-    ]
-    figure.legend(
-        handles=handles if result.margin > 0 else handles[:1], loc="outside lower left", ncols=2, frameon=False
-    )
+    disc: dict[str, Any] = {"marker": "o", "linestyle": "none", "markerfacecolor": "white", "markeredgecolor": INK}
+    handles: list[Artist] = [Line2D([], [], label="electrode", **disc)]
+    if result.margin > 0:
+        untouched = f"not touched: {1e3 * result.margin:.3g} mm wide"
+        handles.append(Patch(facecolor="white", edgecolor=INK, linewidth=0.9, label=untouched))
+    figure.legend(handles=handles, loc="outside lower left", ncols=2, frameon=False)
     return figure
 
 

@@ -107,12 +107,13 @@ def _show(console, fit: "CalibrationFit", taps: "Taps") -> None:
 
 def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
     """The Cramér-Rao bound where it was tapped, as loudly: standard deviation along its worst direction, metres."""
+    import jax.numpy as jnp
     import numpy as np
 
     from jeit.acoustic import cramer_rao
 
     heard, usable = fit.strength > 0, np.asarray(fit.calibration.usable)
-    places, strength = np.asarray(taps.positions)[heard], fit.strength[heard]
+    places, strength = jnp.asarray(taps.positions[heard]), jnp.asarray(fit.strength[heard])
     bound = cramer_rao(fit.calibration.microphone_array, places, strength, use=usable)
     return float(np.median(np.sqrt(np.linalg.eigvalsh(bound)[:, -1])))
 
