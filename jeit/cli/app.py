@@ -19,6 +19,7 @@ from jeit.cli.commands.locate import locate
 from jeit.cli.commands.reconstruct import reconstruct
 from jeit.cli.commands.stream import stream
 from jeit.cli.commands.study import study
+from jeit.cli.options import naming_options
 
 app = typer.Typer(
     name="jeit",
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for output in (sys.stdout, sys.stderr):
         if isinstance(output, io.TextIOWrapper):
             output.reconfigure(errors="replace")  # a terminal that knows no Greek must not end the run
-    command = typer.main.get_command(app)
+    command = as_command()
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
@@ -77,6 +78,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         return _explain(error)
     return status if isinstance(status, int) else 0
+
+
+def as_command():
+    """All of it as one command of click, whose errors speak of options where jeit's speak of arguments."""
+    command = typer.main.get_command(app)
+    _name_options(command)
+    return command
+
+
+def _name_options(command) -> None:
+    """Let every command's errors say the option where jeit says the argument of that name."""
+    for one in getattr(command, "commands", {}).values():
+        _name_options(one)
+    options = {one.name: max(one.opts, key=len) for one in command.params if one.param_type_name == "option"}
+    if command.callback is not None and options:
+        command.callback = naming_options(options)(command.callback)
 
 
 def _explain(error: Exception) -> int:

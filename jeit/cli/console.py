@@ -5,6 +5,8 @@ import time
 from rich.console import Console
 from rich.table import Table
 
+_PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
+
 
 class Steps:
     """Progress on standard output: the step under way with a spinner, steps done with the seconds they took.
@@ -58,14 +60,26 @@ def pairs(title: str, rows: list[tuple[str, str]]) -> Table:
     return table
 
 
+def counted(number: int, noun: str) -> str:
+    """So many of a thing: "1 frame", "1,000 frames"."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def scaled(value: float | None, unit: str) -> str:
     """A value with three digits and an SI prefix: 0.00132 S is "1.32 mS"."""
     if value is None:
         return "not known"
-    for exponent, prefix in ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n")):
+    for exponent, prefix in _PREFIXES:
         if abs(value) >= 10.0**exponent:
             return f"{value / 10.0**exponent:.3g} {prefix}{unit}"
     return f"{value:.3g} {unit}"
+
+
+def in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
+    """A unit with the SI prefix that suits the largest of the values, and all of them in it, for a table's column."""
+    largest = max((abs(value) for value in values), default=0.0)
+    exponent, prefix = next((pair for pair in _PREFIXES if largest >= 10.0 ** pair[0]), _PREFIXES[0])
+    return f"{prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
 
 
 def percent(value: float | None) -> str:

@@ -1,5 +1,6 @@
 """Options and arguments that several commands share."""
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,21 +44,29 @@ Hop = Annotated[
 
 @contextmanager
 def naming_options(options: dict[str, str]) -> Iterator[None]:
-    """Errors that begin with the name of one of these arguments begin with that of its option instead.
+    """Errors that speak of these arguments speak of their options instead, see `in_options`."""
+    try:
+        yield
+    except (ValueError, FileNotFoundError) as error:
+        said = str(error)
+        if (told := in_options(said, options)) == said:
+            raise
+        raise ValueError(told) from error
+
+
+def in_options(said: str, options: dict[str, str]) -> str:
+    """What jeit says of its arguments, at the beginning of a sentence or as `name=`, said of a command's options.
 
     An option in millimetres says so in its name: whether they were given for metres is not asked.
     """
     from jeit.arguments import IN_MILLIMETRES
 
-    try:
-        yield
-    except ValueError as error:
-        said = str(error)
-        for argument, option in options.items():
-            if said.startswith((f"{argument} ", f"{argument}:")):
-                said = said.replace(f"; {IN_MILLIMETRES}", ".") if option.endswith("-mm") else said
-                raise ValueError(option + said.removeprefix(argument)) from error
-        raise
+    for argument, option in options.items():
+        if said.startswith((f"{argument} ", f"{argument}:")):
+            said = said.replace(f"; {IN_MILLIMETRES}", ".") if option.endswith("-mm") else said
+            said = option + said.removeprefix(argument)
+        said = re.sub(rf"\b{argument}=(?!\w)", option, said)
+    return said
 
 
 def check_positive(options: dict[str, float]) -> None:

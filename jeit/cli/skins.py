@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.options import check_within
+from jeit.cli.options import check_within, naming_options
 
 if TYPE_CHECKING:
     from jeit.layout import Layout
@@ -40,12 +40,13 @@ def read_with_outline(name: str, width: float, height: float) -> "Layout":
             check_within(option, side, 1e3 * SMALLEST, 1e3 * LARGEST, "mm")
         return Rectangle(1e-3 * width, 1e-3 * height)
 
-    if not Path(name).suffix:
-        found = named_layout(name) if name.startswith("park-") else named_layout(name, given())
-    else:
-        found = read_layout(name)
-        if found.outline is None:
-            found = read_layout(name, outline=given())
+    with naming_options({"name": "layout", "path": "layout"}):
+        if not Path(name).suffix:
+            found = named_layout(name) if name.startswith("park-") else named_layout(name, given())
+        else:
+            found = read_layout(name)
+            if found.outline is None:
+                found = read_layout(name, outline=given())
     if found.num_electrodes < 3:
         raise ValueError(f"'{found.name}' has {found.num_electrodes} electrodes; give a layout of three or more.")
     return found

@@ -8,8 +8,9 @@ Sections (`tank6cm.toml` in this folder is an example; only `[protocol]` must be
   they are: `layout` = "ring" (disk: `number`, `start_angle_degrees`, `clockwise`), "perimeter" (`number`,
   `start`) or `positions`.
 - `[protocol]`: `kind` = name of a constructor in `jeit.protocol` with its arguments, or "matrices" with
-  `drive` (S, L) in amperes and `measurement` (K, L). `current` in amperes, or `current_unit`;
-  `current_from_name`, a regular expression that finds it in the file's name.
+  `drive` (S, L) in amperes and `measurement` (K, L), or "channels" with those and `drive_index` (M,) and
+  `measurement_index` (M,), from 0. `current` in amperes, or `current_unit`; `current_from_name`, a regular
+  expression that finds it in the file's name.
 - `[data]`: `frames_in` = "columns" or "rows"; `delimiter`, `skip_rows`; `complex_pairs`, `component`; `gain`,
   `polarity`, `unit`, `saturation`; `frame_names`; `keys`, the variables to read from a .mat or .npz file.
 - `[notes]`: `text`, a list of sentences to carry along.
@@ -37,6 +38,7 @@ CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
 VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
 ELECTRODES = {"boundary": BoundaryElectrodes, "disc": SheetDiscs, "point": PointElectrodes}
 BUNDLED = ("tank6cm",)
+PROTOCOL_ARRAYS = ("drive", "measurement", "drive_index", "measurement_index")
 
 # What makes each outline, and whether it must be told.
 _OUTLINE_ARGUMENTS = {
@@ -264,29 +266,49 @@ def _layout(section: dict, origin: str) -> TableLayout:
 
 def _protocol(section: dict, electrodes, path: Path, origin: str) -> Protocol:
     where = "[protocol]"
-    kind = _choice(_need(section, "kind", origin, where), (*_PROTOCOL_OPTIONS, "matrices"), origin, f"{where} kind")
-    common = {"kind", "number", "current", "current_from_name", "current_unit", "name"}
+    kinds = (*_PROTOCOL_OPTIONS, "matrices", "channels")
+    kind = _choice(_need(section, "kind", origin, where), kinds, origin, f"{where} kind")
     try:
         if kind == "matrices":
-            known = {"kind", "name", "drive", "measurement", "select"}
-            _refuse_unknown(section, known, origin, f"{where} matrices")
-            select = section.get("select")
-            return protocols.from_matrices(
-                _need(section, "drive", origin, where),
-                _need(section, "measurement", origin, where),
-                None if select is None else np.asarray(select, bool),
-                name=section.get("name", "matrices"),
-            )
-        _refuse_unknown(section, common | _PROTOCOL_OPTIONS[kind], origin, f"{where} {kind}")
-        number = section.get("number", None if electrodes is None else electrodes.num_electrodes)
-        if number is None:
-            raise ValueError(f"{origin}: {where} needs 'number' (of electrodes), or an [electrodes] section.")
-        if kind == "reference_electrode" and "number" not in section:
-            number -= 1  # that constructor counts the boundary only
-        options = {key: value for key, value in section.items() if key in _PROTOCOL_OPTIONS[kind]}
-        return getattr(protocols, kind)(number, current=_current(section, path, origin), **options)
+            return _from_matrices(section, origin)
+        if kind == "channels":
+            return _from_channels(section, origin)
+        return _constructed(kind, section, electrodes, path, origin)
     except (ValueError, TypeError) as error:
         raise _located(error, origin, where) from None
+
+
+def _from_matrices(section: dict, origin: str) -> Protocol:
+    where = "[protocol]"
+    _refuse_unknown(section, {"kind", "name", "drive", "measurement", "select"}, origin, f"{where} matrices")
+    select = section.get("select")
+    return protocols.from_matrices(
+        _need(section, "drive", origin, where),
+        _need(section, "measurement", origin, where),
+        None if select is None else np.asarray(select, bool),
+        name=section.get("name", "matrices"),
+    )
+
+
+def _from_channels(section: dict, origin: str) -> Protocol:
+    where = "[protocol]"
+    _refuse_unknown(section, {"kind", "name", *PROTOCOL_ARRAYS}, origin, f"{where} channels")
+    arrays = {part: np.asarray(_need(section, part, origin, where)) for part in PROTOCOL_ARRAYS}
+    return Protocol(**arrays, name=section.get("name", "channels"))
+
+
+def _constructed(kind: str, section: dict, electrodes, path: Path, origin: str) -> Protocol:
+    """By the constructor of that name."""
+    where = "[protocol]"
+    common = {"kind", "number", "current", "current_from_name", "current_unit", "name"}
+    _refuse_unknown(section, common | _PROTOCOL_OPTIONS[kind], origin, f"{where} {kind}")
+    number = section.get("number", None if electrodes is None else electrodes.num_electrodes)
+    if number is None:
+        raise ValueError(f"{origin}: {where} needs 'number' (of electrodes), or an [electrodes] section.")
+    if kind == "reference_electrode" and "number" not in section:
+        number -= 1  # that constructor counts the boundary only
+    options = {key: value for key, value in section.items() if key in _PROTOCOL_OPTIONS[kind]}
+    return getattr(protocols, kind)(number, current=_current(section, path, origin), **options)
 
 
 def _current(section: dict, path: Path, origin: str) -> float:

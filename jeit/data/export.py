@@ -2,22 +2,25 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from jeit.data.description import ELECTRODES
+from jeit.data.description import ELECTRODES, PROTOCOL_ARRAYS
 from jeit.data.measurement import Measurement
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Domain
 from jeit.mesh.outline import OUTLINES
+from jeit.protocol import Protocol
 
 
 def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]:
     """Write `path` (.npz) and a description of the same name (.toml); return both paths.
 
-    The NPZ holds `voltages` (F, M) volts, `mask` (F, M), and the protocol's `drive` (S, L) amperes,
-    `measurement` (K, L), `drive_index` (M,), `measurement_index` (M,), `protocol_name`. The TOML holds
-    geometry, electrodes, frame names and notes. `read` gives the same measurement back.
+    The NPZ holds `voltages` (F, M) volts, `mask` (F, M), `frame_names` and `notes`; and the protocol's `drive` (S, L)
+    amperes, `measurement` (K, L), `drive_index` (M,), `measurement_index` (M,), `protocol_name`. The TOML holds
+    geometry, electrodes and protocol, and so describes any table of the same sensor. `read` gives the same measurement
+    back.
 
     Raises `ValueError` for another suffix, and for electrodes or domains that a description cannot say (3-D, an
     outline of your own).
@@ -30,22 +33,19 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
         lines += ["", "[geometry]", *_assignments(_geometry(measurement.domain))]
     if measurement.electrodes is not None:
         lines += ["", "[electrodes]", *_assignments(_electrodes(measurement.electrodes))]
-    component = "complex" if np.iscomplexobj(measurement.voltages) else "real"
-    layout: dict = {"frames_in": "rows", "component": component}
-    if measurement.frame_names:
-        layout["frame_names"] = list(measurement.frame_names)
-    lines += ["", "[data]", *_assignments(layout)]
-    lines += ["", "[notes]", *_assignments({"text": list(measurement.notes)})]
     protocol = measurement.protocol
+    lines += ["", "[protocol]", *_assignments(_protocol(protocol))]
+    component = "complex" if np.iscomplexobj(measurement.voltages) else "real"
+    lines += ["", "[data]", *_assignments({"frames_in": "rows", "component": component})]
+    arrays: dict[str, Any] = {part: np.asarray(getattr(protocol, part)) for part in PROTOCOL_ARRAYS}
     np.savez_compressed(
         file,
         voltages=np.asarray(measurement.voltages),
         mask=np.asarray(measurement.mask),
-        drive=np.asarray(protocol.drive),
-        measurement=np.asarray(protocol.measurement),
-        drive_index=np.asarray(protocol.drive_index),
-        measurement_index=np.asarray(protocol.measurement_index),
+        frame_names=np.array(measurement.frame_names, str),
+        notes=np.array(measurement.notes, str),
         protocol_name=np.asarray(protocol.name),
+        **arrays,
     )
     description = file.with_suffix(".toml")
     description.write_text("\n".join(lines) + "\n", "utf-8")
@@ -75,6 +75,11 @@ def _electrodes(electrodes: AbstractElectrodes) -> dict:
     if electrodes.is_point:
         return described
     return {**described, "contact_impedance": np.asarray(electrodes.contact_impedance).tolist()}
+
+
+def _protocol(protocol: Protocol) -> dict:
+    parts = {part: np.asarray(getattr(protocol, part)).tolist() for part in PROTOCOL_ARRAYS}
+    return {"kind": "channels", "name": protocol.name, **parts}
 
 
 def _assignments(section: dict) -> list[str]:

@@ -142,9 +142,8 @@ def check_imageable(measurement: Measurement, reference: Measurement) -> list[Fr
 
 def _reason(electrodes: int, usable: int, difference: float, signs: float | None, reciprocity: float | None) -> str:
     if usable < electrodes:
-        return (
-            f"only {usable} channels are usable in both it and its reference, fewer than the {electrodes} electrodes."
-        )
+        channels = "channel is" if usable == 1 else "channels are"
+        return f"only {usable} {channels} usable in both it and its reference, fewer than the {electrodes} electrodes."
     if difference < 1e-12:
         return "it equals its reference, so there is no difference to image. Is it the same file?"
     if signs is not None and signs > MOST_IMPOSSIBLE_SIGNS:

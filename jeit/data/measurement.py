@@ -82,7 +82,9 @@ class Measurement(eqx.Module):
                 f"uses {protocol.num_electrodes}. Both must count the same electrodes."
             )
         if self.frame_names and len(self.frame_names) != self.voltages.shape[0]:
-            raise ValueError(f"{len(self.frame_names)} frame names for {self.voltages.shape[0]} frames; give one each.")
+            raise ValueError(
+                f"frame_names are {len(self.frame_names)} and the frames {self.voltages.shape[0]}; give one each."
+            )
 
     @property
     def num_frames(self) -> int:
@@ -147,7 +149,8 @@ class Measurement(eqx.Module):
         mask = self.mask & extra
         note = reason
         if is_concrete(mask):
-            note = f"{int(self.mask.sum() - mask.sum())} voltages masked: {reason}"
+            number = int(self.mask.sum() - mask.sum())
+            note = f"{number} voltage{'s' * (number != 1)} masked: {reason}"
         return self._replace(self.voltages, mask, notes=(*self.notes, note))
 
     def without_electrodes(self, electrodes) -> "Measurement":

@@ -12,12 +12,14 @@ from jeit.data.measurement import Measurement
 
 @dataclass(frozen=True)
 class Format:
-    """A file format: how to know it, how to read it, and whether a description may go with it."""
+    """A file format: how to know it, how to read it, whether a description may go with it, and whether it may borrow
+    that of another measurement."""
 
     summary: str
     recognises: Callable[[Path], bool]
     read: Callable[..., Measurement]
     described: bool = False
+    borrows: bool = False
 
 
 # The first that recognises a file reads it. To add a format, write a module like kit4.py and list it here.
@@ -25,7 +27,7 @@ FORMATS: dict[str, Format] = {
     "kit4": Format(kit4.DESCRIPTION, kit4.recognises, kit4.read),
     "ktc2023": Format(ktc2023.DESCRIPTION, ktc2023.recognises, ktc2023.read),
     "eidors": Format(eidors.DESCRIPTION, eidors.recognises, eidors.read, described=True),
-    "table": Format(table.DESCRIPTION, table.recognises, table.read, described=True),
+    "table": Format(table.DESCRIPTION, table.recognises, table.read, described=True, borrows=True),
     "tank6cm": Format(
         "6 cm tank (.csv, 208 rows of real and imaginary pairs): a table with the bundled description",
         lambda path: False,
@@ -34,7 +36,13 @@ FORMATS: dict[str, Format] = {
 }
 
 
-def read(path: str | Path, format: str | None = None, description: str | Path | None = None) -> Measurement:
+def read(
+    path: str | Path,
+    format: str | None = None,
+    description: str | Path | None = None,
+    *,
+    like: Measurement | None = None,
+) -> Measurement:
     """Read a measurement from a file.
 
     - `path`: the data file.
@@ -42,6 +50,7 @@ def read(path: str | Path, format: str | None = None, description: str | Path | 
       if not given.
     - `description`: a TOML file (or the name of a bundled one) that says what the numbers mean, for formats
       "table" and "eidors"; looked for beside the data if not given.
+    - `like`: a measurement of the same sensor, its reference say, which describes a table that nothing else describes.
 
     Raises `ValueError` when the file is not there, of no known format, or not what its format demands.
     """
@@ -55,6 +64,8 @@ def read(path: str | Path, format: str | None = None, description: str | Path | 
     name = _recognise(file, description) if format is None else format
     check_name("format", name, FORMATS)
     chosen = FORMATS[name]
+    if chosen.borrows:
+        return chosen.read(file, description=description, like=like)
     if chosen.described:
         return chosen.read(file, description=description)
     if description is not None:

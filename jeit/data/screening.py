@@ -53,7 +53,7 @@ def screen(
             f"{name}: every usable voltage is zero, NaN or missing; there is nothing measured in it. Was the "
             "instrument on, and is this the right variable or column?"
         )
-    exclude(np.broadcast_to(dead[:, None], values.shape), f"{int(dead.sum())} frames are all zero.")
+    exclude(np.broadcast_to(dead[:, None], values.shape), f"all zero: {int(dead.sum())} of {len(dead)} frames.")
     exclude(_saturated(values, usable, saturation), "saturated (stuck at an end of the instrument's range).")
     exclude(_without_current(values, usable, protocol), "their drive's current did not flow.")
     if not usable.any():

@@ -1,12 +1,13 @@
 """Reader of plain tables: CSV, text, NPY and NPZ with a TOML description."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 
-from jeit.data.description import Description, TableLayout, load_description
+from jeit.data.description import PROTOCOL_ARRAYS, Description, TableLayout, load_description
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.protocol import Protocol
@@ -34,24 +35,49 @@ def find_description(path: Path) -> str | Path | None:
     return None
 
 
-def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read a table with the `description` given (path or bundled name), or the one found beside it.
+def read(path: Path, description: str | Path | None = None, like: Measurement | None = None) -> Measurement:
+    """Read a table with the `description` given (path or bundled name), or the one found beside it, or that of `like`.
 
-    Raises `ValueError` when there is no description, or when file and description disagree.
+    `like`: a measurement of the same sensor, whose protocol, electrodes and outline hold for a table that nothing else
+    describes; and so does what its description says of units and columns, if it is a table itself. Raises `ValueError`
+    when there is no description, or when file and description disagree.
     """
     which = find_description(path) if description is None else description
-    if which is None:
+    if which is not None:
+        described = load_description(which)
+    elif like is not None:
+        described = _borrowed(like)
+    else:
         raise ValueError(
-            f"{path.name} is a table of numbers, and nothing says what they mean. Put a description beside "
-            f"it, {path.with_suffix('.toml').name} (geometry, electrodes, protocol), or name one with "
-            "--description."
+            f"description: {path.name} is a table of numbers, and nothing says what they mean. Put a description "
+            f"beside it, {path.with_suffix('.toml').name} (geometry, electrodes, protocol), or name one."
         )
-    described = load_description(which)
     if path.suffix.lower() in (".npz", ".npy"):
-        table, mask, protocol = _from_numpy(path, described)
+        arrays = _from_numpy(path)
+        table, mask, protocol = _voltages(arrays, described.layout, path), arrays.get("mask"), None
+        if not described.protocol_section:
+            protocol = _own_protocol(arrays)
+        described = _with_words(described, arrays)
     else:
         table, mask, protocol = _from_text(path, described.layout), None, None
+    if which is None and like is not None:
+        protocol = protocol or like.protocol
     return measurement_from(path, described, frames_from(table, described.layout, path.name), protocol, mask)
+
+
+def _borrowed(like: Measurement) -> Description:
+    """What is said of another measurement of the same sensor, but for its protocol and the names of its frames."""
+    beside = find_description(Path(like.source)) if like.source and recognises(Path(like.source)) else None
+    layout = TableLayout() if beside is None else replace(load_description(beside).layout, frame_names=(), keys=())
+    return Description(
+        origin=f"the description of '{like.name}'",
+        title="",
+        domain=like.domain,
+        electrodes=like.electrodes,
+        layout=layout,
+        notes=(f"described as '{like.name}' is, for it has no description of its own.",),
+        protocol_section={},
+    )
 
 
 def measurement_from(
@@ -66,10 +92,11 @@ def measurement_from(
         raise ValueError(
             f'{described.origin}: no protocol: add a [protocol] section with kind = "adjacent" or another.'
         )
-    names = described.layout.frame_names
-    if names and len(names) != len(np.atleast_2d(frames)):
+    names, number = described.layout.frame_names, len(np.atleast_2d(frames))
+    if names and len(names) != number:
         raise ValueError(
-            f"{described.origin}: [data] names {len(names)} frames, but {path.name} holds {len(np.atleast_2d(frames))}."
+            f"{described.origin}: [data] frame_names must be as many as the frames of {path.name}, {number}; they are "
+            f"{len(names)}."
         )
     return screen(
         frames * described.layout.scale,
@@ -125,34 +152,46 @@ def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
             ) from None
         if len(rows[-1]) != len(rows[0]):
             raise ValueError(
-                f"{path.name}, line {number} has {len(rows[-1])} numbers, the first {len(rows[0])}. Is the "
-                "file cut off?"
+                f"{path.name}, line {number} has length {len(rows[-1])}, the first {len(rows[0])}. Is the file cut off?"
             )
     if not rows:
         raise ValueError(f"{path.name} holds no numbers.")
     return np.array(rows)
 
 
-def _from_numpy(path: Path, described: Description) -> tuple[np.ndarray, np.ndarray | None, Protocol | None]:
+def _from_numpy(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a file by name; the one of an NPY is its voltages."""
     try:
         with path.open("rb") as file:
             content = np.load(file, allow_pickle=False)
             if isinstance(content, np.ndarray):
-                return content, None, None
-            arrays = {name: content[name] for name in content.files}
+                return {"voltages": content}
+            return {name: content[name] for name in content.files}
     except (ValueError, EOFError, OSError, BadZipFile) as error:
         raise ValueError(f"{path.name} is not a readable NumPy file of plain arrays ({error}).") from None
-    keys = described.layout.keys or ("voltages",)
+
+
+def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) -> np.ndarray:
+    keys = layout.keys if layout.keys and path.suffix.lower() == ".npz" else ("voltages",)
     missing = [key for key in keys if key not in arrays]
     if missing:
         raise ValueError(
             f"{path.name}: there is no array '{missing[0]}'; the file has {', '.join(sorted(arrays))}. Name "
             "the voltages with [data] keys in the description."
         )
-    table = arrays[keys[0]] if len(keys) == 1 else np.stack([arrays[key].ravel() for key in keys])
-    parts = ("drive", "measurement", "drive_index", "measurement_index")
-    protocol = None
-    if all(part in arrays for part in parts) and not described.protocol_section:
-        name = str(arrays.get("protocol_name", "custom"))
-        protocol = Protocol(**{part: arrays[part] for part in parts}, name=name)
-    return table, arrays.get("mask"), protocol
+    return arrays[keys[0]] if len(keys) == 1 else np.stack([arrays[key].ravel() for key in keys])
+
+
+def _own_protocol(arrays: dict[str, np.ndarray]) -> Protocol | None:
+    """The protocol in a file of `write_table`; None where there is none."""
+    if not all(part in arrays for part in PROTOCOL_ARRAYS):
+        return None
+    name = str(arrays.get("protocol_name", "custom"))
+    return Protocol(**{part: arrays[part] for part in PROTOCOL_ARRAYS}, name=name)
+
+
+def _with_words(described: Description, arrays: dict[str, np.ndarray]) -> Description:
+    """With the frames' names, where the description has none, and the notes of a file of `write_table`."""
+    names = described.layout.frame_names or tuple(str(one) for one in arrays.get("frame_names", ()))
+    notes = (*described.notes, *(str(one) for one in arrays.get("notes", ())))
+    return replace(described, layout=replace(described.layout, frame_names=names), notes=notes)

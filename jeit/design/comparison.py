@@ -87,8 +87,7 @@ def check_same_outline(first: Layout, second: Layout) -> None:
             for layout, (width, height, _) in zip((first, second), sizes, strict=True)
         )
         raise ValueError(
-            f"the layouts are on different skins, {said}; a file that does not say its skin takes --width-mm and "
-            "--height-mm."
+            f"the layouts are on different skins, {said}; a file that does not say its skin is read with outline=."
         )
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, UInt8
 
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
-from jeit.image import Inclusion, Raster, find_inclusions, segment
+from jeit.image import Inclusion, Raster, find_inclusions, labelled_inclusions, segment
 from jeit.imaging.clock import Clock
 from jeit.imaging.method import METHODS
 from jeit.imaging.preparation import prepare_difference
@@ -37,7 +37,7 @@ class ImagedDifference:
     - `change`: change of conductivity in every cell (m,), S/m (2-D: S); against `calibration.conductivity`.
     - `raster`: `change` on a grid, NaN outside the mesh; `extent` (x_min, x_max, y_min, y_max) in metres.
     - `inclusions`: regions of changed conductivity, strongest first; iterative images are looked at on the scale of the
-      logarithm, which weighs both signs alike.
+      logarithm, which weighs both signs alike. Of an image that was segmented, those of the `labels`.
     - `labels`: 0 background, 1 resistive, 2 conductive for every pixel of the raster, if asked for.
     - `timings`: seconds of each step.
     """
@@ -64,6 +64,14 @@ class ImagedDifference:
     def mesh(self) -> Mesh:
         """The mesh imaged on."""
         return self.calibration.model.mesh
+
+    @property
+    def chosen_by(self) -> str:
+        """What chose the hyperparameter: a rule's name, "default" where it is the method's own number, "given" for any
+        other number; "none" for methods without one."""
+        rule, asked = self.reconstruction.rule, self.settings.hyperparameter
+        own = asked is None or asked == METHODS[self.settings.method].hyperparameter
+        return "default" if rule == "given" and own else rule
 
     @property
     def iterative(self) -> bool:
@@ -112,8 +120,8 @@ def image_difference(
         if not largest > 1e-9 * float(calibration.conductivity):
             raise ValueError(
                 f"'{prepared.measurement.name}': the image is empty, no change reaches a billionth of the background. "
-                f"The hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give a "
-                "smaller one, or a rule."
+                f"The hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give "
+                "another, or a rule."
             )
     with clock("raster and inclusions"):
         grid = Raster.create(mesh, shape=settings.raster_shape)
@@ -130,11 +138,15 @@ def image_difference(
             inclusions=(),
             timings=clock.seconds,
         )
-        departure = found.departure
-        inclusions = find_inclusions(mesh, departure, level=settings.level, least_peak=settings.least_peak)
+        departure, labels = found.departure, None
+        if settings.segment:
+            pixels = np.asarray(grid.sample(departure))
+            labels = segment(pixels)
+            inclusions = labelled_inclusions(labels, pixels, grid)
+        else:
+            inclusions = find_inclusions(mesh, departure, level=settings.level, least_peak=settings.least_peak)
         if found.iterative:
             inclusions = [_with_change(one, calibration.conductivity) for one in inclusions]
-        labels = segment(np.asarray(grid.sample(departure))) if settings.segment else None
     return replace(found, inclusions=tuple(inclusions), labels=labels)
 
 

@@ -175,7 +175,7 @@ def body_of(measurement: Measurement, reference: Measurement) -> tuple[Domain, A
         missing = "[geometry]" if domain is None else "[electrodes]"
         raise ValueError(
             f"'{measurement.name}' does not say what it was measured on: give a description with {missing} "
-            "(a TOML file beside the data, or --description)."
+            "(a TOML file beside the data, or description=)."
         )
     if jnp.iscomplexobj(measurement.voltages):
         raise ValueError(

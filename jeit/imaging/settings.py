@@ -50,17 +50,12 @@ class ImagingSettings:
             raise ValueError("prior: total variation is a method of its own; give method='total-variation'.")
         if self.hyperparameter is None:
             object.__setattr__(self, "hyperparameter", METHODS[self.method].hyperparameter)
-        elif isinstance(self.hyperparameter, str):
-            check_name("hyperparameter", self.hyperparameter, RULES, ", or a number")
-            if (number := METHODS[self.method].number) is not None:
+        else:
+            check_hyperparameter(self.hyperparameter)
+            if isinstance(self.hyperparameter, str) and (number := METHODS[self.method].number) is not None:
                 name = self.method.replace("-", " ").replace("back ", "back-")
                 raise ValueError(f"hyperparameter: {name} takes a number such as {number:g}, not a rule.")
-        elif not (is_number(self.hyperparameter) and self.hyperparameter > 0):
-            raise ValueError(f"hyperparameter must be a positive number or a rule; it is {told(self.hyperparameter)}.")
-        if self.contact is not None:
-            check_name("contact", self.contact, CONTACTS)
-        if not (isinstance(self.num_points, Integral) and 50 <= self.num_points <= 100_000):
-            raise ValueError(f"num_points: give 50 to 100,000 nodes of the mesh; it is {told(self.num_points)}.")
+        check_body(self.contact, self.num_points)
 
 
 def as_settings(given: ImagingSettings | None) -> ImagingSettings:
@@ -68,3 +63,19 @@ def as_settings(given: ImagingSettings | None) -> ImagingSettings:
     settings = ImagingSettings() if given is None else given
     check_kind("settings", settings, ImagingSettings, "ImagingSettings, such as ImagingSettings(method='gauss-newton')")
     return settings
+
+
+def check_body(contact: str | None, num_points: int) -> None:
+    """Raises `ValueError` for a calibration that there is not, and for meshes too coarse or too fine."""
+    if contact is not None:
+        check_name("contact", contact, CONTACTS)
+    if not (isinstance(num_points, Integral) and 50 <= num_points <= 100_000):
+        raise ValueError(f"num_points: give 50 to 100,000 nodes of the mesh; it is {told(num_points)}.")
+
+
+def check_hyperparameter(hyperparameter: float | str) -> None:
+    """Raises `ValueError` for what is neither a positive number nor a rule."""
+    if isinstance(hyperparameter, str):
+        check_name("hyperparameter", hyperparameter, RULES, ", or a number")
+    elif not (is_number(hyperparameter) and hyperparameter > 0):
+        raise ValueError(f"hyperparameter must be a positive number or a rule; it is {told(hyperparameter)}.")

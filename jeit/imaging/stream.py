@@ -10,6 +10,7 @@ from jeit.arguments import check_kind
 from jeit.data import Measurement
 from jeit.imaging.clock import Clock
 from jeit.imaging.preparation import body_of, calibrated_model, check_measurement, select_frames
+from jeit.imaging.settings import check_body, check_hyperparameter
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import GaussNewton
@@ -21,24 +22,30 @@ from jeit.inverse.streaming.imager import check_memory
 class StreamSettings:
     """How to image frame after frame. The defaults here are jeit's defaults, for Python and command line alike.
 
-    - `solver`: `GaussNewton(max_steps=4)`, `LevenbergMarquardt()`, or `OneStep()` for linear images; or
-      the name of one.
+    - `solver`: `GaussNewton()`, `LevenbergMarquardt()`, or `OneStep()` for linear images; or the name of one
+      ("gauss-newton", "levenberg-marquardt", "one-step"). `max_steps`: most iterations for a frame, where the solver
+      has none of its own; as an `Imager` has it, 4, unless given.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; "noise-figure" unless given.
     - `memory`: frames over which an image changes, see `jeit.inverse.Imager`; 0 takes every frame alone.
     - `contact`, `num_points`: as in `jeit.imaging.ImagingSettings`.
 
-    Raises `ValueError` for a solver that does not image frames, and a memory that is no number of them.
+    Raises `ValueError` for a solver that does not image frames, a memory that is no number of them, and as
+    `jeit.imaging.ImagingSettings`.
     """
 
     solver: AbstractSolver | str = field(default_factory=GaussNewton)
+    max_steps: int | None = None
     hyperparameter: float | str | None = None
     memory: float = 0.0
     contact: str | None = None
     num_points: int = 1200
 
     def __post_init__(self):
-        as_solver(self.solver).for_frames()
+        object.__setattr__(self, "solver", as_solver(self.solver, frames=True).for_frames(self.max_steps))
         check_memory(self.memory)
+        check_body(self.contact, self.num_points)
+        if self.hyperparameter is not None:
+            check_hyperparameter(self.hyperparameter)
 
 
 def prepare_imager(

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import ScaledTranslation
 
 INK = "#26292e"
 SOFT = "#8b9098"
@@ -27,13 +28,15 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes
     return pyplot.subplots(figsize=size, layout="constrained")[1]
 
 
-def bare(ax: Axes, extent: tuple[float, float, float, float], *, margin: float = 0.12) -> None:
-    """Equal scales, no frame and no ticks, and room round the `extent` (metres) for electrode numbers."""
+def bare(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool = True) -> None:
+    """Equal scales, no frame and no ticks; round the `extent` (metres) room for a scale bar and, if electrodes are
+    `numbered`, for that."""
     x_min, x_max, y_min, y_max = extent
-    room = margin * max(x_max - x_min, y_max - y_min)
+    size = max(x_max - x_min, y_max - y_min)
+    room = (0.12 if numbered else 0.06) * size
     ax.set_aspect("equal")
     ax.set_xlim(x_min - room, x_max + room)
-    ax.set_ylim(y_min - 1.5 * room, y_max + room)
+    ax.set_ylim(y_min - 0.18 * size, y_max + (room if numbered else 0.03 * size))
     ax.set_axis_off()
 
 
@@ -56,6 +59,14 @@ def draw_horizontal_grid(ax: Axes) -> None:
     ax.set_axisbelow(True)
 
 
+def draw_legend_above(ax: Axes) -> None:
+    """A legend in room of its own above what is drawn from zero up, whatever that is."""
+    entries = len(ax.get_legend_handles_labels()[1])
+    ax.autoscale_view()
+    ax.set_ylim(0, ax.get_ylim()[1] * (1.02 + 0.08 * entries))
+    ax.legend(loc="upper right", frameon=False, labelcolor=INK, borderaxespad=0)
+
+
 def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
     """A bar of a round length, about a quarter of the picture, below its lower left corner."""
     x_min, x_max, y_min, y_max = extent
@@ -64,7 +75,8 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
     x, y = x_min - 0.06 * size, y_min - 0.125 * size
     ax.plot([x, x + length], [y, y], color=INK, linewidth=2.5, solid_capstyle="butt")
     millimetres = 1e3 * length
-    ax.text(x + length / 2, y - 0.012 * size, f"{millimetres:g} mm", ha="center", va="top", color=INK, fontsize=9)
+    below = ax.transData + ScaledTranslation(0, -3 / 72, ax.figure.dpi_scale_trans)
+    ax.text(x, y, f"{millimetres:g} mm", transform=below, ha="left", va="top", color=INK, fontsize=9)
 
 
 def draw_colour_bar(ax: Axes, drawn: ScalarMappable, label: str, *, signed: bool = False) -> None:

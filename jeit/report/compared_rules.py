@@ -7,9 +7,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jeit.imaging.compared_rules import ComparedRules
+from jeit.imaging.compared_rules import ComparedRules, RuleOutcome
+from jeit.mesh import Mesh
 from jeit.report.describe import describe_measurement, plain
 from jeit.report.folder import results_folder
+
+# Inclusions in one image of the picture; more lie over each other.
+_MOST_MARKED = 8
 
 
 def write_choice(result: ComparedRules, folder: str | Path) -> None:
@@ -27,25 +31,44 @@ def draw_choice(result: ComparedRules):
     """The image of every rule above the curves that they were chosen by, as a matplotlib `Figure`."""
     from matplotlib.figure import Figure
 
-    from jeit.plot import ColourScale, plot_choice, plot_image
+    from jeit.plot import plot_choice
+
+    outcomes = result.outcomes
+    figure = Figure(figsize=(max(2.1 * len(outcomes), 8.4), 8.2), layout="constrained")
+    upper, lower = np.asarray(figure.subfigures(2, 1, height_ratios=(1, 1.6)))
+    columns = np.atleast_1d(upper.subplots(1, len(outcomes)))
+    for ax, (name, outcome) in zip(columns, outcomes.items(), strict=True):
+        _draw_outcome(ax, name, outcome, result.prepared.mesh)
+    choices = {name: outcome.choice for name, outcome in outcomes.items()}
+    plot_choice(choices, ax=lower.subplots())
+    figure.suptitle(f"{result.prepared.measurement.name}: change of conductivity by every rule, and how each chose λ")
+    return figure
+
+
+def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
+    """One rule's image on a scale of its own; inclusions are marked where there are few enough to tell apart."""
+    from jeit.plot import ColourScale, plot_image
     from jeit.plot.axes import INK
     from jeit.plot.imaging.hyperparameter import COLOURS
 
-    outcomes = result.outcomes
-    figure = Figure(figsize=(max(2.1 * len(outcomes), 8.4), 7.4), layout="constrained")
-    upper, lower = np.asarray(figure.subfigures(2, 1, height_ratios=(1, 1.9)))
-    factor, unit = (1e3, "mS") if result.prepared.mesh.dimension == 2 else (1.0, "S/m")
-    columns = np.atleast_1d(upper.subplots(1, len(outcomes)))
-    for ax, (name, outcome) in zip(columns, outcomes.items(), strict=True):
-        plot_image(
-            result.prepared.mesh, outcome.change, inclusions=outcome.inclusions, scale=ColourScale(bar=False), ax=ax
-        )
-        largest = factor * float(jnp.abs(outcome.change).max())
-        ax.set_title(name, color=COLOURS.get(name, INK), fontsize=11, pad=0)
-        ax.text(1, 0, f"± {largest:.3g} {unit}", transform=ax.transAxes, ha="right", va="bottom", fontsize=9)
-    choices = {name: outcome.choice for name, outcome in outcomes.items()}
-    plot_choice(choices, title=result.prepared.measurement.name, ax=lower.subplots())
-    return figure
+    number = len(outcome.inclusions)
+    marked = outcome.inclusions if number <= _MOST_MARKED else ()
+    plot_image(mesh, outcome.change, inclusions=marked, scale=ColourScale(bar=False), ax=ax)
+    _draw_scale(ax, float(jnp.abs(outcome.change).max()), "S" if mesh.dimension == 2 else "S/m")
+    ax.set_title(f"{name}\n{number} inclusion{'s' * (number != 1)}", color=COLOURS.get(name, INK), fontsize=11, pad=0)
+
+
+def _draw_scale(ax, largest: float, unit: str) -> None:
+    """A small colour bar below an image, its ends named."""
+    from jeit.plot.axes import INK, SOFT, prefixed
+
+    factor, unit = prefixed(largest, unit)
+    end = factor * largest
+    drawn = next(one for one in (*ax.images, *ax.collections) if one.get_array() is not None)
+    bar = ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.62, aspect=18, pad=0.01)
+    bar.set_ticks([-end, 0, end], labels=[f"−{end:.3g}", "0", f"+{end:.3g} {unit}"])
+    bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+    bar.ax.tick_params(length=2, color=SOFT, labelcolor=INK, labelsize=8)
 
 
 def report_choice(result: ComparedRules) -> dict[str, Any]:

@@ -113,11 +113,13 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         },
         "hyperparameter": {
             "value": float(reconstruction.hyperparameter),
-            "chosen_by": reconstruction.rule,
+            "chosen_by": result.chosen_by,
             "note": (reconstruction.choice.note or None) if reconstruction.choice is not None else None,
         },
         "inclusions": [_inclusion(result, one) for one in result.inclusions],
-        "inclusion_settings": {"level": settings.level, "least_peak": settings.least_peak},
+        "inclusion_settings": {"level": settings.level, "least_peak": settings.least_peak}
+        if result.labels is None
+        else {"found_in": "labels"},
         "timings": {**result.timings, "unit": "s"},
         "versions": {name: version_of(name) for name in _PACKAGES},
     }
@@ -150,6 +152,7 @@ def _calibration(result: ImagedDifference) -> dict[str, Any]:
         "contact_impedance": None if electrodes.is_point else electrodes.contact_impedance,
         "contact_impedance_unit": "ohm·m" if result.mesh.dimension == 2 else "ohm·m²",
         "relative_misfit": float(calibration.misfit),
+        "note": calibration.note or None,
         "iterations": calibration.iterations,
         "status": str(calibration.status),
         "reason": calibration.reason or None,

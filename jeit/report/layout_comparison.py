@@ -42,22 +42,27 @@ def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
 
 def draw_layout_comparison(result: LayoutComparison):
     """Maps of sensitivity and of taxels of both, on one scale, and their histograms, as a matplotlib `Figure`."""
+    from matplotlib.artist import Artist
     from matplotlib.figure import Figure
-    from matplotlib.patches import PathPatch
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch, PathPatch
 
     from jeit.plot import plot_sensitivity_histograms, plot_sensitivity_map, plot_taxel_areas, plot_taxels
     from jeit.plot.axes import INK, bare, draw_scale_bar
     from jeit.plot.design.travel import outline_path
 
-    figure = Figure(figsize=(15.5, 9.0), layout="constrained")
-    axes = figure.subplots(2, 3)
+    figure = Figure(figsize=(14.4, 8.8), layout="constrained")
+    figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12)
+    axes = figure.subplots(2, 3, width_ratios=(1.1, 1.1, 1))
     both = result.responses
     highest = max(float(one.sensitivity.values.max()) for one in both)
     largest = max(float(one.taxels.max_area) for one in both)
     names = told_apart([_shortened(one.layout.name) for one in both])
     for row, name, one in zip(axes, names, both, strict=True):
         centres, outline = one.layout.centres, one.layout.known_outline
-        plot_sensitivity_map(one.sensitivity, electrodes=centres, limit=highest, title=name, ax=row[0])
+        plot_sensitivity_map(
+            one.sensitivity, electrodes=centres, limit=highest, title=f"{name}: sensitivity", ax=row[0]
+        )
         plot_taxels(one.taxels, electrodes=centres, limit=largest, title=f"{name}: taxels", ax=row[1])
         # Its bar, drawn last, is placed by the touched part; both maps are of the whole skin.
         for bar in (row[1].lines[-1], row[1].texts[-1]):
@@ -65,9 +70,15 @@ def draw_layout_comparison(result: LayoutComparison):
         draw_scale_bar(row[1], outline.extent)
         for ax in row[:2]:
             ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9))
-            bare(ax, outline.extent)
+            bare(ax, outline.extent, numbered=False)
     plot_sensitivity_histograms({name: one.sensitivity for name, one in zip(names, both, strict=True)}, ax=axes[0, 2])
     plot_taxel_areas({name: one.taxels for name, one in zip(names, both, strict=True)}, ax=axes[1, 2])
+    disc: dict[str, Any] = {"marker": "o", "linestyle": "none", "markerfacecolor": "white", "markeredgecolor": INK}
+    handles: list[Artist] = [Line2D([], [], label="electrode", **disc)]
+    if result.margin > 0:
+        untouched = f"not touched: {1e3 * result.margin:.3g} mm wide"
+        handles.append(Patch(facecolor="white", edgecolor=INK, linewidth=0.9, label=untouched))
+    figure.legend(handles=handles, loc="outside lower left", ncols=2, frameon=False)
     return figure
 
 

@@ -18,12 +18,13 @@ _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms",
 
 @dataclass(frozen=True)
 class WrittenStream:
-    """What `write_stream` has written: the `number` of frames, `counts` of them by status, and the `latency` in seconds
-    of those that were imaged, (K,)."""
+    """What `write_stream` has written: the `number` of frames, `counts` of them by status, the `latency` in seconds of
+    those that were imaged, (K,), and of the others the `first_reason`, empty if there is none."""
 
     number: int
     counts: dict[str, int]
     latency: Float[np.ndarray, " K"]
+    first_reason: str = ""
 
 
 def write_stream(
@@ -47,7 +48,7 @@ def write_stream(
     mesh, background = calibration.model.mesh, float(calibration.conductivity)
     centre = np.asarray(centroids(mesh))[:, :2]
     nothing = np.full(mesh.num_cells, np.nan, np.float32)
-    kept, latency, counts = [], [], {}
+    kept, latency, counts, refusals = [], [], {}, []
     with open(folder / "frames.csv", "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(_COLUMNS)
@@ -56,6 +57,7 @@ def write_stream(
             file.flush()  # whoever follows the file sees every frame at once
             kept.append(nothing if one.conductivity is None else one.conductivity.astype(np.float32))
             latency += [one.latency] if one.imaged else []
+            refusals += [] if one.imaged else [one.reason]
             counts[str(one.status)] = counts.get(str(one.status), 0) + 1
             if progress is not None:
                 progress(one)
@@ -68,7 +70,7 @@ def write_stream(
         points=np.asarray(mesh.points),
         cells=np.asarray(mesh.cells),
     )
-    return WrittenStream(len(kept), counts, np.array(latency))
+    return WrittenStream(len(kept), counts, np.array(latency), refusals[0] if refusals else "")
 
 
 def _row(one: FrameImage, centre, background: float) -> list[object]:

@@ -177,7 +177,7 @@ EDITED = {
     "strength of text": (put("strengths", ["a", 1.0]), "one of strengths is 'a'"),
     "a number without end": (put("microphones", 3, "b", 10**400), "incomplete or changed by hand"),
     "band without a window": (put("intensity", {"low": 50.0}), None),  # the defaults stand in
-    "band upside down": (put("intensity", {"low": 500.0, "high": 50.0, "window": 0.05, "hop": 0.01}), "low and high"),
+    "band upside down": (put("intensity", {"low": 500.0, "high": 50.0, "window": 0.05, "hop": 0.01}), "low= and high="),
     "band of another kind": (put("intensity", {"lowest": 500.0}), "incomplete or changed by hand"),
     "error of text": (
         put("microphones", 3, "relative_standard_error", {"a": "x", "b": 0.1}),

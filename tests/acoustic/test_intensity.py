@@ -295,9 +295,9 @@ def test_taps_of_intensities_pass():
         ({"low": 500.0, "high": 400.0}, "low < high"),
         ({"high": np.nan}, "high must be a finite number"),
         ({"low": "50"}, "low must be a finite number"),
-        ({"window": 0.0, "hop": 0.0}, "hop must be positive"),
+        ({"window": 0.0, "hop": 0.0}, "window must be positive"),
         ({"hop": -0.01}, "hop must be positive"),
-        ({"hop": 0.1}, "no longer than window"),
+        ({"hop": 0.1}, "no longer than a window"),
         ({"window": 50.0, "hop": 12.5}, "seconds"),
     ],
 )

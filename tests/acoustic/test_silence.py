@@ -74,7 +74,7 @@ def test_a_touch_without_pauses(vibration, silent, heard_before):
     (note,) = lost.notes
     assert note.startswith("microphones ")
     assert "times the calibration's. If the recording never pauses" in note
-    assert "--silence" in note
+    assert "silence=" in note
     found = locate(vibration, heard_before, silence=silent)
     assert found.notes == ()
     assert found.located.all()

@@ -10,7 +10,7 @@ from jeit.cli.commands.choose import show
 from jeit.data import read
 from jeit.imaging import ImagingSettings, compare_on_data
 from jeit.inverse import RULES
-from jeit.report import report_choice
+from jeit.report import draw_choice, report_choice
 
 SMALL = ("--num-points", 300, "--contact", "fixed")
 
@@ -50,6 +50,28 @@ def test_every_rule_in_table_picture_and_report(tank, run, tmp_path):
     (figure,) = [entry for entry in written["rules"] if entry["rule"] == "noise-figure"]
     assert imaged["hyperparameter"]["value"] == pytest.approx(figure["hyperparameter"])
     assert imaged["hyperparameter"]["note"] is None
+
+
+def test_every_image_has_a_scale_and_few_marks(tank):
+    """A bar each, from end to end of its own values, in a unit; and no marks where they would lie over each other."""
+    settings = ImagingSettings(num_points=300, contact="fixed")
+    result = compare_on_data(read(tank.folder / "touched.csv"), read(tank.folder / "rest.csv"), settings)
+    figure = draw_choice(result)
+    figure.draw_without_rendering()
+    outcomes = list(result.outcomes.values())
+    bars = [ax for ax in figure.axes if ax.get_label() == "<colorbar>"]
+    assert len(bars) == len(outcomes)
+    for bar, outcome in zip(bars, outcomes, strict=True):
+        low, middle, high = (label.get_text() for label in bar.get_xticklabels())
+        value, unit = high.split()
+        assert (low[1:], middle, unit[-1]) == (value[1:], "0", "S")
+        factor = {"S": 1, "mS": 1e3, "µS": 1e6}[unit]
+        assert float(value) == pytest.approx(factor * float(np.abs(outcome.change).max()), rel=0.01)
+    images = [ax for ax in figure.axes if "inclusion" in ax.get_title()]
+    for ax, outcome in zip(images, outcomes, strict=True):
+        number = len(outcome.inclusions)
+        assert ax.get_title().endswith(f"{number} inclusion{'s' * (number != 1)}")
+        assert len(ax.patches) == (number if number <= 8 else 0)
 
 
 def test_one_rule_and_quiet(tank, run, tmp_path):

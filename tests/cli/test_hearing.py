@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -68,6 +69,25 @@ def folder(tmp_path_factory):
 def rows(folder):
     with open(folder / "track.csv", newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def test_a_large_error_of_the_models_is_noted(folder, tmp_path, capsys):
+    """Of intensities off by a third; with what it means for a touch, which is told of every calibration."""
+    random = np.random.default_rng(3)
+    with np.load(folder / "taps.npz") as file:
+        taps = {name: file[name] for name in file.files}
+    uneven = taps.pop("intensity") * np.exp(0.33 * random.normal(size=(49, 9)))
+    np.savez(tmp_path / "off.npz", **taps, intensity=uneven)
+    told = {}
+    for name, path in (("exact", folder / "taps.npz"), ("off", tmp_path / "off.npz")):
+        assert main(["calibrate-microphones", str(path), "--output", str(tmp_path / f"{name}.json")]) == 0
+        told[name] = " ".join(capsys.readouterr().out.split())
+    assert "the models miss" not in told["exact"]
+    assert "the models miss what was heard by" in told["off"]
+    assert "try another --decay." in told["off"]
+    exact, off = (float(re.search(r"located to ± ([\d.]+) mm", one)[1]) for one in told.values())
+    assert exact < 0.2
+    assert off > 2
 
 
 def test_intensities_to_a_track(folder, tmp_path, capsys):
@@ -173,8 +193,10 @@ def test_a_touch_without_pauses(folder, tmp_path, capsys):
     command = ["locate", str(tmp_path / "shaken.npz"), "-c", str(folder / "sound.json"), "-o", str(tmp_path)]
     assert main(command) == 0
     assert {row["status"] for row in rows(tmp_path)} == {"no touch"}
-    assert "never pauses" in " ".join(capsys.readouterr().out.split())
-    assert "--silence" in json.loads((tmp_path / "report.json").read_text("utf-8"))["notes"][0]
+    told = " ".join(capsys.readouterr().out.split())
+    assert "never pauses" in told
+    assert "untouched (--silence)" in told
+    assert "silence=" in json.loads((tmp_path / "report.json").read_text("utf-8"))["notes"][0]
     assert main([*command, "--silence", str(tmp_path / "hush.npz"), "-q"]) == 0
     found = np.array([[float(row["x_m"]), float(row["y_m"])] for row in rows(tmp_path)])
     assert np.abs(found - [0.03, 0.02]).max() < 0.003

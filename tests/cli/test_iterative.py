@@ -6,8 +6,19 @@ import json
 
 import numpy as np
 import pytest
+from scipy.ndimage import label
+
+from jeit.cli.console import counted, in_one_unit
+from jeit.data import read, write_table
+from jeit.imaging import StreamSettings
+from jeit.inverse.stream.imager import FRAME_STEPS
 
 FEW = ("--num-points", 250)
+
+
+def arrays_of(path):
+    with np.load(path) as file:
+        return {name: file[name] for name in file.files}
 
 
 @pytest.mark.parametrize(
@@ -32,23 +43,33 @@ def test_iterative_images(method, tank, run, tmp_path):
     objective = report["objective_per_iteration"]
     assert len(objective) == report["iterations"] + 1
     assert (np.diff(objective) < 0).all()
-    content = np.load(output / "image.npz")
+    content = arrays_of(output / "image.npz")
     assert (content["conductivity"] > -content["background"]).all()
     assert "labels" not in content
 
 
 def test_segmentation(tank, run, tmp_path):
-    status, _, error = run(
+    status, told, error = run(
         "reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv",
-        "--output", tmp_path / "out", "--segment", "--quiet", *FEW,
+        "--output", tmp_path / "out", "--segment", *FEW,
     )  # fmt: skip
     assert (status, error) == (0, "")
-    content = np.load(tmp_path / "out" / "image.npz")
+    assert "hyperparameter 300 (default)" in told
+    content = arrays_of(tmp_path / "out" / "image.npz")
     assert content["labels"].shape == (256, 256)
     assert content["labels"].dtype == np.uint8
     assert set(np.unique(content["labels"])) <= {0, 1, 2}
     assert content["labels"].any()
-    report = json.loads((tmp_path / "out" / "report.json").read_text())["reconstruction"]
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["hyperparameter"]["chosen_by"] == "default"
+    # What is listed is what the labels show.
+    islands = sum(label(content["labels"] == kind)[1] for kind in (1, 2))
+    assert len(report["inclusions"]) == islands == sum(told.count(f"  {kind}") for kind in ("conductive", "resistive"))
+    pixel = (0.2 / 256) ** 2
+    assert sum(one["area"] for one in report["inclusions"]) == pytest.approx(
+        (content["labels"] > 0).sum() * pixel, rel=0.01
+    )
+    report = report["reconstruction"]
     assert report["method"] == "total-variation"
     assert report["prior"] == "total variation"
 
@@ -58,7 +79,7 @@ def rows_of(folder):
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("method", ["linear", "gauss-newton"])
+@pytest.mark.parametrize("method", ["one-step", "gauss-newton"])
 def test_a_stream_from_a_file(method, tank, run, tmp_path):
     bad = tank.touched.copy()
     bad[3] = np.nan
@@ -72,7 +93,7 @@ def test_a_stream_from_a_file(method, tank, run, tmp_path):
     rows = rows_of(output)
     assert [row["status"] for row in rows][1:3] == ["refused", "partial"]
     assert "another sensor" in rows[1]["reason"]
-    images = np.load(output / "images.npz")["conductivity"]
+    images = arrays_of(output / "images.npz")["conductivity"]
     assert np.isnan(images[1]).all()
     assert np.isfinite(images[[0, 2, 3]]).all()
     np.testing.assert_allclose(images[0], images[3], rtol=0.02)
@@ -84,22 +105,52 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
     gap = ",".join([first, "", *others[1:]])
     monkeypatch.setattr("sys.stdin", io.StringIO(f"{good}\n\nrubbish\n{good.replace(' ', ',')}\n1 2 3\n{gap}\n"))
     status, _, error = run(
-        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "linear",
+        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "one-step",
         "--quiet", *FEW,
     )  # fmt: skip
     assert (status, error) == (0, "")
     assert [row["status"] for row in rows_of(tmp_path / "out")] == [
         "imaged", "refused", "imaged", "refused", "partial",
     ]  # fmt: skip
+    # One whose frames are all refused says why, and fails; what it leaves has the reasons.
+    monkeypatch.setattr("sys.stdin", io.StringIO("1 2 3\nrubbish\n"))
+    status, _, error = run(
+        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "one-step",
+        "--quiet", *FEW,
+    )  # fmt: skip
+    assert (status, error.count("\n")) == (1, 1)
+    assert "none of 2 frames could be imaged" in error
+    assert "not 40 real voltages" in error
+    assert [row["status"] for row in rows_of(tmp_path / "out")] == ["refused", "refused"]
     # A stream that fails leaves no images of an earlier one behind.
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     assert (tmp_path / "out" / "images.npz").exists()
     status, _, error = run(
-        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "linear",
+        "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "one-step",
         "--quiet", *FEW,
     )  # fmt: skip
     assert (status, "no frame" in error) == (1, True)
     assert not (tmp_path / "out" / "images.npz").exists()
+
+
+def test_a_stream_borrows_the_description_of_its_reference(tank, run, tmp_path):
+    """Of an NPZ written by jeit, whose description lies beside it; the frames lie elsewhere, with none."""
+    write_table(read(tank.folder / "rest.csv"), tmp_path / "empty.npz")
+    (tmp_path / "live").mkdir()
+    np.savetxt(tmp_path / "live" / "frames.csv", tank.touched[None], delimiter=",")
+    options = ("--reference", tmp_path / "empty.npz", "--output", tmp_path / "out", "--method", "one-step", *FEW)
+    status, text, error = run("stream", tmp_path / "live" / "frames.csv", *options)
+    assert (status, error) == (0, "")
+    assert "1 frame: 1 imaged" in text
+
+
+def test_the_help_of_a_stream_tells_the_defaults(run):
+    settings = StreamSettings()
+    told = " ".join(run("stream", "--help")[1].replace("│", " ").split())
+    assert f"{settings.solver.name} (default)" in told
+    assert f"(default {settings.num_points})" in told
+    assert f"{settings.memory:g} (default)" in told
+    assert f"(default {FRAME_STEPS})" in told
 
 
 @pytest.mark.parametrize(
@@ -108,9 +159,15 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
         (("reconstruct", "--method", "newton"), "gauss-newton"),
         (("reconstruct", "--method", "total-variation", "--prior", "noser"), "--prior"),
         (("reconstruct", "--method", "total-variation", "--hyperparameter", "gcv"), "takes a number"),
-        (("stream", "--method", "one-step"), "gauss-newton"),
-        (("stream", "--steps", "0"), "steps"),
-        (("stream", "--hyperparameter", "magic"), "magic"),
+        (
+            ("stream", "--method", "magic"),
+            "--method: there is no 'magic'; give one of one-step, gauss-newton, levenberg",
+        ),
+        (("stream", "--method", "l-bfgs-b"), "--method: l-bfgs-b does not image frames in a bounded time"),
+        (("stream", "--steps", "0"), "--steps must be"),
+        (("stream", "--memory", "-1"), "--memory must be"),
+        (("stream", "--hyperparameter", "magic"), "--hyperparameter: 'magic'"),
+        (("stream", "--contact", "firm"), "--contact: there is no 'firm'"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(arguments, words, tank, run, tmp_path):
@@ -122,3 +179,13 @@ def test_bad_input_is_refused_in_one_line(arguments, words, tank, run, tmp_path)
     assert status == 1
     assert words in error
     assert error.count("\n") == 1
+
+
+def test_one_unit_a_column():
+    assert in_one_unit([2.7e-3, -1.85e-4], "S") == ("mS", ["2.7", "-0.185"])
+    assert in_one_unit([12.0], "S/m") == ("S/m", ["12"])
+    assert in_one_unit([], "S") == ("S", [])
+
+
+def test_one_of_a_thing_is_no_plural():
+    assert [counted(number, "frame") for number in (0, 1, 1000)] == ["0 frames", "1 frame", "1,000 frames"]

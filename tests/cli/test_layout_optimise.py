@@ -6,21 +6,17 @@ import re
 
 import numpy as np
 import pytest
-import typer
 from rich.console import Console
 
-from jeit.cli.commands.layout_optimise import RESULTS, _region, optimise
+from jeit.cli.app import as_command
+from jeit.cli.commands.layout_optimise import RESULTS, _region
 from jeit.cli.console import Steps
 from jeit.layout import Layout, read_layout, write_layout
 from jeit.mesh import Disk, Rectangle
 
-APP = typer.Typer()
-APP.command()(optimise)
-
 
 def run(*arguments):
-    command = typer.main.get_command(APP)
-    command.main(args=[str(one) for one in arguments], standalone_mode=False)
+    as_command().main(args=["layout", "optimise", *map(str, arguments)], standalone_mode=False)
 
 
 @pytest.mark.slow

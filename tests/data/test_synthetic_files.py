@@ -143,17 +143,23 @@ KINDS = {
     "trigonometric": {"measurement": "mean", "current": 1e-3},
     "bipolar": {"drive_pairs": [[0, 1]], "measurement_pairs": [[2, 3], [4, 5]], "current": 1e-3},
     "matrices": {"drive": [[1e-3, -1e-3, 0]], "measurement": [[0, 1, -1], [1, 0, -1]]},
+    "channels": {
+        "drive": [[1e-3, -1e-3, 0]],
+        "measurement": [[0, 1, -1], [1, 0, -1]],
+        "drive_index": [0, 0],
+        "measurement_index": [1, 0],
+    },
 }
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_protocol_can_be_described(tmp_path, kind):
     lines = [f'kind = "{kind}"', *(f"{key} = {json.dumps(value)}" for key, value in KINDS[kind].items())]
-    number = [] if kind == "matrices" else ["number = 8"]
+    number = [] if kind in ("matrices", "channels") else ["number = 8"]
     (tmp_path / "p.toml").write_text("\n".join(["[protocol]", *lines, *number]), "utf-8")
     made = data.load_description(tmp_path / "p.toml").protocol(tmp_path / "p.csv")
     assert made is not None
-    assert made.num_electrodes == {"matrices": 3, "reference_electrode": 9}.get(kind, 8)
+    assert made.num_electrodes == {"matrices": 3, "channels": 3, "reference_electrode": 9}.get(kind, 8)
 
 
 def test_round_trip(tmp_path, tank, setup):
@@ -172,6 +178,51 @@ def test_round_trip(tmp_path, tank, setup):
     assert again.domain == first.domain
     assert again.frame_names == first.frame_names
     assert again.notes[0] == "ein „Test“."
+
+
+def test_what_is_written_describes_other_tables(tmp_path, tank, setup):
+    """Of a protocol in no order that a constructor makes, and of other frames than those that were named."""
+    chosen = protocol.adjacent(8, current=1e-3).subset(np.random.default_rng(0).permutation(40)[:33])
+    frames = np.stack([tank(chosen), 1.2 * tank(chosen), 1.3 * tank(chosen)])
+    frames[0, 3] = np.nan
+    written = data.screen(frames[:2], chosen, frame_names=("reference", "press"), **setup(8))
+    _, description = data.write_table(written, tmp_path / "out.npz")
+    np.savetxt(tmp_path / "live.csv", frames, delimiter=",")
+    live = data.read(tmp_path / "live.csv", description=description)
+    np.testing.assert_allclose(live.voltages, frames, rtol=1e-12)
+    assert live.protocol.same_patterns(chosen)
+    assert live.domain == written.domain
+    assert not any("masked" in note and "2 frames" in note for note in live.notes)
+    assert live.frame_names == ()
+
+
+@pytest.mark.parametrize("given", ["npz", "table in millivolts", "nothing but itself"])
+def test_a_table_borrows_the_description_of_another_measurement(given, tmp_path, tank, setup):
+    """What is said of the reference holds for frames of the same sensor; of its units too, if it is a table."""
+    chosen = protocol.adjacent(8, current=1e-3)
+    rest, scale = tank(chosen), 1.0
+    reference = data.screen(rest, chosen, frame_names=("empty",), **setup(8))
+    if given == "npz":
+        data.write_table(reference, tmp_path / "empty.npz")
+        reference = data.read(tmp_path / "empty.npz")
+    elif given == "table in millivolts":
+        scale = 1e-3
+        np.savetxt(tmp_path / "empty.csv", rest[:, None], delimiter=";")
+        layout = '[data]\nunit = "mV"\ndelimiter = ";"\nframes_in = "columns"\nframe_names = ["empty"]\n'
+        (tmp_path / "empty.toml").write_text(DESCRIPTION + layout, "utf-8")
+        reference = data.read(tmp_path / "empty.csv")
+    frames = np.stack([rest, 1.1 * rest])
+    live = {"delimiter": ";"} if scale != 1 else {"delimiter": ","}
+    np.savetxt(tmp_path / "live.csv", frames.T if scale != 1 else frames, **live)
+    found = data.read(tmp_path / "live.csv", like=reference)
+    np.testing.assert_allclose(found.voltages, scale * frames, rtol=1e-12)
+    assert found.protocol.same_patterns(chosen)
+    assert found.domain == reference.domain
+    assert found.frame_names == ()
+    assert any("described as" in note for note in found.notes)
+    (tmp_path / "live.toml").write_text(DESCRIPTION + '[data]\ndelimiter = "x"\n', "utf-8")
+    with pytest.raises(ValueError, match="delimiter"):  # its own description goes before
+        data.read(tmp_path / "live.csv", like=reference)
 
 
 @pytest.mark.parametrize("shape", ["rectangle", "polygon", "polygon with a hole"])

@@ -235,7 +235,7 @@ REFUSED = {
     ),
     "coarse": (
         one(rest="[mesh]\ncell_mm = 30"),
-        r"mesh\.cell_mm is 30, too coarse for electrodes 6 mm across; 3 would",
+        r"mesh\.cell_mm is 30 mm; give no more than 9 mm, as electrodes of '.*' are 6 mm across",
     ),
     "taxels": (
         one(rest='[touch]\ncolumns = 5\nrows = 5\n[scores]\nwanted = "taxels"'),

@@ -148,3 +148,12 @@ def test_readme_is_short():
     assert text.count(b"<!-- main-command -->") == text.count(b"<!-- test-command -->") == 1
     rows = text.partition(b"<!-- benchmark:begin -->")[2].partition(b"<!-- benchmark:end -->")[0]
     assert rows.count(b"\n|") <= 2 + 8
+
+
+def test_commands_on_hearing_take_what_its_scripts_write():
+    """Whoever follows the page has every file that it names."""
+    page = ROOT / "docs" / "hearing.md"
+    script = "\n".join(blocks(page, "python"))
+    named = {word for line in commands(page) for word in line.split() if word.endswith((".npz", ".wav", ".json"))}
+    assert {"taps.npz", "recording.npz"} <= named
+    assert not [name for name in named if f'"{name}"' not in script]

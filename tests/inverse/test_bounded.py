@@ -86,7 +86,7 @@ def test_bounds_alone_choose_a_bounded_solver_and_too_few_steps_are_said_so(mode
     for one in (alone, result):
         assert float(one.conductivity.max()) <= 2.0 * (1 + 1e-12)
     assert result.status == "step limit"
-    assert "2 trial steps" in result.reason
+    assert "after 2 iterations;" in result.reason
 
 
 @pytest.mark.parametrize(

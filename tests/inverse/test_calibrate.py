@@ -50,3 +50,7 @@ def test_noise_ends_up_in_the_misfit(model):
     noise *= 0.02 * float(jnp.linalg.norm(voltages)) / np.linalg.norm(noise)
     result = calibrate(model, voltages + noise)
     assert float(result.misfit) == pytest.approx(0.02, rel=0.1)
+    assert result.note == ""
+    spoilt = calibrate(model, voltages + 12 * noise)
+    assert "misses 2" in spoilt.note
+    assert "width of the electrodes" in spoilt.note

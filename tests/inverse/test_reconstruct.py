@@ -31,7 +31,7 @@ from jeit.inverse.nonlinear import (
     Log,
     ProjectedGradient,
 )
-from jeit.inverse.nonlinear.solvers import SOLVERS, solver_named
+from jeit.inverse.nonlinear.solvers import SOLVERS, as_solver
 from jeit.layout import ring
 from jeit.mesh import Disk, Refine, centroids, measures
 from jeit.protocol import adjacent
@@ -149,7 +149,16 @@ def test_too_few_steps_are_said_so(model, frame):
     voltages, noise = frame
     result = reconstruct(model, voltages, 1.0, prior=Gaussian(0.02), noise=noise, solver=GaussNewton(max_steps=2))
     assert result.status == "step limit"
-    assert "2 trial steps" in result.reason
+    assert result.iterations == 2
+    assert "after 2 iterations;" in result.reason
+
+
+@pytest.mark.parametrize("solver", [GaussNewton(), LevenbergMarquardt()])
+def test_voltages_of_the_background_are_at_the_minimum(model, solver):
+    """Its objective is nothing, so that no step is small beside it."""
+    result = reconstruct(model, model.voltages(1.0), 1.0, prior=Gaussian(0.02), hyperparameter=3.0, solver=solver)
+    assert result.status == "converged"
+    assert result.iterations <= 1
 
 
 @pytest.mark.parametrize(
@@ -169,7 +178,7 @@ def test_too_few_steps_are_said_so(model, frame):
         ({"noise": np.ones(3)}, "each channel"),
         ({"prior": "noser"}, "Noser"),
         ({"solver": "newton"}, "gauss-newton"),
-        ({"solver": "linear"}, "those of one_step"),
+        ({"solver": "one-step"}, "those of one_step"),
         ({"solver": 3}, "such as GaussNewton"),
         ({"hyperparameter": "magic"}, "magic"),
         ({"hyperparameter": -1.0}, "positive"),
@@ -212,9 +221,15 @@ def test_bad_settings(make, change, message):
 
 def test_a_name_is_a_solver():
     for name in SOLVERS:
-        assert solver_named(name).name == name
-    with pytest.raises(ValueError, match=r"^method must be one of linear, .*; it is 'newton'"):
-        solver_named("newton", "method")
+        assert as_solver(name).name == name
+
+
+def test_a_name_unknown_is_answered_by_those_that_would_do():
+    """A linear image is none of a reconstruction, and what takes long none of a frame."""
+    with pytest.raises(ValueError, match=r"^solver must be one of gauss-newton, levenberg-marquardt, l-bfgs"):
+        as_solver("newton")
+    with pytest.raises(ValueError, match="must be one of one-step, gauss-newton, levenberg"):
+        as_solver("newton", frames=True)
 
 
 def test_informed_shapes_alter_an_image_little(model, frame):

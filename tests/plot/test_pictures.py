@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from jeit.electrodes import BoundaryElectrodes, CombinedElectrodes, FaceDiscs, PointElectrodes, SheetDiscs, plates
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion
-from jeit.layout import ring
-from jeit.mesh import Polygon, centroids, disk, layer, rectangle
+from jeit.layout import perimeter, ring
+from jeit.mesh import Polygon, Rectangle, centroids, disk, layer, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import plot_raster
@@ -77,6 +77,36 @@ def test_electrodes_stand_at_their_place_and_width(mesh, electrodes, ax):
     for k, position in enumerate(np.asarray(electrodes.position), start=1):
         assert np.linalg.norm(numbers[str(k)]) > RADIUS
         assert np.dot(numbers[str(k)], position) > 0.99 * np.linalg.norm(numbers[str(k)]) * RADIUS
+
+
+OUTLINES = {
+    "flat": Rectangle(0.3, 0.1),
+    "notched": Polygon(0.2 * np.array([[0, 0], [1, 0], [1, 1], [0.7, 1], [0.7, 0.3], [0.3, 0.3], [0.3, 1], [0, 1]])),
+}
+
+
+@pytest.mark.parametrize("name", OUTLINES)
+def test_numbers_stand_outside_opposite_their_electrodes(name, ax):
+    """Along the normal, whatever the outline: 0.058 of its size from the electrode, and from the rest no less."""
+    outline = OUTLINES[name]
+    places = perimeter(outline, 12, start=0.02)
+    size = np.ptp(np.asarray(outline.mesh(num_points=200).points), axis=0).max()
+    draw_electrodes(outline.mesh(num_points=200), BoundaryElectrodes(places, 0.01, 0.1), ax=ax)
+    for number, place in texts(ax).items():
+        own = places[int(number) - 1]
+        assert np.linalg.norm(place - own) == pytest.approx(0.058 * size, rel=1e-3)
+        assert -outline.signed_distance(place[None])[0] == pytest.approx(0.058 * size, rel=1e-3)
+
+
+def test_numbers_in_a_narrow_notch_stand_inside_in_a_rim(ax):
+    slit = Polygon([[0, 0], [0.2, 0], [0.2, 0.1], [0.102, 0.1], [0.102, 0.02], [0.098, 0.02], [0.098, 0.1], [0, 0.1]])
+    electrodes = BoundaryElectrodes([[0.102, 0.06], [0.05, 0.0]], 0.01, 0.1)
+    draw_electrodes(slit.mesh(num_points=300), electrodes, ax=ax)
+    inside, outside = ax.texts
+    assert slit.signed_distance(np.array([inside.get_position()]))[0] > 0
+    assert np.linalg.norm(np.array(inside.get_position()) - (0.102, 0.06)) < 0.015
+    assert inside.get_path_effects()
+    assert not outside.get_path_effects()
 
 
 def test_an_electrode_over_the_start_of_the_outline_is_one_piece(mesh, ax):

@@ -83,6 +83,18 @@ def test_several_are_marked_on_one_l_curve_with_a_panel_each(choices, ax):
         assert sum(np.ptp(line.get_xdata()) == 0 and np.size(line.get_xdata()) == 2 for line in panel.lines) == 6
 
 
+def test_names_on_the_l_curve_are_apart(choices, ax):
+    """Decades of λ that change nothing lie on one point of the curve: one of them is named."""
+    plot_choice(choices["l-curve"], ax=ax)
+    ax.figure.draw_without_rendering()
+    decades = [text for text in ax.texts if "10^" in text.get_text()]
+    assert len(decades) > 1
+    boxes = [text.get_window_extent() for text in decades]
+    for k, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:k])
+        assert box.x0 > ax.get_window_extent().x0
+
+
 def test_a_choice_at_the_edge_is_hollow_and_says_so(choices, ax):
     choice = choices["gcv"]
     edge = Choice.among("gcv", choice.candidates, 0, choice.criterion, (choice.residual, choice.penalty))

@@ -9,9 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import StepPatch
 from matplotlib.tri import TriContourSet
 
+from jeit.design import touch_grid
+from jeit.design.sensitivity import SensitivityMap
 from jeit.design.taxels import Taxels
 from jeit.layout import grid
-from jeit.plot import plot_taxel_areas, plot_taxels
+from jeit.mesh import Rectangle
+from jeit.plot import plot_sensitivity_histograms, plot_taxel_areas, plot_taxels
 from jeit.plot.design.taxels import plot_similarity
 from jeit_solvers import KMeans
 
@@ -137,6 +140,26 @@ def test_a_taxel_that_is_nowhere_can_be_drawn(ax):
     assert len(ax.figure.axes) == 1
 
 
+def test_legends_of_histograms_stand_above_them(ax):
+    """Even of the tallest bar, wherever it is."""
+    one = four()
+    plot_taxel_areas({"inside": one, "a layout of a long name that reaches far to the left": one}, bins=4, ax=ax)
+    ax.figure.draw_without_rendering()
+    box = ax.get_legend().get_window_extent().transformed(ax.transData.inverted())
+    assert box.y0 > max(patch.get_path().vertices[:, 1].max() for patch in ax.patches)
+
+
+def test_the_line_in_histograms_of_sensitivity_is_named(ax):
+    places = touch_grid(Rectangle(0.1, 0.1), 4, 4)
+    maps = {
+        name: SensitivityMap(places, scale * jnp.arange(1.0, 17.0)[:, None])
+        for name, scale in (("a", 1e-3), ("b", 2e-3))
+    }
+    plot_sensitivity_histograms(maps, ax=ax)
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["a", "b", "least of a"]
+    assert not ax.spines["top"].get_visible()
+
+
 def test_histograms_share_their_bins(ax):
     one, other = four(), four(places=grid(0.05, 0.05, 8, 8))
     assert plot_taxel_areas({"inside": one, "boundary": other}, bins=7, ax=ax) is ax
@@ -186,5 +209,5 @@ def test_figures_are_made_where_no_axes_are_given():
     from matplotlib import pyplot
 
     for drawn in (plot_taxels(four(), outlines=True), plot_taxel_areas(four()), plot_similarity(four(), 0)):
-        drawn.figure.canvas.draw()
+        drawn.figure.draw_without_rendering()
         pyplot.close(drawn.figure)

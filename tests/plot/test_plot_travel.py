@@ -62,6 +62,20 @@ def test_ways_lead_from_start_to_end(ax):
     assert ax.get_ylim()[0] < min(scale.get_position()[1], bar.get_ydata()[0])
 
 
+def test_a_legend_says_what_is_what(ax):
+    plot_travel(optimisation(), ax=ax)
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == [
+        "where it began", "way, step by step", "where it ended",
+    ]  # fmt: skip
+    plot_travel(optimisation(), keep_out=(Disk(0.01),), ax=ax)
+    assert [text.get_text() for text in ax.get_legend().get_texts()][3:] == ["kept free"]
+    # It covers neither the skin nor the scale bar.
+    ax.figure.draw_without_rendering()
+    box = ax.get_legend().get_window_extent().transformed(ax.transData.inverted())
+    assert box.y1 < -0.05
+    assert box.x0 > max(line.get_xdata()[1] for line in ax.lines)
+
+
 def test_regions_are_hatched_and_starts_chosen(ax):
     plot_travel(optimisation(), 1, keep_out=(Disk(0.01, (0.02, 0.02)),), title="second", ax=ax)
     assert [bool(patch.get_hatch()) for patch in ax.patches] == [False, True]

@@ -60,7 +60,7 @@ def calibrated_intensities(
     told = describe_faults([higher if one > _SAME_FLOOR else "" for one in ratio])
     note = (
         f"{told}. If the recording never pauses, touches count as silence: give a recording of the array untouched "
-        "(silence=, --silence FILE). If gain, unit, surroundings or microphones have changed, calibrate again."
+        "(silence=). If gain, unit, surroundings or microphones have changed, calibrate again."
     )
     return dataclasses.replace(heard, notes=(note,)) if told else heard
 

@@ -54,7 +54,7 @@ def make_grid(settings, rate: float, samples: int | None, name: str) -> Grid:
     if samples is not None and samples < length:
         raise ValueError(
             f"{name}: {samples} samples at {rate:g} Hz last {samples / rate:.3g} s, less than one window of "
-            f"{settings.window:g} s. Record longer, or shorten window."
+            f"{settings.window:g} s. Record longer, or shorten window=."
         )
     # Periodic, not symmetric: then its transform is zero but for three bins.
     taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)

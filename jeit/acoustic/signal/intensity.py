@@ -38,11 +38,16 @@ class IntensitySettings(eqx.Module):
             if isinstance(value, bool) or not isinstance(value, (int, float, np.number)) or not np.isfinite(value):
                 raise ValueError(f"{name} must be a finite number; it is {value!r}.")
         if not 0 <= self.low < self.high:
-            raise ValueError(f"low and high must be a band in Hz, 0 ≤ low < high; they are {self.low} and {self.high}.")
-        if not 0 < self.hop <= self.window:
             raise ValueError(
-                f"hop must be positive and no longer than window, or sound between windows is lost; they are "
-                f"{self.hop} and {self.window} s."
+                f"low= and high= must be a band in Hz, 0 ≤ low < high; they are {self.low} and {self.high}."
+            )
+        for name in ("window", "hop"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, in seconds; it is {getattr(self, name)}.")
+        if self.hop > self.window:
+            raise ValueError(
+                f"hop must be no longer than a window, or sound between windows is lost; they are {self.hop} and "
+                f"{self.window} s."
             )
         if self.window > 10:
             raise ValueError(f"window is {self.window} s, longer than any touch; give seconds (0.05, not 50 ms).")

@@ -5,14 +5,23 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.options import BandHigh, BandLow, Hop, Quiet, Window, intensity_settings, make_folder, naming_options
+from jeit.cli.options import (
+    BandHigh,
+    BandLow,
+    Hop,
+    Quiet,
+    Window,
+    in_options,
+    intensity_settings,
+    make_folder,
+    naming_options,
+)
 
 if TYPE_CHECKING:
+    from jeit.acoustic import Taps
     from jeit.acoustic.calibration.calibrate import CalibrationFit
 
-_OPTIONS = {"decay": "--decay", "path": "--output", "intensity": "--low, --high, --window and --hop"}
-# A relative error of the models that taps at places slightly wrong give.
-_MUCH = 0.3
+_OPTIONS = {"path": "--output", "intensity": "--low, --high, --window and --hop"}
 
 
 def calibrate_microphones(
@@ -63,28 +72,24 @@ def calibrate_microphones(
             step("write")
             write_calibration(fit, output)
     if not quiet:
-        _show(console, fit)
+        _show(console, fit, touched)
         console.print(f"[dim]Written:[/dim] {output}, {files[1].name}", soft_wrap=True)
 
 
-def _show(console, fit: "CalibrationFit") -> None:
+def _show(console, fit: "CalibrationFit", taps: "Taps") -> None:
     import numpy as np
 
     from jeit.cli.console import pairs
 
     calibration = fit.calibration
-    decay, noise = calibration.microphone_array.decay, calibration.microphone_array.noise
     usable = calibration.usable
-    typical = float(np.median(np.asarray(noise.relative)[usable]))
     rows = [
         ("microphones", f"{int(usable.sum())} of {len(usable)} usable"),
         ("taps", f"{len(fit.outlier)}, {int(fit.outlier.sum())} left out as outliers"),
-        ("decay model", decay.name),
-        (
-            "error of the model",
-            f"{100 * typical:.1f} % of an intensity, median"
-            + (": much; are all taps where they are said to be?" if typical > _MUCH else ""),
-        ),
+        ("decay model", calibration.microphone_array.decay.name),
+        ("error of the model", f"{100 * fit.error:.1f} % of an intensity, median"),
+        ("so a touch is located", f"to ± {1e3 * _location_error(fit, taps):.1f} mm by one window, median, at best"),
+        *([("note", in_options(fit.note, {"decay": "--decay"}))] if fit.note else []),
         ("scale", "strength 1 reads 1 at a typical microphone right under the source"),
     ]
     if fit.shared.any():
@@ -98,6 +103,19 @@ def _show(console, fit: "CalibrationFit") -> None:
     if refused:
         console.print()
         console.print(pairs("Left out", refused))
+
+
+def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
+    """The Cramér-Rao bound where it was tapped, as loudly: standard deviation along its worst direction, metres."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from jeit.acoustic import cramer_rao
+
+    heard, usable = fit.strength > 0, np.asarray(fit.calibration.usable)
+    places, strength = jnp.asarray(taps.positions[heard]), jnp.asarray(fit.strength[heard])
+    bound = cramer_rao(fit.calibration.microphone_array, places, strength, use=usable)
+    return float(np.median(np.sqrt(np.linalg.eigvalsh(bound)[:, -1])))
 
 
 def _parameters(fit: "CalibrationFit"):

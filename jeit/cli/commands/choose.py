@@ -15,6 +15,7 @@ from jeit.cli.options import (
     Quiet,
     Reference,
     make_folder,
+    naming_options,
     number_or_name,
 )
 
@@ -56,10 +57,11 @@ def choose(
     console = Console(highlight=False)
     with Steps(console, quiet=quiet) as step:
         step("read")
-        measurement = read(data, format, description)
         base = None if reference is None else read(reference, format, description)
+        measurement = read(data, format, description, like=base)
         chosen = None if frame is None else number_or_name(frame, int)
-        result = compare_on_data(measurement, base, settings, rules=rule or None, frame=chosen, progress=step)
+        with naming_options({"rules": "--rule"}):
+            result = compare_on_data(measurement, base, settings, rules=rule or None, frame=chosen, progress=step)
         step("write")
         write_choice(result, output)
     if not quiet:

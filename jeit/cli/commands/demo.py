@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.options import Quiet, make_folder
+from jeit.cli.options import Quiet, make_folder, naming_options
 
 
 def demo(
@@ -33,7 +33,8 @@ def demo(
     skin = RoundSkin()
     with Steps(console, quiet=quiet) as step:
         step("simulate a press")
-        pressed, rest = simulate_press(skin, jax.random.key(seed), (x, y), noise=noise)
+        with naming_options({"position": "--x and --y"}):
+            pressed, rest = simulate_press(skin, jax.random.key(seed), (x, y), noise=noise)
         result = image_difference(pressed, rest, progress=step)
         step("write")
         write_image(result, output, truth=(x, y))

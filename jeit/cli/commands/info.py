@@ -16,7 +16,7 @@ def info(
     """Say what DATA holds: frames, electrodes, protocol, noise, and what was assumed or masked."""
     from rich.console import Console
 
-    from jeit.cli.console import pairs, percent, scaled
+    from jeit.cli.console import counted, pairs, percent, scaled
     from jeit.data import read
     from jeit.report import report_measurement
 
@@ -31,7 +31,7 @@ def info(
     rows = [
         ("frames", f"{found['frames']}{names}"),
         ("protocol", found["protocol"]),
-        ("channels", f"{found['channels']}, of {found['drives']} drives"),
+        ("channels", f"{found['channels']}, of {counted(found['drives'], 'drive')}"),
         ("masked", f"{found['masked']} of {found['voltages']} voltages"),
         ("largest current", scaled(found["largest_current"], "A")),
         ("largest voltage", scaled(found["largest_voltage"], "V")),

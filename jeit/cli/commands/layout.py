@@ -27,7 +27,7 @@ _OPTIONS = {
     "num_pairs": "--pairs",
     "num_taxels": "--taxels",
     "margin": "--margin-mm",
-    "contrast": "--contrast",
+    "outline": "--width-mm and --height-mm",
 }
 # What is told: its name and unit, its key in the report, and what to multiply by.
 _TOLD = (
@@ -99,10 +99,10 @@ def compare(
     if not 0 <= margin < float("inf"):
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
     both = [skins.read_with_outline(name, width, height) for name in (first, second)]
-    check_same_outline(*both)
     make_folder(output, _FILES)
     console = Console(highlight=False)
     with naming_options(_OPTIONS), Steps(console, quiet=quiet) as step:
+        check_same_outline(*both)
         step("mesh")
         made = [
             Skin.create(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from jeit.cli import skins
-from jeit.cli.options import Quiet, check_at_least, check_positive, check_within, make_folder, naming_options
+from jeit.cli.options import Quiet, check_at_least, check_positive, check_within, make_folder
 from jeit.design import defaults
 
 if TYPE_CHECKING:
@@ -16,15 +16,6 @@ if TYPE_CHECKING:
 RESULTS = ("layout.csv", "layout.svg", "travel.png", "report.json")
 # Nodes to optimise on: fewest that make cells at all, and as many as there can be four times of.
 _LEAST_NODES, _MOST_NODES = 4, 250_000
-# Options by the names that their values have further down.
-_OPTIONS = {
-    "thickness": "--thickness-mm",
-    "contact_impedance": "--contact-impedance",
-    "num_points": "--num-points",
-    "symmetry": "--symmetry",
-    "keep_out": "--keep-out",
-    "minimum_spacing": "--minimum-spacing-mm",
-}
 # What is told: its key in the report, its name and unit, and what to multiply by.
 _TOLD = (
     ("worst_sensitivity_V", "least sensitivity / mV", 1e3),
@@ -101,7 +92,7 @@ def optimise(
     def say(done: int, values) -> None:
         step.tell(f"step {done} of at most {steps}, best score {values.max():.3f}")
 
-    with naming_options(_OPTIONS), Steps(console, quiet=quiet) as step:
+    with Steps(console, quiet=quiet) as step:
         result = improve_layout(start, space, **search, **material, progress=step, callback=say)
         step("write")
         write_improved_layout(result, output)

@@ -6,12 +6,22 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.options import BandHigh, BandLow, Hop, Quiet, Window, intensity_settings, make_folder, naming_options
+from jeit.cli.options import (
+    BandHigh,
+    BandLow,
+    Hop,
+    Quiet,
+    Window,
+    in_options,
+    intensity_settings,
+    make_folder,
+    naming_options,
+)
 
 if TYPE_CHECKING:
     from jeit.acoustic import LocatedTouches, Recording
 
-_OPTIONS = {"gap": "--gap", "method": "--method", "intensity": "--low, --high, --window and --hop"}
+_OPTIONS = {"intensity": "--low, --high, --window and --hop"}
 # Of a touch that has moved farther, start and end are printed, not the middle.
 _STROKE = 0.015  # m
 
@@ -96,7 +106,7 @@ def _show(console, found: "LocatedTouches") -> None:
     counts = ", ".join(f"{number} {status}" for status, number in locations.counts().items())
     rows = [("frames", f"{len(locations.times)}: {counts}"), ("touches", str(len(found.track.touches)))]
     rows += [("faults", describe_faults(locations.faults))] * any(locations.faults)
-    rows += [("note", note) for note in locations.notes]
+    rows += [("note", in_options(note, {"silence": "--silence"})) for note in locations.notes]
     console.print()
     console.print(pairs(locations.name, rows))
     if found.track.touches:

@@ -91,8 +91,8 @@ def reconstruct(
     console = Console(highlight=False)
     with Steps(console, quiet=quiet) as step:
         step("read")
-        measurement = read(data, format, description)
         base = None if reference is None else read(reference, format, description)
+        measurement = read(data, format, description, like=base)
         chosen = None if frame is None else number_or_name(frame, int)
         result = image_difference(measurement, base, settings, frame=chosen, progress=step)
         step("write")
@@ -106,7 +106,7 @@ def show(console, result: "ImagedDifference") -> None:
     """Print what was found."""
     from rich.table import Table
 
-    from jeit.cli.console import pairs, percent, scaled
+    from jeit.cli.console import counted, in_one_unit, pairs, percent, scaled
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
     from jeit_solvers import Status
 
@@ -114,21 +114,24 @@ def show(console, result: "ImagedDifference") -> None:
     unit = "S" if result.mesh.dimension == 2 else "S/m"
     noise = result.quality.difference_noise
     hyperparameter = float(reconstruction.hyperparameter)
-    chosen = "none" if reconstruction.rule == "none" else f"{hyperparameter:.3g} ({reconstruction.rule})"
+    chosen = "none" if result.chosen_by == "none" else f"{hyperparameter:.3g} ({result.chosen_by})"
     rows = [
         ("background", f"{scaled(float(calibration.conductivity), unit)}, misfit {percent(float(calibration.misfit))}"),
         ("difference", f"{percent(result.quality.difference)} of the reference"),
         ("noise in it", "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"),
         ("method", f"{result.settings.method}, hyperparameter {chosen}"),
-        ("mesh", f"{result.mesh.num_points:,} nodes, {result.mesh.num_cells:,} cells"),
+        ("mesh", f"{counted(result.mesh.num_points, 'node')}, {counted(result.mesh.num_cells, 'cell')}"),
     ]
+    if calibration.note:
+        rows.insert(1, ("note", calibration.note))
     if calibration.status != Status.CONVERGED:
         rows.insert(1, ("calibration", f"{calibration.status}. {calibration.reason}"))
     if reconstruction.choice is not None and reconstruction.choice.note:
         rows.append(("hyperparameter", reconstruction.choice.note))
     if isinstance(reconstruction, Reconstruction):
         misfit = f"misfit {float(reconstruction.misfit):.2g} standard deviations"
-        rows.append(("iteration", f"{reconstruction.status}, {reconstruction.iterations} steps, {misfit}"))
+        iterations = counted(reconstruction.iterations, "iteration")
+        rows.append(("iteration", f"{reconstruction.status}, {iterations}, {misfit}"))
         if reconstruction.status != Status.CONVERGED:
             rows.append(("", reconstruction.reason))
     elif result.lowest < -1:
@@ -137,12 +140,12 @@ def show(console, result: "ImagedDifference") -> None:
     console.print()
     console.print(pairs(result.measurement.name, rows))
     console.print()
-    table = Table("inclusion", "x / mm", "y / mm", "area / mm²", f"peak / {unit}", box=None, padding=(0, 2))
+    peak_unit, peaks = in_one_unit([inclusion.peak for inclusion in result.inclusions], unit)
+    table = Table("inclusion", "x / mm", "y / mm", "area / mm²", f"peak / {peak_unit}", box=None, padding=(0, 2))
     for column in table.columns[1:]:
         column.justify = "right"
-    for inclusion in result.inclusions:
+    for inclusion, peak in zip(result.inclusions, peaks, strict=True):
         x, y = inclusion.centroid[:2]
-        numbers = (f"{1e3 * x:.1f}", f"{1e3 * y:.1f}", f"{1e6 * inclusion.area:.0f}", f"{inclusion.peak:.3g}")
-        table.add_row(inclusion.kind, *numbers)
+        table.add_row(inclusion.kind, f"{1e3 * x:.1f}", f"{1e3 * y:.1f}", f"{1e6 * inclusion.area:.0f}", peak)
     console.print(table if result.inclusions else "  no inclusion found")
     console.print()

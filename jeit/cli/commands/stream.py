@@ -27,48 +27,55 @@ def stream(
     ],
     format: Format = None,
     description: Description = None,
-    method: Annotated[str, typer.Option(help="gauss-newton, levenberg-marquardt or linear.")] = "gauss-newton",
+    method: Annotated[
+        str | None, typer.Option(help="gauss-newton (default), levenberg-marquardt, or one-step for linear images.")
+    ] = None,
     hyperparameter: Annotated[
         str | None,
         typer.Option(help="A number, or the rule that chooses it (default noise-figure).", metavar="VALUE|RULE"),
     ] = None,
-    steps: Annotated[int, typer.Option(help="Most iterations for a frame.")] = 4,
+    steps: Annotated[int | None, typer.Option(help="Most iterations for a frame (default 4).")] = None,
     memory: Annotated[
-        float, typer.Option(help="Frames over which an image changes: smooths in time (Kalman). 0: every frame alone.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            help="Frames over which an image changes: smooths in time (Kalman). 0 (default): every frame alone."
+        ),
+    ] = None,
     contact: Contact = None,
-    num_points: Annotated[int, typer.Option(help="Nodes of the mesh, about.")] = 1200,
+    num_points: Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 1200).")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Image every frame of DATA as it comes; bad frames are refused with the reason, and the stream goes on.
 
     Writes frames.csv line by line (x, y and peak of the strongest change, metres and S), and at the end images.npz with
-    `conductivity` (frames, cells), NaN for frames that were refused, `points`, `cells` and `background`.
+    `conductivity` (frames, cells), NaN for frames that were refused, `points`, `cells` and `background`. If all were
+    refused, the exit status is 1.
     """
     import numpy as np
     from rich.console import Console
 
-    from jeit.cli.console import Steps, scaled
+    from jeit.cli.console import Steps, counted, scaled
     from jeit.data import read
     from jeit.imaging.stream import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as images_of
-    from jeit.inverse.nonlinear.solvers import solver_named
     from jeit.report import write_stream
 
-    with naming_options({"solver": "--method", "max_steps": "--steps", "memory": "--memory"}):
-        settings = StreamSettings(
-            solver=solver_named(method).for_frames(steps),
-            hyperparameter=None if hyperparameter is None else number_or_name(hyperparameter),
-            memory=memory,
-            contact=contact,
-            num_points=num_points,
-        )
+    given = {
+        "solver": method,
+        "max_steps": steps,
+        "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
+        "memory": memory,
+        "contact": contact,
+        "num_points": num_points,
+    }
+    with naming_options({"solver": "--method", "max_steps": "--steps"}):
+        settings = StreamSettings(**{name: value for name, value in given.items() if value is not None})
     make_folder(output, ("frames.csv", "images.npz"))
     console = Console(highlight=False)
     with Steps(console, quiet=quiet) as step:
         step("read")
         empty = read(reference, format, description)
-        measured = empty if data == "-" else read(Path(data), format, description)
+        measured = empty if data == "-" else read(Path(data), format, description, like=empty)
         imager, calibration = prepare_imager(empty, settings, measurement=measured, progress=step)
 
     def show(one) -> None:
@@ -77,11 +84,15 @@ def stream(
 
     frames = parse_frames(sys.stdin) if data == "-" else frames_of(measured)
     written = write_stream(images_of(imager, frames), calibration, output, name=data, progress=show)
+    if not written.latency.size:
+        raise ValueError(
+            f"'{data}': none of {counted(written.number, 'frame')} could be imaged; the first: {written.first_reason}"
+        )
     if quiet:
         return
     said = ", ".join(f"{number} {status}" for status, number in sorted(written.counts.items()))
-    console.print(f"\n{written.number} frames: {said}; background {scaled(float(calibration.conductivity), 'S')}")
-    if written.latency.size:
-        middle, high = 1e3 * np.quantile(written.latency, (0.5, 0.99))
-        console.print(f"latency: median {middle:.2f} ms, 99 % within {high:.2f} ms")
+    background = scaled(float(calibration.conductivity), "S")
+    console.print(f"\n{counted(written.number, 'frame')}: {said}; background {background}")
+    middle, high = 1e3 * np.quantile(written.latency, (0.5, 0.99))
+    console.print(f"latency: median {middle:.2f} ms, 99 % within {high:.2f} ms")
     console.print(f"[dim]Written:[/dim] {output / 'frames.csv'}, images.npz", soft_wrap=True)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.options import Quiet
+from jeit.cli.options import Quiet, naming_options
 
 if TYPE_CHECKING:
     from jeit.design.study import Progress, Study
@@ -59,12 +59,13 @@ def resume(
 @study.command()
 def status(file: File, output: Output = None) -> None:
     """Say how far a study is."""
+    from jeit.cli.console import counted
     from jeit.design.study import study_progress
 
     sweep, store = _read(file, output)
     if not store.exists():
-        chunks = len(sweep.chunks)
-        typer.echo(f"{sweep.name}: not begun; {len(sweep.points)} points in {chunks} chunks.")
+        points, chunks = counted(len(sweep.points), "point"), counted(len(sweep.chunks), "chunk")
+        typer.echo(f"{sweep.name}: not begun; {points} in {chunks}.")
         return
     now = study_progress(sweep, store)
     typer.echo(
@@ -86,7 +87,8 @@ def report(file: File, output: Output = None, page: Page = None) -> None:
 def _read(file: Path, output: Path | None) -> "tuple[Study, Path]":
     from jeit.design.study import read_study
 
-    return read_study(file), output or file.with_suffix(".zarr")
+    with naming_options({"path": "STUDY.toml"}):
+        return read_study(file), output or file.with_suffix(".zarr")
 
 
 def _page(file: Path, store: Path, page: Path | None) -> Path:

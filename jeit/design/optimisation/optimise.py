@@ -169,14 +169,13 @@ class _Search(eqx.Module):
             nearest = int(lacking.argmin())
             parts = self.constraints.shortfalls(jnp.asarray(ends.centres[nearest]), jnp.asarray(ends.radii[nearest]))
             worst = max(parts, key=lambda name: float(jnp.max(parts[name], initial=-jnp.inf)))
-            reason = (
-                f"no start satisfies the constraints: {worst} lacks {1e3 * lacking.min():.3g} mm at best; ask for less."
-            )
+            least = 1e3 * lacking.min()
+            reason = f"no start satisfies the constraints: {worst}= lacks {least:.3g} mm at best; ask for less."
             return None, "infeasible", reason
         best = int(np.where(good, values, -np.inf).argmax())
         if fits and values[best] <= start_value + _ROUNDING * abs(start_value):
             return None, status, "no start is better than the layout given."
-        reason = f"start {best + 1} of {len(values)} is best; {good.sum()} satisfy the constraints."
+        reason = f"start {best + 1} of {len(values)} is best; the constraints are satisfied by {good.sum()}."
         if not fits:
             reason += (
                 " The layout given does not satisfy what is asked, and was changed until it did before the first step."

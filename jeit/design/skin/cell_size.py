@@ -1,18 +1,34 @@
-"""How fine the mesh of a skin can be."""
+"""How fine the mesh of a skin can be, and how coarse."""
 
 import math
 
+import numpy as np
+
+from jeit.arguments import IN_MILLIMETRES, check_metres
+from jeit.layout import Layout
 from jeit.mesh.generate.unstructured import MOST_POINTS
 
 # Nodes of a plane mesh, times cell size squared over area: 1.155 for equilateral cells, and some for the edge.
 _NODES = 1.2
+# Of cells, times the smallest diameter of electrodes.
+_COARSEST = 1.5
 
 
-def check_cell_size(name: str, cell_size: float, area: float, num_layers: int = 0) -> None:
-    """Raise `ValueError`, which speaks of `name` in millimetres, where cells of so many metres are too many.
+def check_cell_size(name: str, cell_size: float, layout: Layout, area: float, num_layers: int = 0) -> None:
+    """Raise `ValueError`, which speaks of `name` in millimetres, where cells of so many metres are too large for the
+    electrodes of `layout`, or too many.
 
     `area` of the skin in m²; `num_layers` of cells, 0 for a sheet.
     """
+    check_metres(name, cell_size)
+    smallest = smallest_diameter(layout)
+    most = _COARSEST * smallest
+    if cell_size > (1 + 1e-9) * most:
+        end = f"; {IN_MILLIMETRES}" if cell_size**2 > area else "."
+        raise ValueError(
+            f"{name} is {1e3 * cell_size:g} mm; give no more than {1e3 * most:.3g} mm, as electrodes of "
+            f"'{layout.name}' are {1e3 * smallest:.3g} mm across{end}"
+        )
     plane = _NODES * area * (num_layers + 1)
     number = plane / cell_size**2
     if number > MOST_POINTS:
@@ -20,3 +36,8 @@ def check_cell_size(name: str, cell_size: float, area: float, num_layers: int = 
         raise ValueError(
             f"{name} is {1e3 * cell_size:g} mm, which makes about {number:.2g} nodes; give {least:.2g} mm or more."
         )
+
+
+def smallest_diameter(layout: Layout) -> float:
+    """Of the electrodes, metres."""
+    return float(np.min(layout.diameters))

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.arguments import IN_MILLIMETRES, check_kind, check_metres
+from jeit.arguments import check_kind, check_metres
 from jeit.design.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
-from jeit.design.skin.cell_size import check_cell_size
+from jeit.design.skin.cell_size import check_cell_size, smallest_diameter
 from jeit.design.skin.indentation import AbstractIndentation, Bell
 from jeit.design.skin.protocol import skin_protocol
 from jeit.design.skin.sheet_touches import SheetTouches, sheet_touches
@@ -21,8 +21,6 @@ from jeit.layout.layout import check_layout
 from jeit.mesh import Domain, Mesh, Rectangle, layer
 from jeit.protocol import Protocol
 
-# Of cells, times the smallest diameter of electrodes.
-_COARSEST = 1.5
 # Of a layer of cells, times a touch's depth: the middle of its uppermost cells is a quarter of it below the surface.
 _THICKEST = 3.0
 
@@ -105,7 +103,7 @@ class Skin(eqx.Module):
         if cell_size is None and num_points is None:
             cell_size = CELL_SIZE
         if cell_size is not None:
-            _check_cells(layout, cell_size, outline, num_layers)
+            check_cell_size("cell_size", cell_size, layout, float(outline.area), num_layers)
         electrodes = skin_electrodes(layout, num_layers, contact_impedance)
         plane = outline.mesh(num_points=num_points, cell_size=cell_size)
         mesh = layer(plane, thickness, num_layers) if num_layers else plane
@@ -134,7 +132,7 @@ class Skin(eqx.Module):
         if self.cell_size is None:
             electrodes.check(mesh)
         else:
-            _check_cells(layout, self.cell_size, self.outline, self.num_layers)
+            check_cell_size("cell_size", self.cell_size, layout, float(self.outline.area), self.num_layers)
             _check_electrodes(layout, electrodes, mesh, self.cell_size, None)
         return eqx.tree_at(lambda one: (one.layout, one.model), self, (layout, self.model.with_electrodes(electrodes)))
 
@@ -217,23 +215,11 @@ def skin_electrodes(layout: Layout, num_layers: int, contact_impedance=None) -> 
     return FaceDiscs(np.column_stack([centres, np.zeros(len(centres))]), discs.radius, discs.contact_impedance)
 
 
-def _check_cells(layout: Layout, cell_size: float, outline: Domain, num_layers: int) -> None:
-    check_metres("cell_size", cell_size)
-    most = _COARSEST * _smallest(layout)
-    if 1e3 * cell_size > (1 + 1e-9) * most:
-        end = f"; {IN_MILLIMETRES}" if cell_size > longer_side(outline) else "."
-        raise ValueError(
-            f"cell_size is {1e3 * cell_size:g} mm; give no more than {most:.3g} mm, as electrodes of '{layout.name}' "
-            f"are {_smallest(layout):.3g} mm across{end}"
-        )
-    check_cell_size("cell_size", cell_size, float(outline.area), num_layers)
-
-
 def _check_electrodes(layout: Layout, electrodes, mesh: Mesh, cell_size: float | None, num_points: int | None) -> None:
     try:
         electrodes.check(mesh)
     except ValueError:
-        across = f"{_smallest(layout):.3g} mm across"
+        across = f"{1e3 * smallest_diameter(layout):.3g} mm across"
         if num_points is not None:
             said = f"num_points {num_points} makes cells too coarse for electrodes {across}; give more."
         else:
@@ -242,8 +228,3 @@ def _check_electrodes(layout: Layout, electrodes, mesh: Mesh, cell_size: float |
                 "give less."
             )
         raise ValueError(said) from None
-
-
-def _smallest(layout: Layout) -> float:
-    """Diameter of the smallest electrode, millimetres."""
-    return 1e3 * float(np.min(layout.diameters))

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from jeit.design.scores import TouchPrior, layout_scores
 from jeit.design.sensitivity import SensitivityMap
+from jeit.design.skin.cell_size import smallest_diameter
 from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.design.skin.skin import Skin, model_conductivity
 from jeit.design.skin.touch_grid import TouchGrid, touch_grid
@@ -67,7 +68,7 @@ def check_points(study: Study) -> None:
         try:
             _skin(study, point.shape).with_layout(point.layout)
         except ValueError:
-            smallest = 1e3 * float(np.min(point.layout.diameters))
+            smallest = 1e3 * smallest_diameter(point.layout)
             raise ValueError(
                 f"{where}: too coarse for electrodes of {point.layout.name!r}, {smallest:.3g} mm across; make cells "
                 "smaller."

@@ -282,16 +282,10 @@ def _check(study: Study) -> None:
         )
     for point in study.points:
         _check_measurement(point)
-        smallest = float(np.min(point.layout.diameters))
-        if point.cell_size > 4 * smallest:
-            raise ValueError(
-                f"mesh.cell_mm is {1e3 * point.cell_size:g}, too coarse for electrodes {1e3 * smallest:.3g} mm across; "
-                f"{1e3 * smallest / 2:.3g} would do."
-            )
         if point.thickness > longer_side(study.outline):
             wide = f"{1e3 * longer_side(study.outline):g}"
             raise ValueError(f"skin.thickness_mm is {1e3 * point.thickness:g}, more than the skin is wide: {wide} mm.")
-        check_cell_size("mesh.cell_mm", point.cell_size, study.outline.area, point.layers)
+        check_cell_size("mesh.cell_mm", point.cell_size, point.layout, study.outline.area, point.layers)
 
 
 def _check_measurement(point: Point) -> None:

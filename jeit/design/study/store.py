@@ -67,7 +67,7 @@ class Store:
         if attributes.get("fingerprint") != study.fingerprint:
             raise ValueError(
                 f"{self.path} holds the results of another study, or of this one before it was changed; move it away "
-                "or choose another --output."
+                "or choose another path."
             )
         try:
             self._group = zarr.open_group(str(self.path), mode="r+")

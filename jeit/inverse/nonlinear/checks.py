@@ -26,7 +26,9 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
         raise ValueError("mask: every channel is left out, so there is nothing to reconstruct from.")
     values = np.asarray(measured)[used]
     if not np.isfinite(values).all():
-        raise ValueError(f"voltages: {(~np.isfinite(values)).sum()} channels in use are NaN or infinite; mask them.")
+        raise ValueError(
+            f"voltages: NaN or infinite in {(~np.isfinite(values)).sum()} of the channels in use; mask them."
+        )
     if not values.any():
         raise ValueError("voltages: all channels in use read zero; was the current source on?")
     return jnp.where(used, measured, 0), used

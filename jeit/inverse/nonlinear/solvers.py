@@ -1,6 +1,6 @@
 """Solvers of the nonlinear problem, as small objects that say how many steps they take and what they can do.
 
-`SOLVERS` has them by name, and `solver_named` is where a name becomes an object.
+`SOLVERS` has them by name, and `as_solver` is where a name becomes an object.
 """
 
 import abc
@@ -22,7 +22,7 @@ _Value = TypeVar("_Value")
 _MAX_STEPS = 30
 _REASONS = {
     Status.CONVERGED: "The next step would change the objective by less than the tolerance.",
-    Status.STEP_LIMIT: "Stopped after {} trial steps; raise max_steps, or the hyperparameter.",
+    Status.STEP_LIMIT: "Stopped after {}; raise max_steps, or the hyperparameter.",
     Status.STALLED: "No shorter step lowered the objective; the model is at odds with the data.",
 }
 
@@ -66,21 +66,22 @@ class AbstractSolver(eqx.Module):
         """Itself with these settings where it has none of its own, for an `Imager`. Raises `ValueError` if it is not
         one that images a frame in a bounded time."""
         raise ValueError(
-            f"solver: {self.name} does not image frames in a bounded time; take linear, gauss-newton or "
-            "levenberg-marquardt."
+            f"solver: {self.name} does not image frames in a bounded time; take one of {', '.join(frame_solvers())}."
         )
 
     def descent(self, max_steps: int, rtol: float) -> Descent:
-        """Its steps, for optimistix; the arguments hold where it has none of its own. Raises `ValueError` if it takes
-        other steps."""
+        """Its steps, for optimistix; the arguments hold where it has none of its own. Keeps the cost of the start and
+        of `max_steps` steps. Raises `ValueError` if it takes other steps."""
         raise ValueError(f"solver: {self.name} does not descend along quadratic models.")
 
 
 class GaussNewton(AbstractSolver):
     """Gauss-Newton steps with a backtracking line search; total variation by lagged diffusivity.
 
-    `max_steps`: 30 unless given, for an `Imager` 4. `rtol`: the relative change of the objective that ends the
-    iteration, 1e-6 unless given, with total variation 1e-4, for an `Imager` 1e-3.
+    `max_steps`: 30 unless given, for an `Imager` 4; a step that leads too far counts, and so does the shorter one tried
+    in its place. `rtol`: the iteration ends when the next step would change the objective by less than rtol times
+    itself, or times ½, what one voltage costs that is a standard deviation off; 1e-6 unless given, with total variation
+    1e-4, for an `Imager` 1e-3.
     """
 
     name: ClassVar[str] = "gauss-newton"
@@ -100,7 +101,7 @@ class GaussNewton(AbstractSolver):
 
     def descent(self, max_steps, rtol):
         """Without damping."""
-        return Descent(history=_first(self.max_steps, max_steps), rtol=_first(self.rtol, rtol))
+        return _steps(_first(self.max_steps, max_steps), _first(self.rtol, rtol))
 
 
 class LevenbergMarquardt(AbstractSolver):
@@ -130,8 +131,7 @@ class LevenbergMarquardt(AbstractSolver):
 
     def descent(self, max_steps, rtol):
         """With damping."""
-        steps, tolerance = _first(self.max_steps, max_steps), _first(self.rtol, rtol)
-        return Descent(history=steps, rtol=tolerance, damping=self.damping)
+        return _steps(_first(self.max_steps, max_steps), _first(self.rtol, rtol), self.damping)
 
 
 class LBFGSB(AbstractSolver):
@@ -193,15 +193,14 @@ class LeastSquares(AbstractSolver):
         """Of the residuals of data and prior together."""
         solution = _least_squares(inversion, start, self.solver, self.max_steps, {})
         costs = jnp.stack([_cost(inversion, start), _cost(inversion, solution.value)])
-        status = ended(solution.result)
-        reason = _REASONS[status].format(self.max_steps)
-        return Solved(solution.value, int(solution.stats["num_steps"]), costs, status, reason)
+        status, iterations = ended(solution.result), int(solution.stats["num_steps"])
+        return Solved(solution.value, iterations, costs, status, _REASONS[status].format(counted(iterations)))
 
 
 class OneStep(AbstractSolver):
     """The linear image, one Gauss-Newton step from the background: for an `Imager`."""
 
-    name: ClassVar[str] = "linear"
+    name: ClassVar[str] = "one-step"
 
     @property
     def is_linear(self):
@@ -223,22 +222,34 @@ SOLVERS: dict[str, type[AbstractSolver]] = {
 """Solvers by name."""
 
 
-def solver_named(name: str, argument: str = "solver") -> AbstractSolver:
-    """The solver of that name in `SOLVERS`, with its defaults. Raises `ValueError`, about `argument`, for others."""
-    check_name(argument, name, SOLVERS)
-    return SOLVERS[name]()
+def frame_solvers() -> tuple[str, ...]:
+    """Names of those that image frames in a bounded time, for an `Imager`."""
+    return tuple(name for name, one in SOLVERS.items() if one.for_frames is not AbstractSolver.for_frames)
 
 
-def as_solver(solver: "AbstractSolver | optx.AbstractLeastSquaresSolver | str") -> AbstractSolver:
-    """A solver itself, or the one meant by a name or by a solver of optimistix. Raises `ValueError` for others."""
+def as_solver(
+    solver: "AbstractSolver | optx.AbstractLeastSquaresSolver | str", *, frames: bool = False
+) -> AbstractSolver:
+    """A solver itself, or the one meant by a name in `SOLVERS` or by a solver of optimistix. Raises `ValueError` for
+    others, and says which there are: of frames, or else of reconstructions."""
+    names = frame_solvers() if frames else tuple(name for name, one in SOLVERS.items() if not one().is_linear)
     if isinstance(solver, str):
-        return solver_named(solver)
+        if solver not in SOLVERS:
+            check_name("solver", solver, names)
+        return SOLVERS[solver]()
     if isinstance(solver, optx.AbstractLeastSquaresSolver):
         return LeastSquares(solver)
-    names = ", ".join(SOLVERS)
-    wanted = f"one of jeit.inverse.nonlinear, such as GaussNewton(), a name ({names}), or optimistix's least squares"
-    check_kind("solver", solver, AbstractSolver, wanted)
+    wanted = f"one of jeit.inverse.nonlinear, such as GaussNewton(), a name ({', '.join(names)}), or optimistix's"
+    check_kind("solver", solver, AbstractSolver, f"{wanted} least squares")
     return solver
+
+
+def counted(iterations: int, shortened: int = 0) -> str:
+    """In words, how many iterations there were, and how many steps that had to be shortened."""
+    said = f"{iterations} iteration{'s' * (iterations != 1)}"
+    if not shortened:
+        return said
+    return f"{said} and {shortened} step{'s' * (shortened != 1)} that led too far"
 
 
 def expand(coefficients: Float[Array, " n"], inversion: Inversion):
@@ -267,11 +278,19 @@ def _least_squares(inversion: Inversion, start, solver, max_steps: int, options:
     return optx.least_squares(residual, solver, start, inversion, options=options, max_steps=max_steps, throw=False)
 
 
+def _steps(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
+    """As many steps, with room for the start. `atol` ends it where the objective itself goes to nothing, as that of an
+    undisturbed frame does, and no change is small beside it."""
+    return Descent(rtol=rtol, atol=0.5 * rtol, damping=damping, history=max_steps + 1)
+
+
 def _descend(descent: Descent, inversion: Inversion, start) -> Solved:
     solution = _least_squares(inversion, start, descent, descent.history, {"expand": expand})
-    accepted, status = int(solution.state.num_accepted), ended(solution.result)
-    reason = _REASONS[status].format(descent.history)
-    return Solved(solution.value, max(accepted - 1, 0), solution.state.history[:accepted], status, reason)
+    state, status = solution.state, ended(solution.result)
+    accepted = int(state.num_accepted)
+    iterations = max(accepted - 1, 0)
+    reason = _REASONS[status].format(counted(iterations, int(state.num_steps) - 1 - iterations))
+    return Solved(solution.value, iterations, state.history[:accepted], status, reason)
 
 
 def _between(minimise, inversion: Inversion, start, box, max_steps: int, tolerance: float) -> Solved:
@@ -282,8 +301,10 @@ def _between(minimise, inversion: Inversion, start, box, max_steps: int, toleran
     if found.converged:
         reason = "No step between the bounds would change the image much."
         return Solved(found.x, int(found.steps), costs, Status.CONVERGED, reason)
-    reason = _REASONS[Status.STEP_LIMIT].format(int(found.steps))
-    return Solved(found.x, int(found.steps), costs, Status.STEP_LIMIT, reason)
+    iterations = int(found.steps)
+    return Solved(
+        found.x, iterations, costs, Status.STEP_LIMIT, _REASONS[Status.STEP_LIMIT].format(counted(iterations))
+    )
 
 
 @eqx.filter_jit

@@ -30,8 +30,10 @@ from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.defaults import smooth_prior
 from jeit.inverse.prior.priors import AbstractPrior
 
-# What a frame is given unless the solver says otherwise; and what a shape must tell to be kept.
-_STEPS, _RTOL, _INFORMATIVE = 4, 1e-3, 0.03
+FRAME_STEPS = 4
+"""Most iterations that a frame is given, unless the solver says otherwise."""
+# The tolerance, alike; and what a shape must tell to be kept.
+_RTOL, _INFORMATIVE = 1e-3, 0.03
 # Standard deviation of a masked channel over the largest noise.
 _BLIND = 1e5
 
@@ -118,7 +120,7 @@ class Imager(eqx.Module):
         Kaipio, Karjalainen, Somersalo and Vauhkonen, Ann. N. Y. Acad. Sci. 873 (1999) 430-439.
         """
         check_memory(memory)
-        chosen = as_solver(GaussNewton() if solver is None else solver).for_frames(_STEPS, _RTOL)
+        chosen = as_solver(GaussNewton() if solver is None else solver, frames=True).for_frames(FRAME_STEPS, _RTOL)
         prior = smooth_prior(float(np.ptp(np.asarray(model.mesh.points), axis=0).max())) if prior is None else prior
         check_prior(prior)
         parametrisation = as_parametrisation(parametrisation)
@@ -162,7 +164,7 @@ class Imager(eqx.Module):
     @property
     def steps(self) -> int:
         """Most iterations that a frame is given."""
-        return 1 if self.solver.is_linear else self.solver.descent(_STEPS, _RTOL).history
+        return 1 if self.solver.is_linear else self.solver.descent(FRAME_STEPS, _RTOL).history - 1
 
     def weighing(self, usable: Bool[Array, " M"]) -> Weighing:
         """How to combine frames of which only the `usable` channels count."""
@@ -232,9 +234,9 @@ def _estimate(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate
     if imager.persistence > 0:  # the prior's centre moves, and the coefficients count from there
         expected, start = start, expected
         inversion = eqx.tree_at(lambda i: i.reference, inversion, inversion.estimate(expected))
-    descent = imager.solver.descent(_STEPS, _RTOL)
+    descent = imager.solver.descent(FRAME_STEPS, _RTOL)
     solution = optx.least_squares(
-        residual, descent, start, inversion, options={"expand": expand}, max_steps=descent.history, throw=False
+        residual, descent, start, inversion, options={"expand": expand}, max_steps=imager.steps, throw=False
     )
     # The last step leads to a point not looked at yet. It takes voltages, but no Jacobian, to see if it is better.
     state = solution.state

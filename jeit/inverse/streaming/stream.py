@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.arguments import check_kind
+from jeit.inverse.nonlinear.solvers import counted
 from jeit.inverse.streaming.imager import Imager
 from jeit_solvers import Status
 
@@ -116,7 +117,8 @@ class _Session:
         self.last = filled
         if not converged and status == FrameStatus.IMAGED:
             status = FrameStatus.STEP_LIMIT
-            reason = f"More than {self.imager.steps} iterations are needed for this frame."
+            done = counted(iterations, self.imager.steps - iterations)
+            reason = f"Stopped after {done}: this frame needs more than a frame is given."
         return FrameImage(number, conductivity, status, reason, usable, misfit, iterations, time.perf_counter() - begin)
 
     def _weigh(self, usable) -> None:
@@ -184,7 +186,10 @@ class _Session:
                 return values, none, FrameStatus.REFUSED, reason
         if count < np.count_nonzero(self.mask):
             missing = np.count_nonzero(self.mask) - count
-            return values, usable, FrameStatus.PARTIAL, f"{missing} channels have no reading and are left out."
+            lacking = (
+                "1 channel has no reading and is" if missing == 1 else f"{missing} channels have no reading and are"
+            )
+            return values, usable, FrameStatus.PARTIAL, f"{lacking} left out."
         return values, usable, FrameStatus.IMAGED, ""
 
     def _without_dead_electrode(self, difference, usable):

@@ -8,7 +8,17 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
 from jeit.design.sensitivity import SensitivityMap
-from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar
+from jeit.plot.axes import (
+    INK,
+    SEQUENTIAL,
+    SOFT,
+    axes_or_new,
+    bare,
+    draw_colour_bar,
+    draw_legend_above,
+    draw_scale_bar,
+    soften_axes,
+)
 
 _COLOURS = (INK, "#c8102e", "#1f6fb4", "#2a9d6f")
 
@@ -40,7 +50,7 @@ def plot_sensitivity_map(
     if electrodes is not None:
         x, y = np.asarray(electrodes).T[:2]
         ax.plot(x, y, "o", markersize=4, markerfacecolor="white", markeredgecolor=INK, markeredgewidth=0.8)
-    bare(ax, extent)
+    bare(ax, extent, numbered=False)
     draw_scale_bar(ax, extent)
     if title:
         ax.set_title(title)
@@ -62,11 +72,12 @@ def plot_sensitivity_histograms(
     edges = np.linspace(0, top, bins + 1)
     for colour, (name, theta) in zip(_COLOURS, maps.items(), strict=False):
         ax.stairs(100 * theta.histogram(edges)[0], 1e3 * edges, color=colour, label=name, linewidth=1.4)
-    least = float(next(iter(maps.values())).minimum)
-    ax.axvline(1e3 * least, color=SOFT, linewidth=1, linestyle="--")
-    ax.set_xlabel("Sensitivity (mV)")
-    ax.set_ylabel("Share of the area (%)")
-    ax.legend(frameon=False)
+    first, theta = next(iter(maps.items()))
+    ax.axvline(1e3 * float(theta.minimum), color=SOFT, linewidth=1, linestyle="--", label=f"least of {first}")
+    ax.set_xlabel("Sensitivity (mV)", color=INK)
+    ax.set_ylabel("Share of the area (%)", color=INK)
+    soften_axes(ax)
+    draw_legend_above(ax)
     if title:
         ax.set_title(title)
     return ax

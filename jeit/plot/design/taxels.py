@@ -11,7 +11,17 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, check_name
 from jeit.design.taxels import Taxels
-from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar, extent_of
+from jeit.plot.axes import (
+    INK,
+    SEQUENTIAL,
+    axes_or_new,
+    bare,
+    draw_colour_bar,
+    draw_legend_above,
+    draw_scale_bar,
+    extent_of,
+    soften_axes,
+)
 
 _COLOURS = (INK, "#c8102e", "#1f6fb4", "#2a9d6f", "#8a5cb8", "#d98a1c")
 _PALETTE = "Set3"
@@ -78,10 +88,8 @@ def plot_taxel_areas(
     ax.set_xlabel("Taxel area (cm²)", color=INK)
     ax.set_ylabel("Taxels", color=INK)
     ax.set_title(title or "")
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.spines[["left", "bottom"]].set_color(SOFT)
-    ax.tick_params(color=SOFT, labelcolor=INK)
-    ax.legend(frameon=False)
+    soften_axes(ax)
+    draw_legend_above(ax)
     return ax
 
 
@@ -175,6 +183,6 @@ def _dress(ax: Axes, taxels: Taxels, electrodes: ArrayLike | None, title: str | 
     half = np.stack(_sides(taxels), axis=1) / 2
     places = np.asarray(taxels.places)
     extent = extent_of(np.concatenate([places - half, places + half]))
-    bare(ax, extent)
+    bare(ax, extent, numbered=False)
     draw_scale_bar(ax, extent)
     ax.set_title(title or "")

@@ -1,9 +1,11 @@
 """Where electrodes travelled while a layout was optimised, from start to end."""
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PatchCollection
-from matplotlib.patches import Circle, PathPatch
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, PathPatch
 from matplotlib.path import Path
 
 from jeit.arguments import check_kind
@@ -23,7 +25,7 @@ def plot_travel(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the way of every electrode of one of the starts: hollow where it began, filled where it ended.
+    """Draw the way of every electrode of one of the starts, hollow where it began, filled where it ended, and a legend.
 
     `start`: which, from 0; `keep_out`: regions to be hatched. The title gives the mean way in millimetres unless one is
     given. Raises `ValueError` for a start that is not there, and for what is no `Optimisation`.
@@ -39,7 +41,7 @@ def plot_travel(
     if outline is not None:
         ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9, zorder=2))
         extent = outline.extent
-        bare(ax, extent)
+        bare(ax, extent, numbered=False)
         draw_scale_bar(ax, extent)
     for domain in keep_out:
         ax.add_patch(PathPatch(outline_path(domain), **_FREE))
@@ -48,9 +50,24 @@ def plot_travel(
     ax.add_collection(PatchCollection(began, facecolor="none", edgecolor=SOFT, linewidth=1.0, zorder=3))
     ax.add_collection(LineCollection(list(ways.swapaxes(0, 1)), colors=SOFT, linewidths=1.2, zorder=3))
     ax.add_collection(PatchCollection(ended, facecolor=METAL, edgecolor=INK, linewidth=0.6, zorder=4))
+    _explain(ax, kept_free=bool(keep_out))
     travelled = np.linalg.norm(ends - ways[0], axis=1)
     ax.set_title(f"Moved {1e3 * travelled.mean():.0f} mm on average" if title is None else title, color=INK)
     return ax
+
+
+def _explain(ax: Axes, *, kept_free: bool) -> None:
+    """A legend below, beside the scale bar."""
+    disc = {"marker": "o", "markersize": 8, "linestyle": "none"}
+    handles: list[Artist] = [
+        Line2D([], [], markerfacecolor="none", markeredgecolor=SOFT, label="where it began", **disc),
+        Line2D([], [], color=SOFT, linewidth=1.2, label="way, step by step"),
+        Line2D([], [], markerfacecolor=METAL, markeredgecolor=INK, markeredgewidth=0.6, label="where it ended", **disc),
+    ]
+    if kept_free:
+        handles.append(Patch(facecolor="none", edgecolor=SOFT, hatch="////", label="kept free"))
+    style = {"frameon": False, "fontsize": 9, "labelcolor": INK, "borderaxespad": 0.2, "columnspacing": 1.2}
+    ax.legend(handles=handles, loc="lower right", ncols=2, **style)
 
 
 def outline_path(domain: Domain) -> Path:

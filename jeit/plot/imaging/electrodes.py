@@ -7,7 +7,8 @@ from matplotlib.patches import Circle, Patch, Rectangle
 
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
-from jeit.plot.axes import INK, axes_or_new
+from jeit.plot.axes import axes_or_new
+from jeit.plot.imaging.electrode_numbers import draw_numbers
 
 METAL = "#b8860b"
 
@@ -18,7 +19,7 @@ def draw_electrodes(
     """Draw `electrodes` seen from above, and their numbers, counted from `first`, beside them.
 
     Arcs are drawn along the boundary of `mesh`, discs and patches at their size, points as dots. Numbers stand outside
-    the outline for electrodes on the edge of a 2-D mesh, on the electrode elsewhere. Raises `ValueError` for electrodes
+    the outline for electrodes on the edge of a 2-D mesh, in discs, and beside dots. Raises `ValueError` for electrodes
     that do not know where they are.
     """
     ax = axes_or_new(ax)
@@ -33,49 +34,36 @@ def draw_electrodes(
         x, y = np.array(pen.dots).T
         ax.scatter(x, y, s=28, color=METAL, zorder=3)
     if numbers:
-        _draw_numbers(ax, mesh, np.array(pen.places), np.array(pen.outside), first)
+        draw_numbers(ax, mesh, np.array(pen.places), np.array(pen.beside), first)
     return ax
 
 
 class _Pen:
-    """Collects what is drawn, by kind; and of each electrode its middle, and whether its number stands outside."""
+    """Collects what is drawn, by kind; and of each electrode its middle, and whether its number stands beside it."""
 
     def __init__(self):
         self.arcs: list[np.ndarray] = []
         self.shapes: list[Patch] = []
         self.dots: list[np.ndarray] = []
         self.places: list[np.ndarray] = []
-        self.outside: list[bool] = []
+        self.beside: list[bool] = []
 
-    def _number(self, middle: np.ndarray, *, outside: bool) -> None:
+    def _number(self, middle: np.ndarray, *, beside: bool) -> None:
         self.places.append(middle[:2])
-        self.outside.append(outside)
+        self.beside.append(beside)
 
     def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
         self.arcs += pieces
-        self._number(middle, outside=True)
+        self._number(middle, beside=True)
 
     def disc(self, middle: np.ndarray, radius: float) -> None:
         self.shapes.append(Circle((middle[0], middle[1]), radius))
-        self._number(middle, outside=False)
+        self._number(middle, beside=False)
 
     def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:
         self.shapes.append(Rectangle((middle[0] - width / 2, middle[1] - height / 2), width, height))
-        self._number(middle, outside=True)
+        self._number(middle, beside=True)
 
     def dot(self, middle: np.ndarray) -> None:
         self.dots.append(middle[:2])
-        self._number(middle, outside=True)
-
-
-def _draw_numbers(ax: Axes, mesh: Mesh, plane: np.ndarray, outside: np.ndarray, first: int) -> None:
-    corners = np.asarray(mesh.points)[:, :2]
-    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
-    size = np.ptp(corners, axis=0).max()
-    offset = plane - middle
-    distance = np.linalg.norm(offset, axis=1, keepdims=True)
-    reach = distance > 0.3 * size
-    shift = np.where(reach & outside[:, None], 0.058 * size * offset / np.maximum(distance, 1e-12), 0)
-    fontsize = 9 if len(plane) <= 20 else 7
-    for k, (x, y) in enumerate(plane + shift):
-        ax.text(x, y, str(k + first), ha="center", va="center", fontsize=fontsize, color=INK, zorder=4)
+        self._number(middle, beside=True)

@@ -18,6 +18,8 @@ COLOURS = {
     "noise-figure": "#157f3b",
     "best-resolution": "#7b4fa3",
 }
+# How far apart points with a name stand on the L-curve, over its width and height.
+_APART = 0.06
 # The criterion of each rule, the scale of its axis, and what is looked for.
 _CRITERIA = {
     "gcv": ("prediction error (σ²)", "log", "least"),
@@ -72,7 +74,7 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
         panel = ax.inset_axes(place, sharex=panel)
         for other in several:
             panel.axvline(float(other.hyperparameter), color=_colour(other), linewidth=0.6, alpha=0.45, zorder=0)
-        _draw_criterion(panel, choice, small=len(rules) > 2)
+        _draw_criterion(panel, choice, small=len(rules) > 1)
         panel.tick_params(labelbottom=row == len(rules) - 1)
     if panel is not None:
         panel.set_xlabel("Hyperparameter λ")
@@ -84,8 +86,14 @@ def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
     values, residual, penalty = (np.asarray(array) for array in (curve.candidates, curve.residual, curve.penalty))
     ax.loglog(residual, penalty, color=SOFT, linewidth=1.8, zorder=1)
     exponents = np.arange(np.ceil(np.log10(values[0])), np.floor(np.log10(values[-1])) + 1, dtype=int)
-    for exponent in exponents:
+    extent = np.log10([residual.max() / residual.min(), penalty.max() / penalty.min()])
+    named = np.full((1, 2), np.inf)
+    for exponent in exponents[::-1]:
         place = curve.read(residual, 10.0**exponent), curve.read(penalty, 10.0**exponent)
+        where = np.log10(place) / extent
+        if np.linalg.norm(named - where, axis=1).min() < _APART:
+            continue
+        named = np.vstack([named, where])
         name = "λ = " if exponent == exponents[-1] else ""
         label = {"textcoords": "offset points", "ha": "right", "va": "top", "color": SOFT, "fontsize": 7.5}
         ax.plot(*place, "o", color=SOFT, markersize=3, zorder=1)
@@ -104,6 +112,7 @@ def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
             arrowprops={"arrowstyle": "-", "color": _colour(choice), "linewidth": 0.7, "relpos": (0, 0.5)},
         )
         ax.plot(*place, zorder=3, **_marker(choice, 8))
+    ax.margins(0.09, 0.05)
     ax.set_xlabel("Residual ‖w (v − Jx)‖ (standard deviations)")
     ax.set_ylabel("Penalty √(xᵀQx)")
     _tidy(ax)

@@ -110,7 +110,7 @@ def _dress(ax: Axes, mesh: Mesh | None, electrodes, inclusions, extent, title: s
     if mesh is not None and electrodes is not None:
         draw_electrodes(mesh, electrodes, ax=ax)
     draw_inclusions(inclusions, ax=ax)
-    bare(ax, extent)
+    bare(ax, extent, numbered=electrodes is not None)
     draw_scale_bar(ax, extent)
     if title:
         ax.set_title(title)
