@@ -260,7 +260,7 @@ COMMANDS = {
     "no such description": (lambda t: good(t, "--description", "absent.toml"), "--description absent.toml: there is"),
     "unknown rule to choose": (
         lambda t: ["choose", *good(t)[1:], "--rule", "luck", "--output", t.folder / "out"],
-        "--rule: there is no 'luck'",
+        "--rule must be one of gcv, l-curve",
     ),
     "no description": (lambda t: with_data(t, t.touched, description=None)[:2], "nothing says what they mean"),
     "description is no TOML": (lambda t: spoilt(t, "[geometry]", "[geometry"), "not valid TOML"),
@@ -301,7 +301,10 @@ COMMANDS = {
         lambda t: with_both(t, 'unit = "V"', 'complex_pairs = true\ncomponent = "complex"'),
         "choose the part to image",
     ),
-    "unknown prior": (lambda t: good(t, "--prior", "flat"), "--prior: there is no 'flat'; give one of tikhonov"),
+    "unknown prior": (
+        lambda t: good(t, "--prior", "flat"),
+        "laplace, noser, gaussian; it is 'flat'",
+    ),
     "unknown method": (lambda t: good(t, "--method", "guess"), "one-step, back-projection"),
     "unknown rule": (lambda t: good(t, "--hyperparameter", "luck"), "gcv, l-curve"),
     "negative hyperparameter": (lambda t: good(t, "--hyperparameter", "-1"), "positive number or a rule"),
@@ -319,7 +322,10 @@ COMMANDS = {
         "back-projection has none",
     ),
     "hyperparameter without end": (lambda t: good(t, "--hyperparameter", "1e300"), "the image is empty"),
-    "unknown contact": (lambda t: good(t, "--contact", "firm"), "--contact: there is no 'firm'; give one of each"),
+    "unknown contact": (
+        lambda t: good(t, "--contact", "firm"),
+        "each, common, fixed; it is 'firm'",
+    ),
     "mesh of three nodes": (lambda t: good(t, "--num-points", "3"), "--num-points: give 50 to 100,000"),
     "mesh of a word": (lambda t: good(t, "--num-points", "many"), "Invalid value for '--num-points'"),
     "no such frame": (lambda t: good(t, "--frame", "7"), "no frame 7"),

@@ -114,7 +114,7 @@ def test_a_rule_that_cannot_choose_is_refused_and_the_others_are_not(tank, capsy
 
 
 BAD = {
-    "unknown rule": (lambda t: good(t, "--rule", "luck"), "rules must be one of gcv, l-curve"),
+    "unknown rule": (lambda t: good(t, "--rule", "luck"), "--rule must be one of gcv, l-curve"),
     "unknown prior": (lambda t: good(t, "--prior", "flat"), "tikhonov, laplace, noser, gaussian"),
     "no reference": (lambda t: [t.folder / "touched.csv"], "reference"),
     "no such file": (lambda t: ["absent.csv", "--reference", t.folder / "rest.csv"], "There is no file"),

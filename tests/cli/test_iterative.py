@@ -11,7 +11,7 @@ from scipy.ndimage import label
 from jeit.cli.console import counted, in_one_unit
 from jeit.data import read, write_table
 from jeit.imaging import StreamSettings
-from jeit.inverse.stream.imager import FRAME_STEPS
+from jeit.inverse.streaming.imager import FRAME_STEPS
 
 FEW = ("--num-points", 250)
 
@@ -161,13 +161,13 @@ def test_the_help_of_a_stream_tells_the_defaults(run):
         (("reconstruct", "--method", "total-variation", "--hyperparameter", "gcv"), "takes a number"),
         (
             ("stream", "--method", "magic"),
-            "--method: there is no 'magic'; give one of one-step, gauss-newton, levenberg",
+            "--method must be one of one-step, gauss-newton, levenberg",
         ),
         (("stream", "--method", "l-bfgs-b"), "--method: l-bfgs-b does not image frames in a bounded time"),
         (("stream", "--steps", "0"), "--steps must be"),
         (("stream", "--memory", "-1"), "--memory must be"),
-        (("stream", "--hyperparameter", "magic"), "--hyperparameter: 'magic'"),
-        (("stream", "--contact", "firm"), "--contact: there is no 'firm'"),
+        (("stream", "--hyperparameter", "magic"), "or a number; it is 'magic'"),
+        (("stream", "--contact", "firm"), "--contact must be one of each, common, fixed"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(arguments, words, tank, run, tmp_path):
