@@ -50,7 +50,7 @@ _MOVED = {
     "jeit.design.study": {"jeit.report": "write_study_report"},
     "jeit.electrodes": {
         "jeit.electrodes.electrodes": "Contact is_concrete",
-        "jeit.electrodes.integrated": "IntegratedElectrodes",
+        "jeit.electrodes.precomputed": "IntegratedElectrodes",
         "jeit.layout": "BUILT_IN Layout grid named_layout perimeter quasi_uniform read_layout ring ring_and_centre "
         "write_layout",
     },
@@ -59,9 +59,9 @@ _MOVED = {
     "jeit.imaging": {"jeit.inverse.prior.defaults": "PRIORS"},
     "jeit.inverse": {
         "jeit.inverse.calibration": "Calibration",
-        "jeit.inverse.hyperparameter.chosen": "Choice",
+        "jeit.inverse.hyperparameter.choice": "Choice",
         "jeit.inverse.linear.one_step": "LinearReconstruction",
-        "jeit.inverse.noise": "repeated_noise",
+        "jeit.inverse.channel_weights": "repeated_noise",
         "jeit.inverse.nonlinear": "Background Bounded ContactImpedance ElectrodePosition Linear Log Scale",
         "jeit.inverse.nonlinear.links": "AbstractLink",
         "jeit.inverse.nonlinear.problem": "Inversion",

@@ -1,7 +1,7 @@
 """From two frames to a picture in one call, `image_difference`, and what every rule for λ would choose on the way.
 
 `settings` says how to image, `preparation` checks, meshes and calibrates, `method` images, `difference` looks for
-inclusions; `stream` does it frame after frame.
+inclusions; `stream_preparation` makes ready for frame after frame.
 """
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
@@ -16,7 +16,7 @@ from jeit.imaging.preparation import (
     select_frames,
 )
 from jeit.imaging.settings import CONTACTS, ImagingSettings
-from jeit.imaging.stream import StreamSettings, frames_of, prepare_imager
+from jeit.imaging.stream_preparation import StreamSettings, frames_of, prepare_imager
 
 _tell_old_names(__name__)
 

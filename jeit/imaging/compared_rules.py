@@ -18,7 +18,7 @@ from jeit.imaging.method import prior_for, rule_for
 from jeit.imaging.preparation import PreparedDifference, prepare_difference
 from jeit.imaging.settings import ImagingSettings, as_settings
 from jeit.inverse import RULES
-from jeit.inverse.hyperparameter.chosen import Choice
+from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.rules import choose
 from jeit.inverse.linearisation import Linearisation
 

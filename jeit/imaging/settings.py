@@ -6,7 +6,7 @@ from numbers import Integral
 from jeit.arguments import check_kind, check_name, is_number, told
 from jeit.imaging.method import METHODS
 from jeit.inverse import RULES
-from jeit.inverse.prior.defaults import PRIORS
+from jeit.inverse.prior.defaults import MEASURED, PRIORS
 from jeit.inverse.prior.priors import AbstractPrior
 
 CONTACTS = ("each", "common", "fixed")
@@ -33,7 +33,7 @@ class ImagingSettings:
     """
 
     method: str = "one-step"
-    prior: str | AbstractPrior = "gaussian"
+    prior: str | AbstractPrior = MEASURED
     hyperparameter: float | str | None = None
     contact: str | None = None
     num_points: int = 2000

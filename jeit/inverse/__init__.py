@@ -6,12 +6,12 @@ compute them.
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.inverse.calibration import calibrate
+from jeit.inverse.channel_weights import relative_noise
 from jeit.inverse.hyperparameter.comparison import choose_hyperparameter, compare_rules
 from jeit.inverse.hyperparameter.rules import RULES
 from jeit.inverse.linear.back_projection import back_projection
 from jeit.inverse.linear.greit import greit
 from jeit.inverse.linear.one_step import one_step
-from jeit.inverse.noise import relative_noise
 from jeit.inverse.nonlinear.parametrisation import Parametrisation
 from jeit.inverse.nonlinear.reconstruct import reconstruct
 from jeit.inverse.prior.priors import Gaussian, Laplace, Noser, Tikhonov

@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit.inverse.prior.checks import check_prior
-from jeit.inverse.prior.priors import AbstractPrior, Noser
+from jeit.inverse.prior.defaults import PRIOR
+from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.spectrum import Spectrum
 
 
@@ -38,7 +39,7 @@ class Linearisation(eqx.Module):
         mask: Bool[Array, " M"] | None = None,
     ) -> "Linearisation":
         """At `conductivity`; arguments as in `one_step`. Raises `ValueError` for those that do not fit."""
-        prior = Noser() if prior is None else prior
+        prior = PRIOR if prior is None else prior
         check_model(model)
         check_prior(prior)
         if not prior.is_quadratic:

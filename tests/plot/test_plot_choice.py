@@ -7,7 +7,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from jeit.inverse import RULES
-from jeit.inverse.hyperparameter.chosen import Choice
+from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import disk
 from jeit.plot import plot_choice

@@ -56,7 +56,7 @@ def stream(
 
     from jeit.cli.console import Steps, counted, scaled
     from jeit.data import read
-    from jeit.imaging.stream import StreamSettings, frames_of, parse_frames, prepare_imager
+    from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as images_of
     from jeit.report import write_stream
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from jaxtyping import Array, Bool, Float
 
 from jeit.forward import ForwardModel
-from jeit.inverse.hyperparameter.chosen import Choice
+from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.defaults import RULE
 from jeit.inverse.hyperparameter.rules import RULES, Rule, choose
 from jeit.inverse.linearisation import Linearisation

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from scipy.special import ndtr
 
-from jeit.inverse.hyperparameter.chosen import Choice
+from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import Mesh, centroids, measures
 

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jeit.arguments import check_name
-from jeit.inverse.hyperparameter.chosen import Choice
+from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.point_spread import best_resolution
 from jeit.inverse.spectrum import Spectrum as Spectrum
 from jeit.mesh import Mesh

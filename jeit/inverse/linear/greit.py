@@ -6,13 +6,13 @@ S35-S55. There the body is a disk; here the targets and their images follow the 
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 import scipy.sparse
 from jaxtyping import Array, Bool, Float
 from scipy.spatial import KDTree
 
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
+from jeit.inverse.hyperparameter.greit_noise_figure import greit_noise_figure
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.linearisation import used_channels
 from jeit.mesh import Mesh, centroids, measures
@@ -77,7 +77,7 @@ def greit(
     if isinstance(hyperparameter, str):
         central = response[:, np.argmin(np.linalg.norm(position - middle, axis=1))]
         level = float(np.abs(central).mean())
-        chosen = _of_noise_figure(noise_figure, eigenvalues, vectors.T @ central, level, painted, measure)
+        chosen = greit_noise_figure(noise_figure, eigenvalues, vectors.T @ central, level, painted, measure)
     else:
         chosen = float(hyperparameter)
     matrix = np.zeros((mesh.num_cells, model.protocol.num_measurements))
@@ -148,33 +148,6 @@ def _desired_images(mesh: Mesh, position, area, radius: float) -> scipy.sparse.c
             "larger radius, or a finer mesh."
         )
     return disc @ scipy.sparse.diags_array(area / total)
-
-
-def _of_noise_figure(target: float, eigenvalues, signal, level: float, painted, measure) -> float:
-    """The least λ whose noise figure is `target`.
-
-    With YYᵀ = VΛVᵀ the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy: `signal` is Vᵀy, `painted` XYᵀV, `level` the signal of
-    the data. White noise of unit variance in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
-    """
-    weight = measure / measure.sum()
-    gain = weight @ painted**2
-
-    def excess(log_hyperparameter) -> float:
-        filtered = 1 / (eigenvalues + np.exp(2 * log_hyperparameter))
-        noise, image = np.sqrt(gain @ filtered**2), weight @ np.abs(painted @ (signal * filtered))
-        return float(np.log(level * noise / image / target))
-
-    grid = np.log(np.sqrt(eigenvalues.max()) * np.logspace(-6, 1, 71))
-    values = np.array([excess(value) for value in grid])
-    below = np.flatnonzero(values <= 0)
-    if below.size == 0 or below[0] == 0:
-        low, high = target * np.exp([values.min(), values.max()])
-        raise ValueError(
-            f"noise_figure: no hyperparameter gives {target:g}; here it lies between {low:.3g} and {high:.3g}. A "
-            "larger radius brings it down; a larger noise_figure takes a noisier image."
-        )
-    bracket = (grid[below[0] - 1], grid[below[0]])
-    return float(np.exp(scipy.optimize.root_scalar(excess, bracket=bracket, rtol=1e-10).root))
 
 
 def _check(radius, target_radius, num_targets, hyperparameter, noise_figure) -> None:

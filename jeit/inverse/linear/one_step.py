@@ -8,7 +8,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit.forward import ForwardModel
-from jeit.inverse.hyperparameter.chosen import Choice
+from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.defaults import RULE
 from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.linearisation import Linearisation

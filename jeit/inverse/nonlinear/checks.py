@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
-from jeit.inverse.noise import relative_noise
+from jeit.inverse.channel_weights import relative_noise
 
 
 def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:

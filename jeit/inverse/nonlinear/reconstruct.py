@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import Data, IndependentChannels
-from jeit.inverse.hyperparameter.chosen import Choice
+from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
 from jeit.inverse.nonlinear.informed import informed
@@ -16,7 +16,8 @@ from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametri
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.solvers import LBFGSB, SOLVERS, AbstractSolver, GaussNewton, as_solver
 from jeit.inverse.prior.checks import check_prior
-from jeit.inverse.prior.priors import AbstractPrior, Noser
+from jeit.inverse.prior.defaults import PRIOR
+from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.spectrum import Spectrum
 from jeit_solvers import Status
 
@@ -93,7 +94,7 @@ def reconstruct(
     Tarantola, Inverse Problem Theory (SIAM 2005), ch. 3; Nocedal and Wright, Numerical Optimization (2006), ch. 10.
     """
     measured, used = check_frame(model, voltages, mask)
-    prior = Noser() if prior is None else prior
+    prior = PRIOR if prior is None else prior
     check_prior(prior)
     parametrisation = as_parametrisation(parametrisation)
     parametrisation.check_model(model)

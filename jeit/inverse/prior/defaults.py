@@ -1,8 +1,13 @@
-"""Quadratic priors by the names of the command line, and the smooth one that images of tanks and streams take."""
+"""Which prior is taken where none is given, and the quadratic priors by the names of the command line."""
 
 from collections.abc import Callable
 
 from jeit.inverse.prior.priors import AbstractPrior, Gaussian, Laplace, Noser, Tikhonov
+
+PRIOR = Noser()
+"""Of `one_step` and `reconstruct`: needs no length, and serves where nothing is known of a body."""
+MEASURED = "gaussian"
+"""Of images of measured data, in `PRIORS`; streams take it too."""
 
 
 def smooth_prior(size: float) -> Gaussian:

@@ -16,7 +16,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit.arguments import is_number, told
-from jeit.electrodes.integrated import IntegratedElectrodes
+from jeit.electrodes.precomputed import IntegratedElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import IndependentChannels, Weighing
 from jeit.inverse.hyperparameter.rules import Rule

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterable, Iterator
-from enum import StrEnum
 
 import equinox as eqx
 import jax
@@ -12,26 +11,8 @@ from jaxtyping import Bool, Float
 
 from jeit.arguments import check_kind
 from jeit.inverse.nonlinear.solvers import counted
+from jeit.inverse.streaming.frame_check import FrameCheck, FrameStatus
 from jeit.inverse.streaming.imager import Imager
-from jeit_solvers import Status
-
-# A frame that differs by more than this, relative to an undisturbed one, is another sensor's, or a fault.
-_LARGEST_DIFFERENCE = 0.5
-# Beyond this, an electrode is taken for dead whose channels have changed by half or more, and hold most of the change.
-_SUSPICIOUS, _EXPLAINED, _LOST = 0.15, 0.5, 0.5
-_LEAST_CHANNELS = 0.5
-
-
-class FrameStatus(StrEnum):
-    """What became of a frame. Each is equal to its word."""
-
-    IMAGED = "imaged"
-    PARTIAL = "partial"
-    """Imaged, with some channels left out."""
-    STEP_LIMIT = Status.STEP_LIMIT.value
-    """Imaged, though the steps that a frame is given were too few for it to converge."""
-    REFUSED = "refused"
-    """There is no image of it."""
 
 
 class FrameImage(eqx.Module):
@@ -89,9 +70,7 @@ class _Session:
         self.mask = np.asarray(imager.mask)
         self.unmasked = bool(self.mask.all())
         self.expected = np.asarray(imager.expected)
-        self.touching = np.asarray(imager.touching)
-        self.size = np.linalg.norm(self.expected[self.mask])
-        self.ordinary = (_SUSPICIOUS * self.size) ** 2
+        self.check = FrameCheck(self.mask, self.expected, np.asarray(imager.touching))
         self.coefficients = np.asarray(imager.start)
         self.last = self.expected
         self._weigh(self.mask)
@@ -101,7 +80,7 @@ class _Session:
     def image(self, number: int, frame) -> FrameImage:
         """The image of one frame, or why there is none."""
         begin = time.perf_counter()
-        values, usable, status, reason = self._inspect(frame)
+        values, usable, status, reason = self.check(frame)
         if status == FrameStatus.REFUSED:
             return FrameImage(number, None, status, reason, usable, np.nan, 0, time.perf_counter() - begin)
         if usable is not self.usable and not np.array_equal(usable, self.usable):
@@ -144,62 +123,3 @@ class _Session:
         found = self.imager.estimate(frame, self.weighing, jnp.asarray(self.coefficients))
         self.coefficients = found.coefficients * (self.imager.persistence or 1.0)
         return np.asarray(found.conductivity), float(found.misfit), int(found.iterations), bool(found.converged)
-
-    @np.errstate(over="ignore")  # a square that overflows is not an ordinary one
-    def _inspect(self, frame):
-        """Values, usable channels, status and reason of a frame as it came."""
-        none = np.zeros_like(self.mask)
-        if np.ma.isMaskedArray(frame):
-            frame = np.ma.filled(frame.astype(float), np.nan)
-        try:
-            values = np.asarray(frame)
-        except ValueError:
-            return none, none, FrameStatus.REFUSED, f"The frame is ragged, not {self.mask.size} real voltages."
-        if values.dtype.kind in "US":
-            return values, none, FrameStatus.REFUSED, f"The frame is text, not {self.mask.size} real voltages."
-        if values.shape != self.mask.shape or values.dtype.kind not in "iuf":
-            reason = f"The frame is {values.dtype} of shape {values.shape}, not {self.mask.size} real voltages."
-            return values, none, FrameStatus.REFUSED, reason
-        change = (values - self.expected)[self.mask]
-        if change @ change < self.ordinary:  # which NaN is not, nor a frame of zeros
-            return values, self.mask, FrameStatus.IMAGED, ""
-        finite = np.isfinite(values)
-        usable = self.mask if finite.all() else self.mask & finite
-        count = np.count_nonzero(usable)
-        if count < _LEAST_CHANNELS * np.count_nonzero(self.mask):
-            return (
-                values,
-                usable,
-                FrameStatus.REFUSED,
-                f"Only {count} of {np.count_nonzero(self.mask)} channels can be used.",
-            )
-        if not values[usable].any():
-            return values, none, FrameStatus.REFUSED, "All channels read zero; the current source has failed."
-        difference = np.where(usable, values - self.expected, 0)
-        relative = np.linalg.norm(difference) / self.size
-        if relative > _SUSPICIOUS:
-            usable, reason = self._without_dead_electrode(difference, usable)
-            if reason:
-                return values, usable, FrameStatus.PARTIAL, reason
-            if relative > _LARGEST_DIFFERENCE:
-                reason = f"It differs by {relative:.0%} from an undisturbed frame: another sensor's, or a fault."
-                return values, none, FrameStatus.REFUSED, reason
-        if count < np.count_nonzero(self.mask):
-            missing = np.count_nonzero(self.mask) - count
-            lacking = (
-                "1 channel has no reading and is" if missing == 1 else f"{missing} channels have no reading and are"
-            )
-            return values, usable, FrameStatus.PARTIAL, f"{lacking} left out."
-        return values, usable, FrameStatus.IMAGED, ""
-
-    def _without_dead_electrode(self, difference, usable):
-        """The usable channels less those of an electrode that explains most of a large difference, and a sentence."""
-        total = np.linalg.norm(difference)
-        left = [np.linalg.norm(difference[usable & ~touching]) for touching in self.touching]
-        electrode = int(np.argmin(left))
-        own, rest = usable & self.touching[electrode], usable & ~self.touching[electrode]
-        lost = np.median(np.abs(difference[own]) / np.abs(self.expected[own])) > _LOST
-        explained = left[electrode] <= min(_EXPLAINED * total, _LARGEST_DIFFERENCE * self.size)
-        if not (lost and explained) or rest.sum() < _LEAST_CHANNELS * self.mask.sum():
-            return usable, ""
-        return rest, f"Electrode {electrode + 1} seems to be dead; its channels are left out."

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from jeit.arguments import check_kind
-from jeit.inverse.hyperparameter.chosen import Choice
+from jeit.inverse.hyperparameter.choice import Choice
 from jeit.plot.axes import INK, SOFT, axes_or_new, soften_axes
 
 # A colour for each rule; numbers that were given, and rules not known here, are drawn in the colour of ink.

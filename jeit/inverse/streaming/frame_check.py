@@ -1,0 +1,99 @@
+"""Which frames are imaged, which in part, and which are refused."""
+
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jeit_solvers import Status
+
+# A frame that differs by more than this, relative to an undisturbed one, is another sensor's, or a fault.
+_LARGEST_DIFFERENCE = 0.5
+# Beyond this, an electrode is taken for dead whose channels have changed by half or more, and hold most of the change.
+_SUSPICIOUS, _EXPLAINED, _LOST = 0.15, 0.5, 0.5
+_LEAST_CHANNELS = 0.5
+
+
+class FrameStatus(StrEnum):
+    """What became of a frame. Each is equal to its word."""
+
+    IMAGED = "imaged"
+    PARTIAL = "partial"
+    """Imaged, with some channels left out."""
+    STEP_LIMIT = Status.STEP_LIMIT.value
+    """Imaged, though the steps that a frame is given were too few for it to converge."""
+    REFUSED = "refused"
+    """There is no image of it."""
+
+
+class FrameCheck:
+    """Looks at frames (M,) of a sensor that reads `expected` (M,) volts when undisturbed, in the channels of `mask`.
+
+    `touching` (L, M): which channels each electrode takes part in.
+    """
+
+    def __init__(
+        self, mask: Bool[np.ndarray, " M"], expected: Float[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
+    ):
+        self.mask, self.expected, self.touching = mask, expected, touching
+        self.size = np.linalg.norm(expected[mask])
+        self.ordinary = (_SUSPICIOUS * self.size) ** 2
+
+    @np.errstate(over="ignore")  # a square that overflows is not an ordinary one
+    def __call__(self, frame):
+        """Values, usable channels, status and reason of a frame as it came."""
+        none = np.zeros_like(self.mask)
+        if np.ma.isMaskedArray(frame):
+            frame = np.ma.filled(frame.astype(float), np.nan)
+        try:
+            values = np.asarray(frame)
+        except ValueError:
+            return none, none, FrameStatus.REFUSED, f"The frame is ragged, not {self.mask.size} real voltages."
+        if values.dtype.kind in "US":
+            return values, none, FrameStatus.REFUSED, f"The frame is text, not {self.mask.size} real voltages."
+        if values.shape != self.mask.shape or values.dtype.kind not in "iuf":
+            reason = f"The frame is {values.dtype} of shape {values.shape}, not {self.mask.size} real voltages."
+            return values, none, FrameStatus.REFUSED, reason
+        change = (values - self.expected)[self.mask]
+        if change @ change < self.ordinary:  # which NaN is not, nor a frame of zeros
+            return values, self.mask, FrameStatus.IMAGED, ""
+        finite = np.isfinite(values)
+        usable = self.mask if finite.all() else self.mask & finite
+        count = np.count_nonzero(usable)
+        if count < _LEAST_CHANNELS * np.count_nonzero(self.mask):
+            return (
+                values,
+                usable,
+                FrameStatus.REFUSED,
+                f"Only {count} of {np.count_nonzero(self.mask)} channels can be used.",
+            )
+        if not values[usable].any():
+            return values, none, FrameStatus.REFUSED, "All channels read zero; the current source has failed."
+        difference = np.where(usable, values - self.expected, 0)
+        relative = np.linalg.norm(difference) / self.size
+        if relative > _SUSPICIOUS:
+            usable, reason = self._without_dead_electrode(difference, usable)
+            if reason:
+                return values, usable, FrameStatus.PARTIAL, reason
+            if relative > _LARGEST_DIFFERENCE:
+                reason = f"It differs by {relative:.0%} from an undisturbed frame: another sensor's, or a fault."
+                return values, none, FrameStatus.REFUSED, reason
+        if count < np.count_nonzero(self.mask):
+            missing = np.count_nonzero(self.mask) - count
+            lacking = (
+                "1 channel has no reading and is" if missing == 1 else f"{missing} channels have no reading and are"
+            )
+            return values, usable, FrameStatus.PARTIAL, f"{lacking} left out."
+        return values, usable, FrameStatus.IMAGED, ""
+
+    def _without_dead_electrode(self, difference, usable):
+        """The usable channels less those of an electrode that explains most of a large difference, and a sentence."""
+        total = np.linalg.norm(difference)
+        left = [np.linalg.norm(difference[usable & ~touching]) for touching in self.touching]
+        electrode = int(np.argmin(left))
+        own, rest = usable & self.touching[electrode], usable & ~self.touching[electrode]
+        lost = np.median(np.abs(difference[own]) / np.abs(self.expected[own])) > _LOST
+        explained = left[electrode] <= min(_EXPLAINED * total, _LARGEST_DIFFERENCE * self.size)
+        if not (lost and explained) or rest.sum() < _LEAST_CHANNELS * self.mask.sum():
+            return usable, ""
+        return rest, f"Electrode {electrode + 1} seems to be dead; its channels are left out."
