@@ -119,7 +119,7 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
         "--quiet", *FEW,
     )  # fmt: skip
     assert (status, error.count("\n")) == (1, 1)
-    assert "none of 2 frames could be imaged" in error
+    assert "2 frames, and none could be imaged" in error
     assert "not 40 real voltages" in error
     assert [row["status"] for row in rows_of(tmp_path / "out")] == ["refused", "refused"]
     # A stream that fails leaves no images of an earlier one behind.

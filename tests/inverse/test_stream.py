@@ -293,6 +293,17 @@ def test_an_undisturbed_frame_is_at_its_minimum(kind, model, frames, options):
         np.testing.assert_allclose(one.conductivity, 1.0, atol=1e-5)
 
 
+def test_an_undisturbed_frame_may_be_reached_by_the_last_step(model, options):
+    """Which is not looked at again: but what is left of the objective is all that a step could lower."""
+    rest = model.voltages(1.0)
+    pressed = model.voltages(jnp.where(near(model, PLACES[0]), 0.3, 1.0))
+    for steps in (3, 4, 5):
+        imager = Imager.create(model, 1.0, solver=GaussNewton(max_steps=steps), **options)
+        image = list(stream(imager, [pressed, rest]))[1]
+        close = np.abs(image.conductivity - 1).max() < 1e-5
+        assert (image.status == "imaged") == close
+
+
 @pytest.mark.parametrize("kind", [GaussNewton, LevenbergMarquardt])
 def test_a_change_far_below_the_noise_is_still_imaged(kind, model, options):
     """What ends the iteration does not keep it from its first step."""

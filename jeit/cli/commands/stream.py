@@ -86,7 +86,7 @@ def stream(
     written = write_stream(images_of(imager, frames), calibration, output, name=data, progress=show)
     if not written.latency.size:
         raise ValueError(
-            f"'{data}': none of {counted(written.number, 'frame')} could be imaged; the first: {written.first_reason}"
+            f"'{data}': {counted(written.number, 'frame')}, and none could be imaged; the first: {written.first_reason}"
         )
     if quiet:
         return

@@ -243,12 +243,12 @@ def _estimate(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate
     cost = inversion.cost(state.trial)
     better = cost < state.cost
     coefficients = jnp.where(better, state.trial, solution.value)
-    penalty = inversion.penalty.cost(coefficients)
-    squares = 2 * (jnp.where(better, cost, state.cost) - penalty) + data.rest
+    penalty, least = inversion.penalty.cost(coefficients), jnp.where(better, cost, state.cost)
+    squares = 2 * (least - penalty) + data.rest
     return FrameEstimate(
         conductivity=inversion.conductivity(coefficients),
         coefficients=expected + coefficients,
         misfit=jnp.sqrt(squares / jnp.sum(weighing.noise <= jnp.max(imager.noise))),
         iterations=state.num_accepted - 1 + better,
-        converged=state.converged,
+        converged=state.converged | (least <= descent.atol),  # no step can lower it by more than there is
     )
