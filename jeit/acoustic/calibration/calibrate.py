@@ -114,15 +114,7 @@ def calibrate_microphones(
     squared, power = np.sum(difference**2, axis=-1).T, np.where(usable, power, np.nan).T
     fit = fit_taps(kind, taps.microphones, squared, power, noise, known_noise)
     tried = fit.use.T
-    reasons, explained = _judge(fit, faults)
-    bad = np.array([bool(reason) for reason in reasons])
-    # What some are left out for may show in others only without them.
-    while bad.any() and (~fit.dropped & ~bad).sum() >= 3:
-        fit = refit_without(fit, bad)
-        again, explained = _judge(fit, ("",) * len(bad), explained)
-        bad = np.array([bool(reason) for reason in again]) & ~fit.dropped
-        reasons = tuple(new if worse else old for new, old, worse in zip(again, reasons, bad, strict=True))
-    good = ~fit.dropped & ~bad
+    fit, good, reasons, explained = _leave_out(fit, faults)
     told = describe_faults(reasons)
     if good.sum() < max(3, _LEAST_SHARE * enough.sum()):
         raise ValueError(
@@ -169,6 +161,19 @@ def _check(kind: type[AbstractDecay], distance, power, faults) -> Bool[np.ndarra
             f"{describe_faults(faults)}".strip()
         )
     return enough
+
+
+def _leave_out(fit: TapFit, faults) -> tuple[TapFit, Bool[np.ndarray, " M"], tuple[str, ...], Float[np.ndarray, " M"]]:
+    """The fit to microphones that are of use, which these are, why others are not, and what each model explains."""
+    reasons, explained = _judge(fit, faults)
+    bad = np.array([bool(reason) for reason in reasons])
+    # What some are left out for may show in others only without them.
+    while bad.any() and (~fit.dropped & ~bad).sum() >= 3:
+        fit = refit_without(fit, bad)
+        again, explained = _judge(fit, ("",) * len(bad), explained)
+        bad = np.array([bool(reason) for reason in again]) & ~fit.dropped
+        reasons = tuple(new if worse else old for new, old, worse in zip(again, reasons, bad, strict=True))
+    return fit, ~fit.dropped & ~bad, reasons, explained
 
 
 def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
