@@ -75,7 +75,7 @@ def scores(folder: Path, num_points: int = 1600, levels=LEVELS, targets=TARGETS,
             start = time.perf_counter()
             found = reconstruct(
                 model, empty + difference, background,
-                prior=TotalVariation(), noise=prepared.deviation, mask=mask, solver=GaussNewton(max_steps=100),
+                prior=TotalVariation(), noise=prepared.relative_noise, mask=mask, solver=GaussNewton(max_steps=100),
             )  # fmt: skip
             image = raster.sample(jnp.log(found.conductivity / background))
             seconds = time.perf_counter() - start
