@@ -4,6 +4,7 @@ One sentence each, before anything is compiled: which argument, what was given, 
 light: nothing of the library is imported here.
 """
 
+from jeit.arguments.counts import counted
 from jeit.arguments.keys import check_key
 from jeit.arguments.kinds import check_kind, is_number, told
 from jeit.arguments.lengths import IN_MILLIMETRES, check_metres
@@ -15,6 +16,7 @@ __all__ = [
     "check_kind",
     "check_metres",
     "check_name",
+    "counted",
     "did_you_mean",
     "is_number",
     "told",

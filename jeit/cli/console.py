@@ -60,11 +60,6 @@ def pairs(title: str, rows: list[tuple[str, str]]) -> Table:
     return table
 
 
-def counted(number: int, noun: str) -> str:
-    """So many of a thing: "1 frame", "1,000 frames"."""
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
-
-
 def scaled(value: float | None, unit: str) -> str:
     """A value with three digits and an SI prefix: 0.00132 S is "1.32 mS"."""
     if value is None:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from jeit.arguments import counted
 from jeit.data.measurement import Measurement
 from jeit.data.quality import NoiseEstimate, estimate_noise, impossible_signs, reciprocity_error
 
@@ -142,8 +143,7 @@ def check_imageable(measurement: Measurement, reference: Measurement) -> list[Fr
 
 def _reason(electrodes: int, usable: int, difference: float, signs: float | None, reciprocity: float | None) -> str:
     if usable < electrodes:
-        channels = "channel is" if usable == 1 else "channels are"
-        return f"only {usable} {channels} usable in both it and its reference, fewer than the {electrodes} electrodes."
+        return f"only {counted(usable, 'channel')} usable in both it and its reference, for {electrodes} electrodes."
     if difference < 1e-12:
         return "it equals its reference, so there is no difference to image. Is it the same file?"
     if signs is not None and signs > MOST_IMPOSSIBLE_SIGNS:

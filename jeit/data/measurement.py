@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Inexact
 
-from jeit.arguments import did_you_mean
+from jeit.arguments import counted, did_you_mean
 from jeit.electrodes.electrodes import is_concrete
 from jeit.mesh import Domain
 from jeit.protocol import Protocol
@@ -150,7 +150,7 @@ class Measurement(eqx.Module):
         note = reason
         if is_concrete(mask):
             number = int(self.mask.sum() - mask.sum())
-            note = f"{number} voltage{'s' * (number != 1)} masked: {reason}"
+            note = f"{counted(number, 'voltage')} masked: {reason}"
         return self._replace(self.voltages, mask, notes=(*self.notes, note))
 
     def without_electrodes(self, electrodes) -> "Measurement":

@@ -45,9 +45,8 @@ class ImagingSettings:
     def __post_init__(self):
         check_name("method", self.method, METHODS)
         if not isinstance(self.prior, AbstractPrior):
-            check_name(
-                "prior", self.prior, PRIORS, "" if isinstance(self.prior, str) else ", or an object such as Noser()"
-            )
+            otherwise = "" if isinstance(self.prior, str) else ", or an object such as Noser()"
+            check_name("prior", self.prior, PRIORS, otherwise)
         elif not self.prior.is_quadratic:
             raise ValueError("prior: total variation is a method of its own; give method='total-variation'.")
         if self.hyperparameter is None:

@@ -61,7 +61,7 @@ def prepare_imager(
     called with the name of each step as it begins. Raises `ValueError` for another protocol, and as `image_difference`.
     """
     settings = StreamSettings() if settings is None else settings
-    check_kind("settings", settings, StreamSettings, "StreamSettings, such as StreamSettings(solver='linear')")
+    check_kind("settings", settings, StreamSettings, "StreamSettings, such as StreamSettings(solver='one-step')")
     check_measurement("reference", reference)
     measured = reference if measurement is None else measurement
     _, base = select_frames(measured, reference)

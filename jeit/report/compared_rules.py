@@ -7,6 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jeit.arguments import counted
 from jeit.imaging.compared_rules import ComparedRules, RuleOutcome
 from jeit.mesh import Mesh
 from jeit.report.describe import describe_measurement, plain
@@ -55,7 +56,7 @@ def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
     marked = outcome.inclusions if number <= _MOST_MARKED else ()
     plot_image(mesh, outcome.change, inclusions=marked, scale=ColourScale(bar=False), ax=ax)
     _draw_scale(ax, float(jnp.abs(outcome.change).max()), "S" if mesh.dimension == 2 else "S/m")
-    ax.set_title(f"{name}\n{number} inclusion{'s' * (number != 1)}", color=COLOURS.get(name, INK), fontsize=11, pad=0)
+    ax.set_title(f"{name}\n{counted(number, 'inclusion')}", color=COLOURS.get(name, INK), fontsize=11, pad=0)
 
 
 def _draw_scale(ax, largest: float, unit: str) -> None:

@@ -102,7 +102,7 @@ def describe_faults(reasons: Sequence[str]) -> str:
         if reason:
             groups.setdefault(reason, []).append(k)
     return "; ".join(
-        f"microphone{'s' if len(which) > 1 else ''} {_ranges(np.array(which))}: {reason}"
+        f"{'microphone' if len(which) == 1 else 'microphones'} {_ranges(np.array(which))}: {reason}"
         for reason, which in groups.items()
     )
 

@@ -16,7 +16,8 @@ def info(
     """Say what DATA holds: frames, electrodes, protocol, noise, and what was assumed or masked."""
     from rich.console import Console
 
-    from jeit.cli.console import counted, pairs, percent, scaled
+    from jeit.arguments import counted
+    from jeit.cli.console import pairs, percent, scaled
     from jeit.data import read
     from jeit.report import report_measurement
 

@@ -106,7 +106,8 @@ def show(console, result: "ImagedDifference") -> None:
     """Print what was found."""
     from rich.table import Table
 
-    from jeit.cli.console import counted, in_one_unit, pairs, percent, scaled
+    from jeit.arguments import counted
+    from jeit.cli.console import in_one_unit, pairs, percent, scaled
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
     from jeit_solvers import Status
 

@@ -54,7 +54,8 @@ def stream(
     import numpy as np
     from rich.console import Console
 
-    from jeit.cli.console import Steps, counted, scaled
+    from jeit.arguments import counted
+    from jeit.cli.console import Steps, scaled
     from jeit.data import read
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as images_of

@@ -59,7 +59,7 @@ def resume(
 @study.command()
 def status(file: File, output: Output = None) -> None:
     """Say how far a study is."""
-    from jeit.cli.console import counted
+    from jeit.arguments import counted
     from jeit.design.study import study_progress
 
     sweep, store = _read(file, output)

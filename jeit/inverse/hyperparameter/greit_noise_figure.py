@@ -8,7 +8,7 @@ def greit_noise_figure(target: float, eigenvalues, signal, level: float, painted
     """The least λ whose noise figure is `target`. Raises `ValueError` where none is.
 
     The figure is that of GREIT's authors, the signal-to-noise ratio of the data over that of the image of one target
-    (Adler et al., Physiol. Meas. 30, S35, 2009); `noise_figure` of `rules.py` is that of a difference's own prior.
+    (Adler et al., Physiol. Meas. 30, S35, 2009); `noise_figure` of `rules.py` draws its signals from the prior.
 
     With YYᵀ = VΛVᵀ the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy: `signal` is Vᵀy, `painted` XYᵀV, `level` the signal of
     the data. White noise of unit variance in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from jeit.arguments import check_kind, check_name
+from jeit.arguments import check_kind, check_name, counted
 from jeit.inverse.nonlinear.checks import check_steps, check_tolerance
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit_solvers import BoundedMinimum, Descent, Status, ended, lbfgsb, projected_gradient
@@ -194,7 +194,7 @@ class LeastSquares(AbstractSolver):
         solution = _least_squares(inversion, start, self.solver, self.max_steps, {})
         costs = jnp.stack([_cost(inversion, start), _cost(inversion, solution.value)])
         status, iterations = ended(solution.result), int(solution.stats["num_steps"])
-        return Solved(solution.value, iterations, costs, status, _REASONS[status].format(counted(iterations)))
+        return Solved(solution.value, iterations, costs, status, _reason(status, iterations))
 
 
 class OneStep(AbstractSolver):
@@ -244,12 +244,16 @@ def as_solver(
     return solver
 
 
-def counted(iterations: int, shortened: int = 0) -> str:
+def counted_iterations(iterations: int, shortened: int = 0) -> str:
     """In words, how many iterations there were, and how many steps that had to be shortened."""
-    said = f"{iterations} iteration{'s' * (iterations != 1)}"
+    said = counted(iterations, "iteration")
     if not shortened:
         return said
-    return f"{said} and {shortened} step{'s' * (shortened != 1)} that led too far"
+    return f"{said} and {counted(shortened, 'step')} that led too far"
+
+
+def _reason(status: Status, iterations: int, shortened: int = 0) -> str:
+    return _REASONS[status].format(counted_iterations(iterations, shortened))
 
 
 def expand(coefficients: Float[Array, " n"], inversion: Inversion):
@@ -289,7 +293,7 @@ def _descend(descent: Descent, inversion: Inversion, start) -> Solved:
     state, status = solution.state, ended(solution.result)
     accepted = int(state.num_accepted)
     iterations = max(accepted - 1, 0)
-    reason = _REASONS[status].format(counted(iterations, int(state.num_steps) - 1 - iterations))
+    reason = _reason(status, iterations, int(state.num_steps) - 1 - iterations)
     return Solved(solution.value, iterations, state.history[:accepted], status, reason)
 
 
@@ -302,9 +306,7 @@ def _between(minimise, inversion: Inversion, start, box, max_steps: int, toleran
         reason = "No step between the bounds would change the image much."
         return Solved(found.x, int(found.steps), costs, Status.CONVERGED, reason)
     iterations = int(found.steps)
-    return Solved(
-        found.x, iterations, costs, Status.STEP_LIMIT, _REASONS[Status.STEP_LIMIT].format(counted(iterations))
-    )
+    return Solved(found.x, iterations, costs, Status.STEP_LIMIT, _reason(Status.STEP_LIMIT, iterations))
 
 
 @eqx.filter_jit

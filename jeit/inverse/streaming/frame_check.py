@@ -5,6 +5,7 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jeit.arguments import counted
 from jeit_solvers import Status
 
 # A frame that differs by more than this, relative to an undisturbed one, is another sensor's, or a fault.
@@ -79,11 +80,9 @@ class FrameCheck:
                 reason = f"It differs by {relative:.0%} from an undisturbed frame: another sensor's, or a fault."
                 return values, none, FrameStatus.REFUSED, reason
         if count < np.count_nonzero(self.mask):
-            missing = np.count_nonzero(self.mask) - count
-            lacking = (
-                "1 channel has no reading and is" if missing == 1 else f"{missing} channels have no reading and are"
-            )
-            return values, usable, FrameStatus.PARTIAL, f"{lacking} left out."
+            missing = int(np.count_nonzero(self.mask) - count)
+            reason = f"Left out: {counted(missing, 'channel')} without a reading."
+            return values, usable, FrameStatus.PARTIAL, reason
         return values, usable, FrameStatus.IMAGED, ""
 
     def _without_dead_electrode(self, difference, usable):

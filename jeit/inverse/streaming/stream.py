@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.arguments import check_kind
-from jeit.inverse.nonlinear.solvers import counted
+from jeit.inverse.nonlinear.solvers import counted_iterations
 from jeit.inverse.streaming.frame_check import FrameCheck, FrameStatus
 from jeit.inverse.streaming.imager import Imager
 
@@ -96,7 +96,7 @@ class _Session:
         self.last = filled
         if not converged and status == FrameStatus.IMAGED:
             status = FrameStatus.STEP_LIMIT
-            done = counted(iterations, self.imager.steps - iterations)
+            done = counted_iterations(iterations, self.imager.steps - iterations)
             reason = f"Stopped after {done}: this frame needs more than a frame is given."
         return FrameImage(number, conductivity, status, reason, usable, misfit, iterations, time.perf_counter() - begin)
 
