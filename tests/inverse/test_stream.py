@@ -175,6 +175,11 @@ def dead_part(frame, electrode=4):
     return np.where(adjacent(16).channels_touching(electrode), frame, 0)
 
 
+def fading_electrode(frame):
+    """It reads two fifths, so that the frame differs by a quarter only."""
+    return frame - 0.6 * dead_part(frame)
+
+
 def with_nan(frame):
     frame[[3, 60, 61]] = np.nan
     return frame
@@ -218,7 +223,8 @@ def test_a_bad_frame_is_refused_and_the_stream_goes_on(name, method, frames, ima
 
 @pytest.mark.parametrize("method", ["gauss-newton", "one-step"])
 @pytest.mark.parametrize(
-    ("fault", "left", "message"), [(with_nan, 205, "3 channels"), (dead_electrode, 156, "Electrode 5")]
+    ("fault", "left", "message"),
+    [(with_nan, 205, "3 channels"), (dead_electrode, 156, "Electrode 5"), (fading_electrode, 156, "Electrode 5")],
 )
 def test_channels_without_a_reading_are_left_out(fault, left, message, method, model, frames, imager, linear):
     one = imager if method == "gauss-newton" else linear

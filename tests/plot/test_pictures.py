@@ -104,6 +104,7 @@ def test_numbers_in_a_narrow_notch_stand_inside_in_a_rim(ax):
     draw_electrodes(slit.mesh(num_points=300), electrodes, ax=ax)
     inside, outside = ax.texts
     assert slit.signed_distance(np.array([inside.get_position()]))[0] > 0
+    assert inside.get_position()[0] > 0.102  # on its own side
     assert np.linalg.norm(np.array(inside.get_position()) - (0.102, 0.06)) < 0.015
     assert inside.get_path_effects()
     assert not outside.get_path_effects()
