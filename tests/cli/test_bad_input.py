@@ -287,7 +287,7 @@ COMMANDS = {
     "transposed": (lambda t: with_data(t, t.touched[:, None]), "transposed"),
     "all zero": (lambda t: with_data(t, 0 * t.touched), "every usable voltage is zero"),
     "all missing": (lambda t: with_data(t, np.nan * t.touched), "zero, NaN or missing"),
-    "too few left": (lambda t: with_data(t, np.where(np.arange(40) < 5, t.touched, np.nan)), "5 channels are usable"),
+    "too few left": (lambda t: with_data(t, np.where(np.arange(40) < 5, t.touched, np.nan)), "5 channels usable"),
     "same file twice": (lambda t: [*good(t)[:2], "--reference", t.folder / "touched.csv"], "same file"),
     "no reference": (lambda t: good(t)[:2], "no reference frame of its own"),
     "millivolts against volts": (lambda t: with_data(t, 1e3 * t.touched), "different units"),

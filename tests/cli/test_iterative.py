@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from jeit.cli.console import counted, in_one_unit
+from jeit.arguments import counted
+from jeit.cli.console import in_one_unit
 from jeit.data import read, write_table
 from jeit.imaging import StreamSettings
 from jeit.inverse.streaming.imager import FRAME_STEPS
