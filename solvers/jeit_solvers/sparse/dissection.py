@@ -14,6 +14,9 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_bipartite_matching
 
+# Coordinates are rounded to this share of their extent, so that the order does not hang on how they were rounded.
+_DIGITS = 7
+
 
 def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | None = None) -> np.ndarray:
     """Split a symmetric graph (n, n) without diagonal into a complete binary tree, `depth` separators high.
@@ -21,76 +24,116 @@ def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | No
     Returns for each node of the graph the node of the tree it belongs to (n,): the root is 0, the children of t are
     2 t + 1 and 2 t + 2; leaves hold what no separator took. `coordinates` (n, d) of the nodes make the cuts straight.
     """
-    owner = np.zeros(_num_nodes(graph), dtype=np.int64)
-    parts: list[tuple[int, int, np.ndarray, csr_array]] = [(0, 0, np.arange(_num_nodes(graph)), graph)]
-    while parts:
-        tree_node, level, nodes, part = parts.pop()
-        if level == depth or nodes.size == 0:
-            owner[nodes] = tree_node
-            continue
-        side = bisect(part, None if coordinates is None else coordinates[nodes])
-        owner[nodes[side == 2]] = tree_node
-        for half in (0, 1):
-            chosen = np.flatnonzero(side == half)
-            parts.append((2 * tree_node + 1 + half, level + 1, nodes[chosen], part[chosen][:, chosen]))
+    size = _num_nodes(graph)
+    owner, halving = np.zeros(size, dtype=np.int64), np.arange(size)
+    if coordinates is not None:
+        low, extent = coordinates.min(axis=0), max(np.ptp(coordinates, axis=0).max(), np.finfo(float).tiny)
+        coordinates = np.round((coordinates - low) / extent, _DIGITS)
+    entries = graph.tocoo()
+    rows, columns = entries.coords
+    for _ in range(depth):
+        # All parts of a level are halved at once; separators stay with the tree node that they were taken out at.
+        inside = np.full(size, -1)
+        tree_nodes, inside[halving] = np.unique(owner[halving], return_inverse=True)
+        rows, columns = _within(inside, rows, columns)
+        side = _halve(graph, rows, columns, inside, tree_nodes.size, coordinates)
+        halving = halving[side[halving] < 2]
+        owner[halving] = 2 * owner[halving] + 1 + side[halving]
     return owner
 
 
-def bisect(graph: csr_array, coordinates: np.ndarray | None) -> np.ndarray:
-    """Halve a graph: 0 and 1 for the halves, 2 for the separator between them, for every node.
+def _within(part: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The edges both ends of which lie in one part."""
+    same = (part[rows] == part[columns]) & (part[rows] >= 0)
+    return rows[same], columns[same]
 
-    Several cuts are tried, and the one kept whose separator is smallest for its balance.
+
+def _halve(
+    graph: csr_array, rows: np.ndarray, columns: np.ndarray, part: np.ndarray, number: int, coordinates
+) -> np.ndarray:
+    """Halve every part of a graph: 0 and 1 for the halves, 2 for the separator between them, for every node (n,).
+
+    `part` (n,): the number of a node's part, -1 for nodes of none; `rows`, `columns`: the edges within parts. Several
+    cuts are tried, and for each part the one kept whose separator is smallest for its balance.
     """
-    size = _num_nodes(graph)
-    if size == 1:
-        return np.array([2])
-    entries = graph.tocoo()
-    rows, columns = entries.coords
+    nodes = np.flatnonzero(part >= 0)
+    own = part[nodes]
+    counts = np.bincount(own, minlength=number)
     # Fronts are padded to the largest of their stage: the smaller the part, the more an even split is worth, and the
     # less a node more in the separator costs.
-    small = size < 400
-    shares, price_of_imbalance = ((0.46, 0.5, 0.54), 0.5) if small else ((0.45, 0.5, 0.55), 0.1)
-    best, best_cost = np.zeros(size, dtype=np.int64), np.inf
-    for key in _cut_keys(graph, coordinates):
-        order = np.argsort(key, kind="stable")
-        for share in shares:
-            upper = np.ones(size, dtype=bool)
-            upper[order[: max(1, round(share * size))]] = False
-            side = upper.astype(np.int64)
-            crossing = upper[columns] & ~upper[rows]
-            side[_smallest_cover(rows[crossing], columns[crossing], size)] = 2
-            counts = np.bincount(side, minlength=3)
-            cost = counts[2] + price_of_imbalance * abs(counts[0] - counts[1])
-            if cost < best_cost:
-                best, best_cost = side, cost
+    small = counts < 400
+    price_of_imbalance = np.where(small, 0.5, 0.1)
+    best, best_cost = np.full(part.size, 2), np.full(number, np.inf)
+    for key in _cut_keys(graph, nodes, own, number, coordinates):
+        order = np.lexsort((key, own))
+        rank = np.empty(nodes.size, dtype=np.int64)
+        rank[order] = np.arange(nodes.size) - np.repeat(np.cumsum(counts) - counts, counts)
+        for off_middle in (-1, 0, 1):
+            share = 0.5 + off_middle * np.where(small, 0.04, 0.05)
+            below = np.maximum(1, np.rint(share * counts)).astype(np.int64)
+            side = np.zeros(part.size, dtype=np.int64)
+            side[nodes] = rank >= below[own]
+            crossing = side[columns] > side[rows]
+            side[_smallest_cover(rows[crossing], columns[crossing])] = 2
+            halves = np.bincount(3 * own + side[nodes], minlength=3 * number).reshape(-1, 3)
+            cost = halves[:, 2] + price_of_imbalance * np.abs(halves[:, 0] - halves[:, 1])
+            better = cost < best_cost
+            best_cost[better] = cost[better]
+            chosen = nodes[better[own]]
+            best[chosen] = side[chosen]
+    best[nodes[counts[own] == 1]] = 2
     return best
 
 
-def _cut_keys(graph: csr_array, coordinates: np.ndarray | None) -> list[np.ndarray]:
-    """Functions on the nodes whose level sets are sensible cuts."""
+def _cut_keys(graph: csr_array, nodes: np.ndarray, part: np.ndarray, number: int, coordinates) -> list[np.ndarray]:
+    """Functions on the nodes, (k,) for those of `nodes`, whose level sets are sensible cuts of their parts."""
     if coordinates is not None:
-        centred = coordinates - coordinates.mean(axis=0)
-        _, axes = np.linalg.eigh(centred.T @ centred)
-        projected = centred @ axes[:, ::-1]
-        if projected.shape[1] == 1:
-            return [projected[:, 0]]
-        # The long axis, and the two diagonals to either side of it: near-square parts have no clear long axis.
-        long_axis, next_axis = projected[:, 0], projected[:, 1]
-        return [long_axis, long_axis + 0.4 * next_axis, long_axis - 0.4 * next_axis]
+        return _straight_cuts(coordinates[nodes], part, number)
+    order = np.argsort(part, kind="stable")
+    key = np.empty(nodes.size)
+    for members in np.split(order, np.cumsum(np.bincount(part, minlength=number))[:-1]):
+        chosen = nodes[members]
+        key[members] = _distance_cut(graph[chosen][:, chosen])
+    return [key]
+
+
+def _straight_cuts(coordinates: np.ndarray, part: np.ndarray, number: int) -> list[np.ndarray]:
+    """Across each part's long axis, and across the two diagonals to either side of it: near-square parts have no clear
+    long axis."""
+    dimension = coordinates.shape[1]
+
+    def sums(values):
+        return np.stack([np.bincount(part, column, number) for column in values.T], axis=1)
+
+    counts = np.maximum(np.bincount(part, minlength=number), 1)[:, None]
+    centred = coordinates - (sums(coordinates) / counts)[part]
+    spread = sums((centred[:, :, None] * centred[:, None]).reshape(-1, dimension**2))
+    _, axes = np.linalg.eigh(spread.reshape(number, dimension, dimension))
+    projected = np.einsum("ni,nij->nj", centred, axes[part][:, :, ::-1])
+    if dimension == 1:
+        return [projected[:, 0]]
+    long_axis, next_axis = projected[:, 0], projected[:, 1]
+    return [long_axis, long_axis + 0.4 * next_axis, long_axis - 0.4 * next_axis]
+
+
+def _distance_cut(graph: csr_array) -> np.ndarray:
+    """Of one part without coordinates, in graph distance."""
     size = _num_nodes(graph)
+    if size == 1:
+        return np.zeros(1)
     count, label = connected_components(graph, directed=False)
-    if count > 1:
-        # Parts that do not touch need no separator: whole components go to either side, the largest first.
-        sizes = np.bincount(label)
-        rank = np.empty(count, dtype=np.int64)
-        rank[np.argsort(-sizes, kind="stable")] = np.arange(count)
-        largest = np.flatnonzero(rank[label] == 0)
-        if 2 * largest.size <= size:
-            return [rank[label].astype(float)]
-        key = np.full(size, np.inf)
-        key[largest] = _far_ends(graph[largest][:, largest])
-        return [key]
-    return [_far_ends(graph)]
+    if count == 1:
+        return _far_ends(graph)
+    # Parts that do not touch need no separator: whole components go to either side, the largest first.
+    sizes = np.bincount(label)
+    rank = np.empty(count, dtype=np.int64)
+    rank[np.argsort(-sizes, kind="stable")] = np.arange(count)
+    largest = np.flatnonzero(rank[label] == 0)
+    if 2 * largest.size <= size:
+        return rank[label].astype(float)
+    key = np.full(size, np.inf)
+    key[largest] = _far_ends(graph[largest][:, largest])
+    return key
 
 
 def _far_ends(graph: csr_array) -> np.ndarray:
@@ -120,7 +163,7 @@ def _distances(graph: csr_array, start: int) -> np.ndarray:
     return result
 
 
-def _smallest_cover(lower: np.ndarray, upper: np.ndarray, size: int) -> np.ndarray:
+def _smallest_cover(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Fewest nodes that touch every edge between two sides (König: as many as a maximum matching has edges)."""
     if lower.size == 0:
         return np.empty(0, dtype=np.int64)
