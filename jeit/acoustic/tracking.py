@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from jeit.acoustic.localisation.locations import Locations
 from jeit.arguments import check_kind
@@ -127,7 +127,7 @@ def _smooth(step, measured, spread, located, densities):
 def _filter(step, measured, spread, located, density):
     """Log-likelihood, and for every frame mean, covariance, their predictions, and whether its place was believed."""
     d = measured.shape[1]
-    limit = float(chi2.isf(_BELIEVED, d))
+    limit = float(chdtri(d, _BELIEVED))
 
     def forward(state, now):
         mean, error = state

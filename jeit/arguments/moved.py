@@ -49,7 +49,7 @@ _MOVED = {
     },
     "jeit.design.study": {"jeit.report": "write_study_report"},
     "jeit.electrodes": {
-        "jeit.electrodes.electrodes": "Contact is_concrete",
+        "jeit.electrodes.electrodes": "Contact",
         "jeit.electrodes.precomputed": "IntegratedElectrodes",
         "jeit.layout": "BUILT_IN Layout grid named_layout perimeter quasi_uniform read_layout ring ring_and_centre "
         "write_layout",

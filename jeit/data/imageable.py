@@ -108,9 +108,9 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
     results = []
     for index in range(measurement.num_frames):
         frame = measurement.frame(index)
-        both = np.asarray(frame.mask & mean.mask)
+        both = np.asarray(frame.mask) & np.asarray(mean.mask)
         change = Measurement(
-            np.where(both, np.asarray(frame.voltages - mean.voltages), np.nan), both, measurement.protocol
+            np.where(both, np.asarray(frame.voltages) - np.asarray(mean.voltages), np.nan), both, measurement.protocol
         )
         size = float(np.linalg.norm(np.asarray(change.filled())))
         relative = size / float(np.linalg.norm(np.where(both, np.asarray(mean.filled()), 0)) or np.inf)

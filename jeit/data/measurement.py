@@ -3,15 +3,14 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Inexact
 
 from jeit.arguments import counted, did_you_mean
-from jeit.electrodes.electrodes import is_concrete
 from jeit.mesh import Domain
 from jeit.protocol import Protocol
+from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
 
 
 class Measurement(eqx.Module):
@@ -55,8 +54,8 @@ class Measurement(eqx.Module):
         notes: tuple[str, ...] = (),
     ):
         """`voltages` and `mask` (F, M), or (M,) for one frame. Raises `ValueError` where shapes disagree."""
-        self.voltages = jnp.atleast_2d(jnp.asarray(voltages))
-        self.mask = jnp.atleast_2d(jnp.asarray(mask))
+        self.voltages = as_array(_frames(voltages))
+        self.mask = as_array(_frames(mask))
         self.protocol = protocol
         self.electrodes = electrodes
         self.domain = domain
@@ -129,11 +128,11 @@ class Measurement(eqx.Module):
     def mean_frame(self) -> "Measurement":
         """The mean over frames of the usable voltages; a channel that no frame has stays masked."""
         mean, usable = _mean(self.voltages, self.mask)
-        return self._replace(mean[None], usable[None], frame_names=())
+        return self._replace(mean, usable, frame_names=())
 
     def filled(self, value: float = 0.0) -> Inexact[Array, "F M"]:
         """(F, M) voltages with `value` in place of what is masked."""
-        return jnp.where(self.mask, self.voltages, value)
+        return _filled(self.voltages, self.mask, value)
 
     def masked(self, usable, reason: str) -> "Measurement":
         """The same measurement with fewer usable channels.
@@ -148,7 +147,7 @@ class Measurement(eqx.Module):
             )
         mask = self.mask & extra
         note = reason
-        if is_concrete(mask):
+        if has_values(mask):
             number = int(self.mask.sum() - mask.sum())
             note = f"{counted(number, 'voltage')} masked: {reason}"
         return self._replace(self.voltages, mask, notes=(*self.notes, note))
@@ -184,13 +183,24 @@ class Measurement(eqx.Module):
         )
 
 
-@jax.jit
+def _frames(values):
+    """Values of one frame (M,) or of many, as (F, M)."""
+    return np.atleast_2d(on_host(values)) if has_values(values) else jnp.atleast_2d(values)
+
+
+@either_engine
+def _filled(voltages, mask, value):
+    return namespace(voltages, mask).where(mask, voltages, value)
+
+
+@either_engine
 def _rows(voltages, mask, index):
     return voltages[index], mask[index]
 
 
-@jax.jit
+@either_engine
 def _mean(voltages, mask):
+    xp = namespace(voltages, mask)
     count = mask.sum(axis=0)
-    total = jnp.where(mask, voltages, 0).sum(axis=0)
-    return jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan), count > 0
+    total = xp.where(mask, voltages, 0).sum(axis=0)
+    return xp.where(count > 0, total / xp.maximum(count, 1), xp.nan), count > 0

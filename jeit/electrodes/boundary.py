@@ -1,7 +1,5 @@
 """Electrodes on the edge of a sheet: arcs of the boundary of a 2-D mesh, integrated exactly."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -12,10 +10,10 @@ from jeit.electrodes.electrodes import (
     as_electrode_values,
     as_positions,
     check_dimension,
-    is_concrete,
 )
 from jeit.mesh import Mesh, Refine
 from jeit.mesh.geometry import boundary_loops, facet_measures
+from jeit_solvers.engines import either_engine, has_values, namespace, on_host, sum_into, undifferentiated
 
 
 class BoundaryElectrodes(AbstractMovableElectrodes):
@@ -68,6 +66,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
 
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the boundary edges of `mesh`, exact for P1 basis functions."""
+        xp = namespace(self, mesh)
         start, end = _covered(self.position, self.width, mesh)
         length = facet_measures(mesh)[:, None]
         # Basis functions on an edge: φ_1 = t / length, φ_0 = 1 - φ_1; these are their integrals over [start, end].
@@ -76,23 +75,22 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         second = (end**3 - start**3) / (3 * length**2)
         # Over the turns, (b, L), written out: XLA makes a slow matrix product of a sum over so short an axis.
         one, first, second = (integral[0] + integral[1] + integral[2] for integral in (one, first, second))
-        phi = jnp.stack([one - first, first])
-        phi_phi = jnp.stack([one - 2 * first + second, first - second, second])
+        phi = xp.stack([one - first, first])
+        phi_phi = xp.stack([one - 2 * first + second, first - second, second])
         admittance = 1 / self.contact_impedance
         entries = phi_phi @ admittance  # (3, b)
-        mass = jnp.stack([entries[:2], entries[1:]]).transpose(2, 0, 1)
-        load = jnp.zeros((mesh.num_points, self.num_electrodes), phi.dtype)
-        load = load.at[mesh.facets.T].add(phi * admittance)
+        mass = xp.stack([entries[:2], entries[1:]]).transpose(2, 0, 1)
+        load = sum_into((mesh.num_points, self.num_electrodes), mesh.facets.T, phi * admittance)
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for electrodes off the boundary, wider than it, or overlapping."""
         check_dimension("BoundaryElectrodes", mesh, 2)
-        if not is_concrete(self.position, self.width, mesh.points, mesh.facets):
+        if not has_values(self.position, self.width, mesh):
             return
-        distance = np.asarray(_project(self.position, mesh)[2])
-        start, end = map(np.asarray, _covered(self.position, self.width, mesh))
-        far = np.flatnonzero(distance > np.maximum(0.5 * self.width, 2e-3 * np.ptp(mesh.points, axis=0).max()))
+        position, width, mesh = on_host((self.position, self.width, mesh))
+        distance, (start, end) = _project(position, mesh)[2], _covered(position, width, mesh)
+        far = np.flatnonzero(distance > np.maximum(0.5 * width, 2e-3 * np.ptp(mesh.points, axis=0).max()))
         if far.size:
             raise ValueError(
                 f"position: electrode {far[0] + 1} lies {distance[far[0]]:.3g} m from the boundary of the mesh; "
@@ -100,7 +98,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
             )
         covered = np.clip(end - start, 0, None).sum(axis=0)  # (b, L)
         rounding = max(1e-9, 1e3 * np.finfo(covered.dtype).eps)
-        short = np.flatnonzero(covered.sum(axis=0) < (1 - rounding) * np.asarray(self.width))
+        short = np.flatnonzero(covered.sum(axis=0) < (1 - rounding) * width)
         if short.size:
             raise ValueError(
                 f"width: electrode {short[0] + 1} is {float(self.width[short[0]]):.3g} m wide, more than the boundary "
@@ -150,7 +148,7 @@ def _arc(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
     return np.stack([np.interp(where, arc, vertices[:, axis]) for axis in range(2)], axis=1)
 
 
-@jax.jit
+@either_engine
 def _project(position, mesh: Mesh):
     """Nearest boundary facet (L,) of each position, how far along it the foot point lies (L,), and its distance (L,).
 
@@ -158,18 +156,19 @@ def _project(position, mesh: Mesh):
     corners, τ(t) = (1-t)τ_0 + tτ_1, each the bisector of the two edges that meet there. On the edge itself that is the
     ordinary projection; and unlike that one it has a continuous derivative where an electrode slides over a corner.
     """
+    xp = namespace(position, mesh)
     corners = mesh.points[mesh.facets]
     along = corners[:, 1] - corners[:, 0]
     offset = position[:, None, :] - corners[:, 0]  # (L, b, 2)
-    clipped = jnp.clip(_dot(offset, along) / _dot(along, along), 0, 1)
+    clipped = xp.clip(_dot(offset, along) / _dot(along, along), 0, 1)
     beside = offset - clipped[..., None] * along
-    squared = jax.lax.stop_gradient(_dot(beside, beside))
-    facet = jnp.argmin(squared, axis=1)
+    squared = undifferentiated(_dot(beside, beside))
+    facet = xp.argmin(squared, axis=1)
     tail, head = mesh.facets[facet].T
-    before = jnp.argmax(mesh.facets[:, 1] == tail[:, None], axis=1)
-    after = jnp.argmax(mesh.facets[:, 0] == head[:, None], axis=1)
+    before = xp.argmax(mesh.facets[:, 1] == tail[:, None], axis=1)
+    after = xp.argmax(mesh.facets[:, 0] == head[:, None], axis=1)
     along = along[facet]
-    length = jnp.sqrt(_dot(along, along))
+    length = xp.sqrt(_dot(along, along))
     before, middle, after = (_normalised(corners[:, 1] - corners[:, 0])[index] for index in (before, facet, after))
     first, second = _normalised(before + middle), _normalised(middle + after)
     offset = position - corners[facet, 0]
@@ -177,8 +176,8 @@ def _project(position, mesh: Mesh):
     constant = _dot(offset, first)
     linear = _dot(offset, second - first) - _dot(along, first)
     quadratic = -_dot(along, second - first)
-    fraction = 2 * constant / (jnp.sqrt(jnp.maximum(linear**2 - 4 * quadratic * constant, 0)) - linear)
-    return facet, fraction * length, jnp.sqrt(jnp.min(squared, axis=1))
+    fraction = 2 * constant / (xp.sqrt(xp.maximum(linear**2 - 4 * quadratic * constant, 0)) - linear)
+    return facet, fraction * length, xp.sqrt(squared.min(axis=1))
 
 
 def _dot(first, second):
@@ -187,23 +186,24 @@ def _dot(first, second):
 
 
 def _normalised(vectors):
-    return vectors / jnp.sqrt(_dot(vectors, vectors))[..., None]
+    return vectors / namespace(vectors).sqrt(_dot(vectors, vectors))[..., None]
 
 
-@jax.jit
+@either_engine
 def _covered(position, width, mesh: Mesh):
     """Interval of each edge that each electrode covers: start and end (3, b, L), zero ≤ start ≤ end ≤ length.
 
     The first axis goes round the loop: an electrode may lie across the point where arc length begins.
     """
+    xp = namespace(position, width, mesh)
     length = facet_measures(mesh)
     loop, arc_start = boundary_loops(mesh)
     facet, along, _ = _project(position, mesh)
     same = loop[:, None] == loop[facet]  # (b, L)
-    perimeter = jnp.sum(jnp.where(same, length[:, None], 0), axis=0)
+    perimeter = xp.sum(xp.where(same, length[:, None], 0), axis=0)
     centre = arc_start[facet] + along
-    turns = jnp.array([-1.0, 0.0, 1.0])[:, None] * perimeter
+    turns = np.array([-1.0, 0.0, 1.0], length.dtype)[:, None] * perimeter
     middle = (centre + turns)[:, None, :] - arc_start[:, None]
     half, limit = 0.5 * width, length[:, None]
-    start, end = jnp.clip(middle - half, 0, limit), jnp.clip(middle + half, 0, limit)
-    return jnp.where(same, start, 0), jnp.where(same, end, 0)
+    start, end = xp.clip(middle - half, 0, limit), xp.clip(middle + half, 0, limit)
+    return xp.where(same, start, 0), xp.where(same, end, 0)

@@ -15,6 +15,7 @@ from jeit.electrodes.electrodes import (
     as_electrode_values,
 )
 from jeit.mesh import Mesh, Refine
+from jeit_solvers.engines import namespace
 
 
 class CombinedElectrodes(AbstractCompleteElectrodes):
@@ -40,7 +41,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
     @property
     def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Contact impedances (L,) of all parts, ohm·m² (ohm·m for arcs)."""
-        return jnp.concatenate([part.contact_impedance for part in self.parts])
+        return namespace(self).concatenate([part.contact_impedance for part in self.parts])
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
         """The same electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError`."""
@@ -73,7 +74,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         return Contact(
             tuple(nodes for contact in contacts for nodes in contact.nodes),
             tuple(mass for contact in contacts for mass in contact.mass),
-            jnp.concatenate([contact.load for contact in contacts], axis=1),
+            namespace(contacts).concatenate([contact.load for contact in contacts], axis=1),
         )
 
     def check(self, mesh: Mesh) -> None:

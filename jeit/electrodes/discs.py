@@ -1,8 +1,6 @@
 """Round electrodes: discs inside a sheet, and discs on the faces of a 3-D body."""
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -14,12 +12,11 @@ from jeit.electrodes.electrodes import (
     as_electrode_values,
     as_positions,
     check_dimension,
-    compiled_contact,
-    is_concrete,
 )
 from jeit.electrodes.window import EDGE, nearest_electrodes, smooth_step, triangle_quadrature, window_contact
 from jeit.mesh import Mesh, Refine, measures
 from jeit.mesh.geometry import facet_measures
+from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated
 
 
 class AbstractDiscs(AbstractPlacedElectrodes):
@@ -69,10 +66,11 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
 
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the cells, by quadrature of the windows."""
+        xp = namespace(self, mesh)
         area = measures(mesh)
         barycentric, _ = triangle_quadrature()
-        points = jnp.einsum("pi,mid->mpd", barycentric, mesh.points[mesh.cells])
-        edge = EDGE * jnp.sqrt(area)
+        points = xp.einsum("pi,mid->mpd", barycentric, mesh.points[mesh.cells])
+        edge = EDGE * xp.sqrt(area)
         near = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
         window = disc_window(points, self.position[near], self.radius[near], edge)
         return window_contact(mesh.cells, area, window, near, self.contact_impedance, mesh.num_points)
@@ -107,13 +105,14 @@ class FaceDiscs(AbstractDiscs):
 
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the boundary triangles, by quadrature of the windows."""
+        xp = namespace(self, mesh)
         area = facet_measures(mesh)
         barycentric, _ = triangle_quadrature()
-        points = jnp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
-        edge = EDGE * jnp.sqrt(area)
+        points = xp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
+        edge = EDGE * xp.sqrt(area)
         near = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
         window = disc_window(points, self.position[near], self.radius[near], edge)
-        reached = jnp.take_along_axis(same_face(mesh, self.position, 0.2 * self.radius), near, axis=1)
+        reached = xp.take_along_axis(same_face(mesh, self.position, 0.2 * self.radius), near, axis=1)
         return window_contact(
             mesh.facets, area, window * reached[..., None], near, self.contact_impedance, mesh.num_points
         )
@@ -143,8 +142,9 @@ def disc_window(points, position, radius, edge):
 def facet_normals(mesh: Mesh) -> Float[Array, "b 3"]:
     """Outward unit normals of the boundary triangles of a 3-D mesh."""
     corners = mesh.points[mesh.facets]
-    normal = jnp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
+    xp = namespace(corners)
+    normal = xp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normal / xp.linalg.norm(normal, axis=1, keepdims=True)
 
 
 def same_face(mesh: Mesh, position: Float[Array, "L 3"], tolerance: Float[Array, " L"]) -> Float[Array, "b L"]:
@@ -153,23 +153,22 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], tolerance: Float[Array,
     Keeps an electrode on a thin layer from reaching through to the other face. Not differentiated.
     """
     normal, corner = facet_normals(mesh), mesh.points[mesh.facets[:, 0]]
-    height = jnp.abs(normal @ position.T - jnp.sum(normal * corner, axis=1)[:, None])
-    return jax.lax.stop_gradient(height < tolerance).astype(position.dtype)
+    height = abs(normal @ position.T - (normal * corner).sum(axis=1)[:, None])
+    return undifferentiated(height < tolerance).astype(position.dtype)
 
 
 def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:
     """Raise `ValueError` unless every disc lies on the mesh, apart from the others, and spans enough cells."""
-    position, radius = electrodes.position, electrodes.radius
-    if not is_concrete(position, radius, electrodes.contact_impedance, mesh.points, mesh.cells):
+    if not has_values(electrodes, mesh):
         return
-    position, radius = np.asarray(position), np.asarray(radius)
+    electrodes, mesh = on_host((electrodes, mesh))
+    position, radius = electrodes.position, electrodes.radius
     gap = np.linalg.norm(position[:, None] - position, axis=-1) - radius[:, None] - radius
     np.fill_diagonal(gap, np.inf)
     if gap.min() < 0:
         first, second = np.unravel_index(gap.argmin(), gap.shape)
         raise ValueError(f"Electrodes {first + 1} and {second + 1} overlap by {-gap.min():.3g} m; move them apart.")
-    contact = compiled_contact(electrodes, mesh)
-    covered = np.asarray(contact.load.sum(axis=0) * electrodes.contact_impedance)
+    covered = electrodes.contact(mesh).load.sum(axis=0) * electrodes.contact_impedance
     for electrode in range(len(radius)):
         share = covered[electrode] / (np.pi * radius[electrode] ** 2)
         where = f"electrode {electrode + 1} at {position[electrode].tolist()} m with radius {radius[electrode]:.3g} m"

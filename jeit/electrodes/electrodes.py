@@ -4,14 +4,13 @@ import abc
 from typing import Any, Protocol
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.mesh import Mesh, Refine
+from jeit_solvers.engines import as_array, has_values, namespace
 
 
 class Contact(eqx.Module):
@@ -152,7 +151,7 @@ class AbstractPointElectrodes(AbstractElectrodes):
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """Node 0, where the potential is grounded: point electrodes have no contact mass."""
-        return (jnp.zeros((1, 1), mesh.cells.dtype),)
+        return (namespace(mesh).zeros((1, 1), mesh.cells.dtype),)
 
 
 def replace_contact_impedance(
@@ -163,43 +162,33 @@ def replace_contact_impedance(
     return eqx.tree_at(lambda each: each.contact_impedance, electrodes, values)
 
 
-@jax.jit
-def compiled_contact(electrodes: AbstractElectrodes, mesh: Mesh) -> Contact:
-    """`electrodes.contact(mesh)` compiled as a whole, for checks: op by op its first call would take seconds."""
-    return electrodes.contact(mesh)
-
-
-def is_concrete(*arrays) -> bool:
-    """Whether all `arrays` have values that can be looked at, i.e. none is a JAX tracer."""
-    return not any(isinstance(array, Tracer) for array in arrays)
-
-
 def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) -> Float[Array, " L"]:
     """Broadcast a positive scalar or (L,) argument to (L,) floats; `ValueError` if it cannot be that."""
-    values = jnp.asarray(values, dtype=float)
+    values = as_array(values, float)
     if values.ndim > 1 or (values.ndim == 1 and values.shape[0] != num_electrodes):
         raise ValueError(
             f"{name} has shape {values.shape}; give one number for all electrodes or one for each of the "
             f"{num_electrodes}, in {unit}."
         )
-    if is_concrete(values):
-        bad = ~(np.isfinite(values) & (np.asarray(values) > 0))
-        if bad.any():
-            first = int(np.flatnonzero(np.atleast_1d(bad))[0])
-            raise ValueError(
-                f"{name} must be positive and finite, in {unit}; electrode {first + 1} has "
-                f"{float(np.atleast_1d(values)[first])}."
-            )
-    return jnp.broadcast_to(values, (num_electrodes,))
+    if not has_values(values):
+        return jnp.broadcast_to(values, (num_electrodes,))
+    bad = ~(np.isfinite(values) & (np.asarray(values) > 0))
+    if bad.any():
+        first = int(np.flatnonzero(np.atleast_1d(bad))[0])
+        raise ValueError(
+            f"{name} must be positive and finite, in {unit}; electrode {first + 1} has "
+            f"{float(np.atleast_1d(values)[first])}."
+        )
+    return as_array(np.broadcast_to(values, (num_electrodes,)))
 
 
 def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
     """Check and convert electrode positions (L, d) in metres, d one of `dimensions`; `ValueError`."""
-    position = jnp.asarray(position, dtype=float)
+    position = as_array(position, float)
     if position.ndim != 2 or position.shape[1] not in dimensions or position.shape[0] == 0:
         wanted = " or ".join(f"(L, {d})" for d in dimensions)
         raise ValueError(f"position has shape {position.shape}; give one row per electrode, {wanted}, in metres.")
-    if is_concrete(position) and not np.isfinite(position).all():
+    if has_values(position) and not np.isfinite(position).all():
         rows = np.flatnonzero(~np.isfinite(position).all(axis=1)) + 1
         raise ValueError(f"position has NaN or infinite coordinates at electrodes {rows.tolist()}.")
     return position

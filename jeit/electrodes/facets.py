@@ -12,11 +12,11 @@ from jeit.electrodes.electrodes import (
     Contact,
     ElectrodePen,
     as_electrode_values,
-    is_concrete,
     replace_contact_impedance,
 )
 from jeit.mesh import Mesh, Refine
 from jeit.mesh.geometry import facet_measures
+from jeit_solvers.engines import has_values, namespace, sum_into
 
 
 class FacetElectrodes(AbstractCompleteElectrodes):
@@ -83,12 +83,15 @@ class FacetElectrodes(AbstractCompleteElectrodes):
 
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over whole facets: ∫φ_i = |f| / d, ∫φ_iφ_j = |f| (1 + δ_ij) / (d (d + 1))."""
+        xp = namespace(self, mesh)
         d = mesh.dimension
         measure = facet_measures(mesh)
         admittance = self.covers / self.contact_impedance  # (b, L)
-        mass = (measure * admittance.sum(axis=1))[:, None, None] * (jnp.ones((d, d)) + jnp.eye(d)) / (d * (d + 1))
-        load = jnp.zeros((mesh.num_points, self.num_electrodes), measure.dtype)
-        load = load.at[mesh.facets].add((measure[:, None] * admittance / d)[:, None, :])
+        pairs = (np.ones((d, d)) + np.eye(d)).astype(measure.dtype) / (d * (d + 1))
+        mass = (measure * admittance.sum(axis=1))[:, None, None] * pairs
+        current = (measure[:, None] * admittance / d)[:, None, :]
+        shape = mesh.num_points, self.num_electrodes
+        load = sum_into(shape, mesh.facets, xp.broadcast_to(current, (*mesh.facets.shape, shape[1])))
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
@@ -119,7 +122,7 @@ def electrodes_from_nodes(mesh: Mesh, nodes: Sequence, contact_impedance) -> Fac
     `nodes`: for each electrode its node indices, counted from 0. `contact_impedance` as in `FacetElectrodes`.
     For electrodes of one node each use `NodeElectrodes`. Raises `ValueError` where no facet is covered.
     """
-    if not is_concrete(mesh.facets):
+    if not has_values(mesh.facets):
         raise ValueError("electrodes_from_nodes needs a mesh with values, not one that is being traced.")
     boundary = np.asarray(mesh.facets)
     facets = []

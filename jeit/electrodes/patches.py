@@ -1,7 +1,5 @@
 """Rectangular electrodes on the surface of a 3-D body, such as the plates round a tank."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -13,12 +11,11 @@ from jeit.electrodes.electrodes import (
     as_electrode_values,
     as_positions,
     check_dimension,
-    compiled_contact,
-    is_concrete,
 )
 from jeit.electrodes.window import EDGE, smooth_step, triangle_quadrature, window_contact
 from jeit.mesh import Mesh, Refine
 from jeit.mesh.geometry import facet_measures
+from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated
 
 
 class FacePatches(AbstractPlacedElectrodes):
@@ -69,30 +66,32 @@ class FacePatches(AbstractPlacedElectrodes):
 
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the boundary triangles, by quadrature of the windows."""
+        xp = namespace(self, mesh)
         area = facet_measures(mesh)
         barycentric, _ = triangle_quadrature()
-        points = jnp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
+        points = xp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
         normal, across, up = _frames(mesh, self.position)
         offset = points[:, :, None, :] - self.position  # (b, p, L, 3)
-        edge = EDGE * jnp.sqrt(area)[:, None, None]
-        window = smooth_step((self.width / 2 - jnp.abs(jnp.sum(offset * across, axis=-1))) / edge)
-        window = window * smooth_step((self.height / 2 - jnp.abs(jnp.sum(offset * up, axis=-1))) / edge)
+        edge = EDGE * xp.sqrt(area)[:, None, None]
+        window = smooth_step((self.width / 2 - abs((offset * across).sum(axis=-1))) / edge)
+        window = window * smooth_step((self.height / 2 - abs((offset * up).sum(axis=-1))) / edge)
         # The same side of the body: facing as the electrode does, and no deeper than the patch is large.
         facing = facet_normals(mesh) @ normal.T > 0.5
-        depth = jnp.abs(jnp.sum(offset.mean(axis=1) * normal, axis=-1))
-        near = depth < jnp.maximum(self.width, self.height) / 2
-        window = window * jax.lax.stop_gradient(facing & near)[:, None, :]
-        every = jnp.broadcast_to(jnp.arange(self.num_electrodes), (len(area), self.num_electrodes))
-        window = jnp.swapaxes(window, 1, 2)
+        depth = abs((offset.mean(axis=1) * normal).sum(axis=-1))
+        near = depth < xp.maximum(self.width, self.height) / 2
+        window = window * undifferentiated(facing & near)[:, None, :]
+        every = xp.broadcast_to(xp.arange(self.num_electrodes), (len(area), self.num_electrodes))
+        window = xp.swapaxes(window, 1, 2)
         return window_contact(mesh.facets, area, window, every, self.contact_impedance, mesh.num_points)
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for patches off the surface, overlapping, or too small for the mesh."""
         check_dimension("FacePatches", mesh, 3)
-        if not is_concrete(self.position, self.width, self.height, self.contact_impedance, mesh.points, mesh.facets):
+        if not has_values(self, mesh):
             return
-        contact = compiled_contact(self, mesh)
-        share = np.asarray(contact.load.sum(axis=0) * self.contact_impedance / (self.width * self.height))
+        electrodes, mesh = on_host((self, mesh))
+        touched = electrodes.contact(mesh).load * electrodes.contact_impedance
+        share = touched.sum(axis=0) / (electrodes.width * electrodes.height)
         # A patch bent round a wall is longer than its chord, by a tenth at 80° of arc.
         wrong = np.flatnonzero((share < 0.8) | (share > 1.25))
         if wrong.size:
@@ -100,7 +99,6 @@ class FacePatches(AbstractPlacedElectrodes):
                 f"position: {100 * share[wrong[0]]:.0f} % of electrode {wrong[0] + 1}'s area is found on the mesh's "
                 "surface; move it onto the surface, or refine the mesh there if the patch is smaller than a facet."
             )
-        touched = np.asarray(contact.load) * np.asarray(self.contact_impedance)
         overlap = (touched.T @ touched) / np.sqrt(np.outer(*(2 * [(touched**2).sum(axis=0)])))
         np.fill_diagonal(overlap, 0)
         if overlap.max() > 0.2:
@@ -110,11 +108,12 @@ class FacePatches(AbstractPlacedElectrodes):
 
 def _frames(mesh: Mesh, position):
     """Unit vectors (L, 3) at each electrode: normal of the nearest facet, across, and up. Not differentiated."""
+    xp = namespace(mesh, position)
     centres = mesh.points[mesh.facets].mean(axis=1)
-    nearest = jnp.argmin(jnp.sum((position[:, None] - centres) ** 2, axis=-1), axis=1)
+    nearest = xp.argmin(xp.sum((position[:, None] - centres) ** 2, axis=-1), axis=1)
     normal = facet_normals(mesh)[nearest]
-    horizontal = jnp.abs(normal[:, 2:]) > 0.9
-    upward = jnp.where(horizontal, jnp.array([0.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0]))
-    across = jnp.cross(upward, normal)
-    across = across / jnp.linalg.norm(across, axis=1, keepdims=True)
-    return tuple(map(jax.lax.stop_gradient, (normal, across, jnp.cross(normal, across))))
+    horizontal = abs(normal[:, 2:]) > 0.9
+    upward = xp.where(horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(normal.dtype)
+    across = xp.cross(upward, normal)
+    across = across / xp.linalg.norm(across, axis=1, keepdims=True)
+    return tuple(map(undifferentiated, (normal, across, xp.cross(normal, across))))

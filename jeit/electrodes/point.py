@@ -1,12 +1,12 @@
 """Point electrodes: the zero-size limit, without contact impedance."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.electrodes.electrodes import AbstractPointElectrodes, Contact, ElectrodePen, as_positions, is_concrete
+from jeit.electrodes.electrodes import AbstractPointElectrodes, Contact, ElectrodePen, as_positions
 from jeit.mesh import Mesh, Refine, gradients
+from jeit_solvers.engines import either_engine, has_values, namespace, sum_into, undifferentiated
 
 
 class PointElectrodes(AbstractPointElectrodes):
@@ -45,18 +45,18 @@ class PointElectrodes(AbstractPointElectrodes):
     def contact(self, mesh: Mesh) -> Contact:
         """`load` (n, L): values of the basis functions at the electrodes; no mass."""
         cell, weights, _ = _locate(self.position, mesh)
-        load = jnp.zeros((mesh.num_points, self.num_electrodes), weights.dtype)
-        load = load.at[mesh.cells[cell], jnp.arange(self.num_electrodes)[:, None]].set(weights)
+        index = mesh.cells[cell], np.arange(self.num_electrodes)[:, None]
+        load = sum_into((mesh.num_points, self.num_electrodes), index, weights)
         return _point_contact(self.contact_nodes(mesh), load)
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for electrodes outside the mesh, or two at one place."""
         if self.position.shape[1] != mesh.dimension:
             raise ValueError(f"position has {self.position.shape[1]} coordinates and the mesh is {mesh.dimension}-D.")
-        if not is_concrete(self.position, mesh.points, mesh.cells):
+        if not has_values(self.position, mesh.points, mesh.cells):
             return
         position, points = np.asarray(self.position), np.asarray(mesh.points)
-        outside = np.asarray(jax.jit(_locate)(self.position, mesh)[2])
+        outside = np.asarray(_locate(self.position, mesh)[2])
         # A point on a curved boundary lies slightly outside the polygon: allow a third of a cell.
         far = np.flatnonzero(outside < -1 / 3)
         if far.size:
@@ -107,12 +107,13 @@ class NodeElectrodes(AbstractPointElectrodes):
 
     def contact(self, mesh: Mesh) -> Contact:
         """`load` (n, L): one at each electrode's node; no mass."""
-        load = jnp.zeros((mesh.num_points, self.num_electrodes), mesh.points.dtype)
-        return _point_contact(self.contact_nodes(mesh), load.at[self.nodes, jnp.arange(self.num_electrodes)].set(1))
+        ones = namespace(self, mesh).ones(self.num_electrodes, mesh.points.dtype)
+        index = self.nodes, np.arange(self.num_electrodes)
+        return _point_contact(self.contact_nodes(mesh), sum_into((mesh.num_points, self.num_electrodes), index, ones))
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for a node the mesh does not have."""
-        if is_concrete(self.nodes) and int(self.nodes.max()) >= mesh.num_points:
+        if has_values(self.nodes) and int(self.nodes.max()) >= mesh.num_points:
             raise ValueError(
                 f"nodes: index {int(self.nodes.max())} is out of range for a mesh of {mesh.num_points} nodes; indices "
                 "count from 0."
@@ -120,16 +121,18 @@ class NodeElectrodes(AbstractPointElectrodes):
 
 
 def _point_contact(nodes, load) -> Contact:
-    return Contact(nodes, (jnp.zeros((1, 1, 1), load.dtype),), load)
+    return Contact(nodes, (namespace(load).zeros((1, 1, 1), load.dtype),), load)
 
 
+@either_engine
 def _locate(position, mesh: Mesh):
     """The cell of each position, its barycentric coordinates there, and how far inside (negative: outside) it is."""
+    xp = namespace(position, mesh)
     corners = mesh.points[mesh.cells]  # (m, d + 1, d)
     # Basis functions are linear: their value at a position follows from their gradients.
-    local = jnp.einsum("mij,lmj->lmi", gradients(mesh)[:, 1:], position[:, None] - corners[:, 0])
-    barycentric = jnp.concatenate([1 - local.sum(axis=-1, keepdims=True), local], axis=-1)
-    inside = jax.lax.stop_gradient(barycentric).min(axis=-1)
-    cell = jnp.argmax(inside, axis=1)
-    weights = jnp.take_along_axis(barycentric, cell[:, None, None], 1)[:, 0]
+    local = xp.einsum("mij,lmj->lmi", gradients(mesh)[:, 1:], position[:, None] - corners[:, 0])
+    barycentric = xp.concatenate([1 - local.sum(axis=-1, keepdims=True), local], axis=-1)
+    inside = undifferentiated(barycentric).min(axis=-1)
+    cell = xp.argmax(inside, axis=1)
+    weights = xp.take_along_axis(barycentric, cell[:, None, None], 1)[:, 0]
     return cell, weights, inside.max(axis=1)

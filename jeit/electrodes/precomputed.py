@@ -3,11 +3,13 @@
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jeit.electrodes.electrodes import AbstractElectrodes, Contact, ElectrodePen
 from jeit.mesh import Mesh, Refine
+from jeit_solvers.engines import has_values, namespace, on_device, on_host
 
 
 class IntegratedElectrodes(AbstractElectrodes):
@@ -20,7 +22,11 @@ class IntegratedElectrodes(AbstractElectrodes):
     point: bool = eqx.field(static=True)
 
     def __init__(self, electrodes: AbstractElectrodes, mesh: Mesh):
-        self.integrals = electrodes.contact(mesh)
+        if has_values(electrodes, mesh):
+            integrals = on_host(electrodes).contact(on_host(mesh))
+            self.integrals = integrals if namespace(electrodes, mesh) is np else on_device(integrals)
+        else:
+            self.integrals = electrodes.contact(mesh)
         self.point = electrodes.is_point
 
     @property

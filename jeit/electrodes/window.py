@@ -1,12 +1,12 @@
 """Contact integrals of electrodes whose edge cuts through cells: a smooth window on a fixed quadrature."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.special import roots_jacobi
 
 from jeit.electrodes.electrodes import Contact
+from jeit_solvers.engines import host, namespace, sum_into, undifferentiated
 
 # Half-width of a window's edge, as a share of the local cell size. Smaller is closer to the sharp electrode, until
 # the edge falls between the quadrature points; see tests/electrodes for its convergence.
@@ -30,7 +30,7 @@ def triangle_quadrature(order: int = 5) -> tuple[np.ndarray, np.ndarray]:
 
 def smooth_step(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Rises from 0 at x ≤ -1 to 1 at x ≥ 1 with two continuous derivatives; odd about (0, 1/2)."""
-    t = jnp.clip((x + 1) / 2, 0, 1)
+    t = namespace(x).clip((x + 1) / 2, 0, 1)
     return t**3 * (10 - 15 * t + 6 * t**2)
 
 
@@ -40,9 +40,13 @@ def nearest_electrodes(middles, position, radius) -> Int[Array, "q k"]:
     Of round electrodes, `position` (L, d) and `radius` (L,), that do not overlap, no more than that reach a triangle,
     unless it is so much larger than they are that the mesh is refused. Not differentiated.
     """
-    distance = jnp.sum((middles[:, None] - position) ** 2, axis=-1) - radius**2
-    distance = jax.lax.stop_gradient(distance).astype(jnp.float32)  # the order of the farthest does not matter
-    return jax.lax.top_k(-distance, min(_MOST_AT_ONCE, len(radius)))[1]
+    xp = namespace(middles, position, radius)
+    distance = xp.sum((middles[:, None] - position) ** 2, axis=-1) - radius**2
+    distance = undifferentiated(distance).astype(np.float32)  # the order of the farthest does not matter
+    number = min(_MOST_AT_ONCE, len(radius))
+    if xp is np:
+        return host.argsort(distance, axis=1, kind="stable")[:, :number]
+    return jax.lax.top_k(-distance, number)[1]
 
 
 def window_contact(
@@ -61,6 +65,6 @@ def window_contact(
     current = measure[:, None, None] * weights * window / contact_impedance[electrode][..., None]
     products = (barycentric[:, :, None] * barycentric[:, None]).reshape(len(weights), -1)
     mass = (current.sum(axis=1) @ products).reshape(-1, *2 * barycentric.shape[1:])
-    load = jnp.zeros((num_points, contact_impedance.shape[0]), current.dtype)
-    load = load.at[nodes[:, None], electrode[..., None]].add(current @ barycentric)
+    shape = num_points, contact_impedance.shape[0]
+    load = sum_into(shape, (nodes[:, None], electrode[..., None]), current @ barycentric)
     return Contact((nodes,), (mass,), load)

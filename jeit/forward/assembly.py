@@ -1,13 +1,15 @@
 """P1 finite elements: conductivity per cell, element stiffness, and gradients of nodal fields."""
 
 import functools
+import operator
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from jeit.electrodes.electrodes import is_concrete
 from jeit.mesh import Mesh, gradients, measures
+from jeit_solvers.engines import gather, has_values, namespace, on_host
 
 
 def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
@@ -17,7 +19,7 @@ def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
     cell's nodes is exact.
     """
     if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
-        return conductivity[mesh.cells].mean(axis=1)
+        return gather(conductivity, mesh.cells).mean(axis=1)
     return conductivity
 
 
@@ -28,41 +30,46 @@ def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
     metre (in a 2-D sheet, siemens). A complex admittivity needs a positive real part. Values of tracers are not looked
     at.
     """
-    conductivity = jnp.asarray(conductivity)
-    inexact = jnp.issubdtype(conductivity.dtype, jnp.inexact)
+    conductivity = on_host(conductivity) if has_values(conductivity) else jnp.asarray(conductivity)
     # One type and shape for all that mean the same, or JAX compiles again: Python's numbers are "weakly" typed.
-    conductivity = jnp.asarray(conductivity, conductivity.dtype if inexact else float)
+    kind = jnp.result_type(conductivity)
+    kind = kind if jnp.issubdtype(kind, jnp.inexact) else jnp.result_type(float)
+    conductivity = namespace(conductivity).asarray(conductivity, dtype=kind)
     m, n, d = mesh.num_cells, mesh.num_points, mesh.dimension
     if conductivity.shape not in [(), (m,), (n,), (m, d, d)]:
         raise ValueError(
             f"conductivity has shape {conductivity.shape}; give a scalar, one value per cell ({m},), one per node "
             f"({n},), or tensors ({m}, {d}, {d}). For a batch, use jax.vmap."
         )
-    if is_concrete(conductivity):
-        values = np.asarray(conductivity)
-        if not np.isfinite(values).all():
-            raise ValueError("conductivity has NaN or infinite values.")
-        if values.ndim == 3:
-            if not np.allclose(values, np.swapaxes(values, 1, 2), rtol=1e-12, atol=0):
-                raise ValueError("conductivity tensors must be symmetric.")
-            least = np.linalg.eigvalsh(np.real(values)).min()
-        else:
-            least = np.real(values).min()
-        if least <= 0:
-            raise ValueError(
-                f"conductivity must be positive everywhere; its least value is {least:.3g}. For an insulating "
-                "inclusion use a small positive value, such as a thousandth of the background."
-            )
-    return jnp.broadcast_to(conductivity, (m,)) if conductivity.ndim == 0 else conductivity
+    if has_values(conductivity):
+        _check_values(conductivity)
+    return namespace(conductivity).broadcast_to(conductivity, conductivity.shape or (m,))
+
+
+def _check_values(conductivity: Any) -> None:
+    if not np.isfinite(conductivity).all():
+        raise ValueError("conductivity has NaN or infinite values.")
+    if conductivity.ndim == 3:
+        if not np.allclose(conductivity, np.swapaxes(conductivity, 1, 2), rtol=1e-12, atol=0):
+            raise ValueError("conductivity tensors must be symmetric.")
+        least = np.linalg.eigvalsh(conductivity.real).min()
+    else:
+        least = conductivity.real.min()
+    if least <= 0:
+        raise ValueError(
+            f"conductivity must be positive everywhere; its least value is {least:.3g}. For an insulating "
+            "inclusion use a small positive value, such as a thousandth of the background."
+        )
 
 
 def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Array, "p m"]:
     """Element stiffness ∫ ∇φ_i·σ∇φ_j for conductivity per cell: lower triangles (p, m), p = (d+1)(d+2)/2, siemens."""
+    xp = namespace(mesh, conductivity)
     gradient = gradients(mesh)  # (m, d + 1, d)
-    flux = gradient if conductivity.ndim == 1 else jnp.einsum("mij,mkj->mki", conductivity, gradient)
+    flux = gradient if conductivity.ndim == 1 else xp.einsum("mij,mkj->mki", conductivity, gradient)
     weight = measures(mesh) * (conductivity if conductivity.ndim == 1 else 1)
     rows, columns = np.tril_indices(mesh.dimension + 1)
-    return jnp.stack(
+    return xp.stack(
         [
             weight * sum(gradient[:, row, axis] * flux[:, column, axis] for axis in range(mesh.dimension))
             for row, column in zip(rows, columns, strict=True)
@@ -75,11 +82,12 @@ def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array,
 
     With that weight the product of two of them is the integral ∫_e ∇u·∇w.
     """
-    weighted = gradients(mesh) * jnp.sqrt(measures(mesh))[:, None, None]
-    corners = [fields.at[mesh.cells[:, k]].get(mode="promise_in_bounds") for k in range(mesh.dimension + 1)]
-    return jnp.stack(
+    xp = namespace(mesh, fields)
+    weighted = gradients(mesh) * xp.sqrt(measures(mesh))[:, None, None]
+    corners = [gather(fields, mesh.cells[:, k]) for k in range(mesh.dimension + 1)]
+    return xp.stack(
         [
-            functools.reduce(jnp.add, [weighted[:, k, axis, None] * corner for k, corner in enumerate(corners)])
+            functools.reduce(operator.add, [weighted[:, k, axis, None] * corner for k, corner in enumerate(corners)])
             for axis in range(mesh.dimension)
         ]
     )

@@ -1,19 +1,26 @@
 """`ForwardModel`: conductivity in, electrode voltages and their Jacobian out."""
 
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 from jaxtyping import Array, Inexact
 
 from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward.assembly import check_conductivity, field_gradients
+from jeit.forward.at_once import HostModel, host_model
 from jeit.forward.system import System
 from jeit.forward.transfer import electrode_fields, transfer_impedance
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
-from jeit_solvers import in_turn
+from jeit_solvers import SparseCholesky, in_turn
+from jeit_solvers.engines import gather, has_values, host, namespace, on_device, on_host, sum_into
 
 
 class ForwardModel(eqx.Module):
@@ -21,17 +28,20 @@ class ForwardModel(eqx.Module):
 
     Every method takes a conductivity: a scalar, one value per cell (m,), one per node (n,), or symmetric tensors
     (m, d, d), in siemens per metre (2-D: sheet conductivity in siemens); complex values are admittivities. One of
-    another shape, not positive or not finite raises `ValueError`. All are jit-compiled, differentiable in the
-    conductivity and in every field of the model (`model.electrodes.position`, `.contact_impedance`,
-    `model.mesh.points`, …), and may be wrapped in `jax.vmap`.
+    another shape, not positive or not finite raises `ValueError`. Called as it is, a method answers at once, in NumPy;
+    inside `jax.jit`, `jax.vmap` or a derivative it is compiled, once, and two to four times as fast from then on. All
+    are differentiable in the conductivity and in every field of the model (`model.electrodes.position`,
+    `.contact_impedance`, `model.mesh.points`, …).
 
-    **Fields**: `mesh`, `electrodes`, `protocol`, and `system`, the sparsity pattern and linear solver.
+    **Fields**: `mesh`, `electrodes`, `protocol`; `system`, the sparsity pattern and linear solver; `at_once`, whether
+    NumPy answers where it can.
     """
 
     mesh: Mesh
     electrodes: AbstractElectrodes
     protocol: Protocol
     system: System
+    at_once: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -41,14 +51,17 @@ class ForwardModel(eqx.Module):
         *,
         solver: str | lx.AbstractLinearSolver = "auto",
     ):
-        """`solver`: "auto" (chosen by size; `model.system.solver` says which and why), "cholesky", "cg", or any
-        lineax solver. Raises `ValueError` if electrodes, mesh and protocol do not fit together.
+        """`solver`: "auto" (chosen by size; `model.system.solver` says which and why), "cholesky", "cg", or any lineax
+        solver; one that is asked for is always compiled. Raises `ValueError` if electrodes, mesh and protocol do not
+        fit together.
         """
         _check(mesh, electrodes, protocol)
         self.mesh = mesh
         self.electrodes = electrodes
         self.protocol = protocol
         self.system = System.create(mesh, electrodes, solver)
+        # What is too large for a direct solver is too large for SciPy's too; and a solver that was asked for is used.
+        self.at_once = isinstance(solver, str) and solver == "auto" and isinstance(self.system.solver, SparseCholesky)
 
     def with_electrodes(self, electrodes: AbstractElectrodes) -> "ForwardModel":
         """The same model with other electrodes of the same kind, as many; works under jit. Raises `ValueError` for
@@ -68,21 +81,29 @@ class ForwardModel(eqx.Module):
 
     def voltages(self, conductivity) -> Inexact[Array, " M"]:
         """Voltages (M,) of the protocol's channels, in volts. `conductivity` in S/m (2-D: S); raises `ValueError`."""
-        return _voltages(self, check_conductivity(self.mesh, conductivity))
+        return evaluate(self, voltages_of, check_conductivity(self.mesh, conductivity))
 
     def transfer_impedance(self, conductivity) -> Inexact[Array, "L L"]:
         """Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero.
 
         `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
         """
-        return _transfer_impedance(self, check_conductivity(self.mesh, conductivity))
+        return evaluate(self, transfer_impedance_of, check_conductivity(self.mesh, conductivity))
+
+    def fields(self, conductivity) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
+        """Potentials F (n, L) of the nodes for a unit current into each electrode that leaves evenly through all, in
+        ohms, and the transfer impedance Z (L, L).
+
+        `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
+        """
+        return evaluate(self, fields_of, check_conductivity(self.mesh, conductivity))
 
     def potentials(self, conductivity) -> Inexact[Array, "S n"]:
         """Potential at the nodes for every drive pattern, in volts; the mean over the electrodes is zero.
 
         `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
         """
-        return _potentials(self, check_conductivity(self.mesh, conductivity))
+        return evaluate(self, potentials_of, check_conductivity(self.mesh, conductivity))
 
     def jacobian(self, conductivity) -> Inexact[Array, "M m"]:
         """∂(voltage)/∂(conductivity), volts per siemens per metre (2-D: per siemens).
@@ -103,7 +124,20 @@ class ForwardModel(eqx.Module):
                 "jacobian is with respect to scalar conductivities; for tensors use jax.jacfwd or jax.jacrev of "
                 "model.voltages."
             )
-        return _voltages_and_jacobian(self, conductivity)
+        return evaluate(self, voltages_and_jacobian_of, conductivity)
+
+
+def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) -> Any:
+    """A `quantity` of a model: at once where all values are at hand, compiled where anything is traced.
+
+    `conductivity` as an array, S/m (2-D: S). It is not looked at: one that is not positive or not finite gives NaN.
+    """
+    parts = model.mesh, model.electrodes, model.protocol
+    if not (model.at_once and has_values(parts, conductivity)):
+        return _COMPILED[quantity](model, conductivity)
+    with np.errstate(all="ignore"):
+        found = quantity(host_model(*parts, model.system), on_host(conductivity))
+    return found if namespace(parts) is np else on_device(found)
 
 
 def check_model(model: ForwardModel) -> None:
@@ -139,44 +173,55 @@ def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
         products = (measured[protocol.measurement_index] @ impedance) * driven[protocol.drive_index]
         return products.sum(axis=1)
     table = measured @ impedance @ driven.T
-    return table.at[protocol.measurement_index, protocol.drive_index].get(mode="promise_in_bounds")
+    return gather(table.reshape(-1), protocol.measurement_index * len(driven) + protocol.drive_index)
 
 
-@jax.jit
-def _transfer_impedance(model: ForwardModel, conductivity):
+def transfer_impedance_of(model: ForwardModel | HostModel, conductivity):
+    """Z (L, L) in ohms, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
     return transfer_impedance(model.mesh, conductivity, model.electrodes, model.system)
 
 
-@jax.jit
-def _voltages(model: ForwardModel, conductivity):
-    return select_channels(model.protocol, _transfer_impedance(model, conductivity))
+def voltages_of(model: ForwardModel | HostModel, conductivity):
+    """Voltages (M,) of the channels, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
+    return select_channels(model.protocol, transfer_impedance_of(model, conductivity))
 
 
-@jax.jit
-def _potentials(model: ForwardModel, conductivity):
-    fields, _ = electrode_fields(model.mesh, conductivity, model.electrodes, model.system)
-    return model.protocol.drive @ fields.T
+def fields_of(model: ForwardModel | HostModel, conductivity):
+    """F (n, L) and Z (L, L) in ohms, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
+    return electrode_fields(model.mesh, conductivity, model.electrodes, model.system)
 
 
-@jax.jit
-@in_turn
-def _voltages_and_jacobian(model: ForwardModel, conductivity):
-    mesh, protocol = model.mesh, model.protocol
-    fields, impedance = electrode_fields(mesh, conductivity, model.electrodes, model.system)
+def potentials_of(model: ForwardModel | HostModel, conductivity):
+    """Potentials (S, n) in volts, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
+    return model.protocol.drive @ fields_of(model, conductivity)[0].T
+
+
+def voltages_and_jacobian_of(model: ForwardModel | HostModel, conductivity):
+    """Voltages (M,) and their Jacobian (M, m), of a `conductivity` in S/m (2-D: S); for `evaluate`."""
+    mesh, protocol, jacobian = model.mesh, model.protocol, host.zeros(())
+    xp = namespace(conductivity, mesh)
+    fields, impedance = fields_of(model, conductivity)
     # One product for all patterns and axes: it also keeps XLA from computing the gradients anew for every channel.
-    patterns = jnp.concatenate([-protocol.drive, protocol.measurement])
+    patterns = xp.concatenate([-protocol.drive, protocol.measurement])
     gradient = field_gradients(mesh, fields)
     rows = patterns @ gradient.reshape(-1, gradient.shape[-1]).T
     # ∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, axis by axis.
-    jacobian = jnp.zeros(())
-    for component in jnp.split(rows, mesh.dimension, axis=1):
-        drive = component.at[protocol.drive_index].get(mode="promise_in_bounds")
-        measure = component.at[protocol.num_drives + protocol.measurement_index].get(mode="promise_in_bounds")
-        jacobian += drive * measure
+    for component in xp.split(rows, mesh.dimension, axis=1):
+        drive = gather(component, protocol.drive_index)
+        measure = gather(component, protocol.num_drives + protocol.measurement_index)
+        jacobian = jacobian + drive * measure
     if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
-        per_corner = jacobian / mesh.cells.shape[1]
-        jacobian = sum(
-            jax.ops.segment_sum(per_corner.T, mesh.cells[:, k], num_segments=mesh.num_points).T
-            for k in range(mesh.cells.shape[1])
-        )
+        per_corner = jacobian.T / mesh.cells.shape[1]
+        shape = mesh.num_points, protocol.num_measurements
+        corners = [sum_into(shape, mesh.cells[:, k], per_corner) for k in range(mesh.cells.shape[1])]
+        jacobian = functools.reduce(operator.add, corners).T
     return select_channels(protocol, impedance), jacobian
+
+
+_COMPILED = {
+    transfer_impedance_of: jax.jit(transfer_impedance_of),
+    voltages_of: jax.jit(voltages_of),
+    fields_of: jax.jit(fields_of),
+    potentials_of: jax.jit(potentials_of),
+    voltages_and_jacobian_of: jax.jit(in_turn(voltages_and_jacobian_of)),
+}

@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 from jaxtyping import Array, Inexact
@@ -18,9 +17,11 @@ from jeit_solvers import (
     SparsityPattern,
     analyse,
     choose_solver,
+    factorise,
     quadratic_form,
     solve,
 )
+from jeit_solvers.engines import namespace, undifferentiated
 
 
 class System(eqx.Module):
@@ -57,19 +58,16 @@ class System(eqx.Module):
         """The symmetric positive-definite matrix A of stiffness and contact mass, (n, n) in siemens.
 
         `conductivity` per cell, S/m (2-D: S).
-        Point electrodes leave the constant potential free; a conductance to ground at node 0 fixes it. Currents
-        that sum to zero send nothing through it, so its size does not matter: it is of the order of the rest.
         """
         packed = stiffness(mesh, conductivity)
-        mass = contact.mass
-        if electrodes.is_point:
-            level = jax.lax.stop_gradient(jnp.abs(packed[-1]).mean())
-            mass = (jnp.full((1, 1, 1), level, packed.dtype),)
+        mass = grounded_mass(electrodes, contact, packed)
         return SparseSymmetric(self.pattern.assemble(packed, *mass), self.pattern)
 
     def solve(self, operator: SparseSymmetric, load: Inexact[Array, "n L"]) -> Inexact[Array, "n L"]:
         """A⁻¹ load, one column per electrode. Differentiable by the implicit rule, whichever solver."""
         load = load.astype(operator.values.dtype)
+        if isinstance(self.solver, SparseCholesky) and isinstance(load, np.ndarray):
+            return solve(self.solver.plan, factorise(self.solver.plan, operator.values), load)
         constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B alone, not through the factor
         state = self.solver.init(constant, {})
         if isinstance(self.solver, SparseCholesky):  # all columns at once, where lineax takes them one by one
@@ -92,5 +90,15 @@ class System(eqx.Module):
         """loadᵀ A⁻¹ load; half the work of `solve` where there is a factor."""
         load = load.astype(operator.values.dtype)
         if isinstance(self.solver, SparseCholesky):
-            return quadratic_form(self.solver.plan, self.solver.init(operator, {}), load)
+            return quadratic_form(self.solver.plan, factorise(self.solver.plan, operator.values), load)
         return load.T @ self.solve(operator, load)
+
+
+def grounded_mass(electrodes: AbstractElectrodes, contact: Contact, packed) -> tuple[Inexact[Array, "q k k"], ...]:
+    """Contact mass of the electrodes; or for point electrodes, which leave the constant potential free, a conductance
+    to ground at node 0 that fixes it. Currents that sum to zero send nothing through it, so its size does not matter:
+    it is of the order of the `packed` stiffness."""
+    if not electrodes.is_point:
+        return contact.mass
+    level = undifferentiated(abs(packed[-1]).mean())
+    return (namespace(packed).full((1, 1, 1), level, packed.dtype),)

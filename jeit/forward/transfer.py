@@ -13,6 +13,7 @@ SIAM Review 41 (1999) 85-101; Polydorides and Lionheart, Meas. Sci. Technol. 13 
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Inexact
 
 from jeit.electrodes import AbstractElectrodes
@@ -21,21 +22,29 @@ from jeit.forward.assembly import cell_conductivity, field_gradients
 from jeit.forward.system import System
 from jeit.mesh import Mesh
 from jeit_solvers import NearInverse, Strips, near_inverse, symmetric_inverse
+from jeit_solvers.engines import namespace
 
 
-@eqx.filter_custom_jvp
 def transfer_impedance(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
     """Transfer impedance Z (L, L) in ohms: electrode potentials U = Z I for currents I that sum to zero.
 
     `conductivity` in S/m (2-D: S), (m,), (n,) or (m, d, d). Rows and columns of Z sum to zero, i.e. the mean electrode
     potential is the reference. Symmetric. Checks nothing: `ForwardModel.transfer_impedance` does.
     """
+    formula = _quadratic if namespace(mesh, conductivity, electrodes) is np else _differentiable
+    return formula(mesh, conductivity, electrodes, system)
+
+
+def _quadratic(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
     return _impedance(electrodes, system.quadratic_form(operator, contact.load))
 
 
-@transfer_impedance.def_jvp
+_differentiable = eqx.filter_custom_jvp(_quadratic)
+
+
+@_differentiable.def_jvp
 def _transfer_impedance_jvp(primals, tangents):
     mesh, conductivity, electrodes, system = primals
     fields, impedance = electrode_fields(mesh, conductivity, electrodes, system)
@@ -88,14 +97,15 @@ def _impedance(electrodes: AbstractElectrodes, product: Inexact[Array, "L L"]) -
     Complete electrodes: eliminating the nodes leaves (D - BᵀA⁻¹B) U = I. Its columns sum to zero, so the diagonal
     is minus the sum of the others, which spares the cancellation in D - BᵀA⁻¹B at small contact impedance.
     """
+    xp = namespace(product)
     product = (product + product.T) / 2
     size = product.shape[0]
     if electrodes.is_point:
         return centred(product)
-    others = product * (1 - jnp.eye(size))
-    schur = jnp.diag(others.sum(axis=0)) - others
+    others = product * (1 - np.eye(size))
+    schur = xp.diag(others.sum(axis=0)) - others
     # The constant vector is the null space; weight it like the rest, invert, and take it out again.
-    level = jnp.trace(schur) / size**2
+    level = xp.trace(schur) / size**2
     return centred(symmetric_inverse(schur + level))
 
 

@@ -1,13 +1,12 @@
 """Rasters: an image on the cells of a mesh, sampled on a grid of pixels."""
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Int
 from scipy.spatial import KDTree
 
 from jeit.mesh import Mesh
+from jeit_solvers.engines import as_array, either_engine, namespace
 
 
 class Raster(eqx.Module):
@@ -49,7 +48,7 @@ class Raster(eqx.Module):
             z = (low[2] + high[2]) / 2 if height is None else float(height)
             grid = np.column_stack([grid, np.full(len(grid), z)])
         cell = find_cells(points, cells, grid).reshape(shape)
-        return cls(jnp.asarray(cell, jnp.int32), (x_min, x_max, y_min, y_max))
+        return cls(as_array(cell, np.int32), (x_min, x_max, y_min, y_max))
 
     @property
     def pixel_area(self) -> float:
@@ -67,12 +66,13 @@ class Raster(eqx.Module):
 
     def sample(self, image: Inexact[Array, "*frames m"]) -> Float[Array, "*frames rows columns"]:
         """Values of one image (m,) or many (F, m) at the pixels, NaN outside the mesh."""
-        return _sample(self.cell, jnp.asarray(image))
+        return _sample(self.cell, image)
 
 
-@jax.jit
+@either_engine
 def _sample(cell, image):
-    return jnp.where(cell >= 0, image[..., jnp.maximum(cell, 0)], jnp.nan)
+    xp = namespace(cell, image)
+    return xp.where(cell >= 0, image[..., xp.maximum(cell, 0)], xp.nan)
 
 
 def find_cells(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> np.ndarray:

@@ -7,7 +7,6 @@ This is what `jeit reconstruct` runs, as one function. Its steps are the public 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
@@ -22,6 +21,7 @@ from jeit.inverse.calibration import Calibration
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.mesh import Mesh
+from jeit_solvers.engines import as_array
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class ImagedDifference:
     @property
     def lowest(self) -> float:
         """Least change relative to the background; below -1 the linear image claims a negative conductivity."""
-        return float(jnp.min(self.change) / self.calibration.conductivity)
+        return float(np.asarray(self.change).min()) / float(self.calibration.conductivity)
 
     @property
     def mesh(self) -> Mesh:
@@ -83,7 +83,7 @@ class ImagedDifference:
         """What stands out, per cell: the change of conductivity, or of its logarithm in iterative images."""
         if not self.iterative:
             return self.change
-        return jnp.log1p(self.change / self.calibration.conductivity)
+        return as_array(np.log1p(np.asarray(self.change) / float(self.calibration.conductivity)))
 
 
 def image_difference(
@@ -116,7 +116,7 @@ def image_difference(
     with clock("image"):
         method = METHODS[settings.method]
         reconstruction, change = method.image(prepared, settings.prior, settings.hyperparameter)
-        largest = float(jnp.abs(change).max())
+        largest = float(np.abs(change).max())
         if not largest > 1e-9 * float(calibration.conductivity):
             raise ValueError(
                 f"'{prepared.measurement.name}': the image is empty, no change reaches a billionth of the background. "

@@ -18,6 +18,7 @@ from jeit.inverse.prior.defaults import PRIORS
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.mesh import Domain
 from jeit_solvers import Status
+from jeit_solvers.engines import host
 
 Imaged = tuple[LinearReconstruction | Reconstruction, Float[Array, " m"]]
 """A reconstruction, and the change of conductivity per cell that it finds, S/m (2-D: S)."""
@@ -110,7 +111,7 @@ def _iterated(
     model, background = prepared.model, prepared.calibration.conductivity
     found = reconstruct(
         model,
-        model.voltages(background) + prepared.difference,
+        host.add(model.voltages(background), prepared.difference),
         background,
         prior=prior_for(prior, prepared.domain) if own is None else own,
         hyperparameter=_weight(prepared, hyperparameter),

@@ -16,7 +16,7 @@ from jeit.imaging.clock import Clock
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.mesh import Domain, Mesh
-from jeit_solvers import Status
+from jeit_solvers.engines import as_array
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class PreparedDifference:
     @property
     def relative_noise(self) -> Float[Array, " M"]:
         """How far channels are trusted relative to each other: `relative_noise` of the reference, volts."""
-        return relative_noise(self.reference.voltages[0], self.mask)
+        return relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
 
     @property
     def noise(self) -> float | None:
@@ -61,7 +61,7 @@ class PreparedDifference:
         found = self.quality.difference_noise
         if found is None:
             return None
-        return found.standard_deviation / float(jnp.sqrt(jnp.mean(self.relative_noise[self.mask] ** 2)))
+        return found.standard_deviation / float(np.sqrt(np.mean(np.asarray(self.relative_noise)[self.mask] ** 2)))
 
 
 def prepare_difference(
@@ -84,8 +84,8 @@ def prepare_difference(
         one, base = select_frames(measurement, reference, frame)
         (quality,) = check_imageable(one, base)
         domain, electrodes = body_of(one, base)
-        both = one.mask[0] & base.mask[0]
-        difference = jnp.where(both, one.voltages[0] - base.voltages[0], 0)
+        both = np.asarray(one.mask)[0] & np.asarray(base.mask)[0]
+        difference = as_array(np.where(both, np.asarray(one.voltages)[0] - np.asarray(base.voltages)[0], 0))
     calibration, chosen = calibrated_model(
         base, domain, electrodes, contact=contact, num_points=num_points, clock=clock
     )
@@ -112,10 +112,11 @@ def calibrated_model(
         model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
     with clock("calibrate"):
         chosen = contact or default_contact(base)
-        calibration = calibrate(model, base.voltages[0], mask=base.mask[0], contact=chosen)
-        if contact is None and chosen == "each" and calibration.status != Status.CONVERGED:
+        voltages, mask = np.asarray(base.voltages)[0], np.asarray(base.mask)[0]
+        calibration = calibrate(model, voltages, mask=mask, contact=chosen)
+        if contact is None and chosen == "each" and not calibration.tells_contacts_apart:
             chosen = "common"  # the data do not tell so many impedances apart
-            calibration = calibrate(model, base.voltages[0], mask=base.mask[0], contact=chosen)
+            calibration = calibrate(model, voltages, mask=mask, contact=chosen)
         calibration = jax.block_until_ready(calibration)
         if not np.isfinite(calibration.misfit):
             raise ValueError(

@@ -1,25 +1,31 @@
 """Calibration: the background conductivity and contact impedance that explain a frame of the empty tank."""
 
+from functools import partial
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
+import scipy.optimize
 from jaxtyping import Array, Bool, Float
 
 from jeit.arguments import check_name
 from jeit.forward import ForwardModel
-from jeit.forward.model import check_model
-from jeit_solvers import Status, ended
+from jeit.forward.contact_sensitivity import ContactSensitivity
+from jeit.forward.model import check_model, select_channels
+from jeit_solvers import Status
+from jeit_solvers.engines import as_array, on_host
 
 _REASONS = {
     Status.STEP_LIMIT: "Stopped after {} steps.",
-    Status.STALLED: "No step made the model fit better.",
     Status.FAILED: "The fit became NaN.",
 }
 
 
 # A relative misfit that measured tanks of known geometry do not reach: 1 % of KIT4's, 8 % of the Kuopio challenge's.
 _MUCH = 0.12
+# Relative change of misfit, or of the parameters, that ends a fit.
+_TOLERANCE = 1e-8
 
 
 class Calibration(eqx.Module):
@@ -27,21 +33,29 @@ class Calibration(eqx.Module):
 
     **Fields**: `model`, with its electrodes' contact impedance fitted; `conductivity`, the uniform background
     (S/m; 2-D: S); `voltages` (M,), what the model predicts; `misfit`, ‖predicted - measured‖ / ‖measured‖ over the
-    channels used; `iterations`; `status`, how the fit ended, and `reason`, in a sentence, empty where all is well.
+    channels used; `contact_deviation` (k,), standard deviations of the logarithms of the k contact impedances fitted,
+    from how well the model fits; `iterations`; `status`, how the fit ended, and `reason`, in a sentence, empty where
+    all is well.
     """
 
     model: ForwardModel
     conductivity: Float[Array, ""]
     voltages: Float[Array, " M"]
     misfit: Float[Array, ""]
+    contact_deviation: Float[np.ndarray, " k"]
     iterations: int = eqx.field(static=True)
     status: Status = eqx.field(static=True)
     reason: str = eqx.field(static=True, default="")
 
     @property
+    def tells_contacts_apart(self) -> bool:
+        """Whether every contact impedance fitted is known to within a factor of three."""
+        return bool(self.status == Status.CONVERGED and (self.contact_deviation < 1).all())
+
+    @property
     def note(self) -> str:
         """What a large misfit means, in a sentence; empty where it is not large."""
-        if not self.misfit > _MUCH:
+        if not float(self.misfit) > _MUCH:
             return ""
         return (
             f"the model misses {100 * float(self.misfit):.0f} % of the reference: radius, width of the electrodes, "
@@ -58,7 +72,7 @@ def calibrate(
     contact: str = "common",
     max_steps: int = 100,
 ) -> Calibration:
-    """Fit background conductivity and contact impedance to a reference frame, by Levenberg-Marquardt.
+    """Fit background conductivity and contact impedance to a reference frame, by least squares.
 
     `voltages` (M,) volts of the empty tank. `mask`: True for the channels to use. `contact`: "common", one impedance
     for all electrodes; "each", one per electrode; "fixed", the model's own. The parameters are logarithms, so both
@@ -68,61 +82,115 @@ def calibrate(
     check_model(model)
     if jnp.iscomplexobj(voltages):
         raise ValueError("voltages are complex; calibrate on their real part or magnitude.")
-    measured = jnp.asarray(voltages, float)
+    measured = np.asarray(voltages, float)
     shape = (model.protocol.num_measurements,)
-    used = jnp.ones(shape, bool) if mask is None else jnp.asarray(mask, bool)
+    used = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)
     if measured.shape != shape or used.shape != shape:
         raise ValueError(
             f"voltages has shape {measured.shape} and mask {used.shape}; protocol '{model.protocol.name}' has {shape}."
         )
     check_name("contact", contact, ("common", "each", "fixed"))
-    measured = jnp.where(used, measured, 0)
-    size = jnp.linalg.norm(measured)
+    measured = np.where(used, measured, 0)
+    size = np.linalg.norm(measured)
     if not np.isfinite(size) or size == 0:
         raise ValueError("voltages: the reference frame has no finite, non-zero values to calibrate on.")
     return _fit(model, measured, used, contact, max_steps)
 
 
 def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> Calibration:
-    num_electrodes = model.electrodes.num_electrodes
     if model.electrodes.is_point:
         contact = "fixed"
-    size = jnp.linalg.norm(measured)
+    size = np.linalg.norm(measured)
     # Start at the model's own contact impedance for a conductivity of one, scaled to fit.
-    shape = {"fixed": (0,), "common": (), "each": (num_electrodes,)}[contact]
-    unit = jnp.where(used, model.voltages(1.0), 0)
+    unit = np.where(used, model.voltages(1.0), 0)
     if not unit @ measured > 0:
         raise ValueError(
             "voltages: they have the opposite sign of the model's. Is the polarity of drive or measurement turned "
             "round, or the order of the channels another than the protocol's?"
         )
-    conductivity = jnp.log(jnp.abs(unit @ unit / (unit @ measured)))
-    initial = {"conductivity": conductivity, "contact": jnp.zeros(shape) + conductivity}
-    solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-8)
-    arguments = (model, measured, used, size)
-    solution = optx.least_squares(_residual, solver, initial, arguments, max_steps=max_steps, throw=False)
-    fitted, conductivity = _fitted(model, solution.value)
-    voltages = fitted.voltages(conductivity)
-    misfit = jnp.linalg.norm(jnp.where(used, voltages - measured, 0)) / size
-    status = ended(solution.result) if np.isfinite(misfit) else Status.FAILED
+    problem = _Problem(model, contact)
+    conductivity = np.log(unit @ unit / (unit @ measured))
+    initial = np.full(problem.num_parameters, conductivity)
+
+    def residual(parameters):
+        return np.where(used, problem.voltages(parameters) - measured, 0) / size
+
+    def jacobian(parameters):
+        return np.where(used[:, None], problem.jacobian(parameters), 0) / size
+
+    ends: dict[str, Any] = {
+        "ftol": _TOLERANCE,
+        "xtol": _TOLERANCE,
+        "gtol": None,
+        "max_nfev": max_steps,
+        "jac": jacobian,
+    }
+    solution = scipy.optimize.least_squares(residual, initial, **ends)
+    fitted, conductivity = problem.model(solution.x)
+    voltages = as_array(problem.voltages(solution.x))
+    misfit = as_array(np.linalg.norm(residual(solution.x)))
+    status = Status.CONVERGED if solution.status > 0 else Status.STEP_LIMIT
+    status = status if np.isfinite(misfit) else Status.FAILED
     reason = "" if status == Status.CONVERGED else _REASONS[status].format(max_steps)
-    return Calibration(fitted, conductivity, voltages, misfit, int(solution.stats["num_steps"]), status, reason)
+    deviation = _deviations(solution)[1:]
+    return Calibration(fitted, as_array(conductivity), voltages, misfit, deviation, int(solution.njev), status, reason)
 
 
-def _fitted(model: ForwardModel, parameters) -> tuple[ForwardModel, Float[Array, ""]]:
-    """The model and conductivity that the parameters (logarithms of σ and of z·σ over the model's z) stand for."""
-    conductivity = jnp.exp(parameters["conductivity"])
-    if parameters["contact"].shape == (0,):
-        return model, conductivity
-    # Voltages at fixed z·σ are proportional to 1/σ, so these two are nearly independent of each other.
-    factor = jnp.exp(parameters["contact"] - parameters["conductivity"])
-    electrodes = model.electrodes
-    impedance = electrodes.contact_impedance * factor
-    return model.with_electrodes(electrodes.with_contact_impedance(impedance)), conductivity
+def _deviations(solution: scipy.optimize.OptimizeResult) -> Float[np.ndarray, " p"]:
+    """Standard deviations of fitted parameters, taking what is left of the data for independent errors."""
+    _, size, rows = np.linalg.svd(solution.jac, full_matrices=False)
+    freedom = max(np.count_nonzero(solution.fun) - len(solution.x), 1)
+    with np.errstate(divide="ignore"):
+        return np.linalg.norm(rows / size[:, None], axis=0) * np.sqrt(2 * solution.cost / freedom)
 
 
-def _residual(parameters, arguments):
-    """A function of its arguments alone, so that it is compiled once for all models of one shape."""
-    model, measured, used, size = arguments
-    fitted, conductivity = _fitted(model, parameters)
-    return jnp.where(used, fitted.voltages(conductivity) - measured, 0) / size
+class _Problem:
+    """Voltages as a function of log σ and of log z·σ over the model's z: one for all electrodes, or for each.
+
+    Voltages at fixed z·σ are proportional to 1/σ, so that these are nearly independent of each other.
+    """
+
+    def __init__(self, model: ForwardModel, contact: str):
+        self.given, self.contact = model, contact
+        self.select = partial(select_channels, on_host(model.protocol))
+        self.sensitivity = None if model.electrodes.is_point else ContactSensitivity(model.mesh, model.electrodes)
+        self.known: tuple[bytes, Any] | None = None
+
+    @property
+    def num_parameters(self) -> int:
+        """One for the conductivity, and those of the contacts."""
+        return 1 + {"fixed": 0, "common": 1, "each": self.given.electrodes.num_electrodes}[self.contact]
+
+    def model(self, parameters) -> tuple[ForwardModel, float]:
+        """The model and conductivity that the parameters stand for."""
+        if self.contact == "fixed":
+            return self.given, np.exp(parameters[0])
+        electrodes = self.given.electrodes
+        impedance = np.asarray(electrodes.contact_impedance) * np.exp(parameters[1:] - parameters[0])
+        return self.given.with_electrodes(electrodes.with_contact_impedance(impedance)), np.exp(parameters[0])
+
+    def voltages(self, parameters):
+        """(M,) volts."""
+        return self.select(self._fields(parameters)[2])
+
+    def jacobian(self, parameters):
+        """Of the voltages in the parameters, (M, p) volts."""
+        model, fields, impedance = self._fields(parameters)
+        by_conductivity = -self.select(impedance)[:, None]
+        if self.sensitivity is None:
+            return by_conductivity
+        energies = self.sensitivity(fields, impedance, model.electrodes.contact_impedance)
+        by_contact = np.stack([self.select(energy) for energy in energies], axis=1)
+        if self.contact == "each":
+            return np.concatenate([by_conductivity, by_contact], axis=1)
+        common = by_contact.sum(axis=1, keepdims=True)
+        if self.contact == "common":
+            return np.concatenate([by_conductivity, common], axis=1)
+        return by_conductivity + common  # z·σ goes with σ
+
+    def _fields(self, parameters):
+        key = parameters.tobytes()
+        if self.known is None or self.known[0] != key:
+            model, conductivity = self.model(parameters)
+            self.known = key, (model, *on_host(model.fields(conductivity)))
+        return self.known[1]

@@ -1,12 +1,12 @@
 """How much each channel is to be trusted."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jeit_solvers.engines import either_engine, namespace
 
-@jax.jit
+
+@either_engine
 def relative_noise(
     voltages: Float[Array, " M"], mask: Bool[Array, " M"] | None = None, *, relative: float = 0.01, floor: float = 0.3
 ) -> Float[Array, " M"]:
@@ -16,10 +16,11 @@ def relative_noise(
     model lacks leave errors in proportion to the voltage, largest where the driven electrodes are read. `voltages` (M,)
     of the reference, volts; `mask`: True for usable channels, the others do not count in the median and come out as 1.
     """
-    size = jnp.abs(jnp.asarray(voltages))
-    used = jnp.isfinite(size) if mask is None else jnp.asarray(mask) & jnp.isfinite(size)
-    typical = jnp.nanmedian(jnp.where(used, size, jnp.nan))
-    return jnp.where(used, relative * jnp.sqrt(jnp.where(used, size, 0) ** 2 + (floor * typical) ** 2), 1.0)
+    xp = namespace(voltages, mask)
+    size = abs(xp.asarray(voltages))
+    used = xp.isfinite(size) if mask is None else xp.asarray(mask) & xp.isfinite(size)
+    typical = xp.nanmedian(xp.where(used, size, xp.nan))
+    return xp.where(used, relative * xp.sqrt(xp.where(used, size, 0) ** 2 + (floor * typical) ** 2), 1.0)
 
 
 def repeated_noise(frames, mask=None, *, prior_frames: float = 4.0) -> Float[np.ndarray, " M"]:

@@ -13,14 +13,13 @@ and least squares on those cost a fraction: the work grows with the square of th
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float, Int
 
 from jeit.protocol import Protocol
-from jeit_solvers import symmetric_inverse
+from jeit_solvers import lower_cholesky, symmetric_inverse
+from jeit_solvers.engines import as_array, either_engine, namespace
 
 _RANK = 1e-9
 
@@ -40,7 +39,7 @@ class Data(eqx.Module):
 
     def whiten(self, rows: Float[Array, "r *n"]) -> Float[Array, "r *n"]:
         """Values of weighted channels, (r,) or (r, n), made independent and of unit variance."""
-        return jnp.linalg.cholesky(self.precision).T @ rows
+        return lower_cholesky(self.precision).T @ rows
 
 
 class IndependentChannels(eqx.Module):
@@ -66,7 +65,7 @@ class IndependentChannels(eqx.Module):
         combination *= size[:, None]
         combination[np.abs(combination) < _RANK * np.abs(combination).max()] = 0
         sort = np.argsort(order[:rank])
-        return cls(jnp.asarray(order[:rank][sort]), jnp.asarray(combination[:, sort]))
+        return cls(as_array(order[:rank][sort]), as_array(combination[:, sort]))
 
     def weigh(self, noise: Float[Array, " M"]) -> "Weighing":
         """How to combine voltages of this standard deviation, (M,) volts; the same for all frames of equal noise."""
@@ -87,17 +86,23 @@ class Weighing(eqx.Module):
 
     def combine(self, voltages: Float[Array, " M"]) -> Data:
         """The data ŷ that voltages (M,) amount to."""
-        estimate = self.estimator @ voltages
-        scaled = self.weight * estimate
-        rest = jnp.sum((voltages / self.noise) ** 2) - scaled @ self.precision @ scaled
-        return Data(estimate, self.weight, self.covariance, self.precision, jnp.maximum(rest, 0))
+        return _combine(self, voltages)
 
 
-@jax.jit
+@either_engine
+def _combine(weighing: Weighing, voltages) -> Data:
+    estimate = weighing.estimator @ voltages
+    scaled = weighing.weight * estimate
+    rest = ((voltages / weighing.noise) ** 2).sum() - scaled @ weighing.precision @ scaled
+    kept = weighing.weight, weighing.covariance, weighing.precision
+    return Data(estimate, *kept, namespace(weighing, voltages).maximum(rest, 0))
+
+
+@either_engine
 def _weigh(combination, noise) -> Weighing:
     weighted = combination / noise[:, None]
     precision = weighted.T @ weighted
-    weight = jnp.sqrt(jnp.diagonal(precision))
+    weight = namespace(precision).sqrt(precision.diagonal())
     precision = precision / (weight * weight[:, None])
     covariance = symmetric_inverse(precision)
     estimator = (covariance / weight[:, None]) @ (weighted / weight / noise[:, None]).T

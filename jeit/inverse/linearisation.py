@@ -1,7 +1,6 @@
 """The linearised problem of difference imaging: checked, whitened and decomposed, ready for any hyperparameter."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
@@ -13,6 +12,7 @@ from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.defaults import PRIOR
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.spectrum import Spectrum
+from jeit_solvers.engines import as_array, host
 
 
 class Linearisation(eqx.Module):
@@ -50,7 +50,7 @@ class Linearisation(eqx.Module):
         if jnp.iscomplexobj(conductivity):
             raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
         channels, root_weight = used_channels(model, noise, mask)
-        whitened = _whitened(model.jacobian(conductivity), channels, root_weight)
+        whitened = root_weight[:, None] * host.asarray(model.jacobian(conductivity))[channels]
         product = prior.covariance_product(model.mesh, whitened)
         spectrum = Spectrum.create(whitened, product, prior.null_space(model.mesh))
         return cls(spectrum, prior, channels, root_weight, model.protocol.num_measurements)
@@ -67,7 +67,7 @@ class Linearisation(eqx.Module):
         data = self.root_weight * np.asarray(difference)[self.channels]
         if not np.isfinite(data).all():
             raise ValueError("difference has NaN or infinite voltages in channels in use; mask them.")
-        return jnp.asarray(data)
+        return as_array(data)
 
     def matrix(self, hyperparameter) -> Float[np.ndarray, "m M"]:
         """The reconstruction matrix: change of conductivity per volt, zero for channels not in use."""
@@ -75,11 +75,6 @@ class Linearisation(eqx.Module):
         matrix = np.zeros((whitened.shape[0], self.num_channels))
         matrix[:, self.channels] = whitened * self.root_weight
         return matrix
-
-
-@jax.jit
-def _whitened(jacobian, channels, root_weight):
-    return root_weight[:, None] * jacobian[channels]
 
 
 def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, np.ndarray]:

@@ -11,11 +11,12 @@ residual is v - JR_λv = λ²P_λv = QU diag(λ²/(Λ + λ²)) UᵀQᵀv, whatev
 """
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+
+from jeit_solvers import symmetric_eigen
+from jeit_solvers.engines import either_engine, namespace
 
 
 class Spectrum(eqx.Module):
@@ -36,8 +37,8 @@ class Spectrum(eqx.Module):
     @classmethod
     def create(cls, jacobian: Float[Array, "M m"], product: Float[Array, "m M"], null_space: Float[Array, "m p"]):
         """From the whitened Jacobian, its product with the prior covariance, and the prior's null space."""
-        basis, eigenvalues = _decompose(jacobian, product, null_space)
-        return cls(basis, eigenvalues, jacobian, product, null_space, jacobian @ null_space, jacobian @ product)
+        basis, eigenvalues, seen, outer = _decompose(jacobian, product, null_space)
+        return cls(basis, eigenvalues, jacobian, product, null_space, seen, outer)
 
     def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
         """R_λ (m, M) for whitened data."""
@@ -70,17 +71,18 @@ class Spectrum(eqx.Module):
         return candidates**2 * np.sqrt(damped.sum(axis=1)), np.sqrt(damped @ eigenvalues)
 
 
-@jax.jit
+@either_engine
 def _decompose(jacobian, product, null_space):
+    xp = namespace(jacobian, product, null_space)
     outer = jacobian @ product
-    full, _ = jnp.linalg.qr(jacobian @ null_space, mode="complete")
+    full, _ = xp.linalg.qr(jacobian @ null_space, mode="complete")
     complement = full[:, null_space.shape[1] :]
     projected = complement.T @ outer @ complement
-    eigenvalues, vectors = jnp.linalg.eigh((projected + projected.T) / 2)
-    return complement @ vectors, jnp.maximum(eigenvalues, 0)
+    eigenvalues, vectors = symmetric_eigen((projected + projected.T) / 2)
+    return complement @ vectors, xp.maximum(eigenvalues, 0), jacobian @ null_space, outer
 
 
-@jax.jit
+@either_engine
 def _reconstruction(spectrum: Spectrum, hyperparameter):
     basis = spectrum.basis
     inverse = (basis / (spectrum.eigenvalues + hyperparameter**2)) @ basis.T
@@ -88,23 +90,25 @@ def _reconstruction(spectrum: Spectrum, hyperparameter):
     if spectrum.null_space.shape[1] == 0:
         return matrix
     # What the penalised part leaves of the data, seen by the null space: its least-squares coefficients.
-    coefficients = jnp.linalg.pinv(spectrum.seen)
-    rest = jnp.eye(basis.shape[0]) - spectrum.outer @ inverse
+    coefficients = namespace(spectrum).linalg.pinv(spectrum.seen)
+    rest = np.eye(basis.shape[0]) - spectrum.outer @ inverse
     return matrix + spectrum.null_space @ (coefficients @ rest)
 
 
-@jax.jit
+@either_engine
 def _image(spectrum: Spectrum, data, hyperparameter):
     inner = spectrum.basis @ ((spectrum.basis.T @ data) / (spectrum.eigenvalues + hyperparameter**2))
     image = spectrum.product @ inner
     if spectrum.null_space.shape[1] == 0:
         return image
-    return image + spectrum.null_space @ (jnp.linalg.pinv(spectrum.seen) @ (data - spectrum.outer @ inner))
+    free = namespace(spectrum).linalg.pinv(spectrum.seen)
+    return image + spectrum.null_space @ (free @ (data - spectrum.outer @ inner))
 
 
-@jax.jit
+@either_engine
 def _modes(spectrum: Spectrum):
     modes = spectrum.product @ spectrum.basis
     if spectrum.null_space.shape[1] == 0:
         return modes
-    return modes - spectrum.null_space @ (jnp.linalg.pinv(spectrum.seen) @ (spectrum.outer @ spectrum.basis))
+    free = namespace(spectrum).linalg.pinv(spectrum.seen)
+    return modes - spectrum.null_space @ (free @ (spectrum.outer @ spectrum.basis))

@@ -3,14 +3,14 @@
 from collections.abc import Sequence
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind
 from jeit.electrodes.discs import SheetDiscs
-from jeit.electrodes.electrodes import as_electrode_values, as_positions, is_concrete
+from jeit.electrodes.electrodes import as_electrode_values, as_positions
 from jeit.mesh import Domain
+from jeit_solvers.engines import has_values
 
 # A skin outside these is not known to exist: its lengths would be in millimetres, or have been divided by 1000 twice.
 SMALLEST, LARGEST = 1e-3, 5.0  # m
@@ -64,7 +64,7 @@ class Layout(eqx.Module):
         self.outline = outline
         self.labels = _check_labels(labels, number)
         self.name = name
-        if is_concrete(*jax.tree.leaves((self.centres, self.diameters, outline))):
+        if has_values(self.centres, self.diameters, outline):
             called = [f"electrode {index + 1} ('{label}')" for index, label in enumerate(self.labels)]
             check_discs_fit(np.asarray(self.centres), np.asarray(self.diameters), outline, called)
 

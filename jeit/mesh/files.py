@@ -7,14 +7,16 @@ import io
 from collections.abc import Mapping
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import meshio
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jeit.mesh import _topology
 from jeit.mesh.mesh import Mesh
+
+if TYPE_CHECKING:
+    import meshio
 
 _CELLS = {2: "triangle", 3: "tetra"}
 _FACETS = {2: "line", 3: "triangle"}
@@ -35,7 +37,7 @@ def read(path: str | Path, *, scale: float = 1.0) -> Mesh:
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
     if not isinstance(scale, Real) or not 0 < scale < np.inf:
         raise ValueError(f"scale: expected the file's unit in metres, such as 1e-3 for millimetres, got {scale!r}.")
-    return _from_meshio(_quietly(path, lambda: meshio.read(path)), float(scale), str(path))
+    return _from_meshio(_quietly(path, lambda meshio: meshio.read(path)), float(scale), str(path))
 
 
 def write(
@@ -80,8 +82,8 @@ def write(
         data["gmsh:physical"] = physical
         data["gmsh:geometrical"] = physical
     try:
-        content = meshio.Mesh(points, blocks, point_data=dict(nodes), cell_data=data, field_data=field_data)
-        _quietly(path, lambda: content.write(path, **options))
+        content = {"point_data": dict(nodes), "cell_data": data, "field_data": field_data}
+        _quietly(path, lambda meshio: meshio.Mesh(points, blocks, **content).write(path, **options))
     except OSError as error:
         raise ValueError(f"path: {path} cannot be written: {error.strerror}. Is there such a folder?") from None
 
@@ -97,11 +99,13 @@ def _data(argument: str, name: str, value: ArrayLike, length: int) -> np.ndarray
 
 
 def _quietly(path: Path, action: Any) -> Any:
-    """Run a meshio call: it prints, and leaves the interpreter, where it should raise."""
+    """Do something with meshio: it prints, and leaves the interpreter, where it should raise."""
+    import meshio  # takes a tenth of a second
+
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            return action()
+            return action(meshio)
     except OSError:
         raise
     except (Exception, SystemExit) as error:

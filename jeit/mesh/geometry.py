@@ -1,33 +1,31 @@
-"""Measures and P1 gradients of cells and facets: pure JAX, differentiable in the points.
-
-Compiled one by one, for outside of compiled code, op by op, their first calls would take a second.
-"""
+"""Measures and P1 gradients of cells and facets: differentiable in the points, and at once where they have values."""
 
 from __future__ import annotations
 
 import functools
+import operator
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jeit.mesh._topology import cell_facets, pair_facets
 from jeit.mesh.mesh import Mesh
+from jeit_solvers.engines import either_engine, namespace
 
 
-@jax.jit
+@either_engine
 def measures(mesh: Mesh) -> Float[Array, " m"]:
     """Area in m² (2-D) or volume in m³ (3-D) of every cell, (m,), positive for a valid mesh."""
     corners = mesh.points[mesh.cells]
     edges = corners[:, 1:] - corners[:, :1]
     if mesh.dimension == 2:
         return 0.5 * _cross(edges[:, 0], edges[:, 1])
-    return jnp.sum(jnp.cross(edges[:, 0], edges[:, 1]) * edges[:, 2], axis=-1) / 6.0
+    xp = namespace(mesh.points)
+    return xp.sum(xp.cross(edges[:, 0], edges[:, 1]) * edges[:, 2], axis=-1) / 6.0
 
 
-@jax.jit
+@either_engine
 def gradients(mesh: Mesh) -> Float[Array, "m k d"]:
     """Gradients in 1/m of the d + 1 linear basis functions on every cell, (m, d + 1, d).
 
@@ -35,37 +33,39 @@ def gradients(mesh: Mesh) -> Float[Array, "m k d"]:
     gradients of φ_1 … φ_d are the columns of E⁻¹, and that of φ_0 is minus their sum. E⁻¹ is written out:
     cross products of edges over the determinant.
     """
+    xp = namespace(mesh.points)
     corners = mesh.points[mesh.cells]
     edges = corners[:, 1:] - corners[:, :1]
     if mesh.dimension == 2:
         a, b = edges[:, 0], edges[:, 1]
         determinant = _cross(a, b)[:, None]
-        others = jnp.stack([jnp.stack([b[:, 1], -b[:, 0]], -1), jnp.stack([-a[:, 1], a[:, 0]], -1)], axis=1)
+        others = xp.stack([xp.stack([b[:, 1], -b[:, 0]], -1), xp.stack([-a[:, 1], a[:, 0]], -1)], axis=1)
     else:
         a, b, c = edges[:, 0], edges[:, 1], edges[:, 2]
-        normal = jnp.cross(b, c)
-        determinant = jnp.sum(a * normal, axis=-1)[:, None]
-        others = jnp.stack([normal, jnp.cross(c, a), jnp.cross(a, b)], axis=1)
+        normal = xp.cross(b, c)
+        determinant = xp.sum(a * normal, axis=-1)[:, None]
+        others = xp.stack([normal, xp.cross(c, a), xp.cross(a, b)], axis=1)
     others = others / determinant[:, :, None]
     # Written out, for XLA makes a slow matrix product of a sum over so short an axis.
-    first = -functools.reduce(jnp.add, [others[:, k] for k in range(mesh.dimension)])
-    return jnp.concatenate([first[:, None], others], axis=1)
+    first = -functools.reduce(operator.add, [others[:, k] for k in range(mesh.dimension)])
+    return xp.concatenate([first[:, None], others], axis=1)
 
 
-@jax.jit
+@either_engine
 def centroids(mesh: Mesh) -> Float[Array, "m d"]:
     """Centre of gravity in metres of every cell, (m, d)."""
-    return jnp.mean(mesh.points[mesh.cells], axis=1)
+    return mesh.points[mesh.cells].mean(axis=1)
 
 
-@jax.jit
+@either_engine
 def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
     """Length in m (2-D) or area in m² (3-D) of every boundary facet, (b,)."""
     corners = mesh.points[mesh.facets]
     edges = corners[:, 1:] - corners[:, :1]
+    xp = namespace(mesh.points)
     if mesh.dimension == 2:
-        return jnp.sqrt(edges[:, 0, 0] ** 2 + edges[:, 0, 1] ** 2)
-    return 0.5 * jnp.sqrt(jnp.sum(jnp.cross(edges[:, 0], edges[:, 1]) ** 2, axis=-1))
+        return xp.sqrt(edges[:, 0, 0] ** 2 + edges[:, 0, 1] ** 2)
+    return 0.5 * xp.sqrt(xp.sum(xp.cross(edges[:, 0], edges[:, 1]) ** 2, axis=-1))
 
 
 def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
@@ -76,12 +76,13 @@ def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
     """
     if mesh.dimension != 2:
         raise ValueError("mesh: arc length is defined on the boundary of 2-D meshes only, this one is 3-D.")
-    first = jnp.concatenate([jnp.ones(1, bool), mesh.facets[1:, 0] != mesh.facets[:-1, 1]])
+    xp = namespace(mesh)
+    first = xp.concatenate([xp.ones(1, bool), mesh.facets[1:, 0] != mesh.facets[:-1, 1]])
     # Sums over all pairs of facets: XLA turns a cumulative sum into dozens of small operations.
-    order = jnp.arange(mesh.num_facets)
-    loop = jnp.sum((order <= order[:, None]) & first, axis=1)
+    order = np.arange(mesh.num_facets)
+    loop = xp.sum((order <= order[:, None]) & first, axis=1)
     earlier = (order < order[:, None]) & (loop == loop[:, None])
-    return loop, jnp.sum(jnp.where(earlier, facet_measures(mesh), 0), axis=1)
+    return loop, xp.sum(xp.where(earlier, facet_measures(mesh), 0), axis=1)
 
 
 def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.mesh import _checks, _topology
+from jeit_solvers.engines import as_array
 
 
 class Mesh(eqx.Module):
@@ -87,8 +87,8 @@ class Mesh(eqx.Module):
             facets = _topology.order_loops(facets, coordinates)
         located = _checks.locate_tags(tags or {}, facets)
         return Mesh(
-            points=jnp.asarray(points if coordinates is None else coordinates),
-            cells=jnp.asarray(indices.astype(np.int32)),
-            facets=jnp.asarray(facets.astype(np.int32)),
-            tags={name: jnp.asarray(index.astype(np.int32)) for name, index in located.items()},
+            points=as_array(points if coordinates is None else coordinates),
+            cells=as_array(indices.astype(np.int32)),
+            facets=as_array(facets.astype(np.int32)),
+            tags={name: as_array(index.astype(np.int32)) for name, index in located.items()},
         )

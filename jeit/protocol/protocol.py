@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -14,16 +13,22 @@ from jeit.protocol._check import (
     electrode_indices,
 )
 from jeit.protocol.reciprocity import reciprocal_channel_pairs
+from jeit_solvers.engines import as_array, either_engine
 
 
 def _as_float(values) -> Array:
-    return jnp.asarray(values, dtype=jnp.result_type(float))
+    return as_array(values, float)
 
 
 def _as_index(values) -> Array:
     if not isinstance(values, jax.Array) and np.asarray(values).dtype.kind not in "iub":
         raise ValueError("Protocol: drive_index and measurement_index must be integers (0-based).")
-    return jnp.asarray(values, dtype=jnp.int32)
+    return as_array(values, np.int32)
+
+
+@either_engine
+def _chosen(patterns, index):
+    return patterns[index]
 
 
 class Protocol(eqx.Module):
@@ -88,12 +93,12 @@ class Protocol(eqx.Module):
     @property
     def channel_drive(self) -> Float[Array, "M L"]:
         """(M, L) the currents in amperes that flow while each channel is read."""
-        return self.drive[self.drive_index]
+        return _chosen(self.drive, self.drive_index)
 
     @property
     def channel_measurement(self) -> Float[Array, "M L"]:
         """(M, L) the measurement weights of each channel."""
-        return self.measurement[self.measurement_index]
+        return _chosen(self.measurement, self.measurement_index)
 
     def channels_touching(self, electrodes: int | Sequence[int]) -> Bool[np.ndarray, " M"]:
         """(M,) True where a channel drives or measures any of `electrodes` (0-based indices).
@@ -142,8 +147,8 @@ class Protocol(eqx.Module):
         drives, drive_index = np.unique(np.asarray(self.drive_index)[channels], return_inverse=True)
         rows, measurement_index = np.unique(np.asarray(self.measurement_index)[channels], return_inverse=True)
         return Protocol(
-            drive=self.drive[drives],
-            measurement=self.measurement[rows],
+            drive=_chosen(self.drive, drives),
+            measurement=_chosen(self.measurement, rows),
             drive_index=drive_index,
             measurement_index=measurement_index,
             name=f"{self.name}, {channels.size} of {self.num_measurements} channels",

@@ -57,7 +57,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     # Iterative images reach from a hundredth to a hundred times the background: on the logarithm's scale both show.
     ax = plot_image(
         result.mesh,
-        result.departure / (math.log(10) if result.iterative else 1),
+        np.asarray(result.departure) / (math.log(10) if result.iterative else 1),
         result.calibration.model.electrodes,
         inclusions=result.inclusions if result.labels is None else (),
         title=result.measurement.name,

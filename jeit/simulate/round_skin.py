@@ -5,7 +5,6 @@ No openly licensed measurement of a tactile skin exists; this stands in where on
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -17,6 +16,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
+from jeit_solvers.engines import either_engine, namespace
 
 
 class RoundSkin(eqx.Module):
@@ -49,7 +49,7 @@ class RoundSkin(eqx.Module):
         return BoundaryElectrodes(position, self.electrode_width, self.contact_impedance)
 
 
-@jax.jit
+@either_engine
 def pressed_conductivity(
     points: Float[Array, "m 2"], background: float, position, radius: float, strength: float
 ) -> Float[Array, " m"]:
@@ -58,8 +58,9 @@ def pressed_conductivity(
     The change follows Hertz's pressure under a sphere: `strength` (relative) in the middle of a contact of `radius`
     metres round `position`, zero at its edge. More pressure, more contact, more conductivity.
     """
-    squared = jnp.sum((points - jnp.asarray(position)) ** 2, axis=-1) / radius**2
-    return background * (1 + strength * jnp.sqrt(jnp.maximum(1 - squared, 0)))
+    xp = namespace(points, position)
+    squared = xp.sum((points - xp.asarray(position)) ** 2, axis=-1) / radius**2
+    return background * (1 + strength * xp.sqrt(xp.maximum(1 - squared, 0)))
 
 
 def simulate_press(
@@ -96,12 +97,11 @@ def simulate_press(
     check_key(key)
     model = skin.model()
     points = centroids(model.mesh)
-    rest = jnp.full(model.mesh.num_cells, skin.conductivity)
     pressed = pressed_conductivity(points, skin.conductivity, where, radius, strength)
-    frames = jnp.stack([model.voltages(pressed), model.voltages(rest)])
-    frames += noise * jnp.sqrt(jnp.mean(frames**2)) * jax.random.normal(key, frames.shape)
+    frames = np.stack([model.voltages(pressed), model.voltages(skin.conductivity)])
+    frames += noise * np.sqrt(np.mean(frames**2)) * np.asarray(jax.random.normal(key, frames.shape))
     measured = screen(
-        np.asarray(frames),
+        frames,
         model.protocol,
         electrodes=model.electrodes,
         domain=Disk(skin.radius),

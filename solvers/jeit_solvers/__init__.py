@@ -11,7 +11,7 @@
 from jeit_solvers.batching import in_turn
 from jeit_solvers.clustering import KMeans, kmeans
 from jeit_solvers.cores import over_cores
-from jeit_solvers.dense.cholesky import symmetric_inverse
+from jeit_solvers.dense.cholesky import lower_cholesky, symmetric_eigen, symmetric_inverse
 from jeit_solvers.dense.ridge import QuadraticModel, ridge_model, ridge_step, solve_definite
 from jeit_solvers.optimise.bounded import BoundedMinimum, lbfgsb, projected_gradient, scipy_lbfgsb
 from jeit_solvers.optimise.descent import Descent
@@ -60,6 +60,7 @@ __all__ = [
     "inverse_small",
     "kmeans",
     "lbfgsb",
+    "lower_cholesky",
     "minimise_small",
     "near_inverse",
     "over_cores",
@@ -71,6 +72,7 @@ __all__ = [
     "solve",
     "solve_definite",
     "solve_small",
+    "symmetric_eigen",
     "symmetric_inverse",
     "symmetric_small",
 ]

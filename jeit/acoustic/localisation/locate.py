@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
@@ -115,7 +115,7 @@ def _judge(judge: SourceEstimate, found: SourceEstimate) -> np.ndarray:
 
 def _unexplained(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
     """Whether a misfit is too great for chance."""
-    return (freedom > 0) & (chi2.sf(misfit, np.maximum(freedom, 1)) < _FALSE_MISFIT)
+    return (freedom > 0) & (chdtrc(np.maximum(freedom, 1), misfit) < _FALSE_MISFIT)
 
 
 def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, microphone_array: MicrophoneArray) -> None:
@@ -233,7 +233,7 @@ def _above_floor(heard: Intensities, noise: IntensityNoise, use: np.ndarray) -> 
     """Frames in which a microphone hears what silence would not make it hear."""
     power = np.where(use, heard.power, -np.inf)
     if np.any(heard.floor > 0) and np.isfinite(heard.freedom):
-        least = heard.floor * (chi2.isf(_FALSE_ALARM / use.shape[1], heard.freedom) / heard.freedom - 1)
+        least = heard.floor * (chdtri(heard.freedom, _FALSE_ALARM / use.shape[1]) / heard.freedom - 1)
     else:
         loudest = power.max(initial=0.0)
         least = np.maximum(_HEARD_DEVIATIONS * np.asarray(noise.deviation), _DYNAMIC_RANGE * loudest)

@@ -1,10 +1,11 @@
 """What choosing a hyperparameter leaves behind: the λ chosen, how, and the curve that was looked at."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+
+from jeit_solvers.engines import as_array
 
 
 class Choice(eqx.Module):
@@ -32,9 +33,9 @@ class Choice(eqx.Module):
     @classmethod
     def given(cls, hyperparameter) -> "Choice":
         """Of a number that was given."""
-        value = jnp.asarray(hyperparameter, float)
-        nothing = jnp.zeros(0)
-        return cls(value, value[None], nothing, nothing, nothing, "given")
+        value = as_array(hyperparameter, float)
+        nothing = as_array(np.zeros(0))
+        return cls(value, as_array(np.reshape(value, 1)), nothing, nothing, nothing, "given")
 
     @classmethod
     def among(
@@ -46,10 +47,8 @@ class Choice(eqx.Module):
         """
         edge = {0: "smallest", len(candidates) - 1: "largest"}.get(int(index), "") if between is None else ""
         value = candidates[index] if between is None else between
-        residual, penalty = (jnp.asarray(curve, float) for curve in curves)
-        return cls(
-            jnp.asarray(value), jnp.asarray(candidates), jnp.asarray(criterion), residual, penalty, rule, target, edge
-        )
+        residual, penalty = (as_array(curve, float) for curve in curves)
+        return cls(as_array(value), as_array(candidates), as_array(criterion), residual, penalty, rule, target, edge)
 
     @property
     def note(self) -> str:

@@ -1,10 +1,8 @@
 """One-step (linear) difference imaging: a reconstruction matrix, computed once, times a difference of frames."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit.forward import ForwardModel
@@ -14,6 +12,7 @@ from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.mesh import Mesh
+from jeit_solvers.engines import as_array, either_engine, has_values
 
 
 class LinearReconstruction(eqx.Module):
@@ -49,11 +48,11 @@ class LinearReconstruction(eqx.Module):
         weights = tied / (1 + ratio**2)[:, None]
         return cls(
             model.mesh,
-            jnp.asarray(first),
-            jnp.asarray(second),
-            jnp.asarray(ratio),
-            jnp.asarray(weights),
-            jnp.asarray(hyperparameter, float),
+            as_array(first),
+            as_array(second),
+            as_array(ratio),
+            as_array(weights),
+            as_array(hyperparameter, float),
             matrix.shape[1],
             rule,
             method,
@@ -78,19 +77,15 @@ class LinearReconstruction(eqx.Module):
                 f"difference has shape {shape}; this reconstruction takes ({self.num_measurements},) volts, or "
                 f"(frames, {self.num_measurements})."
             )
-        image = _apply(self.first, self.second, self.ratio, self.weights, difference)
-        # JAX works on the image meanwhile: looked at before, the check would cost as much as the product.
-        if not isinstance(image, Tracer) and not np.isfinite(difference).all():
+        if has_values(difference) and not np.isfinite(difference).all():
             raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
-        return image
+        # Bare arrays: flattening a Module costs as much as the product itself.
+        return _apply(self.first, self.second, self.ratio, self.weights, difference)
 
 
-@jax.jit
+@either_engine
 def _apply(first, second, ratio, weights, difference):
-    # Bare arrays across the jit boundary: flattening a Module costs as much as the product itself.
-    get = jnp.asarray(difference).at
-    combined = get[..., first].get(mode="promise_in_bounds") + ratio * get[..., second].get(mode="promise_in_bounds")
-    return combined @ weights
+    return (difference[..., first] + ratio * difference[..., second]) @ weights
 
 
 def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit.inverse.channel_weights import relative_noise
+from jeit_solvers.engines import host
 
 
 def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
@@ -15,7 +16,7 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
     if jnp.iscomplexobj(voltages):
         raise ValueError("voltages are complex; reconstruct from their real part or magnitude.")
     shape = (model.protocol.num_measurements,)
-    measured = jnp.asarray(voltages, float)
+    measured = host.asarray(voltages, float)
     used = np.ones(shape, bool) if mask is None else np.asarray(mask)
     if measured.shape != shape or used.shape != shape or used.dtype != bool:
         raise ValueError(
@@ -31,7 +32,7 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
         )
     if not values.any():
         raise ValueError("voltages: all channels in use read zero; was the current source on?")
-    return jnp.where(used, measured, 0), used
+    return host.where(used, measured, 0), used
 
 
 def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
@@ -41,7 +42,7 @@ def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
             f"background must be one real conductivity, or one for each of the {model.mesh.num_cells} cells; it is "
             f"{jnp.asarray(background).dtype} of shape {jnp.shape(background)}."
         )
-    return jnp.broadcast_to(jnp.asarray(background, float), (model.mesh.num_cells,))
+    return host.broadcast_to(np.asarray(background, float), (model.mesh.num_cells,))
 
 
 def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[Array, " M"]:
@@ -51,10 +52,12 @@ def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[
         raise ValueError(
             f"noise is {given.dtype} of shape {given.shape}; give one real number, or one for each channel."
         )
-    deviation = relative_noise(measured, used) if noise is None else np.broadcast_to(np.asarray(noise), measured.shape)
+    deviation = (
+        relative_noise(measured, host.asarray(used)) if noise is None else np.broadcast_to(given, measured.shape)
+    )
     if not (np.isfinite(deviation)[used] & (np.asarray(deviation)[used] > 0)).all():
         raise ValueError("noise must be positive and finite for every channel in use.")
-    return jnp.where(used, deviation, 1)
+    return host.where(used, deviation, 1)
 
 
 def check_steps(name: str, steps) -> int:

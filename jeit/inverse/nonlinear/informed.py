@@ -11,6 +11,8 @@ import numpy as np
 
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.prior.bases import DenseBasis
+from jeit_solvers import symmetric_eigen
+from jeit_solvers.engines import either_engine, host, namespace, on_device
 
 
 def informed(inversion: Inversion, least: float, persistence: float = 0.0) -> Inversion:
@@ -22,16 +24,18 @@ def informed(inversion: Inversion, least: float, persistence: float = 0.0) -> In
     squares, rows = (np.asarray(values) for values in _singular_values(inversion))
     kept = squares > max(least**2, 1e-12 * squares[-1])
     size = np.sqrt(_expected_variance(squares[kept], persistence) / squares[kept])
-    shapes = jax.vmap(inversion.basis.expand)(jnp.asarray(size[:, None] * rows[kept])).T
-    return eqx.tree_at(lambda i: i.basis, inversion, DenseBasis(shapes.astype(jnp.float32)))
+    shapes = host.asarray(jax.vmap(inversion.basis.expand)(jnp.asarray(size[:, None] * rows[kept])).T, np.float32)
+    chosen = eqx.tree_at(lambda i: i.basis, inversion, DenseBasis(shapes))
+    return chosen if namespace(inversion) is np else on_device(chosen)
 
 
-@jax.jit
+@either_engine
 def _singular_values(inversion: Inversion):
     """Of the image's whitened Jacobian at the background: squared singular values, right vectors times their roots."""
-    start = jnp.zeros(inversion.num_coefficients)
+    xp = namespace(inversion)
+    start = xp.zeros(inversion.num_coefficients)
     rows = inversion.data.whiten(inversion.linearise(start)[1])[:, : inversion.basis.num_coefficients]
-    squares, left = jnp.linalg.eigh(rows @ rows.T)
+    squares, left = symmetric_eigen(rows @ rows.T)
     return squares, left.T @ rows
 
 

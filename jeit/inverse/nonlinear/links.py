@@ -4,10 +4,12 @@ import abc
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
+import scipy.special
 from jax.core import Tracer
 from jaxtyping import Array, Float
+
+from jeit_solvers.engines import namespace
 
 # Share of the background below which no conductivity is taken where nothing else keeps it from zero.
 _LEAST = 1e-6
@@ -46,7 +48,7 @@ class Linear(AbstractLink):
 
     def slope(self, estimate):
         """1."""
-        return jnp.ones_like(estimate)
+        return namespace(estimate).ones_like(estimate)
 
     def estimate(self, conductivity):
         """σ. In S/m (2-D: S)."""
@@ -62,16 +64,16 @@ class Log(AbstractLink):
 
     def conductivity(self, estimate):
         """exp(x)."""
-        return jnp.exp(estimate)
+        return namespace(estimate).exp(estimate)
 
     def slope(self, estimate):
         """exp(x)."""
-        return jnp.exp(estimate)
+        return namespace(estimate).exp(estimate)
 
     def estimate(self, conductivity):
         """log(σ). σ in S/m (2-D: S). Raises `ValueError` unless it is positive."""
         _check_inside(conductivity, 0, np.inf)
-        return jnp.log(conductivity)
+        return namespace(conductivity).log(conductivity)
 
     def ends(self, lower, upper, reference):
         """Their logarithms: zero is no bound at all."""
@@ -94,22 +96,27 @@ class Bounded(AbstractLink):
 
     def conductivity(self, estimate):
         """The logistic function between the bounds."""
-        return self.lower + (self.upper - self.lower) * jax.nn.sigmoid(estimate)
+        return self.lower + (self.upper - self.lower) * _logistic(estimate)
 
     def slope(self, estimate):
         """Its derivative, largest half way between the bounds."""
-        share = jax.nn.sigmoid(estimate)
+        share = _logistic(estimate)
         return (self.upper - self.lower) * share * (1 - share)
 
     def estimate(self, conductivity):
         """The logit of σ's place between the bounds. Raises `ValueError` outside them."""
         _check_inside(conductivity, self.lower, self.upper)
         share = (conductivity - self.lower) / (self.upper - self.lower)
-        return jnp.log(share) - jnp.log1p(-share)
+        xp = namespace(share)
+        return xp.log(share) - xp.log1p(-share)
 
     def ends(self, lower, upper, reference):
         """Not beside its own. Raises `ValueError`."""
         raise ValueError("bounds: the link is bounded already; give bounds or link=Bounded(lower, upper), not both.")
+
+
+def _logistic(estimate):
+    return scipy.special.expit(estimate) if isinstance(estimate, np.ndarray) else jax.nn.sigmoid(estimate)
 
 
 def _check_inside(conductivity, lower, upper) -> None:

@@ -2,16 +2,17 @@
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jeit.forward import ForwardModel
+from jeit.forward.model import evaluate, voltages_and_jacobian_of, voltages_of
 from jeit.inverse.channels import Data
 from jeit.inverse.nonlinear.links import AbstractLink
 from jeit.inverse.nonlinear.unknowns import AbstractUnknown
 from jeit.inverse.prior.bases import AbstractBasis
 from jeit.inverse.prior.penalty import AbstractPenalty
 from jeit_solvers import QuadraticModel
+from jeit_solvers.engines import has_values, namespace
 
 
 class Inversion(eqx.Module):
@@ -29,6 +30,11 @@ class Inversion(eqx.Module):
     basis: AbstractBasis
     penalty: AbstractPenalty
     unknowns: tuple[AbstractUnknown, ...] = ()
+
+    @property
+    def runs_at_once(self) -> bool:
+        """Whether it can be solved in NumPy, for all of its values are at hand and nothing needs a derivative."""
+        return self.model.at_once and not self.unknowns and has_values(self)
 
     @property
     def num_coefficients(self) -> int:
@@ -65,13 +71,13 @@ class Inversion(eqx.Module):
         """`residual`, and its Jacobian with respect to the coefficients."""
         shapes, values = self._parts(coefficients)
         model, estimate = self._situation(shapes, values)
-        voltages, jacobian = model.voltages_and_jacobian(self.link.conductivity(estimate))
+        voltages, jacobian = evaluate(model, voltages_and_jacobian_of, self.link.conductivity(estimate))
         columns = [self.basis.restrict(jacobian * self.link.slope(estimate))]
         if self.unknowns:
             along = jax.jacfwd(lambda values: self._predict(shapes, values))(values)
             columns += [block * unknown.deviation for block, unknown in zip(along, self.unknowns, strict=True)]
-        weight = self.data.weight
-        return weight * (voltages - self.data.voltages), weight[:, None] * jnp.concatenate(columns, axis=1)
+        weight, xp = self.data.weight, namespace(voltages, jacobian)
+        return weight * (voltages - self.data.voltages), weight[:, None] * xp.concatenate(columns, axis=1)
 
     def cost(self, coefficients: Float[Array, " n"]) -> Float[Array, ""]:
         """½ rᵀ G r + penalty."""
@@ -100,4 +106,4 @@ class Inversion(eqx.Module):
 
     def _predict(self, shapes, values):
         model, estimate = self._situation(shapes, values)
-        return model.voltages(self.link.conductivity(estimate))
+        return evaluate(model, voltages_of, self.link.conductivity(estimate))

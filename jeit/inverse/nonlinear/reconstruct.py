@@ -7,6 +7,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float
 
 from jeit.forward import ForwardModel
+from jeit.forward.model import evaluate, voltages_of
 from jeit.inverse.channels import Data, IndependentChannels
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
@@ -20,6 +21,7 @@ from jeit.inverse.prior.defaults import PRIOR
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.spectrum import Spectrum
 from jeit_solvers import Status
+from jeit_solvers.engines import as_array, either_engine, namespace, on_device, on_host
 
 
 class Reconstruction(eqx.Module):
@@ -106,16 +108,19 @@ def reconstruct(
     observed = model.with_protocol(model.protocol.subset(kept))
     channels = IndependentChannels.create(observed.protocol)
     small = observed.with_protocol(observed.protocol.subset(np.asarray(channels.index)))
+    if model.at_once and not (parametrisation.unknowns or solver.keeps_bounds or solver.needs_squares):
+        small, channels = on_host((small, channels))  # and so is all that is made of them
     data = channels.weigh(deviation[kept]).combine(measured[kept])
     inversion, choice = pose(
         small, data, background, prior, hyperparameter, parametrisation, per_cell=solver.keeps_bounds
     )
     if parametrisation.informative and inversion.penalty.is_standard_normal:
         inversion = informed(inversion, parametrisation.informative)
-    first = jnp.zeros(inversion.num_coefficients) if start is None else _continued(start, inversion, choice)
+    first = as_array(np.zeros(inversion.num_coefficients)) if start is None else _continued(start, inversion, choice)
     coefficients, iterations, costs, status, reason = solver.minimise(inversion, first, box)
-    conductivity, fitted, predicted = _outcome(inversion, model, coefficients)
-    excess = ((predicted - measured) / deviation)[kept]
+    fitted, conductivity = inversion.applied(model, coefficients), _conductivity(inversion, coefficients)
+    predicted = evaluate(fitted, voltages_of, conductivity)
+    excess = ((np.asarray(predicted) - np.asarray(measured)) / np.asarray(deviation))[kept]
     if not (np.isfinite(conductivity).all() and np.isfinite(excess).all()):
         status, reason = Status.FAILED, "Conductivity or voltages are NaN; give better data, more noise or a greater λ."
     elif status != Status.CONVERGED:
@@ -123,10 +128,10 @@ def reconstruct(
     return Reconstruction(
         conductivity=conductivity,
         voltages=predicted,
-        misfit=jnp.sqrt(jnp.mean(excess**2)),
+        misfit=as_array(np.sqrt(np.mean(excess**2))),
         costs=costs + inversion.data.rest / 2,
         coefficients=coefficients,
-        inversion=inversion,
+        inversion=on_device(inversion),
         model=fitted,
         choice=choice,
         iterations=iterations,
@@ -152,6 +157,7 @@ def _solver_for(solver, prior: AbstractPrior, parametrisation: Parametrisation) 
     return solver
 
 
+@np.errstate(all="ignore")  # a problem that is not finite is told of when it is solved
 def pose(
     model: ForwardModel,
     data: Data,
@@ -170,17 +176,19 @@ def pose(
     reference, regions = link.estimate(background), parametrisation.regions_of(mesh)
     asked = prior.default_hyperparameter if hyperparameter is None else hyperparameter
     if prior.is_quadratic:
-        predicted, jacobian = model.voltages_and_jacobian(background)
-        seen = data.whiten(data.weight[:, None] * jacobian * link.slope(reference))
+        predicted, jacobian = on_host(model.voltages_and_jacobian(background))
+        known, slope = on_host((data, link.slope(reference)))
+        seen = known.whiten(known.weight[:, None] * jacobian * slope)
         spectrum = Spectrum.create(seen, prior.covariance_product(mesh, seen), prior.null_space(mesh))
-        difference = data.whiten(data.weight * (data.voltages - predicted))
+        difference = known.whiten(known.weight * (known.voltages - predicted))
         choice = choose(spectrum, asked, difference, mesh)
     else:
         seen, choice = None, _number(asked)
     basis, penalty = prior.penalty(
-        mesh, reference, choice.hyperparameter, jacobian=seen, regions=regions, per_cell=per_cell
+        mesh, reference, float(choice.hyperparameter), jacobian=seen, regions=regions, per_cell=per_cell
     )
-    return Inversion(model, data, link, reference, basis, penalty, parametrisation.unknowns), choice
+    inversion = Inversion(model, data, link, reference, basis, penalty, parametrisation.unknowns)
+    return inversion if namespace(model) is np else on_device(inversion), choice
 
 
 def _number(hyperparameter) -> Choice:
@@ -224,9 +232,6 @@ def _mismatch(model: ForwardModel, measured, background, kept) -> str:
     return f" The voltages are {ratio:.2g} times those of the background; are they in volts, and their signs right?"
 
 
-@eqx.filter_jit
-def _outcome(inversion: Inversion, model: ForwardModel, coefficients):
-    """Conductivity, the model as fitted, and what it predicts for all channels, masked or not."""
-    fitted = inversion.applied(model, coefficients)
-    conductivity = inversion.conductivity(coefficients)
-    return conductivity, fitted, fitted.voltages(conductivity)
+@either_engine
+def _conductivity(inversion: Inversion, coefficients):
+    return inversion.conductivity(coefficients)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
@@ -16,6 +17,7 @@ from jeit.arguments import check_kind, check_name, counted
 from jeit.inverse.nonlinear.checks import check_steps, check_tolerance
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit_solvers import BoundedMinimum, Descent, Status, ended, lbfgsb, projected_gradient
+from jeit_solvers.engines import as_array, on_host
 
 _Value = TypeVar("_Value")
 
@@ -289,12 +291,18 @@ def _steps(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
 
 
 def _descend(descent: Descent, inversion: Inversion, start) -> Solved:
-    solution = _least_squares(inversion, start, descent, descent.history, {"expand": expand})
-    state, status = solution.state, ended(solution.result)
+    if inversion.runs_at_once:
+        start, problem = on_host((start, inversion))
+        point, state = descent.at_once(expand, start, problem, descent.history)
+        point = as_array(point)
+        status = Status.CONVERGED if state.converged else Status.STALLED if state.stuck else Status.STEP_LIMIT
+    else:
+        solution = _least_squares(inversion, start, descent, descent.history, {"expand": expand})
+        point, state, status = solution.value, solution.state, ended(solution.result)
     accepted = int(state.num_accepted)
     iterations = max(accepted - 1, 0)
     reason = _reason(status, iterations, int(state.num_steps) - 1 - iterations)
-    return Solved(solution.value, iterations, state.history[:accepted], status, reason)
+    return Solved(point, iterations, as_array(np.asarray(state.history)[:accepted]), status, reason)
 
 
 def _between(minimise, inversion: Inversion, start, box, max_steps: int, tolerance: float) -> Solved:

@@ -8,12 +8,11 @@ import abc
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.mesh import Mesh, centroids, measures
+from jeit_solvers.engines import host, namespace, sum_into
 
 
 class AbstractBasis(eqx.Module):
@@ -65,7 +64,7 @@ class DiagonalBasis(AbstractBasis):
 
     def pooled(self, regions):
         """One coefficient for each region, with the mean variance of its cells."""
-        return RegionBasis(regions, jnp.sqrt(regions.mean(self.deviation**2)))
+        return RegionBasis(regions, namespace(regions).sqrt(regions.mean(self.deviation**2)))
 
 
 class DenseBasis(AbstractBasis):
@@ -124,21 +123,25 @@ class Regions(eqx.Module):
         empty = np.setdiff1d(np.arange(number), label)
         if empty.size:
             raise ValueError(f"regions: no cell has the label {empty[0]}; use all from 0 to {number - 1}.")
-        return cls(jnp.asarray(label), measures(mesh), number)
+        return cls(host.asarray(label), host.asarray(measures(mesh)), number)
 
     def total(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
         """Sums of cells' values over every region."""
-        return jax.ops.segment_sum(values, jnp.where(self.label < 0, self.number, self.label), self.number + 1)[:-1]
+        where = namespace(self.label).where(self.label < 0, self.number, self.label)
+        return sum_into((self.number + 1, *values.shape[1:]), where, values)[:-1]
 
     def mean(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
         """Means over every region, weighted by area."""
-        weight = self.measure / self.spread(self.total(self.measure))
-        return self.total(values * jnp.expand_dims(jnp.where(self.label < 0, 0, weight), range(1, values.ndim)))
+        xp = namespace(self, values)
+        total = self.spread(self.total(self.measure))  # zero where the image is held fixed
+        weight = xp.where(self.label < 0, 0, self.measure / xp.where(self.label < 0, 1, total))
+        return self.total(values * xp.expand_dims(weight, tuple(range(1, values.ndim))))
 
     def spread(self, values: Float[Array, "p *k"]) -> Float[Array, "m *k"]:
         """Regions' values at the cells, zero where the image is held fixed."""
-        fixed = jnp.expand_dims(self.label < 0, range(1, values.ndim))
-        return jnp.where(fixed, 0, values[jnp.maximum(self.label, 0)])
+        xp = namespace(self, values)
+        fixed = xp.expand_dims(self.label < 0, tuple(range(1, values.ndim)))
+        return xp.where(fixed, 0, values[xp.maximum(self.label, 0)])
 
 
 def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from jeit.inverse.channels import Data
 from jeit_solvers import QuadraticModel, ridge_model
+from jeit_solvers.engines import namespace
 
 
 class AbstractPenalty(eqx.Module):
@@ -51,7 +52,7 @@ class Ridge(AbstractPenalty):
 
     def diagonal(self, coefficients):
         """Ones."""
-        return jnp.ones_like(coefficients)
+        return namespace(coefficients).ones_like(coefficients)
 
     def model(self, residual, jacobian, coefficients, data):
         """Gauss-Newton's, in the space of data or of coefficients."""
@@ -71,9 +72,9 @@ class QuadraticForm(AbstractPenalty):
         """λ² times a SciPy sparse matrix."""
         entries = precision.tocoo()
         return cls(
-            jnp.asarray(entries.row),
-            jnp.asarray(entries.col),
-            hyperparameter**2 * jnp.asarray(entries.data),
+            entries.row,
+            entries.col,
+            float(hyperparameter) ** 2 * entries.data,
             precision.shape[0],
         )
 

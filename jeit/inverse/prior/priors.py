@@ -8,13 +8,12 @@ any generalised inverse and the null space is estimated from the data without pe
 import abc
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 from jax.core import Tracer
 from jaxtyping import Array, Float
+from scipy.spatial.distance import cdist
 
 from jeit.inverse.hyperparameter.defaults import RULE
 from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, Regions, pivoted_cholesky
@@ -22,7 +21,10 @@ from jeit.inverse.prior.penalty import AbstractPenalty, QuadraticForm, Ridge
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geometry import interior_facets
 from jeit_solvers import SparsityPattern, analyse, factorise, solve
+from jeit_solvers.engines import host, on_host
 
+# Rows of a dense covariance at a time.
+_BLOCK = 512
 # Precision given to the constant image where it would have none, relative to a step between neighbouring cells.
 _FREEDOM = 1e-6
 
@@ -66,7 +68,7 @@ class AbstractPrior(eqx.Module):
         if regions is not None:
             raise ValueError("regions: bounded solvers take every cell; use link=Bounded(lower, upper) instead.")
         precision = self.precision(mesh, jacobian)
-        return DiagonalBasis(jnp.ones(mesh.num_cells)), QuadraticForm.create(precision, hyperparameter)
+        return DiagonalBasis(host.ones(mesh.num_cells)), QuadraticForm.create(precision, hyperparameter)
 
     @abc.abstractmethod
     def covariance_product(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> Float[Array, "m M"]:
@@ -82,7 +84,7 @@ class AbstractPrior(eqx.Module):
 
     def null_space(self, mesh: Mesh) -> Float[Array, "m p"]:
         """Basis of the images that cost nothing; none unless a prior says otherwise."""
-        return jnp.zeros((mesh.num_cells, 0))
+        return host.zeros((mesh.num_cells, 0))
 
 
 class Tikhonov(AbstractPrior):
@@ -98,7 +100,7 @@ class Tikhonov(AbstractPrior):
 
     def basis(self, mesh, jacobian):
         """Every cell on its own."""
-        return DiagonalBasis(jnp.ones(mesh.num_cells))
+        return DiagonalBasis(host.ones(mesh.num_cells))
 
 
 class Noser(AbstractPrior):
@@ -112,7 +114,7 @@ class Noser(AbstractPrior):
 
     def covariance_product(self, mesh, jacobian):
         """Jᵀ, its rows divided by the diagonal of Q."""
-        return jacobian.T / jnp.sum(jacobian**2, axis=0)[:, None] ** self.exponent
+        return jacobian.T / (jacobian**2).sum(axis=0)[:, None] ** self.exponent
 
     def precision(self, mesh, jacobian):
         """The diagonal matrix Q."""
@@ -120,7 +122,7 @@ class Noser(AbstractPrior):
 
     def basis(self, mesh, jacobian):
         """Every cell on its own."""
-        return DiagonalBasis(jnp.sum(jacobian**2, axis=0) ** (-self.exponent / 2))
+        return DiagonalBasis((jacobian**2).sum(axis=0) ** (-self.exponent / 2))
 
 
 class Laplace(AbstractPrior):
@@ -132,11 +134,11 @@ class Laplace(AbstractPrior):
     def covariance_product(self, mesh, jacobian):
         """Γ Jᵀ with the generalised inverse that grounds cell 0."""
         pairs, _ = interior_facets(mesh)
-        pattern = SparsityPattern.from_elements([pairs, np.zeros((1, 1), int)], size=mesh.num_cells)
-        link = 2 * jnp.broadcast_to(jnp.array([[1.0, -1.0], [-1.0, 1.0]]), (len(pairs), 2, 2))
-        plan = analyse(pattern, coordinates=np.asarray(centroids(mesh)))
-        factor = factorise(plan, pattern.assemble(link, jnp.full((1, 1, 1), 2.0)))
-        return solve(plan, factor, jacobian.T)
+        pattern = on_host(SparsityPattern.from_elements([pairs, np.zeros((1, 1), int)], size=mesh.num_cells))
+        link = host.broadcast_to(np.array([[2.0, -2.0], [-2.0, 2.0]]), (len(pairs), 2, 2))
+        plan = on_host(analyse(pattern, coordinates=np.asarray(centroids(mesh))))
+        factor = factorise(plan, pattern.assemble(link, np.full((1, 1, 1), 2.0)))
+        return solve(plan, factor, host.asarray(jacobian).T)
 
     def precision(self, mesh, jacobian):
         """The Laplacian matrix Q."""
@@ -151,11 +153,11 @@ class Laplace(AbstractPrior):
         precision = self.precision(mesh, jacobian).toarray()
         precision[np.diag_indices_from(precision)] += _FREEDOM
         lower = scipy.linalg.cholesky(precision, lower=True)
-        return DenseBasis(jnp.asarray(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T))
+        return DenseBasis(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
 
     def null_space(self, mesh):
         """The constant image."""
-        return jnp.ones((mesh.num_cells, 1))
+        return host.ones((mesh.num_cells, 1))
 
 
 class Gaussian(AbstractPrior):
@@ -173,7 +175,9 @@ class Gaussian(AbstractPrior):
 
     def covariance_product(self, mesh, jacobian):
         """Γ Jᵀ, a block of rows at a time: Γ is dense and is not kept."""
-        return _gaussian_product(centroids(mesh), jacobian, self.length)
+        scaled = np.asarray(centroids(mesh)) / (np.sqrt(2) * self.length)
+        rows = np.split(scaled, np.arange(_BLOCK, len(scaled), _BLOCK))
+        return host.concatenate([np.exp(-cdist(row, scaled, "sqeuclidean")) @ np.asarray(jacobian).T for row in rows])
 
     def basis(self, mesh, jacobian):
         """The shapes that hold all but a thousandth of the variance: fewer than cells where `length` spans many."""
@@ -182,7 +186,7 @@ class Gaussian(AbstractPrior):
         def column(cell):
             return np.exp(-np.sum((centres - centres[cell]) ** 2, axis=1) / (2 * self.length**2))
 
-        return DenseBasis(jnp.asarray(pivoted_cholesky(np.ones(len(centres)), column, tolerance=1e-3, max_rank=2000)))
+        return DenseBasis(host.asarray(pivoted_cholesky(np.ones(len(centres)), column, tolerance=1e-3, max_rank=2000)))
 
     def precision(self, mesh, jacobian):
         """Not to be had: the inverse of a Gaussian covariance is dense and ill-conditioned. Raises `ValueError`."""
@@ -190,12 +194,3 @@ class Gaussian(AbstractPrior):
             "prior: Gaussian has no usable precision matrix, which bounds need; take Noser, Tikhonov, Laplace or "
             "TotalVariation, or link=Bounded(lower, upper) in place of bounds."
         )
-
-
-@jax.jit
-def _gaussian_product(centres, jacobian, length):
-    def row(centre):
-        covariance = jnp.exp(-jnp.sum((centres - centre) ** 2, axis=1) / (2 * length**2))
-        return jacobian @ covariance
-
-    return jax.lax.map(row, centres, batch_size=256)

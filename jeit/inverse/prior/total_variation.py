@@ -20,6 +20,7 @@ from jeit.inverse.prior.priors import AbstractPrior
 from jeit.mesh import centroids, measures
 from jeit.mesh.geometry import interior_facets
 from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, solve, solve_definite
+from jeit_solvers.engines import host, namespace, sum_into
 
 # Pull to the background, relative to the price of an edge: what fixes an image that the data do not.
 _LEVEL = 1e-3
@@ -75,17 +76,17 @@ class TotalVariation(AbstractPrior):
             cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             length = np.linalg.norm(cross, axis=1) / 2
         pattern = SparsityPattern.from_elements([pairs, np.arange(mesh.num_cells)[:, None]], size=mesh.num_cells)
-        area = measures(mesh)
+        area = np.asarray(measures(mesh))
         penalty = TotalVariationPenalty(
-            pairs=jnp.asarray(pairs),
-            weight=jnp.asarray(hyperparameter * length / size ** (mesh.dimension - 1)),
-            level=hyperparameter * _LEVEL * area / area.sum(),
-            smoothing=jnp.asarray(self.smoothing),
+            pairs=host.asarray(pairs),
+            weight=float(hyperparameter) * length / size ** (mesh.dimension - 1),
+            level=float(hyperparameter) * _LEVEL * area / area.sum(),
+            smoothing=host.asarray(self.smoothing),
             reference=reference,
             pattern=pattern,
             plan=analyse(pattern, coordinates=np.asarray(centroids(mesh))),
         )
-        return DiagonalBasis(jnp.ones(mesh.num_cells)), penalty
+        return DiagonalBasis(host.ones(mesh.num_cells)), penalty
 
 
 def _refuse(what: str) -> NoReturn:
@@ -114,8 +115,8 @@ class TotalVariationPenalty(AbstractPenalty):
     def cost(self, coefficients):
         """The energy."""
         image, rest = self._parts(coefficients)
-        edges = jnp.sum(self.weight * self._height(image))
-        return edges + 0.5 * jnp.sum(self.level * image**2) + 0.5 * rest @ rest
+        edges = (self.weight * self._height(image)).sum()
+        return edges + 0.5 * (self.level * image**2).sum() + 0.5 * rest @ rest
 
     def diagonal(self, coefficients):
         """Of the form that touches the energy at c."""
@@ -136,25 +137,33 @@ class TotalVariationPenalty(AbstractPenalty):
         stiffness = self.weight / self._height(image)
 
         def step(damping):
-            link = stiffness[:, None, None] * jnp.array([[1.0, -1.0], [-1.0, 1.0]])
-            factor = factorise(self.plan, self.pattern.assemble(link, self.level[:, None, None]))
+            xp = namespace(self, jacobian)
             flux = stiffness * self._jump(self.reference + image)
             gradient = self.level * image
-            gradient = gradient.at[self.pairs[:, 0]].add(flux).at[self.pairs[:, 1]].add(-flux)
+            gradient = gradient + self._divergence(flux)
             size = image.shape[0]
-            columns = jnp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1)
-            solved = solve(self.plan, factor, columns)
-            product = jnp.concatenate([solved[:, :-1], jacobian[:, size:].T]) / (1 + damping)
-            descent = jnp.concatenate([solved[:, -1], rest]) / (1 + damping)
+            solved = self._solve(stiffness, xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1))
+            product = xp.concatenate([solved[:, :-1], jacobian[:, size:].T]) / (1 + damping)
+            descent = xp.concatenate([solved[:, -1], rest]) / (1 + damping)
             inner = solve_definite(jacobian @ product + data.covariance, residual - jacobian @ descent)
             direction = -descent - product @ inner
             across = jacobian @ direction
             own, other = self._parts(direction)
             slope = weighted @ across + gradient @ own + rest @ other
-            bend = jnp.sum(stiffness * self._jump(own) ** 2) + jnp.sum(self.level * own**2) + other @ other
+            bend = (stiffness * self._jump(own) ** 2).sum() + (self.level * own**2).sum() + other @ other
             return direction, slope, across @ data.precision @ across + bend
 
         return cost, step
+
+    def _solve(self, stiffness, columns):
+        """Q⁻¹ columns, Q the touching form of these weights of jumps."""
+        link = stiffness[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        factor = factorise(self.plan, self.pattern.assemble(link, self.level[:, None, None]))
+        return solve(self.plan, factor, columns)
+
+    def _divergence(self, flux):
+        first, second = self.pairs[:, 0], self.pairs[:, 1]
+        return sum_into(self.level.shape, first, flux) - sum_into(self.level.shape, second, flux)
 
     def _parts(self, coefficients):
         size = self.level.shape[0]
@@ -164,4 +173,4 @@ class TotalVariationPenalty(AbstractPenalty):
         return image[self.pairs[:, 0]] - image[self.pairs[:, 1]]
 
     def _height(self, image):
-        return jnp.sqrt(self._jump(self.reference + image) ** 2 + self.smoothing**2)
+        return namespace(self, image).sqrt(self._jump(self.reference + image) ** 2 + self.smoothing**2)

@@ -29,6 +29,7 @@ from jeit.inverse.nonlinear.solvers import AbstractSolver, GaussNewton, as_solve
 from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.defaults import smooth_prior
 from jeit.inverse.prior.priors import AbstractPrior
+from jeit_solvers.engines import as_array
 
 FRAME_STEPS = 4
 """Most iterations that a frame is given, unless the solver says otherwise."""
@@ -147,8 +148,8 @@ class Imager(eqx.Module):
         return cls(
             channels=channels,
             inversion=inversion,
-            noise=deviation,
-            mask=jnp.asarray(used),
+            noise=as_array(deviation),
+            mask=as_array(used),
             expected=jnp.where(used, frame, predicted),
             offset=jnp.where(used, predicted - frame, 0),
             touching=jnp.asarray([model.protocol.channels_touching(k) for k in range(model.protocol.num_electrodes)]),

@@ -16,6 +16,7 @@ from jeit.mesh.generate.refine import Refine, Refinement
 from jeit.mesh.generate.unstructured import Target, check_count, check_positions, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import Domain, Pen, check_length, check_position, numerics
+from jeit_solvers.engines import as_array
 
 
 class Disk(Domain):
@@ -47,12 +48,13 @@ class Disk(Domain):
 
     def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
         """Points (…, 2) on the circle at `arc_length` (…) in metres, counter-clockwise from angle 0."""
-        angle = jnp.asarray(arc_length) / self.radius
-        return jnp.asarray(self.centre) + self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+        xp = numerics(self, arc_length)
+        angle = xp.asarray(arc_length) / self.radius
+        return as_array(xp.asarray(self.centre) + self.radius * xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1))
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
         """The circle as the polygon inscribed in it."""
-        return (self.boundary(jnp.linspace(0, self.perimeter, num_chords, endpoint=False)),)
+        return (self.boundary(self.perimeter * np.arange(num_chords) / num_chords),)
 
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
         """True for each of `points` (…, 2) in metres that lies in the disk or on its edge."""
@@ -61,13 +63,13 @@ class Disk(Domain):
 
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
         """R less the distance (p,) of `points` (p, 2) from the centre, metres."""
-        return jnp.asarray(self.radius - self._from_centre(points)[1])
+        return as_array(self.radius - self._from_centre(points)[1])
 
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
         """`points` (p, 2) in metres, those outside moved to the circle along their radius."""
         offset, distance = self._from_centre(points)
         xp = numerics(self, points)
-        return jnp.asarray(xp.asarray(self.centre) + offset * xp.minimum(1, self.radius / distance[:, None]))
+        return as_array(xp.asarray(self.centre) + offset * xp.minimum(1, self.radius / distance[:, None]))
 
     def _from_centre(self, points: ArrayLike) -> tuple[Any, Any]:
         """Offsets (p, 2) and distances (p,) from the centre, these with a derivative at zero too."""

@@ -11,7 +11,7 @@ from matplotlib.patches import Ellipse, PathPatch
 from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from jeit.acoustic import Calibration, MicrophoneArray
 from jeit.acoustic.surface import AbstractSurface, bounding_box, make_surface
@@ -21,7 +21,7 @@ from jeit.plot.axes import INK, SOFT, bare, draw_scale_bar, extent_of
 MICROPHONE, FOUND = "#1f6fb4", "#c8102e"
 HALO = (withStroke(linewidth=2.5, foreground="white"),)
 # Radius, in standard deviations, of the ellipse that holds 95 % of a normal distribution in the plane.
-_REACH = float(np.sqrt(chi2.ppf(0.95, 2)))
+_REACH = float(np.sqrt(chdtri(2, 0.05)))
 
 AnySurface = Calibration | MicrophoneArray | AbstractSurface | Domain | ArrayLike
 

@@ -6,10 +6,14 @@ LAPACK calls that run side by side in one program can wait for each other for ev
 as two. Matrix products have none of these troubles, and the same code serves complex symmetric matrices.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
+
+from jeit_solvers.engines import host, namespace
 
 _BLOCK = 8
 _LARGEST_IN_HALVES = 128
@@ -23,33 +27,72 @@ def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "b
     real part, which makes the elimination stable without pivoting (Higham, Math. Comp. 67, 1998). What cannot be
     factorised comes back as NaN.
     """
+    if isinstance(matrices, np.ndarray):
+        return _by_halves(matrices) if np.iscomplexobj(matrices) else _by_lapack(matrices)
     if matrices.shape[-1] > _LARGEST_IN_HALVES:
         return _by_block_rows(matrices)
     return _by_halves(matrices)
 
 
-@jax.custom_jvp
+def lower_cholesky(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
+    """L with A = L Lᵀ; NaN where there is none."""
+    if not isinstance(matrix, np.ndarray):
+        return jnp.linalg.cholesky(matrix)
+    try:
+        return host.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        return host.full_like(matrix, np.nan)
+
+
+def symmetric_eigen(matrix: Inexact[Array, "s s"]) -> tuple[Inexact[Array, " s"], Inexact[Array, "s s"]]:
+    """Eigenvalues, ascending, and eigenvectors in columns; NaN where the matrix is not finite."""
+    if not isinstance(matrix, np.ndarray):
+        return jnp.linalg.eigh(matrix)
+    if not np.isfinite(matrix).all():
+        return host.full(len(matrix), np.nan), host.full_like(matrix, np.nan)
+    return host.linalg.eigh(matrix)
+
+
 def symmetric_inverse(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
     """A^-1 of one matrix that `inverse_cholesky` takes."""
+    if not isinstance(matrix, np.ndarray):
+        return _symmetric_inverse(matrix)
+    if not np.isfinite(matrix).all():
+        return host.full_like(matrix, np.nan)
+    inverse = host.linalg.inv(matrix)
+    return (inverse + inverse.T) / 2
+
+
+@jax.custom_jvp
+def _symmetric_inverse(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
     inverse = inverse_cholesky(matrix[None])[0]
     return inverse.T @ inverse
 
 
-@symmetric_inverse.defjvp
+@_symmetric_inverse.defjvp
 def _symmetric_inverse_jvp(primals, tangents):
-    inverse = symmetric_inverse(*primals)
+    inverse = _symmetric_inverse(*primals)
     return inverse, -inverse @ tangents[0] @ inverse
 
 
+def _by_lapack(matrices: Inexact[np.ndarray, "batch s s"]) -> Any:
+    try:
+        return np.tril(np.linalg.inv(np.linalg.cholesky(matrices)))
+    except np.linalg.LinAlgError:
+        return np.full_like(matrices, np.nan)
+
+
 def _transposed(matrices: Inexact[Array, "batch a b"]) -> Inexact[Array, "batch b a"]:
-    return jnp.swapaxes(matrices, -1, -2)
+    return namespace(matrices).swapaxes(matrices, -1, -2)
 
 
 def _inverse_square_root(pivot: Inexact[Array, "batch 1"]) -> Inexact[Array, "batch 1"]:
+    xp = namespace(pivot)
+    root = 1 / xp.sqrt(pivot) if xp is np else jax.lax.rsqrt(pivot)
     if not jnp.issubdtype(pivot.dtype, jnp.complexfloating):
-        return jax.lax.rsqrt(pivot)
+        return root
     # A positive definite real part keeps the real part of every pivot positive; others are refused.
-    return jnp.where(pivot.real > 0, jax.lax.rsqrt(pivot), jnp.nan)
+    return xp.where(pivot.real > 0, root, xp.nan)
 
 
 def _by_halves(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
@@ -58,28 +101,30 @@ def _by_halves(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s
     batch, size, _ = matrices.shape
     block = _BLOCK if batch > 4 else 2 * _BLOCK
     if size <= block:
-        return _unrolled(matrices) if batch > _LARGE_BATCH else _row_by_row(matrices)
+        at_once = batch > _LARGE_BATCH or isinstance(matrices, np.ndarray)
+        return _unrolled(matrices) if at_once else _row_by_row(matrices)
     half = block * -(-size // (2 * block))
     first = _by_halves(matrices[:, :half, :half])
     lower = matrices[:, half:, :half] @ _transposed(first)
     second = _by_halves(matrices[:, half:, half:] - lower @ _transposed(lower))
     corner = -(second @ (lower @ first))
-    top = jnp.concatenate([first, jnp.zeros((*first.shape[:-1], size - half), matrices.dtype)], axis=-1)
-    return jnp.concatenate([top, jnp.concatenate([corner, second], axis=-1)], axis=-2)
+    xp = namespace(matrices)
+    top = xp.concatenate([first, xp.zeros((*first.shape[:-1], size - half), matrices.dtype)], axis=-1)
+    return xp.concatenate([top, xp.concatenate([corner, second], axis=-1)], axis=-2)
 
 
 def _unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
     """[A | 1] becomes [L^T | W] row by row."""
-    size = matrices.shape[-1]
-    identity = jnp.broadcast_to(jnp.eye(size, dtype=matrices.dtype), matrices.shape)
-    augmented = jnp.concatenate([matrices, identity], axis=-1)
+    size, xp = matrices.shape[-1], namespace(matrices)
+    identity = xp.broadcast_to(xp.eye(size, dtype=matrices.dtype), matrices.shape)
+    augmented = xp.concatenate([matrices, identity], axis=-1)
     rows = []
     for k in range(size):
         row = augmented[:, k]
         for previous in rows:
             row = row - previous[:, k : k + 1] * previous
         rows.append(row * _inverse_square_root(row[:, k : k + 1]))
-    return jnp.stack(rows, axis=1)[..., size:]
+    return xp.stack(rows, axis=1)[..., size:]
 
 
 def _row_by_row(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:

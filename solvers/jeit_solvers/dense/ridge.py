@@ -9,7 +9,8 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
+import numpy as np
+import scipy.linalg
 from jaxtyping import Array, Float
 
 from jeit_solvers.dense.cholesky import inverse_cholesky
@@ -26,7 +27,8 @@ def ridge_model(
     precision: Float[Array, "M M"],
 ) -> QuadraticModel:
     """The cost ½ rᵀ C⁻¹ r + ½ ‖c‖² and its `step`, for `Descent`; `covariance` C of the data, and its inverse."""
-    jacobian = jax.lax.optimization_barrier(jacobian)
+    if not isinstance(jacobian, np.ndarray):
+        jacobian = jax.lax.optimization_barrier(jacobian)
     weighted = precision @ residual
     cost = 0.5 * (residual @ weighted + point @ point)
 
@@ -55,12 +57,18 @@ def ridge_step(
     rows, columns = jacobian.shape
     if columns <= rows:
         weighted = jacobian.T @ precision
-        return -solve_definite(weighted @ jacobian + ridge * jnp.eye(columns), weighted @ residual + point)
+        identity = np.eye(columns, dtype=jacobian.dtype)
+        return -solve_definite(weighted @ jacobian + ridge * identity, weighted @ residual + point)
     inner = solve_definite(jacobian @ jacobian.T + ridge * covariance, residual - jacobian @ point / ridge)
     return -point / ridge - inner @ jacobian
 
 
 def solve_definite(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Array, " n"]:
     """A⁻¹ b for a dense symmetric positive definite A; NaN for one that is not."""
+    if isinstance(matrix, np.ndarray):
+        try:
+            return scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix, check_finite=False), vector)
+        except np.linalg.LinAlgError:
+            return np.full_like(vector, np.nan)  # pyright: ignore[reportReturnType]
     inverse = inverse_cholesky(matrix[None])[0]
     return inverse.T @ (inverse @ vector)

@@ -10,8 +10,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
+
+from jeit_solvers.engines import namespace, replace_at
 
 _LEAST_SCALE = 2.0**-20
 _SUFFICIENT = 1e-4
@@ -59,45 +62,47 @@ class Descent(optx.AbstractLeastSquaresSolver):
         """The first point to try is the start. Raises `ValueError` if the options lack `expand`."""
         if "expand" not in options:
             raise ValueError("Descent needs options={'expand': function}; see its documentation.")
-        zero, number = jnp.zeros((), y.dtype), jnp.zeros((), int)
+        xp = namespace(y)
+        zero, number = xp.zeros((), y.dtype), xp.zeros((), int)
         return DescentState(
             trial=y,
-            direction=jnp.zeros_like(y),
+            direction=xp.zeros_like(y),
             scale=zero + 1,
             slope=zero,
             curvature=zero,
-            cost=zero + jnp.inf,
+            cost=zero + np.inf,
             damping=zero + self.damping,
             num_steps=number,
             num_accepted=number,
-            history=jnp.full(self.history, jnp.nan, y.dtype),
-            converged=jnp.zeros((), bool),
-            stuck=jnp.zeros((), bool),
+            history=xp.full(self.history, np.nan, y.dtype),
+            converged=xp.zeros((), bool),
+            stuck=xp.zeros((), bool),
         )
 
     def step(self, fn, y, args, options, state, tags):
         """Evaluate the trial point; go on from it if it is good enough, else try a shorter step."""
+        xp = namespace(y)
         cost, step = options["expand"](state.trial, args)
         predicted = -(state.scale * state.slope + 0.5 * state.scale**2 * state.curvature)
-        good = jnp.isfinite(cost) & (cost <= state.cost - _SUFFICIENT * predicted)
+        good = xp.isfinite(cost) & (cost <= state.cost - _SUFFICIENT * predicted)
 
         def accepted():
-            gain = jnp.where(jnp.isfinite(state.cost), (state.cost - cost) / predicted, 0.5)
-            damping = state.damping * jnp.select([gain > 0.75, gain < 0.25], [0.25, 4.0], 1.0)
+            gain = xp.where(xp.isfinite(state.cost), (state.cost - cost) / predicted, 0.5)
+            damping = state.damping * xp.select([gain > 0.75, gain < 0.25], [0.25, 4.0], 1.0)
             direction, slope, curvature = step(damping)
             return DescentState(
                 trial=state.trial + direction,
                 direction=direction,
-                scale=jnp.ones_like(state.scale),
+                scale=xp.ones_like(state.scale),
                 slope=slope,
                 curvature=curvature,
                 cost=cost,
                 damping=damping,
                 num_steps=state.num_steps + 1,
                 num_accepted=state.num_accepted + 1,
-                history=state.history.at[state.num_accepted].set(cost, mode="drop"),
-                converged=jnp.abs(slope + 0.5 * curvature) <= self.rtol * cost + self.atol,
-                stuck=jnp.zeros((), bool),
+                history=replace_at(state.history, state.num_accepted, cost),
+                converged=abs(slope + 0.5 * curvature) <= self.rtol * cost + self.atol,
+                stuck=xp.zeros((), bool),
             )
 
         def rejected():
@@ -108,10 +113,24 @@ class Descent(optx.AbstractLeastSquaresSolver):
                 (y + scale * state.direction, scale, 4 * state.damping, state.num_steps + 1, scale < _LEAST_SCALE),
             )
             # A start that cannot be evaluated has no line to go back on.
-            return eqx.tree_at(lambda s: s.stuck, shorter, shorter.stuck | ~jnp.isfinite(state.cost))
+            return eqx.tree_at(lambda s: s.stuck, shorter, shorter.stuck | ~xp.isfinite(state.cost))
 
+        if xp is np:
+            return (state.trial, accepted(), None) if good else (y, rejected(), None)
         new = jax.lax.cond(good, accepted, rejected)
         return jnp.where(good, state.trial, y), new, None
+
+    def at_once(
+        self, expand: Callable[..., Any], start: Float[np.ndarray, " n"], arguments: Any, max_steps: int
+    ) -> tuple[Any, DescentState]:
+        """The same steps in NumPy, as `optimistix.least_squares` takes them in a compiled program: where it ended."""
+        options, point = {"expand": expand}, start
+        nothing: Any = None  # what optimistix hands over besides, and these steps do not look at
+        state = self.init(nothing, point, arguments, options, nothing, nothing, nothing)
+        with np.errstate(all="ignore"):
+            while state.num_steps < max_steps and not (state.converged or state.stuck):
+                point, state, _ = self.step(nothing, point, arguments, options, state, nothing)
+        return point, state
 
     def terminate(self, fn, y, args, options, state, tags):
         """Converged, or stuck where no shorter step helps."""

@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact, Int
 
+from jeit_solvers.engines import namespace
 from jeit_solvers.sparse.index_store import IndexStore, PaddedSum
 
 
@@ -37,7 +37,7 @@ class AssemblyMap(NamedTuple):
     ) -> Inexact[Array, " nnz"]:
         """The matrix entries that the group's element matrices add up to; see `SparsityPattern.assemble`."""
         flat = self._packed(matrices, name).reshape(-1)
-        return jnp.concatenate([self.diagonal.apply(indices, flat), self.below.apply(indices, flat)])
+        return namespace(flat).concatenate([self.diagonal.apply(indices, flat), self.below.apply(indices, flat)])
 
     def _packed(self, matrices: Inexact[Array, "..."], name: str) -> Inexact[Array, "..."]:
         """One row of m values for each entry of the elements' lower triangles."""
@@ -54,4 +54,4 @@ class AssemblyMap(NamedTuple):
                 f"{name} must hold {count} symmetric matrices, shape {(count, nodes, nodes)}, or their packed lower "
                 f"triangles, shape {(first.size, count)}; got {matrices.shape}."
             )
-        return jnp.stack([matrices[:, i, j] for i, j in zip(first, second, strict=True)])
+        return namespace(matrices).stack([matrices[:, i, j] for i, j in zip(first, second, strict=True)])

@@ -9,9 +9,10 @@ import math
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact, Int
+
+from jeit_solvers.engines import add_at, as_array, gather, gather_or_zero, has_values, namespace
 
 
 class Slot(NamedTuple):
@@ -23,6 +24,8 @@ class Slot(NamedTuple):
     def read(self, indices: Int[Array, " total"]) -> Int[Array, "..."]:
         """The index array, out of the store it was packed in."""
         stop = self.start + math.prod(self.shape)
+        if has_values(indices):
+            return np.asarray(indices)[self.start : stop].reshape(self.shape)  # pyright: ignore[reportReturnType]
         return jax.lax.slice(indices, (self.start,), (stop,)).reshape(self.shape)
 
 
@@ -47,7 +50,7 @@ class IndexStore:
                 f"The plan needs {self._total} indices, more than 32-bit integers can count: the matrix fills in too "
                 "much for the direct solver. Use `ConjugateGradient`."
             )
-        return jnp.asarray(np.concatenate([np.empty(0, np.int32), *self._arrays]))
+        return as_array(np.concatenate([np.empty(0, np.int32), *self._arrays]))
 
 
 class PaddedSum(NamedTuple):
@@ -83,13 +86,13 @@ class PaddedSum(NamedTuple):
     ) -> Inexact[Array, "sums *k"]:
         """The sums of the given contributions."""
         width, num_sums = self.gather.shape
-        result = jnp.zeros((num_sums, *contributions.shape[1:]), contributions.dtype)
-        gather = self.gather.read(indices)
+        result = namespace(contributions).zeros((num_sums, *contributions.shape[1:]), contributions.dtype)
+        gathered = self.gather.read(indices)
         for layer in range(width):
-            result += contributions.at[gather[layer]].get(mode="fill", fill_value=0)
+            result = result + gather_or_zero(contributions, gathered[layer])
         if self.overflow_sum.shape[0]:
-            overflow = contributions[self.overflow_source.read(indices)]
-            result = result.at[self.overflow_sum.read(indices)].add(overflow)
+            overflow = gather(contributions, self.overflow_source.read(indices))
+            result = add_at(result, self.overflow_sum.read(indices), overflow)
         return result
 
 

@@ -1,15 +1,20 @@
-"""The numeric half of the direct solver, in pure JAX: factorise, solve, and products with the inverse."""
+"""The numeric half of the direct solver: factorise, solve, and products with the inverse.
+
+In NumPy at once where the matrix is NumPy's, else in compiled programs.
+"""
 
 from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Inexact, Int
 
 from jeit_solvers.batching import differentiable_batches, in_turn, one_by_one
 from jeit_solvers.dense.cholesky import inverse_cholesky
+from jeit_solvers.engines import gather_or_zero, namespace
 from jeit_solvers.sparse.index_store import IndexLayout
 from jeit_solvers.sparse.plan import FactorisationPlan, Stage
 
@@ -54,21 +59,21 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
             f"factorise: `values` must have shape {(plan.num_entries,)}, the entries of the plan's pattern; "
             f"got {values.shape}. Use jax.vmap for a batch of matrices."
         )
+    if isinstance(values, np.ndarray):
+        return _by_stages(plan.layout, plan.indices, values)
     numeric = in_turn(partial(_factorise, plan.layout))
     return numeric(plan.indices, values)
 
 
-# Compiled functions of their own, so that a second program with the same plan need not trace them again.
-@partial(jax.jit, static_argnums=0)
-def _factorise(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Factor:
+def _by_stages(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Factor:
     stages, _ = layout.content
-    dtype = values.dtype
-    extended = jnp.concatenate([values, jnp.ones(1, dtype)])
+    dtype, xp = values.dtype, namespace(values)
+    extended = xp.concatenate([values, xp.ones(1, dtype)])
     inverses, lowers, left = [], [], []
     for stage in stages:
         pivots, border = stage.pivots, stage.border
         panel = stage.entries.apply(indices, extended)
-        corner = jnp.zeros(stage.batch * border * border, dtype)
+        corner = xp.zeros(stage.batch * border * border, dtype)
         for link in stage.links:
             schur = left[link.source].reshape(-1)
             panel = panel + link.panel.apply(indices, schur)
@@ -82,20 +87,28 @@ def _factorise(layout: IndexLayout, indices: Int[Array, " total"], values: Inexa
     return Factor(tuple(inverses), tuple(lowers))
 
 
+# Compiled functions of their own, so that a second program with the same plan need not trace them again.
+_factorise = jax.jit(_by_stages, static_argnums=0)
+
+
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
     """x with A x = b, for one right-hand side (n,) or several (n, k) at once; raises `ValueError` for other shapes."""
     vectors = _columns(plan, right_hand_sides, "solve")
+    if isinstance(vectors, np.ndarray):
+        return _both_ways(plan.layout, plan.indices, factor, vectors).reshape(right_hand_sides.shape)
     numeric = differentiable_batches(partial(_solve, plan.layout), _batch_of_solves)
     return numeric(plan.indices, factor, vectors).reshape(right_hand_sides.shape)
 
 
-@partial(jax.jit, static_argnums=0)
-def _solve(
+def _both_ways(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> Inexact[Array, "n k"]:
     stages, solution = layout.content
-    reduced = _forward(layout, indices, factor, vectors)
+    reduced = _half_way(layout, indices, factor, vectors)
     return _backward(stages, indices, factor, reduced)[solution.read(indices)]
+
+
+_solve = jax.jit(_both_ways, static_argnums=0)
 
 
 def _batch_of_solves(batchable, plain, axis_size, batched, indices, factor, vectors):
@@ -114,8 +127,10 @@ def half_solve(
 
     Half the work of `solve`, if products with the inverse are all that is wanted. Raises `ValueError` for other shapes.
     """
-    reduced = _forward(plan.layout, plan.indices, factor, _columns(plan, right_hand_sides, "half_solve"))
-    return jnp.concatenate([rows.reshape(-1, rows.shape[-1]) for rows in reduced])
+    vectors = _columns(plan, right_hand_sides, "half_solve")
+    forward = _half_way if isinstance(vectors, np.ndarray) else _forward
+    reduced = forward(plan.layout, plan.indices, factor, vectors)
+    return namespace(vectors).concatenate([rows.reshape(-1, rows.shape[-1]) for rows in reduced])
 
 
 def quadratic_form(
@@ -127,7 +142,7 @@ def quadratic_form(
 
 
 def _transposed(matrices: Inexact[Array, "batch a b"]) -> Inexact[Array, "batch b a"]:
-    return jnp.swapaxes(matrices, -1, -2)
+    return namespace(matrices).swapaxes(matrices, -1, -2)
 
 
 def _columns(plan: FactorisationPlan, right_hand_sides: Inexact[Array, "n *k"], where: str) -> Inexact[Array, "n k"]:
@@ -139,8 +154,7 @@ def _columns(plan: FactorisationPlan, right_hand_sides: Inexact[Array, "n *k"], 
     return right_hand_sides.reshape(plan.size, -1)
 
 
-@partial(jax.jit, static_argnums=0)
-def _forward(
+def _half_way(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> list[Inexact[Array, "batch pivots k"]]:
     """L^-1 times the vectors, stage by stage. A front's pivot rows gather what its children have subtracted."""
@@ -148,8 +162,8 @@ def _forward(
     count = vectors.shape[1]
     reduced, updates = [], []
     for stage, inverse, lower in zip(stages, factor.inverses, factor.lowers, strict=True):
-        rows = vectors.at[stage.right_hand_side.read(indices)].get(mode="fill", fill_value=0)
-        passed_on = jnp.zeros((), vectors.dtype)
+        rows = gather_or_zero(vectors, stage.right_hand_side.read(indices))
+        passed_on = namespace(vectors).zeros((), vectors.dtype)
         for link in stage.links:
             received = link.rows.apply(indices, updates[link.source].reshape(-1, count))
             received = received.reshape(stage.batch, -1, count)
@@ -160,6 +174,9 @@ def _forward(
     return reduced
 
 
+_forward = jax.jit(_half_way, static_argnums=0)
+
+
 def _backward(
     stages: tuple[Stage, ...],
     indices: Int[Array, " total"],
@@ -168,16 +185,16 @@ def _backward(
 ) -> Inexact[Array, "rows k"]:
     """L^-T times the vectors, from the root down: the pivots of all stages. A front finds its border's solution in its
     parent."""
-    count = reduced[0].shape[-1]
+    count, xp = reduced[0].shape[-1], namespace(reduced)
     fronts: dict[int, Inexact[Array, "rows k"]] = {}
     solved = []
     for number in reversed(range(len(stages))):
         stage, local = stages[number], reduced[number]
-        above = jnp.zeros((stage.batch, 0, count), local.dtype)
+        above = xp.zeros((stage.batch, 0, count), local.dtype)
         if stage.border:
-            above = fronts[stage.parent].at[stage.above.read(indices)].get(mode="fill", fill_value=0)
+            above = gather_or_zero(fronts[stage.parent], stage.above.read(indices))
             local = local - _transposed(factor.lowers[number]) @ above
         pivots = _transposed(factor.inverses[number]) @ local
         solved.append(pivots.reshape(-1, count))
-        fronts[number] = jnp.concatenate([pivots, above], axis=1).reshape(-1, count)
-    return jnp.concatenate(solved[::-1])
+        fronts[number] = xp.concatenate([pivots, above], axis=1).reshape(-1, count)
+    return xp.concatenate(solved[::-1])

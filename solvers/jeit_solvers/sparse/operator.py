@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax
+import numpy as np
 from jaxtyping import Array, Inexact
 
 from jeit_solvers.sparse.pattern import SparsityPattern
@@ -21,7 +22,7 @@ class SparseSymmetric(lineax.AbstractLinearOperator):
     pattern: SparsityPattern
 
     def __init__(self, values: Inexact[Array, " nnz"], pattern: SparsityPattern):
-        values = jnp.asarray(values)
+        values = values if isinstance(values, np.ndarray) else jnp.asarray(values)
         if values.shape != (pattern.num_entries,):
             raise ValueError(
                 f"SparseSymmetric: `values` must have shape {(pattern.num_entries,)}, one for each entry of the "

@@ -179,7 +179,7 @@ class SparsityPattern(eqx.Module):
                 f"and {len(element_matrices)} arrays were given; use None for a group that adds nothing."
             )
         parts = [
-            group.apply(self.indices, jnp.asarray(matrices), f"assemble: argument {number}")
+            group.apply(self.indices, _numbers(matrices), f"assemble: argument {number}")
             for number, (group, matrices) in enumerate(zip(self._assembly, element_matrices, strict=True))
             if matrices is not None
         ]
@@ -213,6 +213,10 @@ class SparsityPattern(eqx.Module):
         coordinates = (np.concatenate([rows, columns[below]]), np.concatenate([columns, rows[below]]))
         data = np.concatenate([values, values[below]])
         return csr_array(coo_array((data, coordinates), shape=(self.size, self.size)))
+
+
+def _numbers(values: Any) -> Any:
+    return values if isinstance(values, np.ndarray) else jnp.asarray(values)
 
 
 def _checked_size(size: Any) -> int:
