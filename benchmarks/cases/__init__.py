@@ -15,7 +15,7 @@ NAMES = (
     "realtime",
     "hearing",
     "design",
-    "startup",
+    "first_call",
     "localisation_error",
     "ktc2023",
     "design_figures",
