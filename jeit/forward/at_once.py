@@ -21,7 +21,8 @@ class HostModel(NamedTuple):
 
 def _host_model(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol, system: System) -> HostModel:
     mesh, electrodes, protocol, system = on_host((mesh, electrodes, protocol, system))
-    return HostModel(mesh, IntegratedElectrodes(electrodes, mesh), protocol, system)
+    # Electrodes of a user's own may have worked their integrals out in JAX.
+    return HostModel(mesh, on_host(IntegratedElectrodes(electrodes, mesh)), protocol, system)
 
 
 # A model is asked for one thing after another, and its electrodes may change while its mesh stays.

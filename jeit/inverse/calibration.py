@@ -24,6 +24,8 @@ _REASONS = {
 
 # A relative misfit that measured tanks of known geometry do not reach: 1 % of KIT4's, 8 % of the Kuopio challenge's.
 _MUCH = 0.12
+# Logarithm of a contact impedance over the model's, beyond which it is all the same.
+_FARTHEST = 50.0
 # Relative change of misfit, or of the parameters, that ends a fit.
 _TOLERANCE = 1e-8
 
@@ -166,7 +168,8 @@ class _Problem:
         if self.contact == "fixed":
             return self.given, np.exp(parameters[0])
         electrodes = self.given.electrodes
-        impedance = np.asarray(electrodes.contact_impedance) * np.exp(parameters[1:] - parameters[0])
+        factor = np.exp(np.clip(parameters[1:] - parameters[0], -_FARTHEST, _FARTHEST))
+        impedance = np.asarray(electrodes.contact_impedance) * factor
         return self.given.with_electrodes(electrodes.with_contact_impedance(impedance)), np.exp(parameters[0])
 
     def voltages(self, parameters):

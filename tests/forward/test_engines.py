@@ -95,3 +95,17 @@ def test_derivatives_go_through_the_compiled_engine(parts):
     _, jacobian = model.voltages_and_jacobian(conductivity)
     reverse = jax.jacrev(model.voltages)(conductivity)
     np.testing.assert_allclose(jacobian, reverse, rtol=0, atol=1e-11 * np.abs(reverse).max())
+
+
+class InJaxAlone(BoundaryElectrodes):
+    """Electrodes of a user who knows nothing of engines."""
+
+    def contact(self, mesh):
+        return super().contact(jax.tree.map(jnp.asarray, mesh))
+
+
+def test_electrodes_written_in_jax_alone_serve(parts):
+    mesh, electrodes, protocol = parts
+    own = InJaxAlone(electrodes.position, electrodes.width, electrodes.contact_impedance)
+    expected = ForwardModel(*parts).voltages(1.5)
+    np.testing.assert_allclose(ForwardModel(mesh, own, protocol).voltages(1.5), expected, rtol=1e-12)

@@ -12,7 +12,7 @@ from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.mesh import Mesh
-from jeit_solvers.engines import as_array, either_engine, has_values
+from jeit_solvers.engines import as_array, either_engine, has_values, host
 
 
 class LinearReconstruction(eqx.Module):
@@ -77,8 +77,10 @@ class LinearReconstruction(eqx.Module):
                 f"difference has shape {shape}; this reconstruction takes ({self.num_measurements},) volts, or "
                 f"(frames, {self.num_measurements})."
             )
-        if has_values(difference) and not np.isfinite(difference).all():
-            raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
+        if has_values(difference):
+            difference = host.asarray(difference)
+            if not np.isfinite(difference).all():
+                raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
         # Bare arrays: flattening a Module costs as much as the product itself.
         return _apply(self.first, self.second, self.ratio, self.weights, difference)
 
