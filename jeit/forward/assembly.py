@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Inexact
 
 from jeit.mesh import Mesh, gradients, measures
-from jeit_solvers.engines import gather, has_values, namespace, on_host
+from jeit_solvers.engines import gather, has_values, namespace
 
 
 def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
@@ -30,11 +30,9 @@ def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
     metre (in a 2-D sheet, siemens). A complex admittivity needs a positive real part. Values of tracers are not looked
     at.
     """
-    conductivity = on_host(conductivity) if has_values(conductivity) else jnp.asarray(conductivity)
+    conductivity = np.asarray(conductivity) if has_values(conductivity) else jnp.asarray(conductivity)
     # One type and shape for all that mean the same, or JAX compiles again: Python's numbers are "weakly" typed.
-    kind = jnp.result_type(conductivity)
-    kind = kind if jnp.issubdtype(kind, jnp.inexact) else jnp.result_type(float)
-    conductivity = namespace(conductivity).asarray(conductivity, dtype=kind)
+    conductivity = namespace(conductivity).asarray(conductivity, dtype=_floating(conductivity.dtype))
     m, n, d = mesh.num_cells, mesh.num_points, mesh.dimension
     if conductivity.shape not in [(), (m,), (n,), (m, d, d)]:
         raise ValueError(
@@ -44,6 +42,15 @@ def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
     if has_values(conductivity):
         _check_values(conductivity)
     return namespace(conductivity).broadcast_to(conductivity, conductivity.shape or (m,))
+
+
+def _floating(kind: Any) -> Any:
+    """The type of floating-point numbers for values of some type. Raises `ValueError` for what are no numbers."""
+    if kind.kind in "OSUmM":
+        raise ValueError(f"conductivity is {kind}; give real or complex numbers, S/m (2-D: S).")
+    if kind.kind in "biu" or kind.itemsize > 16 or (kind.kind == "f" and kind.itemsize > 8):
+        return jnp.result_type(complex if kind.kind == "c" else float)
+    return jnp.result_type(kind.newbyteorder("="))
 
 
 def _check_values(conductivity: Any) -> None:

@@ -59,7 +59,8 @@ class ForwardModel(eqx.Module):
         self.mesh = mesh
         self.electrodes = electrodes
         self.protocol = protocol
-        self.system = System.create(mesh, electrodes, solver)
+        with jax.ensure_compile_time_eval():  # a model may be made inside jit, of a mesh that is known
+            self.system = System.create(mesh, electrodes, solver)
         # What is too large for a direct solver is too large for SciPy's too; and a solver that was asked for is used.
         self.at_once = isinstance(solver, str) and solver == "auto" and isinstance(self.system.solver, SparseCholesky)
 

@@ -4,7 +4,6 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 from jaxtyping import Array, Bool, Float
@@ -13,6 +12,7 @@ from jeit.arguments import check_name
 from jeit.forward import ForwardModel
 from jeit.forward.contact_sensitivity import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
+from jeit.inverse.nonlinear.checks import check_steps
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array, on_host
 
@@ -26,6 +26,8 @@ _REASONS = {
 _MUCH = 0.12
 # Logarithm of a contact impedance over the model's, beyond which it is all the same.
 _FARTHEST = 50.0
+# Volts that no frame has; nor one over them.
+_SMALLEST = 1e-30
 # Relative change of misfit, or of the parameters, that ends a fit.
 _TOLERANCE = 1e-8
 
@@ -82,9 +84,12 @@ def calibrate(
     are proportional to 1/σ at fixed z·σ). Raises `ValueError` for a frame of another shape or without signal.
     """
     check_model(model)
-    if jnp.iscomplexobj(voltages):
+    measured = np.asarray(voltages)
+    if measured.dtype.kind == "c":
         raise ValueError("voltages are complex; calibrate on their real part or magnitude.")
-    measured = np.asarray(voltages, float)
+    if measured.dtype.kind not in "biuf":
+        raise ValueError(f"voltages are {measured.dtype}; give real numbers, in volts.")
+    measured = measured.astype(float)
     shape = (model.protocol.num_measurements,)
     used = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)
     if measured.shape != shape or used.shape != shape:
@@ -92,11 +97,15 @@ def calibrate(
             f"voltages has shape {measured.shape} and mask {used.shape}; protocol '{model.protocol.name}' has {shape}."
         )
     check_name("contact", contact, ("common", "each", "fixed"))
+    max_steps = check_steps("max_steps", max_steps)
     measured = np.where(used, measured, 0)
-    size = np.linalg.norm(measured)
-    if not np.isfinite(size) or size == 0:
+    largest = np.abs(measured).max()
+    if not np.isfinite(largest) or largest == 0:
         raise ValueError("voltages: the reference frame has no finite, non-zero values to calibrate on.")
-    return _fit(model, measured, used, contact, max_steps)
+    if not _SMALLEST < largest < 1 / _SMALLEST:
+        raise ValueError(f"voltages: the largest of the reference frame is {largest:.3g} V; are they in volts?")
+    with np.errstate(all="ignore"):
+        return _fit(model, measured, used, contact, max_steps)
 
 
 def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> Calibration:
@@ -142,8 +151,7 @@ def _deviations(solution: scipy.optimize.OptimizeResult) -> Float[np.ndarray, " 
     """Standard deviations of fitted parameters, taking what is left of the data for independent errors."""
     _, size, rows = np.linalg.svd(solution.jac, full_matrices=False)
     freedom = max(np.count_nonzero(solution.fun) - len(solution.x), 1)
-    with np.errstate(divide="ignore"):
-        return np.linalg.norm(rows / size[:, None], axis=0) * np.sqrt(2 * solution.cost / freedom)
+    return np.linalg.norm(rows / size[:, None], axis=0) * np.sqrt(2 * solution.cost / freedom)
 
 
 class _Problem:

@@ -49,6 +49,8 @@ class Linearisation(eqx.Module):
             )
         if jnp.iscomplexobj(conductivity):
             raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
+        if np.shape(conductivity) not in ((), (model.mesh.num_cells,)):
+            raise ValueError("conductivity: give one number, or one value per cell: the image has a value per cell.")
         channels, root_weight = used_channels(model, noise, mask)
         whitened = root_weight[:, None] * host.asarray(model.jacobian(conductivity))[channels]
         product = prior.covariance_product(model.mesh, whitened)

@@ -44,9 +44,12 @@ def on_device(tree: Any) -> Any:
 
 
 def as_array(values: Any, dtype: Any = None) -> Array:
-    """JAX's array of values that are at hand or traced. `jax.numpy.asarray` compiles a program for every shape."""
+    """JAX's array of values that are at hand or traced, a copy: who gave them may write into theirs.
+
+    `jax.numpy.asarray` may share the memory, and compiles a program for every shape.
+    """
     if has_values(values):
-        return jax.device_put(np.asarray(values, dtype and jax.dtypes.canonicalize_dtype(dtype)))
+        return jax.device_put(np.array(values, dtype and jax.dtypes.canonicalize_dtype(dtype)))
     return jnp.asarray(values, dtype)
 
 
@@ -75,22 +78,17 @@ class Recent:
 
     def __init__(self, make: Callable[..., Any], size: int = 4):
         self._make, self._size = make, size
-        self._kept: list[tuple[list[Any], Any]] = []
+        self._kept: list[tuple[list[Any], Any, Any]] = []
 
     def __call__(self, *trees: Any) -> Any:
         """What `make` returns of these, or has returned."""
-        leaves = jax.tree.leaves(trees)
-        for known, result in reversed(self._kept):
-            if len(known) == len(leaves) and all(one is other for one, other in zip(known, leaves, strict=True)):
+        leaves, structure = jax.tree.flatten(trees)
+        for known, kind, result in reversed(self._kept):
+            if kind == structure and all(one is other for one, other in zip(known, leaves, strict=True)):
                 return result
         result = self._make(*trees)
-        self._kept = [*self._kept[1 - self._size :], (leaves, result)]
+        self._kept = [*self._kept[1 - self._size :], (leaves, structure, result)]
         return result
-
-    @property
-    def results(self) -> list[Any]:
-        """Those kept, the latest first."""
-        return [result for _, result in reversed(self._kept)]
 
 
 def undifferentiated(values: Any) -> Any:

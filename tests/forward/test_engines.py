@@ -109,3 +109,41 @@ def test_electrodes_written_in_jax_alone_serve(parts):
     own = InJaxAlone(electrodes.position, electrodes.width, electrodes.contact_impedance)
     expected = ForwardModel(*parts).voltages(1.5)
     np.testing.assert_allclose(ForwardModel(mesh, own, protocol).voltages(1.5), expected, rtol=1e-12)
+
+
+def test_arrays_of_users_are_copied(parts):
+    """An acquisition loop may write into its buffer again; on a CPU JAX would share memory that is aligned to its taste."""
+    mesh, electrodes, protocol = parts
+    raw = np.empty(128, np.uint8)
+    start = -raw.ctypes.data % 64
+    impedance = raw[start : start + 64].view(float)
+    impedance[:] = 0.1
+    model = ForwardModel(mesh, electrodes.with_contact_impedance(impedance), protocol)
+    before = np.array(model.transfer_impedance(1.0))
+    impedance[:] = 5.0
+    np.testing.assert_array_equal(model.electrodes.contact_impedance, 0.1)
+    np.testing.assert_array_equal(model.transfer_impedance(1.0), before)
+
+
+@pytest.mark.parametrize("kind", [">f8", np.longdouble, int])
+def test_numbers_of_any_kind_are_conductivities(parts, kind):
+    model = ForwardModel(*parts)
+    values = np.arange(1, model.mesh.num_cells + 1).astype(kind)
+    expected = model.voltages(values.astype(float))
+    np.testing.assert_array_equal(model.voltages(values), expected)
+    np.testing.assert_array_equal(model.voltages([float(one) for one in values]), expected)
+    with pytest.raises(ValueError, match="real or complex numbers"):
+        model.voltages(values.astype(object))
+
+
+def test_a_model_may_be_made_inside_jit_of_a_known_mesh(parts):
+    mesh, electrodes, protocol = parts
+
+    @jax.jit
+    def impedance(position):
+        return ForwardModel(mesh, BoundaryElectrodes(position, 0.02, 1e-3), protocol).transfer_impedance(1.0)
+
+    expected = ForwardModel(*parts).transfer_impedance(1.0)
+    np.testing.assert_allclose(
+        impedance(electrodes.position), expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max()
+    )

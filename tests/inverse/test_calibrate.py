@@ -6,6 +6,7 @@ import pytest
 
 from jeit.electrodes import BoundaryElectrodes, PointElectrodes
 from jeit.forward import ForwardModel
+from jeit.forward.contact_sensitivity import ContactSensitivity
 from jeit.inverse import calibrate
 from jeit.layout import ring
 from jeit.mesh import disk
@@ -54,3 +55,47 @@ def test_noise_ends_up_in_the_misfit(model):
     spoilt = calibrate(model, voltages + 12 * noise)
     assert "misses 2" in spoilt.note
     assert "width of the electrodes" in spoilt.note
+
+
+def test_every_impedance_is_recovered_and_told_apart(model):
+    """Contact sensitivities are the derivatives they say: with wrong ones the fit would not arrive here."""
+    impedance = np.geomspace(5e-4, 2e-2, 8)
+    truth = model.with_electrodes(model.electrodes.with_contact_impedance(impedance))
+    result = calibrate(truth, truth.voltages(0.3), contact="each")
+    start = calibrate(model, truth.voltages(0.3), contact="each")
+    for one in (result, start):
+        assert one.status == "converged"
+        np.testing.assert_allclose(one.model.electrodes.contact_impedance, impedance, rtol=1e-3)
+        assert one.tells_contacts_apart
+
+
+def test_contact_sensitivity_against_differences(model):
+    fields, impedance = map(np.asarray, model.fields(0.4))
+    sensitivity = ContactSensitivity(model.mesh, model.electrodes)
+    z = np.asarray(model.electrodes.contact_impedance)
+    found = sensitivity(fields, impedance, z)
+    for electrode in (0, 5):
+        step = 1e-4 * (np.arange(8) == electrode)
+        ends = [
+            np.asarray(model.with_electrodes(model.electrodes.with_contact_impedance(z * np.exp(s))).fields(0.4)[1])
+            for s in (step, -step)
+        ]
+        expected = (ends[0] - ends[1]) / 2e-4
+        np.testing.assert_allclose(found[electrode], expected, rtol=0, atol=1e-7 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda v: {"voltages": v, "max_steps": 2.5}, "max_steps must be a whole number"),
+        (lambda v: {"voltages": v, "max_steps": 0}, "max_steps must be a whole number"),
+        (lambda v: {"voltages": 1e150 * v}, "are they in volts"),
+        (lambda v: {"voltages": 1e-150 * v}, "are they in volts"),
+        (lambda v: {"voltages": v.astype(str)}, "give real numbers"),
+        (lambda v: {"voltages": v + 1j}, "complex"),
+    ],
+    ids=["half a step", "no step", "huge", "tiny", "text", "complex"],
+)
+def test_bad_arguments(model, change, message):
+    with pytest.raises(ValueError, match=message):
+        calibrate(model, **change(np.array(model.voltages(1.0))))

@@ -322,3 +322,12 @@ def test_the_laplace_basis_inverts_its_precision(model):
     eigenvalues = np.linalg.eigvalsh(whitened)
     assert abs(eigenvalues[0]) < 1e-6
     np.testing.assert_allclose(eigenvalues[1:], 1, atol=1e-3)
+
+
+def test_conductivity_as_it_is_does_not_go_below_zero(model):
+    """A factorisation may go well there; steps that lead below are shortened all the same."""
+    inclusion = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.02, 0.01], axis=1) < 0.02
+    voltages = model.voltages(np.where(inclusion, 1e-4, 2.0))
+    options = {"hyperparameter": 0.01, "parametrisation": Parametrisation(link=Linear())}
+    result = reconstruct(model, voltages, 2.0, solver=GaussNewton(max_steps=8), **options)
+    assert result.conductivity.min() > 0

@@ -109,6 +109,7 @@ def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.nd
     )
 
 
+@np.errstate(all="ignore")  # numbers that overflow are told of below
 def one_step(
     model: ForwardModel,
     conductivity,
@@ -133,6 +134,11 @@ def one_step(
     linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
     data = None if difference is None else linear.whiten(difference)
     choice = choose(linear.spectrum, hyperparameter, data, model.mesh)
+    if has_values(choice) and not (np.isfinite(choice.hyperparameter) and choice.hyperparameter > 0):
+        raise ValueError(
+            f"hyperparameter: the rule '{choice.rule}' finds none, for numbers overflow; are noise and conductivity in "
+            "volts and S/m (2-D: S)?"
+        )
     matrix = linear.matrix(choice.hyperparameter)
     method = f"one-step, {type(linear.prior).__name__} prior"
     return LinearReconstruction.create(model, matrix, choice.hyperparameter, choice.rule, method, choice)

@@ -1,6 +1,5 @@
 """What is asked of the arguments of reconstructions, before anything is compiled: errors that say what to give."""
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -13,10 +12,13 @@ from jeit_solvers.engines import host
 def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
     """Voltages as an array with zeros for what is left out, and which channels are used; raises `ValueError`."""
     check_model(model)
-    if jnp.iscomplexobj(voltages):
+    voltages = host.array(voltages)
+    if voltages.dtype.kind == "c":
         raise ValueError("voltages are complex; reconstruct from their real part or magnitude.")
+    if voltages.dtype.kind not in "biuf":
+        raise ValueError(f"voltages are {voltages.dtype}; give real numbers, in volts.")
     shape = (model.protocol.num_measurements,)
-    measured = host.asarray(voltages, float)
+    measured = voltages.astype(float)
     used = np.ones(shape, bool) if mask is None else np.asarray(mask)
     if measured.shape != shape or used.shape != shape or used.dtype != bool:
         raise ValueError(
@@ -37,12 +39,13 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
 
 def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
     """The background per cell; raises `ValueError` for what is not one real number or one for each cell."""
-    if jnp.iscomplexobj(background) or jnp.shape(background) not in ((), (model.mesh.num_cells,)):
+    background = host.array(background)
+    if background.dtype.kind not in "biuf" or background.shape not in ((), (model.mesh.num_cells,)):
         raise ValueError(
             f"background must be one real conductivity, or one for each of the {model.mesh.num_cells} cells; it is "
-            f"{jnp.asarray(background).dtype} of shape {jnp.shape(background)}."
+            f"{background.dtype} of shape {background.shape}."
         )
-    return host.broadcast_to(np.asarray(background, float), (model.mesh.num_cells,))
+    return host.broadcast_to(background.astype(float), (model.mesh.num_cells,))
 
 
 def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[Array, " M"]:

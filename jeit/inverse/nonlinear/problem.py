@@ -71,13 +71,16 @@ class Inversion(eqx.Module):
         """`residual`, and its Jacobian with respect to the coefficients."""
         shapes, values = self._parts(coefficients)
         model, estimate = self._situation(shapes, values)
-        voltages, jacobian = evaluate(model, voltages_and_jacobian_of, self.link.conductivity(estimate))
+        conductivity = self.link.conductivity(estimate)
+        voltages, jacobian = evaluate(model, voltages_and_jacobian_of, conductivity)
         columns = [self.basis.restrict(jacobian * self.link.slope(estimate))]
         if self.unknowns:
             along = jax.jacfwd(lambda values: self._predict(shapes, values))(values)
             columns += [block * unknown.deviation for block, unknown in zip(along, self.unknowns, strict=True)]
         weight, xp = self.data.weight, namespace(voltages, jacobian)
-        return weight * (voltages - self.data.voltages), weight[:, None] * xp.concatenate(columns, axis=1)
+        # A factorisation may go well though some conductivities are below zero; no descent is to end there.
+        residual = xp.where((conductivity > 0).all(), weight * (voltages - self.data.voltages), xp.nan)
+        return residual, weight[:, None] * xp.concatenate(columns, axis=1)
 
     def cost(self, coefficients: Float[Array, " n"]) -> Float[Array, ""]:
         """½ rᵀ G r + penalty."""

@@ -67,7 +67,9 @@ def solve_definite(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> F
     """A⁻¹ b for a dense symmetric positive definite A; NaN for one that is not."""
     if isinstance(matrix, np.ndarray):
         try:
-            return scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix, check_finite=False), vector)
+            return scipy.linalg.cho_solve(
+                scipy.linalg.cho_factor(matrix, check_finite=False), vector, check_finite=False
+            )
         except np.linalg.LinAlgError:
             return np.full_like(vector, np.nan)  # pyright: ignore[reportReturnType]
     inverse = inverse_cholesky(matrix[None])[0]
