@@ -112,7 +112,7 @@ def test_electrodes_written_in_jax_alone_serve(parts):
 
 
 def test_arrays_of_users_are_copied(parts):
-    """An acquisition loop may write into its buffer again; on a CPU JAX would share memory that is aligned to its taste."""
+    """An acquisition loop may write into its buffer again, and JAX would share aligned memory."""
     mesh, electrodes, protocol = parts
     raw = np.empty(128, np.uint8)
     start = -raw.ctypes.data % 64
