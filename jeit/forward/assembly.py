@@ -4,6 +4,7 @@ import functools
 import operator
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
@@ -50,7 +51,7 @@ def _floating(kind: Any) -> Any:
         raise ValueError(f"conductivity is {kind}; give real or complex numbers, S/m (2-D: S).")
     if kind.kind in "biu" or kind.itemsize > 16 or (kind.kind == "f" and kind.itemsize > 8):
         return jnp.result_type(complex if kind.kind == "c" else float)
-    return jnp.result_type(kind.newbyteorder("="))
+    return jax.dtypes.canonicalize_dtype(kind.newbyteorder("="))
 
 
 def _check_values(conductivity: Any) -> None:
