@@ -61,7 +61,7 @@ class ForwardModel(eqx.Module):
         self.protocol = protocol
         with jax.ensure_compile_time_eval():  # a model may be made inside jit, of a mesh that is known
             self.system = System.create(mesh, electrodes, solver)
-        # What is too large for a direct solver is too large for SciPy's too; and a solver that was asked for is used.
+        # Conjugate gradients for a system too large to factorise are compiled; and a solver that was asked for is used.
         self.at_once = isinstance(solver, str) and solver == "auto" and isinstance(self.system.solver, SparseCholesky)
 
     def with_electrodes(self, electrodes: AbstractElectrodes) -> "ForwardModel":
@@ -134,7 +134,7 @@ def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) ->
     `conductivity` as an array, S/m (2-D: S). It is not looked at: one that is not positive or not finite gives NaN.
     """
     parts = model.mesh, model.electrodes, model.protocol
-    if not (model.at_once and has_values(parts, conductivity)):
+    if not (model.at_once and has_values(model, conductivity)):
         return _COMPILED[quantity](model, conductivity)
     with np.errstate(all="ignore"):
         found = quantity(host_model(*parts, model.system), on_host(conductivity))

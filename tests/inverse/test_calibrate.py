@@ -99,3 +99,13 @@ def test_contact_sensitivity_against_differences(model):
 def test_bad_arguments(model, change, message):
     with pytest.raises(ValueError, match=message):
         calibrate(model, **change(np.array(model.voltages(1.0))))
+
+
+def test_impedances_that_no_channel_tells_are_not_told_apart(model):
+    """Without driven electrodes in the channels, noise alone decides on contact impedances."""
+    protocol = skip(8, 1, current=1e-3)
+    blind = ForwardModel(MESH, model.electrodes, protocol.subset(~protocol.channels_on_driven_electrodes()))
+    voltages = np.array(blind.voltages(0.3))
+    voltages *= 1 + 0.02 * np.random.default_rng(1).normal(size=voltages.size)
+    assert not calibrate(blind, voltages, contact="each").tells_contacts_apart
+    assert calibrate(blind, voltages, contact="fixed").tells_contacts_apart

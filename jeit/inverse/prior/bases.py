@@ -123,7 +123,7 @@ class Regions(eqx.Module):
         empty = np.setdiff1d(np.arange(number), label)
         if empty.size:
             raise ValueError(f"regions: no cell has the label {empty[0]}; use all from 0 to {number - 1}.")
-        return cls(host.asarray(label), host.asarray(measures(mesh)), number)
+        return cls(host.array(label), host.asarray(measures(mesh)), number)  # a copy: labels are the user's
 
     def total(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
         """Sums of cells' values over every region."""
