@@ -19,7 +19,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jeit.design.defaults import TEMPERATURE
@@ -29,6 +28,7 @@ from jeit.design.skin.touch_grid import check_places
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity
 from jeit_solvers.dense.cholesky import inverse_cholesky
+from jeit_solvers.engines import has_values
 
 # The largest eigenvalue to ln(r) / 2^k, relative, however close the next.
 _SQUARINGS = 10
@@ -147,9 +147,9 @@ def _check(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise,
         )
     if noise.shape not in ((), (channels,)):
         raise ValueError(f"noise has shape {noise.shape}; give one number, or one for each of {channels} channels.")
-    if not isinstance(noise, Tracer) and not (np.isfinite(noise) & (np.asarray(noise) > 0)).all():
+    if has_values(noise) and not (np.isfinite(noise) & (np.asarray(noise) > 0)).all():
         raise ValueError("noise must be positive and finite: the standard deviation of each channel, in volts.")
-    if not isinstance(temperature, Tracer) and not 0 < temperature < np.inf:
+    if has_values(temperature) and not 0 < temperature < np.inf:
         raise ValueError(f"temperature must be positive; it is {temperature!r}.")
 
 

@@ -3,7 +3,6 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jeit.design.defaults import CONTRAST
@@ -13,6 +12,7 @@ from jeit.design.skin.touched_cells import touched_cells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
+from jeit_solvers.engines import has_values
 
 
 def uniformity(sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
@@ -54,7 +54,7 @@ class SensitivityMap(eqx.Module):
 
         Raises `ValueError` for a level that is negative or not a number.
         """
-        if not isinstance(level, Tracer) and not np.all(np.asarray(level) >= 0):
+        if has_values(level) and not np.all(np.asarray(level) >= 0):
             raise ValueError(f"level must be a sensitivity in volts, not negative; it is {level!r}.")
         return jnp.mean(self.values < level, axis=-1)
 

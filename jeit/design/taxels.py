@@ -5,13 +5,13 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_key
 from jeit.design.defaults import NUM_TAXELS, THRESHOLD
 from jeit_solvers import KMeans, kmeans
+from jeit_solvers.engines import has_values
 
 
 class Taxels(eqx.Module):
@@ -154,13 +154,13 @@ def _check(changes, places, cell_area, num_taxels, threshold) -> None:
         raise ValueError(f"num_taxels must be a whole number from 1 to the {shape[0]} places; it is {num_taxels!r}.")
     if not 0 < threshold < 1:
         raise ValueError(f"threshold is a cosine, more than 0 and less than 1; it is {threshold!r}.")
-    if not isinstance(changes, Tracer):
+    if has_values(changes):
         silent = ~np.isfinite(changes).all(axis=1)
         if silent.any():
             raise ValueError(f"changes: those of {silent.sum()} of {shape[0]} places are NaN or infinite.")
         if not np.any(changes):
             raise ValueError("changes are all zero: none of the touches changes any voltage.")
-    if not isinstance(places, Tracer) and not isinstance(cell_area, Tracer):
+    if has_values(places, cell_area):
         _check_lengths(np.asarray(places, float), np.broadcast_to(np.asarray(cell_area, float), shape[:1]))
 
 

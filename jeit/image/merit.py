@@ -8,8 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
+
+from jeit_solvers.engines import has_values
 
 # The target is what is brighter than this share of the brightest pixel.
 _LEVEL = 0.25
@@ -128,7 +129,7 @@ def _check(raster, extent, position, area, change) -> None:
         if values.shape not in ((), targets):
             raise ValueError(f"{name} has shape {values.shape}; give one number, or one for each of the images.")
     x_min, x_max, y_min, y_max = extent
-    if isinstance(raster, Tracer) or any(isinstance(value, Tracer) for value in (position, area, change, *extent)):
+    if not has_values(raster, position, area, change, extent):
         return
     if not (x_max > x_min and y_max > y_min):
         raise ValueError(f"extent {tuple(extent)} must be (x_min, x_max, y_min, y_max) in metres; see Raster.extent.")

@@ -5,7 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-import scipy.optimize
+import scipy
 from jaxtyping import Array, Bool, Float
 
 from jeit.arguments import check_name
@@ -147,7 +147,7 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     return Calibration(fitted, as_array(conductivity), voltages, misfit, deviation, int(solution.njev), status, reason)
 
 
-def _deviations(solution: scipy.optimize.OptimizeResult) -> Float[np.ndarray, " p"]:
+def _deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, " p"]:
     """Standard deviations of fitted parameters, taking what is left of the data for independent errors."""
     _, size, rows = np.linalg.svd(solution.jac, full_matrices=False)
     freedom = max(np.count_nonzero(solution.fun) - len(solution.x), 1)

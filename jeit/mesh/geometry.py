@@ -6,12 +6,11 @@ import functools
 import operator
 
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jeit.mesh._topology import cell_facets, pair_facets
 from jeit.mesh.mesh import Mesh
-from jeit_solvers.engines import either_engine, namespace
+from jeit_solvers.engines import either_engine, has_values, namespace
 
 
 @either_engine
@@ -90,7 +89,7 @@ def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
     Raises `ValueError` for a mesh that is being traced.
     """
-    if isinstance(mesh.cells, Tracer):
+    if not has_values(mesh.cells):
         raise ValueError("interior_facets needs a mesh with values; call it outside jit and vmap.")
     cells = np.asarray(mesh.cells)
     first, second, _ = pair_facets(cells)

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 
 import equinox as eqx
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.mesh import _checks, _topology
-from jeit_solvers.engines import as_array
+from jeit_solvers.engines import as_array, has_values
 
 
 class Mesh(eqx.Module):
@@ -69,12 +68,12 @@ class Mesh(eqx.Module):
         facets shared by three cells, or several separate parts; warns if the extent exceeds 10 m, which
         almost always means millimetres.
         """
-        if isinstance(cells, Tracer):
+        if not has_values(cells):
             raise ValueError(
                 "cells: the boundary cannot be found from traced node indices. Create the mesh outside the "
                 "transformed function and pass it in, or replace its points with equinox.tree_at."
             )
-        coordinates = None if isinstance(points, Tracer) else _checks.check_points(points)
+        coordinates = _checks.check_points(points) if has_values(points) else None
         num_points, dimension = np.shape(points if coordinates is None else coordinates)
         indices = _checks.check_cells(cells, num_points, dimension)
         if coordinates is not None:

@@ -1,14 +1,9 @@
 """Checks of patterns, with errors that say what to do."""
 
-import jax.core
 import numpy as np
 
 from jeit.arguments import did_you_mean
-
-
-def is_traced(*values) -> bool:
-    """True inside jit, vmap or grad, where values cannot be looked at."""
-    return any(isinstance(value, jax.core.Tracer) for value in values)
+from jeit_solvers.engines import has_values
 
 
 def check_patterns(patterns, what: str) -> None:
@@ -18,7 +13,7 @@ def check_patterns(patterns, what: str) -> None:
             f"Protocol: {what} patterns have shape {tuple(patterns.shape)}. Give a matrix with one row per "
             "pattern and one column per electrode, at least 1 x 2."
         )
-    if is_traced(patterns):
+    if not has_values(patterns):
         return
     values = np.asarray(patterns)
     bad = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
@@ -54,7 +49,7 @@ def check_indices(index, size: int, name: str, of: str) -> None:
         raise ValueError(
             f"Protocol: {name} has shape {tuple(index.shape)}; give one integer per channel, at least one."
         )
-    if is_traced(index):
+    if not has_values(index):
         return
     values = np.asarray(index)
     if values.min() < 0 or values.max() >= size:
@@ -66,7 +61,7 @@ def check_indices(index, size: int, name: str, of: str) -> None:
 
 def check_current(current, where: str) -> None:
     """One amplitude in amperes, positive, and not milliamperes by mistake."""
-    if is_traced(current):
+    if not has_values(current):
         return
     value = np.asarray(current)
     if value.ndim != 0 or value.dtype.kind not in "fiu" or not np.isfinite(value) or value <= 0:

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from jeit.protocol._check import check_amplitude, is_traced
+from jeit.protocol._check import check_amplitude
 from jeit.protocol.protocol import Protocol
+from jeit_solvers.engines import has_values
 
 
 def from_matrices(drive, measurement, select=None, *, name: str = "custom", large_currents: bool = False) -> Protocol:
@@ -67,7 +68,7 @@ def from_channels(
 
 
 def _as_matrix(values, what: str):
-    if is_traced(values):
+    if not has_values(values):
         return values
     if hasattr(values, "toarray"):  # a scipy.sparse matrix, as loadmat returns EIDORS patterns
         values = values.toarray()
@@ -81,5 +82,5 @@ def _as_matrix(values, what: str):
 
 
 def _check_currents(drive, where: str) -> None:
-    if not is_traced(drive) and drive.size and np.all(np.isfinite(drive)):
+    if has_values(drive) and drive.size and np.all(np.isfinite(drive)):
         check_amplitude(float(np.max(np.abs(drive))), where)

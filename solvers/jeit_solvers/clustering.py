@@ -12,10 +12,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit_solvers.batching import in_turn
+from jeit_solvers.engines import has_values
 
 
 class KMeans(eqx.Module):
@@ -69,11 +69,11 @@ def kmeans(
     _check_count("max_steps", max_steps)
     if num_clusters > number:
         raise ValueError(f"num_clusters is {num_clusters}, but there are only {number} points to part.")
-    if not isinstance(tolerance, Tracer) and not 0 <= tolerance < 1:
+    if has_values(tolerance) and not 0 <= tolerance < 1:
         raise ValueError(f"tolerance must be a share of the inertia, from 0 and less than 1; it is {tolerance!r}.")
     if not isinstance(key, (jax.Array, np.ndarray)):
         raise ValueError(f"key is {key!r}; give a key of jax.random, such as jax.random.key(0).")
-    if not isinstance(points, Tracer) and not (finite := np.isfinite(points).all(axis=1)).all():
+    if has_values(points) and not (finite := np.isfinite(points).all(axis=1)).all():
         raise ValueError(f"points: {(~finite).sum()} of {number} are NaN or infinite; leave them out.")
     return _kmeans(jnp.asarray(points, float), key, (max_steps, jnp.asarray(tolerance)), num_clusters, restarts)
 

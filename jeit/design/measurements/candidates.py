@@ -9,8 +9,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
+
+from jeit_solvers.engines import has_values
 
 
 class Candidates(eqx.Module):
@@ -73,7 +74,7 @@ def _check(jacobian, prior, noise, weights, shape: tuple[str, str]) -> tuple[Arr
         raise ValueError(f"weights has shape {weights.shape}; give one for each of the {len(prior)} cells.")
     named = {"jacobian": jacobian, "the prior's matrix": prior, "noise": noise, "weights": weights}
     for name, values in named.items():
-        if isinstance(values, Tracer):
+        if not has_values(values):
             continue
         if not np.isfinite(values).all():
             raise ValueError(f"{name} has NaN or infinite values; leave out measurements that have none.")

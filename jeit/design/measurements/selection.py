@@ -17,12 +17,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit.arguments import check_key
 from jeit.design.measurements.candidates import Candidates
 from jeit_solvers.dense.cholesky import inverse_cholesky
+from jeit_solvers.engines import has_values
 
 Criterion = Literal["D", "A"]
 # A swap must be worth more than this share of what the set tells, or rounding could swap for ever.
@@ -87,7 +87,7 @@ def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -
     if chosen.ndim == 0 or not jnp.issubdtype(chosen.dtype, jnp.integer):
         raise ValueError(f"chosen has shape {chosen.shape} of {chosen.dtype}; give integers (..., N).")
     _check_number(candidates, chosen.shape[-1], criterion)
-    if not isinstance(chosen, Tracer) and not ((chosen >= 0) & (chosen < candidates.num_candidates)).all():
+    if has_values(chosen) and not ((chosen >= 0) & (chosen < candidates.num_candidates)).all():
         raise ValueError(f"chosen must be from 0 to {candidates.num_candidates - 1}.")
     return _of_sets(candidates, chosen.reshape(-1, chosen.shape[-1]), criterion).reshape(chosen.shape[:-1])
 

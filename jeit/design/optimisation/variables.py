@@ -5,8 +5,8 @@ from typing import Literal, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.optimize import linear_sum_assignment
 
 from jeit.arguments import check_name
 from jeit.mesh import Domain
@@ -105,7 +105,7 @@ class Variables(eqx.Module):
             raise ValueError(f"{name} is smaller than an electrode; give millimetres divided by 1000.")
         every = (np.einsum("kij,gj->kgi", images, centres[first] - middle) + middle).reshape(-1, 2)
         # Which image is which electrode: the nearest, all in all.
-        order = linear_sum_assignment(np.linalg.norm(centres[:, None] - every, axis=-1))[1]
+        order = scipy.optimize.linear_sum_assignment(np.linalg.norm(centres[:, None] - every, axis=-1))[1]
         start = [np.clip((centres[first] - low) / size, 0, 1).ravel()]
         if size_range is not None:
             start.append(size_range.variables(radii[first]))

@@ -16,7 +16,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind
@@ -27,6 +26,7 @@ from jeit.forward.assembly import cell_conductivity, check_conductivity, stiffne
 from jeit.forward.model import check_model, select_channels
 from jeit.forward.transfer import fields_and_inverse
 from jeit_solvers import over_cores
+from jeit_solvers.engines import has_values
 
 # Of the error's bound, relative to the voltages; steps to get there.
 _TOLERANCE, _MOST_STEPS = 1e-8, 200
@@ -60,7 +60,7 @@ def touch_changes(
             f"the touches are of a mesh of {touched.num_cells} cells, and the model's has {model.mesh.num_cells}; "
             "touch the model's own, touched_cells(model.mesh, …)."
         )
-    if not linear and any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((model, conductivity, touched))):
+    if not linear and not has_values(model, conductivity, touched):
         raise ValueError("exact changes cannot be traced by jit, grad or vmap; take linear=True there.")
     if linear:
         return _linear(model, cell_conductivity(model.mesh, conductivity), touched)

@@ -1,7 +1,7 @@
 """How GREIT chooses λ: by the noise figure of a target in the middle of the body."""
 
 import numpy as np
-import scipy.optimize
+import scipy
 
 
 def greit_noise_figure(target: float, eigenvalues, signal, level: float, painted, measure) -> float:

@@ -8,8 +8,7 @@ residual is ‖r‖² = Σ f²c² and the penalty xᵀQx = Σ Λc²/(Λ + λ²)�
 from collections.abc import Callable
 
 import numpy as np
-import scipy.optimize
-from jax.core import Tracer
+import scipy
 from jaxtyping import Array, Float
 
 from jeit.arguments import check_name
@@ -17,6 +16,7 @@ from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.point_spread import best_resolution
 from jeit.inverse.spectrum import Spectrum as Spectrum
 from jeit.mesh import Mesh
+from jeit_solvers.engines import has_values
 
 Rule = Callable[[Spectrum, Float[Array, " M"] | None, Mesh | None], Choice]
 
@@ -115,7 +115,7 @@ def choose(spectrum: Spectrum, hyperparameter: float | str | Rule | Choice, data
         return RULES[hyperparameter](spectrum, data, mesh)
     if callable(hyperparameter):
         return hyperparameter(spectrum, data, mesh)
-    if not isinstance(hyperparameter, Tracer):
+    if has_values(hyperparameter):
         value = np.asarray(hyperparameter)
         if value.shape != () or value.dtype.kind not in "iuf" or not (np.isfinite(value) and value > 0):
             raise ValueError(f"hyperparameter must be positive and finite; it is {hyperparameter}.")

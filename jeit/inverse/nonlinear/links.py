@@ -6,10 +6,9 @@ import equinox as eqx
 import jax
 import numpy as np
 import scipy.special
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jeit_solvers.engines import namespace
+from jeit_solvers.engines import has_values, namespace
 
 # Share of the background below which no conductivity is taken where nothing else keeps it from zero.
 _LEAST = 1e-6
@@ -91,7 +90,7 @@ class Bounded(AbstractLink):
     upper: float
 
     def __check_init__(self):
-        if not isinstance(self.lower, Tracer) and not 0 <= self.lower < self.upper < np.inf:
+        if has_values(self.lower) and not 0 <= self.lower < self.upper < np.inf:
             raise ValueError(f"Bounded: give 0 ≤ lower < upper, finite; they are {self.lower} and {self.upper}.")
 
     def conductivity(self, estimate):
@@ -120,7 +119,7 @@ def _logistic(estimate):
 
 
 def _check_inside(conductivity, lower, upper) -> None:
-    if isinstance(conductivity, Tracer):
+    if not has_values(conductivity):
         return
     values = np.asarray(conductivity)
     if not ((values > lower) & (values < upper)).all():

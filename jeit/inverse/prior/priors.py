@@ -11,7 +11,6 @@ import equinox as eqx
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from jax.core import Tracer
 from jaxtyping import Array, Float
 from scipy.spatial.distance import cdist
 
@@ -21,7 +20,7 @@ from jeit.inverse.prior.penalty import AbstractPenalty, QuadraticForm, Ridge
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geometry import interior_facets
 from jeit_solvers import SparsityPattern, analyse, factorise, solve
-from jeit_solvers.engines import host, on_host
+from jeit_solvers.engines import has_values, host, on_host
 
 # Rows of a dense covariance at a time.
 _BLOCK = 512
@@ -170,7 +169,7 @@ class Gaussian(AbstractPrior):
     length: float
 
     def __check_init__(self):
-        if not isinstance(self.length, Tracer) and not self.length > 0:
+        if has_values(self.length) and not self.length > 0:
             raise ValueError(f"length must be positive, in metres; it is {self.length}.")
 
     def covariance_product(self, mesh, jacobian):

@@ -7,8 +7,8 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
@@ -196,7 +196,7 @@ def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resoluti
     weight = np.concatenate([np.full(a.size, _OWN_GROWTH * length) for a, _, length in links] + [values])
     graph = coo_array((weight, (start, end)), shape=(len(flat) + 1,) * 2).tocsr()
     field = dijkstra(graph, directed=False, indices=len(flat))[:-1].reshape(shape)
-    interpolate = RegularGridInterpolator(axes, field)
+    interpolate = scipy.interpolate.RegularGridInterpolator(axes, field)
     first, last = grid[0, 0], grid[-1, -1]
 
     def size(points: np.ndarray) -> np.ndarray:

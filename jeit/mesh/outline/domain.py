@@ -6,16 +6,15 @@ import abc
 from typing import Any, Protocol
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.mesh._checks import warn_large
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
+from jeit_solvers.engines import has_values
 
 
 class Pen(Protocol):
@@ -97,19 +96,14 @@ class Domain(eqx.Module):
         """
 
 
-def traced(*values: Any) -> bool:
-    """Whether any array in `values` is being traced by JAX, so that it cannot be looked at."""
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
-
-
 def numerics(*values: Any) -> Any:
     """JAX's numpy where any of `values` is being traced, NumPy where all are known."""
-    return jnp if traced(*values) else np
+    return np if has_values(*values) else jnp
 
 
 def check_length(name: str, value: Any) -> Any:
     """Check a length in metres and make it a float (traced values pass); `ValueError` unless it is positive."""
-    if traced(value):
+    if not has_values(value):
         return value
     try:
         number = float(value)
@@ -123,7 +117,7 @@ def check_length(name: str, value: Any) -> Any:
 
 def check_position(name: str, value: Any) -> Any:
     """Check a place (x, y) in metres and make it two floats (traced values pass); `ValueError` if it is none."""
-    if traced(value):
+    if not has_values(value):
         return jnp.asarray(value)
     array = np.asarray(value, dtype=float)
     if array.shape != (2,) or not np.isfinite(array).all():

@@ -16,7 +16,8 @@ from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.generate.unstructured import Target, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import polyline
-from jeit.mesh.outline.domain import Domain, Pen, traced
+from jeit.mesh.outline.domain import Domain, Pen
+from jeit_solvers.engines import has_values
 
 
 class Polygon(Domain):
@@ -32,7 +33,7 @@ class Polygon(Domain):
         `ValueError` on fewer than three or repeated vertices, an outline that crosses or touches itself, and holes that
         are not inside.
         """
-        if traced(vertices, holes):
+        if not has_values(vertices, holes):
             self.vertices = jnp.asarray(vertices)
             self.holes = tuple(jnp.asarray(hole) for hole in holes)
             return

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Inexact, Int
 
+from jeit_solvers.engines import has_values
 from jeit_solvers.sparse.operator import SparseSymmetric, require_sparse_symmetric
 
 
@@ -28,7 +28,7 @@ class ConjugateGradient(lineax.AbstractLinearSolver[SparseSymmetric]):
     reason: str = eqx.field(static=True, default="chosen by the user")
 
     def __check_init__(self):
-        if not isinstance(self.tolerance, Tracer) and not 0 < self.tolerance < 1:
+        if has_values(self.tolerance) and not 0 < self.tolerance < 1:
             raise ValueError(
                 f"ConjugateGradient: `tolerance` must be between 0 and 1, the residual relative to the "
                 f"right-hand side; got {self.tolerance}."

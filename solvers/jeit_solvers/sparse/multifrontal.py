@@ -9,12 +9,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Bool, Inexact, Int
 
 from jeit_solvers.batching import differentiable_batches, in_turn, one_by_one
 from jeit_solvers.dense.cholesky import inverse_cholesky
-from jeit_solvers.engines import gather_or_zero, namespace
+from jeit_solvers.engines import gather_or_zero, has_values, namespace
 from jeit_solvers.sparse.index_store import IndexLayout
 from jeit_solvers.sparse.plan import FactorisationPlan, Stage
 
@@ -38,7 +37,7 @@ class Factor(eqx.Module):
     def require_positive_definite(self) -> None:
         """Raise a ValueError if the matrix was not positive definite; does nothing while JAX traces."""
         verdict = self.positive_definite
-        if not isinstance(verdict, Tracer) and not verdict.all():
+        if has_values(verdict) and not verdict.all():
             raise ValueError(
                 "factorise: the matrix is not positive definite, so it has no Cholesky factor. In a finite-element "
                 "system the usual reasons are: a coefficient that is zero, negative or NaN somewhere; no boundary "
