@@ -62,10 +62,10 @@ def either_engine(function: _Function) -> _Function:
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        given = arguments, named
+        given, structure = jax.tree.flatten((arguments, named))  # once: on small arrays it is what takes time
         if not has_values(given):
             return compiled(*arguments, **named)
-        arguments, named = on_host(given)
+        arguments, named = jax.tree.unflatten(structure, on_host(given))
         with np.errstate(all="ignore"):  # JAX says nothing of them either
             result = function(*arguments, **named)
         return result if namespace(given) is np else on_device(result)

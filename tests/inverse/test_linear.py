@@ -1,5 +1,6 @@
 """Linear images: the matrix against its definition, the rules, and what they find on simulated inclusions."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -66,6 +67,23 @@ def test_image_equals_the_full_matrix_for_one_frame_and_many(model, difference):
     expected = frames @ np.asarray(reconstruction.matrix).T
     np.testing.assert_allclose(images, expected, atol=1e-12 * np.abs(expected).max())
     np.testing.assert_allclose(reconstruction.image(frames[0]), expected[0], atol=1e-12 * np.abs(expected).max())
+
+
+def test_an_image_is_the_same_at_once_compiled_batched_and_of_a_reconstruction_that_is_traced(model, difference):
+    reconstruction = one_step(model, 1.0, hyperparameter=0.03)
+    expected = reconstruction.image(np.asarray(difference))
+    assert isinstance(expected, jax.Array)
+    traced = jax.jit(lambda held, voltages: held.image(voltages))(reconstruction, difference)
+    doubled = jax.tree.map(lambda weights: jnp.stack([weights, weights]), reconstruction)
+    images = {
+        "compiled": jax.jit(reconstruction.image)(difference),
+        "batched": jax.vmap(reconstruction.image)(jnp.stack([difference, difference]))[1],
+        "traced": traced,
+        "many reconstructions": jax.vmap(lambda held: held.image(difference))(doubled)[1],
+        "after being traced": reconstruction.image(difference),
+    }
+    for name, image in images.items():
+        np.testing.assert_allclose(image, expected, atol=1e-12 * np.abs(expected).max(), err_msg=name)
 
 
 @pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS.keys())
