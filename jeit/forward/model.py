@@ -14,7 +14,7 @@ from jaxtyping import Array, Inexact
 from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward.assembly import check_conductivity, field_gradients
-from jeit.forward.at_once import HostModel, host_model
+from jeit.forward.integrated import IntegratedModel, host_model, integrated_model
 from jeit.forward.system import System
 from jeit.forward.transfer import electrode_fields, transfer_impedance
 from jeit.mesh import Mesh
@@ -133,12 +133,14 @@ def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) ->
 
     `conductivity` as an array, S/m (2-D: S). It is not looked at: one that is not positive or not finite gives NaN.
     """
-    parts = model.mesh, model.electrodes, model.protocol
-    if not (model.at_once and has_values(model, conductivity)):
+    if not has_values(model):
         return _COMPILED[quantity](model, conductivity)
+    parts = model.mesh, model.electrodes, model.protocol, model.system
+    if not (model.at_once and has_values(conductivity)):
+        return _COMPILED[quantity](integrated_model(*parts), conductivity)
     with np.errstate(all="ignore"):
-        found = quantity(host_model(*parts, model.system), on_host(conductivity))
-    return found if namespace(parts) is np else on_device(found)
+        found = quantity(host_model(*parts), on_host(conductivity))
+    return found if namespace(parts[:3]) is np else on_device(found)
 
 
 def check_model(model: ForwardModel) -> None:
@@ -177,27 +179,27 @@ def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
     return gather(table.reshape(-1), protocol.measurement_index * len(driven) + protocol.drive_index)
 
 
-def transfer_impedance_of(model: ForwardModel | HostModel, conductivity):
+def transfer_impedance_of(model: ForwardModel | IntegratedModel, conductivity):
     """Z (L, L) in ohms, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
     return transfer_impedance(model.mesh, conductivity, model.electrodes, model.system)
 
 
-def voltages_of(model: ForwardModel | HostModel, conductivity):
+def voltages_of(model: ForwardModel | IntegratedModel, conductivity):
     """Voltages (M,) of the channels, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
     return select_channels(model.protocol, transfer_impedance_of(model, conductivity))
 
 
-def fields_of(model: ForwardModel | HostModel, conductivity):
+def fields_of(model: ForwardModel | IntegratedModel, conductivity):
     """F (n, L) and Z (L, L) in ohms, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
     return electrode_fields(model.mesh, conductivity, model.electrodes, model.system)
 
 
-def potentials_of(model: ForwardModel | HostModel, conductivity):
+def potentials_of(model: ForwardModel | IntegratedModel, conductivity):
     """Potentials (S, n) in volts, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
     return model.protocol.drive @ fields_of(model, conductivity)[0].T
 
 
-def voltages_and_jacobian_of(model: ForwardModel | HostModel, conductivity):
+def voltages_and_jacobian_of(model: ForwardModel | IntegratedModel, conductivity):
     """Voltages (M,) and their Jacobian (M, m), of a `conductivity` in S/m (2-D: S); for `evaluate`."""
     mesh, protocol, jacobian = model.mesh, model.protocol, host.zeros(())
     xp = namespace(conductivity, mesh)

@@ -89,6 +89,17 @@ def test_other_electrodes_are_not_taken_for_the_same(parts):
     np.testing.assert_allclose(again.voltages(1.0), first, rtol=1e-9)  # a sheet has no scale of its own
 
 
+def test_integrals_that_a_program_asked_for_first_serve_outside_it(parts):
+    """Of electrodes with values they are worked out once, in NumPy, and belong to no program."""
+    model = ForwardModel(*parts, solver="cholesky")
+    conductivity = jnp.linspace(1.0, 2.0, model.mesh.num_cells)
+    inside = jax.jit(lambda values: model.voltages_and_jacobian(values))(conductivity)
+    traced = compiled(model, "voltages_and_jacobian", conductivity)
+    for results in (model.voltages_and_jacobian(conductivity), traced):
+        for one, other in zip(results, inside, strict=True):
+            np.testing.assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
+
+
 def test_derivatives_go_through_the_compiled_engine(parts):
     model = ForwardModel(*parts)
     conductivity = jnp.linspace(1.0, 2.0, model.mesh.num_cells)
