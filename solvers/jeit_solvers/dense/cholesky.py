@@ -128,21 +128,19 @@ def _unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s 
 
 
 def _row_by_row(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """The same in a loop, and in place: row j holds W up to the diagonal and L^T right of it."""
-    column = jnp.arange(matrices.shape[-1])
-    lower = column <= column[:, None]
+    """The same in a loop, each row less its products with all rows done."""
+    size = matrices.shape[-1]
+    identity = jnp.broadcast_to(jnp.eye(size, dtype=matrices.dtype), matrices.shape)
+    augmented = jnp.concatenate([matrices, identity], axis=-1)
 
     def next_row(done, k):
-        weights = jax.lax.dynamic_index_in_dim(done, k, axis=2)
-        row = jax.lax.dynamic_index_in_dim(matrices, k, axis=1, keepdims=False)
-        right = column >= k
-        row = jnp.where(right, row, 0) - jnp.sum(jnp.where(lower | right, weights * done, 0), axis=1)
-        scale = _inverse_square_root(jax.lax.dynamic_slice_in_dim(row, k, 1, axis=1))
-        row = jnp.where(column == k, scale, row * scale)
-        return jax.lax.dynamic_update_index_in_dim(done, row, k, axis=1), None
+        weights = _transposed(jax.lax.dynamic_index_in_dim(done, k, axis=2))
+        row = jax.lax.dynamic_index_in_dim(augmented, k, axis=1) - weights @ done
+        row = row * _inverse_square_root(jax.lax.dynamic_slice_in_dim(row, k, 1, axis=2))
+        return jax.lax.dynamic_update_slice_in_dim(done, row, k, axis=1), None
 
-    done, _ = jax.lax.scan(next_row, jnp.zeros_like(matrices), column)
-    return jnp.where(lower, done, 0)
+    done, _ = jax.lax.scan(next_row, jnp.zeros_like(augmented), jnp.arange(size))
+    return done[..., size:]
 
 
 def _by_block_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
