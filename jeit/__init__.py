@@ -14,14 +14,15 @@ The names used most, and where the rest is:
   measured: `jeit.simulate`;
 - `plot_image`: pictures (`jeit.plot`).
 
-Importing jeit turns on JAX's 64-bit mode, unless JAX_ENABLE_X64 is set. Rooms are imported when first used.
+Importing jeit turns on JAX's 64-bit mode, unless JAX_ENABLE_X64 is set, and keeps compiled code in the user's cache
+folder, unless JAX has been told of another or JEIT_COMPILATION_CACHE is "off". Rooms are imported when first used.
 """
 
 import importlib
-import os
 from typing import TYPE_CHECKING
 
-import jax
+from jeit.start import keep_compiled_code as _keep_compiled_code
+from jeit.start import take_double_precision as _take_double_precision
 
 if TYPE_CHECKING:
     from jeit.data import read as read
@@ -37,10 +38,8 @@ if TYPE_CHECKING:
     from jeit.plot import plot_image as plot_image
     from jeit.protocol import adjacent as adjacent
 
-# A light touch changes voltages by 1e-4: single precision is not enough. A user who has set
-# JAX_ENABLE_X64 has decided already.
-if "JAX_ENABLE_X64" not in os.environ:
-    jax.config.update("jax_enable_x64", True)
+_take_double_precision()
+_keep_compiled_code()
 
 _ROOMS = (
     "acoustic",

@@ -1,11 +1,10 @@
-"""The command line's frame: its commands, its errors, its compilation cache."""
+"""The command line's frame: its commands and its errors."""
 
 import io
 import os
 import sys
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -66,8 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            if arguments is None:
-                _start(quickly=sys.argv[1:2] != ["study"])
+            if arguments is None and sys.argv[1:2] != ["study"]:
+                _compile_quickly()
             status = command.main(
                 args=sys.argv[1:] if arguments is None else list(arguments), prog_name="jeit", standalone_mode=False
             )
@@ -128,30 +127,7 @@ def _show_warning(message, category, filename, lineno, file=None, line=None) -> 
     print(f"jeit: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
-def _start(*, quickly: bool) -> None:
-    """Set JAX up for one process; `quickly` for one that computes one image: most of its time would be compilation.
-
-    Compiled code is kept between runs, in the user's cache folder or in JAX_COMPILATION_CACHE_DIR; and quickly, unless
-    the user has set XLA_FLAGS, code is compiled without optimisation: a quarter of the time to compile.
-    """
-    if quickly:
-        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
-    import jax
-
-    if jax.config.jax_compilation_cache_dir is not None:  # pyright: ignore[reportAttributeAccessIssue]
-        return
-    folder = _cache_folder() / "jeit" / "jax"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return  # no home to write to: every run compiles afresh
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-
-
-def _cache_folder() -> Path:
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches"
-    variable = "LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"
-    return Path(os.environ.get(variable) or Path.home() / ".cache")
+def _compile_quickly() -> None:
+    """For a process that computes one image: code without optimisation takes a quarter of the time to compile, and
+    compiling would be most of its time. A user who has set XLA_FLAGS has decided already."""
+    os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")

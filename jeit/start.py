@@ -1,0 +1,77 @@
+"""What importing jeit sets up in JAX: double precision, and a place where compiled code is kept between runs."""
+
+import contextlib
+import hashlib
+import os
+import platform
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+
+_MOST_BYTES, _MOST_FILES = 256 * 2**20, 5000
+
+
+def take_double_precision() -> None:
+    """A light touch changes voltages by 1e-4, for which single precision is not enough. A user who has set
+    JAX_ENABLE_X64 has decided already."""
+    if "JAX_ENABLE_X64" not in os.environ:
+        jax.config.update("jax_enable_x64", True)
+
+
+def keep_compiled_code() -> None:
+    """Keep compiled programs in the user's cache folder, so that a program is compiled once on a machine, not in every
+    process.
+
+    Does nothing if the user has told JAX where to keep them (`JAX_COMPILATION_CACHE_DIR`, or
+    `jax_compilation_cache_dir`), if `JEIT_COMPILATION_CACHE` is "off", or where no folder can be written to. JAX looks
+    programs up by their text and by its own and the compiler's versions. Those used longest ago go when there are
+    thousands, or a quarter of a gigabyte.
+    """
+    told = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if told is not None or os.environ.get("JEIT_COMPILATION_CACHE", "").lower() in ("off", "0", "no", "false"):
+        return
+    try:
+        every = _cache_folder() / "jeit" / "jax"
+        folder = every / _processor()
+        folder.mkdir(parents=True, exist_ok=True)
+        _discard_oldest(every)
+    except (OSError, RuntimeError):
+        return
+    if os.access(folder, os.W_OK):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+def _processor() -> str:
+    """A name for this kind of processor: where homes are shared, its code must not run on another."""
+    described = platform.machine() + platform.processor()
+    with contextlib.suppress(OSError), open("/proc/cpuinfo") as lines:
+        described += next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    return hashlib.sha256(described.encode()).hexdigest()[:12]
+
+
+def _discard_oldest(folder: Path) -> None:
+    kept = sorted(_used(folder), reverse=True)
+    size = 0
+    for number, (_, bytes_taken, path) in enumerate(kept):
+        size += bytes_taken
+        if number >= _MOST_FILES or size > _MOST_BYTES:
+            path.unlink(missing_ok=True)
+
+
+def _used(folder: Path) -> Iterator[tuple[float, int, Path]]:
+    """When each file was last used, its bytes, and its path."""
+    for path in folder.glob("*/*"):
+        with contextlib.suppress(FileNotFoundError):  # another process discards too
+            told = path.stat()
+            yield max(told.st_atime, told.st_mtime), told.st_size, path
+
+
+def _cache_folder() -> Path:
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches"
+    variable = "LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"
+    return Path(os.environ.get(variable) or Path.home() / ".cache")

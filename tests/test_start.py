@@ -1,0 +1,81 @@
+"""What importing jeit sets up: compiled code is kept from one process to the next, unless the user says otherwise."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import pytest
+
+import jeit.start
+
+PROGRAM = """
+import jeit, jax, jax.numpy as jnp
+told = []
+jax.monitoring.register_event_listener(lambda event, **_: told.append(event))
+assert jax.jit(lambda x: x @ x + 3)(jnp.eye(3))[0, 0] == 4
+print(jax.config.jax_compilation_cache_dir, told.count("/jax/compilation_cache/cache_hits"))
+"""
+
+
+def run(home, program=PROGRAM, **variables):
+    """The folder that a new process keeps code in, and how many programs it found there."""
+    kept = ("JAX_COMPILATION_CACHE_DIR", "JEIT_COMPILATION_CACHE")
+    environment = {name: value for name, value in os.environ.items() if name not in kept}
+    environment |= {"XDG_CACHE_HOME": str(home), "LOCALAPPDATA": str(home), "HOME": str(home)} | variables
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    folder, hits = done.stdout.split()
+    return folder, int(hits)
+
+
+def test_the_next_process_finds_what_this_one_compiled(tmp_path):
+    folder, hits = run(tmp_path)
+    assert folder.startswith(str(tmp_path))
+    assert hits == 0
+    assert run(tmp_path)[1] > 0
+
+
+def test_a_file_cut_short_is_compiled_anew(tmp_path):
+    run(tmp_path)
+    entries = list(tmp_path.rglob("*-cache"))
+    assert entries
+    for entry in entries:
+        entry.write_bytes(entry.read_bytes()[:100])
+    run(tmp_path)
+
+
+@pytest.mark.parametrize("word", ["off", "0"])
+def test_it_can_be_switched_off(tmp_path, word):
+    assert run(tmp_path, JEIT_COMPILATION_CACHE=word)[0] == "None"
+
+
+def test_what_the_user_has_told_jax_is_left_alone(tmp_path):
+    mine = str(tmp_path / "mine")
+    assert run(tmp_path / "home", JAX_COMPILATION_CACHE_DIR=mine)[0] == mine
+    told = f"import jax; jax.config.update('jax_compilation_cache_dir', {mine!r})"
+    assert run(tmp_path / "home", told + PROGRAM)[0] == mine
+
+
+def test_where_nothing_can_be_written_nothing_is_kept(tmp_path):
+    (tmp_path / "jeit").write_text("a file where the folder would be")
+    if sys.platform != "darwin":
+        assert run(tmp_path)[0] == "None"
+
+
+def test_the_oldest_go_when_there_are_too_many(tmp_path, monkeypatch):
+    (tmp_path / "kind").mkdir()
+    for number in range(6):
+        path = tmp_path / "kind" / f"{number}-cache"
+        path.write_bytes(b"x" * 100)
+        os.utime(path, (number, number))
+    monkeypatch.setattr(jeit.start, "_MOST_FILES", 4)
+    jeit.start._discard_oldest(tmp_path)
+    assert sorted(path.name[0] for path in tmp_path.rglob("*-cache")) == ["2", "3", "4", "5"]
+    monkeypatch.setattr(jeit.start, "_MOST_BYTES", 250)
+    jeit.start._discard_oldest(tmp_path)
+    assert sorted(path.name[0] for path in tmp_path.rglob("*-cache")) == ["4", "5"]
+
+
+def test_double_precision_unless_told_otherwise():
+    assert jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
