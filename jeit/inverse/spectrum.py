@@ -74,12 +74,14 @@ class Spectrum(eqx.Module):
 @either_engine
 def _decompose(jacobian, product, null_space):
     xp = namespace(jacobian, product, null_space)
-    outer = jacobian @ product
-    full, _ = xp.linalg.qr(jacobian @ null_space, mode="complete")
-    complement = full[:, null_space.shape[1] :]
+    outer, seen = jacobian @ product, jacobian @ null_space
+    if null_space.shape[1] == 0:
+        eigenvalues, vectors = symmetric_eigen((outer + outer.T) / 2)
+        return vectors, xp.maximum(eigenvalues, 0), seen, outer
+    complement = xp.linalg.qr(seen, mode="complete")[0][:, null_space.shape[1] :]
     projected = complement.T @ outer @ complement
     eigenvalues, vectors = symmetric_eigen((projected + projected.T) / 2)
-    return complement @ vectors, xp.maximum(eigenvalues, 0), jacobian @ null_space, outer
+    return complement @ vectors, xp.maximum(eigenvalues, 0), seen, outer
 
 
 @either_engine
