@@ -12,6 +12,7 @@ from jeit_solvers import (
     ConjugateGradient,
     SparseCholesky,
     SparseSymmetric,
+    SparsityPattern,
     analyse,
     choose_solver,
     factorise,
@@ -175,3 +176,16 @@ def test_nested_batches_and_gradients_of_batches():
     np.testing.assert_allclose(
         everywhere(jax.grad(energy)), everywhere(jax.grad(dense_energy)), rtol=0, atol=1e-9 * abs(vectors).max() ** 2
     )
+
+
+def test_the_order_of_elimination_hangs_neither_on_size_nor_place():
+    """Nor on what rounding makes of equal coordinates: a body twice as large has the same plan, and compiled code."""
+    points = np.stack(np.meshgrid(np.arange(24.0), np.arange(24.0)), axis=-1).reshape(-1, 2)
+    corner = (np.arange(23)[:, None] * 24 + np.arange(23)).ravel()
+    cells = np.concatenate([corner[:, None] + [0, 1, 25], corner[:, None] + [0, 25, 24]])
+    pattern = SparsityPattern.from_elements([cells], len(points))
+    plan = analyse(pattern, points)
+    for factor, shift in ((0.05, 0.0), (0.06, 0.0), (1 / 3, 0.7), (1.0, -11.1)):
+        other = analyse(pattern, factor * points + shift)
+        assert other.layout == plan.layout
+        np.testing.assert_array_equal(other.indices, plan.indices)

@@ -81,7 +81,6 @@ def _halve(
             best_cost[better] = cost[better]
             chosen = nodes[better[own]]
             best[chosen] = side[chosen]
-    best[nodes[counts[own] == 1]] = 2
     return best
 
 
