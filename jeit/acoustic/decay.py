@@ -9,11 +9,11 @@ import math
 from typing import ClassVar, Self
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jeit.acoustic.noise import column
 from jeit.arguments import check_name
+from jeit_solvers.engines import host, namespace
 
 # Metres²: r = √r² has no derivative at r = 0; a hundredth of a micrometre rounds off the tip.
 _TIP = 1e-16
@@ -68,7 +68,8 @@ class InverseSquare(AbstractDecay):
 
     def log_response(self, squared_distance):
         """log a − log(r² + b)."""
-        return column(jnp.log(self.a), squared_distance) - jnp.log(squared_distance + column(self.b, squared_distance))
+        log = namespace(self, squared_distance).log
+        return column(log(self.a), squared_distance) - log(squared_distance + column(self.b, squared_distance))
 
     def response(self, squared_distance):
         """a / (r² + b)."""
@@ -81,17 +82,17 @@ class InverseSquare(AbstractDecay):
 
     def logarithms(self):
         """log a, log b."""
-        return jnp.log(jnp.stack([self.a, self.b]))
+        return _logarithms(self.a, self.b)
 
     @classmethod
     def from_logarithms(cls, values):
         """From log a, log b."""
-        return cls(*jnp.exp(values))
+        return cls(*namespace(values).exp(values))
 
     @classmethod
     def start(cls, spacing, num_microphones):
         """a = b = spacing²."""
-        same = jnp.full(num_microphones, spacing**2)
+        same = host.full(num_microphones, float(spacing) ** 2)
         return cls(same, same)
 
     @classmethod
@@ -110,13 +111,15 @@ class Exponential(AbstractDecay):
 
     def log_response(self, squared_distance):
         """log a − r / l."""
-        distance = jnp.sqrt(squared_distance + _TIP)
-        return column(jnp.log(self.a), squared_distance) - distance / column(self.length, squared_distance)
+        xp = namespace(self, squared_distance)
+        distance = xp.sqrt(squared_distance + _TIP)
+        return column(xp.log(self.a), squared_distance) - distance / column(self.length, squared_distance)
 
     def response(self, squared_distance):
         """a exp(−r / l)."""
-        distance = jnp.sqrt(squared_distance + _TIP)
-        return column(self.a, squared_distance) * jnp.exp(-distance / column(self.length, squared_distance))
+        xp = namespace(self, squared_distance)
+        distance = xp.sqrt(squared_distance + _TIP)
+        return column(self.a, squared_distance) * xp.exp(-distance / column(self.length, squared_distance))
 
     @property
     def gain(self):
@@ -125,17 +128,17 @@ class Exponential(AbstractDecay):
 
     def logarithms(self):
         """log a, log l."""
-        return jnp.log(jnp.stack([self.a, self.length]))
+        return _logarithms(self.a, self.length)
 
     @classmethod
     def from_logarithms(cls, values):
         """From log a, log l."""
-        return cls(*jnp.exp(values))
+        return cls(*namespace(values).exp(values))
 
     @classmethod
     def start(cls, spacing, num_microphones):
         """a = 1, l = spacing."""
-        return cls(jnp.ones(num_microphones), jnp.full(num_microphones, float(spacing)))
+        return cls(host.ones(num_microphones), host.full(num_microphones, float(spacing)))
 
     @classmethod
     def bounds(cls, extent):
@@ -154,15 +157,17 @@ class AttenuatedInverseSquare(AbstractDecay):
 
     def log_response(self, squared_distance):
         """log a − log(r² + b) − r / l."""
-        distance = jnp.sqrt(squared_distance + _TIP)
-        spreading = jnp.log(squared_distance + column(self.b, squared_distance))
+        xp = namespace(self, squared_distance)
+        distance = xp.sqrt(squared_distance + _TIP)
+        spreading = xp.log(squared_distance + column(self.b, squared_distance))
         attenuation = distance / column(self.length, squared_distance)
-        return column(jnp.log(self.a), squared_distance) - spreading - attenuation
+        return column(xp.log(self.a), squared_distance) - spreading - attenuation
 
     def response(self, squared_distance):
         """a exp(−r / l) / (r² + b)."""
-        distance = jnp.sqrt(squared_distance + _TIP)
-        left = column(self.a, squared_distance) * jnp.exp(-distance / column(self.length, squared_distance))
+        xp = namespace(self, squared_distance)
+        distance = xp.sqrt(squared_distance + _TIP)
+        left = column(self.a, squared_distance) * xp.exp(-distance / column(self.length, squared_distance))
         return left / (squared_distance + column(self.b, squared_distance))
 
     @property
@@ -172,24 +177,29 @@ class AttenuatedInverseSquare(AbstractDecay):
 
     def logarithms(self):
         """log a, log b, log l."""
-        return jnp.log(jnp.stack([self.a, self.b, self.length]))
+        return _logarithms(self.a, self.b, self.length)
 
     @classmethod
     def from_logarithms(cls, values):
         """From log a, log b, log l."""
-        return cls(*jnp.exp(values))
+        return cls(*namespace(values).exp(values))
 
     @classmethod
     def start(cls, spacing, num_microphones):
         """a = b = spacing², l = 3 spacings."""
-        same = jnp.full(num_microphones, spacing**2)
-        return cls(same, same, jnp.full(num_microphones, 3.0 * spacing))
+        same = host.full(num_microphones, float(spacing) ** 2)
+        return cls(same, same, host.full(num_microphones, 3.0 * spacing))
 
     @classmethod
     def bounds(cls, extent):
         """As those of the other two."""
         low, high = InverseSquare.bounds(extent), Exponential.bounds(extent)
         return (*low[0], high[0][1]), (*low[1], high[1][1])
+
+
+def _logarithms(*parameters: Float[Array, " M"]) -> Float[Array, "K M"]:
+    xp = namespace(parameters)
+    return xp.log(xp.stack(parameters))
 
 
 DECAYS: dict[str, type[AbstractDecay]] = {

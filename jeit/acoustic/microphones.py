@@ -1,13 +1,16 @@
 """An array of microphones: where they are, what each receives of a source, and how well that is known."""
 
+import functools
+import operator
+
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.noise import IntensityNoise
 from jeit.acoustic.surface import AbstractSurface
 from jeit.arguments import check_kind
+from jeit_solvers.engines import namespace
 
 
 class MicrophoneArray(eqx.Module):
@@ -28,9 +31,10 @@ class MicrophoneArray(eqx.Module):
     def expected(self, unknowns: Float[Array, "n F"]) -> tuple[Float[Array, "M F"], Float[Array, "M F"]]:
         """Expected levels m and their variances v."""
         each = [unknowns[k : k + 3] for k in range(0, len(unknowns), 3)]
-        sent = [jnp.exp(one[2]) * self.response(one[:2]) for one in each]
-        received = sum(sent[1:], sent[0])
-        return jnp.log(received + self.noise.floor[:, None]), self.noise.level_variance(received)
+        xp = namespace(self, unknowns)
+        sent = [xp.exp(one[2]) * self.response(one[:2]) for one in each]
+        received = functools.reduce(operator.add, sent)
+        return xp.log(received + self.noise.floor[:, None]), self.noise.level_variance(received)
 
 
 def check_array(microphone_array: MicrophoneArray) -> None:

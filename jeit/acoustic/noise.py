@@ -12,10 +12,11 @@ it is nearly normal in both.
 """
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
+
+from jeit_solvers.engines import as_array, namespace
 
 # Of the decay model: no microphone's is known better.
 LEAST_RELATIVE = 1e-3
@@ -48,12 +49,8 @@ class IntensityNoise(eqx.Module):
         rest = base * np.sqrt(2 / degrees)
         if deviation is not None:
             rest = np.maximum(rest, np.broadcast_to(np.asarray(deviation, float), (num_microphones,)))
-        return cls(
-            jnp.asarray(np.maximum(base, _FLOOR_DEVIATIONS * rest)),
-            jnp.asarray(rest),
-            jnp.asarray(4 * base / degrees),
-            jnp.asarray(np.maximum(scatter, LEAST_RELATIVE)),
-        )
+        floor, least = np.maximum(base, _FLOOR_DEVIATIONS * rest), np.maximum(scatter, LEAST_RELATIVE)
+        return cls(*(as_array(values) for values in (floor, rest, 4 * base / degrees, least)))
 
     def variance(self, received: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
         """Of the power above the floor, where `received` is expected."""
@@ -62,8 +59,8 @@ class IntensityNoise(eqx.Module):
 
     def level(self, power: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
         """y = log(power + floor); −∞ where there is neither."""
-        floor = column(self.floor, power)
-        return jnp.log(jnp.maximum(power + floor, 0.05 * floor))
+        floor, xp = column(self.floor, power), namespace(self, power)
+        return xp.log(xp.maximum(power + floor, 0.05 * floor))
 
     def level_variance(self, received: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
         """Of y, where `received` is expected."""
@@ -72,7 +69,7 @@ class IntensityNoise(eqx.Module):
 
 def column(values: Float[Array, " M"], like: Array) -> Array:
     """One value for each microphone, along the first axis of `like`."""
-    return jnp.reshape(values, (-1,) + (1,) * (like.ndim - 1))
+    return values.reshape((-1,) + (1,) * (like.ndim - 1))
 
 
 def below_nothing(power: np.ndarray, usable: np.ndarray) -> np.ndarray:

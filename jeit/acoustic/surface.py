@@ -7,14 +7,13 @@ points known to lie on it; it may curve as it likes as long as no two of its poi
 import abc
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jeit.arguments import told
 from jeit.mesh import Domain, Polygon
+from jeit_solvers.engines import as_array, namespace, on_host, slopes
 
 # Knots of the spline: more make every evaluation slower and the surface no smoother.
 _MOST_KNOTS = 300
@@ -72,7 +71,7 @@ class CurvedSurface(AbstractSurface):
     def place(self, chart):
         """The point above u."""
         flat = chart.reshape(2, -1)
-        squared = jnp.sum((flat[:, None] - self.knots.T[:, :, None]) ** 2, axis=0)
+        squared = namespace(self, chart).sum((flat[:, None] - self.knots.T[:, :, None]) ** 2, axis=0)
         height = self.weights @ _thin_plate(squared) + self.affine[0] + self.affine[1:] @ flat
         points = self.origin[:, None] + self.axes @ flat + self.normal[:, None] * height
         return points.reshape(3, *chart.shape[1:])
@@ -115,50 +114,49 @@ def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -
 def bounding_box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
     """Lower left and upper right corner of the outline's box in the chart, metres."""
     vertices = surface.outline.vertices
-    return jnp.min(vertices, axis=0), jnp.max(vertices, axis=0)
+    return vertices.min(axis=0), vertices.max(axis=0)
 
 
 def in_space(
     surface: AbstractSurface, chart: Float[Array, "2 F"], covariance: Float[Array, "2 2 F"]
 ) -> tuple[Float[Array, "F d"], Float[Array, "F d d"]]:
     """Places in space, and their covariances, of places and covariances in the chart."""
-    place, push = jax.linearize(surface.place, chart)
-    slopes = jnp.stack([push(direction) for direction in jnp.eye(2)[:, :, None] * jnp.ones_like(chart)])
-    return place.T, jnp.einsum("kaf,klf,lbf->fab", slopes, covariance, slopes)
+    place, along = slopes(surface.place, chart)
+    xp = namespace(place, covariance)
+    along = xp.stack(along)
+    return place.T, xp.einsum("kaf,klf,lbf->fab", along, covariance, along)
 
 
 def longer_side(surface: AbstractSurface) -> Float[Array, ""]:
     """The longer side of the outline's box, metres."""
     low, high = bounding_box(surface)
-    return jnp.max(high - low)
+    return (high - low).max()
 
 
 def chart_grid(surface: AbstractSurface, columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Middles of columns × rows pixels that fill the outline's box, (2, rows, columns), bottom row first; and which of
     them lie inside the outline, (rows, columns)."""
-    (left, bottom), (right, top) = (np.asarray(corner) for corner in bounding_box(surface))
+    (left, bottom), (right, top) = bounding_box(on_host(surface))
     x = left + (right - left) * (np.arange(columns) + 0.5) / columns
     y = bottom + (top - bottom) * (np.arange(rows) + 0.5) / rows
     grid = np.stack(np.meshgrid(x, y))
-    return grid, np.asarray(_contains(surface.outline, jnp.asarray(np.moveaxis(grid, 0, -1))))
+    return grid, np.asarray(surface.outline.contains(np.moveaxis(grid, 0, -1)))
 
 
 def outline_sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[Array, "2 K"]]:
     """Where each side of the outline, and of its holes, starts and ends, in the chart."""
-    loops = (surface.outline.vertices, *surface.outline.holes)
-    start, end = (jnp.concatenate([jnp.roll(loop, -shift, axis=0) for loop in loops]) for shift in (0, 1))
+    loops = surface.outline.loops()
+    xp = namespace(loops)
+    start, end = (xp.concatenate([xp.roll(loop, -shift, axis=0) for loop in loops]) for shift in (0, 1))
     return start.T, end.T
-
-
-# Compiled once for each size, not at every call.
-_contains = eqx.filter_jit(Polygon.contains)
 
 
 def _thin_plate(squared):
     """ρ² log ρ of ρ², and 0 at 0."""
-    positive = squared > 0
-    safe = jnp.where(positive, squared, 1.0)
-    return jnp.where(positive, 0.5 * safe * jnp.log(safe), 0.0)
+    xp = namespace(squared)
+    positive = squared.real > 0
+    safe = xp.where(positive, squared, 1.0)
+    return xp.where(positive, 0.5 * safe * xp.log(safe), 0.0)
 
 
 def _curved(vertices: np.ndarray, known: np.ndarray) -> CurvedSurface:
@@ -184,13 +182,13 @@ def _curved(vertices: np.ndarray, known: np.ndarray) -> CurvedSurface:
             "chart; calibrate its parts one by one."
         )
     squared = np.sum((chart[:, None] - chart) ** 2, axis=-1)
-    kernel = np.asarray(_thin_plate(jnp.asarray(squared)))
+    kernel = _thin_plate(squared)
     polynomial = np.column_stack([np.ones(len(chart)), chart])
     # A little smoothing, so that points known to a fraction of a per cent do not make waves.
     system = np.block([[kernel + 1e-9 * scale**2 * np.eye(len(chart)), polynomial], [polynomial.T, np.zeros((3, 3))]])
     solution = np.linalg.lstsq(system, np.concatenate([height, np.zeros(3)]), rcond=None)[0]
     arrays = (origin, axes, normal, chart, solution[:-3], solution[-3:])
-    return CurvedSurface(Polygon((vertices - origin) @ axes), *(jnp.asarray(array) for array in arrays))
+    return CurvedSurface(Polygon((vertices - origin) @ axes), *(as_array(array) for array in arrays))
 
 
 def _spread(points: np.ndarray, most: int) -> np.ndarray:

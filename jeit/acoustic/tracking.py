@@ -7,14 +7,13 @@ passed over, and one too far from where the touch can be is not believed. q is t
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.special import chdtri
 
-from jeit.acoustic.localisation.locations import Locations
+from jeit.acoustic.localisation.locations import FEW_FRAMES, Locations
 from jeit.arguments import check_kind
-from jeit_solvers import solve_small
+from jeit_solvers.engines import at_once, namespace, scan
 
 # Densities tried: from a finger that rests to one that is flung about (m²/s³).
 _DENSITIES = np.geomspace(1e-5, 10.0, 13)
@@ -72,20 +71,11 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
         spread = np.where(located[part, None, None], locations.covariance[part], np.eye(d)) * locations.overlap
         # A covariance may be singular, on a curved surface; nothing is known better than a tenth of a micrometre.
         spread = spread + 1e-14 * np.eye(d)
-        size = 1 << int(last - first).bit_length()
-        pad = size - (last + 1 - first)
         step = np.diff(times[part], prepend=times[first])
-        arrays = (
-            np.pad(step, (0, pad)),
-            np.pad(measured, ((0, pad), (0, 0))),
-            np.concatenate([spread, np.broadcast_to(np.eye(d), (pad, d, d))]),
-            np.pad(located[part], (0, pad)),
-        )
-        state, error, believed = _smooth(*(jnp.asarray(array) for array in arrays), jnp.asarray(densities))
-        kept = last + 1 - first
-        position[part], velocity[part] = np.asarray(state)[:kept, :d], np.asarray(state)[:kept, d:]
-        covariance[part] = np.asarray(error)[:kept, :d, :d]
-        rejected[part] = located[part] & ~np.asarray(believed)[:kept]
+        state, error, believed = _smoothed(step, measured, spread, located[part], densities)
+        position[part], velocity[part] = state[:, :d], state[:, d:]
+        covariance[part] = error[:, :d, :d]
+        rejected[part] = located[part] & ~believed
         length = float(np.linalg.norm(np.diff(position[part], axis=0), axis=1).sum())
         touches.append(Touch(float(times[first]), float(times[last]), int(first), int(last), length))
     return Track(np.asarray(times), position, covariance, velocity, tuple(touches), rejected)
@@ -101,67 +91,84 @@ def _runs(times, located, gap: float) -> list[tuple[int, int]]:
     return [(int(index[a]), int(index[b])) for a, b in zip(firsts, lasts, strict=True)]
 
 
-@jax.jit
+def _smoothed(step, measured, spread, located, densities) -> tuple[np.ndarray, ...]:
+    """What `_smooth` gives: of a touch of few frames in NumPy; of more compiled, padded to a power of two."""
+    frames, d = measured.shape
+    if frames <= FEW_FRAMES:
+        return at_once(_smooth, step, measured, spread, located, densities)
+    pad = (1 << (frames - 1).bit_length()) - frames
+    arrays = (
+        np.pad(step, (0, pad)),
+        np.pad(measured, ((0, pad), (0, 0))),
+        np.concatenate([spread, np.broadcast_to(np.eye(d), (pad, d, d))]),
+        np.pad(located, (0, pad)),
+    )
+    return tuple(np.asarray(array)[:frames] for array in jax.jit(_smooth)(*arrays, densities))
+
+
 def _smooth(step, measured, spread, located, densities):
     """States (n, 2 d), their covariances, and which places were believed, at the likeliest of the densities."""
-    filtered = jax.vmap(lambda density: _filter(step, measured, spread, located, density))(densities)
-    best = jnp.argmax(filtered[0])
-    mean, error, predicted_mean, predicted_error, believed = jax.tree.map(lambda array: array[best], filtered[1])
-    d = measured.shape[1]
+    xp, d = namespace(measured), measured.shape[1]
+    score, filtered = _filter(step, measured, spread, located, densities)
+    best = xp.argmax(score)
+    mean, error, predicted_mean, predicted_error, believed = (array[:, best] for array in filtered)
 
     def back(later, now):
         later_mean, later_error = later
         mean, error, next_mean, next_error, next_step = now
         move = _move(next_step, d)
-        gain = _solve(next_error, move @ error).T
+        gain = xp.linalg.solve(next_error, move @ error).T
         mean = mean + gain @ (later_mean - next_mean)
         error = error + gain @ (later_error - next_error) @ gain.T
         return (mean, error), (mean, error)
 
-    last = (mean[-1], error[-1])
-    rest = (mean[:-1], error[:-1], predicted_mean[1:], predicted_error[1:], step[1:])
-    _, (means, errors) = jax.lax.scan(back, last, rest, reverse=True)
-    return jnp.concatenate([means, mean[-1:]]), jnp.concatenate([errors, error[-1:]]), believed
+    # After the last frame nothing else is known than was predicted for it: there the smoother changes nothing.
+    beyond = predicted_mean[-1], predicted_error[-1]
+    later = (xp.concatenate([array[1:], array[-1:]]) for array in (predicted_mean, predicted_error, step))
+    _, (means, errors) = scan(back, beyond, (mean, error, *later), reverse=True)
+    return means, errors, believed
 
 
-def _filter(step, measured, spread, located, density):
-    """Log-likelihood, and for every frame mean, covariance, their predictions, and whether its place was believed."""
-    d = measured.shape[1]
+def _filter(step, measured, spread, located, densities):
+    """Log-likelihood (Q,) of each density, and for every frame and density mean, covariance, their predictions, and
+    whether its place was believed."""
+    xp, d = namespace(measured), measured.shape[1]
     limit = float(chdtri(d, _BELIEVED))
 
     def forward(state, now):
         mean, error = state
         step, place, spread, there = now
         move = _move(step, d)
-        mean, error = move @ mean, move @ error @ move.T + density * _noise(step, d)
-        off, inner = place - mean[:d], error[:d, :d] + spread
-        gain = _solve(inner, error[:d]).T
-        square = off @ _solve(inner, off[:, None])[:, 0]
+        mean, error = mean @ move.T, move @ error @ move.T + densities[:, None, None] * _noise(step, d)
+        off, inner = place - mean[:, :d], error[:, :d, :d] + spread
+        gain = xp.swapaxes(xp.linalg.solve(inner, error[:, :d]), 1, 2)
+        square = xp.sum(off * xp.linalg.solve(inner, off[:, :, None])[:, :, 0], axis=1)
         believed = there & (square < limit)
-        logarithm = jnp.log(jnp.linalg.det(inner))
+        logarithm = xp.log(xp.linalg.det(inner))
         # A place not believed still counts against a density, as much as one at the limit.
-        score = jnp.where(there, -0.5 * (jnp.minimum(square, limit) + logarithm), 0.0)
-        new_mean = jnp.where(believed, mean + gain @ off, mean)
+        score = xp.where(there, -0.5 * (xp.minimum(square, limit) + logarithm), 0.0)
+        new_mean = xp.where(believed[:, None], mean + xp.einsum("qij,qj->qi", gain, off), mean)
         # Joseph's form, and symmetric: the difference of the textbook's is lost in rounding where places are exact.
-        keep = jnp.eye(2 * d).at[:, :d].add(-gain)
-        updated = keep @ error @ keep.T + gain @ spread @ gain.T
-        new_error = jnp.where(believed, (updated + updated.T) / 2, error)
+        keep = xp.eye(2 * d) - xp.concatenate([gain, xp.zeros_like(gain)], axis=2)
+        updated = keep @ error @ xp.swapaxes(keep, 1, 2) + gain @ spread @ xp.swapaxes(gain, 1, 2)
+        new_error = xp.where(believed[:, None, None], (updated + xp.swapaxes(updated, 1, 2)) / 2, error)
         return (new_mean, new_error), (score, new_mean, new_error, mean, error, believed)
 
-    begin = jnp.concatenate([measured[0], jnp.zeros(d)])
-    wide = jnp.concatenate([1e4 * jnp.trace(spread[0]) * jnp.ones(d), jnp.full(d, _FIRST_SPEED**2)])
-    _, (score, *rest) = jax.lax.scan(forward, (begin, jnp.diag(wide)), (step, measured, spread, located))
-    return jnp.sum(score), tuple(rest)
+    begin = xp.concatenate([measured[0], xp.zeros(d)])
+    wide = xp.concatenate([1e4 * xp.trace(spread[0]) * xp.ones(d), xp.full(d, _FIRST_SPEED**2)])
+    many = len(densities)
+    first = xp.tile(begin, (many, 1)), xp.tile(xp.diag(wide), (many, 1, 1))
+    _, (score, *rest) = scan(forward, first, (step, measured, spread, located))
+    return xp.sum(score, axis=0), rest
 
 
 def _move(step, d: int) -> Float[Array, "s s"]:
-    return jnp.eye(2 * d).at[:d, d:].set(step * jnp.eye(d))
+    """What a step of time does to position and velocity."""
+    xp = namespace(step)
+    return xp.kron(xp.eye(2) + step * xp.eye(2, k=1), xp.eye(d))
 
 
 def _noise(step, d: int) -> Float[Array, "s s"]:
-    block = jnp.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
-    return jnp.kron(block, jnp.eye(d))
-
-
-def _solve(matrix: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    return solve_small(matrix[:, :, None] * jnp.ones(right.shape[1]), right)
+    """Covariance of position and velocity after a step of white acceleration of density 1."""
+    xp = namespace(step)
+    return xp.kron(xp.stack([step**3 / 3, step**2 / 2, step**2 / 2, step]).reshape(2, 2), xp.eye(d))

@@ -117,13 +117,12 @@ def _overlay(found: LocatedTouches) -> np.ndarray | None:
     if not located.size:
         return None
     microphone_array, use, _ = microphones_in_use(heard, found.calibration)
-    localiser = Localiser.create(microphone_array, method=found.method, map_shape=(_PIXELS, _PIXELS))
+    localiser = Localiser.create(microphone_array, method=found.method, map_shape=(_PIXELS, _PIXELS), compiled=False)
     times = locations.times[located]
     time_constant = max(0.3, 0.5 * float(times[-1] - times[0]))
     image = np.zeros((_PIXELS, _PIXELS))
     for start in range(0, located.size, _FRAMES):
-        # Always as many frames, so that one program serves all.
-        some = located[np.minimum(np.arange(start, start + _FRAMES), located.size - 1)]
+        some = located[start : start + _FRAMES]
         bright = brightness(localiser.maps(heard.power[some], use[some]), method=found.method)
         image = np.maximum(image, fade(bright, locations.times[some], at=times[-1], time_constant=time_constant))
     return image

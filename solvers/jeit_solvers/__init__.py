@@ -18,6 +18,7 @@ from jeit_solvers.optimise.descent import Descent
 from jeit_solvers.optimise.small_problems import (
     Minimum,
     definite_small,
+    gradient_small,
     hessian_small,
     inverse_small,
     minimise_small,
@@ -54,6 +55,7 @@ __all__ = [
     "definite_small",
     "ended",
     "factorise",
+    "gradient_small",
     "half_solve",
     "hessian_small",
     "in_turn",

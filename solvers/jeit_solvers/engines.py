@@ -18,6 +18,9 @@ from jaxtyping import Array, Inexact, Int, Shaped
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
+# So small that its square is nothing beside any number.
+_COMPLEX_STEP = 1e-100
+
 
 host: Any = np
 """NumPy, for arrays that are to go where JAX's are declared."""
@@ -53,6 +56,13 @@ def as_array(values: Any, dtype: Any = None) -> Array:
     return jnp.asarray(values, dtype)
 
 
+def at_once(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """What `function` returns of arrays that have values, worked out in NumPy."""
+    arguments, named = on_host((arguments, named))
+    with np.errstate(all="ignore"):  # JAX says nothing of them either
+        return function(*arguments, **named)
+
+
 def either_engine(function: _Function) -> _Function:
     """`function` of arrays: in NumPy, at once, where all have values; compiled as a whole where any is traced.
 
@@ -62,12 +72,10 @@ def either_engine(function: _Function) -> _Function:
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
-        given, structure = jax.tree.flatten((arguments, named))  # once: on small arrays it is what takes time
+        given = jax.tree.leaves((arguments, named))
         if not has_values(given):
             return compiled(*arguments, **named)
-        arguments, named = jax.tree.unflatten(structure, on_host(given))
-        with np.errstate(all="ignore"):  # JAX says nothing of them either
-            result = function(*arguments, **named)
+        result = at_once(function, *arguments, **named)
         return result if namespace(given) is np else on_device(result)
 
     return call  # pyright: ignore[reportReturnType]
@@ -92,8 +100,46 @@ class Recent:
 
 
 def undifferentiated(values: Any) -> Any:
-    """The same values, which no derivative goes through."""
-    return values if isinstance(values, np.ndarray) else jax.lax.stop_gradient(values)
+    """The same pytree of arrays, which no derivative goes through."""
+    return values if namespace(values) is np else jax.lax.stop_gradient(values)
+
+
+def kept(values: Any) -> Any:
+    """The same pytree of arrays, worked out once: XLA may else work them out anew wherever they are used."""
+    return values if namespace(values) is np else jax.lax.optimization_barrier(values)
+
+
+def while_loop(condition: Callable[[Any], Any], body: Callable[[Any], Any], state: Any) -> Any:
+    """The state after so many turns of `body` as `condition` asks for; `jax.lax.while_loop` of JAX's arrays."""
+    if namespace(state) is jnp:
+        return jax.lax.while_loop(condition, body, state)
+    while condition(state):
+        state = body(state)
+    return state
+
+
+def scan(body: Callable[[Any, Any], tuple[Any, Any]], state: Any, each: Any, *, reverse: bool = False) -> Any:
+    """The last state of `body(state, one)`, turn by turn along the first axis of `each`, and what it gave besides,
+    stacked; at least one turn in NumPy, `jax.lax.scan` of JAX's arrays."""
+    if namespace(state, each) is jnp:
+        return jax.lax.scan(body, state, each, reverse=reverse)
+    given: Any = [None] * len(jax.tree.leaves(each)[0])
+    for k in sorted(range(len(given)), reverse=reverse):
+        state, given[k] = body(state, jax.tree.map(lambda array, k=k: array[k], each))
+    return state, jax.tree.map(lambda *parts: np.stack(parts), *given)
+
+
+def slopes(function: Callable[[Any], Any], x: Any) -> tuple[Any, list[Any]]:
+    """What `function` returns at x (n, F), and its derivatives along each of the n rows; columns are independent.
+
+    In NumPy by complex steps (Squire and Trapp, SIAM Rev. 40, 1998, 110-112), exact to rounding: the function must be
+    analytic. In JAX by forward differentiation.
+    """
+    if isinstance(x, np.ndarray):
+        ahead = [function(x + _COMPLEX_STEP * row) for row in 1j * np.eye(len(x))[:, :, None]]
+        return function(x), [jax.tree.map(lambda part: np.imag(part) / _COMPLEX_STEP, one) for one in ahead]
+    value, push = jax.linearize(function, x)
+    return value, [push(direction) for direction in jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)]
 
 
 def gather(values: Shaped[Array, "n *k"], index: Int[Array, "*i"]) -> Shaped[Array, "..."]:
@@ -120,6 +166,15 @@ def replace_at(values: Shaped[Array, " n"], index: Any, value: Any) -> Shaped[Ar
 def sum_into(shape: tuple[int, ...], index: Any, values: Inexact[Array, "*i"]) -> Inexact[Array, "*n"]:
     """Zeros of this shape, to which `values` are added at `index`, repeated indices again and again."""
     return add_at(namespace(values).zeros(shape, values.dtype), index, values)
+
+
+def set_at(total: Shaped[Array, "*n"], index: Any, values: Any) -> Shaped[Array, "*n"]:
+    """`total` with `values` in place of those at `index`; indices beyond the end, of JAX's arrays, are passed over."""
+    if isinstance(total, np.ndarray):
+        changed: Any = np.array(total)
+        changed[index] = values
+        return changed
+    return total.at[index].set(values, mode="drop")
 
 
 def add_at(total: Inexact[Array, "*n"], index: Any, values: Inexact[Array, "*i"]) -> Inexact[Array, "*n"]:

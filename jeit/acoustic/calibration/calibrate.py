@@ -5,7 +5,6 @@ with are left out, and said.
 """
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -28,6 +27,7 @@ from jeit.acoustic.signal.intensity import IntensitySettings, check_settings, ta
 from jeit.acoustic.signal.recording import Taps
 from jeit.acoustic.surface import make_surface
 from jeit.arguments import check_kind
+from jeit_solvers.engines import as_array, host, on_device
 
 # A microphone is of no use whose model explains less of its levels' variance, or is known no better (relative error).
 _LEAST_EXPLAINED, _MOST_ERROR = 0.3, 1.0
@@ -76,6 +76,7 @@ class CalibrationFit(eqx.Module):
         )
 
 
+@np.errstate(all="ignore")  # of what fits nothing, reasons are given
 def calibrate_microphones(
     taps: Taps,
     *,
@@ -123,18 +124,19 @@ def calibrate_microphones(
             f"order of the channels? {told}."
         )
     # The factor between parameters and strengths, as `Calibration` has it.
-    gain = np.log(np.asarray(kind.from_logarithms(fit.values).gain))[good].mean()
-    strength = np.where(fit.heard, np.exp(np.asarray(fit.strength) + gain), np.nan)
+    gain = np.log(np.asarray(kind.from_logarithms(host.asarray(fit.values)).gain))[good].mean()
+    strength = np.where(fit.heard, np.exp(fit.strength + gain), np.nan)
+    values = host.concatenate([fit.values[:1] - gain, fit.values[1:]])
     calibration = Calibration(
         MicrophoneArray(
-            jnp.asarray(taps.microphones), surface, kind.from_logarithms(fit.values.at[0].add(-gain)), fit.noise
+            as_array(taps.microphones), surface, on_device(kind.from_logarithms(values)), on_device(fit.noise)
         ),
         good,
         reasons,
         standard_errors(fit),
         settings,
         taps.name,
-        _range(strength[(fit.use & (power > 3 * np.asarray(fit.noise.deviation)[:, None])).any(axis=0)]),
+        _range(strength[(fit.use & (power > 3 * fit.noise.deviation[:, None])).any(axis=0)]),
     )
     return CalibrationFit(
         calibration, distance, power.T, tried, strength, fit.outlier, explained, (fit.held == SHARED) & good
@@ -179,11 +181,11 @@ def _leave_out(fit: TapFit, faults) -> tuple[TapFit, Bool[np.ndarray, " M"], tup
 def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
     """Why each microphone is of no use, "" where it is; and the share of its levels' variance that its model explains,
     as it was `explained` before for those that are left out."""
-    expected, level, use = fit.expected(), np.asarray(fit.level), fit.use
+    expected, level, use = fit.expected(), fit.level, fit.use
     errors = standard_errors(fit)
     well = np.max(errors[1:], axis=0) < _MOST_ERROR
     needed = len(fit.kind.parameters) + 2
-    deviation, relative = np.asarray(fit.noise.deviation), np.asarray(fit.noise.relative)
+    deviation, relative = fit.noise.deviation, fit.noise.relative
     typical = float(np.median(relative[use.any(axis=1)])) if use.any() else 0.0
     share = np.zeros(len(faults)) if explained is None else explained.copy()
     reasons = []

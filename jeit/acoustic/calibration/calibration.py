@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -17,6 +16,7 @@ from jeit.acoustic.signal._arrays import check_extent, check_microphones, real
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.surface import AbstractSurface, CurvedSurface, Plane
 from jeit.mesh import Polygon
+from jeit_solvers.engines import as_array, on_host
 
 FORMAT, VERSION = "jeit microphone calibration", 1
 _UNITS = {"length": "m", "intensity": "square of the samples' unit"}
@@ -84,7 +84,7 @@ class Calibration(eqx.Module):
             raise ValueError(f"{name}: {error}") from None
 
     def _content(self) -> dict[str, Any]:
-        microphone_array = self.microphone_array
+        microphone_array = on_host(self.microphone_array)
         surface: dict[str, Any] = {
             "outline": _list(microphone_array.surface.outline.vertices),
             "holes": [_list(hole) for hole in microphone_array.surface.outline.holes],
@@ -137,22 +137,23 @@ class Calibration(eqx.Module):
 
         def column(key: str) -> Array:
             values = np.array([_real(one[key], f"{key} of microphone {k}") for k, one in enumerate(each)])
-            return jnp.asarray(values)
+            return as_array(values)
 
         parameters = [column(key) for key in kind.parameters]
         for key, values in zip(kind.parameters, parameters, strict=True):
             if not (np.asarray(values) > 0).all():
                 raise ValueError(f"{key} of microphone {int(np.argmin(values))} is not positive.")
         noise = [column(f"noise_{key}") for key in ("floor", "deviation", "cross")]
-        if min(float(jnp.min(values)) for values in (*noise, column("relative_noise"))) < 0:
+        if min(np.asarray(values).min() for values in (*noise, column("relative_noise"))) < 0:
             raise ValueError("noise of a microphone is negative.")
         positions = np.array([_place(one["position"], surface.dimension, k) for k, one in enumerate(each)])
-        known = surface.outline.vertices
-        if isinstance(surface, CurvedSurface):
-            known = jnp.concatenate([known, surface.knots])
-        check_microphones(positions, np.asarray(surface.place(known.T)).T)
+        at_hand = on_host(surface)
+        known: Any = at_hand.outline.vertices
+        if isinstance(at_hand, CurvedSurface):
+            known = np.concatenate([known, at_hand.knots])
+        check_microphones(positions, np.asarray(at_hand.place(known.T)).T)
         microphone_array = MicrophoneArray(
-            jnp.asarray(positions),
+            as_array(positions),
             surface,
             kind(*parameters),
             IntensityNoise(noise[0], noise[1], noise[2], column("relative_noise")),
@@ -180,7 +181,7 @@ def _surface(content: dict[str, Any]) -> AbstractSurface:
     arrays = [_array(content["curve"][key], f"curve, {key}", shape) for key, shape in _CURVE.items()]
     if len(arrays[3]) != len(arrays[4]):
         raise ValueError(f"curve: {len(arrays[3])} knots and {len(arrays[4])} weights; give a weight for each knot.")
-    return CurvedSurface(outline, *(jnp.asarray(array) for array in arrays))
+    return CurvedSurface(outline, *(as_array(array) for array in arrays))
 
 
 def _array(value, what: str, shape: tuple[int, ...]) -> np.ndarray:

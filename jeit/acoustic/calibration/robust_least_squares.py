@@ -8,10 +8,8 @@ from dataclasses import replace
 from operator import itemgetter
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from jeit.acoustic.calibration.decay_fit import (
@@ -25,6 +23,7 @@ from jeit.acoustic.calibration.decay_fit import (
 from jeit.acoustic.calibration.tap_noise import additive_deviations, relative_errors
 from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise, below_nothing
+from jeit_solvers.engines import host, on_host, slopes
 
 _ALTERNATIONS, _REWEIGHTINGS = 6, 12
 # Student's t with so many degrees of freedom weighs residuals.
@@ -56,19 +55,19 @@ class TapFit(eqx.Module):
     power: Float[np.ndarray, "M T"]
     noise: IntensityNoise
     known_noise: bool
-    values: Float[Array, "K M"]
+    values: Float[np.ndarray, "K M"]
     held: Int[np.ndarray, " M"]
-    strength: Float[Array, " T"]
+    strength: Float[np.ndarray, " T"]
     weight: Float[np.ndarray, "M T"]
     outlier: Bool[np.ndarray, " T"]
     dropped: Bool[np.ndarray, " M"]
-    start: Float[Array, "K M"]
+    start: Float[np.ndarray, "K M"]
     bounds: tuple[np.ndarray, np.ndarray]
 
     @property
     def usable(self) -> Bool[np.ndarray, "M T"]:
         """Readings whose level is a number, of microphones that are not left out."""
-        above = np.nan_to_num(self.power, nan=-np.inf) + np.asarray(self.noise.floor)[:, None] > 0
+        above = np.nan_to_num(self.power, nan=-np.inf) + self.noise.floor[:, None] > 0
         return above & ~self.dropped[:, None]
 
     @property
@@ -89,18 +88,18 @@ class TapFit(eqx.Module):
         return free
 
     @property
-    def level(self) -> Float[Array, "M T"]:
+    def level(self) -> Float[np.ndarray, "M T"]:
         """y = log(power + floor), anything where that is not usable."""
-        return self.noise.level(jnp.asarray(np.where(self.usable, self.power, 1.0)))
+        return np.asarray(self.noise.level(host.where(self.usable, self.power, 1.0)))
 
     def problem(self, *, with_outliers: bool = False) -> DecayProblem:
         """The least-squares problem with the weights as they are."""
-        weight = jnp.asarray(np.where(self.usable if with_outliers else self.use, self.weight, 0.0))
-        return DecayProblem(self.level, jnp.asarray(self.squared), weight, self.noise.floor, self.kind)
+        weight = np.where(self.usable if with_outliers else self.use, self.weight, 0.0)
+        return DecayProblem(self.level, self.squared, weight, np.asarray(self.noise.floor), self.kind)
 
     def expected(self) -> Float[np.ndarray, "M T"]:
         """Levels that the models say."""
-        return np.asarray(self.problem().expected(self.values, self.strength)[0])
+        return self.problem().expected(self.values, self.strength)[0]
 
 
 def fit_taps(
@@ -116,6 +115,7 @@ def fit_taps(
     spacing = float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
     lower, upper = (np.array(bound) for bound in kind.bounds(extent))
     start = kind.start(spacing if spacing > 0 else extent / 4, len(microphones)).logarithms()
+    start, noise = np.asarray(start), on_host(noise)
     count, taps = squared.shape
     fit = TapFit(
         kind,
@@ -125,7 +125,7 @@ def fit_taps(
         known_noise,
         values=start,
         held=np.full(count, FREE),
-        strength=jnp.zeros(taps),
+        strength=np.zeros(taps),
         weight=np.zeros(squared.shape),
         outlier=np.zeros(taps, bool),
         dropped=np.zeros(count, bool),
@@ -135,17 +135,16 @@ def fit_taps(
     # The loudest microphone alone says how strong a tap was.
     seen = np.where(fit.use, power, -np.inf)
     loudest = seen.argmax(axis=0), np.arange(taps)
-    response = np.asarray(kind.from_logarithms(start).log_response(jnp.asarray(squared)))
+    response = fit.problem().log_response(start)
     strength = np.log(np.clip(seen[loudest], 1e-300, 1e300)) - response[loudest]
     fit = replace(
         fit,
-        strength=jnp.asarray(np.where(fit.heard & np.isfinite(strength), strength, 0.0)),
+        strength=np.where(fit.heard & np.isfinite(strength), strength, 0.0),
         # At first the model is good to 20 % at best.
         weight=1 / np.maximum(_level_variance(fit, np.nan_to_num(np.maximum(power, 0.0))), 0.04),
     )
     for _ in range(_ALTERNATIONS):
-        values = fit_each(fit.problem(), fit.values, fit.strength)
-        values = jnp.clip(values, lower[:, None], upper[:, None])
+        values = fit_each(fit.problem(), fit.values, fit.strength, fit.bounds)
         strength = fit_strengths(fit.problem(with_outliers=True), values, fit.strength)
         fit = _reweighed(replace(fit, values=values, strength=strength))
     return _share_shapes(_refine(fit))
@@ -163,9 +162,9 @@ def standard_errors(fit: TapFit) -> Float[np.ndarray, "K M"]:
         return np.full(free.shape, np.nan)
 
     def scale(values):
-        return jnp.sum(jnp.where(free[0], jnp.log(fit.kind.from_logarithms(values).gain), 0.0))
+        return np.where(free[0], np.log(fit.kind.from_logarithms(values).gain), 0.0)
 
-    normal = np.asarray(jax.grad(scale)(fit.values)).ravel()
+    normal = np.ravel(slopes(scale, fit.values)[1])
     covariance = log_covariance(fit.problem(), fit.values, fit.strength, free, normal)
     return np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(free.shape)
 
@@ -174,11 +173,11 @@ def _refine(fit: TapFit) -> TapFit:
     """All microphones together, and what their residuals say, until nothing changes."""
     for _ in range(_REWEIGHTINGS):
         before, free = fit.values, fit.free
-        values, strength = fit_together(fit.problem(), before, fit.strength, jnp.asarray(free))
+        values, strength = fit_together(fit.problem(), before, fit.strength, free)
         fit = _keep_between(replace(fit, values=values, strength=strength))
         strength = fit_strengths(fit.problem(with_outliers=True), fit.values, fit.strength)
         fit = _reweighed(replace(fit, strength=strength))
-        if float(jnp.max(jnp.abs(fit.values - before)[free], initial=0.0)) < 1e-9:
+        if np.abs(fit.values - before)[free].max(initial=0.0) < 1e-9:
             break
     return fit
 
@@ -193,7 +192,7 @@ def _share_shapes(fit: TapFit) -> TapFit:
     determined = (fit.held == FREE) & (errors < _LOOSE)
     if determined.sum() < _ENOUGH:
         return fit
-    shape = np.median(np.asarray(fit.values)[1:, determined], axis=1)
+    shape = np.median(fit.values[1:, determined], axis=1)
     loose = (fit.held == FREE) & (errors >= _LOOSE)
     values = np.array(fit.values)
     pinned = [np.concatenate([limit[:1], shape]) for limit in fit.bounds]
@@ -209,7 +208,7 @@ def _share_shapes(fit: TapFit) -> TapFit:
             loose[k], values[:, k] = True, shared[0]
     if not loose.any():
         return fit
-    return _refine(replace(fit, values=jnp.asarray(values), held=np.where(loose, SHARED, fit.held)))
+    return _refine(replace(fit, values=values, held=np.where(loose, SHARED, fit.held)))
 
 
 def _keep_between(fit: TapFit) -> TapFit:
@@ -220,20 +219,20 @@ def _keep_between(fit: TapFit) -> TapFit:
     beyond = ((values <= lower[:, None]) | (values >= upper[:, None]) | ~np.isfinite(values)).any(axis=0)
     problem = fit.problem()
     for k in np.flatnonzero(fit.use.any(axis=1) & (held != SHARED) & (beyond | (held != FREE))):
-        starts = (jnp.nan_to_num(values), fit.start)
+        starts = (np.nan_to_num(values), fit.start)
         found = (fit_between(problem, first, fit.strength, int(k), fit.bounds) for first in starts)
         values[:, k] = min(found, key=itemgetter(1))[0]
         if (values[1:, k] >= upper[1:] - 1e-6).any():
             held[k] = ABOVE
         else:
             held[k] = FREE if (values[:, k] > lower + 1e-6).all() else BELOW
-    return replace(fit, values=jnp.asarray(values), held=held)
+    return replace(fit, values=values, held=held)
 
 
 def _reweighed(fit: TapFit) -> TapFit:
     """The noise, the outliers and the weights that the residuals say."""
     expected = fit.expected()
-    received = np.maximum(np.exp(expected) - np.asarray(fit.noise.floor)[:, None], 0.0)
+    received = np.maximum(np.exp(expected) - fit.noise.floor[:, None], 0.0)
     # What unknown strengths and parameters take out of the residuals.
     count = fit.use.sum()
     spent = fit.heard.sum() + fit.free.sum()
@@ -242,10 +241,12 @@ def _reweighed(fit: TapFit) -> TapFit:
         use = np.isfinite(fit.power) & ~fit.outlier
         deviation = additive_deviations(fit.power, received, use, inflation)
         betrayed = below_nothing(fit.power.T, np.isfinite(fit.power.T))
-        fit = replace(fit, noise=IntensityNoise.create(len(received), deviation=np.maximum(deviation, betrayed)))
+        fit = replace(
+            fit, noise=on_host(IntensityNoise.create(len(received), deviation=np.maximum(deviation, betrayed)))
+        )
     relative = relative_errors(fit.noise, received, _residual_of_equals(fit, received), fit.use, inflation)
-    fit = replace(fit, noise=replace(fit.noise, relative=jnp.asarray(relative)))
-    residual = np.where(fit.usable, np.asarray(fit.level) - expected, 0.0)
+    fit = replace(fit, noise=replace(fit.noise, relative=relative))
+    residual = np.where(fit.usable, fit.level - expected, 0.0)
     square = residual**2 / np.maximum(_variance(fit, np.maximum(received, 1e-150)), LEAST_RELATIVE**2)
     usable = fit.usable
     level = np.minimum(square, 100.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
@@ -260,11 +261,11 @@ def _residual_of_equals(fit: TapFit, received: np.ndarray) -> Float[np.ndarray, 
 
     With weights of their own one could be believed ever more for agreeing with strengths that it alone decides.
     """
-    relative = np.asarray(fit.noise.relative)
-    alike = replace(fit, noise=replace(fit.noise, relative=jnp.full(len(relative), np.median(relative))))
+    relative = fit.noise.relative
+    alike = replace(fit, noise=replace(fit.noise, relative=np.full(len(relative), np.median(relative))))
     alike = replace(alike, weight=1 / _level_variance(alike, received))
     strength = fit_strengths(alike.problem(with_outliers=True), fit.values, fit.strength)
-    return np.where(fit.usable, np.asarray(fit.level) - replace(alike, strength=strength).expected(), 0.0)
+    return np.where(fit.usable, fit.level - replace(alike, strength=strength).expected(), 0.0)
 
 
 def _level_variance(fit: TapFit, received: np.ndarray) -> np.ndarray:
@@ -274,4 +275,4 @@ def _level_variance(fit: TapFit, received: np.ndarray) -> np.ndarray:
 
 
 def _variance(fit: TapFit, received: np.ndarray) -> np.ndarray:
-    return np.asarray(fit.noise.level_variance(jnp.asarray(received)))
+    return np.asarray(fit.noise.level_variance(host.asarray(received)))

@@ -9,13 +9,12 @@ axis of all arrays here, microphones the first; intensities are taken relative t
 """
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit_solvers import inverse_small, symmetric_small
+from jeit_solvers.engines import kept, namespace, slopes
 
 
 class Consistency(eqx.Module):
@@ -32,10 +31,11 @@ class Consistency(eqx.Module):
         cls, power: Float[Array, "M F"], use: Bool[Array, "M F"], microphone_array: MicrophoneArray
     ) -> "Consistency":
         """Of intensities; what is not used may be anything, NaN included."""
-        known = jnp.where(use, power, 0.0)
-        scale = jnp.max(known, axis=0)
-        loudest = jnp.argmax(known, axis=0)
-        return cls(known / jnp.where(scale > 0, scale, 1.0), loudest, scale, use, microphone_array)
+        xp = namespace(power, use)
+        known = xp.where(use, power, 0.0)
+        scale = xp.max(known, axis=0)
+        loudest = xp.argmax(known, axis=0)
+        return cls(known / xp.where(scale > 0, scale, 1.0), loudest, scale, use, microphone_array)
 
     @property
     def frames(self) -> tuple[Array, ...]:
@@ -45,22 +45,20 @@ class Consistency(eqx.Module):
     def differences(self, chart: Float[Array, "2 F"]) -> Float[Array, "M F"]:
         """I_k g_k − I_i g_i, and 0 for what is not used."""
         told = self.power / self.microphone_array.response(chart)
-        most = jnp.take_along_axis(told, self.loudest[None], axis=0)
-        return jnp.where(self.use, most - told, 0.0)
+        xp = namespace(self, told)
+        most = xp.take_along_axis(told, self.loudest[None], axis=0)
+        return xp.where(self.use, most - told, 0.0)
 
     def cost(self, chart: Float[Array, "2 F"]) -> Float[Array, " F"]:
         """The loss L, relative to the square of the loudest intensity."""
-        return jnp.sum(self.differences(chart) ** 2, axis=0)
+        return (self.differences(chart) ** 2).sum(axis=0)
 
     def expand(self, chart: Float[Array, "2 F"]) -> tuple[Array, Array, Array]:
         """Loss, gradient, and the Gauss-Newton matrix."""
-        off, push = jax.linearize(self.differences, chart)
-        slopes = [push(direction) for direction in jnp.eye(2)[:, :, None] * jnp.ones_like(chart)]
-        off, slopes = jax.lax.optimization_barrier((off, slopes))
-        gradient = 2 * jnp.stack([jnp.sum(off * slope, axis=0) for slope in slopes])
-        rows = [[2 * jnp.sum(one * other, axis=0) for other in slopes[: k + 1]] for k, one in enumerate(slopes)]
-        matrix = symmetric_small(rows)
-        return jnp.sum(off**2, axis=0), gradient, matrix
+        off, along = kept(slopes(self.differences, chart))
+        gradient = 2 * namespace(off).stack([(off * slope).sum(axis=0) for slope in along])
+        rows = [[2 * (one * other).sum(axis=0) for other in along[: k + 1]] for k, one in enumerate(along)]
+        return (off**2).sum(axis=0), gradient, symmetric_small(rows)
 
     def start(self, chart: Float[Array, "2 F"]) -> Float[Array, "2 F"]:
         """The chart coordinates are all the unknowns there are."""
@@ -73,47 +71,49 @@ class Consistency(eqx.Module):
         if not isinstance(microphone_array.decay, InverseSquare):
             return microphone_array.response(chart)
         place = microphone_array.surface.place(chart)
-        terms = [jnp.sum(place**2, axis=0), *place, jnp.ones_like(place[0])]
-        return jnp.stack([terms[i] * terms[j] for i in range(len(terms)) for j in range(i + 1)])
+        xp = namespace(place)
+        terms = [xp.sum(place**2, axis=0), *place, xp.ones_like(place[0])]
+        return xp.stack([terms[i] * terms[j] for i in range(len(terms)) for j in range(i + 1)])
 
     def screen(self, features: Float[Array, "N P"]) -> Float[Array, "F P"]:
         """The loss at candidate places, by matrix products for all frames and places.
 
         With A = I_k g_k and n microphones in use it is n A² − 2 A Σ I_i g_i + Σ I_i² g_i². Where g is quadratic in the
         place, the loss is a polynomial of the fourth degree: ten coefficients a frame and one product."""
-        number = jnp.sum(self.use, axis=0)
+        xp = namespace(self, features)
+        number = xp.sum(self.use, axis=0)
         if not isinstance(self.microphone_array.decay, InverseSquare):
             inverse = 1 / features
-            most = jnp.take(inverse, self.loudest, axis=0)
+            most = xp.take(inverse, self.loudest, axis=0)
             return (number[:, None] * most - 2 * (self.power.T @ inverse)) * most + (self.power.T**2) @ inverse**2
         decay, where = self.microphone_array.decay, self.microphone_array.microphones
-        constant = jnp.sum(where**2, axis=1) + decay.b
-        quadratic = jnp.column_stack([jnp.ones(len(where)), -2 * where, constant]) / decay.a[:, None]
+        constant = xp.sum(where**2, axis=1) + decay.b
+        quadratic = xp.column_stack([xp.ones(len(where)), -2 * where, constant]) / decay.a[:, None]
         told = [self.power * column[:, None] for column in quadratic.T]
-        most = [jnp.take_along_axis(each, self.loudest[None], axis=0)[0] for each in told]
-        total = [jnp.sum(each, axis=0) for each in told]
+        most = [xp.take_along_axis(each, self.loudest[None], axis=0)[0] for each in told]
+        total = [xp.sum(each, axis=0) for each in told]
         coefficients = []
         for i in range(len(told)):
             for j in range(i + 1):
                 both = number * most[i] * most[j] - most[i] * total[j] - most[j] * total[i]
-                both = both + jnp.sum(told[i] * told[j], axis=0)
+                both = both + xp.sum(told[i] * told[j], axis=0)
                 coefficients.append(both if i == j else 2 * both)
-        return jnp.stack(coefficients, axis=1) @ features
+        return xp.stack(coefficients, axis=1) @ features
 
     def covariance(self, chart: Float[Array, "2 F"], strength: Float[Array, " F"]) -> Float[Array, "2 2 F"]:
         """Of the minimum, from the intensities' variances: Σ_i (∂u/∂I_i)(∂u/∂I_i)ᵀ var I_i, with the derivative of the
         minimum by the implicit function theorem, ∂u/∂I = −H⁻¹ ∂²L/∂u∂I at small differences."""
-        told, push = jax.linearize(lambda u: 1 / self.microphone_array.response(u), chart)
-        slope = jnp.stack([push(direction) for direction in jnp.eye(2)[:, :, None] * jnp.ones_like(chart)])
-        slope = slope * self.power
-        most = jnp.take_along_axis(slope, self.loudest[None, None], axis=1)
-        rise = jnp.where(self.use, most - slope, 0.0)
-        matrix = jnp.einsum("kmf,lmf->klf", rise, rise)
+        told, along = slopes(lambda u: 1 / self.microphone_array.response(u), chart)
+        xp = namespace(self, told)
+        slope = xp.stack(along) * self.power
+        most = xp.take_along_axis(slope, self.loudest[None, None], axis=1)
+        rise = xp.where(self.use, most - slope, 0.0)
+        matrix = xp.einsum("kmf,lmf->klf", rise, rise)
         # ∂/∂I_i of ½∂L/∂u: −g_i times the rise of its difference; of the loudest, g_k times that of all.
-        is_loudest = jnp.arange(told.shape[0])[:, None] == self.loudest
-        drive = jnp.where(is_loudest, jnp.sum(rise, axis=1, keepdims=True) * told, -told * rise)
+        is_loudest = xp.arange(told.shape[0])[:, None] == self.loudest
+        drive = xp.where(is_loudest, xp.sum(rise, axis=1, keepdims=True) * told, -told * rise)
         received = strength / told
-        variance = self.microphone_array.noise.variance(received) / jnp.where(self.scale > 0, self.scale, 1.0) ** 2
-        spread = jnp.einsum("kmf,lmf,mf->klf", drive, drive, jnp.where(self.use, variance, 0.0))
+        variance = self.microphone_array.noise.variance(received) / xp.where(self.scale > 0, self.scale, 1.0) ** 2
+        spread = xp.einsum("kmf,lmf,mf->klf", drive, drive, xp.where(self.use, variance, 0.0))
         inverse = inverse_small(matrix)
-        return jnp.einsum("ijf,jkf,klf->ilf", inverse, spread, inverse)
+        return xp.einsum("ijf,jkf,klf->ilf", inverse, spread, inverse)

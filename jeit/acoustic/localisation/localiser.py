@@ -1,8 +1,8 @@
 """The localiser: intensities of many frames to positions, by maximum likelihood or by intensity consistency.
 
 Each frame is screened on a coarse grid, its best two valleys are descended, and a minimum beyond the outline gives way
-to the best place on the outline. All of it is one compiled program, differentiable by the implicit function theorem in
-the intensities, the microphones' positions and the decay models.
+to the best place on the outline. All of it is one program, compiled unless it is asked for once, differentiable by the
+implicit function theorem in the intensities, the microphones' positions and the decay models.
 """
 
 import equinox as eqx
@@ -20,6 +20,16 @@ from jeit.acoustic.microphones import MicrophoneArray, check_array
 from jeit.acoustic.surface import bounding_box, in_space, longer_side
 from jeit.arguments import check_name
 from jeit_solvers import inverse_small
+from jeit_solvers.engines import (
+    at_once,
+    either_engine,
+    has_values,
+    namespace,
+    on_device,
+    on_host,
+    scan,
+    undifferentiated,
+)
 
 METHODS = {"likelihood": Likelihood, "consistency": Consistency}
 # Places screened, in the outline's box.
@@ -57,6 +67,7 @@ class Localiser(eqx.Module):
     pixels: Pixels | None
     features: Float[Array, "N P"] | None
     method: str = eqx.field(static=True)
+    compiled: bool = eqx.field(static=True, default=True)
 
     @classmethod
     def create(
@@ -65,29 +76,32 @@ class Localiser(eqx.Module):
         *,
         method: str = "likelihood",
         map_shape: tuple[int, int] | None = None,
+        compiled: bool = True,
     ) -> "Localiser":
         """`method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster on
         which every frame's whole map is worked out and where the descent starts, (200, 200) in the paper; a coarse grid
-        of 400 places and no maps unless given. Raises `ValueError` for another method, or a shape that makes no sense.
+        of 400 places and no maps unless given. `compiled`: False for what is asked for once, which NumPy answers before
+        JAX has compiled it. Raises `ValueError` for another method, or a shape that makes no sense.
         """
         check_array(microphone_array)
         check_name("method", method, METHODS)
-        low, high = bounding_box(microphone_array.surface)
+        low, high = bounding_box(on_host(microphone_array.surface))
         sides_of_box = np.asarray(high - low)
         spacing = np.sqrt(np.prod(sides_of_box) / _COARSE)
         counts = [max(3, round(side / spacing)) for side in sides_of_box]
         coarse = Pixels.create(microphone_array.surface, *counts)
         if map_shape is None:
-            return cls(microphone_array, coarse, None, None, method)
+            return cls(microphone_array, coarse, None, None, method, compiled)
         if len(map_shape) != 2 or min(map_shape) < 2:
             raise ValueError(f"map_shape must be (rows, columns) of at least two each; it is {map_shape!r}.")
         pixels = Pixels.create(microphone_array.surface, int(map_shape[1]), int(map_shape[0]))
-        return cls(microphone_array, coarse, pixels, METHODS[method].features(microphone_array, pixels.chart), method)
+        features = _features(METHODS[method], microphone_array, pixels.chart)
+        return cls(microphone_array, coarse, pixels, features, method, compiled)
 
     def __call__(self, power: ArrayLike, use: ArrayLike | None = None) -> SourceEstimate:
         """Locate the source of each frame. `power` (F, M): intensities above the floor; `use`: which to look at, all
         that are finite unless given. Frames with fewer than three usable microphones give NaN."""
-        return _locate(self, *self._checked(power, use))
+        return self._run(_locate, power, use)
 
     def maps(self, power: ArrayLike, use: ArrayLike | None = None) -> Float[Array, "F rows columns"]:
         """The map of each frame: the paper's loss, relative to the square of the loudest intensity, or minus the
@@ -95,7 +109,7 @@ class Localiser(eqx.Module):
         localiser was made without `map_shape`."""
         if self.pixels is None:
             raise ValueError("maps were not asked for: make the Localiser with map_shape=(rows, columns).")
-        return _maps(self, *self._checked(power, use))
+        return self._run(_maps, power, use)
 
     def with_maps(
         self, power: ArrayLike, use: ArrayLike | None = None
@@ -103,17 +117,24 @@ class Localiser(eqx.Module):
         """Both: what is found of each frame, and its map."""
         return self(power, use), self.maps(power, use)
 
-    def _checked(self, power, use) -> tuple[Array, Array]:
-        """Intensities as an array, and which are to be looked at."""
-        power = jnp.asarray(power, float)
-        finite = jnp.isfinite(power)
-        use = finite if use is None else finite & jnp.asarray(use, bool)
+    def _run(self, function, power, use):
+        """`function` of the localiser, of intensities as an array, and of which are to be looked at."""
+        at_hand = not self.compiled and np.size(power) > 0 and has_values(self, power, use)
+        xp = np if at_hand else jnp
+        power = xp.asarray(power, float)
+        finite = xp.isfinite(power)
+        use = finite if use is None else finite & xp.asarray(use, bool)
         if power.ndim != 2 or power.shape != use.shape or power.shape[1] != len(self.microphone_array.microphones):
             raise ValueError(
                 f"power has shape {power.shape} and use {use.shape}; give (frames, microphones) with "
                 f"{len(self.microphone_array.microphones)} microphones."
             )
-        return power, use
+        return on_device(at_once(function, self, power, use)) if at_hand else _compiled(function, self, power, use)
+
+
+@eqx.filter_jit
+def _compiled(function, localiser: Localiser, power, use):
+    return function(localiser, power, use)
 
 
 def _in_chunks(function, most: int, *arrays):
@@ -123,11 +144,18 @@ def _in_chunks(function, most: int, *arrays):
     chunks = -(-number // size_of_chunk)
     pad = ((0, chunks * size_of_chunk - number), (0, 0))
 
-    def cut(array):
-        return jnp.pad(array, pad).reshape(chunks, size_of_chunk, -1).transpose(0, 2, 1)
+    xp = namespace(arrays)
 
-    found = jax.lax.map(lambda chunk: function(*chunk), tuple(cut(array) for array in arrays))
+    def cut(array):
+        return xp.pad(array, pad).reshape(chunks, size_of_chunk, -1).transpose(0, 2, 1)
+
+    _, found = scan(lambda _, chunk: (None, function(*chunk)), None, tuple(cut(array) for array in arrays))
     return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:number], found)
+
+
+@either_engine
+def _features(objective, microphone_array: MicrophoneArray, chart) -> Array:
+    return objective.features(microphone_array, chart)
 
 
 def _raster(localiser: Localiser, microphone_array: MicrophoneArray) -> tuple[Pixels, Array]:
@@ -137,21 +165,22 @@ def _raster(localiser: Localiser, microphone_array: MicrophoneArray) -> tuple[Pi
     return localiser.coarse, METHODS[localiser.method].features(microphone_array, localiser.coarse.chart)
 
 
-@eqx.filter_jit
 def _maps(localiser: Localiser, power, use) -> Array:
     """Of all frames at once: one product, with nothing to copy."""
     pixels, features = _raster(localiser, localiser.microphone_array)
     use = _usable(localiser, power, use)
     maps = METHODS[localiser.method].create(power.T, use.T, localiser.microphone_array).screen(features)
-    return (maps if pixels.full else jnp.where(pixels.inside, maps, jnp.nan)).reshape(-1, *pixels.shape)
+    return (maps if pixels.full else namespace(maps).where(pixels.inside, maps, np.nan)).reshape(-1, *pixels.shape)
 
 
 def _starts(localiser: Localiser, power, use):
     """Where the descents of each frame start: first (F, 2), second (F, 2), and whether that is worth it (F,)."""
-    still = jax.lax.stop_gradient(localiser.microphone_array)
+    still = undifferentiated(localiser.microphone_array)
     pixels, features = _raster(localiser, still)
     # Valleys of a model known to be exact are narrower than pixels are apart: screened as if it were not.
-    still = eqx.tree_at(lambda one: one.noise.relative, still, jnp.maximum(still.noise.relative, _SCREENED_AT))
+    still = eqx.tree_at(
+        lambda one: one.noise.relative, still, namespace(still).maximum(still.noise.relative, _SCREENED_AT)
+    )
 
     def screen(power, use):
         maps = METHODS[localiser.method].create(power, use, still).screen(features)
@@ -159,7 +188,7 @@ def _starts(localiser: Localiser, power, use):
         return first.T, second.T, worth
 
     most = _CHUNK if localiser.pixels is None else _CHUNK_OF_MAPS
-    return _in_chunks(screen, most, jax.lax.stop_gradient(power), use)
+    return _in_chunks(screen, most, undifferentiated(power), use)
 
 
 def _usable(localiser: Localiser, power, use):
@@ -167,7 +196,6 @@ def _usable(localiser: Localiser, power, use):
     return use & (power + localiser.microphone_array.noise.floor > 0)
 
 
-@eqx.filter_jit
 def _locate(localiser: Localiser, power, use) -> SourceEstimate:
     use = _usable(localiser, power, use)
     first, second, worth = _starts(localiser, power, use)
@@ -181,8 +209,8 @@ def _locate(localiser: Localiser, power, use) -> SourceEstimate:
 def _refine(localiser: Localiser, power, use, first, second, worth) -> SourceEstimate:
     """From the starts (2, F) of each frame; `power` and `use` (M, F)."""
     microphone_array = localiser.microphone_array
-    fixed = jax.lax.stop_gradient(microphone_array)
-    still = METHODS[localiser.method].create(jax.lax.stop_gradient(power), use, fixed)
+    fixed = undifferentiated(microphone_array)
+    still = METHODS[localiser.method].create(undifferentiated(power), use, fixed)
     # Where one pixel of many was the start there is no second valley to try.
     unknowns, excess, rival, converged, side = find_minima(
         still, first, second, worth if localiser.pixels is None else None
@@ -194,24 +222,25 @@ def _refine(localiser: Localiser, power, use, first, second, worth) -> SourceEst
 
 
 def _describe(objective, likelihood: Likelihood, unknowns, excess, rival, converged) -> SourceEstimate:
+    xp = namespace(likelihood, unknowns)
     surface, chart = likelihood.microphone_array.surface, unknowns[:2]
     if isinstance(objective, Likelihood):
-        strength = jnp.exp(unknowns[2])
+        strength = xp.exp(unknowns[2])
         spread = inverse_small(likelihood.expand(unknowns)[2])[:2, :2]
     else:
         strength = likelihood.strength(likelihood.microphone_array.response(chart))
         spread = objective.covariance(chart, strength)
-    misfit = likelihood.misfit(jnp.concatenate([chart, jnp.log(strength)[None]]))
+    misfit = likelihood.misfit(xp.concatenate([chart, xp.log(strength)[None]]))
     place, covariance = in_space(surface, chart, spread)
-    number = jnp.sum(likelihood.use, axis=0)
-    known = (number >= 3) & jnp.all(jnp.isfinite(unknowns), axis=0)
+    number = xp.sum(likelihood.use, axis=0)
+    known = (number >= 3) & xp.all(xp.isfinite(unknowns), axis=0)
     return SourceEstimate(
-        position=jnp.where(known[:, None], place, jnp.nan),
-        covariance=jnp.where(known[:, None, None], covariance, jnp.nan),
-        strength=jnp.where(known, strength, jnp.nan),
-        misfit=jnp.where(known, misfit, jnp.nan),
-        freedom=jnp.maximum(number - 3, 0),
-        excess=jnp.where(known, 2 * excess, jnp.nan),
-        rival=jnp.where(known, 2 * rival, jnp.nan),
+        position=xp.where(known[:, None], place, xp.nan),
+        covariance=xp.where(known[:, None, None], covariance, xp.nan),
+        strength=xp.where(known, strength, xp.nan),
+        misfit=xp.where(known, misfit, xp.nan),
+        freedom=xp.maximum(number - 3, 0),
+        excess=xp.where(known, 2 * excess, xp.nan),
+        rival=xp.where(known, 2 * rival, xp.nan),
         converged=converged & known,
     )

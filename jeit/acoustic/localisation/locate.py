@@ -1,14 +1,13 @@
 """From a recording to places: which frames hold a touch, where it is, and what is wrong with the others."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
 from jeit.acoustic.localisation.localiser import Localiser, SourceEstimate
-from jeit.acoustic.localisation.locations import Locations, LocationStatus
+from jeit.acoustic.localisation.locations import FEW_FRAMES, Locations, LocationStatus
 from jeit.acoustic.localisation.setup_changes import find_setup_changes
 from jeit.acoustic.localisation.two_sources import locate_two
 from jeit.acoustic.microphones import MicrophoneArray
@@ -17,6 +16,7 @@ from jeit.acoustic.signal.faults import describe_faults
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.acoustic.surface import longer_side
+from jeit_solvers.engines import as_array, on_host
 
 # Chance that a silent frame is taken for a touch; that a frame one source explains is said not to be.
 _FALSE_ALARM, _FALSE_MISFIT = 1e-6, 1e-4
@@ -57,7 +57,8 @@ def locate(
     touched = use.any(axis=1) & _above_floor(heard, microphone_array.noise, use)
     enough = use.sum(axis=1) >= 3
     solve = touched & enough
-    localiser = Localiser.create(microphone_array, method=method, map_shape=map_shape)
+    many = int(solve.sum()) > FEW_FRAMES
+    localiser = Localiser.create(microphone_array, method=method, map_shape=map_shape, compiled=many)
     frames, d = len(heard.times), calibration.microphone_array.microphones.shape[1]
     status = np.where(touched, LocationStatus.TOUCH, LocationStatus.NO_TOUCH).astype(object)
     status[~enough] = LocationStatus.UNUSABLE
@@ -75,7 +76,7 @@ def locate(
         power, used = _padded(heard.power[solve], use[solve])
         found = localiser(power, used)
         # The likelihood judges frames, whichever loss has placed them.
-        judge = found if method == "likelihood" else Localiser.create(microphone_array)(power, used)
+        judge = found if method == "likelihood" else Localiser.create(microphone_array, compiled=many)(power, used)
         number = int(solve.sum())
         for key in ("position", "covariance", "strength"):
             result[key][solve] = getattr(found, key)[:number]
@@ -86,7 +87,7 @@ def locate(
         excess = np.zeros(frames)
         excess[solve] = np.asarray(judge.excess)[:number]
         status[(status == LocationStatus.MISFIT) & (excess > _OUTSIDE)] = LocationStatus.OUTSIDE
-        _bound(status, result, float(longer_side(microphone_array.surface)))
+        _bound(status, result, float(longer_side(on_host(microphone_array.surface))))
         notes += _notes(status, heard, use, microphone_array)
     return Locations(
         np.asarray(heard.times),
@@ -220,7 +221,10 @@ def microphones_in_use(
         noise = eqx.tree_at(
             lambda n: (n.deviation, n.floor),
             known,
-            (jnp.asarray(wider), jnp.maximum(known.floor, IntensityNoise.create(len(wider), deviation=wider).floor)),
+            (
+                as_array(wider),
+                as_array(np.maximum(known.floor, IntensityNoise.create(len(wider), deviation=wider).floor)),
+            ),
         )
     return (
         eqx.tree_at(lambda microphone_array: microphone_array.noise, calibration.microphone_array, noise),
@@ -241,8 +245,8 @@ def _above_floor(heard: Intensities, noise: IntensityNoise, use: np.ndarray) -> 
 
 
 def _padded(power: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Frames repeated up to a round number of them, so that few sizes are ever compiled."""
+    """Many frames repeated up to a round number of them, so that few sizes are ever compiled; few as they are."""
     number = len(power)
-    round_number = max(64, 1 << (number - 1).bit_length()) if number <= 1024 else -(-number // 1024) * 1024
+    round_number = number if number <= FEW_FRAMES else -(-number // FEW_FRAMES) * FEW_FRAMES
     index = np.minimum(np.arange(round_number), number - 1)
     return power[index], use[index]

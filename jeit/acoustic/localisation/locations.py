@@ -6,6 +6,9 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+# So many frames NumPy is done with before a program for them would be compiled.
+FEW_FRAMES = 1024
+
 
 class LocationStatus(StrEnum):
     """What a frame is; see `Locations`."""

@@ -107,14 +107,12 @@ def _show(console, fit: "CalibrationFit", taps: "Taps") -> None:
 
 def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
     """The Cramér-Rao bound where it was tapped, as loudly: standard deviation along its worst direction, metres."""
-    import jax.numpy as jnp
     import numpy as np
 
     from jeit.acoustic import cramer_rao
 
     heard, usable = fit.strength > 0, np.asarray(fit.calibration.usable)
-    places, strength = jnp.asarray(taps.positions[heard]), jnp.asarray(fit.strength[heard])
-    bound = cramer_rao(fit.calibration.microphone_array, places, strength, use=usable)
+    bound = cramer_rao(fit.calibration.microphone_array, taps.positions[heard], fit.strength[heard], use=usable)
     return float(np.median(np.sqrt(np.linalg.eigvalsh(bound)[:, -1])))
 
 
@@ -122,8 +120,10 @@ def _parameters(fit: "CalibrationFit"):
     """A table of the decay models of all usable microphones."""
     from rich.table import Table
 
+    from jeit_solvers.engines import on_host
+
     calibration = fit.calibration
-    decay, noise = calibration.microphone_array.decay, calibration.microphone_array.noise
+    decay, noise = on_host((calibration.microphone_array.decay, calibration.microphone_array.noise))
     factors, units = {"a": 1.0, "b": 1e6, "length": 1e3}, {"a": "m²", "b": "mm²", "length": "mm"}
     if decay.name == "exponential":
         units["a"] = "1"

@@ -17,7 +17,7 @@ from jeit.mesh.generate.unstructured import Target, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import polyline
 from jeit.mesh.outline.domain import Domain, Pen
-from jeit_solvers.engines import has_values
+from jeit_solvers.engines import as_array, has_values
 
 
 class Polygon(Domain):
@@ -41,8 +41,8 @@ class Polygon(Domain):
         inner = [loops.check_loop(hole, f"holes[{k}]", clockwise=True) for k, hole in enumerate(holes)]
         loops.check_apart(outer, inner)
         warn_large(float(np.ptp(outer, axis=0).max()), "vertices")
-        self.vertices = jnp.asarray(outer)
-        self.holes = tuple(jnp.asarray(hole) for hole in inner)
+        self.vertices = as_array(outer)
+        self.holes = tuple(as_array(hole) for hole in inner)
 
     @property
     def area(self) -> Float[Array, ""]:

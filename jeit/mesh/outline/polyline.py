@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from jeit.mesh.loops import inside as enclosed
 from jeit.mesh.outline.domain import numerics
+from jeit_solvers.engines import either_engine, namespace
 
 Loop = Float[Array, "k 2"]
 
@@ -41,8 +42,12 @@ def along(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
     return jnp.stack([jnp.interp(wrapped, stops, closed[:, axis]) for axis in range(2)], axis=-1)
 
 
+@either_engine
 def contains(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."]:
     """True for each of `points` (…, 2) inside the first loop and outside the holes (even-odd rule)."""
+    if namespace(loops, points) is np:
+        at = np.asarray(points)
+        return enclosed(at.reshape(-1, 2), loops).reshape(at.shape[:-1])  # pyright: ignore
     points = jnp.asarray(points)
     inside = jnp.zeros(points.shape[:-1], bool)
     for loop in loops:

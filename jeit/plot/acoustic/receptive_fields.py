@@ -3,7 +3,6 @@
 import textwrap
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
@@ -15,6 +14,7 @@ from jeit.acoustic.calibration.calibrate import CalibrationFit
 from jeit.arguments import check_kind
 from jeit.plot.acoustic.surface_view import FOUND, HALO
 from jeit.plot.axes import INK, SOFT, axes_or_new, soften_axes
+from jeit_solvers.engines import on_host
 
 _TAP = "#8fb4d9"
 
@@ -43,8 +43,8 @@ def plot_receptive_fields(
     ax.set_axis_off()
     ax.set_title(title or "", loc="left", pad=26)
     distance = np.linspace(0, float(fit.distance.max()), 200)
-    squares = jnp.asarray(np.broadcast_to(distance**2, (number, distance.size)))
-    curve = np.asarray(fit.calibration.microphone_array.decay.response(squares))
+    decay = on_host(fit.calibration.microphone_array.decay)
+    curve = np.asarray(decay.response(np.broadcast_to(distance**2, (number, distance.size))))
     relative = fit.power / _strengths(fit)[:, None]
     noise = np.asarray(fit.calibration.microphone_array.noise.deviation) / np.nanmedian(fit.strength)
     seen = relative[:, chosen][np.isfinite(relative[:, chosen]) & (relative[:, chosen] > 0)]
@@ -56,6 +56,7 @@ def plot_receptive_fields(
     for place, index in enumerate(chosen):
         row, column = divmod(place, columns)
         panel = ax.inset_axes((column * wide, 1 - (row + 1) * tall, 0.93 * wide, 0.9 * tall))
+        panel.set_in_layout(False)  # the labels of all of them reach farther
         _draw_field(panel, fit, int(index), relative[:, index], (distance, curve[index], noise[index]), columns)
         panel.set_xlim(0, 1e3 * distance[-1])
         panel.set_ylim(low, high)
@@ -85,8 +86,7 @@ def _label(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
 
 def _strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
     """Of every tap: those left out of the fit have none, and get the median of what the microphones say."""
-    squares = jnp.asarray(fit.distance.T**2)
-    response = np.asarray(fit.calibration.microphone_array.decay.response(squares)).T
+    response = np.asarray(on_host(fit.calibration.microphone_array.decay).response(fit.distance.T**2)).T
     strength = np.where((fit.power > 0) & fit.calibration.usable, fit.power / response, np.nan)
     heard = np.isfinite(strength).any(axis=1)
     median = np.full(len(strength), np.nan)

@@ -2,8 +2,6 @@
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
@@ -17,6 +15,7 @@ from jeit.acoustic import Calibration, MicrophoneArray
 from jeit.acoustic.surface import AbstractSurface, bounding_box, make_surface
 from jeit.mesh import Domain
 from jeit.plot.axes import INK, SOFT, bare, draw_scale_bar, extent_of
+from jeit_solvers.engines import host, on_host, slopes
 
 MICROPHONE, FOUND = "#1f6fb4", "#c8102e"
 HALO = (withStroke(linewidth=2.5, foreground="white"),)
@@ -27,7 +26,8 @@ AnySurface = Calibration | MicrophoneArray | AbstractSurface | Domain | ArrayLik
 
 
 class View(NamedTuple):
-    """A surface seen along its chart's normal: `surface`, `microphones` (M, 2) in the chart, which are `usable`."""
+    """A surface seen along its chart's normal: `surface`, in NumPy's arrays, `microphones` (M, 2) in the chart, which
+    are `usable`."""
 
     surface: AbstractSurface
     microphones: np.ndarray
@@ -36,7 +36,7 @@ class View(NamedTuple):
     @property
     def extent(self) -> tuple[float, float, float, float]:
         """(x_min, x_max, y_min, y_max) of the outline, metres."""
-        (left, bottom), (right, top) = (np.asarray(corner) for corner in bounding_box(self.surface))
+        (left, bottom), (right, top) = bounding_box(self.surface)
         return float(left), float(right), float(bottom), float(top)
 
     def chart(self, points: ArrayLike, name: str) -> np.ndarray:
@@ -58,8 +58,9 @@ class View(NamedTuple):
         spread, d = np.asarray(covariance, float), self.surface.dimension
         if spread.shape != (d, d):
             raise ValueError(f"{name} has shape {spread.shape}; give ({d}, {d}) in m².")
-        slopes = jax.jacfwd(lambda x: self.surface.project(x[:, None])[:, 0])(jnp.asarray(point, float))
-        return np.asarray(slopes @ spread @ slopes.T)
+        _, along = slopes(self.surface.project, np.asarray(point, float)[:, None])
+        turn = np.concatenate(along, axis=1)
+        return turn @ spread @ turn.T
 
 
 def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: ArrayLike | None = None) -> View:
@@ -73,12 +74,12 @@ def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: A
     if isinstance(surface, MicrophoneArray):
         microphones = surface.microphones if microphones is None else microphones
         surface = surface.surface
-    surface = surface if isinstance(surface, AbstractSurface) else make_surface(surface)
-    place = np.zeros((0, 2)) if microphones is None else chart_of(surface, microphones, "microphones")
+    seen: AbstractSurface = on_host(surface if isinstance(surface, AbstractSurface) else make_surface(surface))
+    place = np.zeros((0, 2)) if microphones is None else chart_of(seen, microphones, "microphones")
     good = np.ones(len(place), bool) if usable is None else np.asarray(usable, bool)
     if good.shape != (len(place),):
         raise ValueError(f"usable has shape {good.shape}; give one for each of the {len(place)} microphones.")
-    return View(surface, place, good)
+    return View(seen, place, good)
 
 
 def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarray:
@@ -86,14 +87,13 @@ def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarr
     place = np.asarray(points, float)
     if place.ndim != 2 or place.shape[1] != surface.dimension:
         raise ValueError(f"{name} has shape {place.shape}; give (n, {surface.dimension}) in metres.")
-    return np.asarray(surface.project(jnp.asarray(place.T))).T
+    return np.asarray(surface.project(host.asarray(place.T))).T
 
 
 def outline_of(view: View) -> Path:
     """The outline and its holes, in the chart."""
-    outline = view.surface.outline
-    loops = [np.asarray(loop) for loop in (outline.vertices, *outline.holes)]
-    return Path.make_compound_path(*(Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in loops))
+    loops = (Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in view.surface.outline.loops())
+    return Path.make_compound_path(*loops)
 
 
 def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool = False) -> list[Line2D]:

@@ -5,12 +5,17 @@ systems are solved by formulas written out.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+
+from jeit_solvers.engines import host, namespace, set_at, slopes, while_loop
 
 # What a function must give at x (n, F), with data whose last axis is F: its value (F,), gradient (n, F), and a positive
 # definite model of its Hessian (n, n, F), the Gauss-Newton or Fisher matrix for instance.
@@ -21,6 +26,8 @@ _MOST_DAMPING = 1e12
 _LEAST_PART = 32
 # Steps that the whole batch takes before what is left of it is gathered.
 _WHOLE_STEPS = 8
+# Between points whose slopes make a Hessian.
+_APART = 1e-6
 
 
 class Minimum(eqx.Module):
@@ -37,48 +44,61 @@ def solve_small(matrix: Float[Array, "n n F"], right: Float[Array, "n F"]) -> Fl
     number, lower = matrix.shape[0], _cholesky(matrix)
     forward: list[Array] = []
     for i in range(number):
-        rest = right[i] - sum((lower[i, k] * forward[k] for k in range(i)), jnp.zeros(()))
+        rest = right[i] - sum(lower[i, k] * forward[k] for k in range(i))
         forward.append(rest / lower[i, i])
     solution: dict[int, Array] = {}
     for i in reversed(range(number)):
-        rest = forward[i] - sum((lower[k, i] * solution[k] for k in range(i + 1, number)), jnp.zeros(()))
+        rest = forward[i] - sum(lower[k, i] * solution[k] for k in range(i + 1, number))
         solution[i] = rest / lower[i, i]
-    return jnp.stack([solution[i] for i in range(number)])
+    return namespace(matrix, right).stack([solution[i] for i in range(number)])
+
+
+def gradient_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n F"]:
+    """The gradients at x of F functions, each of its own column: `value` (n, F) -> (F,), analytic."""
+    if isinstance(x, np.ndarray):
+        return host.stack(slopes(value, x)[1])
+    return jax.grad(lambda at: jnp.sum(value(at)))(x)
 
 
 def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n n F"]:
-    """The Hessians at x of F functions, each of its own column: `value` (n, F) -> (F,)."""
-    slope = jax.grad(lambda at: jnp.sum(value(at)))
+    """The Hessians at x of F functions, each of its own column: `value` (n, F) -> (F,), analytic.
+
+    In NumPy central differences of complex steps: good to some eight digits, for steps that need no more."""
+    if isinstance(x, np.ndarray):
+        apart = _APART * np.eye(len(x))[:, :, None]
+        rows = [gradient_small(value, x + each) - gradient_small(value, x - each) for each in apart]
+        return host.stack(rows) / (2 * _APART)
     directions = jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)
-    return jnp.stack([jax.jvp(slope, (x,), (direction,))[1] for direction in directions])
+    return jnp.stack([jax.jvp(partial(gradient_small, value), (x,), (direction,))[1] for direction in directions])
 
 
 def definite_small(matrix: Float[Array, "n n F"]) -> Bool[Array, " F"]:
     """Which of F symmetric matrices are positive definite."""
-    lower = _cholesky(matrix)
-    diagonal = jnp.stack([lower[i, i] for i in range(len(matrix))])
-    return jnp.all(jnp.isfinite(diagonal) & (diagonal > 0), axis=0)
+    lower, xp = _cholesky(matrix), namespace(matrix)
+    diagonal = xp.stack([lower[i, i] for i in range(len(matrix))])
+    return xp.all(xp.isfinite(diagonal) & (diagonal > 0), axis=0)
 
 
 def _cholesky(matrix: Float[Array, "n n F"]) -> dict[tuple[int, int], Array]:
     lower: dict[tuple[int, int], Array] = {}
     for j in range(matrix.shape[0]):
         for i in range(j, matrix.shape[0]):
-            rest = matrix[i, j] - sum((lower[i, k] * lower[j, k] for k in range(j)), jnp.zeros(()))
-            lower[i, j] = jnp.sqrt(rest) if i == j else rest / lower[j, j]
+            rest = matrix[i, j] - sum(lower[i, k] * lower[j, k] for k in range(j))
+            lower[i, j] = namespace(matrix).sqrt(rest) if i == j else rest / lower[j, j]
     return lower
 
 
 def symmetric_small(rows: Sequence[Sequence[Array]]) -> Float[Array, "n n F"]:
     """The symmetric matrices of which `rows` are the lower triangles, entries (F,)."""
-    number = len(rows)
-    return jnp.stack([jnp.stack([rows[max(i, j)][min(i, j)] for j in range(number)]) for i in range(number)])
+    number, xp = len(rows), namespace(rows)
+    return xp.stack([xp.stack([rows[max(i, j)][min(i, j)] for j in range(number)]) for i in range(number)])
 
 
 def inverse_small(matrix: Float[Array, "n n F"]) -> Float[Array, "n n F"]:
     """The inverses of F symmetric positive definite matrices."""
-    identity = jnp.eye(len(matrix))[:, :, None] * jnp.ones_like(matrix[0])
-    return jnp.stack([solve_small(matrix, column) for column in identity])
+    xp = namespace(matrix)
+    identity = xp.eye(len(matrix))[:, :, None] * xp.ones_like(matrix[0])
+    return xp.stack([solve_small(matrix, column) for column in identity])
 
 
 class _State(eqx.Module):
@@ -124,24 +144,26 @@ def minimise_small(
     next step promises to lower the value by less than `tolerance` · (1 + |value|). Functions that are not finite at
     their start stay there, not converged, their value infinite; so do those to `skip`.
 
-    All take eight steps together; those that need more, mostly few, are then gathered and go on, a quarter of the batch
-    at a time, with the expansion `finish` if there is one: a dearer one with the exact Hessian, say.
+    All take eight steps together; those that need more, mostly few, are then gathered and go on, with the expansion
+    `finish` if there is one: a dearer one with the exact Hessian, say. A compiled program, whose arrays cannot shrink,
+    gathers a quarter of the batch at a time.
     """
     limits = _Limits(lower, upper, largest_step, max_steps, tolerance)
-    first = jnp.clip(start, lower, upper)
+    xp = namespace(start, data, lower, upper)
+    first = xp.clip(start, lower, upper)
     number = first.shape[1]
-    nothing = jnp.zeros(number, bool)
+    nothing = xp.zeros(number, bool)
     state = _State(
         x=first,
-        value=jnp.full(number, jnp.inf),
-        gradient=jnp.zeros_like(first),
-        matrix=jnp.eye(len(first))[:, :, None] * jnp.ones_like(first),
-        damping=jnp.full(number, 1e-2),
-        taken=jnp.zeros(number, int),
+        value=xp.full(number, xp.inf),
+        gradient=xp.zeros_like(first),
+        matrix=xp.eye(len(first))[:, :, None] * xp.ones_like(first),
+        damping=xp.full(number, 1e-2),
+        taken=xp.zeros(number, int),
         done=nothing if skip is None else skip,
         converged=nothing,
     )
-    part = number // 4
+    part = number if xp is np else number // 4
     if part < _LEAST_PART:
         state = _advance(state, data, max_steps + 1, finish or expand, limits)
     else:
@@ -149,52 +171,60 @@ def minimise_small(
             state = _advance(state, data, _WHOLE_STEPS + 1, expand, limits)
 
         def go_on_with_some(state: _State) -> _State:
-            index = jnp.nonzero(~state.done, size=part, fill_value=number)[0]
-            gathered, mine = jax.tree.map(lambda array: jnp.take(array, index, axis=-1, mode="clip"), (state, data))
-            gathered = eqx.tree_at(lambda s: s.done, gathered, gathered.done | (index == number))
+            index = _first_true(~state.done, part)
+            gathered, mine = jax.tree.map(lambda array: xp.take(array, index, axis=-1, mode="clip"), (state, data))
+            gathered = replace(gathered, done=gathered.done | (index == number))
             ended = _advance(gathered, mine, max_steps + 1, finish or expand, limits)
-            return jax.tree.map(lambda all, some: all.at[..., index].set(some, mode="drop"), state, ended)
+            return jax.tree.map(lambda all, some: set_at(all, (..., index), some), state, ended)
 
-        state = jax.lax.while_loop(lambda state: ~jnp.all(state.done), go_on_with_some, state)
-    return Minimum(state.x, state.value, state.converged, jnp.max(state.taken))
+        state = while_loop(lambda state: ~xp.all(state.done), go_on_with_some, state)
+    return Minimum(state.x, state.value, state.converged, xp.max(state.taken, initial=0))
+
+
+def _first_true(which: Bool[Array, " F"], most: int) -> Int[Array, " i"]:
+    """Indices of the first that are true: so many or fewer in NumPy; else so many, F where there are no more."""
+    if isinstance(which, np.ndarray):
+        return host.flatnonzero(which)[:most]
+    return jnp.nonzero(which, size=most, fill_value=which.size)[0]
 
 
 def _step_from(state: _State, limits: _Limits) -> tuple[Array, Array]:
     """Where the next step leads, and by how much it promises to lower the value, to first order."""
-    x, gradient, matrix = state.x, state.gradient, state.matrix
+    x, gradient, matrix, xp = state.x, state.gradient, state.matrix, namespace(state)
     held = ((x <= limits.lower) & (gradient > 0)) | ((x >= limits.upper) & (gradient < 0))
-    diagonal = jnp.eye(x.shape[0], dtype=bool)[:, :, None]
+    diagonal = xp.eye(x.shape[0], dtype=bool)[:, :, None]
     damped = matrix + diagonal * (state.damping * matrix + 1e-300)
-    damped = jnp.where(held[:, None] | held[None], jnp.where(diagonal, 1.0, 0.0), damped)
-    step = -solve_small(damped, jnp.where(held, 0.0, gradient))
-    step = jnp.where(jnp.isfinite(step), step, 0.0)
-    step = step / jnp.maximum(1.0, jnp.max(jnp.abs(step) / limits.largest_step, axis=0))
-    new = jnp.clip(x + step, limits.lower, limits.upper)
-    return new, -jnp.sum((new - x) * gradient, axis=0)
+    damped = xp.where(held[:, None] | held[None], xp.where(diagonal, 1.0, 0.0), damped)
+    step = -solve_small(damped, xp.where(held, 0.0, gradient))
+    step = xp.where(xp.isfinite(step), step, 0.0)
+    step = step / xp.maximum(1.0, xp.max(xp.abs(step) / limits.largest_step, axis=0))
+    new = xp.clip(x + step, limits.lower, limits.upper)
+    return new, -xp.sum((new - x) * gradient, axis=0)
 
 
 def _advance(state: _State, data, steps: int, expand: Expansion, limits: _Limits) -> _State:
     """So many steps of all functions, or fewer if all are done."""
+    xp = namespace(state, data)
 
     def body(loop):
         count, state = loop
         # The first turn only looks at the start: no step leads away from there yet.
-        fresh = jnp.isinf(state.value)
+        fresh = xp.isinf(state.value)
         trial, promised = _step_from(state, limits)
         value, gradient, matrix = expand(trial, data)
         better = (value <= state.value) & ~state.done
         # Cut off at a bound, a step may lead uphill: then a more damped one, closer to the gradient, is tried.
-        settled = (promised >= 0) & (promised <= limits.tolerance * (1 + jnp.abs(state.value))) & ~fresh
-        damping = jnp.where(better, jnp.maximum(state.damping / 10, 1e-12), 8 * jnp.maximum(state.damping, 1e-4))
+        settled = (promised >= 0) & (promised <= limits.tolerance * (1 + xp.abs(state.value))) & ~fresh
+        damping = xp.where(better, xp.maximum(state.damping / 10, 1e-12), 8 * xp.maximum(state.damping, 1e-4))
         taken = state.taken + ~(state.done | fresh)
         # A step too small to tell better from worse ends the search as well.
         converged = state.converged | (~state.done & (settled | (damping > _MOST_DAMPING)))
-        broken = fresh & ~jnp.isfinite(value)
+        broken = fresh & ~xp.isfinite(value)
         return count + 1, _State(
-            x=jnp.where(better, trial, state.x),
-            value=jnp.where(better, value, state.value),
-            gradient=jnp.where(better, gradient, state.gradient),
-            matrix=jnp.where(better, matrix, state.matrix),
+            x=xp.where(better, trial, state.x),
+            value=xp.where(better, value, state.value),
+            gradient=xp.where(better, gradient, state.gradient),
+            matrix=xp.where(better, matrix, state.matrix),
             damping=damping,
             taken=taken,
             done=state.done | converged | broken | (taken >= limits.max_steps),
@@ -202,6 +232,6 @@ def _advance(state: _State, data, steps: int, expand: Expansion, limits: _Limits
         )
 
     def go_on(loop):
-        return (loop[0] < steps) & ~jnp.all(loop[1].done)
+        return (loop[0] < steps) & ~xp.all(loop[1].done)
 
-    return jax.lax.while_loop(go_on, body, (jnp.zeros((), int), state))[1]
+    return while_loop(go_on, body, (xp.zeros((), int), state))[1]
