@@ -136,11 +136,12 @@ def longer_side(surface: AbstractSurface) -> Float[Array, ""]:
 def chart_grid(surface: AbstractSurface, columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Middles of columns × rows pixels that fill the outline's box, (2, rows, columns), bottom row first; and which of
     them lie inside the outline, (rows, columns)."""
-    (left, bottom), (right, top) = bounding_box(on_host(surface))
+    at_hand: AbstractSurface = on_host(surface)
+    (left, bottom), (right, top) = bounding_box(at_hand)
     x = left + (right - left) * (np.arange(columns) + 0.5) / columns
     y = bottom + (top - bottom) * (np.arange(rows) + 0.5) / rows
     grid = np.stack(np.meshgrid(x, y))
-    return grid, np.asarray(surface.outline.contains(np.moveaxis(grid, 0, -1)))
+    return grid, np.asarray(at_hand.outline.contains(np.moveaxis(grid, 0, -1)))
 
 
 def outline_sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[Array, "2 K"]]:

@@ -1,5 +1,6 @@
 """The command line's frame: its commands and its errors."""
 
+import gc
 import io
 import os
 import sys
@@ -65,8 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
-            if arguments is None and sys.argv[1:2] != ["study"]:
-                _compile_quickly()
+            if arguments is None:
+                _start(quickly=sys.argv[1:2] != ["study"])
             status = command.main(
                 args=sys.argv[1:] if arguments is None else list(arguments), prog_name="jeit", standalone_mode=False
             )
@@ -127,7 +128,10 @@ def _show_warning(message, category, filename, lineno, file=None, line=None) -> 
     print(f"jeit: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
-def _compile_quickly() -> None:
-    """For a process that computes one image: code without optimisation takes a quarter of the time to compile, and
-    compiling would be most of its time. A user who has set XLA_FLAGS has decided already."""
-    os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+def _start(*, quickly: bool) -> None:
+    """Set up one process; `quickly` for one that computes one image: code without optimisation takes a quarter of the
+    time to compile, which would be most of its time. A user who has set XLA_FLAGS has decided already."""
+    if quickly:
+        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+    # What is imported and traced are many small objects, which Python would look through for rubbish again and again.
+    gc.set_threshold(100_000, 20, 50)

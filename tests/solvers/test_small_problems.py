@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from jeit_solvers import inverse_small, minimise_small, solve_small
+from jeit_solvers import gradient_small, hessian_small, inverse_small, minimise_small, solve_small
 
 
 def definite(number, batch, seed=0, spread=3.0):
@@ -260,3 +260,31 @@ def test_never_higher_than_the_start():
     assert (np.diff(costs, axis=0) <= 0).all()
     assert result.converged.all()
     np.testing.assert_allclose(result.x, 1.0, atol=1e-6)
+
+
+def test_numpy_and_compiled_code_agree(problems, found):
+    """The same steps, though NumPy gathers all that are left at once."""
+    start = found[0]
+    limits = [bound[:, None] for bound in (LOW, HIGH)]
+    options = {"lower": limits[0], "upper": limits[1], "largest_step": np.full((NUMBER, 1), 0.5), "tolerance": 1e-14}
+
+    def in_numpy(x, data):
+        return tuple(np.asarray(part) for part in expand(x, data))
+
+    at_once = minimise_small(in_numpy, start, problems, max_steps=100, **options)
+    np.testing.assert_allclose(at_once.x, found[1].x, atol=1e-10)
+    assert at_once.converged.all()
+
+
+def test_derivatives_in_numpy(problems):
+    """Gradients to rounding, Hessians to eight digits."""
+    matrix, centre = problems
+
+    def value(x):
+        off = (matrix * (x - centre)[None]).sum(axis=1)
+        return (off**4).sum(axis=0) + (off**2).sum(axis=0)
+
+    x = np.random.default_rng(6).uniform(-1, 1, (NUMBER, BATCH))
+    gradient, hessian = gradient_small(value, jnp.asarray(x)), hessian_small(value, jnp.asarray(x))
+    np.testing.assert_allclose(gradient_small(value, x), gradient, rtol=1e-12, atol=1e-12 * np.abs(gradient).max())
+    np.testing.assert_allclose(hessian_small(value, x), hessian, rtol=1e-7, atol=1e-8 * np.abs(hessian).max())

@@ -13,7 +13,7 @@ from jeit.acoustic.localisation.pixels import Pixels
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.surface import bounding_box, in_space, longer_side
 from jeit_solvers import inverse_small, minimise_small
-from jeit_solvers.engines import at_once, has_values, namespace, on_device, scan
+from jeit_solvers.engines import at_once, has_values, namespace, on_device, on_host, scan
 
 # Places of which all pairs are screened, and pairs that are tried.
 _PLACES, _STARTS = 150, 3
@@ -41,7 +41,7 @@ def locate_two(microphone_array: MicrophoneArray, power: ArrayLike, use: ArrayLi
     xp = np if few else jnp
     power = xp.asarray(power, float)
     use = xp.isfinite(power) if use is None else xp.isfinite(power) & xp.asarray(use, bool)
-    low, high = (np.asarray(corner) for corner in bounding_box(microphone_array.surface))
+    low, high = bounding_box(on_host(microphone_array.surface))
     spacing = np.sqrt(np.prod(high - low) / _PLACES)
     columns, rows = (max(3, round(side / spacing)) for side in high - low)
     pixels = Pixels.create(microphone_array.surface, columns, rows)

@@ -41,7 +41,8 @@ def plot_receptive_fields(
     rows = -(-chosen.size // columns)
     ax = axes_or_new(ax, (max(4.8, min(11.0, 2.2 * columns)), max(3.6, min(9.0, 1.75 * rows))))
     ax.set_axis_off()
-    ax.set_title(title or "", loc="left", pad=26)
+    # At a height of its own: matplotlib would look for it in all panels.
+    ax.set_title(title or "", loc="left", y=1.0, pad=26)
     distance = np.linspace(0, float(fit.distance.max()), 200)
     decay = on_host(fit.calibration.microphone_array.decay)
     curve = np.asarray(decay.response(np.broadcast_to(distance**2, (number, distance.size))))

@@ -1,0 +1,119 @@
+"""Two engines, one formula: touches that NumPy locates at once are those that the compiled program locates."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from microphone_arrays import array, hear, inside, noisy, quick_likelihood
+
+from jeit.acoustic import Localiser, cramer_rao, track, tracking
+from jeit.acoustic.decay import DECAYS
+from jeit.acoustic.localisation.locations import Locations, LocationStatus
+from jeit.acoustic.localisation.two_sources import locate_two
+from jeit_solvers.engines import slopes
+
+FRAMES = 160
+
+
+@pytest.fixture(scope="module")
+def touched():
+    """Noisy frames inside and beyond, some with readings missing."""
+    microphone_array = array(9, relative=0.1, floor=1e-4, freedom=100.0)
+    rng = np.random.default_rng(11)
+    places = inside(FRAMES)
+    places[::8] += [0.15, 0.02]
+    power = noisy(microphone_array.noise, hear(microphone_array, places, np.exp(rng.normal(size=FRAMES))), rng)
+    power[rng.random(power.shape) < 0.05] = np.nan
+    return microphone_array, power
+
+
+def assert_same(one, other, tolerance=1e-7):
+    """All arrays agree to a part of their size, and NaN where the other is."""
+    for mine, theirs in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        mine, theirs = np.asarray(mine, float), np.asarray(theirs, float)
+        size = np.abs(theirs[np.isfinite(theirs)]).max(initial=1e-300)
+        np.testing.assert_allclose(mine, theirs, rtol=tolerance, atol=tolerance * size)
+
+
+@quick_likelihood
+def test_places_and_maps(method, touched):
+    microphone_array, power = touched
+    localisers = [
+        Localiser.create(microphone_array, method=method, compiled=compiled, map_shape=shape)
+        for shape in (None, (30, 40))
+        for compiled in (False, True)
+    ]
+    assert_same(localisers[0](power), localisers[1](power))
+    assert_same(localisers[2].maps(power), localisers[3].maps(power))
+    assert isinstance(localisers[0](power).position, jax.Array)
+
+
+def test_what_is_traced_is_compiled(touched):
+    microphone_array, power = touched
+    localiser = Localiser.create(microphone_array, compiled=False)
+    assert_same(localiser(power[:40]), jax.jit(lambda power: localiser(power))(power[:40]))
+
+
+def test_two_sources(touched):
+    """Where they are known: steps of Fisher's matrix creep where nothing fits."""
+    microphone_array, power = touched
+    both = power[1:40] + power[41:80]
+    at_once = locate_two(microphone_array, both)
+    compiled = jax.jit(lambda power: locate_two(microphone_array, power))(both)
+    np.testing.assert_array_equal(at_once.freedom, compiled.freedom)
+    np.testing.assert_allclose(at_once.misfit, compiled.misfit, rtol=1e-5)
+    deviation = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(compiled.covariance))[..., -1:])
+    off = np.nan_to_num(at_once.position - compiled.position)
+    assert (np.abs(off) <= 1e-3 * deviation).all()
+    assert np.median(np.abs(off)) < 1e-9
+
+
+def test_bound(touched):
+    microphone_array, _ = touched
+    places = inside(30)
+    compiled = jax.jit(lambda places: cramer_rao(microphone_array, places, 2.0))(places)
+    assert_same(cramer_rao(microphone_array, places, 2.0), compiled, 1e-12)
+
+
+def test_tracks(monkeypatch):
+    rng = np.random.default_rng(12)
+    times = np.arange(100) * 0.0125
+    position = np.cumsum(1e-3 * rng.normal(size=(100, 2)), axis=0)
+    position[rng.random(100) < 0.1] = np.nan
+    number = np.zeros(100)
+    found = Locations(
+        times,
+        position,
+        np.tile(1e-6 * np.eye(2), (100, 1, 1)),
+        number,
+        np.full(100, LocationStatus.TOUCH, object),
+        number,
+        number.astype(int),
+        np.ones((100, 9), bool),
+        np.full((100, 2), np.nan),
+        number,
+        overlap=4.0,
+        faults=("",) * 9,
+        notes=(),
+        name="",
+    )
+    at_once = track(found)
+    monkeypatch.setattr(tracking, "FEW_FRAMES", 0)
+    compiled = track(found)
+    assert_same(
+        [at_once.position, at_once.covariance, at_once.velocity, at_once.rejected],
+        [compiled.position, compiled.covariance, compiled.velocity, compiled.rejected],
+        1e-9,
+    )
+
+
+@pytest.mark.parametrize("name", DECAYS)
+def test_slopes_of_decay_models(name):
+    """Complex steps are what JAX differentiates."""
+    values = np.log(np.random.default_rng(13).uniform(0.5, 2.0, (len(DECAYS[name].parameters), 5)))
+    squared = np.geomspace(1e-6, 1.0, 35).reshape(5, 7)
+
+    def of(squared):
+        return lambda values: DECAYS[name].from_logarithms(values).log_response(squared)
+
+    assert_same(slopes(of(squared), values), slopes(of(jnp.asarray(squared)), jnp.asarray(values)), 1e-13)
