@@ -134,7 +134,7 @@ def recording(rounds: int) -> tuple[Timed, int]:
     ).calibration
     sound = stroke(skin, jax.random.key(2), np.array([[-0.07, -0.06], [0.07, 0.05]]), strength=2.0)
     heard = Recording(sound.samples, sound.rate)
-    return timed(lambda: track(locate(heard, calibration)), rounds), sound.samples.shape[1]
+    return timed(lambda: track(locate(heard, calibration, compiled=True)), rounds), sound.samples.shape[1]
 
 
 def _asked(spent: dict[str, float], theirs: dict[str, float]) -> list[Asked]:

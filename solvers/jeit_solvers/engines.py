@@ -129,6 +129,18 @@ def scan(body: Callable[[Any, Any], tuple[Any, Any]], state: Any, each: Any, *, 
     return state, jax.tree.map(lambda *parts: np.stack(parts), *given)
 
 
+def complex_slope(function: Callable[[Any], Any], x: Any, row: int) -> Any:
+    """The derivative of `function` of NumPy's x (n, F) along a row; columns are independent. See `slopes`."""
+    return _complex_step(function, x, row)[1]
+
+
+def _complex_step(function, x, row: int) -> tuple[Any, Any]:
+    ahead = x.astype(complex)
+    ahead[row] += 1j * _COMPLEX_STEP
+    found = function(ahead)
+    return jax.tree.map(np.real, found), jax.tree.map(lambda part: np.imag(part) / _COMPLEX_STEP, found)
+
+
 def slopes(function: Callable[[Any], Any], x: Any) -> tuple[Any, list[Any]]:
     """What `function` returns at x (n, F), and its derivatives along each of the n rows; columns are independent.
 
@@ -136,8 +148,8 @@ def slopes(function: Callable[[Any], Any], x: Any) -> tuple[Any, list[Any]]:
     analytic. In JAX by forward differentiation.
     """
     if isinstance(x, np.ndarray):
-        ahead = [function(x + _COMPLEX_STEP * row) for row in 1j * np.eye(len(x))[:, :, None]]
-        return function(x), [jax.tree.map(lambda part: np.imag(part) / _COMPLEX_STEP, one) for one in ahead]
+        ahead = [_complex_step(function, x, row) for row in range(len(x))]
+        return ahead[0][0], [slope for _, slope in ahead]
     value, push = jax.linearize(function, x)
     return value, [push(direction) for direction in jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)]
 

@@ -59,7 +59,9 @@ def test_two_sources(touched):
     microphone_array, power = touched
     both = power[1:40] + power[41:80]
     at_once = locate_two(microphone_array, both)
-    compiled = jax.jit(lambda power: locate_two(microphone_array, power))(both)
+    compiled = locate_two(microphone_array, both, compiled=True)
+    traced = jax.jit(lambda power: locate_two(microphone_array, power))(both)
+    np.testing.assert_array_equal(traced.position, compiled.position)
     np.testing.assert_array_equal(at_once.freedom, compiled.freedom)
     np.testing.assert_allclose(at_once.misfit, compiled.misfit, rtol=1e-5)
     deviation = np.sqrt(np.linalg.eigvalsh(np.nan_to_num(compiled.covariance))[..., -1:])

@@ -44,12 +44,15 @@ def locate(
     map_shape: tuple[int, int] | None = None,
     intensity: IntensitySettings | None = None,
     silence: Recording | None = None,
+    compiled: bool | None = None,
 ) -> Locations:
     """Locate the touch in every frame of a recording.
 
     `method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster that is
     searched, (200, 200) in the paper; a coarse grid unless given (both are refined). `intensity`: band and window for
     samples, those of the calibration unless given; `silence`: the array untouched, as of `calibrated_intensities`.
+    `compiled`: whether a program is compiled first, in seconds, which is several times as fast from then on: for more
+    than 1,024 frames with a touch unless given; True is for many recordings, one after the other.
     Raises `ValueError` for a recording of another number of microphones, and where fewer than three can be used.
     """
     heard = calibrated_intensities(recording, calibration, intensity, silence=silence)
@@ -57,8 +60,8 @@ def locate(
     touched = use.any(axis=1) & _above_floor(heard, microphone_array.noise, use)
     enough = use.sum(axis=1) >= 3
     solve = touched & enough
-    many = int(solve.sum()) > FEW_FRAMES
-    localiser = Localiser.create(microphone_array, method=method, map_shape=map_shape, compiled=many)
+    compiled = int(solve.sum()) > FEW_FRAMES if compiled is None else compiled
+    localiser = Localiser.create(microphone_array, method=method, map_shape=map_shape, compiled=compiled)
     frames, d = len(heard.times), calibration.microphone_array.microphones.shape[1]
     status = np.where(touched, LocationStatus.TOUCH, LocationStatus.NO_TOUCH).astype(object)
     status[~enough] = LocationStatus.UNUSABLE
@@ -73,17 +76,17 @@ def locate(
     }
     notes = list(heard.notes)
     if solve.any():
-        power, used = _padded(heard.power[solve], use[solve])
+        power, used = _padded(heard.power[solve], use[solve], compiled)
         found = localiser(power, used)
         # The likelihood judges frames, whichever loss has placed them.
-        judge = found if method == "likelihood" else Localiser.create(microphone_array, compiled=many)(power, used)
+        judge = found if method == "likelihood" else Localiser.create(microphone_array, compiled=compiled)(power, used)
         number = int(solve.sum())
         for key in ("position", "covariance", "strength"):
             result[key][solve] = getattr(found, key)[:number]
         for key in ("misfit", "freedom"):
             result[key][solve] = getattr(judge, key)[:number]
         status[solve] = _judge(judge, found)[:number]
-        _explain(status, result, heard.power, use, microphone_array)
+        _explain(status, result, heard.power, use, microphone_array, compiled)
         excess = np.zeros(frames)
         excess[solve] = np.asarray(judge.excess)[:number]
         status[(status == LocationStatus.MISFIT) & (excess > _OUTSIDE)] = LocationStatus.OUTSIDE
@@ -119,11 +122,18 @@ def _unexplained(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
     return (freedom > 0) & (chdtrc(np.maximum(freedom, 1), misfit) < _FALSE_MISFIT)
 
 
-def _explain(status: np.ndarray, result: dict[str, np.ndarray], power, use, microphone_array: MicrophoneArray) -> None:
+def _explain(
+    status: np.ndarray,
+    result: dict[str, np.ndarray],
+    power,
+    use,
+    microphone_array: MicrophoneArray,
+    compiled: bool,
+) -> None:
     """Try two sources where one does not explain the frame; widen the covariance where neither does."""
     tried = np.flatnonzero((status == LocationStatus.MISFIT) & (use.sum(axis=1) > 6))
     if tried.size:
-        two = locate_two(microphone_array, *_padded(power[tried], use[tried]))
+        two = locate_two(microphone_array, *_padded(power[tried], use[tried], compiled), compiled=compiled)
         misfit, freedom = np.asarray(two.misfit)[: tried.size], np.asarray(two.freedom)[: tried.size]
         stronger, weaker = np.asarray(two.strength)[: tried.size].T
         much_better = (misfit < _BOTH * result["misfit"][tried]) & (misfit < _STILL_FAIR * freedom)
@@ -244,9 +254,11 @@ def _above_floor(heard: Intensities, noise: IntensityNoise, use: np.ndarray) -> 
     return np.asarray((power > least).any(axis=1))
 
 
-def _padded(power: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Many frames repeated up to a round number of them, so that few sizes are ever compiled; few as they are."""
+def _padded(power: np.ndarray, use: np.ndarray, compiled: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Frames repeated up to a round number of them, so that few sizes are ever compiled."""
+    if not compiled:
+        return power, use
     number = len(power)
-    round_number = number if number <= FEW_FRAMES else -(-number // FEW_FRAMES) * FEW_FRAMES
+    round_number = max(64, 1 << (number - 1).bit_length()) if number <= 1024 else -(-number // 1024) * 1024
     index = np.minimum(np.arange(round_number), number - 1)
     return power[index], use[index]

@@ -8,7 +8,6 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.acoustic.localisation.likelihood import Likelihood
-from jeit.acoustic.localisation.locations import FEW_FRAMES
 from jeit.acoustic.localisation.pixels import Pixels
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.surface import bounding_box, in_space, longer_side
@@ -31,14 +30,17 @@ class TwoSources(eqx.Module):
     converged: Bool[Array, " F"]
 
 
-def locate_two(microphone_array: MicrophoneArray, power: ArrayLike, use: ArrayLike | None = None) -> TwoSources:
+def locate_two(
+    microphone_array: MicrophoneArray, power: ArrayLike, use: ArrayLike | None = None, *, compiled: bool = False
+) -> TwoSources:
     """The most probable pair of sources of each frame: all pairs of a coarse grid are screened, the best three refined.
 
     `power` (F, M): intensities above the floor; `use`: which to look at, all that are finite unless given. Six unknowns
-    need six microphones or more: frames with fewer give NaN. Both are found inside the outline's box.
+    need six microphones or more: frames with fewer give NaN. Both are found inside the outline's box. `compiled`: by a
+    compiled program, for what is asked for again and again; what is traced is in any case.
     """
-    few = has_values(microphone_array, power, use) and 0 < np.shape(power)[0] <= FEW_FRAMES
-    xp = np if few else jnp
+    at_hand = not compiled and np.size(power) > 0 and has_values(microphone_array, power, use)
+    xp = np if at_hand else jnp
     power = xp.asarray(power, float)
     use = xp.isfinite(power) if use is None else xp.isfinite(power) & xp.asarray(use, bool)
     low, high = bounding_box(on_host(microphone_array.surface))
@@ -46,7 +48,7 @@ def locate_two(microphone_array: MicrophoneArray, power: ArrayLike, use: ArrayLi
     columns, rows = (max(3, round(side / spacing)) for side in high - low)
     pixels = Pixels.create(microphone_array.surface, columns, rows)
     arguments = microphone_array, pixels, power.T, use.T
-    return on_device(at_once(_locate_two, *arguments)) if few else jax.jit(_locate_two)(*arguments)
+    return on_device(at_once(_locate_two, *arguments)) if at_hand else jax.jit(_locate_two)(*arguments)
 
 
 def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -> TwoSources:

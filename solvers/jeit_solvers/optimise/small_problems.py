@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jeit_solvers.engines import host, namespace, set_at, slopes, while_loop
+from jeit_solvers.engines import complex_slope, host, namespace, set_at, slopes, while_loop
 
 # What a function must give at x (n, F), with data whose last axis is F: its value (F,), gradient (n, F), and a positive
 # definite model of its Hessian (n, n, F), the Gauss-Newton or Fisher matrix for instance.
@@ -66,8 +66,12 @@ def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Fl
     In NumPy central differences of complex steps: good to some eight digits, for steps that need no more."""
     if isinstance(x, np.ndarray):
         apart = _APART * np.eye(len(x))[:, :, None]
-        rows = [gradient_small(value, x + each) - gradient_small(value, x - each) for each in apart]
-        return host.stack(rows) / (2 * _APART)
+
+        def second(k: int, m: int) -> Any:
+            ahead, behind = (complex_slope(value, at, m) for at in (x + apart[k], x - apart[k]))
+            return (ahead - behind) / (2 * _APART)
+
+        return symmetric_small([[second(k, m) for m in range(k + 1)] for k in range(len(x))])
     directions = jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)
     return jnp.stack([jax.jvp(partial(gradient_small, value), (x,), (direction,))[1] for direction in directions])
 
