@@ -137,7 +137,8 @@ def seconds(job: Job, folder: Path) -> tuple[float, float]:
     Of a job with something done `before`, the part after that.
     """
     environment = dict(os.environ, XDG_CACHE_HOME=str(folder / "cache"), MPLCONFIGDIR=str(folder / "matplotlib"))
-    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    for name in ("JAX_COMPILATION_CACHE_DIR", "JEIT_COMPILATION_CACHE", "PYTHONDONTWRITEBYTECODE"):
+        environment.pop(name, None)
     timed = "import time\n{}\nstart, cpu = time.perf_counter(), time.process_time()\n{}\n"
     timed += "print(time.perf_counter() - start, time.process_time() - cpu)"
     if job.arguments:
