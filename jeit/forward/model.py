@@ -16,7 +16,7 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.forward.assembly import check_conductivity, field_gradients
 from jeit.forward.integrated import IntegratedModel, host_model, integrated_model
 from jeit.forward.system import System
-from jeit.forward.transfer import electrode_fields, transfer_impedance
+from jeit.forward.transfer import electrode_fields, solved_system, transfer_impedance
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 from jeit_solvers import SparseCholesky, in_turn
@@ -194,6 +194,11 @@ def fields_of(model: ForwardModel | IntegratedModel, conductivity):
     return electrode_fields(model.mesh, conductivity, model.electrodes, model.system)
 
 
+def solved_system_of(model: ForwardModel | IntegratedModel, conductivity):
+    """The system solved for the electrodes' loads, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
+    return solved_system(model.mesh, conductivity, model.electrodes, model.system)
+
+
 def potentials_of(model: ForwardModel | IntegratedModel, conductivity):
     """Potentials (S, n) in volts, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
     return model.protocol.drive @ fields_of(model, conductivity)[0].T
@@ -225,6 +230,7 @@ _COMPILED = {
     transfer_impedance_of: jax.jit(transfer_impedance_of),
     voltages_of: jax.jit(voltages_of),
     fields_of: jax.jit(fields_of),
+    solved_system_of: jax.jit(solved_system_of),
     potentials_of: jax.jit(potentials_of),
     voltages_and_jacobian_of: jax.jit(in_turn(voltages_and_jacobian_of)),
 }

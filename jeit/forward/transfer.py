@@ -11,6 +11,8 @@ point electrodes the load depends on their position, and 2 ∂_θ⟨load, F⟩ d
 SIAM Review 41 (1999) 85-101; Polydorides and Lionheart, Meas. Sci. Technol. 13 (2002) 1871-1883.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +23,7 @@ from jeit.electrodes.electrodes import Contact
 from jeit.forward.assembly import cell_conductivity, field_gradients
 from jeit.forward.system import System
 from jeit.mesh import Mesh
-from jeit_solvers import NearInverse, Strips, near_inverse, symmetric_inverse
+from jeit_solvers import NearInverse, SparseSymmetric, Strips, near_inverse, symmetric_inverse
 from jeit_solvers.engines import namespace
 
 
@@ -62,33 +64,47 @@ def electrode_fields(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, s
     Volts per ampere; `conductivity` in S/m (2-D: S). Differentiable by the implicit rule of the linear solve (one more
     solve per direction).
     """
+    return solved_system(mesh, conductivity, electrodes, system).fields_and_impedance(electrodes)
+
+
+class SolvedSystem(NamedTuple):
+    """The matrix A of stiffness and contact mass, siemens, the `load` (n, L) of the electrodes and X = A⁻¹ load."""
+
+    operator: SparseSymmetric
+    load: Inexact[Array, "n L"]
+    solution: Inexact[Array, "n L"]
+
+    def fields_and_impedance(self, electrodes: AbstractElectrodes):
+        """F (n, L) and Z (L, L), as of `electrode_fields`."""
+        impedance = _impedance(electrodes, self.load.T @ self.solution)
+        if not electrodes.is_point:
+            return self.solution @ impedance, impedance
+        fields = self.solution - self.solution.mean(axis=1, keepdims=True)
+        return fields - (self.load.T @ fields).mean(axis=0), impedance
+
+
+def solved_system(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> SolvedSystem:
+    """The system of the electrodes' loads, solved; arguments as of `electrode_fields`."""
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
-    solution = system.solve(operator, contact.load)
-    impedance = _impedance(electrodes, contact.load.T @ solution)
-    if not electrodes.is_point:
-        return solution @ impedance, impedance
-    fields = solution - solution.mean(axis=1, keepdims=True)
-    return fields - (contact.load.T @ fields).mean(axis=0), impedance
+    return SolvedSystem(operator, contact.load, system.solve(operator, contact.load))
 
 
 @eqx.filter_jit
 def fields_and_inverse(
-    mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System, strips: Strips, reach: int
+    solved: SolvedSystem, electrodes: AbstractElectrodes, strips: Strips, reach: int
 ) -> tuple[Inexact[Array, "p L"], NearInverse]:
     """F at places of strips of the nodes, and K⁻¹ between them, up to `reach` strips apart, ohms, but for a constant.
 
-    `conductivity` in S/m (2-D: S). K is the matrix of the electrode model with all electrodes floating: the potential
-    at one node for a unit current into another. What it leaves open, a constant, no change of conductivity sees.
+    K is the matrix of the electrode model with all electrodes floating: the potential at one node for a unit current
+    into another. What it leaves open, a constant, no change of conductivity sees.
     """
-    contact = electrodes.contact(mesh)
-    operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
-    fields, _ = electrode_fields(mesh, conductivity, electrodes, system)
-    fields, inverse = strips.spread(fields), near_inverse(strips, operator, reach)
+    fields = strips.spread(solved.fields_and_impedance(electrodes)[0])
+    inverse = near_inverse(strips, solved.operator, reach)
     if electrodes.is_point:
         return fields, inverse
     # Electrodes carry what enters at the nodes back out: with X = A⁻¹ load, K⁻¹ = A⁻¹ + X Z Xᵀ, and X Z = F.
-    return fields, inverse.add(strips.spread(system.solve(operator, contact.load)), fields)
+    return fields, inverse.add(strips.spread(solved.solution), fields)
 
 
 def _impedance(electrodes: AbstractElectrodes, product: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:

@@ -23,7 +23,7 @@ from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.skin.touched_nodes import touched_nodes
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity, stiffness
-from jeit.forward.model import check_model, select_channels
+from jeit.forward.model import check_model, evaluate, select_channels, solved_system_of
 from jeit.forward.transfer import fields_and_inverse
 from jeit_solvers import over_cores
 from jeit_solvers.engines import has_values
@@ -83,7 +83,8 @@ def _linear(model: ForwardModel, conductivity, touched: TouchedCells):
 def _exact(model: ForwardModel, conductivity, touched: TouchedCells):
     touched_at = touched_nodes(model, touched)
     reach = touched_at.strips.reach(touched_at.nodes)
-    known = fields_and_inverse(model.mesh, conductivity, model.electrodes, model.system, touched_at.strips, reach)
+    solved = evaluate(model, solved_system_of, conductivity)
+    known = fields_and_inverse(solved, model.electrodes, touched_at.strips, reach)
     touches = jax.tree.map(jnp.asarray, (touched.cells, touched.change, touched_at.nodes, touched_at.corners))
     number = len(touched.cells)
     found = over_cores(partial(_changes, model, conductivity, known, touches), number, _EXACT)[:number]
