@@ -21,6 +21,9 @@ from jeit.cli.commands.stream import stream
 from jeit.cli.commands.study import study
 from jeit.cli.options import naming_options
 
+# Commands that run one program again and again: a frame in a third of the time.
+_REPEATING = ("study", "stream", "layout optimise")
+
 app = typer.Typer(
     name="jeit",
     add_completion=False,
@@ -67,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.showwarning = _show_warning
             if arguments is None:
-                _start(quickly=sys.argv[1:2] != ["study"])
+                _start(quickly=not " ".join(sys.argv[1:3]).startswith(_REPEATING))
             status = command.main(
                 args=sys.argv[1:] if arguments is None else list(arguments), prog_name="jeit", standalone_mode=False
             )
@@ -129,8 +132,8 @@ def _show_warning(message, category, filename, lineno, file=None, line=None) -> 
 
 
 def _start(*, quickly: bool) -> None:
-    """Set up one process; `quickly` for one that computes one image: code without optimisation takes a quarter of the
-    time to compile, which would be most of its time. A user who has set XLA_FLAGS has decided already."""
+    """Set up one process; `quickly` for one that runs no program many times: code without optimisation takes a quarter
+    of the time to compile, which would be most of its time. A user who has set XLA_FLAGS has decided already."""
     if quickly:
         os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
     # What is imported and traced are many small objects, which Python would look through for rubbish again and again.
