@@ -16,7 +16,6 @@ Signal Processing: Estimation Theory (1993), chapter 3.
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -28,7 +27,7 @@ from jeit.design.skin.touch_grid import check_places
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity
 from jeit_solvers.dense.cholesky import inverse_cholesky
-from jeit_solvers.engines import has_values
+from jeit_solvers.engines import as_array, either_engine, has_values, namespace, undifferentiated
 
 # The largest eigenvalue to ln(r) / 2^k, relative, however close the next.
 _SQUARINGS = 10
@@ -57,7 +56,7 @@ class TouchPrior(eqx.Module):
         squared = np.sum((place[:, None] - place) ** 2, axis=-1)
         values, vectors = np.linalg.eigh(deviation**2 * np.exp(-squared / (2 * correlation**2)))
         kept = values > 1e-6 * values[-1]
-        return cls(jnp.asarray(vectors[:, kept] * np.sqrt(values[kept])))
+        return cls(as_array(vectors[:, kept] * np.sqrt(values[kept])))
 
 
 class Scores(eqx.Module):
@@ -131,9 +130,10 @@ def layout_scores(
     conductivity = check_conductivity(model.mesh, conductivity)
     if conductivity.ndim == 3 or jnp.iscomplexobj(conductivity):
         raise ValueError("conductivity: scores need a real, scalar one.")
-    noise = jnp.asarray(noise, float)
+    noise = as_array(noise, float)
     _check(model, touches, prior, noise, temperature)
-    return _scores(model, cell_conductivity(model.mesh, conductivity), touches, prior, noise, temperature)
+    conductivity = cell_conductivity(model.mesh, conductivity)
+    return _scores(model.jacobian(conductivity), conductivity, touches, prior, noise, temperature)
 
 
 def _check(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> None:
@@ -153,24 +153,27 @@ def _check(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise,
         raise ValueError(f"temperature must be positive; it is {temperature!r}.")
 
 
-@jax.jit
-def _scores(model: ForwardModel, conductivity, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> Scores:
-    jacobian = model.jacobian(conductivity).T  # (m, M)
+@either_engine
+def _scores(jacobian, conductivity, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> Scores:
+    """From the Jacobian (M, m) of the voltages."""
+    xp = namespace(jacobian)
     weights, slopes = touches.weights(conductivity)
-    changes = weights @ jacobian  # (n, M)
-    sensitivity = jnp.linalg.norm(changes, axis=1)
-    log_mean = jax.nn.logsumexp(-jnp.log(sensitivity) / temperature) - jnp.log(len(sensitivity))
+    changes = weights @ jacobian.T  # (n, M)
+    sensitivity = xp.linalg.norm(changes, axis=1)
+    powers = -xp.log(sensitivity) / temperature
+    largest = undifferentiated(powers.max())
+    log_mean = largest + xp.log(xp.exp(powers - largest).mean())
     seen = changes / noise
     rows = prior.factor.T @ seen  # (r, M)
-    root = inverse_cholesky((jnp.eye(len(rows)) + rows @ rows.T)[None])[0]
+    root = inverse_cholesky((xp.eye(len(rows)) + rows @ rows.T)[None])[0]
     half = prior.factor @ root.T  # C = half halfᵀ
     return Scores(
         sensitivity,
-        jnp.exp(-temperature * log_mean),
-        jnp.sum(half**2, axis=1),
-        -2 * jnp.sum(jnp.log(jnp.diagonal(root))),
+        xp.exp(-temperature * log_mean),
+        (half**2).sum(axis=1),
+        -2 * xp.log(xp.diagonal(root)).sum(),
         _largest_eigenvalue(half.T @ half),
-        _localisation_error(seen, slopes @ jacobian / noise),
+        _localisation_error(seen, slopes @ jacobian.T / noise),
     )
 
 
@@ -179,20 +182,20 @@ def _largest_eigenvalue(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
 
     The derivative of a simple eigenvalue is that of vᵀ(matrix)v with its vector v held.
     """
-    power = jax.lax.stop_gradient(matrix)
+    power = undifferentiated(matrix)
     for _ in range(_SQUARINGS):
         power = power @ power
-        power = power / jnp.max(jnp.abs(power))
-    vector = power[:, jnp.argmax(jnp.diagonal(power))]
+        power = power / abs(power).max()
+    vector = power[:, namespace(power).diagonal(power).argmax()]
     return vector @ matrix @ vector / (vector @ vector)
 
 
 def _localisation_error(along_a: Float[Array, "n M"], along: Float[Array, "2 n M"]) -> Float[Array, " n"]:
     """√tr of the 2 × 2 block of the inverse of the information, by its Schur complement; infinite where singular."""
-    size = jnp.sum(along_a**2, axis=1)
+    xp, size = namespace(along_a), (along_a**2).sum(axis=1)
     # What of the slopes an amplitude cannot explain; formed before it is squared, for the difference may be small.
-    x, y = along - (jnp.sum(along * along_a, axis=2) / size)[..., None] * along_a
-    xx, yy, xy = jnp.sum(x * x, axis=1), jnp.sum(y * y, axis=1), jnp.sum(x * y, axis=1)
+    x, y = along - ((along * along_a).sum(axis=2) / size)[..., None] * along_a
+    xx, yy, xy = (x * x).sum(axis=1), (y * y).sum(axis=1), (x * y).sum(axis=1)
     determinant = xx * yy - xy**2
     known = determinant > 1e-12 * xx * yy
-    return jnp.where(known, jnp.sqrt((xx + yy) / jnp.where(known, determinant, 1.0)), jnp.inf)
+    return xp.where(known, xp.sqrt((xx + yy) / xp.where(known, determinant, 1.0)), xp.inf)

@@ -1,7 +1,6 @@
 """Sensitivity maps: how much the voltages of a skin change where it is touched."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -12,12 +11,18 @@ from jeit.design.skin.touched_cells import touched_cells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
-from jeit_solvers.engines import has_values
+from jeit_solvers.engines import either_engine, has_values, namespace
 
 
+@either_engine
 def uniformity(sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
     """Mean Θ of n places over its root mean square: 1 where all are alike, less the more they differ."""
-    return jnp.mean(sensitivity, axis=-1) / jnp.sqrt(jnp.mean(sensitivity**2, axis=-1))
+    return sensitivity.mean(axis=-1) / namespace(sensitivity).sqrt((sensitivity**2).mean(axis=-1))
+
+
+@either_engine
+def _share_below(level, sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
+    return (sensitivity < level).astype(sensitivity.dtype).mean(axis=-1)
 
 
 class SensitivityMap(eqx.Module):
@@ -30,21 +35,25 @@ class SensitivityMap(eqx.Module):
     changes: Float[Array, "n M"]
 
     @property
+    @either_engine
     def values(self) -> Float[Array, " n"]:
         """Θ (n,), volts."""
-        return jnp.linalg.norm(self.changes, axis=-1)
+        return namespace(self.changes).linalg.norm(self.changes, axis=-1)
 
     @property
+    @either_engine
     def minimum(self) -> Float[Array, ""]:
         """Least Θ, volts: the worst place."""
         return self.values.min(axis=-1)
 
     @property
+    @either_engine
     def mean(self) -> Float[Array, ""]:
         """Mean Θ, volts."""
         return self.values.mean(axis=-1)
 
     @property
+    @either_engine
     def uniformity(self) -> Float[Array, ""]:
         """Mean Θ over its root mean square: 1 where all places are alike, less the more they differ."""
         return uniformity(self.values)
@@ -56,7 +65,7 @@ class SensitivityMap(eqx.Module):
         """
         if has_values(level) and not np.all(np.asarray(level) >= 0):
             raise ValueError(f"level must be a sensitivity in volts, not negative; it is {level!r}.")
-        return jnp.mean(self.values < level, axis=-1)
+        return _share_below(level, self.values)
 
     def histogram(self, bins: int | np.ndarray = 40) -> tuple[np.ndarray, np.ndarray]:
         """Share of the area in each of some bins of Θ, and the bins' edges in volts; `bins` as of `numpy.histogram`."""

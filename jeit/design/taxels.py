@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_key
 from jeit.design.defaults import NUM_TAXELS, THRESHOLD
 from jeit_solvers import KMeans, kmeans
-from jeit_solvers.engines import has_values
+from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 
 
 class Taxels(eqx.Module):
@@ -35,60 +35,70 @@ class Taxels(eqx.Module):
         return self.clusters.labels
 
     @property
+    @either_engine
     def members(self) -> Bool[Array, "*layouts k n"]:
         """Which places each taxel covers. Taxels overlap, and some places may be in none."""
         return self.similarity >= self.threshold
 
     @property
+    @either_engine
     def positions(self) -> Float[Array, "*layouts k 2"]:
         """The centroid of each cluster's places, metres."""
         count = self.similarity.shape[-2]
-        weight = (self.labels[..., None, :] == jnp.arange(count)[:, None]) * self.cell_area[..., None, :]
-        return weight @ self.places / jnp.sum(weight, axis=-1, keepdims=True)
+        weight = (self.labels[..., None, :] == np.arange(count)[:, None]) * self.cell_area[..., None, :]
+        return weight @ self.places / weight.sum(axis=-1, keepdims=True)
 
     @property
+    @either_engine
     def areas(self) -> Float[Array, "*layouts k"]:
         """Area that each taxel covers, m²; 0 for a mean change that is like no place's own."""
-        return jnp.sum(jnp.where(self.members, self.cell_area[..., None, :], 0), axis=-1)
+        return (self.members * self.cell_area[..., None, :]).sum(axis=-1)
 
     @property
+    @either_engine
     def mean_area(self) -> Float[Array, "*layouts"]:
         """Mean of the `areas`, m²."""
-        return jnp.mean(self.areas, axis=-1)
+        return self.areas.mean(axis=-1)
 
     @property
+    @either_engine
     def std_area(self) -> Float[Array, "*layouts"]:
         """Standard deviation of the `areas` among the k taxels, m²."""
-        return jnp.std(self.areas, axis=-1)
+        return self.areas.std(axis=-1)
 
     @property
+    @either_engine
     def max_area(self) -> Float[Array, "*layouts"]:
         """Largest of the `areas`, m²."""
-        return jnp.max(self.areas, axis=-1)
+        return self.areas.max(axis=-1)
 
     @property
+    @either_engine
     def coverage(self) -> Int[Array, "*layouts n"]:
         """How many taxels cover each place."""
-        return jnp.sum(self.members, axis=-2)
+        return self.members.sum(axis=-2)
 
     @property
+    @either_engine
     def overlap(self) -> Float[Array, "*layouts"]:
         """How many taxels cover a point of the skin on average: their areas' sum over the skin's."""
-        return jnp.sum(self.areas, axis=-1) / jnp.sum(self.cell_area, axis=-1)
+        return self.areas.sum(axis=-1) / self.cell_area.sum(axis=-1)
 
     @property
+    @either_engine
     def diameters(self) -> Float[Array, "*layouts k"]:
         """Diameter of the circle of each taxel's area, 2 √(area / π), metres."""
-        return 2 * jnp.sqrt(self.areas / jnp.pi)
+        return 2 * namespace(self.areas).sqrt(self.areas / np.pi)
 
     @property
+    @either_engine
     def two_point_discrimination(self) -> Float[Array, "*layouts"]:
         """Distance from which on two touches can be told apart, metres: the mean of the `diameters`.
 
         The paper's estimate, "average diameter of the virtual taxels". Two touches nearer than that are within one
         taxel, on average: their changes differ in strength rather than in pattern.
         """
-        return jnp.mean(self.diameters, axis=-1)
+        return self.diameters.mean(axis=-1)
 
 
 def find_taxels(
@@ -130,14 +140,20 @@ def find_taxels(
     change, place = jnp.asarray(changes, float), jnp.asarray(places, float)
     unit = _unit(change)
     clusters = kmeans(unit if directions else change, num_taxels, key, restarts=restarts)
-    area = jnp.broadcast_to(jnp.asarray(cell_area, float), place.shape[:1])
-    return Taxels(place, area, clusters, _unit(clusters.centres) @ unit.T, float(threshold))
+    area = as_array(namespace(cell_area).broadcast_to(cell_area, place.shape[:1]), float)
+    return Taxels(place, area, clusters, _cosines(clusters.centres, unit), float(threshold))
 
 
+@either_engine
+def _cosines(vectors: Float[Array, "k m"], unit: Float[Array, "n m"]) -> Float[Array, "k n"]:
+    return _unit(vectors) @ unit.T
+
+
+@either_engine
 def _unit(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """Scaled to length 1, and zero where they are zero, with a derivative that is zero there as well."""
-    square = jnp.sum(vectors**2, axis=1, keepdims=True)
-    return jnp.where(square > 0, vectors / jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+    xp, square = namespace(vectors), (vectors**2).sum(axis=1, keepdims=True)
+    return xp.where(square > 0, vectors / xp.sqrt(xp.where(square > 0, square, 1)), 0)
 
 
 def _check(changes, places, cell_area, num_taxels, threshold) -> None:
@@ -155,10 +171,10 @@ def _check(changes, places, cell_area, num_taxels, threshold) -> None:
     if not 0 < threshold < 1:
         raise ValueError(f"threshold is a cosine, more than 0 and less than 1; it is {threshold!r}.")
     if has_values(changes):
-        silent = ~np.isfinite(changes).all(axis=1)
+        silent = ~np.isfinite(np.asarray(changes)).all(axis=1)
         if silent.any():
             raise ValueError(f"changes: those of {silent.sum()} of {shape[0]} places are NaN or infinite.")
-        if not np.any(changes):
+        if not np.asarray(changes).any():
             raise ValueError("changes are all zero: none of the touches changes any voltage.")
     if has_values(places, cell_area):
         _check_lengths(np.asarray(places, float), np.broadcast_to(np.asarray(cell_area, float), shape[:1]))

@@ -84,7 +84,7 @@ class SolvedSystem(NamedTuple):
 
 
 def solved_system(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> SolvedSystem:
-    """The system of the electrodes' loads, solved; arguments as of `electrode_fields`."""
+    """The system of the electrodes' loads, solved; `conductivity` in S/m (2-D: S)."""
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
     return SolvedSystem(operator, contact.load, system.solve(operator, contact.load))

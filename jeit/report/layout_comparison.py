@@ -20,7 +20,7 @@ def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> Non
     folder = results_folder(folder, ("comparison.png", "report.json"))
     text = json.dumps(report_layout_comparison(result), indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "report.json").write_text(text + "\n", "utf-8")
-    draw_layout_comparison(result).savefig(folder / "comparison.png", dpi=130, bbox_inches="tight")
+    draw_layout_comparison(result).savefig(folder / "comparison.png", dpi=130)
 
 
 def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:

@@ -87,9 +87,10 @@ def compare(
     from rich.console import Console
 
     from jeit.cli.console import Steps
-    from jeit.design import Skin, compare_layouts
+    from jeit.design import compare_layouts
     from jeit.design.comparison import check_same_outline
     from jeit.design.skin.protocol import skin_protocol
+    from jeit.design.skin.skin import skins_of
     from jeit.report import write_layout_comparison
 
     skins.check_layer(thickness, conductivity)
@@ -104,16 +105,9 @@ def compare(
     with naming_options(_OPTIONS), Steps(console, quiet=quiet) as step:
         check_same_outline(*both)
         step("mesh")
-        made = [
-            Skin.create(
-                one,
-                thickness=1e-3 * thickness,
-                conductivity=conductivity,
-                cell_size=1e-3 * cell,
-                protocol=skin_protocol(one, num_pairs=pairs),
-            )
-            for one in both
-        ]
+        protocols = [skin_protocol(one, num_pairs=pairs) for one in both]
+        material = {"thickness": 1e-3 * thickness, "conductivity": conductivity}
+        made = skins_of(both, protocols, **material, cell_size=1e-3 * cell)
         result = compare_layouts(
             made[0],
             made[1],

@@ -40,4 +40,4 @@ def check_cell_size(name: str, cell_size: float, layout: Layout, area: float, nu
 
 def smallest_diameter(layout: Layout) -> float:
     """Of the electrodes, metres."""
-    return float(np.min(layout.diameters))
+    return float(np.asarray(layout.diameters).min())

@@ -3,11 +3,11 @@
 import abc
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jeit.design.defaults import BALL_DIAMETER, DEPTH, DEVIATION
 from jeit.mesh.outline.domain import check_length
+from jeit_solvers.engines import either_engine, namespace
 
 
 class AbstractIndentation(eqx.Module):
@@ -37,10 +37,12 @@ class Bell(AbstractIndentation):
         self.depth = check_length("depth", depth)
         self.deviation = check_length("deviation", deviation)
 
+    @either_engine
     def depth_at(self, distance):
         """The bell."""
-        inside = jnp.asarray(distance) < self.reach
-        return jnp.where(inside, self.depth * jnp.exp(-0.5 * (distance / self.deviation) ** 2), 0.0)
+        xp = namespace(self, distance)
+        distance = xp.asarray(distance)
+        return xp.where(distance < self.reach, self.depth * xp.exp(-0.5 * (distance / self.deviation) ** 2), 0.0)
 
     @property
     def reach(self) -> float:
@@ -64,11 +66,12 @@ class Hemisphere(AbstractIndentation):
                 f"deeper than {5e2 * self.diameter:g} mm; give less depth, or a larger one."
             )
 
+    @either_engine
     def depth_at(self, distance):
         """The cap of the ball."""
-        radius = self.diameter / 2
-        height = jnp.sqrt(jnp.maximum(radius**2 - jnp.asarray(distance) ** 2, 0.0))
-        return jnp.maximum(self.depth - radius + height, 0.0)
+        xp, radius = namespace(self, distance), self.diameter / 2
+        height = xp.sqrt(xp.maximum(radius**2 - xp.asarray(distance) ** 2, 0.0))
+        return xp.maximum(self.depth - radius + height, 0.0)
 
     @property
     def reach(self) -> float:

@@ -3,12 +3,14 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.design.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
 from jeit.design.skin.touched_cells import TouchedCells, touched_cells
 from jeit.mesh import Mesh, centroids
+from jeit_solvers.engines import gather, host, namespace, sum_into
 
 
 class SheetTouches(eqx.Module):
@@ -32,12 +34,13 @@ class SheetTouches(eqx.Module):
     def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:
         """Change of every cell's conductivity by every touch, siemens, and its derivative in the place."""
         cells = self.touched.cells
-        blank = jnp.zeros((len(cells), len(conductivity)))
+        index = np.arange(len(cells))[:, None], cells
 
         def spread(change):
-            return blank.at[jnp.arange(len(cells))[:, None], cells].add(change * conductivity[cells])
+            return sum_into((len(cells), len(conductivity)), index, change * gather(conductivity, cells))
 
-        return spread(self.touched.change), jnp.stack([spread(self.slope[..., axis]) for axis in range(2)])
+        slopes = [spread(self.slope[..., axis]) for axis in range(2)]
+        return spread(self.touched.change), namespace(conductivity).stack(slopes)
 
 
 def sheet_touches(
@@ -60,4 +63,4 @@ def sheet_touches(
     middles = centroids(mesh)[touched.cells]
     slope = jax.jit(jax.vmap(jax.vmap(jax.grad(change), (None, 0))))(touched.places, middles)
     slope = jnp.where(touched.change[..., None] != 0, slope, 0.0)
-    return SheetTouches(touched, slope, jnp.asarray(thickness, float), float(indentation.depth_at(jnp.zeros(()))))
+    return SheetTouches(touched, slope, jnp.asarray(thickness, float), float(indentation.depth_at(host.zeros(()))))

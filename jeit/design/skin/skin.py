@@ -1,5 +1,7 @@
 """`Skin`: a layout of electrodes in a conducting sheet, or on the bottom of a layer; checked, meshed, and touched."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +22,7 @@ from jeit.layout import Layout
 from jeit.layout.layout import check_layout
 from jeit.mesh import Domain, Mesh, Rectangle, layer
 from jeit.protocol import Protocol
+from jeit_solvers.engines import host
 
 # Of a layer of cells, times a touch's depth: the middle of its uppermost cells is a quarter of it below the surface.
 _THICKEST = 3.0
@@ -149,7 +152,7 @@ class Skin(eqx.Module):
             return touched_cells(
                 self.model.mesh, indentation, places, thickness=float(self.thickness), contrast=contrast
             )
-        deepest = float(indentation.depth_at(jnp.asarray(0.0)))
+        deepest = float(indentation.depth_at(host.zeros(())))
         most = _THICKEST * self.num_layers * deepest
         said = (
             f"thickness is {1e3 * self.thickness:g} mm; give more than the {1e3 * deepest:g} mm that a touch is deep, "
@@ -174,6 +177,25 @@ class Skin(eqx.Module):
     def voltage_changes(self, touched: TouchedCells, *, linear: bool = False) -> Float[Array, "n M"]:
         """Changes (n, M) of its voltages by touches, volts: exact, or linear; errors and limits of `touch_changes`."""
         return touch_changes(self.model, self.model_conductivity, touched, linear=linear)
+
+
+def skins_of(layouts: Sequence[Layout], protocols: Sequence[Protocol], **options) -> list[Skin]:
+    """Skins of layouts and their protocols, with `options` of `Skin.create`, whose errors it raises; one mesh and its
+    factorisation's plan serve all that follow each other on the same outline with as many electrodes."""
+    made: list[Skin] = []
+    for layout, protocol in zip(layouts, protocols, strict=True):
+        if made and _serves(made[-1], layout):
+            moved = made[-1].with_layout(layout, options.get("contact_impedance"))
+            made.append(eqx.tree_at(lambda one: one.model, moved, moved.model.with_protocol(protocol)))
+        else:
+            made.append(Skin.create(layout, protocol=protocol, **options))
+    return made
+
+
+def _serves(skin: Skin, layout: Layout) -> bool:
+    """Whether the mesh of a skin is that of a layout too."""
+    same = eqx.tree_equal(skin.outline, plain_outline(layout.known_outline))
+    return bool(same) and layout.num_electrodes == skin.layout.num_electrodes
 
 
 def check_skin(name: str, given) -> None:

@@ -12,6 +12,7 @@ from jeit.design.skin.indentation import AbstractIndentation
 from jeit.design.skin.touch_grid import check_places
 from jeit.electrodes.window import smooth_step
 from jeit.mesh import Mesh, centroids
+from jeit_solvers.engines import as_array, host
 
 
 class TouchedCells(eqx.Module):
@@ -56,7 +57,7 @@ def touched_cells(
     check_kind("indentation", indentation, AbstractIndentation, "an indentation, such as Bell() or Hemisphere()")
     _check_values(contrast, edge)
     layer = mesh.dimension == 3
-    deepest = float(np.max(indentation.depth_at(jnp.zeros(()))))
+    deepest = float(indentation.depth_at(host.zeros(())))
     below = np.zeros(len(middle))
     if layer:
         if thickness is not None:
@@ -92,7 +93,7 @@ def touched_cells(
     kept, there = _padded([one[used] for one, used in zip(cells, changed, strict=True)])
     change = np.zeros(kept.shape)
     change[there] = (contrast - 1) * share[changed]
-    return TouchedCells(jnp.asarray(places), jnp.asarray(kept), jnp.asarray(change), mesh.num_cells)
+    return TouchedCells(as_array(places), as_array(kept), as_array(change), mesh.num_cells)
 
 
 def _padded(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

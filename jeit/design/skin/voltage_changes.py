@@ -26,7 +26,7 @@ from jeit.forward.assembly import cell_conductivity, check_conductivity, stiffne
 from jeit.forward.model import check_model, evaluate, select_channels, solved_system_of
 from jeit.forward.transfer import fields_and_inverse
 from jeit_solvers import over_cores
-from jeit_solvers.engines import has_values
+from jeit_solvers.engines import has_values, on_device
 
 # Of the error's bound, relative to the voltages; steps to get there.
 _TOLERANCE, _MOST_STEPS = 1e-8, 200
@@ -85,7 +85,7 @@ def _exact(model: ForwardModel, conductivity, touched: TouchedCells):
     reach = touched_at.strips.reach(touched_at.nodes)
     solved = evaluate(model, solved_system_of, conductivity)
     known = fields_and_inverse(solved, model.electrodes, touched_at.strips, reach)
-    touches = jax.tree.map(jnp.asarray, (touched.cells, touched.change, touched_at.nodes, touched_at.corners))
+    touches = on_device((touched.cells, touched.change, touched_at.nodes, touched_at.corners))
     number = len(touched.cells)
     found = over_cores(partial(_changes, model, conductivity, known, touches), number, _EXACT)[:number]
     lost = np.flatnonzero(~np.isfinite(np.asarray(found)).all(axis=1))

@@ -34,12 +34,14 @@ def area(loops: Sequence[Loop]) -> Float[Array, ""]:
     return sum(holes, outer)
 
 
+@either_engine
 def along(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
     """Points (…, 2) on a loop at `arc_length` (…) in metres from its first vertex; it wraps round."""
-    closed = jnp.concatenate([loop, loop[:1]])
-    stops = jnp.concatenate([jnp.zeros(1), jnp.cumsum(_side_lengths(loop))])
-    wrapped = jnp.mod(jnp.asarray(arc_length, dtype=stops.dtype), stops[-1])
-    return jnp.stack([jnp.interp(wrapped, stops, closed[:, axis]) for axis in range(2)], axis=-1)
+    xp = namespace(loop)
+    closed = xp.concatenate([loop, loop[:1]])
+    stops = xp.concatenate([xp.zeros(1), xp.cumsum(_side_lengths(loop))])
+    wrapped = xp.mod(xp.asarray(arc_length, dtype=stops.dtype), stops[-1])
+    return xp.stack([xp.interp(wrapped, stops, closed[:, axis]) for axis in range(2)], axis=-1)
 
 
 @either_engine
@@ -85,7 +87,8 @@ def _nearest_on(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tuple[Any,
 
 
 def _side_lengths(loop: Loop) -> Float[Array, " k"]:
-    return jnp.sqrt(jnp.sum((jnp.roll(loop, -1, axis=0) - loop) ** 2, axis=1))
+    xp = namespace(loop)
+    return xp.sqrt(((xp.roll(loop, -1, axis=0) - loop) ** 2).sum(axis=1))
 
 
 def _shoelace(loop: Loop) -> Float[Array, ""]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
@@ -16,6 +15,7 @@ from jeit.mesh.generate.unstructured import Target, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import polyline
 from jeit.mesh.outline.domain import Domain, Pen, check_length, check_position
+from jeit_solvers.engines import as_array, either_engine, namespace
 
 
 class Rectangle(Domain):
@@ -51,7 +51,7 @@ class Rectangle(Domain):
     def vertices(self) -> Float[Array, "4 2"]:
         """Corners (4, 2) in metres, counter-clockwise from the lower left one."""
         left, right, low, high = self.extent
-        return jnp.array([[left, low], [right, low], [right, high], [left, high]])
+        return as_array([[left, low], [right, low], [right, high], [left, high]])
 
     def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
         """Points (…, 2) on the outline at `arc_length` (…) in metres, counter-clockwise from the lower left."""
@@ -61,11 +61,13 @@ class Rectangle(Domain):
         """The corners."""
         return (self.vertices,)
 
+    @either_engine
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
         """True for each of `points` (…, 2) in metres that lies in the rectangle or on its edge."""
-        offset = jnp.abs(jnp.asarray(points) - jnp.asarray(self.centre))
-        half = 0.5 * jnp.asarray([self.width, self.height])
-        return jnp.all(offset <= half * (1 + 1e-12), axis=-1)
+        xp = namespace(self, points)
+        offset = abs(xp.asarray(points) - xp.asarray(self.centre))
+        half = 0.5 * xp.asarray([self.width, self.height])
+        return (offset <= half * (1 + 1e-12)).all(axis=-1)
 
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
         """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
@@ -116,6 +118,6 @@ class Rectangle(Domain):
         tolerance = 1e-9 * max(self.width, self.height)
         sides = {"left": (0, left), "right": (0, right), "bottom": (1, bottom), "top": (1, top)}
         return {
-            name: jnp.asarray(np.flatnonzero((np.abs(ends[:, :, axis] - value) < tolerance).all(axis=1)), jnp.int32)
+            name: as_array(np.flatnonzero((np.abs(ends[:, :, axis] - value) < tolerance).all(axis=1)), np.int32)
             for name, (axis, value) in sides.items()
         }
