@@ -66,7 +66,7 @@ def rooms_of(house: dict[str, Path]) -> list[str]:
     faults = []
     for name, path in house.items():
         parts = name.split(".")
-        if name in ("jeit", "jeit.__main__", "jeit.start"):  # the entrance
+        if name in ("jeit", "jeit.__main__", "jeit._start"):  # the entrance
             continue
         if parts[1] not in ROOMS or path.parent.name == "jeit":
             faults.append(f"{name} is in no room")
