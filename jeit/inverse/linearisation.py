@@ -12,7 +12,11 @@ from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.defaults import PRIOR
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.spectrum import Spectrum
+from jeit.protocol import Protocol
 from jeit_solvers.engines import as_array, host
+
+# Singular values so small, beside the largest, are rounding.
+_NOTHING = 1e-12
 
 
 class Linearisation(eqx.Module):
@@ -53,7 +57,8 @@ class Linearisation(eqx.Module):
             raise ValueError("conductivity: give one number, or one value per cell: the image has a value per cell.")
         channels, root_weight = used_channels(model, noise, mask)
         whitened = root_weight[:, None] * host.asarray(model.jacobian(conductivity))[channels]
-        product = prior.covariance_product(model.mesh, whitened)
+        directions = _directions(model.protocol, channels, root_weight)
+        product = prior.covariance_product(model.mesh, directions.T @ whitened) @ directions.T
         spectrum = Spectrum.create(whitened, product, prior.null_space(model.mesh))
         return cls(spectrum, prior, channels, root_weight, model.protocol.num_measurements)
 
@@ -94,3 +99,18 @@ def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, np.ndar
     if not (np.isfinite(deviation) & (deviation > 0)).all():
         raise ValueError("noise must be positive and finite for every channel in use.")
     return np.flatnonzero(used), 1 / deviation
+
+
+def _directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarray, "K r"]:
+    """An orthonormal basis of all that changes of conductivity can do to whitened data: L electrodes have L(L - 1)/2
+    transfer impedances, of which all channels are combinations, however many.
+
+    Drive d and measurement m, which sum to zero, see Σ_ab d_a m_b G_ab = Σ_a<b (d_a m_b + d_b m_a)(G_ab - (G_aa +
+    G_bb)/2) of a symmetric G, be it the transfer impedance or its derivative.
+    """
+    drive = np.asarray(protocol.drive)[np.asarray(protocol.drive_index)[channels]]
+    measurement = np.asarray(protocol.measurement)[np.asarray(protocol.measurement_index)[channels]]
+    first, second = np.triu_indices(protocol.num_electrodes, 1)
+    seen = drive[:, first] * measurement[:, second] + drive[:, second] * measurement[:, first]
+    directions, size, _ = np.linalg.svd(root_weight[:, None] * seen, full_matrices=False)
+    return directions[:, size > _NOTHING * size[0]]
