@@ -95,8 +95,8 @@ def jobs(options: Options) -> list[Job]:
     return [
         *few,
         # Together they are allowed 8 s.
-        Job("jeit calibrate-microphones", ("calibrate-microphones", "taps.npz"), files=_SKIN, warm=5.0),
-        Job("jeit locate", ("locate", "recording.npz", "-c", "skin.json"), files=_CALIBRATED, warm=3.0),
+        Job("jeit calibrate-microphones", ("calibrate-microphones", "taps.npz"), files=_SKIN, warm=4.0),
+        Job("jeit locate", ("locate", "recording.npz", "-c", "skin.json"), files=_CALIBRATED, warm=4.0),
         Job("jeit layout compare", ("layout", "compare", "park-inner", "park-boundary"), warm=15.0),
         Job("jeit layout optimise", ("layout", "optimise", "park-boundary"), warm=25.0),
         Job("model, voltages and Jacobian, 1,150 nodes", script="ask(0.1, 1150)", before=_MODEL, cold=4.0),
