@@ -21,8 +21,8 @@ folder, unless JAX has been told of another or JEIT_COMPILATION_CACHE is "off". 
 import importlib
 from typing import TYPE_CHECKING
 
-from jeit._start import keep_compiled_code as _keep_compiled_code
-from jeit._start import take_double_precision as _take_double_precision
+from jeit.start import keep_compiled_code as _keep_compiled_code
+from jeit.start import take_double_precision as _take_double_precision
 
 if TYPE_CHECKING:
     from jeit.data import read as read

@@ -19,7 +19,7 @@ PACKAGES = {
 def faults(name: str, path: Path) -> list[str]:
     """What is wrong with the contents of a package."""
     package = importlib.import_module(name)
-    entrance = "jeit._start."  # jeit itself calls it, and offers it to nobody
+    entrance = "jeit.start."  # jeit itself calls it, and offers it to nobody
     taken = {one.rpartition(".")[2] for one in on_import(path) if one.startswith(f"{name}.") and entrance not in one}
     said = set(getattr(package, "__all__", ()))
     found = [f"{one} is not in __all__" for one in sorted(taken - said)]

@@ -7,7 +7,7 @@ import sys
 import jax
 import pytest
 
-import jeit._start
+from jeit.start import compiled_code
 
 PROGRAM = """
 import jeit, jax, jax.numpy as jnp
@@ -69,11 +69,11 @@ def test_the_oldest_go_when_there_are_too_many(tmp_path, monkeypatch):
         path = tmp_path / "kind" / f"{number}-cache"
         path.write_bytes(b"x" * 100)
         os.utime(path, (number, number))
-    monkeypatch.setattr(jeit._start, "_MOST_FILES", 4)
-    jeit._start._discard_oldest(tmp_path)
+    monkeypatch.setattr(compiled_code, "_MOST_FILES", 4)
+    compiled_code._discard_oldest(tmp_path)
     assert sorted(path.name[0] for path in tmp_path.rglob("*-cache")) == ["2", "3", "4", "5"]
-    monkeypatch.setattr(jeit._start, "_MOST_BYTES", 250)
-    jeit._start._discard_oldest(tmp_path)
+    monkeypatch.setattr(compiled_code, "_MOST_BYTES", 250)
+    compiled_code._discard_oldest(tmp_path)
     assert sorted(path.name[0] for path in tmp_path.rglob("*-cache")) == ["4", "5"]
 
 

@@ -1,4 +1,4 @@
-"""What importing jeit sets up in JAX: double precision, and a place where compiled code is kept between runs."""
+"""A place where compiled code is kept between runs: which, for whom, and how much."""
 
 import contextlib
 import hashlib
@@ -11,13 +11,6 @@ from pathlib import Path
 import jax
 
 _MOST_BYTES, _MOST_FILES = 256 * 2**20, 5000
-
-
-def take_double_precision() -> None:
-    """A light touch changes voltages by 1e-4, for which single precision is not enough. A user who has set
-    JAX_ENABLE_X64 has decided already."""
-    if "JAX_ENABLE_X64" not in os.environ:
-        jax.config.update("jax_enable_x64", True)
 
 
 def keep_compiled_code() -> None:
