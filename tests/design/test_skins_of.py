@@ -1,0 +1,47 @@
+"""Skins of several layouts: one mesh serves those that it can, and what is measured is what each skin alone gives."""
+
+import numpy as np
+import pytest
+
+from jeit.design import Skin
+from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.skin import skins_of
+from jeit.layout import named_layout
+from jeit.mesh import Rectangle
+
+FIELD = Rectangle(0.1, 0.08)
+OPTIONS = {"num_layers": 0, "cell_size": 8e-3}
+
+
+def skins(*layouts):
+    return skins_of(layouts, [skin_protocol(one) for one in layouts], **OPTIONS)
+
+
+def test_layouts_of_as_many_electrodes_on_one_outline_share_a_mesh():
+    first, second = (named_layout(name, FIELD) for name in ("grid-3x2", "perimeter-6"))
+    made, alone = skins(first, second), Skin.create(second, **OPTIONS)
+    assert made[1].model.mesh.points is made[0].model.mesh.points
+    assert made[1].layout.name == "perimeter-6"
+    assert made[1].model.protocol == skin_protocol(second)
+    voltages = made[1].model.voltages(made[1].model_conductivity)
+    np.testing.assert_allclose(voltages, alone.model.voltages(alone.model_conductivity), rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [named_layout("grid-3x2", Rectangle(0.1, 0.1)), named_layout("grid-3x3", FIELD)],
+    ids=["another outline", "more electrodes"],
+)
+def test_others_have_their_own(other):
+    made = skins(named_layout("grid-3x2", FIELD), other)
+    assert made[1].model.mesh.points is not made[0].model.mesh.points
+    assert made[1].outline.area == pytest.approx(other.known_outline.area)
+    alone = Skin.create(other, **OPTIONS)
+    voltages = made[1].model.voltages(made[1].model_conductivity)
+    np.testing.assert_allclose(voltages, alone.model.voltages(alone.model_conductivity), rtol=1e-10)
+
+
+def test_a_shared_mesh_is_checked_for_the_electrodes_of_every_layout():
+    small = named_layout("grid-3x2", FIELD, diameter=1e-3)
+    with pytest.raises(ValueError, match=r"cell_size is 8 mm; give no more than 1.5 mm"):
+        skins(named_layout("grid-3x2", FIELD), small)
