@@ -26,7 +26,7 @@ ROOMS["simulate"] = {*ROOMS["design"], "design", "data", "acoustic"}
 ROOMS["imaging"] = {*ROOMS["inverse"], "inverse", "data", "image"}
 ROOMS["plot"] = {*ROOMS["simulate"], *ROOMS["imaging"], "simulate", "imaging"}
 ROOMS["report"] = {*ROOMS["plot"], "plot"}
-ROOMS["cli"] = {*ROOMS["report"], "report"}
+ROOMS["cli"] = {*ROOMS["report"], "report", "start"}
 
 
 def modules(top: Path) -> dict[str, Path]:

@@ -77,5 +77,43 @@ def test_the_oldest_go_when_there_are_too_many(tmp_path, monkeypatch):
     assert sorted(path.name[0] for path in tmp_path.rglob("*-cache")) == ["4", "5"]
 
 
+def test_what_nothing_was_written_to_is_discarded(tmp_path):
+    """A full disk leaves such files, and JAX does not write over them."""
+    folder = tmp_path / "one"
+    folder.mkdir()
+    (folder / "full-cache").write_bytes(b"x")
+    (folder / "empty-cache").write_bytes(b"")
+    compiled_code._discard_oldest(tmp_path)
+    assert [path.name for path in folder.iterdir()] == ["full-cache"]
+
+
+def test_a_warning_of_a_damaged_program_discards_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(compiled_code, "_cache_folder", lambda: tmp_path)
+    folder = tmp_path / "jeit" / "jax" / "here"
+    folder.mkdir(parents=True)
+    for name in ("jit_stage-1-cache", "jit_stage-2-cache", "jit_stages-1-cache"):
+        (folder / name).write_bytes(b"x")
+    told = "Error reading persistent compilation cache entry for 'jit_stage': error: Error -5"
+    before = jax.config.jax_compilation_cache_dir
+    try:
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path / "another"))
+        assert not compiled_code.discarded_damaged(told)
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        assert not compiled_code.discarded_damaged("Error writing persistent compilation cache entry for 'jit_stage'")
+        assert compiled_code.discarded_damaged(told)
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
+    assert [path.name for path in folder.iterdir()] == ["jit_stages-1-cache"]
+
+
+def test_a_relative_cache_folder_is_not_taken(monkeypatch):
+    """As the XDG base directory specification has it."""
+    for told in ("", "somewhere", "~/cache"):
+        monkeypatch.setenv("XDG_CACHE_HOME", told)
+        monkeypatch.setenv("LOCALAPPDATA", told)
+        assert compiled_code._cache_folder().is_absolute()
+        assert "~" not in compiled_code._cache_folder().parts
+
+
 def test_double_precision_unless_told_otherwise():
     assert jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]

@@ -20,6 +20,7 @@ from jeit.cli.commands.reconstruct import reconstruct
 from jeit.cli.commands.stream import stream
 from jeit.cli.commands.study import study
 from jeit.cli.options import naming_options
+from jeit.start import discarded_damaged
 
 # Commands that run one program again and again: a frame in a third of the time.
 _REPEATING = ("study", "stream", "layout optimise")
@@ -128,6 +129,8 @@ def _fail(message: str, status: int) -> int:
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
+    if discarded_damaged(str(message)):
+        return
     print(f"jeit: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 

@@ -12,6 +12,9 @@ from jeit.design.skin.skin import Skin, check_skin
 from jeit.design.skin.touch_grid import touches_away_from_the_edge
 from jeit.layout import Layout
 
+# By so much less than the other's least a place must feel to be blind: rounding of coordinates is not.
+_ROUNDING = 1e-6
+
 
 class LayoutComparison(eqx.Module):
     """What two skins feel.
@@ -111,7 +114,7 @@ def _told(response: SkinResponse, other: SkinResponse) -> dict:
         "sensitivity_min_V": float(theta.minimum),
         "sensitivity_mean_V": float(theta.mean),
         "sensitivity_uniformity": float(theta.uniformity),
-        "blind_spot_fraction": float(theta.blind_spot(other.sensitivity.minimum)),
+        "blind_spot_fraction": float(theta.blind_spot((1 - _ROUNDING) * other.sensitivity.minimum)),
         "taxel_count": int((areas > 0).sum()),
         "taxel_area_cm2": {"mean": float(areas.mean()), "std": float(areas.std()), "max": float(areas.max())},
         "taxel_overlap": float(taxels.overlap),

@@ -34,6 +34,9 @@ MARGIN = 10e-3  # m
 CELL_SIZE = 4.5e-3  # m
 NUM_LAYERS = 5
 
+# Of conductivities where a touch is: beyond it exact voltages are not found, and change no more.
+MOST_CONTRAST = 1e6
+
 # Virtual taxels: the paper's clusters and cosine.
 NUM_TAXELS = 90
 THRESHOLD = 0.7

@@ -1,9 +1,11 @@
 """A place where compiled code is kept between runs: which, for whom, and how much."""
 
 import contextlib
+import glob
 import hashlib
 import os
 import platform
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +25,8 @@ def keep_compiled_code() -> None:
     thousands, or a quarter of a gigabyte.
     """
     told = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if told is not None or os.environ.get("JEIT_COMPILATION_CACHE", "").lower() in ("off", "0", "no", "false"):
+    asked = os.environ.get("JEIT_COMPILATION_CACHE", "").strip().lower()
+    if told is not None or asked in ("off", "0", "no", "none", "false", "disabled"):
         return
     try:
         every = _cache_folder() / "jeit" / "jax"
@@ -38,6 +41,21 @@ def keep_compiled_code() -> None:
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
+def discarded_damaged(warning: str) -> bool:
+    """Whether a warning is JAX's that it could not read a program it kept; all kept under its name are gone then.
+
+    It would compile it anew in every process to come, and say so again: it does not write over what is there.
+    """
+    told = re.match(r"Error reading persistent compilation cache entry for '([\w<>.-]+)'", warning)
+    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if told is None or not folder or not Path(folder).is_relative_to(_cache_folder() / "jeit"):
+        return False
+    for path in Path(folder).glob(f"{glob.escape(told[1])}-*"):
+        with contextlib.suppress(OSError):
+            path.unlink()
+    return True
+
+
 def _processor() -> str:
     """A name for this kind of processor: where homes are shared, its code must not run on another."""
     described = platform.machine() + platform.processor()
@@ -47,11 +65,13 @@ def _processor() -> str:
 
 
 def _discard_oldest(folder: Path) -> None:
+    """Of the files, as far as they are too many; and those that nothing was written to, as on a full disk: JAX would
+    fail to read them ever after."""
     kept = sorted(_used(folder), reverse=True)
     size = 0
     for number, (_, bytes_taken, path) in enumerate(kept):
         size += bytes_taken
-        if number >= _MOST_FILES or size > _MOST_BYTES:
+        if number >= _MOST_FILES or size > _MOST_BYTES or not bytes_taken:
             path.unlink(missing_ok=True)
 
 
@@ -67,4 +87,5 @@ def _cache_folder() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches"
     variable = "LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"
-    return Path(os.environ.get(variable) or Path.home() / ".cache")
+    told = Path(os.environ.get(variable, ""))
+    return told if told.is_absolute() else Path.home() / ".cache"

@@ -19,6 +19,17 @@ def mixed():
     return microphone_array, power
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+@both
+def test_no_frames_give_nothing(method, compiled):
+    """As where a mask leaves none."""
+    microphone_array = array(9, relative=0.1)
+    found = Localiser.create(microphone_array, method=method, compiled=compiled)(np.zeros((0, 9)))
+    assert found.position.shape == (0, 2)
+    assert found.covariance.shape == (0, 2, 2)
+    assert found.converged.shape == (0,)
+
+
 @pytest.mark.slow
 @both
 def test_frames_do_not_see_each_other(method, mixed):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jeit.design import Skin
-from jeit.layout import Layout, grid, write_layout
+from jeit.layout import Layout, grid, named_layout, write_layout
 from jeit.mesh import Rectangle
 
 SKIN = Rectangle(0.06, 0.05)
@@ -40,6 +40,15 @@ def test_two_files_side_by_side(layouts, run, tmp_path):
     assert inside["taxel_area_cm2"]["mean"] <= inside["taxel_area_cm2"]["max"] < 30
     assert report["options"]["margin_mm"] == 5
     assert report["options"]["pairs"] == 6
+
+
+def test_a_layout_and_its_file_are_alike(run, tmp_path):
+    """Files have millimetres of nine digits: what is rounded off makes no place blind."""
+    write_layout(named_layout("grid-3x2", Rectangle(0.06, 0.05)), tmp_path / "file.csv")
+    options = ["--width-mm", 60, "--height-mm", 50, "--output", tmp_path / "out", *OPTIONS]
+    assert run("layout", "compare", "grid-3x2", tmp_path / "file.csv", *options)[0] == 0
+    report = json.loads((tmp_path / "out" / "report.json").read_text("utf-8"))
+    assert [one["blind_spot_fraction"] for one in report["layouts"]] == [0, 0]
 
 
 def test_the_second_layout_is_checked_before_the_first_is_touched(layouts, run, tmp_path, monkeypatch):
@@ -101,6 +110,7 @@ def test_layouts_on_different_skins_are_not_compared(layouts, run, tmp_path):
         ),
         ([None, "--cell-mm", 0.001], "--cell-mm is 0.001 mm, which makes about 2.2e+10 nodes; give 0.15 mm or more"),
         ([None, "--contrast", 1], "--contrast must be a factor for the conductivity"),
+        ([None, "--contrast", 1e7], "up to 1e+06, where the limit is reached long before"),
         ([None, "--places", 100_000], "--places must be from 2 to 256"),
         ([None, "--taxels", 0], "--taxels must be at least 1"),
         ([None, "--taxels", 101], "--taxels is 101; give from 1 to the"),

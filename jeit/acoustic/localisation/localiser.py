@@ -92,7 +92,7 @@ class Localiser(eqx.Module):
         coarse = Pixels.create(microphone_array.surface, *counts)
         if map_shape is None:
             return cls(microphone_array, coarse, None, None, method, compiled)
-        if len(map_shape) != 2 or min(map_shape) < 2:
+        if np.shape(map_shape) != (2,) or min(map_shape) < 2:
             raise ValueError(f"map_shape must be (rows, columns) of at least two each; it is {map_shape!r}.")
         pixels = Pixels.create(microphone_array.surface, int(map_shape[1]), int(map_shape[0]))
         features = _features(METHODS[method], microphone_array, pixels.chart)
@@ -119,7 +119,7 @@ class Localiser(eqx.Module):
 
     def _run(self, function, power, use):
         """`function` of the localiser, of intensities as an array, and of which are to be looked at."""
-        at_hand = not self.compiled and np.size(power) > 0 and has_values(self, power, use)
+        at_hand = not self.compiled and has_values(self, power, use)
         xp = np if at_hand else jnp
         power = xp.asarray(power, float)
         finite = xp.isfinite(power)
@@ -129,6 +129,9 @@ class Localiser(eqx.Module):
                 f"power has shape {power.shape} and use {use.shape}; give (frames, microphones) with "
                 f"{len(self.microphone_array.microphones)} microphones."
             )
+        if not len(power):  # as of one that nothing is known of
+            found = self._run(function, np.full((1, power.shape[1]), np.nan), None)
+            return jax.tree.map(lambda array: array[:0], found)
         return on_device(at_once(function, self, power, use)) if at_hand else _compiled(function, self, power, use)
 
 

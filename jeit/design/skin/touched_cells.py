@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from jeit.arguments import check_kind
-from jeit.design.defaults import CONTRAST
+from jeit.design.defaults import CONTRAST, MOST_CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
 from jeit.design.skin.touch_grid import check_places
 from jeit.electrodes.window import smooth_step
@@ -106,10 +106,10 @@ def _padded(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_values(contrast: float, edge: float) -> None:
-    if not 0 <= contrast < np.inf or contrast == 1:
+    if not 0 <= contrast <= MOST_CONTRAST or contrast == 1:
         raise ValueError(
-            f"contrast must be a factor for the conductivity, 0 for an insulator, above 1 for a conductor; it is "
-            f"{contrast!r}."
+            f"contrast must be a factor for the conductivity, 0 for an insulator, above 1 for a conductor, up to "
+            f"{MOST_CONTRAST:g}, where the limit is reached long before; it is {contrast!r}."
         )
     if not 0 <= edge < np.inf:
         raise ValueError(f"edge must be a depth in metres, not negative; it is {edge!r}.")

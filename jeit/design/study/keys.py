@@ -111,7 +111,7 @@ _SECTIONS: dict[str, dict[str, _Key]] = {
         "depth_mm": Quantity(0.01, 100, 1e3 * defaults.DEPTH),
         "deviation_mm": Quantity(0.1, 200, 1e3 * defaults.DEVIATION),
         "diameter_mm": Quantity(0.1, 200, 1e3 * defaults.BALL_DIAMETER),
-        "contrast": Quantity(0, 1e6, defaults.CONTRAST),
+        "contrast": Quantity(0, defaults.MOST_CONTRAST, defaults.CONTRAST),
         "exact": Flag(False),
         "columns": Quantity(1, 1000, defaults.STUDY_PLACES, whole=True),
         "rows": Quantity(1, 1000, defaults.STUDY_PLACES, whole=True),
