@@ -1,0 +1,24 @@
+"""The physics of contact: load → pressure → change of conductivity, in time → voltages.
+
+An indenter says how far its surface is above its lowest point, and a support how pressure spreads beneath it.
+Arrays are NumPy's: what touches what is no smooth function of anything.
+"""
+
+from jeit.simulate.contact.foundation import Foundation
+from jeit.simulate.contact.half_space import HalfSpace
+from jeit.simulate.contact.indenters import Bar, DepthMap, Disc, Prism, Revolved, Ring, ball
+from jeit.simulate.contact.joined import Joined, Placed
+
+__all__ = [
+    "Bar",
+    "DepthMap",
+    "Disc",
+    "Foundation",
+    "HalfSpace",
+    "Joined",
+    "Placed",
+    "Prism",
+    "Revolved",
+    "Ring",
+    "ball",
+]

@@ -1,0 +1,85 @@
+"""A thin soft layer on a rigid back: pressure at a place follows from how far the layer is pressed in there alone."""
+
+import numpy as np
+
+from jeit.arguments import check_metres, is_number, told
+from jeit.simulate.contact.indenters import AbstractIndenter
+from jeit.simulate.contact.pressure import AbstractPressure, AbstractSupport, check_load, contact_window, raster
+
+# Pixels along a side: of the raster that finds the contact, and of that which the load is balanced on.
+_COARSE, _FINE = 24, 96
+
+
+class FoundationPressure(AbstractPressure):
+    """k (approach − gap) where that is positive; `stiffness` k in Pa/m. Known at every point, without a raster."""
+
+    indenter: AbstractIndenter
+    stiffness: float
+
+    def at(self, points):
+        """Of the indenter's gap there."""
+        return self.stiffness * np.maximum(self.approach - self.indenter.gap(points), 0.0)
+
+
+class Foundation(AbstractSupport):
+    """Winkler's foundation: p = E δ / thickness (Johnson, Contact Mechanics, 1985, section 4.3).
+
+    **Fields**: `modulus` E of the layer in pascals, that of compression between plates that keep it from spreading;
+    `thickness` in metres. It is for layers thinner than the contact is wide.
+    """
+
+    modulus: float
+    thickness: float
+
+    def __init__(self, modulus: float, thickness: float):
+        """Raises `ValueError` for values that are not positive."""
+        check_modulus(modulus)
+        check_metres("thickness", thickness)
+        self.modulus, self.thickness = float(modulus), float(thickness)
+
+    @property
+    def stiffness(self) -> float:
+        """Pressure over indentation, Pa/m."""
+        return self.modulus / self.thickness
+
+    def pressure(self, indenter: AbstractIndenter, load: float) -> FoundationPressure:
+        """That beneath `indenter` under `load` newtons.
+
+        Raises `ValueError` for a load that is not positive, and one that presses through the layer.
+        """
+        check_load(load)
+
+        def balanced(window, number: int) -> tuple[np.ndarray, float]:
+            points, pixel = raster(window, number)
+            gap = indenter.gap(points)
+            return gap, level(gap.ravel(), load / (self.stiffness * pixel.prod()))
+
+        def pressed(window, number: int) -> np.ndarray:
+            gap, approach = balanced(window, number)
+            return gap < approach
+
+        window = contact_window(pressed, indenter.reach, _COARSE)
+        gap, approach = balanced(window, _FINE)
+        if approach >= self.thickness:
+            raise ValueError(
+                f"load is {load:g} N, which takes the indenter {1e3 * approach:.3g} mm into a layer "
+                f"{1e3 * self.thickness:.3g} mm thick; give less load, a wider indenter or a stiffer layer."
+            )
+        points, pixel = raster(window, _FINE)
+        reach = float(np.linalg.norm(points[gap < approach], axis=-1).max() + np.hypot(*pixel))
+        return FoundationPressure(float(load), approach, reach, indenter, self.stiffness)
+
+
+def level(gap: np.ndarray, volume: float) -> float:
+    """The level δ at which Σ max(δ − gap, 0) is `volume`: water poured over heights `gap` (q,), infinite where none can
+    stand. With the m lowest under water it is (volume + their sum) / m, and exact for the m for which no other is."""
+    heights = np.sort(gap[np.isfinite(gap)])
+    filled = (volume + np.cumsum(heights)) / np.arange(1, len(heights) + 1)
+    above = np.append(heights[1:], np.inf)
+    return float(filled[np.argmax(filled <= above)])
+
+
+def check_modulus(modulus) -> None:
+    """Raise `ValueError` for what is no positive modulus in pascals."""
+    if not (is_number(modulus) and modulus > 0):
+        raise ValueError(f"modulus must be positive, in pascals (1e6 for a soft rubber); it is {told(modulus)}.")

@@ -1,0 +1,69 @@
+"""Indenters moved and turned in their frame, and several that are one rigid body."""
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.simulate.contact.indenters import AbstractIndenter, check_indenter
+
+
+class Placed(AbstractIndenter):
+    """An `indenter` turned by `angle` radians, counter-clockwise, then moved to `position` (x, y), metres."""
+
+    indenter: AbstractIndenter
+    position: Float[np.ndarray, "2"]
+    angle: float
+
+    def __init__(self, indenter: AbstractIndenter, position=(0.0, 0.0), angle: float = 0.0):
+        """Raises `ValueError` for what is no indenter, place or angle."""
+        check_indenter("indenter", indenter)
+        self.indenter, self.position, self.angle = indenter, check_position(position), check_angle(angle)
+
+    def gap(self, points):
+        """The indenter's, at the points as they lie in its frame."""
+        cos, sin = np.cos(self.angle), np.sin(self.angle)
+        return self.indenter.gap((np.asarray(points) - self.position) @ np.array([[cos, -sin], [sin, cos]]))
+
+    @property
+    def reach(self) -> float:
+        """The indenter's, and how far it was moved."""
+        return float(np.hypot(*self.position) + self.indenter.reach)
+
+
+class Joined(AbstractIndenter):
+    """Several `parts`, one rigid body under one load: their lowest points are level. Mostly `Placed` ones."""
+
+    parts: tuple[AbstractIndenter, ...]
+
+    def __init__(self, *parts: AbstractIndenter):
+        """Raises `ValueError` for no parts, and for what is no indenter."""
+        if not parts:
+            raise ValueError(
+                "parts: give one indenter at least, such as Joined(Disc(0.01), Placed(Disc(0.01), (0.02, 0)))"
+            )
+        for number, part in enumerate(parts):
+            check_indenter(f"part {number}", part)
+        self.parts = parts
+
+    def gap(self, points):
+        """The least of the parts'."""
+        return np.min([part.gap(points) for part in self.parts], axis=0)
+
+    @property
+    def reach(self) -> float:
+        """The farthest of the parts'."""
+        return max(part.reach for part in self.parts)
+
+
+def check_position(position) -> Float[np.ndarray, "2"]:
+    """A place (x, y) in metres as an array. Raises `ValueError` for what is none."""
+    where = np.asarray(position, float)
+    if where.shape != (2,) or not np.isfinite(where).all():
+        raise ValueError(f"position: give (x, y) in metres, not {position!r}.")
+    return where
+
+
+def check_angle(angle) -> float:
+    """An angle in radians. Raises `ValueError` for what is none."""
+    if not np.isscalar(angle) or not np.isfinite(angle):
+        raise ValueError(f"angle: give radians, not {angle!r}.")
+    return float(angle)  # pyright: ignore[reportArgumentType]

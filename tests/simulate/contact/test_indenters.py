@@ -1,0 +1,81 @@
+"""Indenters: their gaps where geometry gives them, however they are moved, turned and joined."""
+
+import numpy as np
+import pytest
+
+from jeit.design import Bell
+from jeit.simulate.contact import Bar, DepthMap, Disc, Joined, Placed, Prism, Revolved, Ring, ball
+
+MIDDLE = np.zeros(2)
+
+
+@pytest.mark.parametrize(
+    ("indenter", "point", "gap"),
+    [
+        (Disc(0.02), (0.006, 0.008), 0.0),
+        (Disc(0.02), (0.006, 0.0081), np.inf),
+        (Ring(0.02, 0.01), (0.004, 0.0), np.inf),
+        (Ring(0.02, 0.01), (0.0, -0.007), 0.0),
+        (Bar(0.1, 0.002), (0.049, 0.0009), 0.0),
+        (Bar(0.1, 0.002), (0.0009, 0.049), np.inf),
+        (Prism(0.04, 0.02, 0.01), (0.015, -0.005), 0.005),
+        (ball(0.02), (0.006, 0.0), 0.002),
+        (ball(0.02), (0.0, 0.0101), np.inf),
+        (Revolved(Bell(2e-3, 5e-3)), (0.005, 0.0), 2e-3 * (1 - np.exp(-0.5))),
+        (Placed(Disc(0.02), (0.03, 0.0)), (0.039, 0.0), 0.0),
+        (Placed(Bar(0.1, 0.002), (0.01, 0.0), np.pi / 2), (0.01, 0.04), 0.0),
+        (Placed(Prism(0.04, 0.02, 0.01), (0.01, 0.02), np.pi / 6), (0.01 - 0.0025, 0.02 + 0.0025 * 3**0.5), 0.005),
+        (Joined(Placed(Disc(0.01), (0.02, 0)), ball(0.01)), (0.02, 0.003), 0.0),
+        (Joined(Placed(Disc(0.01), (0.02, 0)), ball(0.01)), (0.003, 0.0), 0.001),
+    ],
+)
+def test_gap(indenter, point, gap):
+    assert float(indenter.gap(np.array(point))) == pytest.approx(gap, rel=1e-9, abs=1e-17)
+
+
+@pytest.mark.parametrize(
+    "indenter",
+    [
+        Disc(0.02),
+        Ring(0.02, 0.01),
+        Bar(0.1, 0.002),
+        Prism(0.04, 0.02, 0.01),
+        ball(0.01),
+        Joined(Disc(0.01), ball(0.02)),
+    ],
+)
+def test_nothing_beyond_reach_and_zero_somewhere(indenter):
+    points = np.random.default_rng(0).uniform(-1, 1, (40_000, 2)) * 1.2 * indenter.reach
+    gap = indenter.gap(points)
+    assert np.isinf(gap[np.linalg.norm(points, axis=1) > indenter.reach * (1 + 1e-12)]).all()
+    assert 0 <= gap.min() < 0.02 * indenter.reach
+
+
+def test_a_depth_map_is_linear_between_its_pixels():
+    height = np.array([[0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [np.nan, 1.0, 3.0]])
+    indenter = DepthMap(height, 1.0)
+    gap = indenter.gap(np.array([[0.0, 0.0], [0.5, -0.5], [1.0, 1.0], [-0.5, 0.5], [1.5, 0.0]]))
+    np.testing.assert_allclose(gap, [2.0, 1.5, 0.0, np.inf, np.inf])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Disc(0.0), "diameter must be a positive length"),
+        (lambda: Ring(0.01, 0.02), "inner_diameter is 20 mm, more than the outer"),
+        (lambda: Ring(0.01, 0.01), "nothing is left"),
+        (lambda: Bar(0.01, np.nan), "width must be"),
+        (lambda: Prism(0.01, 0.01, -1.0), "height must be"),
+        (lambda: Revolved(0.01), "indentation must be"),
+        (lambda: DepthMap(np.zeros(4), 1e-3), "height must be an image"),
+        (lambda: DepthMap(np.full((4, 4), np.nan), 1e-3), "0 pixels of it finite"),
+        (lambda: Placed(0.01), "indenter must be an indenter"),
+        (lambda: Placed(Disc(0.01), (0.0, np.nan)), r"position: give \(x, y\)"),
+        (lambda: Placed(Disc(0.01), (0.0, 0.0), np.inf), "angle: give radians"),
+        (Joined, "parts: give one"),
+        (lambda: Joined(Disc(0.01), "ball"), "part 1 must be an indenter"),
+    ],
+)
+def test_impossible_indenters_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

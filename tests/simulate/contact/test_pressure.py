@@ -1,0 +1,147 @@
+"""Pressure under indenters: Hertz, the flat punch, Winkler's closed forms; what is asked of every contact."""
+
+import numpy as np
+import pytest
+
+from jeit.simulate.contact import Bar, Disc, Foundation, HalfSpace, Joined, Placed, Prism, Ring, ball
+from jeit.simulate.contact.half_space import sinking
+from jeit.simulate.contact.indenters import AbstractIndenter
+from jeit.simulate.contact.pressure import raster
+
+RADIUS, LOAD = 0.01, 0.05
+MIDDLE = np.zeros((1, 2))
+RUBBER = HalfSpace(1e6, 0.5)
+LAYER = Foundation(1e6, 3e-3)
+TWO = Joined(Placed(Disc(0.01), (0.01, 0.0)), Placed(ball(0.02), (-0.01, 0.002)))
+SHAPES = {
+    "disc": Disc(0.02),
+    "ring": Ring(0.02, 0.012),
+    "bar": Bar(0.03, 0.004),
+    "prism": Prism(0.03, 0.02, 0.01),
+    "ball": ball(0.02),
+    "two": TWO,
+}
+
+
+class Paraboloid(AbstractIndenter):
+    """r² / 2R: what Hertz takes a ball for."""
+
+    def gap(self, points):
+        return np.sum(np.asarray(points) ** 2, axis=-1) / (2 * RADIUS)
+
+    @property
+    def reach(self) -> float:
+        return RADIUS
+
+
+def hertz(support):
+    """Contact radius, greatest pressure and approach: Johnson, Contact Mechanics, 1985, equations 4.22 to 4.24."""
+    radius = (3 * LOAD * RADIUS / (4 * support.plane_modulus)) ** (1 / 3)
+    return radius, 3 * LOAD / (2 * np.pi * radius**2), radius**2 / RADIUS
+
+
+def test_a_ball_on_a_half_space_is_hertz():
+    errors, radii = [], []
+    for pixels in (24, 48, 96):
+        support = HalfSpace(1e6, 0.3, pixels)
+        radius, peak, approach = hertz(support)
+        found = support.pressure(Paraboloid(), LOAD)
+        points, _ = raster(pixels / 2 * found.pixel, pixels)
+        exact = peak * np.sqrt(np.maximum(1 - np.sum(points**2, axis=-1) / radius**2, 0))
+        errors.append(np.linalg.norm(found.values - exact) / np.linalg.norm(exact))
+        radii.append(abs(np.sqrt((found.values > 0).sum() * found.pixel.prod() / np.pi) / radius - 1))
+        assert found.values.max() == pytest.approx(peak, rel=0.01)
+    assert found.approach == pytest.approx(approach, rel=1e-4)
+    assert found.values.max() == pytest.approx(peak, rel=1e-3)
+    assert errors[-1] < 5e-3
+    assert radii[-1] < 5e-3
+    # The root at the contact's edge leaves h^1.5 or so, up to how the edge falls on the pixels.
+    assert np.log2(errors[0] / errors[-1]) / 2 > 0.9
+
+
+def test_a_flat_punch_on_a_half_space():
+    """F = 2 a E* δ, with p = F / (2π a √(a² − r²)): its error is that of a disc of pixels, and falls with them."""
+    errors = []
+    for pixels in (32, 64, 128):
+        support = HalfSpace(1e6, 0.5, pixels)
+        found = support.pressure(Disc(2 * RADIUS), LOAD)
+        errors.append(abs(2 * RADIUS * support.plane_modulus * found.approach / LOAD - 1))
+        assert found.at(MIDDLE) == pytest.approx(LOAD / (2 * np.pi * RADIUS**2), rel=0.03)
+    assert errors[-1] < 4e-3
+    assert errors[-1] < errors[0] / 2
+
+
+def test_the_surface_sinks_under_a_pressed_square():
+    """In the middle, of side 2a, by 8 a p log(1 + √2) / (π E*); at r, far off, by F / (π E* r) and a² / 6r² more."""
+    side, number = 0.01, 120
+    points, pixel = raster((3 * side, 3 * side), number)
+    pressure = np.where(np.abs(points).max(axis=-1) < side / 2, 1000.0, 0.0)
+    found = sinking(number, pixel, 2e6)(pressure)
+    middle = found[number // 2 - 1 : number // 2 + 1, number // 2 - 1 : number // 2 + 1].mean()
+    assert middle == pytest.approx(4 * side * 1000 * np.log(1 + 2**0.5) / (np.pi * 2e6), rel=2e-3)
+    far = np.linalg.norm(points[0, 0])
+    assert found[0, 0] == pytest.approx(1000 * side**2 / (np.pi * 2e6 * far), rel=5e-3)
+
+
+@pytest.mark.parametrize("load", [1e-3, 1.0, 8.0])
+def test_a_ball_on_a_foundation(load):
+    """The cap's volume: F = k π δ² (R − δ/3), and k π R δ² where δ ≪ R."""
+    found = LAYER.pressure(ball(2 * RADIUS), load)
+    depth = found.approach
+    assert LAYER.stiffness * np.pi * depth**2 * (RADIUS - depth / 3) == pytest.approx(load, rel=2e-4)
+    assert found.reach == pytest.approx(np.sqrt(depth * (2 * RADIUS - depth)), rel=0.05)
+    assert float(found.at(MIDDLE)[0]) == pytest.approx(LAYER.stiffness * depth)
+
+
+def test_a_flat_punch_on_a_foundation():
+    """Uniform pressure F / A; a hole in it raises it."""
+    area = np.pi * RADIUS**2
+    assert float(LAYER.pressure(Disc(2 * RADIUS), 20.0).at(MIDDLE)[0]) == pytest.approx(20 / area, rel=5e-3)
+    ring = LAYER.pressure(Ring(2 * RADIUS, RADIUS), 20.0)
+    assert float(ring.at(MIDDLE)[0]) == 0
+    assert float(ring.at(np.array([0.0, 0.8 * RADIUS]))) == pytest.approx(20 / (0.75 * area), rel=5e-3)
+
+
+@pytest.mark.parametrize("support", [RUBBER, LAYER], ids=["half-space", "foundation"])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_load_is_carried_where_bodies_touch(support, shape):
+    load = 0.4
+    found = support.pressure(SHAPES[shape], load)
+    own = support is RUBBER
+    window = (1 + RUBBER.pixels) / 2 * found.pixel if own else np.full(2, 1.02 * found.reach)
+    points, pixel = raster(window, 801)
+    pressure = found.at(points)
+    assert pressure.min() >= 0
+    # Cells of the sum are cut by edges: a share of pixel / width of the load.
+    assert pressure.sum() * pixel.prod() == pytest.approx(load, rel=0.05)
+    assert (pressure[np.linalg.norm(points, axis=-1) > found.reach] == 0).all()
+    if own:
+        assert found.values.sum() * found.pixel.prod() == pytest.approx(load, rel=1e-12)
+
+
+@pytest.mark.parametrize("shape", ["ball", "two", "prism"])
+def test_bodies_do_not_overlap(shape):
+    """Signorini: distance is zero under pressure, and nowhere negative."""
+    found = RUBBER.pressure(SHAPES[shape], 0.4)
+    points, pixel = raster(found.pixel * RUBBER.pixels / 2, RUBBER.pixels)
+    distance = sinking(RUBBER.pixels, pixel, RUBBER.plane_modulus)(found.values) + SHAPES[shape].gap(points)
+    distance -= found.approach
+    assert np.abs(distance[found.values > 0]).max() < 1e-5 * found.approach
+    assert distance.min() > -1e-5 * found.approach
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: LAYER.pressure(ball(0.01), 0.0), "load must be positive, in newtons"),
+        (lambda: RUBBER.pressure(ball(0.01), np.nan), "load must be positive"),
+        (lambda: LAYER.pressure(Disc(0.01), 100.0), "takes the indenter 3.8. mm into a layer 3 mm thick"),
+        (lambda: Foundation(-1.0, 1e-3), "modulus must be positive"),
+        (lambda: Foundation(1e6, 0.0), "thickness must be"),
+        (lambda: HalfSpace(1e6, 0.6), "poisson must be"),
+        (lambda: HalfSpace(1e6, pixels=4), "pixels must be"),
+    ],
+)
+def test_impossible_contacts_are_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
