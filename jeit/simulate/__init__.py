@@ -1,7 +1,8 @@
 """Simulated skins and touches, where nothing is measured: skins that are pressed, skins that sound, and the
 touches on them.
 
-What a sounding skin is made of (its layer, microphones and readout) is in `jeit.simulate.acoustic`.
+The physics of pressing is in `jeit.simulate.contact`; what a sounding skin is made of (its layer, microphones and
+readout), in `jeit.simulate.acoustic`.
 """
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
@@ -11,15 +12,49 @@ from jeit.simulate.acoustic.microphones import microphone_grid
 from jeit.simulate.acoustic.sound import quiet
 from jeit.simulate.acoustic.sounding_skin import SoundingSkin
 from jeit.simulate.acoustic.touches import pat, stroke, tap, tickle
+from jeit.simulate.contact import (
+    Bar,
+    DepthMap,
+    Disc,
+    Foundation,
+    HalfSpace,
+    Joined,
+    Material,
+    MovingPress,
+    Placed,
+    Press,
+    PressedSkin,
+    Prism,
+    Revolved,
+    Ring,
+    ball,
+    material,
+)
 from jeit.simulate.round_skin import RoundSkin, simulate_press
 
 _tell_old_names(__name__)
 
 __all__ = [
+    "Bar",
     "Burst",
+    "DepthMap",
+    "Disc",
+    "Foundation",
+    "HalfSpace",
+    "Joined",
+    "Material",
+    "MovingPress",
+    "Placed",
+    "Press",
+    "PressedSkin",
+    "Prism",
+    "Revolved",
+    "Ring",
     "RoundSkin",
     "SoundingSkin",
+    "ball",
     "calibration_taps",
+    "material",
     "microphone_grid",
     "pat",
     "quiet",

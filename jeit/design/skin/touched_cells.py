@@ -73,7 +73,7 @@ def touched_cells(
         )
     candidates = np.flatnonzero(below < deepest + edge)
     near = KDTree(middle[candidates, :2]).query_ball_point(places, indentation.reach, return_sorted=True)
-    cells, there = _padded([candidates[np.asarray(index, int)] for index in near])
+    cells, there = padded([candidates[np.asarray(index, int)] for index in near])
     depth = np.asarray(indentation.depth_at(np.linalg.norm(middle[cells, :2] - places[:, None], axis=-1)))
     if not layer:
         share = depth / thickness
@@ -90,13 +90,13 @@ def touched_cells(
             "the skin (places are in metres), or its cells are too coarse for so shallow an indentation; refine the "
             "mesh, in a layer upwards."
         )
-    kept, there = _padded([one[used] for one, used in zip(cells, changed, strict=True)])
+    kept, there = padded([one[used] for one, used in zip(cells, changed, strict=True)])
     change = np.zeros(kept.shape)
     change[there] = (contrast - 1) * share[changed]
     return TouchedCells(as_array(places), as_array(kept), as_array(change), mesh.num_cells)
 
 
-def _padded(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def padded(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Rows of whole numbers as one array, with zeros at their ends, and where they are."""
     length = np.array([len(row) for row in rows])
     there = np.arange(max(length.max(), 1)) < length[:, None]

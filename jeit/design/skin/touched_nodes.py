@@ -8,8 +8,8 @@ from jeit.design.skin.touched_cells import TouchedCells
 from jeit.forward import ForwardModel
 from jeit_solvers import Strips
 
-# Touches whose nodes are sought at once.
-_AT_ONCE = 64
+# Touches whose nodes are sought at once; and what the number of nodes is a multiple of: programs are compiled for each.
+_AT_ONCE, _MULTIPLE = 64, 16
 
 
 class TouchedNodes(eqx.Module):
@@ -40,7 +40,7 @@ def touched_nodes(model: ForwardModel, touches: TouchedCells) -> TouchedNodes:
         found.append((start + touch, number, node))
     corners[~real] = 0
     touch, number, node = (np.concatenate(part) for part in zip(*found, strict=True))
-    nodes = np.zeros((len(cells), -(-(number.max(initial=0) + 1) // 8) * 8), np.int32)
+    nodes = np.zeros((len(cells), -(-(number.max(initial=0) + 1) // _MULTIPLE) * _MULTIPLE), np.int32)
     nodes[touch, number] = node
     final = np.minimum(np.arange(nodes.shape[1]), np.bincount(touch, minlength=len(cells))[:, None] - 1)
     return TouchedNodes(strips, np.take_along_axis(nodes, final, axis=1), corners)

@@ -37,6 +37,8 @@ _CUT_OFF, _MOST_WEAKENED = 10.0, 1e6
 _SMALLEST = 1e-12
 # Touches worked on at once: their blocks of the inverse are to stay in the cache, or of the Jacobian.
 _EXACT, _LINEAR = 2, 8
+# What the inverse's reach is a multiple of: programs are compiled for each.
+_STRIPS = 3
 
 
 def touch_changes(
@@ -82,7 +84,7 @@ def _linear(model: ForwardModel, conductivity, touched: TouchedCells):
 
 def _exact(model: ForwardModel, conductivity, touched: TouchedCells):
     touched_at = touched_nodes(model, touched)
-    reach = touched_at.strips.reach(touched_at.nodes)
+    reach = -(-touched_at.strips.reach(touched_at.nodes) // _STRIPS) * _STRIPS
     solved = evaluate(model, solved_system_of, conductivity)
     known = fields_and_inverse(solved, model.electrodes, touched_at.strips, reach)
     touches = on_device((touched.cells, touched.change, touched_at.nodes, touched_at.corners))

@@ -8,6 +8,9 @@ from jeit.simulate.contact.foundation import Foundation
 from jeit.simulate.contact.half_space import HalfSpace
 from jeit.simulate.contact.indenters import Bar, DepthMap, Disc, Prism, Revolved, Ring, ball
 from jeit.simulate.contact.joined import Joined, Placed
+from jeit.simulate.contact.materials import Material, material
+from jeit.simulate.contact.press import MovingPress, Press
+from jeit.simulate.contact.pressed_skin import PressedSkin
 
 __all__ = [
     "Bar",
@@ -16,9 +19,14 @@ __all__ = [
     "Foundation",
     "HalfSpace",
     "Joined",
+    "Material",
+    "MovingPress",
     "Placed",
+    "Press",
+    "PressedSkin",
     "Prism",
     "Revolved",
     "Ring",
     "ball",
+    "material",
 ]

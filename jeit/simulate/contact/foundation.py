@@ -1,6 +1,7 @@
 """A thin soft layer on a rigid back: pressure at a place follows from how far the layer is pressed in there alone."""
 
 import numpy as np
+from jaxtyping import Float
 
 from jeit.arguments import check_metres, is_number, told
 from jeit.simulate.contact.indenters import AbstractIndenter
@@ -52,7 +53,8 @@ class Foundation(AbstractSupport):
         def balanced(window, number: int) -> tuple[np.ndarray, float]:
             points, pixel = raster(window, number)
             gap = indenter.gap(points)
-            return gap, level(gap.ravel(), load / (self.stiffness * pixel.prod()))
+            area = np.full(gap.size, pixel.prod())
+            return gap, float(level(gap.ravel(), area, load / self.stiffness))
 
         def pressed(window, number: int) -> np.ndarray:
             gap, approach = balanced(window, number)
@@ -60,23 +62,44 @@ class Foundation(AbstractSupport):
 
         window = contact_window(pressed, indenter.reach, _COARSE)
         gap, approach = balanced(window, _FINE)
+        self._check_approach(approach, load)
+        points, pixel = raster(window, _FINE)
+        reach = float(np.linalg.norm(points[gap < approach], axis=-1).max() + np.hypot(*pixel))
+        return FoundationPressure(float(load), approach, reach, indenter, self.stiffness)
+
+    def spread(self, indenter: AbstractIndenter, loads, points, areas):
+        """The approach is the one that balances the load on these very points."""
+        gap = indenter.gap(points)
+        approach = level(gap, areas, loads / self.stiffness)
+        deepest = approach.argmax()
+        self._check_approach(approach[deepest], loads[deepest])
+        return self.stiffness * np.maximum(approach[:, None] - gap, 0.0)
+
+    def _check_approach(self, approach: float, load: float) -> None:
         if approach >= self.thickness:
             raise ValueError(
                 f"load is {load:g} N, which takes the indenter {1e3 * approach:.3g} mm into a layer "
                 f"{1e3 * self.thickness:.3g} mm thick; give less load, a wider indenter or a stiffer layer."
             )
-        points, pixel = raster(window, _FINE)
-        reach = float(np.linalg.norm(points[gap < approach], axis=-1).max() + np.hypot(*pixel))
-        return FoundationPressure(float(load), approach, reach, indenter, self.stiffness)
 
 
-def level(gap: np.ndarray, volume: float) -> float:
-    """The level δ at which Σ max(δ − gap, 0) is `volume`: water poured over heights `gap` (q,), infinite where none can
-    stand. With the m lowest under water it is (volume + their sum) / m, and exact for the m for which no other is."""
-    heights = np.sort(gap[np.isfinite(gap)])
-    filled = (volume + np.cumsum(heights)) / np.arange(1, len(heights) + 1)
-    above = np.append(heights[1:], np.inf)
-    return float(filled[np.argmax(filled <= above)])
+def level(
+    gap: Float[np.ndarray, "*n q"], area: Float[np.ndarray, "*n q"], volume: Float[np.ndarray, "*n"] | float
+) -> Float[np.ndarray, "*n"]:
+    """The level δ at which Σ area · max(δ − gap, 0) is `volume`; 0 where every gap is infinite.
+
+    Water poured over ground: with the lowest m places under water δ is (volume + Σ area gap) / Σ area over these, exact
+    for the m at which the next place stands out.
+    """
+    order = np.argsort(gap, axis=-1)
+    heights = np.take_along_axis(gap, order, axis=-1)
+    areas = np.where(np.isfinite(heights), np.take_along_axis(area, order, axis=-1), 0.0)
+    lifted = areas * np.where(areas > 0, heights, 0.0)
+    ground, covered = np.cumsum(lifted, axis=-1), np.cumsum(areas, axis=-1)
+    levels = (np.asarray(volume)[..., None] + ground) / np.where(covered > 0, covered, np.inf)
+    above = np.concatenate([heights[..., 1:], np.full((*heights.shape[:-1], 1), np.inf)], axis=-1)
+    first = np.argmax((levels <= above) & (covered > 0), axis=-1)
+    return np.take_along_axis(levels, first[..., None], axis=-1)[..., 0]
 
 
 def check_modulus(modulus) -> None:

@@ -61,6 +61,12 @@ class HalfSpace(AbstractSupport):
         reach = float(np.linalg.norm(points[values > 0], axis=-1).max() + np.hypot(*pixel))
         return PressureRaster(float(load), approach, reach, values, pixel)
 
+    def spread(self, indenter: AbstractIndenter, loads, points, areas):
+        """Each load's own pressure at these points, scaled to carry it."""
+        pressures = np.stack([self.pressure(indenter, load).at(own) for load, own in zip(loads, points, strict=True)])
+        carried = np.sum(pressures * areas, axis=1)
+        return pressures * np.where(carried > 0, loads / np.where(carried > 0, carried, 1.0), 0.0)[:, None]
+
     def _balanced(self, indenter: AbstractIndenter, load: float, window, number: int):
         points, pixel = raster(window, number)
         sink = sinking(number, pixel, self.plane_modulus)

@@ -34,6 +34,18 @@ class AbstractSupport(eqx.Module):
     def pressure(self, indenter: AbstractIndenter, load: float) -> AbstractPressure:
         """That beneath `indenter` under `load` newtons. Raises `ValueError` for a load that cannot be carried."""
 
+    @abc.abstractmethod
+    def spread(
+        self,
+        indenter: AbstractIndenter,
+        loads: Float[np.ndarray, " n"],
+        points: Float[np.ndarray, "n q 2"],
+        areas: Float[np.ndarray, "n q"],
+    ) -> Float[np.ndarray, "n q"]:
+        """Pressures (n, q) under n `loads`, newtons, at `points` in the indenter's frame, each of which stands for an
+        area, m²: they carry the load among them, all of it, or are zero where the indenter touches none. Raises
+        `ValueError` as `pressure` does."""
+
 
 class PressureRaster(AbstractPressure):
     """Pressure known on pixels round the origin, row 0 at the least y, and linear between their middles.

@@ -30,7 +30,7 @@ class Strips(eqx.Module):
     """Unknowns of a matrix in strips, of which some unknowns are wanted.
 
     `position` (n,): strip · `size` + number within the strip, where wanted ones come first; `wanted`: the most of them
-    in one strip. The `place` of a wanted unknown is strip · `wanted` + number within the strip.
+    in one strip, or a few more. The `place` of a wanted unknown is strip · `wanted` + number within the strip.
     """
 
     position: Int[np.ndarray, " n"]
@@ -52,7 +52,8 @@ class Strips(eqx.Module):
         within[order] = np.arange(len(strip)) - np.repeat(np.cumsum(counts) - counts, counts)
         size = int(counts.max())
         most = int(np.bincount(strip[wanted], minlength=1).max())
-        return cls((strip * size + within).astype(np.int32), len(counts), size, max(most, 1))
+        most = min(-(-max(most, 1) // 8) * 8, size)  # few sizes: programs are compiled for each
+        return cls((strip * size + within).astype(np.int32), len(counts), size, most)
 
     @property
     def place(self) -> Int[np.ndarray, " n"]:

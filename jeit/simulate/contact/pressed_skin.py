@@ -1,0 +1,182 @@
+"""`PressedSkin`: a skin of some material, and what it reads while it is pressed."""
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from jeit.arguments import check_key, check_kind, is_number, told
+from jeit.design.skin.touched_cells import TouchedCells, padded
+from jeit.design.skin.voltage_changes import touch_changes
+from jeit.forward import ForwardModel
+from jeit.forward.assembly import check_conductivity
+from jeit.forward.contact_sensitivity import ContactSensitivity
+from jeit.forward.model import check_model, select_channels
+from jeit.simulate.contact.cell_pressure import Samples, pressed_cells
+from jeit.simulate.contact.drift import gains, walk, white_noise
+from jeit.simulate.contact.materials import Material
+from jeit.simulate.contact.press import motions_of, touches_of
+from jeit.simulate.contact.response import advance, held_pressure, unstrained
+from jeit_solvers.engines import as_array
+
+# Touches worked on at once: those whose numbers of cells are between the same two powers of this.
+_AT_ONCE, _FEW = 1024, 4
+# Of the greatest change of a touch: less is left out.
+_LEAST = 1e-6
+
+
+class PressedSkin(eqx.Module):
+    """A sheet, or a layer, of a material that is pressed; readings are exact, by low-rank changes of one factorisation.
+
+    **Fields**: `model`, any forward model of a sheet, or of a layer whose top is at its greatest z; `material`;
+    `conductivity` at rest, S/m (2-D: S); `gain` (M,) of every channel.
+    """
+
+    model: ForwardModel
+    material: Material
+    conductivity: Float[np.ndarray, "..."]
+    gain: Float[np.ndarray, " M"]
+
+    def __init__(self, key: Array, model: ForwardModel, material: Material, *, conductivity=None):
+        """A skin whose gains are drawn from `key`. `conductivity` at rest, S/m (2-D: S): the material's unless given.
+
+        Raises `ValueError` for what is no key, model, material or conductivity.
+        """
+        check_key(key)
+        check_model(model)
+        check_kind("material", material, Material, 'a Material, such as material("velostat")')
+        if conductivity is None:
+            conductivity = material.conductivity * (material.thickness if model.mesh.dimension == 2 else 1.0)
+        self.model, self.material = model, material
+        self.conductivity = np.asarray(check_conductivity(model.mesh, conductivity))
+        self.gain = gains(key, material.gain_spread, model.protocol.num_measurements)
+
+    def rest(self) -> Float[np.ndarray, " M"]:
+        """Voltages (M,) of the skin that nobody touches and nothing disturbs, as its channels read them."""
+        return self.gain * np.asarray(self.model.voltages(self.conductivity))
+
+    def frames(self, key: Array, presses, *, held: float = 1.0, elapsed: float = 0.0) -> Float[np.ndarray, "n M"]:
+        """Voltages (n, M) of n touches of a skin that has had no load before: one press each, or a tuple of several at
+        once.
+
+        `held`: seconds that the load has been there. `elapsed`: seconds since the skin was as its model says, over
+        which it drifts, once for all these frames. Raises `ValueError` for presses off the skin or through it, and what
+        is no press or time.
+        """
+        check_key(key)
+        _check_seconds("held", held)
+        _check_seconds("elapsed", elapsed)
+        exact = self._voltages(self.touched(presses, held=held))
+        return self._read(key, exact, np.array([float(elapsed)]))
+
+    def touched(self, presses, *, held: float = 1.0) -> TouchedCells:
+        """The cells whose conductivity n touches change, and by how much; as of `frames`, whose errors it raises."""
+        touches = touches_of(presses)
+        pressed = pressed_cells(Samples.of(self.model.mesh), self.material.support, touches)
+        change = self.material.change(held_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
+        places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])
+        return _touched(places, pressed.cells, change, self.model.mesh.num_cells)
+
+    def record(self, key: Array, motions, seconds: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T M"]:
+        """Voltages (T, M) at times `seconds` (T,) of a skin under moving presses, a `MovingPress` or several at once.
+
+        The skin has had no load before the first frame, and drifts from time 0. Raises `ValueError` for times that are
+        negative or fall, motions of other lengths, and as `frames` does.
+        """
+        check_key(key)
+        seconds = _check_times(seconds)
+        exact = self._voltages(self.touched_in_time(motions, seconds))
+        return self._read(key, exact, seconds)
+
+    def touched_in_time(self, motions, seconds: Float[np.ndarray, " T"]) -> TouchedCells:
+        """What is changed in each of T frames, also by loads that were there before; as of `record`."""
+        motions = motions_of(motions, len(seconds))
+        found = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
+        touches = [tuple(press for press in some if press is not None) for some in found]
+        pressed = pressed_cells(Samples.of(self.model.mesh), self.material.support, touches)
+        there = [own.any(axis=-1) for own in pressed.pressure]
+        cells = np.unique(pressed.cells[np.array(there)])
+        place = np.searchsorted(cells, pressed.cells)
+        shape = len(cells), pressed.pressure.shape[-1]
+        strain, before = unstrained(self.material, cells.size * shape[1]), seconds[0]
+        change = np.zeros((len(seconds), len(cells)))
+        for frame, now in enumerate(seconds):
+            pressure = np.zeros(shape)
+            pressure[place[frame][there[frame]]] = pressed.pressure[frame][there[frame]]
+            strain, effective = advance(self.material, strain, pressure.ravel(), now - before)
+            change[frame], before = self.material.change(effective.reshape(shape)).mean(axis=-1), now
+        places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])
+        return _touched(places, np.broadcast_to(cells, change.shape), change, self.model.mesh.num_cells)
+
+    def _voltages(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
+        """Without drift, gains and noise."""
+        rest = np.asarray(self.model.voltages(self.conductivity))
+        voltages = np.tile(rest, (len(touched.places), 1))
+        places, cells, change = (np.asarray(one) for one in (touched.places, touched.cells, touched.change))
+        number = np.count_nonzero(change, axis=1)
+        sizes = np.where(number > 0, _FEW ** np.ceil(np.log(np.maximum(number, 2)) / np.log(_FEW)), 0)
+        for size in np.unique(sizes[sizes > 0]):
+            alike = np.flatnonzero(sizes == size)
+            for some in np.split(alike, range(_AT_ONCE, len(alike), _AT_ONCE)):
+                even = some[np.minimum(np.arange(_even(len(some))), len(some) - 1)]
+                own = slice(0, min(int(size), cells.shape[1]))
+                arrays = as_array(places[even]), as_array(cells[even, own]), as_array(change[even, own])
+                rows = TouchedCells(*arrays, num_cells=touched.num_cells)
+                voltages[some] += np.asarray(touch_changes(self.model, self.conductivity, rows))[: len(some)]
+        return voltages
+
+    def _read(self, key: Array, exact: Float[np.ndarray, "n M"], seconds: Float[np.ndarray, " t"]):
+        """What the channels read of exact voltages at `seconds` (n,), or (1,) for all: drift, gains and noise.
+
+        A sheet of e^d σ with contacts e^c z has the voltages of one of σ with contacts e^(c + d) z, over e^d; what
+        contacts change is linear, that of the skin at rest.
+        """
+        for_conductivity, for_contacts, for_noise = jax.random.split(key, 3)
+        own = self.material
+        drift = walk(for_conductivity, seconds, own.conductivity_trend, own.conductivity_walk, 1)
+        if drift.any() or own.contact_trend or own.contact_walk:
+            number = self.model.electrodes.num_electrodes
+            contacts = walk(for_contacts, seconds, own.contact_trend, own.contact_walk, number)
+            exact = (exact + (contacts + drift) @ self._contact_slope()) * np.exp(-drift)
+        rest = self.model.voltages(self.conductivity)
+        deviation = own.noise * float(np.sqrt(np.mean(np.asarray(rest) ** 2)))
+        return self.gain * (exact + white_noise(for_noise, deviation, exact.shape))
+
+    def _contact_slope(self) -> Float[np.ndarray, "L M"]:
+        """∂v/∂log z (L, M) of the skin at rest, volts; none for points."""
+        electrodes, protocol = self.model.electrodes, self.model.protocol
+        if electrodes.is_point:
+            return np.zeros((electrodes.num_electrodes, protocol.num_measurements))
+        fields, impedance = (np.asarray(one) for one in self.model.fields(self.conductivity))
+        slope = ContactSensitivity(self.model.mesh, electrodes)(fields, impedance, electrodes.contact_impedance)
+        return np.stack([select_channels(protocol, one) for one in slope])
+
+
+def _touched(places, cells, change, number: int) -> TouchedCells:
+    """The changes that count, as of `TouchedCells`, the first of each row."""
+    kept = np.abs(change) > _LEAST * np.abs(change).max(axis=1, keepdims=True)
+    rows, there = padded([row[one] for row, one in zip(cells, kept, strict=True)])
+    wide = _even(rows.shape[1]) - rows.shape[1]
+    changes = np.zeros(rows.shape)
+    changes[there] = change[kept]
+    rows, changes = (np.pad(array, ((0, 0), (0, wide))) for array in (rows, changes))
+    return TouchedCells(as_array(places), as_array(rows), as_array(changes), number)
+
+
+def _even(number: int) -> int:
+    """The least of 16, 32, 64 … that is not less: JAX compiles for every number of touches and of cells."""
+    return 2 ** max(4, (number - 1).bit_length())
+
+
+def _check_seconds(name: str, value) -> None:
+    if not (is_number(value) and value >= 0):
+        raise ValueError(f"{name} must be seconds, zero or more; it is {told(value)}.")
+
+
+def _check_times(seconds) -> Float[np.ndarray, " T"]:
+    seconds = np.asarray(seconds, float)
+    if seconds.ndim != 1 or not seconds.size or not np.isfinite(seconds).all():
+        raise ValueError(f"seconds must be times (T,) of the frames; they have shape {seconds.shape}.")
+    if seconds[0] < 0 or (np.diff(seconds) < 0).any():
+        raise ValueError("seconds must not be negative, nor fall.")
+    return seconds

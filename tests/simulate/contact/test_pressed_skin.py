@@ -1,0 +1,217 @@
+"""Frames of pressed skins: loads are carried, voltages are those of the model solved anew, time leaves its marks."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from jeit.design import Skin
+from jeit.electrodes import BoundaryElectrodes, PointElectrodes
+from jeit.forward import ForwardModel
+from jeit.layout import named_layout, ring
+from jeit.mesh import Disk
+from jeit.protocol import adjacent
+from jeit.simulate.contact import (
+    Bar,
+    Disc,
+    Foundation,
+    HalfSpace,
+    Joined,
+    MovingPress,
+    Placed,
+    Press,
+    PressedSkin,
+    ball,
+    material,
+)
+from jeit.simulate.contact.cell_pressure import Samples, pressed_cells
+
+KEY = jax.random.key(0)
+VELOSTAT = material("velostat")
+# Nothing random, nothing in time.
+STILL = dataclasses.replace(
+    VELOSTAT, hysteresis=0.0, creep=(), conductivity_trend=0.0, conductivity_walk=0.0, contact_trend=0.0,
+    contact_walk=0.0, noise=0.0, gain_spread=0.0,
+)  # fmt: skip
+PRESSES = [
+    Press(ball(0.015), 2.0, (0.01, 0.02)),
+    Press(Disc(0.016), 5.0, (-0.02, 0.0)),
+    Press(Bar(0.03, 0.004), 3.0, (0.0, -0.02), 0.5),
+    Press(Joined(Disc(0.006), Placed(Disc(0.006), (0.012, 0.0))), 1.0, (0.02, -0.01), -1.0),
+]
+
+
+@pytest.fixture(scope="module")
+def model():
+    mesh = Disk(0.05).mesh(num_points=600)
+    return ForwardModel(mesh, BoundaryElectrodes(ring(0.05, 16), 0.008, 0.2), adjacent(16))
+
+
+@pytest.fixture(scope="module")
+def skin(model):
+    return PressedSkin(KEY, model, STILL)
+
+
+def anew(skin, touched):
+    """The model solved for every touch."""
+    found = []
+    for cells, change in zip(np.asarray(touched.cells), np.asarray(touched.change), strict=True):
+        conductivity = np.array(skin.conductivity)
+        np.add.at(conductivity, cells, conductivity[cells] * change)
+        found.append(skin.model.voltages(conductivity))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(
+    "support", [Foundation(1e6, 2e-3), HalfSpace(3e6, pixels=24)], ids=["foundation", "half-space"]
+)
+def test_cells_carry_the_load(model, support):
+    """To rounding: also what hangs over the edge, and what falls between the samples."""
+    samples = Samples.of(model.mesh)
+    presses = [*PRESSES, Press(Disc(0.01), 1.0, (0.049, 0.0)), Press(ball(0.001), 1e-3, (0.0123, 0.0))]
+    found = pressed_cells(samples, support, [(press,) for press in presses])
+    carried = np.einsum("ncs,nc->n", found.pressure, samples.area[found.cells])
+    np.testing.assert_allclose(carried, [press.load for press in presses], rtol=1e-12)
+    assert samples.area.sum() * samples.points.shape[1] == pytest.approx(np.pi * 0.05**2, rel=5e-3)
+
+
+def test_pressure_on_cells_is_that_under_the_indenter(model):
+    samples, support = Samples.of(model.mesh), VELOSTAT.support
+    press = PRESSES[0]
+    cells, pressure = pressed_cells(samples, support, [(press,)])
+    exact = support.pressure(press.indenter, press.load).at(samples.points[cells[0]] - press.position)
+    assert np.abs(pressure[0] - exact).max() < 0.05 * exact.max()
+    turned = PRESSES[2]
+    cells, pressure = pressed_cells(samples, support, [(turned,)])
+    along = samples.points[cells[0]][pressure[0] > 0] - turned.position
+    assert np.abs(along @ [-np.sin(0.5), np.cos(0.5)]).max() <= 0.002
+    assert np.abs(along @ [np.cos(0.5), np.sin(0.5)]).max() == pytest.approx(0.015, rel=0.1)
+
+
+def test_frames_are_those_of_the_model_solved_anew(skin):
+    presses = [*PRESSES, tuple(PRESSES), ()]
+    found = skin.frames(KEY, presses)
+    exact = anew(skin, skin.touched(presses))
+    assert np.abs(found - exact).max() < 1e-8 * np.abs(exact - skin.rest()).max()
+    np.testing.assert_array_equal(found[-1], skin.rest())
+    assert np.abs(found[0] - skin.rest()).max() > 1e-3 * np.abs(skin.rest()).max()
+
+
+def test_a_layer_is_pressed_too():
+    layer = Skin.create(named_layout("grid-3x3"), num_layers=2, cell_size=0.009)
+    skin = PressedSkin(KEY, layer.model, dataclasses.replace(material("hydrogel"), noise=0.0, gain_spread=0.0))
+    presses = [Press(ball(0.04), 3.0, (0.03, 0.02)), Press(Disc(0.03), 3.0, (-0.03, 0.0))]
+    samples = Samples.of(layer.model.mesh)
+    cells, pressure = pressed_cells(samples, skin.material.support, [(press,) for press in presses])
+    np.testing.assert_allclose(np.einsum("ncs,nc->n", pressure, samples.area[cells]), 3.0, rtol=1e-12)
+    exact = anew(skin, skin.touched(presses))
+    assert np.abs(skin.frames(KEY, presses) - exact).max() < 1e-7 * np.abs(exact - skin.rest()).max()
+    assert (np.asarray(skin.touched(presses).change) <= 0).all()
+
+
+def test_several_at_once_press_as_their_sum(skin):
+    near = [Press(Disc(0.01), 1.0, (0.0, 0.0)), Press(Disc(0.01), 2.0, (0.004, 0.0))]
+    samples, support = Samples.of(skin.model.mesh), STILL.support
+    both = pressed_cells(samples, support, [tuple(near)])
+    total = np.zeros((skin.model.mesh.num_cells, samples.points.shape[1]))
+    for press in near:
+        one = pressed_cells(samples, support, [(press,)])
+        np.add.at(total, one.cells[0], one.pressure[0])
+    spread = np.zeros_like(total)
+    np.add.at(spread, both.cells[0], both.pressure[0])
+    np.testing.assert_allclose(spread, total, rtol=1e-12)
+
+
+def test_a_record_of_a_press_that_stays_is_its_frames(model):
+    creeping = dataclasses.replace(STILL, creep=VELOSTAT.creep, hysteresis=VELOSTAT.hysteresis)
+    skin, press = PressedSkin(KEY, model, creeping), PRESSES[1]
+    seconds = np.array([2.0, 3.0, 12.0])
+    found = skin.record(KEY, MovingPress(press.indenter, np.full(3, press.load), press.position), seconds)
+    for frame, since in enumerate(seconds - 2.0):
+        np.testing.assert_allclose(found[frame], skin.frames(KEY, [press], held=since)[0], rtol=1e-10)
+    assert (np.diff(np.linalg.norm(found - skin.rest(), axis=1)) > 0).all()
+
+
+def test_a_stroke_leaves_a_trace_that_fades(model):
+    skin = PressedSkin(KEY, model, dataclasses.replace(STILL, creep=((0.2, 1.0),)))
+    seconds = np.array([0.0, 0.5, 1.0, 1.5, 1.6, 3.6, 60.0])
+    place = np.array([[-0.02, 0.0], [0.0, 0.0], [0.02, 0.0], [0.02, 0.01], [0, 0], [0, 0], [0, 0]])
+    stroke = MovingPress(Disc(0.01), [3.0, 3.0, 3.0, 3.0, 0.0, 0.0, 0.0], place)
+    touched = skin.touched_in_time(stroke, seconds)
+    found = skin.record(KEY, stroke, seconds)
+    exact = anew(skin, touched)
+    change = np.linalg.norm(found - skin.rest(), axis=1)
+    assert np.abs(found - exact).max() < 1e-7 * change.max()
+    assert 0 < change[5] < change[4] / 5 < change[3] / 5
+    assert change[6] < 1e-9 * change[3]
+
+
+def test_noise_gains_and_keys(model):
+    noisy = PressedSkin(KEY, model, dataclasses.replace(STILL, noise=1e-3, gain_spread=0.02))
+    still = PressedSkin(KEY, model, STILL)
+    frames = noisy.frames(KEY, [PRESSES[0]] * 200)
+    np.testing.assert_array_equal(frames, noisy.frames(KEY, [PRESSES[0]] * 200))
+    exact = still.frames(KEY, [PRESSES[0]])
+    deviation = 1e-3 * np.sqrt(np.mean(still.rest() ** 2))
+    assert ((frames - frames.mean(axis=0)) / noisy.gain).std() == pytest.approx(deviation, rel=0.02)
+    np.testing.assert_allclose(frames.mean(axis=0) / noisy.gain, exact[0], atol=5 * deviation / 200**0.5)
+    assert not np.array_equal(frames, noisy.frames(jax.random.key(1), [PRESSES[0]] * 200))
+    assert not np.array_equal(noisy.gain, PressedSkin(jax.random.key(1), model, noisy.material).gain)
+
+
+def test_drift_is_that_of_another_skin(model):
+    """Conductivity exactly; contacts, which neighbouring voltages hardly see, to first order."""
+    drifting = dataclasses.replace(STILL, conductivity_trend=1e-4, contact_trend=-1e-4)
+    skin = PressedSkin(KEY, model, drifting)
+    found = skin.frames(KEY, [()], elapsed=300.0)[0]
+    electrodes = model.electrodes.with_contact_impedance(0.2 * np.exp(-0.03))
+    other = ForwardModel(model.mesh, electrodes, model.protocol)
+    exact = np.asarray(other.voltages(skin.conductivity * np.exp(0.03)))
+    assert np.abs(found - exact).max() < 2e-3 * np.abs(exact - skin.rest()).max()
+    recorded = skin.record(KEY, MovingPress(Disc(0.01), [0.0, 1.0]), [300.0, 301.0])[0]
+    np.testing.assert_allclose(recorded, found, rtol=1e-12)
+    alone = np.asarray(other.voltages(skin.conductivity)) - skin.rest()
+    slope = skin._contact_slope().sum(axis=0)
+    assert np.linalg.norm(-0.03 * slope - alone) < 0.05 * np.linalg.norm(alone)
+
+
+def test_walking_contacts_are_read_by_their_own_channels(model):
+    skin = PressedSkin(KEY, model, dataclasses.replace(STILL, contact_walk=1e-2))
+    found = skin.frames(KEY, [(), ()], elapsed=100.0)
+    np.testing.assert_array_equal(found[0], found[1])
+    assert np.linalg.norm(found[0] - skin.rest()) > 0
+    points = ForwardModel(model.mesh, PointElectrodes(ring(0.05, 16)), adjacent(16))
+    np.testing.assert_allclose(
+        PressedSkin(KEY, points, skin.material).frames(KEY, [()], elapsed=100.0)[0],
+        points.voltages(skin.conductivity),
+        rtol=1e-12,
+    )
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda skin: skin.frames(0, PRESSES), "key must be"),
+        (lambda skin: skin.frames(KEY, PRESSES[0]), "presses must be a list"),
+        (lambda skin: skin.frames(KEY, []), "presses: give one"),
+        (lambda skin: skin.frames(KEY, [Disc(0.01)]), r"presses\[0\] must be a Press"),
+        (lambda skin: skin.frames(KEY, PRESSES, held=-1.0), "held must be seconds"),
+        (lambda skin: skin.frames(KEY, PRESSES, elapsed=np.nan), "elapsed must be seconds"),
+        (lambda skin: skin.frames(KEY, [Press(Disc(0.01), 1.0, (20.0, 0.0))]), "lie off the skin"),
+        (lambda skin: skin.frames(KEY, [Press(Disc(0.004), 100.0)]), "into a layer 2 mm thick"),
+        (lambda skin: skin.record(KEY, MovingPress(Disc(0.01), [1.0, 1.0]), [1.0, 0.0]), "nor fall"),
+        (lambda skin: skin.record(KEY, MovingPress(Disc(0.01), [1.0, 1.0]), [1.0]), "has 2 frames"),
+        (lambda skin: skin.record(KEY, MovingPress(Disc(0.01), [0.0, 0.0]), [0.0, 1.0]), "no press has any load"),
+        (lambda skin: skin.record(KEY, PRESSES[0], [0.0]), "motions"),
+        (lambda skin: MovingPress(Disc(0.01), [1.0, -1.0]), "loads, in newtons"),
+        (lambda skin: MovingPress(Disc(0.01), [1.0, 1.0], np.zeros((3, 2))), "for T frames"),
+        (lambda skin: Press(Disc(0.01), -1.0), "load must be positive"),
+        (lambda skin: PressedSkin(KEY, skin, STILL), "model must be"),
+        (lambda skin: PressedSkin(KEY, skin.model, "velostat"), "material must be"),
+        (lambda skin: PressedSkin(KEY, skin.model, STILL, conductivity=-1.0), "must be positive"),
+    ],
+)
+def test_impossible_presses_are_refused(skin, call, message):
+    with pytest.raises(ValueError, match=message):
+        call(skin)
