@@ -40,7 +40,7 @@ def transfer_impedance(mesh: Mesh, conductivity, electrodes: AbstractElectrodes,
 def _quadratic(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
     contact = electrodes.contact(mesh)
     operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
-    return _impedance(electrodes, system.quadratic_form(operator, contact.load))
+    return electrode_impedance(electrodes, system.quadratic_form(operator, contact.load))
 
 
 _differentiable = eqx.filter_custom_jvp(_quadratic)
@@ -76,7 +76,7 @@ class SolvedSystem(NamedTuple):
 
     def fields_and_impedance(self, electrodes: AbstractElectrodes):
         """F (n, L) and Z (L, L), as of `electrode_fields`."""
-        impedance = _impedance(electrodes, self.load.T @ self.solution)
+        impedance = electrode_impedance(electrodes, self.load.T @ self.solution)
         if not electrodes.is_point:
             return self.solution @ impedance, impedance
         fields = self.solution - self.solution.mean(axis=1, keepdims=True)
@@ -107,7 +107,7 @@ def fields_and_inverse(
     return fields, inverse.add(strips.spread(solved.solution), fields)
 
 
-def _impedance(electrodes: AbstractElectrodes, product: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:
+def electrode_impedance(electrodes: AbstractElectrodes, product: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:
     """Z from the product loadᵀ A⁻¹ load, A being the stiffness with contact mass (complete) or grounding (point).
 
     Complete electrodes: eliminating the nodes leaves (D - BᵀA⁻¹B) U = I. Its columns sum to zero, so the diagonal

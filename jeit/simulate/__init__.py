@@ -27,6 +27,7 @@ from jeit.simulate.contact import (
     Prism,
     Revolved,
     Ring,
+    TwoSheets,
     ball,
     material,
 )
@@ -52,6 +53,7 @@ __all__ = [
     "Ring",
     "RoundSkin",
     "SoundingSkin",
+    "TwoSheets",
     "ball",
     "calibration_taps",
     "material",

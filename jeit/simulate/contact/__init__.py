@@ -11,6 +11,7 @@ from jeit.simulate.contact.joined import Joined, Placed
 from jeit.simulate.contact.materials import Material, material
 from jeit.simulate.contact.press import MovingPress, Press
 from jeit.simulate.contact.pressed_skin import PressedSkin
+from jeit.simulate.contact.two_sheets import TwoSheets
 
 __all__ = [
     "Bar",
@@ -27,6 +28,7 @@ __all__ = [
     "Prism",
     "Revolved",
     "Ring",
+    "TwoSheets",
     "ball",
     "material",
 ]
