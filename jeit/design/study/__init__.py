@@ -5,7 +5,8 @@
 """
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
-from jeit.design.study.run import Progress, run_study, study_progress
+from jeit.design.study.progress import Progress
+from jeit.design.study.run import run_study, study_progress
 from jeit.design.study.spec import Point, Study, read_study
 from jeit.design.study.store import open_results
 

@@ -1,6 +1,6 @@
-"""`Store`: a study's results on disk, a Zarr store in which a chunk either is finished or does not count.
+"""`Store`: results on disk, of a study or of other chunks, in Zarr, where a chunk either is finished or does not count.
 
-Every point has files of its own, so that no chunk touches another's. Which chunks are finished stands, with a checksum
+No chunk touches another's files. Which chunks are finished stands, with a checksum
 of each, in one file that is replaced as a whole, after the chunk's own.
 """
 
@@ -9,64 +9,47 @@ import json
 import os
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
-from jeit.design.study.batch import study_grid
+from jeit.design.study.contents import Contents, study_contents
 from jeit.design.study.spec import Study
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
-_SCORES = {
-    "minimum": {"minimum": ("V", "least sensitivity")},
-    "mean": {"mean": ("V", "mean sensitivity")},
-    "uniformity": {"uniformity": ("1", "mean sensitivity over its root mean square")},
-    "blind_spot": {"blind_spot": ("1", "share of the area less sensitive than the noise of all channels")},
-    "taxels": {
-        "taxel_count": ("1", "virtual taxels of some area"),
-        "taxel_area_mean": ("cm²", "mean area of the virtual taxels"),
-        "taxel_area_std": ("cm²", "standard deviation of the virtual taxels' areas"),
-        "taxel_area_max": ("cm²", "largest area of a virtual taxel"),
-    },
-    "information": {"information": ("nat", "log-determinant of the information on touches (D)")},
-    "mean_variance": {"mean_variance": ("1", "mean posterior variance of a touch's amplitude (A)")},
-    "largest_variance": {"largest_variance": ("1", "largest posterior variance of a pattern of touches (E)")},
-    "localisation_error": {
-        "localisation_error_mean": ("mm", "mean Cramér-Rao bound of a touch's place, infinite if one cannot be told"),
-        "localisation_error_max": ("mm", "largest Cramér-Rao bound of a touch's place"),
-        "localisation_lost": ("1", "share of the area where a touch's place cannot be told"),
-    },
-}
 
 
 class Store:
-    """The store of `study` at `path`; made empty if there is none."""
+    """The store of a study, or of other `Contents`, at `path`; made empty if there is none."""
 
-    def __init__(self, study: Study, path: str | Path, *, create: bool = True):
+    def __init__(self, work: Study | Contents, path: str | Path, *, create: bool = True):
         """Raises `FileNotFoundError` if there is no store and none is to be made, `ValueError` if there is something
         else, or another study's, or if it is damaged, `ImportError` without the extra `cluster`, and `OSError` if it
         cannot be written."""
         zarr = require("zarr")
-        self.study, self.path = study, Path(path)
+        self.contents = work if isinstance(work, Contents) else study_contents(work)
+        self.path, kind = Path(path), self.contents.kind
         if not self.path.exists():
             if not create:
-                raise FileNotFoundError(f"path: there is no study at {self.path}; run it first.")
+                raise FileNotFoundError(f"path: there is no {kind} at {self.path}; run it first.")
             try:
-                _create(zarr, study, self.path)
+                _create(zarr, self.contents, self.path)
             except OSError as error:
-                raise OSError(error.errno, f"the study's store cannot be made ({error.strerror})", str(path)) from error
+                raise OSError(
+                    error.errno, f"the {kind}'s store cannot be made ({error.strerror})", str(path)
+                ) from error
         attributes = self._attributes()
         if not attributes:
             raise ValueError(
-                f"{self.path} holds no study: name the store that 'jeit study run' wrote, or, for a new one, a place "
-                "where nothing is."
+                f"{self.path} holds no {kind}: name the store that {self.contents.made_by} wrote, or, for a new one, a "
+                "place where nothing is."
             )
-        if attributes.get("fingerprint") != study.fingerprint:
+        if attributes.get("fingerprint") != self.contents.fingerprint:
             raise ValueError(
-                f"{self.path} holds the results of another study, or of this one before it was changed; move it away "
+                f"{self.path} holds the results of another {kind}, or of this one before it was changed; move it away "
                 "or choose another path."
             )
         try:
@@ -91,21 +74,24 @@ class Store:
         """Write chunk `number`, then that it is finished. Raises `OSError`, after which it does not count."""
         try:
             for name, values in results.items():
-                self.write_array(name, self.study.chunks[number], values)
+                self.write_array(name, self.contents.chunks[number], values)
             self._mark(number, _checksum(results))
         except OSError as error:
+            kept = f"{len(self.finished())} of {len(self.contents.chunks)} chunks are finished and kept"
             raise OSError(
                 error.errno,
-                f"{error.strerror}: a chunk could not be written; {len(self.finished())} of {len(self.study.chunks)} "
-                "chunks are finished and kept. Mend that, then resume the study",
+                f"{error.strerror}: a chunk could not be written; {kept}. Mend that, then resume the "
+                f"{self.contents.kind}",
                 str(self.path),
             ) from error
 
-    def write_array(self, name: str, points: tuple[int, ...], values: np.ndarray) -> None:
+    def write_array(self, name: str, points: Sequence[int], values: np.ndarray) -> None:
         """Write `values` (k, …) of array `name` at k points."""
-        array = self._group[name]
-        for point, value in zip(points, values, strict=True):
-            array[point] = value  # pyright: ignore[reportIndexIssue]
+        array, first = self._group[name], 0
+        for rows in _runs(points):
+            last = first + rows.stop - rows.start
+            array[rows] = values[first:last]  # pyright: ignore[reportIndexIssue]
+            first = last
 
     def _mark(self, number: int, checksum: str) -> None:
         content = _read_json(self.path)
@@ -123,10 +109,10 @@ class Store:
             temporary.unlink(missing_ok=True)
 
     def _checksum(self, number: int) -> str | None:
-        points = list(self.study.chunks[number])
+        runs = _runs(self.contents.chunks[number])
         try:
             return _checksum(
-                {name: np.stack([self._group[name][point] for point in points]) for name in _arrays(self.study)}
+                {name: np.concatenate([self._group[name][rows] for rows in runs]) for name in self.contents.arrays}
             )  # pyright: ignore
         except (OSError, ValueError, RuntimeError):
             return None  # a file that cannot be decoded
@@ -150,7 +136,7 @@ class Store:
         said = " ".join(str(reason).split()).rstrip(".")
         return ValueError(
             f"{self.path / 'zarr.json'} cannot be read ({said}): the store is damaged, and does not say what is "
-            "finished. Put that file back from a copy; or move the store away and run the study again."
+            f"finished. Put that file back from a copy; or move the store away and run the {self.contents.kind} again."
         )
 
 
@@ -185,63 +171,32 @@ def require(name: str) -> ModuleType:
         raise ImportError(f"Studies need {name}: pip install 'jeit[cluster]'.") from None
 
 
-def _arrays(study: Study) -> dict[str, tuple[str, str]]:
-    """Unit and meaning of every result of `study`."""
-    arrays = {"sensitivity": ("V", "sensitivity ‖Δv‖ to a touch")}
-    for score, some in _SCORES.items():
-        if score in study.scores:
-            arrays |= some
-    return arrays
+def _runs(points: Sequence[int]) -> list[slice]:
+    """Points that follow each other, together."""
+    places = np.asarray(points)
+    ends = np.flatnonzero(np.diff(places) != 1) + 1
+    return [slice(int(run[0]), int(run[-1]) + 1) for run in np.split(places, ends)]
 
 
-def _create(zarr: ModuleType, study: Study, path: Path) -> None:
+def _create(zarr: ModuleType, contents: Contents, path: Path) -> None:
     """All at once: made under another name, then renamed."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.new")
     shutil.rmtree(temporary, ignore_errors=True)
-    grid = study_grid(study)
-    coordinates = [point.coordinates for point in study.points]
-    along = {name: [values[name] for values in coordinates] for name in coordinates[0]}
     attributes = {
-        "coordinates": " ".join([*along, "x_mm", "y_mm"]),
-        "fingerprint": study.fingerprint,
+        **contents.attributes,
+        "fingerprint": contents.fingerprint,
         "finished": {},
-        "name": study.name,
-        "study": study.text,
         "versions": {name: metadata.version(name) for name in _PACKAGES},
     }
     try:
-        group = zarr.open_group(str(temporary), mode="w", zarr_format=3, attributes=attributes)
-        for name, values in along.items():
-            _write_whole(group, name, "point", values)
-        for axis, values in enumerate(np.asarray(grid.places).T):
-            _write_whole(group, ("x_mm", "y_mm")[axis], "place", np.round(1e3 * values, 9).tolist())
-        number, places = len(study.points), len(grid.places)
-        for name, (unit, meaning) in _arrays(study).items():
-            wide = name == "sensitivity"
-            group.create_array(
-                name,
-                shape=(number, places) if wide else (number,),
-                chunks=(1, places) if wide else (1,),
-                dtype="float64",
-                fill_value=np.nan,
-                dimension_names=("point", "place") if wide else ("point",),
-                attributes={"units": unit, "long_name": meaning},
-            )
+        group = zarr.open_group(str(temporary), mode="w", zarr_format=3, attributes=dict(sorted(attributes.items())))
+        contents.fill(group)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="Consolidated metadata is currently not part")
             zarr.consolidate_metadata(str(temporary))
         os.rename(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _write_whole(group, name: str, dimension: str, values: list) -> None:
-    text = isinstance(values[0], str)
-    array = np.array(values, dtype=object if text else None)
-    written = group.create_array(
-        name, shape=array.shape, chunks=array.shape, dtype=str if text else array.dtype, dimension_names=(dimension,)
-    )
-    written[:] = array
 
 
 def _checksum(results: Mapping[str, np.ndarray]) -> str:

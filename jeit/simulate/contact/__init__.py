@@ -10,6 +10,8 @@ from jeit.simulate.contact.indenters import Bar, DepthMap, Disc, Prism, Revolved
 from jeit.simulate.contact.joined import Joined, Placed
 from jeit.simulate.contact.materials import Material, material
 from jeit.simulate.contact.press import MovingPress, Press
+from jeit.simulate.contact.press_draws import PressDraws
+from jeit.simulate.contact.press_sets import PressSet, open_presses, simulate_presses
 from jeit.simulate.contact.pressed_skin import PressedSkin
 from jeit.simulate.contact.two_sheets import TwoSheets
 
@@ -24,6 +26,8 @@ __all__ = [
     "MovingPress",
     "Placed",
     "Press",
+    "PressDraws",
+    "PressSet",
     "PressedSkin",
     "Prism",
     "Revolved",
@@ -31,4 +35,6 @@ __all__ = [
     "TwoSheets",
     "ball",
     "material",
+    "open_presses",
+    "simulate_presses",
 ]

@@ -1,0 +1,24 @@
+"""Chunks of work on the workers of a cluster."""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, TypeVar
+
+from jeit.design.study.store import require
+
+_Result = TypeVar("_Result")
+
+
+def over_cluster(
+    client: Any, solve: Callable[[Any, int], _Result], work: Any, numbers: Iterable[int]
+) -> Iterator[tuple[int, _Result]]:
+    """Numbers of chunks with what `solve(work, number)` returns, as they are solved by the workers of a
+    `dask.distributed.Client`; those of a worker that is lost are solved again."""
+    distributed = require("distributed")
+    # The work goes with every chunk: scattered, it would be lost with a worker that alone has it.
+    futures = {client.submit(solve, work, number, pure=False, retries=2): number for number in numbers}
+    try:
+        for future, results in distributed.as_completed(futures, with_results=True):
+            yield futures[future], results
+            future.release()
+    finally:
+        client.cancel(list(futures))

@@ -1,0 +1,94 @@
+"""What is in a store: the arrays of a study, and their names, units and meanings."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jeit.design.study.batch import study_grid
+from jeit.design.study.spec import Study
+
+_SCORES = {
+    "minimum": {"minimum": ("V", "least sensitivity")},
+    "mean": {"mean": ("V", "mean sensitivity")},
+    "uniformity": {"uniformity": ("1", "mean sensitivity over its root mean square")},
+    "blind_spot": {"blind_spot": ("1", "share of the area less sensitive than the noise of all channels")},
+    "taxels": {
+        "taxel_count": ("1", "virtual taxels of some area"),
+        "taxel_area_mean": ("cm²", "mean area of the virtual taxels"),
+        "taxel_area_std": ("cm²", "standard deviation of the virtual taxels' areas"),
+        "taxel_area_max": ("cm²", "largest area of a virtual taxel"),
+    },
+    "information": {"information": ("nat", "log-determinant of the information on touches (D)")},
+    "mean_variance": {"mean_variance": ("1", "mean posterior variance of a touch's amplitude (A)")},
+    "largest_variance": {"largest_variance": ("1", "largest posterior variance of a pattern of touches (E)")},
+    "localisation_error": {
+        "localisation_error_mean": ("mm", "mean Cramér-Rao bound of a touch's place, infinite if one cannot be told"),
+        "localisation_error_max": ("mm", "largest Cramér-Rao bound of a touch's place"),
+        "localisation_lost": ("1", "share of the area where a touch's place cannot be told"),
+    },
+}
+
+
+class Contents(NamedTuple):
+    """What a store holds, results by chunks.
+
+    **Fields**: `kind`, one word for it, and `made_by`, what makes it, for messages; `fingerprint`, of all that decides
+    the results; `chunks`, the rows of every array that each chunk has; `arrays`, names of the results; `attributes`,
+    plain values to be kept with them; `fill`, which makes all arrays in an empty Zarr group.
+    """
+
+    kind: str
+    made_by: str
+    fingerprint: str
+    chunks: Sequence[Sequence[int]]
+    arrays: Sequence[str]
+    attributes: dict[str, Any]
+    fill: Callable[[Any], None]
+
+
+def study_contents(study: Study) -> Contents:
+    """Of a study's store: a row of every array is a point, in files of its own."""
+    coordinates = [point.coordinates for point in study.points]
+    along = {name: [values[name] for values in coordinates] for name in coordinates[0]}
+    arrays = _arrays(study)
+
+    def fill(group: Any) -> None:
+        grid = study_grid(study)
+        for name, values in along.items():
+            _write_whole(group, name, "point", values)
+        for axis, values in enumerate(np.asarray(grid.places).T):
+            _write_whole(group, ("x_mm", "y_mm")[axis], "place", np.round(1e3 * values, 9).tolist())
+        number, places = len(study.points), len(grid.places)
+        for name, (unit, meaning) in arrays.items():
+            wide = name == "sensitivity"
+            group.create_array(
+                name,
+                shape=(number, places) if wide else (number,),
+                chunks=(1, places) if wide else (1,),
+                dtype="float64",
+                fill_value=np.nan,
+                dimension_names=("point", "place") if wide else ("point",),
+                attributes={"units": unit, "long_name": meaning},
+            )
+
+    attributes = {"coordinates": " ".join([*along, "x_mm", "y_mm"]), "name": study.name, "study": study.text}
+    return Contents("study", "'jeit study run'", study.fingerprint, study.chunks, [*arrays], attributes, fill)
+
+
+def _arrays(study: Study) -> dict[str, tuple[str, str]]:
+    """Unit and meaning of every result of `study`."""
+    arrays = {"sensitivity": ("V", "sensitivity ‖Δv‖ to a touch")}
+    for score, some in _SCORES.items():
+        if score in study.scores:
+            arrays |= some
+    return arrays
+
+
+def _write_whole(group, name: str, dimension: str, values: list) -> None:
+    text = isinstance(values[0], str)
+    array = np.array(values, dtype=object if text else None)
+    written = group.create_array(
+        name, shape=array.shape, chunks=array.shape, dtype=str if text else array.dtype, dimension_names=(dimension,)
+    )
+    written[:] = array

@@ -1,0 +1,49 @@
+"""How far work in chunks is, and how long it will take."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+
+class Progress(NamedTuple):
+    """How far a study is: finished and all points and chunks; `seconds_left`, None until the first of this run.
+
+    With exact maps, `points` also counts those of a chunk that is not finished, and would be solved again.
+    """
+
+    points: int
+    all_points: int
+    chunks: int
+    all_chunks: int
+    seconds_left: float | None
+
+
+class Teller:
+    """Calls `progress` about work in `chunks`, and reckons the time left from the points finished since it was made;
+    `done` were before."""
+
+    def __init__(self, chunks: Sequence[Sequence[int]], done: set[int], progress: Callable[[Progress], None] | None):
+        self._chunks, self._done, self._progress = chunks, set(done), progress
+        self._all = sum(len(chunk) for chunk in chunks)
+        self._first, self._start = self._points(), time.monotonic()
+        self._tell(self._first, None)
+
+    def finished(self, number: int) -> None:
+        """A chunk is."""
+        self._done.add(number)
+        self._reckon(self._points())
+
+    def solved(self, points: int) -> None:
+        """So many points of the chunk under way are."""
+        self._reckon(self._points() + points)
+
+    def _reckon(self, points: int) -> None:
+        pace = (time.monotonic() - self._start) / (points - self._first)
+        self._tell(points, pace * (self._all - points))
+
+    def _points(self) -> int:
+        return sum(len(self._chunks[number]) for number in self._done)
+
+    def _tell(self, points: int, seconds_left: float | None) -> None:
+        if self._progress is not None:
+            self._progress(Progress(points, self._all, len(self._done), len(self._chunks), seconds_left))

@@ -1,0 +1,73 @@
+"""Presses drawn at random: what is pressed, how hard, where, and how many at once."""
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from jeit.arguments import check_key, check_kind
+from jeit.mesh import Domain
+from jeit.simulate.contact.indenters import AbstractIndenter, check_indenter
+from jeit.simulate.contact.press import Press
+
+# Places drawn at once for each that is wanted, until one is on the skin.
+_TRIES = 20
+
+
+class PressDraws(eqx.Module):
+    """Touches of one to `at_once` presses, each number as likely as another, all independent.
+
+    **Fields**: `indenters`, each as likely as another, turned by any angle; `outline` of the places, and their least
+    distance `margin` from it, metres, all over alike; `load`, least and greatest, newtons, its logarithm uniform.
+    """
+
+    indenters: tuple[AbstractIndenter, ...]
+    outline: Domain
+    load: tuple[float, float]
+    margin: float
+    at_once: int
+
+    def __init__(self, indenters, outline: Domain, load: tuple[float, float], *, margin: float = 0.0, at_once: int = 1):
+        """Raises `ValueError` for no indenters, no outline, loads that are not positive and rising, and a margin that
+        leaves no place."""
+        indenters = tuple(indenters)
+        if not indenters:
+            raise ValueError("indenters: give one at least, such as [ball(0.015)].")
+        for number, indenter in enumerate(indenters):
+            check_indenter(f"indenters[{number}]", indenter)
+        check_kind("outline", outline, Domain, "an outline, such as Disk(0.05)")
+        if len(load) != 2 or not 0 < load[0] <= load[1] < np.inf:
+            raise ValueError(f"load: give the least and the greatest, positive, in newtons; it is {load!r}.")
+        if not (isinstance(at_once, int) and at_once >= 1):
+            raise ValueError(f"at_once must be a whole number, 1 or more; it is {at_once!r}.")
+        self.indenters, self.outline, self.at_once = indenters, outline, at_once
+        self.load, self.margin = (float(load[0]), float(load[1])), float(margin)
+        if not self._inside(self._anywhere(np.random.default_rng(0), 1000)).any():
+            raise ValueError(f"margin is {1e3 * self.margin:g} mm, which leaves no place on the skin; give less.")
+
+    def draw(self, key: Array, number: int) -> list[tuple[Press, ...]]:
+        """So many touches. Raises `ValueError` for what is no key."""
+        check_key(key)
+        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        counts = random.integers(1, self.at_once, number, endpoint=True)
+        total = counts.sum()
+        which = random.integers(len(self.indenters), size=total)
+        load = np.exp(random.uniform(np.log(self.load[0]), np.log(self.load[1]), total))
+        angle = random.uniform(-np.pi, np.pi, total)
+        place = np.zeros((0, 2))
+        while len(place) < total:
+            tried = self._anywhere(random, _TRIES * int(total))
+            place = np.concatenate([place, tried[self._inside(tried)]])
+        presses = [
+            Press(self.indenters[one], float(newtons), where, float(turned))
+            for one, newtons, where, turned in zip(which, load, place[:total], angle, strict=True)
+        ]
+        ends = np.cumsum(counts)
+        return [tuple(presses[end - count : end]) for end, count in zip(ends, counts, strict=True)]
+
+    def _anywhere(self, random: np.random.Generator, number: int) -> np.ndarray:
+        low_x, high_x, low_y, high_y = map(float, self.outline.extent)
+        return random.uniform((low_x, low_y), (high_x, high_y), (number, 2))
+
+    def _inside(self, places: np.ndarray) -> np.ndarray:
+        return np.asarray(self.outline.signed_distance(places)) >= self.margin
