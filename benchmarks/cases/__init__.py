@@ -15,6 +15,7 @@ NAMES = (
     "realtime",
     "hearing",
     "design",
+    "contact",
     "first_call",
     "localisation_error",
     "ktc2023",

@@ -10,6 +10,7 @@ import pytest
 FOLDER = Path(__file__).resolve().parents[2] / "examples"
 MOST = {
     "press_on_a_skin": 3e-3,
+    "press_with_a_load": 1e-8,
     "design_a_skin": 0.6,
     "design_gradient": 1e-5,
     "every_method": 0.25,

@@ -71,6 +71,13 @@ def _hearing(names: dict, folder: Path, printed: list[str]) -> None:
     assert (folder / "track.png").stat().st_size > 10_000
 
 
+def _pressing(names: dict, folder: Path, printed: list[str]) -> None:
+    assert names["frames"].shape == (4, 208)
+    assert names["film"].shape == (60, 208)
+    assert 0.001 < float(printed[0].rstrip("%")) / 100 < 0.1
+    assert names["data"].finished.values.all()
+
+
 def _reconstruction(names: dict, folder: Path, printed: list[str]) -> None:
     assert names["result"].status == "converged"
     assert 1.8e-3 < float(names["result"].conductivity.max()) < 5e-3  # S; the inclusion has 3 mS
@@ -85,6 +92,7 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "README.md": _readme,
     "design.md": _design,
     "hearing.md": _hearing,
+    "pressing.md": _pressing,
     "reconstruction.md": _reconstruction,
 }
 

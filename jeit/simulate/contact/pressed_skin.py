@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jeit.arguments import check_key, check_kind, is_number, told
 from jeit.design.skin.touched_cells import TouchedCells, padded
@@ -12,6 +12,7 @@ from jeit.forward import ForwardModel
 from jeit.forward.assembly import check_conductivity
 from jeit.forward.contact_sensitivity import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
+from jeit.mesh import Mesh, centroids, measures
 from jeit.simulate.contact.cell_pressure import Samples, pressed_cells
 from jeit.simulate.contact.drift import gains, walk, white_noise
 from jeit.simulate.contact.materials import Material
@@ -19,8 +20,9 @@ from jeit.simulate.contact.press import motions_of, touches_of
 from jeit.simulate.contact.response import advance, held_pressure, unstrained
 from jeit_solvers.engines import as_array
 
-# Touches worked on at once: those whose numbers of cells are between the same two powers of this.
-_AT_ONCE, _FEW = 1024, 4
+# Touches worked on at once; their numbers of cells that part them; and their extent over the root of their area, above
+# which their contacts are apart.
+_AT_ONCE, _CELLS, _APART = 1024, (128, 512, 2048), 3.0
 # Of the greatest change of a touch: less is left out.
 _LEAST = 1e-6
 
@@ -66,7 +68,7 @@ class PressedSkin(eqx.Module):
         check_key(key)
         _check_seconds("held", held)
         _check_seconds("elapsed", elapsed)
-        exact = self._voltages(self.touched(presses, held=held))
+        exact = self.voltages_under(self.touched(presses, held=held))
         return self._read(key, exact, np.array([float(elapsed)]))
 
     def touched(self, presses, *, held: float = 1.0) -> TouchedCells:
@@ -85,7 +87,7 @@ class PressedSkin(eqx.Module):
         """
         check_key(key)
         seconds = _check_times(seconds)
-        exact = self._voltages(self.touched_in_time(motions, seconds))
+        exact = self.voltages_under(self.touched_in_time(motions, seconds))
         return self._read(key, exact, seconds)
 
     def touched_in_time(self, motions, seconds: Float[np.ndarray, " T"]) -> TouchedCells:
@@ -108,18 +110,15 @@ class PressedSkin(eqx.Module):
         places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])
         return _touched(places, np.broadcast_to(cells, change.shape), change, self.model.mesh.num_cells)
 
-    def _voltages(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
-        """Without drift, gains and noise."""
+    def voltages_under(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
+        """Voltages (n, M) of the model under n touches, undisturbed. Raises as `touch_changes` does."""
         rest = np.asarray(self.model.voltages(self.conductivity))
         voltages = np.tile(rest, (len(touched.places), 1))
         places, cells, change = (np.asarray(one) for one in (touched.places, touched.cells, touched.change))
-        number = np.count_nonzero(change, axis=1)
-        sizes = np.where(number > 0, _FEW ** np.ceil(np.log(np.maximum(number, 2)) / np.log(_FEW)), 0)
-        for size in np.unique(sizes[sizes > 0]):
-            alike = np.flatnonzero(sizes == size)
+        for alike in _kinds(self.model.mesh, cells, change):
             for some in np.split(alike, range(_AT_ONCE, len(alike), _AT_ONCE)):
                 even = some[np.minimum(np.arange(_even(len(some))), len(some) - 1)]
-                own = slice(0, min(int(size), cells.shape[1]))
+                own = slice(0, _even(int(np.count_nonzero(change[some], axis=1).max())))
                 arrays = as_array(places[even]), as_array(cells[even, own]), as_array(change[even, own])
                 rows = TouchedCells(*arrays, num_cells=touched.num_cells)
                 voltages[some] += np.asarray(touch_changes(self.model, self.conductivity, rows))[: len(some)]
@@ -161,6 +160,19 @@ def _touched(places, cells, change, number: int) -> TouchedCells:
     changes[there] = change[kept]
     rows, changes = (np.pad(array, ((0, 0), (0, wide))) for array in (rows, changes))
     return TouchedCells(as_array(places), as_array(rows), as_array(changes), number)
+
+
+def _kinds(mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, "n c"]) -> list[np.ndarray]:
+    """Numbers of the touches that change anything, those together that cost alike: by how many cells they have, and
+    whether these lie together or, of several contacts, apart."""
+    there = change != 0
+    number = there.sum(axis=1)
+    middles = np.asarray(centroids(mesh))[:, :2][cells]
+    low, high = (find(np.where(there[..., None], middles, far), axis=1) for find, far in ((np.min, 1), (np.max, -1)))
+    area = np.sum(np.where(there, np.asarray(measures(mesh))[cells], 0.0), axis=1)
+    apart = np.linalg.norm(high - low, axis=1) > _APART * np.sqrt(area)
+    kinds = np.where(number > 0, 1 + 2 * np.searchsorted(_CELLS, number) + apart, 0)
+    return [np.flatnonzero(kinds == kind) for kind in np.unique(kinds[kinds > 0])]
 
 
 def _even(number: int) -> int:

@@ -1,0 +1,62 @@
+"""A load in newtons on a skin: indenter, pressure, conductivity and a frame in time; see `press_with_a_load.png`."""
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.layout import ring
+from jeit.mesh import Disk
+from jeit.protocol import adjacent
+from jeit.simulate import Bar, Joined, MovingPress, Placed, PressedSkin, ball, material
+
+
+def main() -> float:
+    electrodes = BoundaryElectrodes(ring(0.05, 16), width=0.008, contact_impedance=300.0)
+    model = ForwardModel(Disk(0.05).mesh(num_points=3000), electrodes, adjacent(16))
+    skin = PressedSkin(jax.random.key(0), model, material("velostat"))
+    tool = Joined(Placed(ball(0.016), (0.012, 0.0)), Placed(Bar(0.016, 0.005), (-0.01, 0.0), 0.6))
+
+    # Pressed for four seconds, held, lifted; read 20 times a second.
+    seconds = np.arange(0, 12, 0.05)
+    load = np.interp(seconds, [0, 1, 5, 7, 8], [0, 0, 20, 20, 0])
+    press = MovingPress(tool, load, position=(0.008, 0.01), angle=0.4)
+    frames = skin.record(jax.random.key(1), press, seconds)
+    touched = skin.touched_in_time(press, seconds)
+
+    figure, (shape, under, changed, read) = plt.subplots(1, 4, figsize=(15, 3.6), layout="constrained")
+    x, y = np.meshgrid(*2 * (np.linspace(-0.024, 0.024, 241),))
+    places = np.stack([x, y], axis=-1)
+    pressure = skin.material.support.pressure(tool, load.max()).at(places)
+    extent = (-24, 24, -24, 24)
+    drawn = shape.imshow(1e3 * tool.gap(places), origin="lower", extent=extent, cmap="viridis_r")
+    figure.colorbar(drawn, ax=shape, label="mm above its lowest point")
+    drawn = under.imshow(1e-3 * pressure, origin="lower", extent=extent, cmap="magma")
+    figure.colorbar(drawn, ax=under, label="kPa")
+    held = int(np.searchsorted(seconds, 7.0))
+    change = np.zeros(model.mesh.num_cells)
+    np.add.at(change, np.asarray(touched.cells)[held], np.asarray(touched.change)[held])
+    drawn = changed.tripcolor(*1e3 * np.asarray(model.mesh.points).T, np.asarray(model.mesh.cells), 100 * change)
+    figure.colorbar(drawn, ax=changed, label="% more conductivity")
+    changed.set_aspect("equal")
+    most = np.argsort(-np.abs(frames[held] - skin.rest()))[:3]
+    read.plot(seconds, 1e3 * (frames - skin.rest())[:, most], linewidth=1)
+    above = read.twinx()
+    above.plot(seconds, load, "k--", linewidth=1)
+    above.set_ylabel("load, N (dashed)")
+    read.set(xlabel="s", ylabel="change of three voltages, mV", title="a frame in time")
+    for ax, title in ((shape, "indenter"), (under, "pressure"), (changed, "conductivity")):
+        ax.set(title=title, xlabel="mm")
+    figure.savefig("press_with_a_load.png")
+
+    # As exact as solving the model anew.
+    anew = model.voltages(skin.conductivity * (1 + change)) - model.voltages(skin.conductivity)
+    found = skin.voltages_under(touched)[held] - np.asarray(model.voltages(skin.conductivity))
+    return float(np.abs(found - anew).max() / np.abs(anew).max())
+
+
+if __name__ == "__main__":
+    error = main()
+    print(f"low-rank change against the model solved anew: {error:.0e}")
+    assert error < 1e-8
