@@ -24,7 +24,8 @@ ROOMS["design"] = {*ROOMS["inverse"], "layout", "inverse"}
 ROOMS["data"] = {*ROOMS["forward"], "layout", "forward"}
 ROOMS["simulate"] = {*ROOMS["design"], "design", "data", "acoustic"}
 ROOMS["imaging"] = {*ROOMS["inverse"], "inverse", "data", "image"}
-ROOMS["plot"] = {*ROOMS["simulate"], *ROOMS["imaging"], "simulate", "imaging"}
+ROOMS["touch"] = {"arguments"}
+ROOMS["plot"] = {*ROOMS["simulate"], *ROOMS["imaging"], "simulate", "imaging", "touch"}
 ROOMS["report"] = {*ROOMS["plot"], "plot"}
 ROOMS["cli"] = {*ROOMS["report"], "report", "start"}
 

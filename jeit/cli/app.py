@@ -19,11 +19,12 @@ from jeit.cli.commands.locate import locate
 from jeit.cli.commands.reconstruct import reconstruct
 from jeit.cli.commands.stream import stream
 from jeit.cli.commands.study import study
+from jeit.cli.commands.touch import touch
 from jeit.cli.options import naming_options
 from jeit.start import discarded_damaged
 
 # Commands that run one program again and again: a frame in a third of the time.
-_REPEATING = ("study", "stream", "layout optimise")
+_REPEATING = ("study", "stream", "layout optimise", "touch fit")
 
 app = typer.Typer(
     name="jeit",
@@ -42,6 +43,7 @@ app.command()(calibrate_microphones)
 app.command()(locate)
 app.add_typer(layout)
 app.add_typer(study)
+app.add_typer(touch)
 
 
 @app.callback(invoke_without_command=True)

@@ -17,19 +17,27 @@ from jeit.plot.imaging.figures_of_merit import plot_figures_of_merit
 from jeit.plot.imaging.hyperparameter import plot_choice
 from jeit.plot.imaging.image import plot_image
 from jeit.plot.imaging.mesh import plot_mesh
+from jeit.plot.touch.learning import plot_confusion, plot_force_errors, plot_key_errors, plot_place_errors
+from jeit.plot.touch.touches import plot_answers, plot_places
 
 _tell_old_names(__name__)
 
 __all__ = [
     "ColourScale",
     "Marks",
+    "plot_answers",
     "plot_choice",
+    "plot_confusion",
     "plot_error_curve",
     "plot_figures_of_merit",
+    "plot_force_errors",
     "plot_image",
+    "plot_key_errors",
     "plot_loss_map",
     "plot_mesh",
     "plot_pairs",
+    "plot_place_errors",
+    "plot_places",
     "plot_receptive_fields",
     "plot_sensitivity_histograms",
     "plot_sensitivity_map",

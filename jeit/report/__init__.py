@@ -1,5 +1,5 @@
 """What is told of results, and all that is written to a folder: measurements, images, streams, compared rules,
-calibrations of microphones, tracks, layouts, studies."""
+calibrations of microphones, tracks, layouts, studies, learnt skins."""
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.report.calibration import draw_calibration, write_calibration
@@ -7,6 +7,7 @@ from jeit.report.compared_rules import draw_choice, report_choice, write_choice
 from jeit.report.image import draw_image, report_image, write_image
 from jeit.report.layout_comparison import draw_layout_comparison, report_layout_comparison, write_layout_comparison
 from jeit.report.layout_improvement import draw_improved_layout, report_improved_layout, write_improved_layout
+from jeit.report.learnt_skin import report_learnt_skin, write_learnt_skin, write_touches
 from jeit.report.measurement import report_measurement
 from jeit.report.stream import write_stream
 from jeit.report.study import write_study_report
@@ -25,6 +26,7 @@ __all__ = [
     "report_image",
     "report_improved_layout",
     "report_layout_comparison",
+    "report_learnt_skin",
     "report_measurement",
     "report_track",
     "write_calibration",
@@ -32,7 +34,9 @@ __all__ = [
     "write_image",
     "write_improved_layout",
     "write_layout_comparison",
+    "write_learnt_skin",
     "write_stream",
     "write_study_report",
+    "write_touches",
     "write_track",
 ]

@@ -1,0 +1,1 @@
+"""Pictures of what learnt skins say, and of how well they learnt."""

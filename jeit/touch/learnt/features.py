@@ -1,0 +1,84 @@
+"""What a method learns from: changes of the channels in one of several forms, as scores of principal components."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+# Components at most, and presses for each.
+_MOST, _PRESSES_EACH = 60, 3
+
+
+def _differences(changes, reference, unit):
+    return changes / unit
+
+
+def _ratios(changes, reference, unit):
+    size = np.maximum(np.abs(reference), 1e-3 * np.sqrt(np.mean(reference**2, axis=1, keepdims=True)))
+    return changes / np.where(size > 0, size, 1.0)
+
+
+def _compressed(changes, reference, unit):
+    return np.sign(changes) * np.log1p(np.abs(changes) / unit)
+
+
+def _normalised(changes, reference, unit):
+    size = np.sqrt(np.mean((changes / unit) ** 2, axis=1, keepdims=True))
+    size = np.where(size > 0, size, 1.0)
+    return np.hstack([changes / unit / size, np.log(size)])
+
+
+def _shapes(changes, reference, unit):
+    size = np.sqrt(np.mean(changes**2, axis=1, keepdims=True))
+    size = np.where(size > 0, size, 1.0)
+    return np.hstack([changes / size, np.log(size)])
+
+
+# Changes (n, m), the reference (n, m), and a unit (m,) for each channel, to features.
+FORMS = {
+    "differences": _differences,
+    "ratios": _ratios,
+    "compressed": _compressed,
+    "normalised": _normalised,
+    "shapes": _shapes,
+}
+SAID = {
+    "differences": "changes of the voltages",
+    "ratios": "changes relative to the reference",
+    "compressed": "logarithms of the changes",
+    "normalised": "changes in each channel's unit, relative to the frame's size",
+    "shapes": "changes relative to the frame's size",
+}
+
+
+@dataclass(frozen=True)
+class Features:
+    """Features of one `form`: standardised with `mean` and `deviation` (p,), then scores of `components` (p, k)."""
+
+    form: str
+    unit: Float[np.ndarray, " m"]
+    mean: Float[np.ndarray, " p"]
+    deviation: Float[np.ndarray, " p"]
+    components: Float[np.ndarray, "p k"]
+
+    @classmethod
+    def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray) -> "Features":
+        """From changes (N, m) and their reference (N, m)."""
+        size = np.abs(changes)
+        unit = np.median(size, axis=0)
+        unit = np.where(unit > 0, unit, np.mean(size, axis=0))
+        values = FORMS[form](changes, reference, unit)
+        mean, deviation = values.mean(axis=0), values.std(axis=0)
+        deviation = np.where(deviation > 1e-12 * max(deviation.max(), 1e-300), deviation, np.inf)
+        rows = np.linalg.svd((values - mean) / deviation, full_matrices=False)[2]
+        return cls(form, unit, mean, deviation, rows[: max(2, min(_MOST, len(values) // _PRESSES_EACH))].T)
+
+    def __call__(self, changes: np.ndarray, reference: np.ndarray) -> Float[np.ndarray, "n k"]:
+        """Scores (n, k) of changes (n, m)."""
+        values = FORMS[self.form](changes, reference, self.unit)
+        return (values - self.mean) / self.deviation @ self.components
+
+
+def forms_for(has_reference: bool) -> tuple[str, ...]:
+    """Those that can be made."""
+    return tuple(form for form in FORMS if has_reference or form != "ratios")

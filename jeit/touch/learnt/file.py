@@ -1,0 +1,111 @@
+"""Learnt skins as files: arrays and scikit-learn's estimators as skops keeps them, never a pickle."""
+
+import zipfile
+import zlib
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from jeit.touch.learnt.channels import Channels
+from jeit.touch.learnt.classifiers import LinearEnsemble, QuadraticDiscriminant
+from jeit.touch.learnt.extras import need_learning
+from jeit.touch.learnt.features import Features
+from jeit.touch.learnt.forest import Forest
+from jeit.touch.learnt.gaussian_process import GaussianProcess
+from jeit.touch.learnt.keys import LearntKeys, Standardised
+from jeit.touch.learnt.labels import LearntLabels
+from jeit.touch.learnt.learnt_skin import LearntSkin
+from jeit.touch.learnt.nearest import Nearest
+from jeit.touch.learnt.network import Network
+from jeit.touch.learnt.numbers import LearntNumbers
+from jeit.touch.learnt.spread import Spread
+
+_KIND, _VERSION = "a jeit learnt skin", 1
+_OURS = {
+    one.__name__: one
+    for one in (
+        Channels,
+        Features,
+        Forest,
+        GaussianProcess,
+        LearntKeys,
+        LearntLabels,
+        LearntNumbers,
+        LinearEnsemble,
+        Nearest,
+        Network,
+        QuadraticDiscriminant,
+        Spread,
+        Standardised,
+    )
+}
+_FAULTS = (
+    ValueError,
+    TypeError,
+    KeyError,
+    AttributeError,
+    EOFError,
+    OSError,
+    RuntimeError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+def write_skin(skin: LearntSkin, path: str | Path) -> None:
+    """Write a learnt skin to one file, without how well it was learnt."""
+    from skops.io import dump
+
+    need_learning()
+    own = {one.name: getattr(skin, one.name) for one in fields(skin) if one.name != "standing"}
+    dump({"kind": _KIND, "version": _VERSION, "skin": _plain(own)}, path)
+
+
+def read_skin(path: str | Path) -> LearntSkin:
+    """The skin of a file, or of the folder that `jeit touch fit` made.
+
+    Nothing in the file is executed: it holds numbers, and estimators of scikit-learn. Raises `FileNotFoundError`, and
+    `ValueError` for files of another kind, and such as hold anything else.
+    """
+    from skops.io import get_untrusted_types, load
+
+    need_learning()
+    path = Path(path)
+    if path.is_dir():
+        path = path / "skin.skops"
+    if not path.is_file():
+        raise FileNotFoundError(f"'{path}': there is no such file; `jeit touch fit` makes one.")
+    try:
+        strange = sorted(get_untrusted_types(file=path))
+        if strange:
+            raise ValueError(f"it holds {', '.join(strange[:3])}, which no learnt skin does")
+        content = load(path, trusted=[])
+        if not isinstance(content, dict) or content.get("kind") != _KIND:
+            raise ValueError("it is of another kind")
+        if content["version"] != _VERSION:
+            raise ValueError(f"it is of version {content['version']}, and this jeit reads {_VERSION}")
+        own: Any = _whole(content["skin"])
+        return LearntSkin(**own)
+    except _FAULTS as error:
+        said = " ".join(str(error).split())
+        raise ValueError(f"'{path}' is not a learnt skin that can be read ({said}); fit it again.") from None
+
+
+def _plain(value):
+    """Our own objects as dictionaries of what they hold."""
+    if type(value).__name__ in _OURS and type(value) is _OURS[type(value).__name__]:
+        return {"jeit": type(value).__name__, **{one.name: _plain(getattr(value, one.name)) for one in fields(value)}}
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return value
+
+
+def _whole(value):
+    """And back."""
+    if isinstance(value, dict):
+        held = {key: _whole(one) for key, one in value.items() if key != "jeit"}
+        return _OURS[value["jeit"]](**held) if "jeit" in value else held
+    return [_whole(one) for one in value] if isinstance(value, list) else value

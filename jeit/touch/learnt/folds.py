@@ -1,0 +1,92 @@
+"""Folds of cross-validation for skins that drift: stretches of time, groups and repeated frames never split."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+NUM_FOLDS = 5
+# Presses held out may be so many times farther from the others' places than presses of a random fold.
+_FARTHER = 2.0
+
+
+def time_folds(
+    frames: np.ndarray,
+    group: np.ndarray | None = None,
+    time: np.ndarray | None = None,
+    *,
+    alike: Float[np.ndarray, "N d"] | None = None,
+    kinds: np.ndarray | None = None,
+    number: int = NUM_FOLDS,
+) -> tuple[Int[np.ndarray, " N"], tuple[str, ...]]:
+    """The fold (N,) that each press is held out in, and notes.
+
+    Presses in order of `time`, or as recorded, are cut into `number` stretches. Where that leaves out places (`alike`,
+    numbers (N, d)) or `kinds` (N,) altogether, as when one was pressed after the other, into more and shorter ones,
+    dealt out in turn. With a `group`, groups in order of their mean time. Presses with one and the same frame go to one
+    fold: they would tell each other's answer.
+    """
+    count = len(frames)
+    order = np.arange(count) if time is None else np.argsort(time, kind="stable")
+    rank = np.empty(count, int)
+    rank[order] = np.arange(count)
+    notes = []
+    unit = np.arange(count)
+    groups = unit if group is None else np.unique(group, return_inverse=True)[1]
+    grouped = group is not None and groups.max() > 0
+    if grouped:
+        unit = groups
+        number = min(number, int(unit.max()) + 1)
+    elif group is not None:
+        notes.append("all presses are of one group: folds are stretches of time.")
+    same = np.unique(np.nan_to_num(frames), axis=0, return_inverse=True)[1].ravel()
+    copies = count - same.max() - 1
+    if copies:
+        notes.append(f"{copies} frames are copies of others: kept in one fold with them.")
+        unit = _joined(unit, same)
+    stretches = number
+    fold = _dealt(unit, rank, number, stretches)
+    while not grouped and stretches < count / 4 and not _covered(fold, alike, kinds):
+        stretches *= 2
+        fold = _dealt(unit, rank, number, stretches)
+    if stretches > number:
+        notes.append(
+            f"places or kinds were pressed one after the other: held out in {stretches} short stretches of time."
+        )
+    return fold, tuple(notes)
+
+
+def _dealt(unit: np.ndarray, rank: np.ndarray, number: int, stretches: int) -> Int[np.ndarray, " N"]:
+    """Folds of units of presses: stretches of their order, dealt out in turn."""
+    sizes = np.bincount(unit)
+    by_time = np.argsort(np.bincount(unit, rank) / sizes, kind="stable")
+    middles = np.cumsum(sizes[by_time]) - sizes[by_time] / 2
+    fold = np.empty(len(sizes), int)
+    fold[by_time] = np.minimum((middles * stretches / len(unit)).astype(int), stretches - 1) % number
+    return np.unique(fold, return_inverse=True)[1][unit]
+
+
+def _covered(fold: np.ndarray, alike: np.ndarray | None, kinds: np.ndarray | None) -> bool:
+    """Whether what is held out is like what is not."""
+    if kinds is not None:
+        return all(set(kinds[fold == one]) <= set(kinds[fold != one]) for one in np.unique(fold))
+    if alike is None:
+        return True
+    dealt = np.random.default_rng(0).permutation(fold)
+    return _farthest(alike, fold) <= _FARTHER * _farthest(alike, dealt)
+
+
+def _farthest(alike: np.ndarray, fold: np.ndarray) -> float:
+    """Mean distance of what is held out from what is not, of the fold where it is greatest."""
+    unit = alike.std(axis=0).max() or 1.0
+    return max(KDTree(alike[fold != one]).query(alike[fold == one])[0].mean() + 1e-3 * unit for one in np.unique(fold))
+
+
+def _joined(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Numbers of the sets that hang together, where two are one if they share either number."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    first = one.max() + 1
+    size = first + other.max() + 1
+    graph = coo_array((np.ones(len(one)), (one, first + other)), shape=(size, size))
+    return np.unique(connected_components(graph, directed=False)[1][one], return_inverse=True)[1]

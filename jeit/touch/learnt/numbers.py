@@ -1,0 +1,141 @@
+"""Numbers learnt from frames, places or forces: the method that errs least on presses held out, and by how much."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.touch.learnt.features import Features, forms_for
+from jeit.touch.learnt.regressors import QUICK, REGRESSORS
+from jeit.touch.learnt.spread import Spread
+
+BLEND = "blend"
+METHODS = ("auto", *REGRESSORS, BLEND)
+# Methods that are blended at most, and by how much better a blend must be than the best alone.
+_BLENDED, _BETTER = 3, 0.98
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A `method` on a `form` of the features, and what it said of presses that were held out (N, d)."""
+
+    method: str
+    form: str
+    held_out: Float[np.ndarray, "N d"]
+    error: float
+
+
+@dataclass(frozen=True)
+class LearntNumbers:
+    """`members`, each features and a model whose means are the answer, standardised: targets are `mean` + `scale` ×
+    that; `spread` says how far off it is."""
+
+    members: list[tuple[Features, Any]]
+    mean: Float[np.ndarray, " d"]
+    scale: float
+    spread: Spread
+
+    def predict(self, changes, reference) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+        """Numbers (n, d) and their standard deviations (n, d)."""
+        said = 0.0
+        for features, model in self.members:
+            said = said + np.asarray(model.predict(features(changes, reference))).reshape(len(changes), -1)
+        values = self.mean + self.scale * said / len(self.members)
+        return values, self.spread(values, changes)
+
+
+def learn_numbers(
+    changes: Float[np.ndarray, "N m"],
+    reference: Float[np.ndarray, "N m"] | None,
+    targets: Float[np.ndarray, "N d"],
+    folds: np.ndarray,
+    *,
+    method: str = "auto",
+    progress: Callable[[str], None] = lambda said: None,
+) -> tuple[LearntNumbers, list[Tried]]:
+    """Learn `targets` (N, d) from changes (N, m) and their reference, by `method`, or the best of all.
+
+    Of every method tried, in order of its mean error on `folds` (N,) held out: what it said. Quick methods are tried on
+    all forms of the features, the others on the two forms that suited those best.
+    """
+    has_reference = reference is not None
+    reference = np.zeros_like(changes) if reference is None else reference
+    forms = forms_for(has_reference)
+    cut = _Cut(changes, reference, targets, folds)
+    tried = []
+    for form in forms:
+        for quick in QUICK:
+            progress(f"{quick} on {form}")
+            tried.append(cut.hold_out(quick, form))
+    best = list(dict.fromkeys(one.form for one in sorted(tried, key=_error)))[:2]
+    wanted = [one for one in REGRESSORS if one not in QUICK and method in ("auto", BLEND, one)]
+    for name in wanted:
+        for form in best if name == "gaussian-process" else best[:1]:
+            progress(f"{name} on {form}")
+            tried.append(cut.hold_out(name, form))
+    tried.sort(key=_error)
+    if method not in ("auto", BLEND):
+        tried = [one for one in tried if one.method == method]
+    chosen = _chosen(tried, targets, blend=method == BLEND) if method in ("auto", BLEND) else tried[:1]
+    said = np.mean([one.held_out for one in chosen], axis=0)
+    if len(chosen) > 1:
+        tried.insert(
+            0, Tried(BLEND, " + ".join(f"{one.method} on {one.form}" for one in chosen), said, _off(said, targets))
+        )
+    members = []
+    for one in chosen:
+        progress(f"{one.method}, all presses")
+        features = Features.learn(one.form, changes, reference)
+        model = REGRESSORS[one.method](features(changes, reference), (targets - cut.mean) / cut.scale)
+        members.append((features, model))
+    ends = (folds == 0) | (folds == folds.max())
+    spread = Spread.learn(said, changes, said - targets, ends)
+    return LearntNumbers(members, cut.mean, cut.scale, spread), tried
+
+
+def _chosen(tried: list[Tried], targets: np.ndarray, *, blend: bool) -> list[Tried]:
+    """The best alone, or the best of each method together where that is better, or asked for."""
+    own = list({one.method: one for one in reversed(tried)}.values())
+    own = sorted(own, key=_error)[:_BLENDED]
+    together = [own[:number] for number in range(2, len(own) + 1)]
+    best = min(together, key=lambda some: _off(np.mean([one.held_out for one in some], axis=0), targets))
+    error = _off(np.mean([one.held_out for one in best], axis=0), targets)
+    return best if blend or error < _BETTER * own[0].error else own[:1]
+
+
+def _error(one: Tried) -> float:
+    return one.error
+
+
+def _off(said: np.ndarray, targets: np.ndarray) -> float:
+    """Mean distance."""
+    return float(np.linalg.norm(said - targets, axis=1).mean())
+
+
+class _Cut:
+    """Presses cut into folds, with the features of each form once for all methods."""
+
+    def __init__(self, changes, reference, targets, folds):
+        self.changes, self.reference, self.targets, self.folds = changes, reference, targets, folds
+        self.mean = targets.mean(axis=0)
+        self.scale = float(np.sqrt(np.mean((targets - self.mean) ** 2)))
+        self.features = {}
+
+    def hold_out(self, method: str, form: str) -> Tried:
+        said = np.empty_like(self.targets)
+        for fold in range(self.folds.max() + 1):
+            out = self.folds == fold
+            learnt, asked = self._scores(form, fold, out)
+            model = REGRESSORS[method](learnt, (self.targets[~out] - self.mean) / self.scale)
+            said[out] = self.mean + self.scale * np.asarray(model.predict(asked)).reshape(int(out.sum()), -1)
+        return Tried(method, form, said, _off(said, self.targets))
+
+    def _scores(self, form: str, fold: int, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if (form, fold) not in self.features:
+            features = Features.learn(form, self.changes[~out], self.reference[~out])
+            self.features[form, fold] = tuple(
+                features(self.changes[some], self.reference[some]) for some in (~out, out)
+            )
+        return self.features[form, fold]

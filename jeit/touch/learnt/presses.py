@@ -1,0 +1,230 @@
+"""Recorded presses: frames of a skin, and what touched it in each; checked, and read from NPZ files."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jeit.touch.learnt.npz import npz_arrays
+
+# No skin is known that is longer: its coordinates would be in millimetres.
+_LONGEST = 5.0  # m
+# No press is harder: forces would be in grams or millinewtons.
+_HARDEST = 2000.0  # N
+_FEWEST = 10
+# Labels and positions of a frame of an untouched skin.
+NO_TOUCH = "none"
+_NO_TOUCH = ("none", "no touch", "no-touch", "no_touch", "notouch")
+_ROWS = ("positions", "force", "label", "touched", "group", "time")
+
+
+@dataclass(frozen=True)
+class Presses:
+    """N presses on a skin of M channels; what is None was not recorded. Make them with `Presses.create`.
+
+    **Fields**
+
+    - `frames`: (N, M), in any unit; NaN where there is no reading.
+    - `reference`: (N, M), the untouched skin's frame that goes with each, None if frames are changes already.
+    - `positions`: (N, 2 or 3) metres, NaN where nothing touched; `force`: (N,) N; `label`: (N,) text, "none" where
+      nothing touched; `touched`: (N, K), which of K keys were pressed.
+    - `group`: (N,), the session or person of each: cross-validation never splits one; `time`: (N,) s.
+    - `name`, for errors and reports; `notes`: what was mended.
+    """
+
+    frames: Float[np.ndarray, "N M"]
+    reference: Float[np.ndarray, "N M"] | None = None
+    positions: Float[np.ndarray, "N d"] | None = None
+    force: Float[np.ndarray, " N"] | None = None
+    label: np.ndarray | None = None
+    touched: Bool[np.ndarray, "N K"] | None = None
+    group: np.ndarray | None = None
+    time: Float[np.ndarray, " N"] | None = None
+    name: str = "presses"
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def create(
+        cls,
+        frames,
+        *,
+        reference=None,
+        positions=None,
+        force=None,
+        label=None,
+        touched=None,
+        group=None,
+        time=None,
+        name: str = "presses",
+    ) -> "Presses":
+        """Check what was recorded; shapes and units as of the fields, `reference` also (M,) for all.
+
+        Raises `ValueError` for shapes that disagree, fewer than ten presses, positions in millimetres, nothing to
+        learn, and values that cannot be.
+        """
+        frames = check_frames("frames", frames)
+        if len(frames) < _FEWEST:
+            raise ValueError(
+                f"frames: {len(frames)} presses are too few to learn from and to tell how well; give {_FEWEST} or more."
+            )
+        given = {
+            "positions": None if positions is None else _check_positions(positions),
+            "force": None if force is None else _check_force(force),
+            "label": None if label is None else _check_label(label),
+            "touched": None if touched is None else _check_touched(touched),
+            "group": None if group is None else _one_dimensional("group", group),
+            "time": None if time is None else _check_time(time),
+        }
+        for key, values in given.items():
+            if values is not None and len(values) != len(frames):
+                raise ValueError(f"{key} has {len(values)} rows and frames {len(frames)}; give one for each press.")
+        if all(given[key] is None for key in ("positions", "force", "label", "touched")):
+            raise ValueError("frames: there is nothing to learn from them; give positions, force, label or touched.")
+        reference = None if reference is None else check_reference(reference, frames)
+        return replace(cls(frames, reference, name=name), **given)
+
+    def rows(self, index) -> "Presses":
+        """The presses with these numbers, or of a slice."""
+        kept = {key: getattr(self, key) for key in ("frames", "reference", *_ROWS)}
+        return replace(self, **{key: None if values is None else values[index] for key, values in kept.items()})
+
+
+def read_presses(path: str | Path) -> Presses:
+    """Presses of an NPZ file with arrays named as the fields of `Presses`: `frames`, and any of the others.
+
+    Raises `FileNotFoundError`, and `ValueError` for what is no such file and as of `Presses.create`.
+    """
+    arrays = npz_arrays(path, ("frames", "reference", *_ROWS), ("frames",))
+    try:
+        return Presses.create(**arrays, name=Path(path).name)
+    except ValueError as error:
+        raise ValueError(f"'{path}': {error}") from None
+
+
+def read_frames(path: str | Path) -> dict[str, np.ndarray]:
+    """What `LearntSkin.predict` takes, of an NPZ file: `frames`, and `reference` and `group` if it has them.
+
+    Raises `FileNotFoundError`, and `ValueError` for what is no such file.
+    """
+    arrays = npz_arrays(path, ("frames", "reference", "group"), ("frames",))
+    try:
+        return arrays | {"frames": check_frames("frames", arrays["frames"])}
+    except ValueError as error:
+        raise ValueError(f"'{path}': {error}") from None
+
+
+def check_frames(name: str, given) -> Float[np.ndarray, "N M"]:
+    """Frames (N, M) as numbers, infinite ones as NaN; raises `ValueError` for anything else."""
+    try:
+        frames = np.asarray(given)
+    except ValueError:
+        raise ValueError(f"{name}: rows differ in length; give one array (frames, channels).") from None
+    if frames.dtype.kind not in "fiu" or frames.ndim != 2 or not frames.shape[1]:
+        raise ValueError(
+            f"{name} is {frames.dtype} of shape {frames.shape}; give real numbers, (frames, channels), one row for "
+            "each frame."
+        )
+    frames = frames.astype(float)
+    return np.where(np.isfinite(frames), frames, np.nan)
+
+
+def check_reference(given, frames) -> Float[np.ndarray, "N M"]:
+    """A reference (N, M) for each of the `frames`; raises `ValueError` for other shapes, and where it is not finite."""
+    reference = np.asarray(given)
+    if reference.dtype.kind not in "fiu" or reference.shape not in (frames.shape, frames.shape[1:]):
+        raise ValueError(
+            f"reference is {reference.dtype} of shape {reference.shape}; give ({frames.shape[1]},) for all frames, or "
+            f"{frames.shape}, one for each."
+        )
+    reference = np.broadcast_to(reference.astype(float), frames.shape)
+    return np.where(np.isfinite(reference), reference, np.nan)
+
+
+def _check_positions(given) -> np.ndarray:
+    positions = np.asarray(given)
+    if positions.dtype.kind not in "fiu" or positions.ndim != 2 or positions.shape[1] not in (2, 3):
+        raise ValueError(f"positions has shape {positions.shape}; give (presses, 2) or (presses, 3), in metres.")
+    positions = positions.astype(float)
+    bad = np.isinf(positions).any(axis=1) | (np.isnan(positions).any(axis=1) & ~np.isnan(positions).all(axis=1))
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise ValueError(
+            f"positions: row {row} is {positions[row].tolist()}; give numbers, or NaN throughout where nothing touched."
+        )
+    there = positions[~np.isnan(positions).any(axis=1)]
+    if len(there) < _FEWEST:
+        raise ValueError(f"positions: {len(there)} presses have one; give {_FEWEST} or more, or leave positions out.")
+    extent = np.ptp(there, axis=0).max()
+    if extent > _LONGEST:
+        raise ValueError(
+            f"positions spread over {extent:.4g}: are these metres? Divide millimetres by 1000; no side may be longer "
+            f"than {_LONGEST:g} m."
+        )
+    if extent == 0:
+        raise ValueError("positions are all the same: there is nothing to tell apart.")
+    return positions
+
+
+def _check_force(given) -> np.ndarray:
+    force = _one_dimensional("force", given)
+    if force.dtype.kind not in "fiu" or not np.isfinite(force).all():
+        raise ValueError("force must be finite numbers, in newtons; 0 where nothing touched.")
+    if np.abs(force).max() > _HARDEST:
+        raise ValueError(f"force is up to {np.abs(force).max():.4g}: are these newtons? 100 g weigh 0.981 N.")
+    if np.ptp(force) == 0:
+        raise ValueError("force is the same in all presses: there is nothing to tell apart.")
+    return force.astype(float)
+
+
+def _check_label(given) -> np.ndarray:
+    label = np.asarray(given)
+    if label.dtype.kind == "O":
+        kinds = sorted({type(one).__name__ for one in label.ravel()})
+        if kinds != ["str"]:
+            raise ValueError(f"label mixes {' and '.join(kinds)}; give text throughout.")
+        label = label.astype(str)
+    label = _one_dimensional("label", label)
+    if label.dtype.kind not in "Uiub":
+        raise ValueError(f"label is {label.dtype}; give text, or whole numbers.")
+    label = label.astype(str)
+    if any(not one.strip() for one in label):
+        raise ValueError("label: some are empty; give every press one, and 'none' where nothing touched.")
+    label = np.array([NO_TOUCH if one.strip().lower() in _NO_TOUCH else one.strip() for one in label])
+    kinds, counts = np.unique(label, return_counts=True)
+    if len(kinds) < 2:
+        raise ValueError(f"label: all presses are '{kinds[0]}'; give two kinds or more, or leave label out.")
+    if counts.min() < 2:
+        rare = kinds[counts.argmin()]
+        raise ValueError(f"label: there is only one press '{rare}'; give two or more of each kind, better twenty.")
+    return label
+
+
+def _check_touched(given) -> np.ndarray:
+    touched = np.asarray(given)
+    if touched.ndim != 2 or touched.dtype.kind not in "biuf" or not np.isin(touched, (0, 1)).all():
+        raise ValueError(
+            f"touched is {touched.dtype} of shape {touched.shape}; give (presses, keys), true where a key was pressed."
+        )
+    touched = touched.astype(bool)
+    fixed = np.flatnonzero(touched.all(axis=0) | ~touched.any(axis=0))
+    if fixed.size:
+        raise ValueError(f"touched: key {fixed[0]} is the same in all presses; leave its column out.")
+    return touched
+
+
+def _check_time(given) -> np.ndarray:
+    time = _one_dimensional("time", given)
+    if time.dtype.kind not in "fiu" or not np.isfinite(time).all():
+        raise ValueError("time must be finite numbers, in seconds.")
+    return time.astype(float)
+
+
+def _one_dimensional(name: str, given: Sequence | np.ndarray) -> np.ndarray:
+    values = np.asarray(given)
+    if values.ndim == 2 and 1 in values.shape:
+        values = values.ravel()
+    if values.ndim != 1 or values.dtype.kind == "O":
+        raise ValueError(f"{name} is {values.dtype} of shape {values.shape}; give one plain value for each press.")
+    return values

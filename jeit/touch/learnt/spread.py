@@ -1,0 +1,70 @@
+"""Standard deviations of what is learnt: errors of presses held out that were like it, made to hold as they say."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import KDTree
+
+_LIKE, _SHARES = 40, ((1.0, 0.6827), (1.96, 0.95))
+# Of the weight of a frame's size beside its place, and of the mean of all errors beside those alike.
+_SIZE, _ALL = 0.3, 0.15
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Squared errors (N, d) of presses held out, at `where` (N, d + 1) they lay; `unit` (d + 1,) of those."""
+
+    where: Float[np.ndarray, "N e"]
+    squares: Float[np.ndarray, "N d"]
+    low: Float[np.ndarray, " e"]
+    unit: Float[np.ndarray, " e"]
+    factor: Float[np.ndarray, " d"]
+
+    @classmethod
+    def learn(cls, said: np.ndarray, changes: np.ndarray, errors: np.ndarray, last: np.ndarray) -> "Spread":
+        """From what was said (N, d) of presses held out, their changes (N, m), and how far off it was (N, d).
+
+        `last` (N,): which came before or after all others when they were held out, as presses to come do: deviations
+        are made to hold for those.
+        """
+        where = np.column_stack([said, _size(changes)])
+        low, unit = where.mean(axis=0), where.std(axis=0)
+        unit = np.where(unit > 0, unit, 1.0)
+        unit[-1] /= _SIZE
+        most = np.quantile(np.abs(errors), 0.99, axis=0)  # one that is far off says little of its neighbours
+        squares = np.minimum(np.abs(errors), most) ** 2
+        found = cls((where - low) / unit, squares, low, unit, np.ones(errors.shape[1]))
+        local = found._local(found.where, own=True)
+        factor = [_factor(np.abs(error) / one) for error, one in zip(errors[last].T, local[last].T, strict=True)]
+        return cls(found.where, squares, low, unit, np.array(factor))
+
+    def __call__(self, said: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "n d"]:
+        """Standard deviations (n, d) of what is said (n, d) of frames with these changes."""
+        where = (np.column_stack([said, _size(changes)]) - self.low) / self.unit
+        return self.factor * self._local(where)
+
+    def held_out(self, said: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "N d"]:
+        """The same of the presses that it was learnt from, each without its own error."""
+        where = (np.column_stack([said, _size(changes)]) - self.low) / self.unit
+        return self.factor * self._local(where, own=True)
+
+    def _local(self, where: np.ndarray, *, own: bool = False) -> np.ndarray:
+        number = min(_LIKE, len(self.where) - 1)
+        near = np.asarray(KDTree(self.where).query(where, number + own)[1])[:, int(own) :]
+        like = self.squares[near].mean(axis=1)
+        everywhere = self.squares.mean(axis=0)
+        return np.sqrt((1 - _ALL) * like + _ALL * everywhere + 1e-300)
+
+
+def _size(changes: np.ndarray) -> np.ndarray:
+    return np.log(np.sqrt(np.mean(changes**2, axis=1)) + 1e-300)
+
+
+def _factor(ratios: np.ndarray) -> float:
+    """By what to multiply so that one deviation and 1.96 hold as nearly as can be in their share of presses."""
+    candidates = np.geomspace(0.2, 5, 200)
+    missed = [
+        max(abs(np.mean(ratios <= times * candidate) - share) for times, share in _SHARES) for candidate in candidates
+    ]
+    return float(candidates[int(np.argmin(missed))])

@@ -1,0 +1,86 @@
+"""`jeit touch`: presses to a learnt skin, frames to touches, and what is said of files that cannot be."""
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "touch" / "learnt"))
+from made_skins import record
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("touch")
+    recorded = record(80)
+    label = np.where(recorded["positions"][:, 0] > 0, "right", "left")
+    np.savez(folder / "presses.npz", **recorded, label=label)
+    np.savez(folder / "places.npz", **{key: recorded[key] for key in ("frames", "reference", "positions")})
+    fresh = record(40, seed=1)
+    frames = fresh["frames"].copy()
+    frames[3] = 7.0
+    np.savez(folder / "frames.npz", frames=frames, reference=fresh["reference"])
+    np.savez(folder / "bare.npz", frames=frames)
+    np.savez(folder / "fewer.npz", frames=frames[:, :9], reference=fresh["reference"][:, :9])
+    np.savez(folder / "millimetres.npz", frames=recorded["frames"], positions=1e3 * recorded["positions"])
+    return folder, fresh
+
+
+def test_from_presses_to_touches(files, run):
+    folder, fresh = files
+    status, output, error = run(
+        "touch", "fit", folder / "presses.npz", "--output", folder / "skin", "--method", "neighbours"
+    )
+    assert (status, error) == (0, "")
+    assert "off on average" in output
+    assert "% right" in output
+    assert (folder / "skin" / "learning.png").read_bytes().startswith(b"\x89PNG")
+    report = json.loads((folder / "skin" / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
+    assert set(report["held_out"]) == {"place", "force", "label"}
+    assert report["held_out"]["place"]["method"].startswith("neighbours")
+    assert report["held_out"]["place"]["mean_error_m"] < 0.02
+    assert abs(report["held_out"]["place"]["share_within_one_standard_deviation"] - 0.68) < 0.15
+    status, output, error = run("touch", "predict", folder / "skin", folder / "frames.npz", "--output", folder / "out")
+    assert (status, error) == (0, "")
+    assert "1 unlike any learnt from" in output
+    rows = list(csv.DictReader((folder / "out" / "touches.csv").read_text("utf-8").splitlines()))
+    assert list(rows[0]) == [
+        *("frame", "x_m", "y_m", "std_x_m", "std_y_m", "force_N", "std_force_N", "label", "probability", "unlike")
+    ]
+    assert len(rows) == 40
+    assert (rows[3]["x_m"], rows[3]["label"], rows[3]["unlike"]) == ("", "", "1")
+    places = np.array([[float(row["x_m"]), float(row["y_m"])] for row in rows if row["x_m"]])
+    right = np.delete(fresh["positions"], 3, axis=0)
+    assert np.linalg.norm(places - right, axis=1).mean() < 0.015
+    assert (folder / "out" / "touches.png").read_bytes().startswith(b"\x89PNG")
+    report = json.loads((folder / "out" / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
+    assert report["unlike"] == [3]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("fit", "millimetres.npz"), "are these metres"),
+        (("fit", "none.npz"), "there is no such file"),
+        (("fit", "frames.npz"), "nothing to learn from"),
+        (("fit", "places.npz", "--method", "magic"), "--method"),
+        (("fit", "places.npz", "--channels", "99"), "--channels must be from 2 to 40"),
+        (("fit", "places.npz", "--per-session"), "--per-session: presses have no group"),
+        (("predict", "frames.npz", "frames.npz"), "not a learnt skin that can be read"),
+        (("predict", "nowhere", "frames.npz"), "there is no such file"),
+        (("predict", "skin", "bare.npz"), "reference is missing"),
+        (("predict", "skin", "fewer.npz"), "frames have 9 channels, and the skin that was learnt has 40"),
+    ],
+)
+def test_what_cannot_be_is_said(files, run, tmp_path, words, said):
+    folder, _ = files
+    if words[1] == "skin" and not (folder / "skin").exists():
+        run("touch", "fit", folder / "places.npz", "--output", folder / "skin", "--method", "ridge", "--quiet")
+    words = [folder / word if word.endswith(".npz") or word in ("skin", "nowhere") else word for word in words]
+    status, _, error = run("touch", *words, "--output", tmp_path / "out")
+    assert status == 1
+    assert said in error
+    assert error.count("\n") == 1

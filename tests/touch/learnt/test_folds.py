@@ -1,0 +1,48 @@
+"""Folds of cross-validation: stretches of time, nothing that belongs together split."""
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from jeit.touch.learnt.folds import time_folds
+
+RNG = np.random.default_rng(0)
+FRAMES = RNG.normal(size=(60, 4))
+
+
+def test_they_are_stretches_of_time():
+    folds, notes = time_folds(FRAMES, alike=RNG.normal(size=(60, 2)))
+    np.testing.assert_array_equal(folds, np.repeat(np.arange(5), 12))
+    assert notes == ()
+    time = RNG.permutation(60).astype(float)
+    np.testing.assert_array_equal(time_folds(FRAMES, None, time)[0][np.argsort(time)], np.repeat(np.arange(5), 12))
+
+
+def test_groups_are_not_split():
+    group = RNG.permutation(np.repeat(["a", "b", "c"], 20))
+    folds, _ = time_folds(FRAMES, group)
+    assert all(len(set(folds[group == one])) == 1 for one in "abc")
+    assert len(set(folds)) == 3
+    assert "one group" in time_folds(FRAMES, np.repeat("a", 60))[1][0]
+
+
+def test_copies_are_not_split():
+    copied = FRAMES.copy()
+    copied[[30, 59]] = copied[0]
+    folds, notes = time_folds(copied)
+    assert len({folds[0], folds[30], folds[59]}) == 1
+    assert "2 frames are copies" in notes[0]
+
+
+def test_places_pressed_one_after_the_other_are_in_all_folds():
+    """A raster pressed line by line: held out by stretches, whole parts of the skin would be."""
+    places = np.stack(np.meshgrid(np.arange(20.0), np.arange(15.0), indexing="ij"), axis=-1).reshape(-1, 2)
+    folds, notes = time_folds(RNG.normal(size=(300, 4)), alike=places)
+    apart = [KDTree(places[folds != one]).query(places[folds == one])[0].mean() for one in range(5)]
+    assert max(apart) < 1.6  # where stretches of four lines would be 2.5 lines away on average
+    assert "short stretches" in notes[0]
+
+
+def test_kinds_pressed_one_after_the_other_are_in_all_folds():
+    kinds = np.repeat(np.arange(4), 15)
+    folds, _ = time_folds(FRAMES, kinds=kinds)
+    assert all(set(kinds[folds != one]) == {0, 1, 2, 3} for one in range(5))

@@ -1,0 +1,176 @@
+"""A skin that has learnt: how far off it is, how sure it says it is, and what it does where it cannot know."""
+
+import numpy as np
+import pytest
+from made_skins import CHANNELS, off, record
+
+from jeit.touch import LearntSkin, Presses
+
+FRESH = record(120, seed=1)
+ASK = {key: FRESH[key] for key in ("frames", "reference")}
+
+
+def test_places_and_forces_of_fresh_presses(skin):
+    told = skin.predict(**ASK)
+    assert off(told, FRESH["positions"]).mean() < 4e-3
+    assert np.abs(told.force - FRESH["force"]).mean() < 0.25
+    assert not told.unlike.any()
+    assert told.alive.mean() > 0.999
+
+
+def test_the_best_method_is_taken(skin):
+    """Better than lines by far, where nothing is linear."""
+    place = skin.standing["place"]
+    errors = dict(place.tried)
+    assert place.method == min(errors, key=errors.get)
+    assert errors[place.method] < 0.5 * errors["ridge on differences"]
+    assert place.held_out.shape == (200, 2)
+
+
+def test_deviations_hold_as_often_as_they_say(skin):
+    many = record(600, seed=2)
+    told = skin.predict(many["frames"], many["reference"])
+    ratio = np.abs(told.position - many["positions"]) / told.position_std
+    assert abs(np.mean(ratio < 1) - 0.683) < 0.1
+    assert abs(np.mean(ratio < 1.96) - 0.95) < 0.05
+
+
+def test_frames_one_by_one_are_as_together(skin):
+    together = skin.predict(**ASK)
+    alone = skin.predict(FRESH["frames"][7], FRESH["reference"][7])
+    np.testing.assert_allclose(alone.position[0], together.position[7], rtol=1e-9)
+    np.testing.assert_allclose(alone.position_std[0], together.position_std[7], rtol=1e-9)
+
+
+@pytest.mark.parametrize("reading", [0.0, np.nan, 5.0])
+def test_a_channel_that_dies_costs_little(quick, reading):
+    sound = off(quick.predict(**ASK), FRESH["positions"]).mean()
+    for channel in (3, 17, 30):
+        frames = FRESH["frames"].copy()
+        frames[:, channel] = reading
+        told = quick.predict(frames, FRESH["reference"])
+        assert off(told, FRESH["positions"]).mean() < 2 * sound
+        assert not told.alive[:, channel].any() or np.isfinite(reading)
+        assert any(f" {channel}" in note for note in told.notes)
+
+
+def test_frames_unlike_any_are_said_to_be(quick):
+    frames = FRESH["frames"].copy()
+    frames[:5] = np.random.default_rng(0).normal(size=(5, CHANNELS))
+    told = quick.predict(frames, FRESH["reference"])
+    np.testing.assert_array_equal(np.flatnonzero(told.unlike), range(5))
+    assert np.isnan(told.position[:5]).all()
+    assert np.isnan(told.force[:5]).all()
+    assert "5 of 120 frames are unlike" in told.notes[-1]
+
+
+def test_untouched_frames_are_at_no_place():
+    recorded = record(200, untouched=40, noise=0.002)
+    skin = LearntSkin.fit(Presses.create(**recorded), method="neighbours")
+    fresh = record(100, seed=3, untouched=30, noise=0.002)
+    told = skin.predict(fresh["frames"], fresh["reference"])
+    still = np.isnan(told.position).any(axis=1)
+    assert still[70:].mean() > 0.9
+    assert still[:70].mean() < 0.1
+    assert (told.force[still] == 0).all()
+
+
+def test_places_where_a_press_was_recorded_late():
+    recorded = record(200)
+    late = {key: recorded[key][:-1] for key in ("frames", "reference")}
+    skin = LearntSkin.fit(Presses.create(**late, positions=recorded["positions"][1:]), method="neighbours")
+    assert skin.lag == 1
+    assert "frames seem to be of the press 1 row before" in skin.notes[0]
+    assert off(skin.predict(**ASK), FRESH["positions"]).mean() < 8e-3
+
+
+def test_few_channels(recorded):
+    skin = LearntSkin.fit(Presses.create(**recorded), method="neighbours", num_channels=12)
+    assert skin.channels.used.sum() == 12
+    assert "12 of 40 channels are used" in skin.notes[0]
+    assert off(skin.predict(**ASK), FRESH["positions"]).mean() < 0.012
+
+
+def test_labels_and_no_touch():
+    recorded = record(240, untouched=60, noise=0.003)
+    x = recorded["positions"][:, 0]
+    label = np.where(np.isnan(x), "none", np.where(x > 0, "right", "left"))
+    skin = LearntSkin.fit(Presses.create(recorded["frames"], reference=recorded["reference"], label=label))
+    fresh = record(200, seed=4, untouched=50, noise=0.003)
+    told = skin.predict(fresh["frames"], fresh["reference"])
+    x = fresh["positions"][:, 0]
+    right = np.where(np.isnan(x), "none", np.where(x > 0, "right", "left"))
+    assert np.mean(told.label == right) > 0.93
+    assert abs(told.probability.mean() - np.mean(told.label == right)) < 0.06
+    assert len(skin.standing["label"].tried) >= 9
+
+
+def test_keys_pressed_together():
+    """Six keys, each with a pattern of its own, that saturate together."""
+    rng = np.random.default_rng(0)
+    patterns = rng.normal(size=(6, CHANNELS))
+
+    def press(number, seed):
+        rng = np.random.default_rng(seed)
+        touched = rng.random((number, 6)) < 0.5
+        return np.tanh(touched @ patterns / 3) + 0.08 * rng.normal(size=(number, CHANNELS)), touched
+
+    frames, touched = press(250, 1)
+    skin = LearntSkin.fit(Presses.create(frames, touched=touched))
+    fresh, right = press(300, 2)
+    told = skin.predict(fresh)
+    assert np.mean(told.touched == right) > 0.97
+    assert np.mean((told.touched == right).all(axis=1)) > 0.85
+    assert np.mean((told.key_probability > 0.5) == told.touched) == 1
+
+
+def test_sessions_that_drift_are_standardised():
+    parts = [record(100, seed=seed) for seed in range(3)]
+    drift = 0.1 * np.random.default_rng(1).normal(size=(4, CHANNELS))
+    changes = [one["frames"] - one["reference"] + own for own, one in zip(drift, parts, strict=False)]
+    group = np.repeat(["mon", "tue", "wed"], 100)
+    presses = Presses.create(
+        np.concatenate(changes), positions=np.concatenate([one["positions"] for one in parts]), group=group
+    )
+    fresh = record(100, seed=8)
+    asked = fresh["frames"] - fresh["reference"] + drift[3]
+    with_it, without = (
+        off(LearntSkin.fit(presses, method="neighbours", per_session=one).predict(asked), fresh["positions"])
+        for one in (True, False)
+    )
+    assert np.nanmean(with_it) < 0.8 * np.nanmean(without)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda skin: skin.predict(FRESH["frames"][:, :30], FRESH["reference"][:, :30]), "frames have 30 channels"),
+        (lambda skin: skin.predict(FRESH["frames"]), "reference is missing"),
+        (lambda skin: skin.predict(FRESH["frames"], FRESH["reference"][0, ::-1] ** 3), "unlike those that were learnt"),
+        (lambda skin: skin.predict(FRESH["frames"], 1e3 * FRESH["reference"]), "1e\\+03 times as large"),
+        (lambda skin: skin.predict("frames"), "give real numbers"),
+        (lambda skin: LearntSkin.fit(FRESH), "presses must be Presses"),
+        (lambda skin: LearntSkin.fit(Presses.create(**FRESH), method="magic"), "method"),
+        (lambda skin: LearntSkin.fit(Presses.create(**FRESH), method="linear-svm"), "the presses have none"),
+        (lambda skin: LearntSkin.fit(Presses.create(**FRESH), num_channels=1), "num_channels must be from 2 to 40"),
+        (lambda skin: LearntSkin.fit(Presses.create(**FRESH), per_session=True), "no group"),
+        (lambda skin: LearntSkin.fit(Presses.create(0 * FRESH["frames"], force=FRESH["force"])), "no channel changes"),
+    ],
+)
+def test_what_cannot_be_is_refused(quick, call, said):
+    with pytest.raises(ValueError, match=said):
+        call(quick)
+
+
+def test_presses_without_most_readings_are_left_out():
+    recorded = record(60)
+    frames = recorded["frames"].copy()
+    frames[:4, ::2] = np.nan
+    frames[:, 5] = np.nan
+    skin = LearntSkin.fit(Presses.create(**{**recorded, "frames": frames}), method="ridge")
+    assert "1 channels have no reading at all: 5." in skin.notes
+    assert any("4 presses lack more than a third" in note for note in skin.notes)
+    frames[:, ::2] = np.nan
+    frames[:55] = np.nan
+    with pytest.raises(ValueError, match="have readings of two thirds"):
+        LearntSkin.fit(Presses.create(**{**recorded, "frames": frames}))

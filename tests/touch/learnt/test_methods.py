@@ -1,0 +1,104 @@
+"""Methods: those told for one frame in microseconds are scikit-learn's, to rounding; and all learn."""
+
+import numpy as np
+import pytest
+
+from jeit.touch.learnt.classifiers import CLASSIFIERS, log_odds, probabilities, sharpness_of
+from jeit.touch.learnt.gaussian_process import GaussianProcess, _tuned
+from jeit.touch.learnt.nearest import Nearest
+from jeit.touch.learnt.regressors import REGRESSORS
+
+RNG = np.random.default_rng(0)
+FEATURES = RNG.normal(size=(220, 6)) * np.linspace(2, 0.5, 6)
+TARGETS = np.stack([np.tanh(FEATURES[:, 0]), np.sin(FEATURES[:, 1])], axis=1) + 0.03 * RNG.normal(size=(220, 2))
+LABEL = (FEATURES[:, 0] > 0) + 2 * (FEATURES[:, 1] > 0)
+ASKED = RNG.normal(size=(50, 6)) * np.linspace(2, 0.5, 6)
+
+
+@pytest.mark.parametrize("name", sorted(REGRESSORS))
+def test_numbers_are_learnt(name):
+    said = np.asarray(REGRESSORS[name](FEATURES, TARGETS).predict(ASKED))
+    right = np.stack([np.tanh(ASKED[:, 0]), np.sin(ASKED[:, 1])], axis=1)
+    guess = np.abs(right - right.mean(axis=0)).mean()
+    assert np.abs(said - right).mean() < (0.75 if name == "ridge" else 0.55) * guess
+
+
+@pytest.mark.parametrize("name", sorted(CLASSIFIERS))
+def test_labels_are_learnt(name):
+    model = CLASSIFIERS[name](FEATURES, LABEL)
+    odds = log_odds(model, ASKED)
+    right = (ASKED[:, 0] > 0) + 2 * (ASKED[:, 1] > 0)
+    assert odds.shape == (50, 4)
+    assert np.mean(odds.argmax(axis=1) == right) > 0.75
+    np.testing.assert_allclose(probabilities(odds, 2.0).sum(axis=1), 1)
+
+
+@pytest.mark.parametrize("name", sorted(CLASSIFIERS))
+def test_two_kinds_are_learnt(name):
+    label = (FEATURES[:, 0] > 0).astype(int)
+    odds = log_odds(CLASSIFIERS[name](FEATURES, label), FEATURES)
+    assert odds.shape == (220, 2)
+    assert np.mean(odds.argmax(axis=1) == label) > 0.9
+
+
+def test_trees_are_scikit_learns():
+    from sklearn.ensemble import AdaBoostClassifier, BaggingClassifier, HistGradientBoostingRegressor
+    from sklearn.tree import DecisionTreeClassifier
+
+    options = {"max_iter": 100, "max_leaf_nodes": 15, "min_samples_leaf": 8, "l2_regularization": 1.0}
+    boosted = HistGradientBoostingRegressor(random_state=0, **options).fit(FEATURES, TARGETS[:, 1])
+    np.testing.assert_allclose(REGRESSORS["trees"](FEATURES, TARGETS).predict(ASKED)[:, 1], boosted.predict(ASKED))
+    bagged = BaggingClassifier(DecisionTreeClassifier(random_state=0), 30, random_state=0).fit(FEATURES, LABEL)
+    told = CLASSIFIERS["bagged-trees"](FEATURES, LABEL).decision_function(ASKED)
+    np.testing.assert_allclose(told, bagged.predict_proba(ASKED))
+    one = DecisionTreeClassifier(max_leaf_nodes=21, random_state=0)
+    ada = AdaBoostClassifier(one, n_estimators=30, random_state=0).fit(FEATURES, LABEL)
+    told = CLASSIFIERS["boosted-trees"](FEATURES, LABEL).decision_function(ASKED)
+    np.testing.assert_array_equal(told.argmax(axis=1), ada.predict(ASKED))
+
+
+@pytest.mark.parametrize("number", [2, 4])
+def test_subspace_discriminants_are_scikit_learns(number):
+    from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+    from sklearn.ensemble import BaggingClassifier
+
+    one = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
+    bagged = BaggingClassifier(one, 30, bootstrap=False, max_features=0.5, random_state=0)
+    label = LABEL % number
+    told = CLASSIFIERS["subspace-discriminant"](FEATURES, label).predict_proba(ASKED)
+    np.testing.assert_allclose(told, bagged.fit(FEATURES, label).predict_proba(ASKED), atol=1e-12)
+
+
+def test_the_nearest_are_scikit_learns():
+    from sklearn.neighbors import KNeighborsRegressor
+
+    ours = Nearest.of_numbers(FEATURES, TARGETS)
+    theirs = KNeighborsRegressor(ours.count, weights="distance").fit(FEATURES, TARGETS)
+    np.testing.assert_allclose(ours.predict(ASKED), theirs.predict(ASKED), rtol=1e-9)
+    np.testing.assert_allclose(ours.predict(FEATURES), TARGETS, atol=1e-6)
+
+
+def test_the_gaussian_process_is_scikit_learns():
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import Matern
+
+    length, noise = _tuned(FEATURES, TARGETS)
+    theirs = GaussianProcessRegressor(Matern(length, nu=1.5), alpha=noise, optimizer=None).fit(FEATURES, TARGETS)
+    np.testing.assert_allclose(GaussianProcess.fit(FEATURES, TARGETS).predict(ASKED), theirs.predict(ASKED), atol=1e-7)
+
+
+def test_few_centres_tell_nearly_what_all_do(monkeypatch):
+    whole = GaussianProcess.fit(FEATURES, TARGETS).predict(ASKED)
+    monkeypatch.setattr("jeit.touch.learnt.gaussian_process._CENTRES", 150)
+    few = GaussianProcess.fit(FEATURES, TARGETS)
+    assert len(few.centres) == 150
+    assert np.abs(few.predict(ASKED) - whole).mean() < 0.05
+
+
+def test_the_likeliest_sharpness_is_found():
+    right = RNG.integers(0, 3, 4000)
+    odds = RNG.normal(size=(4000, 3))
+    odds = np.log(probabilities(odds, 1.0))
+    drawn = (probabilities(odds, 1.0).cumsum(axis=1) > RNG.random((4000, 1))).argmax(axis=1)
+    assert 0.8 < sharpness_of(odds, drawn) < 1.25
+    assert sharpness_of(odds, right) < 0.1

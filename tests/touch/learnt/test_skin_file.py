@@ -1,0 +1,77 @@
+"""Learnt skins as files: as they were, and nothing else than skins."""
+
+import zipfile
+
+import numpy as np
+import pytest
+from made_skins import record
+
+from jeit.touch import LearntSkin, Presses, read_skin, write_skin
+
+FRESH = record(30, seed=1)
+
+
+def same(one, other):
+    one, other = (each.predict(FRESH["frames"], FRESH["reference"]) for each in (one, other))
+    for name in ("position", "position_std", "force", "force_std", "probability", "novelty"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    np.testing.assert_array_equal(one.label, other.label)
+
+
+def test_what_is_read_says_the_same(skin, tmp_path):
+    write_skin(skin, tmp_path / "skin.skops")
+    again = read_skin(tmp_path)  # the folder of it
+    asked = FRESH["frames"], FRESH["reference"]
+    np.testing.assert_array_equal(again.predict(*asked).position, skin.predict(*asked).position)
+    assert again.notes == skin.notes
+
+
+@pytest.mark.parametrize("method", ["ridge", "trees", "network", "gaussian-process", "blend"])
+def test_every_method_of_places(method, tmp_path, recorded):
+    presses = Presses.create(**recorded)
+    skin = LearntSkin.fit(presses.rows(slice(60)), method=method)
+    write_skin(skin, tmp_path / "one.skops")
+    again = read_skin(tmp_path / "one.skops")
+    asked = FRESH["frames"], FRESH["reference"]
+    np.testing.assert_array_equal(again.predict(*asked).position, skin.predict(*asked).position)
+
+
+@pytest.mark.parametrize("method", ["quadratic-discriminant", "quadratic-svm", "bagged-trees", "nearest"])
+def test_classifiers(method, tmp_path, recorded):
+    label = np.where(recorded["positions"][:, 0] > 0, "right", "left")
+    skin = LearntSkin.fit(
+        Presses.create(recorded["frames"], reference=recorded["reference"], label=label), method=method
+    )
+    write_skin(skin, tmp_path / "one.skops")
+    asked = FRESH["frames"], FRESH["reference"]
+    np.testing.assert_array_equal(
+        read_skin(tmp_path / "one.skops").predict(*asked).probability, skin.predict(*asked).probability
+    )
+
+
+class Payload:
+    """What reading might run."""
+
+    def __reduce__(self):
+        return (open, ("ran", "w"))
+
+
+def test_other_files_are_refused_and_nothing_runs(tmp_path, monkeypatch):
+    from skops.io import dump
+
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match="jeit touch fit"):
+        read_skin("none")
+    (tmp_path / "text").write_text("skin")
+    with zipfile.ZipFile("zip", "w") as file:
+        file.writestr("schema.json", "{}")
+    dump({"kind": "another"}, "another")
+    dump({"kind": "a jeit learnt skin", "version": 9, "skin": {}}, "newer")
+    dump({"kind": "a jeit learnt skin", "version": 1, "skin": {"jeit": "Presses"}}, "strange")
+    dump({"kind": "a jeit learnt skin", "version": 1, "skin": {"channels": 1}}, "less")
+    dump({"kind": "a jeit learnt skin", "version": 1, "skin": {"channels": Payload()}}, "payload")
+    dump({"kind": "a jeit learnt skin", "version": 1, "skin": {"channels": np.random.default_rng}}, "function")
+    for name in ("text", "zip", "another", "newer", "strange", "less", "payload", "function"):
+        with pytest.raises(ValueError, match="not a learnt skin that can be read"):
+            read_skin(name)
+    assert not (tmp_path / "ran").exists()
