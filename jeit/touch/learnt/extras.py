@@ -1,7 +1,11 @@
-"""What learning needs besides jeit's own dependencies."""
+"""What learning needs besides jeit's own dependencies, and how much of the machine it takes."""
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from importlib.util import find_spec
+
+import numpy as np
 
 
 def need_learning() -> None:
@@ -14,6 +18,16 @@ def need_learning() -> None:
 def one_thread() -> AbstractContextManager:
     """Within it libraries keep to one thread: on presses by the thousand, more wait for each other longer than they
     work."""
+    import sklearn.ensemble  # noqa: F401 - only what is loaded is kept to it
     from threadpoolctl import threadpool_limits
 
     return threadpool_limits(1)
+
+
+def over_threads(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, at_once: int) -> np.ndarray:
+    """`function` of some rows at a time, side by side where there are many; what it gives, joined."""
+    parts = [rows[first : first + at_once] for first in range(0, max(len(rows), 1), at_once)]
+    if len(parts) < 4:
+        return np.concatenate([function(part) for part in parts])
+    with ThreadPoolExecutor(2) as pool:
+        return np.concatenate(list(pool.map(function, parts)))

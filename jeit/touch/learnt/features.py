@@ -64,12 +64,7 @@ class Features:
     @classmethod
     def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray) -> "Features":
         """From changes (N, m) and their reference (N, m)."""
-        size = np.abs(changes)
-        unit = np.median(size, axis=0)
-        unit = np.where(unit > 0, unit, np.mean(size, axis=0))
-        values = FORMS[form](changes, reference, unit)
-        mean, deviation = values.mean(axis=0), values.std(axis=0)
-        deviation = np.where(deviation > 1e-12 * max(deviation.max(), 1e-300), deviation, np.inf)
+        unit, values, mean, deviation = standardisation(form, changes, reference)
         rows = np.linalg.svd((values - mean) / deviation, full_matrices=False)[2]
         return cls(form, unit, mean, deviation, rows[: max(2, min(_MOST, len(values) // _PRESSES_EACH))].T)
 
@@ -77,6 +72,18 @@ class Features:
         """Scores (n, k) of changes (n, m)."""
         values = FORMS[self.form](changes, reference, self.unit)
         return (values - self.mean) / self.deviation @ self.components
+
+
+def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of changes (N, m): each channel's unit, its usual size; features (N, p) of the `form`, their mean and deviation,
+    infinite where one never changes."""
+    size = np.abs(changes)
+    unit = np.median(size, axis=0)
+    unit = np.where(unit > 0, unit, np.mean(size, axis=0))
+    values = FORMS[form](changes, reference, np.where(unit > 0, unit, 1.0))
+    deviation = values.std(axis=0)
+    known = deviation > 1e-9 * max(deviation.max(), 1e-300)
+    return np.where(unit > 0, unit, 1.0), values, values.mean(axis=0), np.where(known, deviation, np.inf)
 
 
 def forms_for(has_reference: bool) -> tuple[str, ...]:

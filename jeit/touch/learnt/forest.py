@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jeit.touch.learnt.extras import over_threads
+
 # Frames walked down at once: what they look up stays in the cache.
 _AT_ONCE = 128
 
@@ -27,17 +29,23 @@ class Forest:
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """What the trees add up to."""
-        trees = np.arange(len(self.feature))
-        found = np.empty((len(features), self.value.shape[2]))
-        for first in range(0, len(features), _AT_ONCE):
-            some = features[first : first + _AT_ONCE]
-            row = np.arange(len(some))[:, None]
-            node = np.zeros((len(some), len(trees)), np.int32)
+        trees, size, targets = self.value.shape
+        first_node = size * np.arange(trees)
+        # Nodes are numbered throughout, and all arrays flat: `take` is quicker than indices of two axes.
+        feature, threshold = self.feature.ravel(), self.threshold.ravel()
+        below, above = ((one + first_node[:, None]).ravel() for one in (self.left, self.right))
+        value = self.value.reshape(-1, targets)
+
+        def answer(some: np.ndarray) -> np.ndarray:
+            row = (some.shape[1] * np.arange(len(some)))[:, None]
+            flat = np.ascontiguousarray(some).ravel()
+            node = np.broadcast_to(first_node, (len(some), trees))
             for _ in range(self.depth):
-                above = some[row, self.feature[trees, node]] > self.threshold[trees, node]
-                node = np.where(above, self.right[trees, node], self.left[trees, node])
-            found[first : first + _AT_ONCE] = self.value[trees, node].sum(axis=1)
-        return found + self.start
+                further = flat.take(row + feature.take(node)) > threshold.take(node)
+                node = np.where(further, above.take(node), below.take(node))
+            return value.take(node, axis=0).sum(axis=1)
+
+        return over_threads(answer, features, _AT_ONCE) + self.start
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """For classifiers: the trees' votes for each class."""

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.touch.learnt.classifiers import log_odds, probabilities, sharpness_of
-from jeit.touch.learnt.features import FORMS
+from jeit.touch.learnt.features import FORMS, standardisation
 from jeit.touch.learnt.forest import Forest
 
 _STRENGTHS = (1e-3, 1e-2, 1e-1, 1.0)
@@ -31,10 +31,8 @@ class Standardised:
     @classmethod
     def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray) -> "Standardised":
         """From changes (N, m) and their reference."""
-        unit = np.median(np.abs(changes), axis=0)
-        unit = np.where(unit > 0, unit, np.mean(np.abs(changes), axis=0))
-        values = FORMS[form](changes, reference, unit)
-        return cls(form, unit, values.mean(axis=0), np.maximum(values.std(axis=0), 1e-300))
+        unit, _, mean, deviation = standardisation(form, changes, reference)
+        return cls(form, unit, mean, deviation)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> np.ndarray:
         """Features (n, p) of changes (n, m)."""

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from jeit.touch.learnt.extras import over_threads
+
 _AT_ONCE = 256
 _COUNTS = (3, 5, 8, 12)
 
@@ -50,13 +52,13 @@ class Nearest:
     def _near(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n c"], Int[np.ndarray, "n c"]]:
         """Distances of the nearest presses, the nearest first, and their numbers."""
         squares = np.sum(self.features**2, axis=1)
-        distance, number = np.empty((len(features), self.count)), np.empty((len(features), self.count), int)
-        for first in range(0, len(features), _AT_ONCE):
-            some = features[first : first + _AT_ONCE]
-            squared = squares - 2 * some @ self.features.T + np.sum(some**2, axis=1)[:, None]
-            near = np.argpartition(squared, self.count - 1, axis=1)[:, : self.count]
-            apart = np.linalg.norm(self.features[near] - some[:, None], axis=2)
+
+        def near(some: np.ndarray) -> np.ndarray:
+            squared = squares - 2 * some @ self.features.T  # less the frame's own, the same for all
+            number = np.argpartition(squared, self.count - 1, axis=1)[:, : self.count]
+            apart = np.linalg.norm(self.features[number] - some[:, None], axis=2)
             order = np.argsort(apart, axis=1, kind="stable")
-            distance[first : first + _AT_ONCE] = np.take_along_axis(apart, order, axis=1)
-            number[first : first + _AT_ONCE] = np.take_along_axis(near, order, axis=1)
-        return distance, number
+            return np.stack([np.take_along_axis(one, order, axis=1) for one in (apart, number)], axis=-1)
+
+        found = over_threads(near, features, _AT_ONCE)
+        return found[..., 0], found[..., 1].astype(int)
