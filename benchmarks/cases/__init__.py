@@ -19,6 +19,7 @@ NAMES = (
     "first_call",
     "localisation_error",
     "ktc2023",
+    "real_skins",
     "design_figures",
 )
 

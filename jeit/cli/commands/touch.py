@@ -36,7 +36,7 @@ def fit(
     method: Annotated[
         str | None,
         typer.Option(
-            help="ridge, neighbours, gaussian-process, trees, network or blend for places and forces; or one of the "
+            help="ridge, neighbours, gaussian-process, trees, forest, network, blend for places and forces; one of the "
             "classifiers of labels; auto (default): what errs least on presses held out."
         ),
     ] = None,

@@ -53,25 +53,28 @@ SAID = {
 
 @dataclass(frozen=True)
 class Features:
-    """Features of one `form`: standardised with `mean` and `deviation` (p,), then scores of `components` (p, k)."""
+    """Features of one `form`: standardised by `mean` and `deviation` (p,), then scores of any `components` (p, k)."""
 
     form: str
     unit: Float[np.ndarray, " m"]
     mean: Float[np.ndarray, " p"]
     deviation: Float[np.ndarray, " p"]
-    components: Float[np.ndarray, "p k"]
+    components: Float[np.ndarray, "p k"] | None
 
     @classmethod
-    def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray) -> "Features":
-        """From changes (N, m) and their reference (N, m)."""
+    def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray, *, rotated: bool = True) -> "Features":
+        """From changes (N, m) and their reference (N, m); without components unless `rotated`."""
         unit, values, mean, deviation = standardisation(form, changes, reference)
+        if not rotated:
+            return cls(form, unit, mean, deviation, None)
         rows = np.linalg.svd((values - mean) / deviation, full_matrices=False)[2]
         return cls(form, unit, mean, deviation, rows[: max(2, min(_MOST, len(values) // _PRESSES_EACH))].T)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> Float[np.ndarray, "n k"]:
         """Scores (n, k) of changes (n, m)."""
         values = FORMS[self.form](changes, reference, self.unit)
-        return (values - self.mean) / self.deviation @ self.components
+        standard = (values - self.mean) / self.deviation
+        return standard if self.components is None else standard @ self.components
 
 
 def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, ...]:

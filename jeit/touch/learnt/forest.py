@@ -66,6 +66,18 @@ class Forest:
         return cls._joined(trees, start, np.arange(len(models)))
 
     @classmethod
+    def of_averaged(cls, models: list[Any]) -> "Forest":
+        """Of scikit-learn's regression trees: their mean."""
+        trees = []
+        for model in models:
+            one = model.tree_
+            leaf = one.children_left < 0
+            value = one.value[:, :, 0] / len(models)
+            trees.append((one.feature, one.threshold, one.children_left, one.children_right, leaf, value))
+        targets = trees[0][-1].shape[1]
+        return cls._joined(trees, np.zeros(targets), np.arange(targets))
+
+    @classmethod
     def of_trees(cls, models: list[Any], weights: np.ndarray, classes: np.ndarray, *, votes: bool) -> "Forest":
         """Of scikit-learn's classification trees: their leaves' shares of the classes, or whole `votes`, weighted."""
         trees = []

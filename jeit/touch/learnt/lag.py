@@ -5,9 +5,10 @@ from scipy.spatial import KDTree
 
 from jeit.touch.learnt.features import Features
 
-_MOST, _NEIGHBOURS, _COMPONENTS = 2, 5, 12
-# Places told from frames as they are must be no better than a guess, and by another lag so much better.
-_GUESS, _BETTER = 0.93, 0.85
+_MOST, _NEIGHBOURS, _COMPONENTS = 2, 8, 12
+# Places told from frames as they are must be no better than a guess, and by one lag better than that, and than by any
+# other, by so many standard errors.
+_GUESS, _STANDARD_ERRORS = 0.95, 4.0
 
 
 def lag_of(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tuple[int, float, float]:
@@ -15,12 +16,14 @@ def lag_of(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tup
     the nearest frames with none and with that lag, metres."""
     features = Features.learn("normalised", changes, np.zeros_like(changes))
     scores = features(changes, np.zeros_like(changes))[:, :_COMPONENTS]
-    errors = {lag: _error(scores, positions, folds, lag) for lag in range(-_MOST, _MOST + 1)}
+    errors = {lag: _errors(scores, positions, folds, lag) for lag in range(-_MOST, _MOST + 1)}
     guess = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
-    best = min(errors, key=lambda lag: errors[lag])
-    plain = errors[0] > _GUESS * guess and errors[best] < _BETTER * min(errors[0], guess)
+    means = {lag: float(off.mean()) for lag, off in errors.items()}
+    best, second = sorted(means, key=lambda lag: means[lag])[:2]
+    enough = _STANDARD_ERRORS * float(errors[best].std()) / np.sqrt(len(positions))
+    plain = means[0] > _GUESS * guess > means[best] and means[second] - means[best] > enough
     best = best if plain else 0
-    return best, errors[0], errors[best]
+    return best, means[0], means[best]
 
 
 def shifted(number: int, lag: int) -> tuple[slice, slice]:
@@ -28,7 +31,7 @@ def shifted(number: int, lag: int) -> tuple[slice, slice]:
     return slice(max(lag, 0), number + min(lag, 0)), slice(max(-lag, 0), number - max(lag, 0))
 
 
-def _error(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, lag: int) -> float:
+def _errors(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, lag: int) -> np.ndarray:
     frames, presses = shifted(len(scores), lag)
     scores, positions, folds = scores[frames], positions[presses], folds[presses]
     off = np.empty(len(scores))
@@ -37,4 +40,4 @@ def _error(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, lag: in
         learnt = positions[~out]
         near = KDTree(scores[~out]).query(scores[out], min(_NEIGHBOURS, len(learnt)))[1].reshape(out.sum(), -1)
         off[out] = np.linalg.norm(learnt[near].mean(axis=1) - positions[out], axis=1)
-    return float(off.mean())
+    return off

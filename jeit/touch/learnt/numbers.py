@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.touch.learnt.features import Features, forms_for
-from jeit.touch.learnt.regressors import QUICK, REGRESSORS
+from jeit.touch.learnt.regressors import OF_CHANNELS, QUICK, REGRESSORS
 from jeit.touch.learnt.spread import Spread
 
 BLEND = "blend"
@@ -72,7 +72,7 @@ def learn_numbers(
     best = list(dict.fromkeys(one.form for one in sorted(tried, key=_error)))[:2]
     wanted = [one for one in REGRESSORS if one not in QUICK and method in ("auto", BLEND, one)]
     for name in wanted:
-        for form in best if name == "gaussian-process" else best[:1]:
+        for form in best if name in ("gaussian-process", "forest") else best[:1]:
             progress(f"{name} on {form}")
             tried.append(cut.hold_out(name, form))
     tried.sort(key=_error)
@@ -87,7 +87,7 @@ def learn_numbers(
     members = []
     for one in chosen:
         progress(f"{one.method}, all presses")
-        features = Features.learn(one.form, changes, reference)
+        features = Features.learn(one.form, changes, reference, rotated=one.method not in OF_CHANNELS)
         model = REGRESSORS[one.method](features(changes, reference), (targets - cut.mean) / cut.scale)
         members.append((features, model))
     ends = (folds == 0) | (folds == folds.max())
@@ -127,15 +127,15 @@ class _Cut:
         said = np.empty_like(self.targets)
         for fold in range(self.folds.max() + 1):
             out = self.folds == fold
-            learnt, asked = self._scores(form, fold, out)
+            learnt, asked = self._scores(form, fold, out, rotated=method not in OF_CHANNELS)
             model = REGRESSORS[method](learnt, (self.targets[~out] - self.mean) / self.scale)
             said[out] = self.mean + self.scale * np.asarray(model.predict(asked)).reshape(int(out.sum()), -1)
         return Tried(method, form, said, _off(said, self.targets))
 
-    def _scores(self, form: str, fold: int, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if (form, fold) not in self.features:
-            features = Features.learn(form, self.changes[~out], self.reference[~out])
-            self.features[form, fold] = tuple(
+    def _scores(self, form: str, fold: int, out: np.ndarray, *, rotated: bool) -> tuple[np.ndarray, np.ndarray]:
+        if (form, fold, rotated) not in self.features:
+            features = Features.learn(form, self.changes[~out], self.reference[~out], rotated=rotated)
+            self.features[form, fold, rotated] = tuple(
                 features(self.changes[some], self.reference[some]) for some in (~out, out)
             )
-        return self.features[form, fold]
+        return self.features[form, fold, rotated]

@@ -14,6 +14,7 @@ from jeit.touch.learnt.nearest import Nearest
 from jeit.touch.learnt.network import Network
 
 _ALPHAS = np.logspace(-2, 5, 15)
+_TREES = 100
 
 
 def ridge(features, targets) -> Any:
@@ -32,12 +33,24 @@ def trees(features, targets) -> Any:
     return Forest.of_boosted(models)
 
 
+def forest(features, targets) -> Any:
+    """Trees with random splits, averaged (Geurts et al. 2006)."""
+    from sklearn.ensemble import ExtraTreesRegressor
+
+    targets = targets[:, 0] if targets.shape[1] == 1 else targets
+    found = ExtraTreesRegressor(_TREES, max_features=0.3, min_samples_leaf=2, random_state=0).fit(features, targets)
+    return Forest.of_averaged(found.estimators_)
+
+
 REGRESSORS: dict[str, Callable[..., Any]] = {
     "ridge": ridge,
     "neighbours": Nearest.of_numbers,
     "gaussian-process": GaussianProcess.fit,
     "trees": trees,
+    "forest": forest,
     "network": Network.train,
 }
 # Quick enough to be tried on every form of the features.
 QUICK = ("ridge", "neighbours")
+# Those that look for the few channels that tell: asked of channels, not of their principal components.
+OF_CHANNELS = ("forest",)
