@@ -105,6 +105,7 @@ def predict(
     import numpy as np
     from rich.console import Console
 
+    from jeit.arguments import counted
     from jeit.cli.console import Steps
     from jeit.report.learnt_skin import TOUCH_FILES, write_touches
     from jeit.touch import read_frames, read_skin
@@ -120,11 +121,12 @@ def predict(
         write_touches(touches, output, skin=str(skin), name=frames.name)
     if quiet:
         return
-    said = [f"{len(touches)} frames", f"{int(touches.unlike.sum())} unlike any learnt from"]
+    said = [counted(len(touches), "frame"), f"{int(touches.unlike.sum())} unlike any learnt from"]
     if touches.position is not None and touches.position_std is not None:
         placed = np.isfinite(touches.position).all(axis=1)
-        spread = 1e3 * np.median(touches.position_std[placed]) if placed.any() else np.nan
-        said.append(f"{int(placed.sum())} with a place, standard deviation {spread:.3g} mm (median)")
+        said.append(f"{int(placed.sum())} with a place")
+        if placed.any():
+            said[-1] += f", standard deviation {1e3 * np.median(touches.position_std[placed]):.3g} mm (median)"
     console.print("\n" + "; ".join(said))
     _print_notes(console, touches.notes)
     console.print(f"[dim]Written:[/dim] {output / 'touches.csv'}, report.json, touches.png", soft_wrap=True)

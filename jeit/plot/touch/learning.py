@@ -69,8 +69,8 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
         for row, column in np.argwhere(shares >= 0.5):
             colour = "white" if shares[row, column] > 50 else INK
             ax.text(column, row, f"{shares[row, column]:.0f}", ha="center", va="center", color=colour, fontsize=8)
-    ax.set_xlabel("Label given", color=INK)
-    ax.set_ylabel("Label", color=INK)
+    ax.set_xlabel("Label told", color=INK)
+    ax.set_ylabel("True label", color=INK)
     right = 100 * np.mean(label.right == label.held_out)
     ax.set_title(f"Labels: {right:.1f} % right of presses held out" if title is None else title)
     return ax

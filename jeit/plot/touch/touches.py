@@ -32,7 +32,8 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
     there = np.flatnonzero(np.isfinite(touches.position).all(axis=1))
     if not there.size:
         ax.set_axis_off()
-        ax.set_title("No touch" if title is None else title)
+        said = "All frames unlike any learnt from" if touches.unlike.all() else "No touch"
+        ax.set_title(said if title is None else title)
         return ax
     place, std = touches.position[there, :2], touches.position_std[there, :2]  # pyright: ignore[reportOptionalSubscript]
     extent = extent_of(np.vstack([place - std, place + std]))

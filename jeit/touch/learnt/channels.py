@@ -10,12 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jeit.touch.learnt.neighbourhood import Neighbourhood
+
 # Share of the variance that patterns leave to noise; patterns at most, and presses for each.
 _LEFT, _MOST, _PRESSES_EACH = 1e-3, 60, 4
 # A channel is dead beyond so many times what all but a thousandth of the presses that taught had.
 _BEYOND, _QUANTILE = 2.0, 0.999
-# Of channels, before a frame is given up instead; and frames at once.
-_MOST_DEAD, _AT_ONCE = 0.34, 4096
+# Of channels, before a frame is given up instead.
+_MOST_DEAD = 0.34
+# Of the distance to the nearest press, in novelty.
+_NEAR = 2 / 1.75
 
 
 @dataclass(frozen=True)
@@ -23,7 +27,8 @@ class Channels:
     """M channels, of which some are `used` (M,): neither constant nor without readings.
 
     For those: `scale` (m,) of changes, `patterns` (m, k), `spread` (k,) of scores, `noise` (m,) in scales; `farthest`
-    (m,): residuals that are still those of a channel alive; `usual`: novelty of all but a hundredth of the presses.
+    (m,): residuals that are still those of a channel alive; `usual`: novelty of all but a hundredth of the presses;
+    `neighbourhood`: how near presses are to each other.
     """
 
     used: Bool[np.ndarray, " M"]
@@ -33,6 +38,7 @@ class Channels:
     noise: Float[np.ndarray, " m"]
     farthest: Float[np.ndarray, " m"]
     usual: float
+    neighbourhood: Neighbourhood
 
     @classmethod
     def learn(cls, changes: Float[np.ndarray, "N M"]) -> "Channels":
@@ -59,7 +65,9 @@ class Channels:
         left, apart = np.concatenate(left), np.concatenate(apart)
         farthest = _BEYOND * np.nanquantile(left, _QUANTILE, axis=0)
         farthest = np.maximum(farthest, max(6.0, float(np.nanquantile(left, 0.99))))
-        return cls(used, scale, patterns, spread, noise, farthest, float(np.quantile(apart, 0.99)))
+        every, _ = _explain(scaled, ~missing[:, used], patterns, spread, noise)
+        usual = float(np.quantile(apart, 0.99))
+        return cls(used, scale, patterns, spread, noise, farthest, usual, Neighbourhood.learn(every))
 
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Changes (n, m) of the channels used, as foretold by the others where one is dead or has no reading; which
@@ -75,22 +83,27 @@ class Channels:
                 one[0] for one in _explain(whole[None, frame], alive[None, frame], *model)
             )
             whole[frame] = np.where(alive[frame], whole[frame], self.patterns @ scores[frame])
-        return whole * self.scale, alive, _novelty(scores, residual, alive, self.spread) / self.usual
+        novelty = _novelty(scores, residual, alive, self.spread) / self.usual
+        return whole * self.scale, alive, np.maximum(novelty, _NEAR * self.neighbourhood(scores))
 
     def _alive(self, frame: np.ndarray, alive: np.ndarray) -> np.ndarray:
-        """Which channels of a frame the others bear out: those borne out least are left out, time and again."""
-        alive = alive.copy()
-        fewest = (1 - _MOST_DEAD) * len(frame)
+        """Which channels of a frame the others bear out: those borne out least are left out, time and again, and those
+        that what is left bears out taken back."""
+        given, alive = alive, alive.copy()
+        fewest, back = (1 - _MOST_DEAD) * len(frame), False
         while alive.sum() > fewest:
             weighted = self.patterns * (alive / self.noise**2)[:, None]
             gram = np.linalg.inv(weighted.T @ self.patterns + np.diag(1 / self.spread**2))
             residual = (frame - self.patterns @ (gram @ (weighted.T @ frame))) / self.noise
             own = 1 - np.einsum("ij,jk,ik->i", self.patterns, gram, weighted)  # a channel's say in what foretells it
-            beyond = np.where(alive, np.abs(residual) / np.maximum(own, 1e-3) / self.farthest, 0.0)
-            worst = beyond.max()
-            if worst <= 1:
+            beyond = np.where(given, np.abs(residual) / np.maximum(own, 1e-3) / self.farthest, np.inf)
+            worst = np.max(beyond, where=alive, initial=0.0)
+            if worst <= 1 and back:
                 break
-            alive &= beyond < max(1.0, worst / 2)
+            if worst <= 1:
+                alive, back = beyond <= 1, True
+            else:
+                alive &= beyond < (worst if back else max(1.0, worst / 2))
         return alive
 
 

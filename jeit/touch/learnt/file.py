@@ -16,6 +16,7 @@ from jeit.touch.learnt.keys import LearntKeys, Standardised
 from jeit.touch.learnt.labels import LearntLabels
 from jeit.touch.learnt.learnt_skin import LearntSkin
 from jeit.touch.learnt.nearest import Nearest
+from jeit.touch.learnt.neighbourhood import Neighbourhood
 from jeit.touch.learnt.network import Network
 from jeit.touch.learnt.numbers import LearntNumbers
 from jeit.touch.learnt.spread import Spread
@@ -33,6 +34,7 @@ _OURS = {
         LearntNumbers,
         LinearEnsemble,
         Nearest,
+        Neighbourhood,
         Network,
         QuadraticDiscriminant,
         Spread,
@@ -54,10 +56,12 @@ _FAULTS = (
 
 
 def write_skin(skin: LearntSkin, path: str | Path) -> None:
-    """Write a learnt skin to one file, without how well it was learnt."""
+    """Write a learnt skin to one file, without how well it was learnt. Raises `ValueError` for a folder."""
     from skops.io import dump
 
     need_learning()
+    if Path(path).is_dir():
+        raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / 'skin.skops'}.")
     own = {one.name: getattr(skin, one.name) for one in fields(skin) if one.name != "standing"}
     dump({"kind": _KIND, "version": _VERSION, "skin": _plain(own)}, path)
 

@@ -7,6 +7,8 @@ from scipy.spatial import KDTree
 NUM_FOLDS = 5
 # Presses held out may be so many times farther from the others' places than presses of a random fold.
 _FARTHER = 2.0
+# Places are repeated where there are fewer, beside the presses.
+_REPEATED = 0.7
 
 
 def time_folds(
@@ -22,8 +24,8 @@ def time_folds(
 
     Presses in order of `time`, or as recorded, are cut into `number` stretches. Where that leaves out places (`alike`,
     numbers (N, d)) or `kinds` (N,) altogether, as when one was pressed after the other, into more and shorter ones,
-    dealt out in turn. With a `group`, groups in order of their mean time. Presses with one and the same frame go to one
-    fold: they would tell each other's answer.
+    dealt out in turn. With a `group`, groups in order of their mean time. Presses with one and the same frame, and at
+    one and the same place, go to one fold: they would tell each other's answer, as no press between places could.
     """
     count = len(frames)
     order = np.arange(count) if time is None else np.argsort(time, kind="stable")
@@ -43,14 +45,23 @@ def time_folds(
     if copies:
         notes.append(f"{copies} frames are copies of others: kept in one fold with them.")
         unit = _joined(unit, same)
+    if alike is not None and not grouped:
+        places = np.unique(alike, axis=0, return_inverse=True)[1].ravel()
+        if number <= places.max() + 1 < _REPEATED * count:
+            notes.append(f"{places.max() + 1} places or forces were repeated: held out with all of their presses.")
+            unit = _joined(unit, places)
     stretches = number
     fold = _dealt(unit, rank, number, stretches)
     while not grouped and stretches < count / 4 and not _covered(fold, alike, kinds):
         stretches *= 2
         fold = _dealt(unit, rank, number, stretches)
+    if kinds is not None and not grouped and not _covered(fold, None, kinds):
+        fold = _dealt_by_kind(rank, kinds, number)
     if stretches > number:
+        what = "labels were given" if alike is None else "places were pressed"
         notes.append(
-            f"places or kinds were pressed one after the other: held out in {stretches} short stretches of time."
+            f"{what} one after the other: held out in {stretches} short stretches of time, in which drift may pass for "
+            "what was learnt."
         )
     return fold, tuple(notes)
 
@@ -63,6 +74,15 @@ def _dealt(unit: np.ndarray, rank: np.ndarray, number: int, stretches: int) -> I
     fold = np.empty(len(sizes), int)
     fold[by_time] = np.minimum((middles * stretches / len(unit)).astype(int), stretches - 1) % number
     return np.unique(fold, return_inverse=True)[1][unit]
+
+
+def _dealt_by_kind(rank: np.ndarray, kinds: np.ndarray, number: int) -> Int[np.ndarray, " N"]:
+    """Folds of presses of each kind in turn, where some kinds are rare."""
+    fold = np.empty(len(kinds), int)
+    for kind in np.unique(kinds):
+        own = np.flatnonzero(kinds == kind)
+        fold[own[np.argsort(rank[own])]] = np.arange(len(own)) % number
+    return fold
 
 
 def _covered(fold: np.ndarray, alike: np.ndarray | None, kinds: np.ndarray | None) -> bool:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_kind, check_name
+from jeit.arguments import check_kind, check_name, counted
 from jeit.touch.learnt import labels as label_methods
 from jeit.touch.learnt import numbers as number_methods
 from jeit.touch.learnt.channel_choice import choose_channels
@@ -102,7 +102,7 @@ class LearntSkin:
         elif not channels.used.all():
             silent = np.flatnonzero(~channels.used)
             notes.append(
-                f"{len(silent)} of {len(channels.used)} channels never change, and are not used: {_few(silent)}."
+                f"{counted(len(silent), 'channel')} of {len(channels.used)} without changes, not used: {_few(silent)}."
             )
         whole, alive, _ = channels.complete(changes)
         if not alive.all():
@@ -136,6 +136,7 @@ class LearntSkin:
         used = np.zeros(frames.shape, bool)
         used[:, self.channels.used] = alive
         touching = np.sqrt(np.mean((whole / self.channels.scale) ** 2, axis=1)) > self.quiet
+        unlike &= touching
         ours = None if reference is None else reference[:, self.channels.used]
         ours = np.zeros_like(whole) if ours is None else np.where(np.isnan(ours), 0.0, ours)
         found: dict = dict.fromkeys(
@@ -143,8 +144,8 @@ class LearntSkin:
         )
         if self.label is not None:
             label, found["probability"] = self.label.predict(whole, ours)
-            found["label"] = np.where(unlike, "", label)
-            found["probability"] = np.where(unlike, np.nan, found["probability"])
+            found["label"] = np.where(unlike, "", np.where(touching, label, NO_TOUCH))
+            found["probability"] = np.where(unlike | (~touching & (label != NO_TOUCH)), np.nan, found["probability"])
             touching &= label != NO_TOUCH
         for name, learnt in (("position", self.place), ("force", self.force)):
             if learnt is not None:
@@ -158,14 +159,16 @@ class LearntSkin:
             found["force_std"] = found["force_std"][:, 0]
         if self.keys is not None:
             touched, probability = self.keys.predict(whole, ours)
-            found["touched"] = touched & ~unlike[:, None]
-            found["key_probability"] = np.where(unlike[:, None], np.nan, probability)
+            found["touched"] = touched & (touching & ~unlike)[:, None]
+            found["key_probability"] = np.where(unlike[:, None], np.nan, np.where(touching[:, None], probability, 0.0))
         return Touches(**found, unlike=unlike, novelty=novelty, alive=used, notes=self._told(alive, unlike))
 
     def _check(self, frames) -> np.ndarray:
         frames = np.asarray(frames)
         frames = check_frames("frames", frames[None] if frames.ndim == 1 else frames)
         number = len(self.channels.used)
+        if not len(frames):
+            raise ValueError("frames: there are none.")
         if frames.shape[1] != number:
             raise ValueError(f"frames have {frames.shape[1]} channels, and the skin that was learnt has {number}.")
         return frames
@@ -183,6 +186,10 @@ class LearntSkin:
         own, learnt = np.nanmean(reference, axis=0), self.mean_reference
         there = np.isfinite(own) & np.isfinite(learnt) & self.channels.used
         own, learnt = own[there], learnt[there]
+        if not there.any():
+            raise ValueError(
+                "reference has no finite reading of a channel that is used; give that of the untouched skin."
+            )
         alike = float(own @ learnt / np.sqrt((own @ own) * (learnt @ learnt))) if own.any() else 0.0
         size = np.sqrt((own @ own) / (learnt @ learnt)) if learnt.any() else 1.0
         if alike < _ALIKE or not 1 / _SIZES < size < _SIZES:
@@ -238,7 +245,9 @@ def _check_fit(presses: Presses, method: str, num_channels: int | None, per_sess
     ):
         learnt = "labels" if method in label_methods.METHODS else "places and forces"
         raise ValueError(f"method: {method!r} learns {learnt}, and the presses have none; leave method to 'auto'.")
-    if num_channels is not None and not 2 <= num_channels <= presses.frames.shape[1]:
+    whole = isinstance(num_channels, int | np.integer) and not isinstance(num_channels, bool)
+    most = presses.frames.shape[1]
+    if num_channels is not None and not (whole and 2 <= num_channels <= most):
         raise ValueError(
             f"num_channels must be from 2 to {presses.frames.shape[1]}, those there are; it is {num_channels}."
         )
@@ -254,7 +263,7 @@ def _usable(presses: Presses) -> tuple[Presses, list[str]]:
     notes = []
     if not ever.all():
         silent = np.flatnonzero(~ever)
-        notes.append(f"{len(silent)} channels have no reading at all: {_few(silent)}.")
+        notes.append(f"{counted(len(silent), 'channel')} without any reading: {_few(silent)}.")
     fair = there[:, ever].mean(axis=1) >= _FEWEST if ever.any() else np.zeros(len(there), bool)
     if fair.sum() < 10:
         raise ValueError(f"frames: only {int(fair.sum())} have readings of two thirds of the channels; 10 are needed.")
@@ -292,13 +301,18 @@ def _answers(presses: Presses) -> np.ndarray:
 
 
 def _quiet(scaled: np.ndarray, presses: Presses) -> float:
-    """Between the sizes of changes of untouched frames and of touched ones; 0 where none was untouched."""
-    if presses.positions is None:
-        return 0.0
-    still = np.isnan(presses.positions).any(axis=1)
+    """Between the sizes of changes of untouched frames and of touched ones; half of the least size of a touch where
+    none was untouched."""
+    still = np.zeros(len(scaled), bool)
+    if presses.positions is not None:
+        still |= np.isnan(presses.positions).any(axis=1)
+    if presses.label is not None:
+        still |= presses.label == NO_TOUCH
+    if presses.touched is not None:
+        still |= ~presses.touched.any(axis=1)
     size = np.sqrt(np.mean(scaled**2, axis=1))
     if still.sum() < 5:
-        return 0.0
+        return 0.5 * float(np.quantile(size[~still], 0.01))
     sizes = np.sort(size)
     # The threshold with the fewest mistakes, each kind counted by its share.
     wrong = [np.mean(size[still] > at) + np.mean(size[~still] <= at) for at in sizes]
@@ -345,6 +359,8 @@ def _learn_all(skin: LearntSkin, whole, reference, presses: Presses, method: str
         rows = np.arange(len(whole))
         folds, told = time_folds(presses.frames, *_when(presses, rows))
         notes += told
+        if presses.touched.sum(axis=1).max() < 2:
+            notes.append("no two keys were pressed together: what is said of keys pressed together is a guess.")
         found["keys"], tried = learn_keys(whole, reference, presses.touched, folds, progress=progress)
         methods = [
             (f"key {key}: {name}", float(error))

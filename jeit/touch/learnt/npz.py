@@ -12,10 +12,12 @@ _FAULTS = (ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedE
 def npz_arrays(path: str | Path, names: tuple[str, ...], needed: tuple[str, ...]) -> dict[str, np.ndarray]:
     """The arrays of these `names`, as far as the file has them.
 
-    Raises `FileNotFoundError`, and `ValueError` for another kind of file, a broken one, arrays of objects, and where
-    one that is `needed` is missing.
+    Raises `FileNotFoundError`, and `ValueError` for a folder, another kind of file, a broken one, arrays of objects,
+    and where one that is `needed` is missing.
     """
     path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"'{path}' is a folder; give an NPZ file.")
     if not path.is_file():
         raise FileNotFoundError(f"'{path}': there is no such file.")
     try:

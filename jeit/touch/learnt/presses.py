@@ -13,7 +13,7 @@ from jeit.touch.learnt.npz import npz_arrays
 _LONGEST = 5.0  # m
 # No press is harder: forces would be in grams or millinewtons.
 _HARDEST = 2000.0  # N
-_FEWEST = 10
+_FEWEST, _FEWEST_OF_A_KIND = 10, 4
 # Labels and positions of a frame of an untouched skin.
 NO_TOUCH = "none"
 _NO_TOUCH = ("none", "no touch", "no-touch", "no_touch", "notouch")
@@ -195,9 +195,12 @@ def _check_label(given) -> np.ndarray:
     kinds, counts = np.unique(label, return_counts=True)
     if len(kinds) < 2:
         raise ValueError(f"label: all presses are '{kinds[0]}'; give two kinds or more, or leave label out.")
-    if counts.min() < 2:
+    if counts.min() < _FEWEST_OF_A_KIND:
         rare = kinds[counts.argmin()]
-        raise ValueError(f"label: there is only one press '{rare}'; give two or more of each kind, better twenty.")
+        raise ValueError(
+            f"label: '{rare}' has {counts.min()} of the presses; give {_FEWEST_OF_A_KIND} or more of each kind, better "
+            "twenty."
+        )
     return label
 
 

@@ -9,6 +9,8 @@ from scipy.spatial import KDTree
 _LIKE, _SHARES = 40, ((1.0, 0.6827), (1.96, 0.95))
 # Of the weight of a frame's size beside its place, and of the mean of all errors beside those alike.
 _SIZE, _ALL = 0.3, 0.15
+# Of the spread of all that was learnt: nothing is known better.
+_LEAST = 1e-4
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Spread:
         near = np.asarray(KDTree(self.where).query(where, number + own)[1])[:, int(own) :]
         like = self.squares[near].mean(axis=1)
         everywhere = self.squares.mean(axis=0)
-        return np.sqrt((1 - _ALL) * like + _ALL * everywhere + 1e-300)
+        return np.maximum(np.sqrt((1 - _ALL) * like + _ALL * everywhere), _LEAST * self.unit[: like.shape[1]])
 
 
 def _size(changes: np.ndarray) -> np.ndarray:

@@ -5,12 +5,13 @@ import numpy as np
 CHANNELS = 40
 
 
-def record(number=160, *, seed=0, noise=0.01, drift=0.0, untouched=0):
+def record(number=160, *, seed=0, noise=0.01, drift=0.0, untouched=0, places=None):
     """Frames, references, places (m) and forces (N) of presses on a square of 0.1 m; the last are `untouched`."""
     rng = np.random.default_rng(seed)
     skin = np.random.default_rng(99)  # the same skin whatever the presses
     centres, depth = skin.uniform(-0.06, 0.06, (CHANNELS, 2)), skin.uniform(0.5, 2.0, CHANNELS)
-    places, force = rng.uniform(-0.05, 0.05, (number, 2)), rng.uniform(0.5, 4.0, number)
+    random, force = rng.uniform(-0.05, 0.05, (number, 2)), rng.uniform(0.5, 4.0, number)
+    places = random if places is None else np.array(places)
     apart = np.linalg.norm(places[:, None] - centres, axis=2)
     touched = np.arange(number) < number - untouched
     size = np.where(touched, force / (force + 2), 0.0)

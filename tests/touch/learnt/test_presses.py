@@ -33,7 +33,7 @@ def test_one_reference_is_for_all_frames():
 
 
 def test_labels_are_text_and_no_touch_has_one_name():
-    label = ["None", "no touch"] + ["7"] * 11 + ["8"] * 11
+    label = ["None", "no touch"] * 2 + ["7"] * 10 + ["8"] * 10
     assert sorted(set(Presses.create(GOOD["frames"], label=label).label)) == ["7", "8", "none"]
     assert Presses.create(GOOD["frames"], label=np.repeat([3, 4], 12)).label[0] == "3"
 
@@ -64,7 +64,7 @@ def test_infinite_readings_are_none():
         ({"force": np.linspace(0, 1e5, 24)}, "are these newtons"),
         ({"force": np.full(24, np.nan)}, "force must be finite"),
         ({"label": ["a"] * 24}, "all presses are 'a'"),
-        ({"label": ["a"] * 23 + ["b"]}, "only one press 'b'"),
+        ({"label": ["a"] * 21 + ["b"] * 3}, "'b' has 3 of the presses"),
         ({"label": ["a"] * 23 + [""]}, "some are empty"),
         ({"label": np.array(["a"] * 12 + [1] * 12, object)}, "label mixes int and str"),
         ({"label": np.linspace(0, 1, 24)}, "label is float64"),
@@ -83,6 +83,8 @@ def test_what_cannot_be_is_refused(change, said):
 def test_files_of_other_kinds_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="no such file"):
         read_presses(tmp_path / "none.npz")
+    with pytest.raises(ValueError, match="is a folder"):
+        read_presses(tmp_path)
     (tmp_path / "text.npz").write_text("frames")
     with pytest.raises(ValueError, match="not a readable NPZ file"):
         read_presses(tmp_path / "text.npz")
