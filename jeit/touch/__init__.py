@@ -1,0 +1,20 @@
+"""From frames to meaning: where, how hard and how a skin is touched.
+
+Rooms: `contacts` (what an image shows, from frame to frame, in newtons).
+"""
+
+from jeit.touch.contacts import (
+    CellFinder,
+    Contact,
+    ImageNoise,
+    RasterFinder,
+    find_contacts,
+)
+
+__all__ = [
+    "CellFinder",
+    "Contact",
+    "ImageNoise",
+    "RasterFinder",
+    "find_contacts",
+]

@@ -1,0 +1,15 @@
+"""Contacts found in images of change, followed from frame to frame, and what load each carries."""
+
+from jeit.touch.contacts.cell_finder import CellFinder
+from jeit.touch.contacts.contact import Contact
+from jeit.touch.contacts.finder import find_contacts
+from jeit.touch.contacts.image_noise import ImageNoise
+from jeit.touch.contacts.raster_finder import RasterFinder
+
+__all__ = [
+    "CellFinder",
+    "Contact",
+    "ImageNoise",
+    "RasterFinder",
+    "find_contacts",
+]
