@@ -1,4 +1,5 @@
-"""Pictures, with matplotlib: meshes, images, electrodes, sensitivity, taxels, layouts, voltages, microphones, touches.
+"""Pictures, with matplotlib: meshes, images, electrodes, sensitivity, taxels, layouts, voltages, microphones, touches,
+contacts.
 
 Every function takes `ax`, makes a figure of its own where none is given, and returns the axes it drew on. Lengths are
 in metres in the arguments and in millimetres in the pictures.
@@ -17,6 +18,8 @@ from jeit.plot.imaging.figures_of_merit import plot_figures_of_merit
 from jeit.plot.imaging.hyperparameter import plot_choice
 from jeit.plot.imaging.image import plot_image
 from jeit.plot.imaging.mesh import plot_mesh
+from jeit.plot.touch.contact_stages import plot_contact_stages
+from jeit.plot.touch.contacts import plot_contacts
 
 _tell_old_names(__name__)
 
@@ -24,6 +27,8 @@ __all__ = [
     "ColourScale",
     "Marks",
     "plot_choice",
+    "plot_contact_stages",
+    "plot_contacts",
     "plot_error_curve",
     "plot_figures_of_merit",
     "plot_image",

@@ -4,12 +4,13 @@ from jeit.touch.contacts.cell_finder import CellFinder
 from jeit.touch.contacts.contact import Contact
 from jeit.touch.contacts.finder import find_contacts
 from jeit.touch.contacts.image_noise import ImageNoise
-from jeit.touch.contacts.raster_finder import RasterFinder
+from jeit.touch.contacts.raster_finder import RasterFinder, RasterStages
 
 __all__ = [
     "CellFinder",
     "Contact",
     "ImageNoise",
     "RasterFinder",
+    "RasterStages",
     "find_contacts",
 ]
