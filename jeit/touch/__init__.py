@@ -6,15 +6,19 @@ Rooms: `contacts` (what an image shows, from frame to frame, in newtons).
 from jeit.touch.contacts import (
     CellFinder,
     Contact,
+    ContactTracker,
     ImageNoise,
     RasterFinder,
     find_contacts,
+    track_contacts,
 )
 
 __all__ = [
     "CellFinder",
     "Contact",
+    "ContactTracker",
     "ImageNoise",
     "RasterFinder",
     "find_contacts",
+    "track_contacts",
 ]

@@ -5,12 +5,16 @@ from jeit.touch.contacts.contact import Contact
 from jeit.touch.contacts.finder import find_contacts
 from jeit.touch.contacts.image_noise import ImageNoise
 from jeit.touch.contacts.raster_finder import RasterFinder, RasterStages
+from jeit.touch.contacts.tracker import ContactTracker, TouchPath, track_contacts
 
 __all__ = [
     "CellFinder",
     "Contact",
+    "ContactTracker",
     "ImageNoise",
     "RasterFinder",
     "RasterStages",
+    "TouchPath",
     "find_contacts",
+    "track_contacts",
 ]
