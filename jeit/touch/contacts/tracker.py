@@ -69,8 +69,8 @@ class ContactTracker(eqx.Module):
 
     A frame's contacts go to the touches whose predicted places (place + velocity · time) are nearest, all distances
     together as small as can be, none more than `reach` metres. What no contact is left for is waited for `gap` seconds.
-    Where it may be hidden in another's contact, as when two fingers cross, both are taken to move on as they did, for
-    four gaps at most.
+    Where it may be hidden in another's contact, as when two fingers cross, it is taken to move on as it did, for four
+    gaps at most.
 
     **Fields**: those; `least` frames of a touch, fewer are not told of; `time` of the last frame, -inf before the
     first; `open` and `closed` touches; `number`, so many were begun.
@@ -109,10 +109,9 @@ class ContactTracker(eqx.Module):
         pairs = {int(row): int(one) for row, one in zip(rows, columns, strict=True) if distance[row, one] <= self.reach}
         wide = self.reach + np.sqrt(np.array([one.area for one in contacts]) / np.pi)
         lost = [row for row in range(len(going)) if row not in pairs]
-        shares = [(row, one) for row in lost for one in pairs.values() if distance[row, one] <= wide[one]]
-        hidden, shared = {row for row, _ in shares}, {one for _, one in shares}
+        hidden = {row for row in lost for one in pairs.values() if distance[row, one] <= wide[one]}
         followed = [
-            _after(one, time, contacts[pairs[row]], pairs[row] in shared)
+            _after(one, time, contacts[pairs[row]])
             if row in pairs
             else _Followed(one.number, time, one.at(time), one.velocity, one.seen, row in hidden)
             for row, one in enumerate(going)
@@ -150,10 +149,8 @@ def track_contacts(
     return tracker.touches
 
 
-def _after(one: _Followed, time: float, contact: Contact, shared: bool) -> _Followed:
-    """A touch after a frame with this contact of its own, or one that it may share."""
-    seen, expected = (*one.seen, (time, contact)), one.at(time)
-    if shared:
-        return _Followed(one.number, time, expected, one.velocity, seen)
-    off = (contact.centroid - expected) / (time - one.time)
-    return _Followed(one.number, time, contact.centroid, one.velocity + _BELIEVED * off, seen)
+def _after(one: _Followed, time: float, contact: Contact) -> _Followed:
+    """A touch after a frame with this contact."""
+    off = (contact.centroid - one.at(time)) / (time - one.time)
+    velocity = one.velocity + _BELIEVED * off
+    return _Followed(one.number, time, contact.centroid, velocity, (*one.seen, (time, contact)))

@@ -7,6 +7,7 @@ import pytest
 
 from jeit.mesh import centroids, disk, layer, measures
 from jeit.touch.contacts import CellFinder, ImageNoise, RasterFinder, find_contacts
+from jeit.touch.contacts.cell_outline import outline_of_cells
 
 FINDERS = [CellFinder, RasterFinder]
 MESH = disk(0.05, num_points=2500)
@@ -91,6 +92,15 @@ def test_deviation_is_how_far_the_centroid_strays(skin, finder, within):
     strayed = np.sqrt(np.var(places, axis=0).sum())
     told = find_contacts(ready, skin.one, noise)[0].deviation
     assert told == pytest.approx(strayed, rel=within)
+
+
+def test_outline_of_cells_is_their_outer_edge_alone():
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    loop = outline_of_cells(points, np.array([[0, 1, 2], [0, 2, 3]]))
+    assert sorted(loop.tolist()) == sorted(points.tolist())
+    around = np.flatnonzero((np.linalg.norm(CENTRE, axis=1) < 0.03) & (np.linalg.norm(CENTRE, axis=1) > 0.01))
+    outer = outline_of_cells(np.asarray(MESH.points), np.asarray(MESH.cells)[around])
+    assert np.linalg.norm(outer, axis=1).min() > 0.027  # not that of the hole
 
 
 def test_noise_of_frames_is_that_of_channels(skin):
