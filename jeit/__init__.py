@@ -9,7 +9,7 @@ The names used most, and where the rest is:
 - `adjacent`: what is driven and measured (`jeit.protocol`);
 - `ForwardModel`: conductivity to voltages and Jacobian (`jeit.forward`);
 - `calibrate`, `one_step`, `reconstruct`: linear and nonlinear imaging (`jeit.inverse`);
-- `find_inclusions`: what an image shows (`jeit.image`);
+- `find_inclusions`: what an image shows (`jeit.image`); who touches a skin, where and how hard: `jeit.touch`;
 - layouts of electrodes compared and improved: `jeit.design`; microphones under a skin: `jeit.acoustic`; what is not
   measured: `jeit.simulate`;
 - `plot_image`: pictures (`jeit.plot`).
@@ -56,6 +56,7 @@ _ROOMS = (
     "protocol",
     "report",
     "simulate",
+    "touch",
 )
 _HOMES = {
     "BoundaryElectrodes": "electrodes",

@@ -23,9 +23,9 @@ ROOMS["acoustic"] = {"arguments", "mesh"}
 ROOMS["design"] = {*ROOMS["inverse"], "layout", "inverse"}
 ROOMS["data"] = {*ROOMS["forward"], "layout", "forward"}
 ROOMS["simulate"] = {*ROOMS["design"], "design", "data", "acoustic"}
+ROOMS["touch"] = {*ROOMS["inverse"], "inverse", "image", "data"}
 ROOMS["imaging"] = {*ROOMS["inverse"], "inverse", "data", "image"}
-ROOMS["touch"] = {"arguments"}
-ROOMS["plot"] = {*ROOMS["simulate"], *ROOMS["imaging"], "simulate", "imaging", "touch"}
+ROOMS["plot"] = {*ROOMS["simulate"], *ROOMS["imaging"], "simulate", "touch", "imaging"}
 ROOMS["report"] = {*ROOMS["plot"], "plot"}
 ROOMS["cli"] = {*ROOMS["report"], "report", "start"}
 

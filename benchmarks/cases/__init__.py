@@ -17,6 +17,7 @@ NAMES = (
     "design",
     "contact",
     "first_call",
+    "contacts",
     "localisation_error",
     "ktc2023",
     "real_skins",

@@ -4,8 +4,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit.image.watershed import basins, cell_neighbours
 from jeit.mesh import Mesh, centroids, measures
-from jeit.mesh.geometry import interior_facets
 
 
 class Inclusion(eqx.Module):
@@ -55,11 +55,11 @@ def find_inclusions(
     if strongest == 0:
         return []
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
-    neighbours = _neighbours(mesh)
+    neighbours = cell_neighbours(mesh)
     found = []
     for sign in (1, -1):
         change = sign * values
-        basin = _basins(change, neighbours, floor=level * least_peak * strongest, least_prominence=least_prominence)
+        basin = basins(change, neighbours, floor=level * least_peak * strongest, least_prominence=least_prominence)
         for label in np.unique(basin[basin >= 0]):
             peak = change[label]
             region = (basin == label) & (change >= level * peak)
@@ -69,40 +69,3 @@ def find_inclusions(
             centroid = tuple(float(value) for value in weight @ centre[region] / weight.sum())
             found.append(Inclusion(sign, centroid, float(measure[region].sum()), float(sign * peak)))
     return sorted(found, key=lambda inclusion: -abs(inclusion.peak))
-
-
-def _neighbours(mesh: Mesh) -> list[list[int]]:
-    pairs, _ = interior_facets(mesh)
-    neighbours: list[list[int]] = [[] for _ in range(mesh.num_cells)]
-    for first, second in pairs.tolist():
-        neighbours[first].append(second)
-        neighbours[second].append(first)
-    return neighbours
-
-
-def _basins(change: np.ndarray, neighbours: list[list[int]], *, floor: float, least_prominence: float) -> np.ndarray:
-    """The peak (a cell's index) that every cell above `floor` belongs to, -1 below: a watershed from the top down.
-
-    Where two basins meet, the lower one is swallowed unless its peak stands out from the meeting point.
-    """
-    peak = np.full(len(change), -1)
-    swallowed: dict[int, int] = {}
-
-    def root(label: int) -> int:
-        while label in swallowed:
-            label = swallowed[label]
-        return label
-
-    for cell in np.argsort(-change).tolist():
-        if change[cell] <= floor:
-            break
-        labels = {root(int(peak[other])) for other in neighbours[cell] if peak[other] >= 0}
-        if not labels:
-            peak[cell] = cell
-            continue
-        highest = max(labels, key=lambda label: change[label])
-        peak[cell] = highest
-        for label in labels - {highest}:
-            if change[label] - change[cell] < least_prominence * change[label]:
-                swallowed[label] = highest
-    return np.array([root(label) if label >= 0 else -1 for label in peak.tolist()])

@@ -1,4 +1,5 @@
-"""Pictures, with matplotlib: meshes, images, electrodes, sensitivity, taxels, layouts, voltages, microphones, touches.
+"""Pictures, with matplotlib: meshes, images, electrodes, sensitivity, taxels, layouts, voltages, microphones, touches,
+contacts.
 
 Every function takes `ax`, makes a figure of its own where none is given, and returns the axes it drew on. Lengths are
 in metres in the arguments and in millimetres in the pictures.
@@ -17,6 +18,8 @@ from jeit.plot.imaging.figures_of_merit import plot_figures_of_merit
 from jeit.plot.imaging.hyperparameter import plot_choice
 from jeit.plot.imaging.image import plot_image
 from jeit.plot.imaging.mesh import plot_mesh
+from jeit.plot.touch.contact_stages import plot_contact_stages
+from jeit.plot.touch.contacts import plot_contacts
 from jeit.plot.touch.learning import plot_confusion, plot_force_errors, plot_key_errors, plot_place_errors
 from jeit.plot.touch.touches import plot_answers, plot_places
 
@@ -28,6 +31,8 @@ __all__ = [
     "plot_answers",
     "plot_choice",
     "plot_confusion",
+    "plot_contact_stages",
+    "plot_contacts",
     "plot_error_curve",
     "plot_figures_of_merit",
     "plot_force_errors",

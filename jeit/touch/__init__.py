@@ -1,17 +1,39 @@
-"""From frames to meaning: skins that learn where, how hard and by what they are touched."""
+"""From frames to meaning: where, how hard and how a skin is touched.
 
+Rooms: `contacts` (what an image shows, from frame to frame, in newtons), `learnt` (skins that learn from recorded
+presses, without a model).
+"""
+
+from jeit.touch.contacts import (
+    CellFinder,
+    Contact,
+    ContactTracker,
+    ImageNoise,
+    LoadCalibration,
+    RasterFinder,
+    find_contacts,
+    track_contacts,
+)
 from jeit.touch.learnt.file import read_skin, write_skin
 from jeit.touch.learnt.learnt_skin import LearntSkin, Standing
 from jeit.touch.learnt.presses import Presses, read_frames, read_presses
 from jeit.touch.learnt.touches import Touches
 
 __all__ = [
+    "CellFinder",
+    "Contact",
+    "ContactTracker",
+    "ImageNoise",
     "LearntSkin",
+    "LoadCalibration",
     "Presses",
+    "RasterFinder",
     "Standing",
     "Touches",
+    "find_contacts",
     "read_frames",
     "read_presses",
     "read_skin",
+    "track_contacts",
     "write_skin",
 ]

@@ -11,6 +11,7 @@ FOLDER = Path(__file__).resolve().parents[2] / "examples"
 MOST = {
     "press_on_a_skin": 3e-3,
     "press_with_a_load": 1e-8,
+    "contacts_from_images": 4e-3,
     "design_a_skin": 0.6,
     "design_gradient": 1e-5,
     "every_method": 0.25,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import command_line
 import matplotlib
+import numpy as np
 import pytest
 from matplotlib import pyplot
 
@@ -56,6 +57,13 @@ def fault(line: str) -> str | None:
     return f"{' '.join(path)} takes {places} arguments, not {given}" if given > places else None
 
 
+def _contacts(names: dict, folder: Path, printed: list[str]) -> None:
+    assert np.linalg.norm(names["contact"].centroid - [0.01, 0.02]) < 2e-3
+    assert 0.04 < names["path"].length < 0.06
+    assert abs(names["force"].force - 2.0) < 0.4
+    assert len(printed) == 2
+
+
 def _design(names: dict, folder: Path, printed: list[str]) -> None:
     assert (folder / "sensitivity.png").stat().st_size > 10_000
     assert names["found"].scores.worst > 1.3 * names["scores"].worst
@@ -90,6 +98,7 @@ def _readme(names: dict, folder: Path, printed: list[str]) -> None:
 
 HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "README.md": _readme,
+    "contacts.md": _contacts,
     "design.md": _design,
     "hearing.md": _hearing,
     "pressing.md": _pressing,

@@ -1,1 +1,1 @@
-"""Pictures of what learnt skins say, and of how well they learnt."""
+"""Pictures of contacts in images, and of what learnt skins say and how well they learnt."""

@@ -1,0 +1,97 @@
+"""What finds contacts: the one interface, and what it asks of an image."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from scipy import sparse
+
+from jeit.arguments import check_kind, is_number, told
+from jeit.mesh import Mesh
+from jeit.touch.contacts.contact import Contact
+from jeit.touch.contacts.image_noise import ImageNoise
+
+
+class AbstractFinder(eqx.Module):
+    """A way to find contacts in images on one mesh, of which all is prepared that does not depend on the image.
+
+    **Fields**: `smoothing` (m, m), applied to images first; `sign`, +1 where touched skin conducts better, -1 where
+    worse; `floor`, how many standard deviations a cell must stand out to belong to a contact.
+    """
+
+    smoothing: eqx.AbstractVar[sparse.csr_array]
+    sign: eqx.AbstractVar[int]
+    floor: eqx.AbstractVar[float]
+
+    @property
+    def num_cells(self) -> int:
+        """Number m of cells of an image."""
+        return self.smoothing.indptr.size - 1
+
+    @abstractmethod
+    def find(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> list[Contact]:
+        """Contacts in a `change` (m,), turned so that contacts are positive."""
+
+    def above_noise(
+        self, change: Float[np.ndarray, " m"], noise: ImageNoise
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """A change (m,) smoothed, and the same with zeros where it is below the floor."""
+        change = self.smoothing @ change
+        # No smoothed cell strays further than this, however cells stray together.
+        return change, np.where(change > self.floor * (self.smoothing @ noise.deviation), change, 0.0)
+
+
+def find_contacts(
+    finder: AbstractFinder, image: Float[np.ndarray, " m"], noise: ImageNoise | None = None
+) -> list[Contact]:
+    """Contacts in an image, strongest first.
+
+    `finder`: `CellFinder(mesh)` or `RasterFinder(mesh)` for the mesh of the image. `image` (m,): change of conductivity
+    in every cell, S (3-D: S/m), as `LinearReconstruction.image` gives it. `noise` of such images; of the image itself
+    unless given, see `ImageNoise.of_image`. Changes of the other sign than the finder's are left out. Raises
+    `ValueError` for an image of another mesh, NaN, and noise of another mesh.
+    """
+    check_kind("finder", finder, AbstractFinder, "a finder, such as CellFinder(mesh)")
+    change = checked_image(finder, image)
+    if noise is None:
+        noise = ImageNoise.of_image(change)
+    check_kind("noise", noise, ImageNoise, "ImageNoise, such as ImageNoise.of_frames(reconstruction, frames)")
+    if noise.deviation.shape != change.shape:
+        raise ValueError(f"noise is of {noise.deviation.size} cells, and the image of {change.size}; both of one mesh.")
+    found = finder.find(change, noise)
+    if finder.sign < 0:
+        found = [eqx.tree_at(lambda one: (one.peak, one.integral), one, (-one.peak, -one.integral)) for one in found]
+    return sorted(found, key=lambda one: -abs(one.peak))
+
+
+def checked_image(finder: AbstractFinder, image) -> Float[np.ndarray, " m"]:
+    """An image, turned so that contacts are positive. Raises `ValueError` for what is no image on the finder's mesh."""
+    values = np.asarray(image)
+    if values.shape != (finder.num_cells,):
+        raise ValueError(
+            f"image has shape {values.shape}; give one value for each of the {finder.num_cells} cells of the finder's "
+            "mesh. Was it reconstructed on another?"
+        )
+    if values.dtype.kind not in "iuf":
+        raise ValueError(f"image must be real; it is {values.dtype}.")
+    if not np.isfinite(values).all():
+        raise ValueError("image has NaN or infinite values; reconstruct it from unmasked channels first.")
+    return finder.sign * values
+
+
+def check_finder(mesh: Mesh, sign: int, floor: float) -> None:
+    """Raises `ValueError` for what is no 2-D mesh, a sign that is none, and a floor that is negative."""
+    check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
+    if mesh.dimension != 2:
+        raise ValueError("mesh has three dimensions; contacts are found on sheets: reconstruct on a 2-D mesh.")
+    if sign not in (1, -1):
+        raise ValueError(f"sign must be 1, where touched skin conducts better, or -1, where worse; it is {told(sign)}.")
+    if not (is_number(floor) and floor >= 0):
+        raise ValueError(f"floor must be zero or more, in standard deviations; it is {told(floor)}.")
+
+
+def check_share(name: str, value) -> None:
+    """Raises `ValueError` for what is not between 0 and 1."""
+    if not (is_number(value) and 0 <= value < 1):
+        raise ValueError(f"{name} must be a share, from 0 to below 1; it is {told(value)}.")

@@ -1,0 +1,120 @@
+"""Load calibration: from how strong a contact is in an image to newtons, with what it is uncertain by.
+
+    peak = s exp(b ρ² + c ρ⁴) F / (F + F½),    ρ = distance from the middle of the skin / its radius,
+
+rises with the load F and saturates, as conductivity under pressure does, and is the stronger the nearer the electrodes
+are. It is for one indenter, or those much alike: a wider contact under the same load has another peak.
+"""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+
+from jeit.arguments import check_kind, check_metres, told
+from jeit.touch.contacts.contact import Contact
+
+# Parameters s, b, c and F½, and what is left to tell how well they fit.
+_FEWEST = 8
+# Calibrated peaks end before the curve's saturation, where any load would do.
+_HIGHEST = 0.98
+
+
+class Load(eqx.Module):
+    """A `force` in newtons, and its standard deviation `deviation`, newtons."""
+
+    force: float
+    deviation: float
+
+
+class LoadCalibration(eqx.Module):
+    """How peaks follow loads.
+
+    **Fields**: `centre` (2,) and `radius` of the skin, metres; `parameters` (4,): log s, b, c and log F½, with their
+    `covariance` (4, 4); `scatter`, standard deviation of the logarithm of a peak about the curve; of what was
+    calibrated, `loads`, least and greatest, newtons, `farthest` ρ, and `highest`, the greatest share of saturation.
+    """
+
+    centre: Float[np.ndarray, "2"]
+    radius: float
+    parameters: Float[np.ndarray, "4"]
+    covariance: Float[np.ndarray, "4 4"]
+    scatter: float
+    loads: tuple[float, float]
+    farthest: float
+    highest: float
+
+    @classmethod
+    def fit(cls, contacts, loads, *, radius: float, centre=(0.0, 0.0)) -> "LoadCalibration":
+        """From `contacts` (n) under known `loads` (n,) newtons, eight at least, at several places, by least squares of
+        the logarithm of their peaks; `radius` of the skin and its `centre`, metres.
+
+        Raises `ValueError` for fewer, loads that are not positive or all the same, peaks of both signs, and a curve
+        that does not fit.
+        """
+        check_metres("radius", radius)
+        contacts, loads = list(contacts), np.asarray(loads, float)
+        if len(contacts) < _FEWEST or loads.shape != (len(contacts),):
+            raise ValueError(
+                f"contacts and loads: give {_FEWEST} or more, one load for each; there are {len(contacts)} "
+                f"contacts, and loads of shape {loads.shape}."
+            )
+        for number, contact in enumerate(contacts):
+            check_kind(f"contacts[{number}]", contact, Contact, "a Contact, as of find_contacts")
+        if not (np.isfinite(loads).all() and (loads > 0).all() and np.ptp(loads) > 0):
+            raise ValueError("loads must be positive, in newtons, and not all the same.")
+        peaks = np.array([one.peak for one in contacts])
+        if abs(np.sign(peaks).sum()) != len(peaks):
+            raise ValueError("contacts: their peaks must all be of one sign, and none zero.")
+        centre = np.asarray(centre, float)
+        distance = np.array([np.linalg.norm(one.centroid - centre) for one in contacts]) / radius
+        logarithm = np.log(np.abs(peaks))
+        begin = np.array([logarithm.max(), 0.0, 0.0, np.log(np.median(loads))])
+
+        def left(parameters):
+            return _log_peak(parameters, distance, loads) - logarithm
+
+        # Weak priors, of a thousandth of a reading each, where places or loads do not tell a parameter.
+        weak = np.sqrt(1e-3) * np.array([0.0, 0.3, 0.3, 0.3])
+        found = least_squares(lambda parameters: np.concatenate([left(parameters), weak * (parameters - begin)]), begin)
+        if not found.success:
+            raise ValueError(f"contacts and loads: no curve fits them ({found.message}).")
+        scatter = float(np.sqrt((left(found.x) ** 2).sum() / (len(loads) - len(begin))))
+        covariance = scatter**2 * np.linalg.inv(found.jac.T @ found.jac)
+        highest = float((loads / (loads + np.exp(found.x[3]))).max())
+        span = float(loads.min()), float(loads.max())
+        return cls(centre, float(radius), found.x, covariance, scatter, span, float(distance.max()), highest)
+
+    def load(self, contact: Contact) -> Load:
+        """The load of a contact, newtons, and its standard deviation: of the fit, and of the scatter about it.
+
+        Raises `ValueError` for a peak beyond those calibrated, where the curve says nothing of the load, and for a
+        place farther out.
+        """
+        check_kind("contact", contact, Contact, "a Contact, as of find_contacts")
+        distance = float(np.linalg.norm(contact.centroid - self.centre)) / self.radius
+        if distance > self.farthest + 0.05:
+            raise ValueError(
+                f"contact is {1e3 * distance * self.radius:.1f} mm from the middle, and calibrated contacts reach "
+                f"{1e3 * self.farthest * self.radius:.1f} mm; calibrate with loads farther out."
+            )
+        scale, first, second, half = self.parameters
+        share = abs(contact.peak) / np.exp(scale + first * distance**2 + second * distance**4)
+        # Two standard deviations of a peak about the curve are no sign of a greater load.
+        if share > min(self.highest * np.exp(2 * self.scatter), max(self.highest, _HIGHEST)):
+            raise ValueError(
+                f"contact: its peak {told(contact.peak)} is {share / self.highest:.2f} times the highest that was "
+                f"calibrated there, by {self.loads[1]:g} N; calibrate with greater loads."
+            )
+        force = float(np.exp(half) * share / (1 - share))
+        # d log F / d log peak = 1 / (1 − share); by the parameters: minus that times ∂ log peak, and F½ as it is.
+        steep = 1 / (1 - share)
+        slope = np.array([-steep, -steep * distance**2, -steep * distance**4, 1.0])
+        variance = slope @ self.covariance @ slope + (steep * self.scatter) ** 2
+        return Load(force, force * float(np.sqrt(variance)))
+
+
+def _log_peak(parameters, distance, loads):
+    """Logarithms of peaks at distances ρ under loads, newtons."""
+    scale, first, second, half = parameters
+    return scale + first * distance**2 + second * distance**4 + np.log(loads / (loads + np.exp(half)))

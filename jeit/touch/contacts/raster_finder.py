@@ -1,0 +1,165 @@
+"""Contacts on a raster, by OpenCV: region of interest, grey, adaptive threshold, opening, contours, centroids.
+
+The steps of Chen et al., "New flexible tactile sensor based on electrical impedance tomography", Micromachines 13
+(2022) 185. Sizes are not printed there: those here err less than a constant of 10, an opening of 5 pixels and no
+smoothing, on simulated skins (`python -m benchmarks contacts`).
+"""
+
+import importlib
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy import sparse
+
+from jeit.arguments import is_number, told
+from jeit.image import Raster
+from jeit.mesh import Mesh
+from jeit.touch.contacts.contact import Contact
+from jeit.touch.contacts.finder import AbstractFinder, check_finder
+from jeit.touch.contacts.image_noise import ImageNoise
+from jeit.touch.contacts.smoothing import gaussian_means
+
+# Standard deviation, in pixels, of the blur under which the slope at an edge is taken: a raster of cells has steps.
+_BLUR = 3.0
+
+
+class RasterStages(eqx.Module):
+    """What every step of `RasterFinder` makes of an image; all (rows, columns), row 0 at the top.
+
+    **Fields**: `region`, the change on the pixels of the skin, NaN beside it; `grey`, 0 to 255; `threshold` and
+    `opened`, whether a pixel is kept; `contacts`; `extent` (x_min, x_max, y_min, y_max), metres.
+    """
+
+    region: Float[np.ndarray, "rows columns"]
+    grey: UInt8[np.ndarray, "rows columns"]
+    threshold: Bool[np.ndarray, "rows columns"]
+    opened: Bool[np.ndarray, "rows columns"]
+    contacts: list[Contact]
+    extent: tuple[float, float, float, float]
+
+
+class RasterFinder(AbstractFinder):
+    """Grey levels from the floor to the image's greatest change; pixels `constant` levels above the Gaussian mean of
+    the `block` round them; opened by an ellipse; external contours, and the centroid of what each encloses.
+
+    **Fields**: `raster` of the mesh; `smoothing` (m, m), applied first; `block` and `opening`, odd numbers of pixels;
+    `constant`, grey levels; `floor` and `sign`, see `AbstractFinder`: what stands out by less is black, or empty frames
+    would have contacts.
+    """
+
+    raster: Raster
+    smoothing: sparse.csr_array
+    block: int
+    constant: float
+    opening: int
+    floor: float
+    sign: int
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        *,
+        pixels: int = 256,
+        smoothing: float | None = None,
+        block: int = 101,
+        constant: float = 20.0,
+        opening: int = 9,
+        floor: float = 5.0,
+        sign: int = 1,
+    ):
+        """`pixels` along a side of the raster; `smoothing`, metres, see `CellFinder`.
+
+        Raises `ImportError` without OpenCV, and `ValueError` for a mesh of three dimensions and sizes that are no odd
+        numbers of pixels.
+        """
+        import_opencv()
+        check_finder(mesh, sign, floor)
+        for name, value, least in (("block", block, 3), ("opening", opening, 1)):
+            if not (isinstance(value, int) and value >= least and value % 2):
+                raise ValueError(f"{name} must be an odd number of pixels from {least} up; it is {told(value)}.")
+        if not (isinstance(pixels, int) and pixels >= 16):
+            raise ValueError(f"pixels must be a whole number from 16 up; it is {told(pixels)}.")
+        if not is_number(constant):
+            raise ValueError(f"constant must be a number of grey levels; it is {told(constant)}.")
+        self.raster = Raster.create(mesh, shape=(pixels, pixels))
+        self.smoothing = gaussian_means(mesh, smoothing)
+        self.block, self.constant, self.opening = block, float(constant), opening
+        self.floor, self.sign = float(floor), int(sign)
+
+    def find(self, change, noise):
+        """See `find_contacts`."""
+        _, clear = self.above_noise(change, noise)
+        return self.stages(change, noise).contacts if clear.any() else []
+
+    def stages(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> RasterStages:
+        """What every step makes of a `change` (m,), turned so that contacts are positive."""
+        opencv = import_opencv()
+        cell = np.asarray(self.raster.cell)
+        inside = cell >= 0
+        change, clear = self.above_noise(change, noise)
+        region, clear = np.where(inside, change[cell], np.nan), np.where(inside, clear[cell], 0.0)
+        highest = clear.max()
+        grey = np.rint(255 * clear / (highest or 1.0)).astype(np.uint8)
+        # OpenCV takes pixels above the mean less its constant. Beside the skin stands what is near on it: beside black,
+        # all of its rim would stand out.
+        size = (self.block, self.block)
+        near = opencv.GaussianBlur(grey * 1.0, size, 0) / np.maximum(opencv.GaussianBlur(inside * 1.0, size, 0), 1e-12)
+        threshold = opencv.adaptiveThreshold(
+            np.where(inside, grey, near).astype(np.uint8),
+            255,
+            opencv.ADAPTIVE_THRESH_GAUSSIAN_C,
+            opencv.THRESH_BINARY,
+            self.block,
+            -self.constant,
+        ) * inside.astype(np.uint8)
+        ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (self.opening, self.opening))
+        opened = opencv.morphologyEx(threshold, opencv.MORPH_OPEN, ellipse)
+        contours, _ = opencv.findContours(opened, opencv.RETR_EXTERNAL, opencv.CHAIN_APPROX_NONE)
+        steepness = _steepness(opencv, np.where(inside, region, 0.0), self._pixel())
+        place = self.raster.pixel_centres()
+        contacts = [self._contact(opencv, region, place, steepness, contour[:, 0], noise) for contour in contours]
+        kept = sorted((one for one in contacts if one is not None), key=lambda one: -one.peak)
+        return RasterStages(region, grey, threshold > 0, opened > 0, kept, self.raster.extent)
+
+    def _contact(self, opencv, region, place, steepness, contour: np.ndarray, noise: ImageNoise) -> Contact | None:
+        """What a contour (k, 2) of columns and rows encloses."""
+        filled = np.zeros(region.shape, np.uint8)
+        opencv.drawContours(filled, [contour[:, None]], -1, 1, opencv.FILLED)
+        within = (filled > 0) & np.isfinite(region)
+        if not within.any():
+            return None
+        centroid, area = place[within].mean(axis=0), float(self.raster.pixel_area * within.sum())
+        column, row = contour.T
+        edge = place[row, column]
+        # A change δv moves the edge by δv / |∇v|, and with it the centroid by ∮ (x − c) δv / |∇v| ds / area.
+        length = np.linalg.norm(np.roll(edge, -1, axis=0) - np.roll(edge, 1, axis=0), axis=1) / 2
+        share = (length / (steepness[row, column] * area))[:, None] * (edge - centroid)
+        cell = np.asarray(self.raster.cell)[row, column]
+        slope = np.zeros((self.num_cells, 2))
+        np.add.at(slope, cell[cell >= 0], share[cell >= 0])
+        change = region[within]
+        integral = float(self.raster.pixel_area * change.sum())
+        return Contact(centroid, area, float(change.max()), integral, edge, noise.distance(self.smoothing.T @ slope))
+
+    def _pixel(self) -> float:
+        x_min, x_max = self.raster.extent[:2]
+        return (x_max - x_min) / self.raster.cell.shape[1]
+
+
+def _steepness(opencv: Any, region: np.ndarray, pixel: float) -> np.ndarray:
+    """|∇v| on every pixel, over metres, and nowhere less than a thousandth of the greatest."""
+    smooth = opencv.GaussianBlur(region, (0, 0), _BLUR)
+    steep = np.hypot(*np.gradient(smooth, pixel))
+    return np.maximum(steep, 1e-3 * steep.max(initial=0.0) + np.finfo(float).tiny)
+
+
+def import_opencv() -> Any:
+    """OpenCV. Raises `ImportError`, which says what to install, where it is missing."""
+    try:
+        return importlib.import_module("cv2")
+    except ImportError as error:
+        raise ImportError(
+            'Contacts on a raster need OpenCV: pip install "jeit[vision]". CellFinder needs nothing more.'
+        ) from error

@@ -1,0 +1,156 @@
+"""Contacts followed from frame to frame: which is which, when each begins and ends, and where it went."""
+
+from collections.abc import Iterable, Sequence
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
+
+from jeit.arguments import check_kind, check_metres, is_number, told
+from jeit.touch.contacts.contact import Contact
+
+# Of what a contact is off its prediction, how much goes into the velocity: half, so that two frames' noise evens out.
+_BELIEVED = 0.5
+# Gaps that a touch is waited for which another's contact hides.
+_HIDDEN = 4
+
+
+class TouchPath(eqx.Module):
+    """One touch: its `number`, in order of onset, and of every frame that it was seen in `times` (T,) seconds,
+    `position` (T, 2) metres, `peak` (T,) in the images' unit and `area` (T,) m²."""
+
+    number: int
+    times: Float[np.ndarray, " T"]
+    position: Float[np.ndarray, "T 2"]
+    peak: Float[np.ndarray, " T"]
+    area: Float[np.ndarray, " T"]
+
+    @property
+    def onset(self) -> float:
+        """Time of the first frame, seconds."""
+        return float(self.times[0])
+
+    @property
+    def offset(self) -> float:
+        """Time of the last frame, seconds."""
+        return float(self.times[-1])
+
+    @property
+    def length(self) -> float:
+        """Length of the path, metres."""
+        return float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
+
+
+class _Followed(eqx.Module):
+    """A touch that goes on: where it was at `time`, how fast it moved there (m/s), what was seen of it, and whether
+    another's contact may hide it now."""
+
+    number: int
+    time: float
+    place: Float[np.ndarray, "2"]
+    velocity: Float[np.ndarray, "2"]
+    seen: tuple[tuple[float, Contact], ...]
+    hidden: bool = False
+
+    def at(self, time: float) -> np.ndarray:
+        """Where it is expected, metres."""
+        return self.place + (time - self.time) * self.velocity
+
+    def path(self) -> TouchPath:
+        """What was seen of it."""
+        times, contacts = zip(*self.seen, strict=True)
+        columns = ([getattr(one, name) for one in contacts] for name in ("centroid", "peak", "area"))
+        return TouchPath(self.number, np.array(times), *map(np.array, columns))
+
+
+class ContactTracker(eqx.Module):
+    """Touches up to now. `tracker.follow(time, contacts)` gives the tracker after the next frame; this one stays.
+
+    A frame's contacts go to the touches whose predicted places (place + velocity · time) are nearest, all distances
+    together as small as can be, none more than `reach` metres. What no contact is left for is waited for `gap` seconds.
+    Where it may be hidden in another's contact, as when two fingers cross, it is taken to move on as it did, for four
+    gaps at most.
+
+    **Fields**: those; `least` frames of a touch, fewer are not told of; `time` of the last frame, -inf before the
+    first; `open` and `closed` touches; `number`, so many were begun.
+    """
+
+    gap: float = 0.15
+    reach: float = 0.012
+    least: int = 2
+    time: float = -np.inf
+    open: tuple[_Followed, ...] = ()
+    closed: tuple[TouchPath, ...] = ()
+    number: int = 0
+
+    def __check_init__(self):
+        """Raises `ValueError` for a gap and a reach that are not positive, and numbers of frames that are none."""
+        check_metres("reach", self.reach)
+        if not (is_number(self.gap) and self.gap > 0):
+            raise ValueError(f"gap must be positive, in seconds; it is {told(self.gap)}.")
+        if not (isinstance(self.least, int) and self.least >= 1):
+            raise ValueError(f"least must be a number of frames, 1 or more; it is {told(self.least)}.")
+
+    def follow(self, time: float, contacts: Sequence[Contact]) -> "ContactTracker":
+        """After a frame at `time`, seconds, with these contacts. Raises `ValueError` for a time that is not later."""
+        if not (is_number(time) and time > self.time):
+            raise ValueError(f"time must be later than the frame before, {self.time:g} s; it is {told(time)}.")
+        for number, contact in enumerate(contacts):
+            check_kind(f"contacts[{number}]", contact, Contact, "a Contact, as of find_contacts")
+        waited = [time - one.seen[-1][0] > self.gap * (_HIDDEN if one.hidden else 1) for one in self.open]
+        late = [one for one, over in zip(self.open, waited, strict=True) if over]
+        going = [one for one, over in zip(self.open, waited, strict=True) if not over]
+        expected = np.array([one.at(time) for one in going]).reshape(-1, 1, 2)
+        places = np.array([one.centroid for one in contacts]).reshape(1, -1, 2)
+        distance = np.linalg.norm(expected - places, axis=-1)
+        # Beyond reach any two are as good as none: no pair within it is given up for another's sake.
+        rows, columns = linear_sum_assignment(np.where(distance <= self.reach, distance, 1e3 * self.reach))
+        pairs = {int(row): int(one) for row, one in zip(rows, columns, strict=True) if distance[row, one] <= self.reach}
+        wide = self.reach + np.sqrt(np.array([one.area for one in contacts]) / np.pi)
+        lost = [row for row in range(len(going)) if row not in pairs]
+        hidden = {row for row in lost for one in pairs.values() if distance[row, one] <= wide[one]}
+        followed = [
+            _after(one, time, contacts[pairs[row]])
+            if row in pairs
+            else _Followed(one.number, time, one.at(time), one.velocity, one.seen, row in hidden)
+            for row, one in enumerate(going)
+        ]
+        new = [contacts[one] for one in range(len(contacts)) if one not in pairs.values()]
+        begun = [
+            _Followed(self.number + k, time, one.centroid, np.zeros(2), ((time, one),)) for k, one in enumerate(new)
+        ]
+        closed = self.closed + self._told_of(late)
+        values = (time, (*followed, *begun), closed, self.number + len(new))
+        return ContactTracker(self.gap, self.reach, self.least, *values)
+
+    @property
+    def touches(self) -> list[TouchPath]:
+        """All touches so far, those that go on too, in order of onset."""
+        return sorted(self.closed + self._told_of(self.open), key=lambda path: path.number)
+
+    def _told_of(self, followed: Iterable[_Followed]) -> tuple[TouchPath, ...]:
+        return tuple(one.path() for one in followed if len(one.seen) >= self.least)
+
+
+def track_contacts(
+    times: Float[np.ndarray, " F"], contacts: Sequence[Sequence[Contact]], tracker: ContactTracker | None = None
+) -> list[TouchPath]:
+    """Touches of a recording: `contacts` of every frame, at `times` (F,) seconds that rise.
+
+    `tracker` to begin with, `ContactTracker()` unless given. Raises `ValueError` for another number of times, and as
+    `ContactTracker.follow` does.
+    """
+    if len(times) != len(contacts):
+        raise ValueError(f"times: give one for each of the {len(contacts)} frames; there are {len(times)}.")
+    tracker = ContactTracker() if tracker is None else tracker
+    for time, found in zip(times, contacts, strict=True):
+        tracker = tracker.follow(float(time), found)
+    return tracker.touches
+
+
+def _after(one: _Followed, time: float, contact: Contact) -> _Followed:
+    """A touch after a frame with this contact."""
+    off = (contact.centroid - one.at(time)) / (time - one.time)
+    velocity = one.velocity + _BELIEVED * off
+    return _Followed(one.number, time, contact.centroid, velocity, (*one.seen, (time, contact)))

@@ -1,0 +1,40 @@
+"""A simulated skin, finer than the mesh of its images, and what it reads."""
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.inverse import one_step
+from jeit.layout import ring
+from jeit.mesh import Disk
+from jeit.protocol import adjacent
+from jeit.simulate import Disc, Press, PressedSkin, material
+from jeit.touch.contacts import ImageNoise
+
+
+@pytest.fixture(scope="session")
+def skin():
+    """Frames of two contacts, of one in the middle, and of none: readings, images, and what is known of the noise."""
+    electrodes = BoundaryElectrodes(ring(0.05, 16), 0.008, 300.0)
+    fine, coarse = (ForwardModel(Disk(0.05).mesh(num_points=n), electrodes, adjacent(16)) for n in (2500, 700))
+    pressed = PressedSkin(jax.random.key(0), fine, material("velostat"))
+    empty = pressed.frames(jax.random.key(1), [()] * 1100)
+    before, reference = empty[1000:], empty[1000:].mean(axis=0)
+    reconstruction = one_step(coarse, float(pressed.conductivity[0]), noise=before.std(axis=0))
+    two = (Press(Disc(0.008), 1.0, (0.025, 0.0)), Press(Disc(0.008), 2.0, (-0.02, 0.01)))
+    frames = pressed.frames(jax.random.key(2), [two, Press(Disc(0.0115), 1.0, (0.01, 0.005))])
+    return SimpleNamespace(
+        mesh=coarse.mesh,
+        reconstruction=reconstruction,
+        before=before,
+        reference=reference,
+        empty=np.asarray(reconstruction.image(empty[:1000] - reference)),
+        noise=ImageNoise.of_frames(reconstruction, before),
+        two=np.asarray(reconstruction.image(frames[0] - reference)),
+        one=np.asarray(reconstruction.image(frames[1] - reference)),
+        change=frames[1] - reference,
+    )

@@ -1,0 +1,212 @@
+"""Contacts found: places, areas, noise; none where nothing touches."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from jeit.mesh import centroids, disk, layer, measures
+from jeit.touch.contacts import CellFinder, ImageNoise, RasterFinder, find_contacts
+from jeit.touch.contacts.cell_outline import outline_of_cells
+
+FINDERS = [CellFinder, RasterFinder]
+MESH = disk(0.05, num_points=2500)
+CENTRE = np.asarray(centroids(MESH))
+QUIET = ImageNoise(np.full(MESH.num_cells, 1e-6))
+
+
+def bump(x, y, width=0.007):
+    return np.exp(-((CENTRE - [x, y]) ** 2).sum(axis=1) / (2 * width**2))
+
+
+@pytest.mark.parametrize("finder", FINDERS)
+def test_bumps_are_where_they_are(finder):
+    found = find_contacts(finder(MESH), bump(0.02, 0.01) + 0.6 * bump(-0.02, -0.005), QUIET)
+    assert len(found) == 2
+    np.testing.assert_allclose(found[0].centroid, [0.02, 0.01], atol=5e-4)
+    np.testing.assert_allclose(found[1].centroid, [-0.02, -0.005], atol=5e-4)
+    assert found[1].peak / found[0].peak == pytest.approx(0.6, rel=0.02)
+    for one in found:  # the outline lies round the centroid, and encloses about the region
+        x, y = (one.contour - one.centroid).T
+        enclosed = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
+        assert enclosed == pytest.approx(one.area, rel=0.15)
+
+
+def test_area_and_integral_of_a_smoothed_gaussian():
+    """A Gaussian of variance w² smoothed by one of ℓ² is one of w² + ℓ², whose cut at a level has area 2π(w² + ℓ²)
+    ln(1 / level), and peak w² / (w² + ℓ²)."""
+    (found,) = find_contacts(CellFinder(MESH, smoothing=0.003, level=0.5), bump(0.0, 0.0), QUIET)
+    wide = 0.007**2 + 0.003**2
+    assert found.peak == pytest.approx(0.007**2 / wide, rel=0.03)
+    assert found.area == pytest.approx(2 * np.pi * wide * np.log(2), rel=0.05)
+    assert found.integral == pytest.approx(2 * np.pi * 0.007**2 * 0.5, rel=0.05)
+
+
+def test_near_contacts_part_and_a_shoulder_does_not():
+    assert len(find_contacts(CellFinder(MESH), bump(0.011, 0) + bump(-0.011, 0), QUIET)) == 2
+    assert len(find_contacts(CellFinder(MESH), bump(0.006, 0) + bump(-0.006, 0), QUIET)) == 1
+
+
+@pytest.mark.parametrize("finder", FINDERS)
+def test_negative_changes_are_contacts_only_where_asked(finder):
+    image = -bump(0.02, 0.01)
+    assert find_contacts(finder(MESH), image, QUIET) == []
+    (found,) = find_contacts(finder(MESH, sign=-1), image, QUIET)
+    assert found.peak < 0
+    assert found.integral < 0
+    np.testing.assert_allclose(found.centroid, [0.02, 0.01], atol=5e-4)
+
+
+@pytest.mark.parametrize("finder", FINDERS)
+def test_two_presses_are_two(skin, finder):
+    found = find_contacts(finder(skin.mesh), skin.two, skin.noise)
+    assert len(found) == 2
+    truth = np.array([[0.025, 0.0], [-0.02, 0.01]])
+    off = np.linalg.norm(truth[:, None] - np.array([one.centroid for one in found]), axis=-1).min(axis=1)
+    assert off.max() < 0.004
+
+
+@pytest.mark.parametrize("finder", FINDERS)
+def test_no_contact_in_a_thousand_empty_frames(skin, finder):
+    ready = finder(skin.mesh)
+    assert sum(len(find_contacts(ready, image, skin.noise)) for image in skin.empty) == 0
+    eager = finder(skin.mesh, floor=1.0)  # and it is the floor that keeps them out
+    assert sum(bool(find_contacts(eager, image, skin.noise)) for image in skin.empty[:50]) > 25
+
+
+@pytest.mark.parametrize(("finder", "within"), [(CellFinder, 0.2), (RasterFinder, 0.7)])
+def test_deviation_is_how_far_the_centroid_strays(skin, finder, within):
+    """Against 200 draws of noise fifty times that of the readings, whose own error is 5 %; a contour steps by pixels,
+    and its threshold moves with what is round it."""
+    random = np.random.default_rng(0)
+    volts = 50 * random.choice([-1, 1], 208) * skin.before.std(axis=0)
+    noise = ImageNoise.of_channels(skin.reconstruction, np.abs(volts))
+    images = np.asarray(skin.reconstruction.image(skin.change + volts * random.normal(size=(200, 208))))
+    ready = finder(skin.mesh, floor=0.5)
+    (exact,) = find_contacts(finder(skin.mesh), skin.one, skin.noise)
+    places = []
+    for image in images:
+        found = find_contacts(ready, image, noise)
+        nearest = min(found, key=lambda one: np.linalg.norm(one.centroid - exact.centroid))
+        places.append(nearest.centroid)
+    strayed = np.sqrt(np.var(places, axis=0).sum())
+    told = find_contacts(ready, skin.one, noise)[0].deviation
+    assert told == pytest.approx(strayed, rel=within)
+
+
+def test_outline_of_cells_is_their_outer_edge_alone():
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    loop = outline_of_cells(points, np.array([[0, 1, 2], [0, 2, 3]]))
+    assert sorted(loop.tolist()) == sorted(points.tolist())
+    around = np.flatnonzero((np.linalg.norm(CENTRE, axis=1) < 0.03) & (np.linalg.norm(CENTRE, axis=1) > 0.01))
+    outer = outline_of_cells(np.asarray(MESH.points), np.asarray(MESH.cells)[around])
+    assert np.linalg.norm(outer, axis=1).min() > 0.027  # not that of the hole
+
+
+def test_noise_of_frames_is_that_of_channels(skin):
+    told = ImageNoise.of_channels(skin.reconstruction, skin.before.std(axis=0))
+    np.testing.assert_allclose(skin.noise.deviation, told.deviation, rtol=0.3)  # a hundred frames tell it to 7 %
+    matrix = np.asarray(skin.reconstruction.matrix)
+    covariance = (matrix * skin.before.std(axis=0) ** 2) @ matrix.T
+    np.testing.assert_allclose(told.factor.T @ told.factor, covariance, atol=1e-9 * np.abs(covariance).max())
+
+
+def test_noise_unknown_is_taken_from_the_image(skin):
+    random = np.random.default_rng(0)
+    own = ImageNoise.of_image(0.01 * random.normal(size=MESH.num_cells) + bump(0.0, 0.0, 0.003))
+    assert own.deviation[0] == pytest.approx(0.01, rel=0.1)  # a narrow contact, of 2 % of the cells
+    assert own.factor is None
+    assert own.distance(np.ones((MESH.num_cells, 2))) == pytest.approx(np.sqrt(2) * own.deviation.sum())
+    found = find_contacts(CellFinder(skin.mesh), skin.one)
+    assert len(found) == 1
+    assert np.linalg.norm(found[0].centroid - [0.01, 0.005]) < 0.003
+
+
+def test_smoothing_is_a_mean(skin):
+    finder = CellFinder(skin.mesh)
+    np.testing.assert_allclose(finder.smoothing @ np.ones(skin.mesh.num_cells), 1.0)
+    assert CellFinder(skin.mesh, smoothing=0.0).smoothing.nnz == skin.mesh.num_cells
+    assert np.asarray(measures(skin.mesh)).sum() == pytest.approx(finder.areas.sum())
+
+
+@pytest.mark.parametrize("finder", FINDERS)
+@pytest.mark.parametrize(
+    ("image", "wrong"),
+    [
+        (np.zeros(17), "another"),
+        (np.full(MESH.num_cells, np.nan), "NaN"),
+        (np.zeros(MESH.num_cells, complex), "real"),
+    ],
+)
+def test_images_that_are_none(finder, image, wrong):
+    with pytest.raises(ValueError, match=wrong):
+        find_contacts(finder(MESH), image, QUIET)
+
+
+def test_stages_lead_from_image_to_contacts(skin):
+    finder = RasterFinder(skin.mesh)
+    stages = finder.stages(skin.two, skin.noise)
+    inside = np.isfinite(stages.region)
+    assert inside.mean() == pytest.approx(np.pi / 4, rel=0.01)
+    assert stages.grey.max() == 255
+    assert not stages.grey[~inside].any()
+    assert not stages.threshold[~inside].any()
+    assert (stages.opened <= stages.threshold).all()
+    found = find_contacts(finder, skin.two, skin.noise)
+    assert [one.peak for one in stages.contacts] == [one.peak for one in found]
+    assert sum(one.area for one in found) == pytest.approx(finder.raster.pixel_area * stages.opened.sum(), rel=0.01)
+
+
+def test_an_image_of_nothing_has_no_contact():
+    assert find_contacts(CellFinder(MESH), np.zeros(MESH.num_cells)) == []
+    assert find_contacts(RasterFinder(MESH), np.zeros(MESH.num_cells)) == []
+
+
+def test_noise_of_another_mesh(skin):
+    with pytest.raises(ValueError, match="both of one mesh"):
+        find_contacts(CellFinder(MESH), bump(0, 0), skin.noise)
+    with pytest.raises(ValueError, match="noise must be ImageNoise"):
+        find_contacts(CellFinder(MESH), bump(0, 0), 1e-3)
+    with pytest.raises(ValueError, match="finder must be"):
+        find_contacts(MESH, bump(0, 0), QUIET)
+
+
+@pytest.mark.parametrize(
+    ("options", "wrong"),
+    [({"sign": 0}, "sign"), ({"floor": -1}, "floor"), ({"level": 1.0}, "level"), ({"smoothing": 3.0}, "smoothing")],
+)
+def test_cell_finders_that_are_none(options, wrong):
+    with pytest.raises(ValueError, match=wrong):
+        CellFinder(MESH, **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "wrong"), [({"block": 100}, "block"), ({"opening": 0}, "opening"), ({"pixels": 3}, "pixels")]
+)
+def test_raster_finders_that_are_none(options, wrong):
+    with pytest.raises(ValueError, match=wrong):
+        RasterFinder(MESH, **options)
+
+
+def test_a_body_is_no_sheet():
+    with pytest.raises(ValueError, match="three dimensions"):
+        CellFinder(layer(disk(0.05, num_points=60), 0.01, num_layers=1))
+
+
+def test_frames_that_tell_no_noise(skin):
+    with pytest.raises(ValueError, match="10 frames or more"):
+        ImageNoise.of_frames(skin.reconstruction, skin.before[:3])
+    with pytest.raises(ValueError, match="all the same"):
+        ImageNoise.of_frames(skin.reconstruction, np.zeros((20, 208)))
+    with pytest.raises(ValueError, match="deviation"):
+        ImageNoise.of_channels(skin.reconstruction, np.zeros(7))
+    with pytest.raises(ValueError, match="not zero for all"):
+        ImageNoise.of_channels(skin.reconstruction, 0.0)
+    with pytest.raises(ValueError, match="finite"):
+        ImageNoise.of_image(np.array([1.0, np.nan]))
+
+
+def test_without_opencv_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(ImportError, match=r"jeit\[vision\]"):
+        RasterFinder(MESH)

@@ -1,0 +1,99 @@
+"""Loads from peaks: the curve found again, error bars that hold, and what was not calibrated refused."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.layout import ring
+from jeit.mesh import Disk
+from jeit.protocol import adjacent
+from jeit.simulate import Disc, Press, PressedSkin, material
+from jeit.touch.contacts import CellFinder, Contact, LoadCalibration, find_contacts
+
+RADIUS = 0.05
+
+
+def contact(load, distance, noise=0.0, sign=1):
+    rho = distance / RADIUS
+    peak = sign * 2e-6 * np.exp(0.8 * rho**2 + 0.5 * rho**4) * load / (load + 8.0) * np.exp(noise)
+    return Contact(np.array([0.0, distance]), 1e-4, float(peak), 1e-10, np.zeros((3, 2)), 0.0)
+
+
+def drawn(random, number, scatter, sign=1):
+    loads, places = random.uniform(0.5, 20, number), random.uniform(0, 0.04, number)
+    noise = scatter * random.normal(size=number)
+    return [contact(*one, sign) for one in zip(loads, places, noise, strict=True)], loads
+
+
+def test_an_exact_curve_is_found_again():
+    calibration = LoadCalibration.fit(*drawn(np.random.default_rng(0), 60, 1e-6), radius=RADIUS)
+    np.testing.assert_allclose(calibration.parameters, [np.log(2e-6), 0.8, 0.5, np.log(8.0)], atol=0.02)
+    for load, place in ((1.0, 0.0), (5.0, 0.03), (15.0, 0.035)):
+        assert calibration.load(contact(load, place)).force == pytest.approx(load, rel=0.01)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_error_bars_hold_what_they_say(sign):
+    random, off = np.random.default_rng(1), []
+    for _ in range(20):  # each calibration has one error for all the loads that it tells
+        calibration = LoadCalibration.fit(*drawn(random, 40, 0.05, sign), radius=RADIUS)
+        for load, place in zip(random.uniform(1, 8, 40), random.uniform(0, 0.035, 40), strict=True):
+            told = calibration.load(contact(load, place, 0.05 * random.normal(), sign))
+            off.append((told.force - load) / told.deviation)
+    assert np.std(off) == pytest.approx(1.0, abs=0.2)
+    assert np.mean(np.abs(off) < 2) > 0.9
+
+
+def test_loads_rise_with_peaks():
+    calibration = LoadCalibration.fit(*drawn(np.random.default_rng(2), 40, 0.05), radius=RADIUS)
+    forces = [calibration.load(contact(load, 0.02)).force for load in np.linspace(0.5, 15, 30)]
+    assert (np.diff(forces) > 0).all()
+
+
+def test_what_was_not_calibrated_is_refused():
+    calibration = LoadCalibration.fit(*drawn(np.random.default_rng(3), 40, 0.01), radius=RADIUS)
+    with pytest.raises(ValueError, match="greater loads"):
+        calibration.load(contact(60.0, 0.02))
+    with pytest.raises(ValueError, match="farther out"):
+        calibration.load(contact(5.0, 0.047))
+
+
+def test_a_skin_is_calibrated_over_its_radius(skin):
+    """Loads at places and of sizes that were not calibrated, to 15 %, near the edge as in the middle."""
+    electrodes = BoundaryElectrodes(ring(RADIUS, 16), 0.008, 300.0)
+    model = ForwardModel(Disk(RADIUS).mesh(num_points=2500), electrodes, adjacent(16))
+    pressed = PressedSkin(jax.random.key(0), model, dataclasses.replace(material("velostat"), gain_spread=0.0))
+    finder = CellFinder(skin.mesh)
+
+    def peaks(key, radii, loads):
+        turned = np.arange(len(radii)) * 2.4
+        presses = [
+            Press(Disc(0.01), load, (r * np.cos(a), r * np.sin(a)))
+            for r, load, a in zip(radii, loads, turned, strict=True)
+        ]
+        images = np.asarray(skin.reconstruction.image(pressed.frames(jax.random.key(key), presses) - pressed.rest()))
+        return [find_contacts(finder, image, skin.noise)[0] for image in images]
+
+    radii, loads = np.tile([0.0, 0.012, 0.024, 0.035], 6), np.repeat([0.5, 1.0, 2.0, 5.0, 10.0, 20.0], 4)
+    calibration = LoadCalibration.fit(peaks(1, radii, loads), loads, radius=RADIUS)
+    _, second, fourth, _ = calibration.parameters
+    assert second * 0.6**2 + fourth * 0.6**4 > 0.3  # a third stronger and more, at 30 mm
+    others = np.array([0.7, 1.5, 3.0, 8.0, 4.0, 1.2])
+    found = [calibration.load(one) for one in peaks(2, [0.005, 0.018, 0.03, 0.0, 0.033, 0.028], others)]
+    np.testing.assert_allclose([one.force for one in found], others, rtol=0.15)
+
+
+def test_bad_input():
+    contacts, loads = drawn(np.random.default_rng(4), 20, 0.05)
+    with pytest.raises(ValueError, match="8 or more"):
+        LoadCalibration.fit(contacts[:5], loads[:5], radius=RADIUS)
+    with pytest.raises(ValueError, match="not all the same"):
+        LoadCalibration.fit(contacts, np.ones(20), radius=RADIUS)
+    with pytest.raises(ValueError, match="one sign"):
+        LoadCalibration.fit([contact(1.0, 0.0, sign=-1), *contacts[1:]], loads, radius=RADIUS)
+    with pytest.raises(ValueError, match="radius"):
+        LoadCalibration.fit(contacts, loads, radius=0.0)

@@ -1,0 +1,84 @@
+"""Touches followed: identities where paths cross, gaps, onsets and offsets."""
+
+import numpy as np
+import pytest
+
+from jeit.touch.contacts import Contact, ContactTracker, track_contacts
+
+TIMES = np.arange(60) / 60
+
+
+def contact(place, peak=1.0):
+    return Contact(np.asarray(place, float), 1e-4, peak, 1e-4, np.zeros((3, 2)), 0.0)
+
+
+def crossing(hide):
+    """Two fingers at right angles, one contact between them while they are nearer than `hide`; the peak tells them."""
+    along = np.linspace(-0.03, 0.03, 60)
+    frames = []
+    for x in along:
+        first, second = np.array([x, x]) / np.sqrt(2), np.array([x, -x]) / np.sqrt(2)
+        near = np.linalg.norm(first - second) < hide
+        frames.append([contact((first + second) / 2)] if near else [contact(second, 2.0), contact(first, 1.0)])
+    return frames
+
+
+@pytest.mark.parametrize("hide", [0.0, 0.008, 0.02])
+def test_fingers_that_cross_keep_who_they_are(hide):
+    touches = track_contacts(TIMES, crossing(hide))
+    assert len(touches) == 2
+    for path in touches:
+        apart = np.abs(np.linspace(-0.03, 0.03, 60)) * np.sqrt(2) > 0.021
+        own = path.peak[np.isin(path.times, TIMES[apart])]
+        assert len(set(own)) == 1
+        assert path.length == pytest.approx(0.06, rel=0.3)
+
+
+def test_without_velocity_they_would_be_swapped():
+    """Fingers that meet head on and pass: nearest places alone would take each for the other."""
+    along = np.linspace(-0.03, 0.03, 61)
+    frames = [[contact((x, 0.001), 1.0), contact((-x, -0.001), 2.0)] for x in along]
+    touches = track_contacts(np.arange(61) / 60, frames)
+    assert [len(set(path.peak)) for path in touches] == [1, 1]
+
+
+def test_short_gaps_are_bridged_and_long_ones_part_touches():
+    place = np.stack([0.1 * TIMES, 0 * TIMES], axis=-1)
+    seen = [[contact(one)] for one in place]
+    short = [[] if 20 <= k < 26 else one for k, one in enumerate(seen)]
+    (path,) = track_contacts(TIMES, short)
+    assert (path.onset, path.offset, len(path.times)) == (0.0, TIMES[-1], 54)
+    long = [[] if 20 <= k < 40 else one for k, one in enumerate(seen)]
+    first, second = track_contacts(TIMES, long)
+    assert first.offset == TIMES[19]
+    assert second.onset == TIMES[40]
+
+
+def test_a_touch_of_one_frame_is_not_told_of():
+    frames = [[contact((0.0, 0.0))] if k == 5 else [] for k in range(20)]
+    assert track_contacts(TIMES[:20], frames) == []
+    assert len(track_contacts(TIMES[:20], frames, ContactTracker(least=1))) == 1
+
+
+def test_far_contacts_are_another_touch():
+    frames = [[contact((0.0, 0.0))]] * 10 + [[contact((0.03, 0.0))]] * 10
+    assert len(track_contacts(TIMES[:20], frames)) == 2
+
+
+def test_a_tracker_stays_as_it_was():
+    empty = ContactTracker()
+    after = empty.follow(0.0, [contact((0, 0))]).follow(0.1, [contact((0, 0))])
+    assert empty.touches == []
+    assert len(after.touches) == 1
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match="later"):
+        ContactTracker().follow(1.0, []).follow(1.0, [])
+    with pytest.raises(ValueError, match="times: give one"):
+        track_contacts(TIMES[:3], [[]])
+    with pytest.raises(ValueError, match=r"contacts\[0\]"):
+        ContactTracker().follow(0.0, [(0.0, 0.0)])  # pyright: ignore[reportArgumentType]
+    for options in ({"gap": 0.0}, {"reach": -1.0}, {"least": 0}):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            ContactTracker(**options)
