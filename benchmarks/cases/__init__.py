@@ -21,6 +21,7 @@ NAMES = (
     "localisation_error",
     "ktc2023",
     "real_skins",
+    "discriminants",
     "design_figures",
 )
 

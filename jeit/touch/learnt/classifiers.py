@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.touch.learnt.forest import Forest
+from jeit.touch.learnt.machine import Machine
 from jeit.touch.learnt.nearest import Nearest
 
 # Of the paper's ensembles: members, and leaves of a boosted tree.
@@ -72,14 +73,14 @@ def linear_svm(features, label) -> Any:
     """A support vector machine with linear borders."""
     from sklearn.svm import SVC
 
-    return SVC(kernel="linear").fit(features, label)
+    return Machine.of(SVC(kernel="linear").fit(features, label))
 
 
 def quadratic_svm(features, label) -> Any:
     """A support vector machine with quadratic borders."""
     from sklearn.svm import SVC
 
-    return SVC(kernel="poly", degree=2, coef0=1.0).fit(features, label)
+    return Machine.of(SVC(kernel="poly", degree=2, coef0=1.0).fit(features, label))
 
 
 def boosted_trees(features, label) -> Any:

@@ -15,6 +15,7 @@ from jeit.touch.learnt.gaussian_process import GaussianProcess
 from jeit.touch.learnt.keys import LearntKeys, Standardised
 from jeit.touch.learnt.labels import LearntLabels
 from jeit.touch.learnt.learnt_skin import LearntSkin
+from jeit.touch.learnt.machine import Machine
 from jeit.touch.learnt.nearest import Nearest
 from jeit.touch.learnt.neighbourhood import Neighbourhood
 from jeit.touch.learnt.network import Network
@@ -33,6 +34,7 @@ _OURS = {
         LearntLabels,
         LearntNumbers,
         LinearEnsemble,
+        Machine,
         Nearest,
         Neighbourhood,
         Network,

@@ -76,6 +76,19 @@ def test_subspace_discriminants_are_scikit_learns(number):
     np.testing.assert_allclose(told, bagged.fit(FEATURES, label).predict_proba(ASKED), atol=1e-12)
 
 
+@pytest.mark.parametrize("number", [2, 4])
+@pytest.mark.parametrize(("name", "kernel"), [("linear-svm", "linear"), ("quadratic-svm", "poly")])
+def test_machines_are_scikit_learns(name, kernel, number):
+    from sklearn.svm import SVC
+
+    label = LABEL % number
+    theirs = SVC(kernel=kernel, degree=2, coef0=1.0).fit(FEATURES, label)
+    told = CLASSIFIERS[name](FEATURES, label).decision_function(ASKED)
+    np.testing.assert_array_equal(told.argmax(axis=1), theirs.predict(ASKED))
+    if number > 2:
+        np.testing.assert_allclose(told, theirs.decision_function(ASKED), rtol=1e-9)
+
+
 def test_the_nearest_are_scikit_learns():
     from sklearn.neighbors import KNeighborsRegressor
 
