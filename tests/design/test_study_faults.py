@@ -141,7 +141,7 @@ def test_a_lost_worker_loses_nothing(study, whole_store, store_path):
     distributed = pytest.importorskip("distributed")
     told = []
     with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
 

@@ -138,7 +138,7 @@ def test_killed_within_a_chunk_and_resumed_the_store_is_the_same(presses, whole,
 def test_workers_simulate_the_same(presses, whole, tmp_path):
     distributed = pytest.importorskip("distributed")
     with (
-        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster) as client,
     ):
         found = simulate_presses(presses, tmp_path / "far.zarr", client=client)
