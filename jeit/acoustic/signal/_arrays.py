@@ -1,8 +1,4 @@
-"""Checks of what recordings and taps are made of, and the arrays of an NPZ file."""
-
-import zipfile
-import zlib
-from pathlib import Path
+"""Checks of what recordings and taps are made of."""
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -15,38 +11,6 @@ LOWEST_RATE = 100.0  # Hz
 LARGEST_EXTENT = 5.0  # m
 # Taps may miss the outline by so much of the skin's length; microphones nearer than this are at one place.
 _BESIDE, _SAME = 0.05, 1e-6  # of the length; m
-
-
-def npz_arrays(path: Path, start: bytes, *keys: str) -> dict[str, np.ndarray]:
-    """The arrays named, as far as an NPZ file has them, and under "" the names of all that it holds.
-
-    `start` is the file's first four bytes. Raises `ValueError` for other files, broken ones, and arrays of objects.
-    """
-    if start == b"\x93NUM":
-        raise ValueError("it holds a single array without names; save it with numpy.savez and the names of its arrays.")
-    if start != b"PK\x03\x04":
-        raise ValueError("neither an NPZ nor a WAV file; save the arrays with numpy.savez.")
-    arrays: dict[str, np.ndarray] = {}
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as content:
-            for key in keys:
-                if key in content.files:
-                    arrays[key] = content[key]
-                    if not isinstance(arrays[key], np.ndarray):
-                        raise ValueError(f"'{key}' in it is a file of another kind")
-            arrays[""] = np.array(content.files)
-    except (ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError) as error:
-        message = " ".join(str(error).split())
-        raise ValueError(f"not a readable NPZ file of plain arrays ({message}); write it again.") from None
-    return arrays
-
-
-def need(arrays: dict[str, np.ndarray], *keys: str) -> None:
-    """Raise `ValueError` where an array is missing, with the names of those that are there."""
-    missing = [key for key in keys if key not in arrays]
-    if missing:
-        held = ", ".join(str(name) for name in arrays[""][:12]) or "nothing"
-        raise ValueError(f"there is no array '{missing[0]}'; the file holds {held}.")
 
 
 def either(arrays: dict[str, np.ndarray], first: str, second: str) -> str:

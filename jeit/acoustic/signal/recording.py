@@ -22,15 +22,17 @@ from jeit.acoustic.signal._arrays import (
     check_taps,
     coordinates,
     either,
-    need,
-    npz_arrays,
     number,
     real,
     sampling_rate,
     short,
 )
 from jeit.acoustic.signal.faults import intensity_faults
+from jeit.arguments import need, npz_arrays
 from jeit.mesh.loops import check_loop
+
+# Said of files that are neither.
+_OTHERWISE = "neither an NPZ nor a WAV file"
 
 
 class Recording(eqx.Module):
@@ -213,7 +215,9 @@ def read_recording(path: str | Path) -> Recording | Intensities:
         if start in (b"RIFF", b"RIFX", b"RF64"):
             return _read_wav(path)
         optional = ("floor", "freedom", "overlap")
-        arrays = npz_arrays(path, start, "samples", "rate", "full_scale", "intensity", "times", *optional)
+        arrays = npz_arrays(
+            path, "samples", "rate", "full_scale", "intensity", "times", *optional, otherwise=_OTHERWISE
+        )
         kind = either(arrays, "intensity", "samples")
         if kind == "samples":
             if arrays["samples"].ndim == 3:
@@ -234,11 +238,10 @@ def read_taps(path: str | Path) -> Taps:
     with `rate`; optionally `full_scale`. Raises `ValueError` for other content, `OSError` where there is no such file.
     """
     path = Path(path)
-    with path.open("rb") as file:
-        start = file.read(4)
     geometry = ("microphones", "outline", "positions")
     try:
-        arrays = npz_arrays(path, start, *geometry, "intensity", "samples", "rate", "full_scale")
+        asked = (*geometry, "intensity", "samples", "rate", "full_scale")
+        arrays = npz_arrays(path, *asked, otherwise=_OTHERWISE)
         need(arrays, *geometry)
         kind = either(arrays, "intensity", "samples")
         values = {"power" if kind == "intensity" else "samples": arrays[kind]}

@@ -1,13 +1,14 @@
 """Recorded presses: frames of a skin, and what touched it in each; checked, and read from NPZ files."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jeit.touch.learnt.npz import npz_arrays
+from jeit.arguments import need, npz_arrays
 
 # No skin is known that is longer: its coordinates would be in millimetres.
 _LONGEST = 5.0  # m
@@ -96,11 +97,8 @@ def read_presses(path: str | Path) -> Presses:
 
     Raises `FileNotFoundError`, and `ValueError` for what is no such file and as of `Presses.create`.
     """
-    arrays = npz_arrays(path, ("frames", "reference", *_ROWS), ("frames",))
-    try:
-        return Presses.create(**arrays, name=Path(path).name)
-    except ValueError as error:
-        raise ValueError(f"'{path}': {error}") from None
+    with _naming(path):
+        return Presses.create(**_arrays(path, "frames", "reference", *_ROWS), name=Path(path).name)
 
 
 def read_frames(path: str | Path) -> dict[str, np.ndarray]:
@@ -108,9 +106,27 @@ def read_frames(path: str | Path) -> dict[str, np.ndarray]:
 
     Raises `FileNotFoundError`, and `ValueError` for what is no such file.
     """
-    arrays = npz_arrays(path, ("frames", "reference", "group"), ("frames",))
-    try:
+    with _naming(path):
+        arrays = _arrays(path, "frames", "reference", "group")
         return arrays | {"frames": check_frames("frames", arrays["frames"])}
+
+
+def _arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
+    """Those that a file has of the arrays named, `frames` at least."""
+    if Path(path).is_dir():
+        raise ValueError("it is a folder; give an NPZ file.")
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"'{path}': there is no such file.")
+    arrays = npz_arrays(Path(path), *keys)
+    need(arrays, "frames")
+    return {key: array for key, array in arrays.items() if key}
+
+
+@contextmanager
+def _naming(path: str | Path) -> Iterator[None]:
+    """Errors say which file they are about."""
+    try:
+        yield
     except ValueError as error:
         raise ValueError(f"'{path}': {error}") from None
 
