@@ -10,7 +10,7 @@
 
 from jeit_solvers.batching import in_turn
 from jeit_solvers.clustering import KMeans, kmeans
-from jeit_solvers.cores import over_cores
+from jeit_solvers.cores import number_of_cores, over_cores
 from jeit_solvers.dense.cholesky import lower_cholesky, symmetric_eigen, symmetric_inverse
 from jeit_solvers.dense.ridge import QuadraticModel, ridge_model, ridge_step, solve_definite
 from jeit_solvers.optimise.bounded import BoundedMinimum, lbfgsb, projected_gradient, scipy_lbfgsb
@@ -65,6 +65,7 @@ __all__ = [
     "lower_cholesky",
     "minimise_small",
     "near_inverse",
+    "number_of_cores",
     "over_cores",
     "projected_gradient",
     "quadratic_form",

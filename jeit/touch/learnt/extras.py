@@ -3,9 +3,12 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from importlib import import_module
 from importlib.util import find_spec
 
 import numpy as np
+
+from jeit_solvers import number_of_cores
 
 
 def need_learning() -> None:
@@ -18,8 +21,9 @@ def need_learning() -> None:
 def one_thread() -> AbstractContextManager:
     """Within it libraries keep to one thread: on presses by the thousand, more wait for each other longer than they
     work."""
-    import sklearn.ensemble  # noqa: F401 - only what is loaded is kept to it
     from threadpoolctl import threadpool_limits
+
+    import_module("sklearn.ensemble")  # only what is loaded is kept to it
 
     return threadpool_limits(1)
 
@@ -29,5 +33,5 @@ def over_threads(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray,
     parts = [rows[first : first + at_once] for first in range(0, max(len(rows), 1), at_once)]
     if len(parts) < 4:
         return np.concatenate([function(part) for part in parts])
-    with ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(number_of_cores()) as pool:
         return np.concatenate(list(pool.map(function, parts)))
