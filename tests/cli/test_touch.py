@@ -2,13 +2,9 @@
 
 import csv
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "touch" / "learnt"))
 from made_skins import record
 
 
