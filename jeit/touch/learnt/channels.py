@@ -16,6 +16,8 @@ from jeit.touch.learnt.neighbourhood import Neighbourhood
 _LEFT, _MOST, _PRESSES_EACH = 1e-3, 60, 4
 # A channel is dead beyond so many times what all but a thousandth of the presses that taught had.
 _BEYOND, _QUANTILE = 2.0, 0.999
+# Of the greatest change: what varies less is rounding.
+_ROUNDING = 1e-13
 # Of channels, before a frame is given up instead.
 _MOST_DEAD = 0.34
 # Of the distance to the nearest press, in novelty.
@@ -47,7 +49,8 @@ class Channels:
         used = missing.mean(axis=0) < 0.5
         deviation = np.zeros(changes.shape[1])
         deviation[used] = np.nanstd(changes[:, used], axis=0)
-        used &= deviation > 1e-9 * deviation.max(initial=0)
+        size = np.nanmax(np.abs(changes[:, used]), initial=0.0)
+        used &= deviation > max(1e-9 * deviation.max(initial=0.0), _ROUNDING * size)
         if not used.any():
             raise ValueError("frames: no channel changes; are these frames, and the skin connected?")
         scale = deviation[used]

@@ -42,13 +42,6 @@ FORMS = {
     "normalised": _normalised,
     "shapes": _shapes,
 }
-SAID = {
-    "differences": "changes of the voltages",
-    "ratios": "changes relative to the reference",
-    "compressed": "logarithms of the changes",
-    "normalised": "changes in each channel's unit, relative to the frame's size",
-    "shapes": "changes relative to the frame's size",
-}
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ def time_folds(
     Presses in order of `time`, or as recorded, are cut into `number` stretches. Where that leaves out places (`alike`,
     numbers (N, d)) or `kinds` (N,) altogether, as when one was pressed after the other, into more and shorter ones,
     dealt out in turn. With a `group`, groups in order of their mean time. Presses with one and the same frame, and at
-    one and the same place, go to one fold: they would tell each other's answer, as no press between places could.
+    one and the same place (d > 1), go to one fold: they would tell each other's answer, as no press between places
+    could.
     """
     count = len(frames)
     order = np.arange(count) if time is None else np.argsort(time, kind="stable")
@@ -45,10 +46,10 @@ def time_folds(
     if copies:
         notes.append(f"{copies} frames are copies of others: kept in one fold with them.")
         unit = _joined(unit, same)
-    if alike is not None and not grouped:
+    if alike is not None and alike.shape[1] > 1 and not grouped:
         places = np.unique(alike, axis=0, return_inverse=True)[1].ravel()
         if number <= places.max() + 1 < _REPEATED * count:
-            notes.append(f"{places.max() + 1} places or forces were repeated: held out with all of their presses.")
+            notes.append(f"{places.max() + 1} places were repeated: held out with all of their presses.")
             unit = _joined(unit, places)
     stretches = number
     fold = _dealt(unit, rank, number, stretches)

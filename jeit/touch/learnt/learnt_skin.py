@@ -38,7 +38,6 @@ class Standing:
     tried: list[tuple[str, float]]
     held_out: np.ndarray
     right: np.ndarray
-    rows: np.ndarray
     std: np.ndarray | None = None
 
 
@@ -109,14 +108,12 @@ class LearntSkin:
             notes.append(
                 f"{100 * (1 - alive.mean()):.2g} % of the readings were not borne out by the others: replaced."
             )
-        reference = None if presses.reference is None else presses.reference[:, channels.used]
-        skin = cls(
-            channels,
-            None if presses.reference is None else np.nanmean(presses.reference, axis=0),
-            *(None, None, None, None),
-            *(_quiet(whole / channels.scale, presses), 0, per_session, presses.name, notes),
-        )
-        return _learn_all(skin, whole, reference, presses, method, progress)
+        whole, presses, lag, said = _in_step(whole, presses)
+        quiet = _quiet(whole / channels.scale, presses)
+        mean = None if presses.reference is None else _mean_reference(presses.reference)
+        name, notes = presses.name, notes + said
+        skin = cls(channels, mean, None, None, None, None, quiet, lag, per_session, name, notes)
+        return _learn_all(skin, whole, presses, method, progress)
 
     def predict(self, frames, reference=None, group=None) -> Touches:
         """Touches of frames (n, M), with the `reference` (M,) or (n, M) if there was one in the presses learnt from,
@@ -137,8 +134,7 @@ class LearntSkin:
         used[:, self.channels.used] = alive
         touching = np.sqrt(np.mean((whole / self.channels.scale) ** 2, axis=1)) > self.quiet
         unlike &= touching
-        ours = None if reference is None else reference[:, self.channels.used]
-        ours = np.zeros_like(whole) if ours is None else np.where(np.isnan(ours), 0.0, ours)
+        ours = self._used(reference, whole)
         found: dict = dict.fromkeys(
             ("position", "position_std", "force", "force_std", "label", "probability", "touched", "key_probability")
         )
@@ -183,9 +179,8 @@ class LearntSkin:
                 "reference is missing: the skin was learnt from frames with one; give (channels,) or one each."
             )
         reference = check_reference(given, frames)
-        own, learnt = np.nanmean(reference, axis=0), self.mean_reference
-        there = np.isfinite(own) & np.isfinite(learnt) & self.channels.used
-        own, learnt = own[there], learnt[there]
+        there = np.isfinite(reference).any(axis=0) & self.channels.used
+        own, learnt = _mean_reference(reference)[there], self.mean_reference[there]
         if not there.any():
             raise ValueError(
                 "reference has no finite reading of a channel that is used; give that of the untouched skin."
@@ -198,6 +193,13 @@ class LearntSkin:
                 "it of this skin, its channels in the same order and units?"
             )
         return reference
+
+    def _used(self, reference: np.ndarray | None, whole: np.ndarray) -> np.ndarray:
+        """The reference (n, m) of the channels used, the mean of those learnt from where it has no reading; zeros where
+        there is none."""
+        if reference is None or self.mean_reference is None:
+            return np.zeros_like(whole)
+        return np.where(np.isnan(reference), self.mean_reference, reference)[:, self.channels.used]
 
     def _told(self, alive: np.ndarray, unlike: np.ndarray) -> tuple[str, ...]:
         notes = []
@@ -248,9 +250,7 @@ def _check_fit(presses: Presses, method: str, num_channels: int | None, per_sess
     whole = isinstance(num_channels, int | np.integer) and not isinstance(num_channels, bool)
     most = presses.frames.shape[1]
     if num_channels is not None and not (whole and 2 <= num_channels <= most):
-        raise ValueError(
-            f"num_channels must be from 2 to {presses.frames.shape[1]}, those there are; it is {num_channels}."
-        )
+        raise ValueError(f"num_channels must be from 2 to {most}, those there are; it is {num_channels}.")
     if per_session and presses.group is None:
         raise ValueError("per_session: presses have no group that says the session of each.")
 
@@ -319,54 +319,64 @@ def _quiet(scaled: np.ndarray, presses: Presses) -> float:
     return float(sizes[int(np.argmin(wrong))])
 
 
-def _learn_all(skin: LearntSkin, whole, reference, presses: Presses, method: str, progress) -> LearntSkin:
+def _mean_reference(reference: np.ndarray) -> np.ndarray:
+    """Of every channel; 0 where it has no reading at all."""
+    there = np.isfinite(reference)
+    return np.where(there, reference, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+
+
+def _in_step(whole: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, int, list[str]]:
+    """Frames with the presses that they are of, where they were plainly recorded some rows late; by how many; notes."""
+    if presses.positions is None:
+        return whole, presses, 0, []
+    rows, folds, _ = _placed(presses)
+    lag, straight, late = lag_of(whole[rows], presses.positions[rows], folds)
+    if not lag:
+        return whole, presses, 0, []
+    frames, answers = shifted(len(whole), lag)
+    reference = None if presses.reference is None else presses.reference[frames]
+    moved = replace(presses.rows(answers), frames=presses.frames[frames], reference=reference)
+    said = (
+        f"frames seem to be of the press {counted(abs(lag), 'row')} {'before' if lag > 0 else 'after'} (places told "
+        f"{1e3 * late:.3g} mm off, as recorded {1e3 * straight:.3g} mm): learnt so; check the recording."
+    )
+    return whole[frames], moved, lag, [said]
+
+
+def _learn_all(skin: LearntSkin, whole, presses: Presses, method: str, progress) -> LearntSkin:
+    """The skin with all that presses say learnt from their changes (N, m)."""
     notes, standing, found = list(skin.notes), {}, {}
+    reference = None if presses.reference is None else skin._used(presses.reference, whole)
+    every = np.arange(len(whole))
     if presses.positions is not None:
         rows, folds, told = _placed(presses)
         notes += told
-        lag, straight, late = lag_of(whole[rows], presses.positions[rows], folds)
-        if lag:
-            found["lag"] = lag
-            notes.append(
-                f"frames seem to be of the press {abs(lag)} row{'s' if abs(lag) > 1 else ''} "
-                f"{'before' if lag > 0 else 'after'} (places told {1e3 * late:.3g} mm off, as recorded "
-                f"{1e3 * straight:.3g} mm): learnt so; check the recording."
-            )
-            frames, moved = (np.arange(len(whole))[one] for one in shifted(len(whole), lag))
-            whole, reference = whole[frames], None if reference is None else reference[frames]
-            presses = replace(presses.rows(moved), frames=presses.frames[frames], reference=presses.reference)
-            rows, folds, _ = _placed(presses)
-        found["place"], standing["place"] = _numbers(
-            whole, reference, np.asarray(presses.positions)[rows], rows, folds, _asked(method, number_methods), progress
-        )
+        places = presses.positions[rows]
+        found["place"], standing["place"] = _numbers(whole, reference, places, rows, folds, method, progress)
     if presses.force is not None:
-        rows = np.arange(len(whole))
-        folds, _ = time_folds(presses.frames, *_when(presses, rows), alike=presses.force[:, None])
-        found["force"], standing["force"] = _numbers(
-            whole, reference, presses.force[:, None], rows, folds, _asked(method, number_methods), progress
-        )
+        known = presses.positions is not None and np.isfinite(presses.positions).all()
+        alike = presses.positions if known else presses.force[:, None]
+        folds, _ = time_folds(presses.frames, *_when(presses, every), alike=alike)
+        force = presses.force[:, None]
+        found["force"], standing["force"] = _numbers(whole, reference, force, every, folds, method, progress)
     if presses.label is not None:
-        rows = np.arange(len(whole))
-        folds, told = time_folds(presses.frames, *_when(presses, rows), kinds=presses.label)
+        folds, told = time_folds(presses.frames, *_when(presses, every), kinds=presses.label)
         learnt, tried = learn_labels(
             whole, reference, presses.label, folds, method=_asked(method, label_methods), progress=progress
         )
         notes += [*told, *learnt.notes]
         found["label"] = learnt
         methods = [(f"{one.method} on {one.form}", one.error) for one in tried]
-        standing["label"] = Standing(methods[0][0], methods, learnt.classes[tried[0].held_out], presses.label, rows)
+        standing["label"] = Standing(methods[0][0], methods, learnt.classes[tried[0].held_out], presses.label)
     if presses.touched is not None:
-        rows = np.arange(len(whole))
-        folds, told = time_folds(presses.frames, *_when(presses, rows))
+        folds, told = time_folds(presses.frames, *_when(presses, every))
         notes += told
         if presses.touched.sum(axis=1).max() < 2:
             notes.append("no two keys were pressed together: what is said of keys pressed together is a guess.")
         found["keys"], tried = learn_keys(whole, reference, presses.touched, folds, progress=progress)
-        methods = [
-            (f"key {key}: {name}", float(error))
-            for key, (name, error) in enumerate(zip(tried.methods, tried.errors, strict=True))
-        ]
-        standing["keys"] = Standing("for each key its own", methods, tried.held_out, presses.touched, rows)
+        pairs = zip(tried.methods, tried.errors.tolist(), strict=True)
+        methods = [(f"key {key}: {name}", error) for key, (name, error) in enumerate(pairs)]
+        standing["keys"] = Standing("for each key its own", methods, tried.held_out, presses.touched)
     return replace(skin, **found, notes=list(dict.fromkeys(notes)), standing=standing)
 
 
@@ -379,18 +389,12 @@ def _placed(presses: Presses) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
 
 
 def _numbers(whole, reference, targets, rows, folds, method, progress) -> tuple[LearntNumbers, Standing]:
-    own = None if reference is None else reference[rows]
-    learnt, tried = learn_numbers(whole[rows], own, targets, folds, method=method, progress=progress)
+    """Numbers (n, d) learnt from the changes of some rows, and how well."""
+    own, asked = None if reference is None else reference[rows], _asked(method, number_methods)
+    learnt, tried = learn_numbers(whole[rows], own, targets, folds, method=asked, progress=progress)
+    methods = [(one.name, one.error) for one in tried]
     said = tried[0].held_out
-    methods = [
-        (
-            f"{one.method}: {one.form}" if one.method == number_methods.BLEND else f"{one.method} on {one.form}",
-            one.error,
-        )
-        for one in tried
-    ]
-    std = learnt.spread.held_out(said, whole[rows])
-    return learnt, Standing(methods[0][0], methods, said, targets, rows, std)
+    return learnt, Standing(methods[0][0], methods, said, targets, learnt.spread.held_out(said, whole[rows]))
 
 
 def _asked(method: str, methods) -> str:

@@ -38,8 +38,7 @@ class Network:
         scale = np.full(features.shape[1], size)
         steps = _EPOCHS * max(1, -(-len(features) // _BATCH))
         rng = np.random.default_rng(0)
-        order = np.concatenate([rng.permutation(len(features)) for _ in range(_EPOCHS + 1)])
-        batches = order[: steps * _BATCH] if len(order) >= steps * _BATCH else np.resize(order, steps * _BATCH)
+        order = np.concatenate([rng.permutation(len(features)) for _ in range(_EPOCHS)])
         keys = jax.random.split(jax.random.key(0))
         network = eqx.nn.MLP(
             features.shape[1], targets.shape[1], _WIDTH, 2, activation=jnp.tanh, dtype=jnp.float32, key=keys[0]
@@ -48,7 +47,7 @@ class Network:
             network,
             jnp.asarray(features / scale, jnp.float32),
             jnp.asarray(targets, jnp.float32),
-            jnp.asarray(batches.reshape(steps, _BATCH)),
+            jnp.asarray(np.resize(order, (steps, _BATCH))),
             keys[1],
             optax.adamw(optax.cosine_decay_schedule(_RATE, steps), weight_decay=_DECAY),
         )

@@ -26,6 +26,11 @@ class Tried:
     held_out: Float[np.ndarray, "N d"]
     error: float
 
+    @property
+    def name(self) -> str:
+        """The method and the form; of a blend, those it is of."""
+        return f"{self.method}: {self.form}" if self.method == BLEND else f"{self.method} on {self.form}"
+
 
 @dataclass(frozen=True)
 class LearntNumbers:
@@ -81,9 +86,7 @@ def learn_numbers(
     chosen = _chosen(tried, targets, blend=method == BLEND) if method in ("auto", BLEND) else tried[:1]
     said = np.mean([one.held_out for one in chosen], axis=0)
     if len(chosen) > 1:
-        tried.insert(
-            0, Tried(BLEND, " + ".join(f"{one.method} on {one.form}" for one in chosen), said, _off(said, targets))
-        )
+        tried.insert(0, Tried(BLEND, " + ".join(one.name for one in chosen), said, _off(said, targets)))
     members = []
     for one in chosen:
         progress(f"{one.method}, all presses")

@@ -9,6 +9,8 @@ from scipy.spatial import KDTree
 _LIKE, _SHARES = 40, ((1.0, 0.6827), (1.96, 0.95))
 # Of the weight of a frame's size beside its place, and of the mean of all errors beside those alike.
 _SIZE, _ALL = 0.3, 0.15
+# Presses that say how often a deviation holds.
+_ENOUGH = 30
 # Of the spread of all that was learnt: nothing is known better.
 _LEAST = 1e-4
 
@@ -28,7 +30,7 @@ class Spread:
         """From what was said (N, d) of presses held out, their changes (N, m), and how far off it was (N, d).
 
         `last` (N,): which came before or after all others when they were held out, as presses to come do: deviations
-        are made to hold for those.
+        are made to hold for those, where they are enough to tell.
         """
         where = np.column_stack([said, _size(changes)])
         low, unit = where.mean(axis=0), where.std(axis=0)
@@ -38,6 +40,7 @@ class Spread:
         squares = np.minimum(np.abs(errors), most) ** 2
         found = cls((where - low) / unit, squares, low, unit, np.ones(errors.shape[1]))
         local = found._local(found.where, own=True)
+        last = last if last.sum() >= _ENOUGH else np.ones_like(last)
         factor = [_factor(np.abs(error) / one) for error, one in zip(errors[last].T, local[last].T, strict=True)]
         return cls(found.where, squares, low, unit, np.array(factor))
 

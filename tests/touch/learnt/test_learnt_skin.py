@@ -99,7 +99,7 @@ def test_places_pressed_again_and_again_are_held_out_together():
     fresh = off(skin.predict(**ASK), FRESH["positions"])
     forecast = dict(skin.standing["place"].tried)[skin.standing["place"].method]
     assert 0.6 * np.nanmean(fresh) < forecast < 3 * np.nanmean(fresh)
-    assert "49 places or forces were repeated" in skin.notes[0]
+    assert "49 places were repeated" in skin.notes[0]
 
 
 def test_places_where_a_press_was_recorded_late():
@@ -168,6 +168,47 @@ def test_sessions_that_drift_are_standardised():
     assert np.nanmean(with_it) < 6e-3
     assert np.isnan(with_it).mean() < 0.1
     assert np.isnan(without).mean() > 0.9  # like nothing that was learnt from, and said to be
+
+
+def test_a_reference_that_lacks_readings():
+    """They are taken for the mean, in learning and in telling: no form of the features is lost to one of them."""
+    recorded = record(80)
+    reference = recorded["reference"].copy()
+    reference[::7, 4] = np.nan
+    skin = LearntSkin.fit(Presses.create(**{**recorded, "reference": reference}), method="ridge")
+    assert "ridge on ratios" in dict(skin.standing["place"].tried)
+    lacking = FRESH["reference"].copy()
+    lacking[:, 9] = np.nan
+    assert off(skin.predict(FRESH["frames"], lacking), FRESH["positions"]).mean() < 0.03
+
+
+def test_frames_recorded_late_take_their_own_reference_along():
+    """And it is their own press that says whether they were touched."""
+    recorded = record(240, untouched=40, noise=0.002)
+    order = np.random.default_rng(3).permutation(240)
+    recorded = {key: values[order] for key, values in recorded.items()}
+    late = {key: recorded[key][:-1] for key in ("frames", "reference")}
+    skin = LearntSkin.fit(Presses.create(**late, positions=recorded["positions"][1:]), method="neighbours")
+    straight = LearntSkin.fit(
+        Presses.create(**{key: recorded[key] for key in ("frames", "reference", "positions")}), method="neighbours"
+    )
+    assert skin.lag == 1
+    assert 0.5 * straight.quiet < skin.quiet < 2 * straight.quiet
+
+
+def test_forces_of_a_few_weights_are_held_out_by_time():
+    recorded = record(120)
+    force = np.round(recorded["force"])
+    skin = LearntSkin.fit(
+        Presses.create(recorded["frames"], reference=recorded["reference"], force=force), method="ridge"
+    )
+    assert not any("repeated" in note for note in skin.notes)
+
+
+def test_frames_that_never_change_teach_nothing():
+    frames, reference = np.full((20, 6), 0.1), np.linspace(0.3, 1, 6)
+    with pytest.raises(ValueError, match="no channel changes"):
+        LearntSkin.fit(Presses.create(frames, reference=reference, force=np.arange(20.0)))
 
 
 @pytest.mark.parametrize(
