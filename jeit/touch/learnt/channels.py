@@ -6,6 +6,7 @@ be within so many deviations, and it is not.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,6 +21,8 @@ _BEYOND, _QUANTILE = 2.0, 0.999
 _ROUNDING = 1e-13
 # Of channels, before a frame is given up instead.
 _MOST_DEAD = 0.34
+# Frames one after the other that lack channels as no other does, before all are taken one by one.
+_ALONE = 8
 # Of the distance to the nearest press, in novelty.
 _NEAR = 2 / 1.75
 
@@ -76,30 +79,33 @@ class Channels:
         """Changes (n, m) of the channels used, as foretold by the others where one is dead or has no reading; which
         are alive (n, m); and novelty (n,), 1 where a frame is as far from those learnt from as the farthest of them."""
         whole = changes[:, self.used] / self.scale
-        alive = ~np.isnan(whole)
-        whole = np.where(alive, whole, 0.0)
-        model = self.patterns, self.spread, self.noise
-        scores, residual = _explain(whole, alive, *model)
-        for frame in np.flatnonzero((np.abs(residual) > self.farthest).any(axis=1) | ~alive.all(axis=1)):
-            alive[frame] = self._alive(whole[frame], alive[frame])
-            scores[frame], residual[frame] = (
-                one[0] for one in _explain(whole[None, frame], alive[None, frame], *model)
-            )
-            whole[frame] = np.where(alive[frame], whole[frame], self.patterns @ scores[frame])
+        given = ~np.isnan(whole)
+        whole, alive = np.where(given, whole, 0.0), given.copy()
+        scores, residual = self._explain_all(whole)
+        left, alone = np.flatnonzero((np.abs(residual) > self.farthest).any(axis=1) | ~given.all(axis=1)), 0
+        while left.size:
+            # Frames mostly lack the same channels: what one lacks is tried on all that are left.
+            pattern = self._alive(whole[left[0]], given[left[0]])
+            some = left if alone < _ALONE else left[:1]
+            beyond, some_scores, some_residual = self._beyond(whole[some], given[some], pattern)
+            same = (beyond <= 1) == pattern
+            borne = same.all(axis=1)
+            borne[0] = True
+            alone = alone + 1 if borne.sum() == 1 else 0
+            rows = some[borne]
+            alive[rows], scores[rows] = pattern, some_scores[borne]
+            residual[rows] = np.where(pattern, some_residual[borne], 0.0)
+            whole[rows] = np.where(pattern, whole[rows], scores[rows] @ self.patterns.T)
+            left = np.setdiff1d(left, rows, assume_unique=True)
         novelty = _novelty(scores, residual, alive, self.spread) / self.usual
         return whole * self.scale, alive, np.maximum(novelty, _NEAR * self.neighbourhood(scores))
 
-    def _alive(self, frame: np.ndarray, alive: np.ndarray) -> np.ndarray:
+    def _alive(self, frame: np.ndarray, given: np.ndarray) -> np.ndarray:
         """Which channels of a frame the others bear out: those borne out least are left out, time and again, and those
         that what is left bears out taken back."""
-        given, alive = alive, alive.copy()
-        fewest, back = (1 - _MOST_DEAD) * len(frame), False
+        alive, fewest, back = given.copy(), (1 - _MOST_DEAD) * len(frame), False
         while alive.sum() > fewest:
-            weighted = self.patterns * (alive / self.noise**2)[:, None]
-            gram = np.linalg.inv(weighted.T @ self.patterns + np.diag(1 / self.spread**2))
-            residual = (frame - self.patterns @ (gram @ (weighted.T @ frame))) / self.noise
-            own = 1 - np.einsum("ij,jk,ik->i", self.patterns, gram, weighted)  # a channel's say in what foretells it
-            beyond = np.where(given, np.abs(residual) / np.maximum(own, 1e-3) / self.farthest, np.inf)
+            (beyond,) = self._beyond(frame[None], given[None], alive)[0]
             worst = np.max(beyond, where=alive, initial=0.0)
             if worst <= 1 and back:
                 break
@@ -108,6 +114,28 @@ class Channels:
             else:
                 alive &= beyond < (worst if back else max(1.0, worst / 2))
         return alive
+
+    def _beyond(self, whole, given, alive) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How far channels of frames (n, m) are from what those `alive` (m,) foretell, 1 where no farther than ever,
+        infinite where not `given` (n, m); the frames' scores (n, k) and residuals (n, m)."""
+        weighted = self.patterns * (alive / self.noise**2)[:, None]
+        gain = weighted @ np.linalg.inv(weighted.T @ self.patterns + np.diag(1 / self.spread**2))
+        scores = whole @ gain
+        residual = (whole - scores @ self.patterns.T) / self.noise
+        own = 1 - np.einsum("ij,ij->i", self.patterns, gain)  # a channel's say in what foretells it
+        beyond = np.where(given, np.abs(residual) / np.maximum(own, 1e-3) / self.farthest, np.inf)
+        return beyond, scores, residual
+
+    def _explain_all(self, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Scores and residuals of frames (n, m) of which all channels are alive."""
+        scores = whole @ self._gain
+        return scores, (whole - scores @ self.patterns.T) / self.noise
+
+    @cached_property
+    def _gain(self) -> Float[np.ndarray, "m k"]:
+        """From channels, all of them alive, to scores."""
+        weighted = self.patterns / self.noise[:, None] ** 2
+        return np.linalg.solve(weighted.T @ self.patterns + np.diag(1 / self.spread**2), weighted.T).T
 
 
 def _factors(scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

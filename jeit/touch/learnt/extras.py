@@ -28,10 +28,23 @@ def one_thread() -> AbstractContextManager:
     return threadpool_limits(1)
 
 
-def over_threads(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, at_once: int) -> np.ndarray:
-    """`function` of some rows at a time, side by side where there are many; what it gives, joined."""
-    parts = [rows[first : first + at_once] for first in range(0, max(len(rows), 1), at_once)]
+def in_parts(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, at_once: int) -> np.ndarray:
+    """`function` of some rows at a time, joined: what it makes on the way stays small."""
+    return np.concatenate([function(rows[some]) for some in _parts(len(rows), at_once)])
+
+
+def over_threads(
+    function: Callable[..., dict[str, np.ndarray]], *arrays: np.ndarray, at_once: int
+) -> dict[str, np.ndarray]:
+    """`function` of some rows of `arrays` at a time, side by side where there are many; the arrays it gives, joined."""
+    parts = _parts(len(arrays[0]), at_once)
     if len(parts) < 4:
-        return np.concatenate([function(part) for part in parts])
-    with ThreadPoolExecutor(number_of_cores()) as pool:
-        return np.concatenate(list(pool.map(function, parts)))
+        found = [function(*(one[some] for one in arrays)) for some in parts]
+    else:
+        with one_thread(), ThreadPoolExecutor(number_of_cores()) as pool:
+            found = list(pool.map(lambda some: function(*(one[some] for one in arrays)), parts))
+    return {key: np.concatenate([one[key] for one in found]) for key in found[0]}
+
+
+def _parts(number: int, at_once: int) -> list[slice]:
+    return [slice(first, first + at_once) for first in range(0, max(number, 1), at_once)]

@@ -1,9 +1,13 @@
 """What a method learns from: changes of the channels in one of several forms, as scores of principal components."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+
+from jeit.touch.learnt.imaged import Contacts, Imaged, Images
+from jeit.touch.learnt.whitening import Whitened, are_repeated
 
 # Components at most, and presses for each.
 _MOST, _PRESSES_EACH = 60, 3
@@ -42,30 +46,47 @@ FORMS = {
     "normalised": _normalised,
     "shapes": _shapes,
 }
+# What makes a form that is learnt itself, from changes (N, m) and answers (N, d).
+Maker = Callable[[np.ndarray, np.ndarray], Whitened | Contacts | Images]
 
 
 @dataclass(frozen=True)
 class Features:
-    """Features of one `form`: standardised by `mean` and `deviation` (p,), then scores of any `components` (p, k)."""
+    """Features of one `form`: standardised by `mean` and `deviation` (p,), then scores of any `components` (p, k).
+    `made`, of a form that is learnt itself, makes them; for others there is a `unit` (m,) of each channel."""
 
     form: str
     unit: Float[np.ndarray, " m"]
     mean: Float[np.ndarray, " p"]
     deviation: Float[np.ndarray, " p"]
     components: Float[np.ndarray, "p k"] | None
+    made: Whitened | Contacts | Images | None = None
 
     @classmethod
-    def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray, *, rotated: bool = True) -> "Features":
-        """From changes (N, m) and their reference (N, m); without components unless `rotated`."""
-        unit, values, mean, deviation = standardisation(form, changes, reference)
-        if not rotated:
-            return cls(form, unit, mean, deviation, None)
+    def learn(
+        cls,
+        form: str,
+        changes: Float[np.ndarray, "N m"],
+        reference: Float[np.ndarray, "N m"],
+        *,
+        made: Whitened | Contacts | Images | None = None,
+        rotated: bool = True,
+    ) -> "Features":
+        """From changes and their reference; of many numbers components, unless not `rotated`."""
+        if made is None:
+            unit, values, mean, deviation = standardisation(form, changes, reference)
+        else:
+            unit, values = np.ones(changes.shape[1]), made(changes)
+            mean, deviation = values.mean(axis=0), _or_infinite(made.deviation(values))
+        if not rotated or isinstance(made, Contacts):
+            return cls(form, unit, mean, deviation, None, made)
         rows = np.linalg.svd((values - mean) / deviation, full_matrices=False)[2]
-        return cls(form, unit, mean, deviation, rows[: max(2, min(_MOST, len(values) // _PRESSES_EACH))].T)
+        components = rows[: max(2, min(_MOST, len(values) // _PRESSES_EACH))].T
+        return cls(form, unit, mean, deviation, components, made)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> Float[np.ndarray, "n k"]:
         """Scores (n, k) of changes (n, m)."""
-        values = FORMS[self.form](changes, reference, self.unit)
+        values = FORMS[self.form](changes, reference, self.unit) if self.made is None else self.made(changes)
         standard = (values - self.mean) / self.deviation
         return standard if self.components is None else standard @ self.components
 
@@ -77,11 +98,33 @@ def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tu
     unit = np.median(size, axis=0)
     unit = np.where(unit > 0, unit, np.mean(size, axis=0))
     values = FORMS[form](changes, reference, np.where(unit > 0, unit, 1.0))
-    deviation = values.std(axis=0)
+    return np.where(unit > 0, unit, 1.0), values, values.mean(axis=0), _or_infinite(values.std(axis=0))
+
+
+def _or_infinite(deviation: np.ndarray) -> np.ndarray:
     known = deviation > 1e-9 * max(deviation.max(), 1e-300)
-    return np.where(unit > 0, unit, 1.0), values, values.mean(axis=0), np.where(known, deviation, np.inf)
+    return np.where(known, deviation, np.inf)
 
 
-def forms_for(has_reference: bool) -> tuple[str, ...]:
-    """Those that can be made."""
-    return tuple(form for form in FORMS if has_reference or form != "ratios")
+@dataclass(frozen=True)
+class Forms:
+    """The `names` of forms that features can take, and the `makers` of those that are learnt: of frames that repeat
+    others, and of images."""
+
+    names: tuple[str, ...]
+    makers: dict[str, Maker]
+
+    @classmethod
+    def of(cls, answers: Float[np.ndarray, "N d"], imaged: Imaged | None, *, has_reference: bool) -> "Forms":
+        """Those that can be made, by what is known."""
+        makers: dict[str, Maker] = {"whitened": Whitened.learn} if are_repeated(answers) else {}
+        if imaged is not None:
+            makers |= {"contacts": lambda changes, answers: Contacts(imaged)}
+            makers |= {"images": lambda changes, answers: Images(imaged)}
+        plain = [form for form in FORMS if has_reference or form != "ratios"]
+        return cls((*plain, *makers), makers)
+
+    def learn(self, form: str, changes, reference, answers, *, rotated: bool = True) -> Features:
+        """Features of one form, see `Features.learn`."""
+        made = self.makers[form](changes, answers) if form in self.makers else None
+        return Features.learn(form, changes, reference, made=made, rotated=rotated)

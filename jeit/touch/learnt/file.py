@@ -12,6 +12,7 @@ from jeit.touch.learnt.extras import need_learning
 from jeit.touch.learnt.features import Features
 from jeit.touch.learnt.forest import Forest
 from jeit.touch.learnt.gaussian_process import GaussianProcess
+from jeit.touch.learnt.imaged import Contacts, Imaged, Images
 from jeit.touch.learnt.keys import LearntKeys, Standardised
 from jeit.touch.learnt.labels import LearntLabels
 from jeit.touch.learnt.learnt_skin import LearntSkin
@@ -21,15 +22,19 @@ from jeit.touch.learnt.neighbourhood import Neighbourhood
 from jeit.touch.learnt.network import Network
 from jeit.touch.learnt.numbers import LearntNumbers
 from jeit.touch.learnt.spread import Spread
+from jeit.touch.learnt.whitening import Whitened
 
 _KIND, _VERSION = "a jeit learnt skin", 1
 _OURS = {
     one.__name__: one
     for one in (
         Channels,
+        Contacts,
         Features,
         Forest,
         GaussianProcess,
+        Imaged,
+        Images,
         LearntKeys,
         LearntLabels,
         LearntNumbers,
@@ -41,6 +46,7 @@ _OURS = {
         QuadraticDiscriminant,
         Spread,
         Standardised,
+        Whitened,
     )
 }
 _FAULTS = (

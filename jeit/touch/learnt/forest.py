@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jeit.touch.learnt.extras import over_threads
+from jeit.touch.learnt.extras import in_parts
 
 # Frames walked down at once: what they look up stays in the cache.
 _AT_ONCE = 128
@@ -45,7 +45,7 @@ class Forest:
                 node = np.where(further, above.take(node), below.take(node))
             return value.take(node, axis=0).sum(axis=1)
 
-        return over_threads(answer, features, _AT_ONCE) + self.start
+        return in_parts(answer, features, _AT_ONCE) + self.start
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """For classifiers: the trees' votes for each class."""

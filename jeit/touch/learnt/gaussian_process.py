@@ -8,6 +8,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
+from jeit.touch.learnt.extras import in_parts
+
 # Presses that length and noise are found on; centres at most (all presses, if there are no more).
 _TUNED_ON, _CENTRES = 400, 640
 _AT_ONCE = 512
@@ -47,12 +49,13 @@ class GaussianProcess:
         """Targets (n, d)."""
         scaled = self.centres / self.length
         squares = np.sum(scaled**2, axis=1)
-        found = np.empty((len(features), self.weights.shape[1]))
-        for first in range(0, len(features), _AT_ONCE):
-            some = features[first : first + _AT_ONCE] / self.length
+
+        def means(some: np.ndarray) -> np.ndarray:
+            some = some / self.length
             squared = np.sum(some**2, axis=1)[:, None] + squares - 2 * some @ scaled.T
-            found[first : first + _AT_ONCE] = _kernel(np.sqrt(np.maximum(squared, 0.0))) @ self.weights
-        return found
+            return _kernel(np.sqrt(np.maximum(squared, 0.0))) @ self.weights
+
+        return in_parts(means, features, _AT_ONCE)
 
 
 def _kernel(distance: np.ndarray) -> np.ndarray:

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.touch.learnt.classifiers import CLASSIFIERS, log_odds, probabilities, sharpness_of, shrinkage_of
-from jeit.touch.learnt.features import Features, forms_for
+from jeit.touch.learnt.features import Features, Forms
+from jeit.touch.learnt.imaged import Imaged
 
 METHODS = ("auto", *CLASSIFIERS)
 _QUICK = "linear-discriminant"
@@ -49,28 +50,31 @@ def learn_labels(
     folds: np.ndarray,
     *,
     method: str = "auto",
+    imaged: Imaged | None = None,
     progress: Callable[[str], None] = lambda said: None,
 ) -> tuple[LearntLabels, list[TriedLabels]]:
-    """Learn `label` (N,) from changes (N, m) and their reference, by `method`, or the one of the nine that errs least.
+    """Learn `label` (N,) from changes (N, m), their reference, and images of them where there are any, by `method`, or
+    the one of the nine that errs least.
 
     Of every one tried, in order of its errors on `folds` (N,) held out: what it said. The form of the features is the
     one that suits the linear discriminant best.
     """
-    forms = forms_for(reference is not None)
+    has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
     classes, right = np.unique(label, return_inverse=True)
+    forms = Forms.of(right[:, None], imaged, has_reference=has_reference)
     tried = []
-    for form in forms:
+    for form in forms.names:
         progress(f"{_QUICK} on {form}")
-        tried.append(_hold_out(_QUICK, form, changes, reference, right, folds))
+        tried.append(_hold_out(_QUICK, form, forms, changes, reference, right, folds))
     form = min(tried, key=_error).form
     for name in [one for one in CLASSIFIERS if one != _QUICK and method in ("auto", one)]:
         progress(f"{name} on {form}")
-        tried.append(_hold_out(name, form, changes, reference, right, folds))
+        tried.append(_hold_out(name, form, forms, changes, reference, right, folds))
     tried.sort(key=_error)
     tried = [one for one in tried if method in ("auto", one.method)]
     best = tried[0]
-    features = Features.learn(best.form, changes, reference)
+    features = forms.learn(best.form, changes, reference, right[:, None])
     scores = features(changes, reference)
     notes = []
     if best.method == "quadratic-discriminant" and shrinkage_of(scores, right):
@@ -87,12 +91,12 @@ def _error(one: TriedLabels) -> float:
     return one.error
 
 
-def _hold_out(method, form, changes, reference, right, folds) -> TriedLabels:
+def _hold_out(method, form, forms: Forms, changes, reference, right, folds) -> TriedLabels:
     number = right.max() + 1
     odds = np.full((len(right), number), -1e3)
     for fold in range(folds.max() + 1):
         out = folds == fold
-        features = Features.learn(form, changes[~out], reference[~out])
+        features = forms.learn(form, changes[~out], reference[~out], right[~out, None])
         model = CLASSIFIERS[method](features(changes[~out], reference[~out]), right[~out])
         odds[np.ix_(out, model.classes_)] = log_odds(model, features(changes[out], reference[out]))
     held_out = odds.argmax(axis=1)

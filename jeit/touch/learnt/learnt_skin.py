@@ -1,18 +1,21 @@
 """A skin that has learnt, from recorded presses, to tell where, how hard and by what it is touched."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from jeit.arguments import check_kind, check_name, counted
+from jeit.forward import ForwardModel
 from jeit.touch.learnt import labels as label_methods
 from jeit.touch.learnt import numbers as number_methods
 from jeit.touch.learnt.channel_choice import choose_channels
 from jeit.touch.learnt.channels import Channels
-from jeit.touch.learnt.extras import need_learning, one_thread
+from jeit.touch.learnt.extras import need_learning, one_thread, over_threads
 from jeit.touch.learnt.folds import time_folds
+from jeit.touch.learnt.imaged import Imaged, check_imaged
 from jeit.touch.learnt.keys import LearntKeys, learn_keys
 from jeit.touch.learnt.labels import LearntLabels, learn_labels
 from jeit.touch.learnt.lag import lag_of, shifted
@@ -22,6 +25,7 @@ from jeit.touch.learnt.touches import Touches
 
 # A frame is unlike any learnt from beyond so many times the novelty of the farthest of them, or with fewer channels.
 _UNLIKE, _FEWEST = 2.0, 0.66
+_AT_ONCE = 256
 # A reference is another skin's if it is less like those learnt from than this, or of another size.
 _ALIKE, _SIZES = 0.8, 5.0
 # Frames of a session, before it can be standardised by itself.
@@ -70,6 +74,7 @@ class LearntSkin:
         presses: Presses,
         *,
         method: str = "auto",
+        model: ForwardModel | None = None,
         num_channels: int | None = None,
         per_session: bool = False,
         progress: Callable[[str], None] = lambda said: None,
@@ -77,16 +82,18 @@ class LearntSkin:
         """Learn from recorded presses.
 
         `method`: "auto" takes what errs least on presses held out, in stretches of time; or one of `METHODS`, for what
-        it can learn. `num_channels`: only so many, those that tell most, are used. `per_session`: changes of each
-        `group` are standardised by themselves, against drift. Raises `ValueError` for another method, one that cannot
-        learn what the presses say, and presses that nothing can be learnt from.
+        it can learn. `model` of the skin, if one is known, of some hundred nodes: its images of the changes, and the
+        contacts in them, are learnt from too. `num_channels`: only so many, those that tell most, are used.
+        `per_session`: changes of each `group` are standardised by themselves, against drift. Raises `ValueError` for
+        another method, one that cannot learn what the presses say, presses that nothing can be learnt from, and a model
+        of another number of channels.
         """
-        _check_fit(presses, method, num_channels, per_session)
+        _check_fit(presses, method, model, num_channels, per_session)
         with one_thread():
-            return cls._fit(presses, method, num_channels, per_session, progress)
+            return cls._fit(presses, method, model, num_channels, per_session, progress)
 
     @classmethod
-    def _fit(cls, presses: Presses, method, num_channels, per_session, progress) -> "LearntSkin":
+    def _fit(cls, presses: Presses, method, model, num_channels, per_session, progress) -> "LearntSkin":
         notes = list(presses.notes)
         presses, dropped = _usable(presses)
         notes += dropped
@@ -111,9 +118,14 @@ class LearntSkin:
         whole, presses, lag, said = _in_step(whole, presses)
         quiet = _quiet(whole / channels.scale, presses)
         mean = None if presses.reference is None else _mean_reference(presses.reference)
+        imaged = None
+        if model is not None:
+            progress("images")
+            imaged, told = Imaged.create(model, whole, channels.used, mean)
+            said += told
         name, notes = presses.name, notes + said
         skin = cls(channels, mean, None, None, None, None, quiet, lag, per_session, name, notes)
-        return _learn_all(skin, whole, presses, method, progress)
+        return _learn_all(skin, whole, presses, method, imaged, progress)
 
     def predict(self, frames, reference=None, group=None) -> Touches:
         """Touches of frames (n, M), with the `reference` (M,) or (n, M) if there was one in the presses learnt from,
@@ -128,36 +140,37 @@ class LearntSkin:
         changes = _changes(frames, reference)
         if self.per_session:
             changes = standardised(changes, group)
+        found = over_threads(self._tell, changes, self._used(reference, changes), at_once=_AT_ONCE)
+        said: dict[str, Any] = {one.name: found.get(one.name) for one in fields(Touches) if one.name != "notes"}
+        return Touches(**said, notes=self._told(found["alive"], found["unlike"]))
+
+    def _tell(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
+        """What `Touches` say of some frames, as far as it was learnt."""
         whole, alive, novelty = self.channels.complete(changes)
         unlike = (novelty > _UNLIKE) | (alive.mean(axis=1) < _FEWEST)
-        used = np.zeros(frames.shape, bool)
-        used[:, self.channels.used] = alive
         touching = np.sqrt(np.mean((whole / self.channels.scale) ** 2, axis=1)) > self.quiet
         unlike &= touching
-        ours = self._used(reference, whole)
-        found: dict = dict.fromkeys(
-            ("position", "position_std", "force", "force_std", "label", "probability", "touched", "key_probability")
-        )
+        found = {"novelty": novelty, "unlike": unlike, "alive": np.zeros(changes.shape, bool)}
+        found["alive"][:, self.channels.used] = alive
         if self.label is not None:
-            label, found["probability"] = self.label.predict(whole, ours)
+            label, probability = self.label.predict(whole, reference)
             found["label"] = np.where(unlike, "", np.where(touching, label, NO_TOUCH))
-            found["probability"] = np.where(unlike | (~touching & (label != NO_TOUCH)), np.nan, found["probability"])
+            found["probability"] = np.where(unlike | (~touching & (label != NO_TOUCH)), np.nan, probability)
             touching &= label != NO_TOUCH
-        for name, learnt in (("position", self.place), ("force", self.force)):
-            if learnt is not None:
-                said, std = learnt.predict(whole, ours)
-                shown = (touching & ~unlike)[:, None]
-                said, std = np.where(shown, said, np.nan), np.where(shown, std, np.nan)
-                found |= {name: said, f"{name}_std": std}
-        if found["force"] is not None:
+        shown = (touching & ~unlike)[:, None]
+        if self.place is not None:
+            said, std = self.place.predict(whole, reference)
+            found |= {"position": np.where(shown, said, np.nan), "position_std": np.where(shown, std, np.nan)}
+        if self.force is not None:
+            said, std = self.force.predict(whole, reference)
             still = ~touching & ~unlike
-            found["force"] = np.where(still, 0.0, np.maximum(found["force"][:, 0], 0.0))
-            found["force_std"] = found["force_std"][:, 0]
+            pressed = np.where(shown, np.maximum(said, 0.0), np.nan)[:, 0]
+            found |= {"force": np.where(still, 0.0, pressed), "force_std": np.where(shown, std, np.nan)[:, 0]}
         if self.keys is not None:
-            touched, probability = self.keys.predict(whole, ours)
-            found["touched"] = touched & (touching & ~unlike)[:, None]
+            touched, probability = self.keys.predict(whole, reference)
+            found["touched"] = touched & shown
             found["key_probability"] = np.where(unlike[:, None], np.nan, np.where(touching[:, None], probability, 0.0))
-        return Touches(**found, unlike=unlike, novelty=novelty, alive=used, notes=self._told(alive, unlike))
+        return found
 
     def _check(self, frames) -> np.ndarray:
         frames = np.asarray(frames)
@@ -194,16 +207,17 @@ class LearntSkin:
             )
         return reference
 
-    def _used(self, reference: np.ndarray | None, whole: np.ndarray) -> np.ndarray:
-        """The reference (n, m) of the channels used, the mean of those learnt from where it has no reading; zeros where
-        there is none."""
+    def _used(self, reference: np.ndarray | None, changes: np.ndarray) -> Float[np.ndarray, "n m"]:
+        """The reference of the channels used, the mean of those learnt from where it has no reading; zeros where there
+        is none."""
         if reference is None or self.mean_reference is None:
-            return np.zeros_like(whole)
+            return np.zeros((len(changes), int(self.channels.used.sum())))
         return np.where(np.isnan(reference), self.mean_reference, reference)[:, self.channels.used]
 
     def _told(self, alive: np.ndarray, unlike: np.ndarray) -> tuple[str, ...]:
         notes = []
         numbers = np.flatnonzero(self.channels.used)
+        alive = alive[:, numbers]
         lost = np.mean(~alive, axis=0)
         dead = numbers[lost > 0.5]
         if dead.size:
@@ -236,7 +250,7 @@ def standardised(changes: np.ndarray, group) -> np.ndarray:
     return result
 
 
-def _check_fit(presses: Presses, method: str, num_channels: int | None, per_session: bool) -> None:
+def _check_fit(presses: Presses, method: str, model, num_channels: int | None, per_session: bool) -> None:
     need_learning()
     check_kind("presses", presses, Presses, "Presses, as of read_presses(path)")
     check_name("method", method, METHODS)
@@ -251,6 +265,10 @@ def _check_fit(presses: Presses, method: str, num_channels: int | None, per_sess
     most = presses.frames.shape[1]
     if num_channels is not None and not (whole and 2 <= num_channels <= most):
         raise ValueError(f"num_channels must be from 2 to {most}, those there are; it is {num_channels}.")
+    if model is not None:
+        check_imaged(model, most)
+    if model is not None and per_session:
+        raise ValueError("model: images are of changes in volts, and per_session takes their unit away; leave one out.")
     if per_session and presses.group is None:
         raise ValueError("per_session: presses have no group that says the session of each.")
 
@@ -343,7 +361,7 @@ def _in_step(whole: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, 
     return whole[frames], moved, lag, [said]
 
 
-def _learn_all(skin: LearntSkin, whole, presses: Presses, method: str, progress) -> LearntSkin:
+def _learn_all(skin: LearntSkin, whole, presses: Presses, method: str, imaged: Imaged | None, progress) -> LearntSkin:
     """The skin with all that presses say learnt from their changes (N, m)."""
     notes, standing, found = list(skin.notes), {}, {}
     reference = None if presses.reference is None else skin._used(presses.reference, whole)
@@ -352,17 +370,23 @@ def _learn_all(skin: LearntSkin, whole, presses: Presses, method: str, progress)
         rows, folds, told = _placed(presses)
         notes += told
         places = presses.positions[rows]
-        found["place"], standing["place"] = _numbers(whole, reference, places, rows, folds, method, progress)
+        found["place"], standing["place"] = _numbers(whole, reference, places, rows, folds, method, imaged, progress)
     if presses.force is not None:
         known = presses.positions is not None and np.isfinite(presses.positions).all()
         alike = presses.positions if known else presses.force[:, None]
         folds, _ = time_folds(presses.frames, *_when(presses, every), alike=alike)
         force = presses.force[:, None]
-        found["force"], standing["force"] = _numbers(whole, reference, force, every, folds, method, progress)
+        found["force"], standing["force"] = _numbers(whole, reference, force, every, folds, method, imaged, progress)
     if presses.label is not None:
         folds, told = time_folds(presses.frames, *_when(presses, every), kinds=presses.label)
         learnt, tried = learn_labels(
-            whole, reference, presses.label, folds, method=_asked(method, label_methods), progress=progress
+            whole,
+            reference,
+            presses.label,
+            folds,
+            method=_asked(method, label_methods),
+            imaged=imaged,
+            progress=progress,
         )
         notes += [*told, *learnt.notes]
         found["label"] = learnt
@@ -388,10 +412,10 @@ def _placed(presses: Presses) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     return rows, folds, told
 
 
-def _numbers(whole, reference, targets, rows, folds, method, progress) -> tuple[LearntNumbers, Standing]:
+def _numbers(whole, reference, targets, rows, folds, method, imaged, progress) -> tuple[LearntNumbers, Standing]:
     """Numbers (n, d) learnt from the changes of some rows, and how well."""
     own, asked = None if reference is None else reference[rows], _asked(method, number_methods)
-    learnt, tried = learn_numbers(whole[rows], own, targets, folds, method=asked, progress=progress)
+    learnt, tried = learn_numbers(whole[rows], own, targets, folds, method=asked, imaged=imaged, progress=progress)
     methods = [(one.name, one.error) for one in tried]
     said = tried[0].held_out
     return learnt, Standing(methods[0][0], methods, said, targets, learnt.spread.held_out(said, whole[rows]))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from jeit.touch.learnt.extras import over_threads
+from jeit.touch.learnt.extras import in_parts
 
 _AT_ONCE = 256
 _COUNTS = (3, 5, 8, 12)
@@ -60,5 +60,5 @@ class Nearest:
             order = np.argsort(apart, axis=1, kind="stable")
             return np.stack([np.take_along_axis(one, order, axis=1) for one in (apart, number)], axis=-1)
 
-        found = over_threads(near, features, _AT_ONCE)
+        found = in_parts(near, features, _AT_ONCE)
         return found[..., 0], found[..., 1].astype(int)

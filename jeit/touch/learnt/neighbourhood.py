@@ -2,6 +2,7 @@
 same patterns, but like no press that was recorded."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -35,5 +36,9 @@ class Neighbourhood:
         return self._relative(scores[:, :_SCORES]) / self.usual
 
     def _relative(self, scores: np.ndarray, *, second: bool = False) -> np.ndarray:
-        distance = np.asarray(KDTree(self.scores).query(scores, 2)[0])[:, int(second)]
+        distance = np.asarray(self._tree.query(scores, 2)[0])[:, int(second)]
         return distance / (np.linalg.norm(scores, axis=1) + _SMALL * self.size)
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self.scores)

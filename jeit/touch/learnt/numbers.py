@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jeit.touch.learnt.features import Features, forms_for
+from jeit.touch.learnt.features import Features, Forms
+from jeit.touch.learnt.imaged import Imaged
 from jeit.touch.learnt.regressors import OF_CHANNELS, QUICK, REGRESSORS
 from jeit.touch.learnt.spread import Spread
 
@@ -58,19 +59,21 @@ def learn_numbers(
     folds: np.ndarray,
     *,
     method: str = "auto",
+    imaged: Imaged | None = None,
     progress: Callable[[str], None] = lambda said: None,
 ) -> tuple[LearntNumbers, list[Tried]]:
-    """Learn `targets` (N, d) from changes (N, m) and their reference, by `method`, or the best of all.
+    """Learn `targets` (N, d) from changes (N, m), their reference, and images of them where there are any, by
+    `method`, or the best of all.
 
     Of every method tried, in order of its mean error on `folds` (N,) held out: what it said. Quick methods are tried on
     all forms of the features, the others on the two forms that suited those best.
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
-    forms = forms_for(has_reference)
-    cut = _Cut(changes, reference, targets, folds)
+    forms = Forms.of(targets, imaged, has_reference=has_reference)
+    cut = _Cut(changes, reference, targets, folds, forms)
     tried = []
-    for form in forms:
+    for form in forms.names:
         for quick in QUICK:
             progress(f"{quick} on {form}")
             tried.append(cut.hold_out(quick, form))
@@ -90,7 +93,7 @@ def learn_numbers(
     members = []
     for one in chosen:
         progress(f"{one.method}, all presses")
-        features = Features.learn(one.form, changes, reference, rotated=one.method not in OF_CHANNELS)
+        features = forms.learn(one.form, changes, reference, targets, rotated=one.method not in OF_CHANNELS)
         model = REGRESSORS[one.method](features(changes, reference), (targets - cut.mean) / cut.scale)
         members.append((features, model))
     ends = (folds == 0) | (folds == folds.max())
@@ -120,8 +123,9 @@ def _off(said: np.ndarray, targets: np.ndarray) -> float:
 class _Cut:
     """Presses cut into folds, with the features of each form once for all methods."""
 
-    def __init__(self, changes, reference, targets, folds):
+    def __init__(self, changes, reference, targets, folds, forms: Forms):
         self.changes, self.reference, self.targets, self.folds = changes, reference, targets, folds
+        self.forms = forms
         self.mean = targets.mean(axis=0)
         self.scale = float(np.sqrt(np.mean((targets - self.mean) ** 2)))
         self.features = {}
@@ -137,7 +141,8 @@ class _Cut:
 
     def _scores(self, form: str, fold: int, out: np.ndarray, *, rotated: bool) -> tuple[np.ndarray, np.ndarray]:
         if (form, fold, rotated) not in self.features:
-            features = Features.learn(form, self.changes[~out], self.reference[~out], rotated=rotated)
+            learnt = self.changes[~out], self.reference[~out], self.targets[~out]
+            features = self.forms.learn(form, *learnt, rotated=rotated)
             self.features[form, fold, rotated] = tuple(
                 features(self.changes[some], self.reference[some]) for some in (~out, out)
             )

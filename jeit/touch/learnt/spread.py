@@ -1,6 +1,7 @@
 """Standard deviations of what is learnt: errors of presses held out that were like it, made to hold as they say."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
@@ -56,10 +57,14 @@ class Spread:
 
     def _local(self, where: np.ndarray, *, own: bool = False) -> np.ndarray:
         number = min(_LIKE, len(self.where) - 1)
-        near = np.asarray(KDTree(self.where).query(where, number + own)[1])[:, int(own) :]
+        near = np.asarray(self._tree.query(where, number + own)[1])[:, int(own) :]
         like = self.squares[near].mean(axis=1)
         everywhere = self.squares.mean(axis=0)
         return np.maximum(np.sqrt((1 - _ALL) * like + _ALL * everywhere), _LEAST * self.unit[: like.shape[1]])
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self.where)
 
 
 def _size(changes: np.ndarray) -> np.ndarray:

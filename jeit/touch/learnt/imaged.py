@@ -1,0 +1,108 @@
+"""What the model of a skin makes of changes of its voltages: a linear image, and the strongest contact in it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from jeit.arguments import check_kind
+from jeit.forward import ForwardModel
+from jeit.inverse import calibrate, one_step
+from jeit.mesh import centroids, measures
+from jeit.touch.learnt.extras import in_parts
+from jeit_solvers.engines import as_array
+
+# A contact is what exceeds this share of its peak, among so many of all cells, those nearest to the peak.
+_LEVEL, _ROUND = 0.7, 0.2
+# Beside the image, where all cells weigh one, each number that tells the contact weighs so much.
+_WEIGHT = 3.0
+_AT_ONCE = 128
+
+
+@dataclass(frozen=True)
+class Imaged:
+    """Images in c cells of changes of m channels, `matrix` (m, c), touches positive; the cells' `centres` (c, d) metres
+    and `sizes` (c,); `around` (c, k), the cells nearest to each."""
+
+    matrix: Float[np.ndarray, "m c"]
+    centres: Float[np.ndarray, "c d"]
+    sizes: Float[np.ndarray, " c"]
+    around: Int[np.ndarray, "c k"]
+
+    @classmethod
+    def create(
+        cls, model: ForwardModel, changes: Float[np.ndarray, "N m"], used: Bool[np.ndarray, " M"], reference
+    ) -> tuple["Imaged", list[str]]:
+        """One-step images by a model calibrated on the `reference` (M,), if there is one, of the channels `used`; with
+        notes. Which sign touches have is taken from the changes of presses."""
+        notes, conductivity, mask = [], 1.0, as_array(used)
+        if reference is not None and np.abs(reference[used]).max() > 0:
+            found = calibrate(model, as_array(reference), mask=mask, contact="fixed")
+            if np.isfinite(found.misfit):
+                model, conductivity = found.model, found.conductivity
+                notes += [found.note] if found.note else []
+        matrix = np.asarray(one_step(model, conductivity, mask=mask).matrix).T[used]
+        centres, sizes = np.asarray(centroids(model.mesh)), np.asarray(measures(model.mesh))
+        around = KDTree(centres).query(centres, max(1, int(_ROUND * len(centres))))[1]
+        image = changes @ matrix
+        sign = np.sign(np.median(image.max(axis=1) + image.min(axis=1))) or 1.0
+        return cls(sign * matrix, centres, sizes, np.reshape(around, (len(centres), -1))), notes
+
+    def contacts(self, images: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n d+3"]:
+        """Of the strongest contact of each image: its centroid (d), and the logarithms of peak, integral and size."""
+        row = np.arange(len(images))[:, None]
+        cells = self.around[images.argmax(axis=1)]
+        near, sizes = images[row, cells], self.sizes[cells]
+        peak = np.maximum(images.max(axis=1), 1e-300)[:, None]
+        above = sizes * np.maximum(near - _LEVEL * peak, 0.0)
+        weight = np.maximum(above.sum(axis=1, keepdims=True), 1e-300)
+        place = np.einsum("nk,nkd->nd", above / weight, self.centres[cells])
+        integral, area = (sizes * np.maximum(near, 0.0)).sum(axis=1), (sizes * (above > 0)).sum(axis=1)
+        return np.column_stack([place, np.log(np.maximum(np.column_stack([peak, integral, area]), 1e-300))])
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Features: the strongest contact of the image."""
+
+    imaged: Imaged
+
+    def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
+        """Features (n, p) of changes (n, m)."""
+        return in_parts(lambda some: self.imaged.contacts(some @ self.imaged.matrix), changes, _AT_ONCE)
+
+    def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
+        """What one of each feature is: its own deviation."""
+        return values.std(axis=0)
+
+
+@dataclass(frozen=True)
+class Images:
+    """Features: the strongest contact, and the image relative to its own size, with the logarithm of that."""
+
+    imaged: Imaged
+
+    def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
+        """Features (n, p) of changes (n, m)."""
+
+        def features(some: np.ndarray) -> np.ndarray:
+            image = some @ self.imaged.matrix
+            size = np.maximum(np.sqrt(np.mean(image**2, axis=1, keepdims=True)), 1e-300)
+            return np.hstack([self.imaged.contacts(image), np.log(size), image / size])
+
+        return in_parts(features, changes, _AT_ONCE)
+
+    def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
+        """What one of each feature is: of the contact a part of its own deviation, of cells that of all."""
+        told = values.shape[1] - len(self.imaged.sizes)
+        own = values.std(axis=0)
+        return np.concatenate([own[:told] / _WEIGHT, np.full(len(own) - told, np.sqrt(np.mean(own[told:] ** 2)))])
+
+
+def check_imaged(model: ForwardModel, num_channels: int) -> None:
+    """Raise `ValueError` for what is no model, and one of another number of channels."""
+    check_kind("model", model, ForwardModel, "a ForwardModel(mesh, electrodes, protocol)")
+    number = model.protocol.num_measurements
+    if number != num_channels:
+        raise ValueError(f"model: its protocol has {number} channels, and frames have {num_channels}; give the skin's.")

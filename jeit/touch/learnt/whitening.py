@@ -1,0 +1,52 @@
+"""Changes in units of what varies between frames of one and the same press: noise, drift, and what is not asked."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+# Frames that repeat another, at least.
+_FEWEST = 20
+
+
+@dataclass(frozen=True)
+class Whitened:
+    """Features: changes times `root` (m, m), of which what varies between repeated frames has the covariance 1."""
+
+    root: Float[np.ndarray, "m m"]
+
+    @classmethod
+    def learn(cls, changes: Float[np.ndarray, "N m"], answers: Float[np.ndarray, "N d"]) -> "Whitened":
+        """From frames of which some repeat others: have the same answers. Shrunk after Ledoit and Wolf (2004)."""
+        from sklearn.covariance import ledoit_wolf
+
+        scale = np.maximum(changes.std(axis=0), 1e-300)
+        group, count = _groups(answers)
+        means = np.zeros((len(count), changes.shape[1]))
+        np.add.at(means, group, changes / count[group, None])
+        left = ((changes - means[group]) / scale)[count[group] > 1]
+        if not left.any():
+            return cls(np.diag(1 / scale))
+        freedom = len(left) - np.sum(count > 1)
+        values, vectors = np.linalg.eigh(len(left) / freedom * ledoit_wolf(left, assume_centered=True)[0])
+        values = np.maximum(values, 1e-12 * values.max())
+        return cls((vectors / np.sqrt(values)) @ vectors.T / scale[:, None])
+
+    def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
+        """Features (n, m) of changes (n, m)."""
+        return changes @ self.root
+
+    def deviation(self, values: Float[np.ndarray, "N m"]) -> Float[np.ndarray, " m"]:
+        """What one of each feature is: the same for all."""
+        return np.full(values.shape[1], np.sqrt(np.mean(values.var(axis=0))))
+
+
+def are_repeated(answers: Float[np.ndarray, "N d"]) -> bool:
+    """Whether enough frames repeat others for their noise to be known."""
+    return int(np.sum(_groups(answers)[1] - 1)) >= _FEWEST
+
+
+def _groups(answers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (N,) of frames, one for each answer, and how many have it."""
+    group, count = np.unique(answers, axis=0, return_inverse=True, return_counts=True)[1:]
+    return group.ravel(), count
