@@ -2,7 +2,8 @@
 
 Changes of a skin's M channels are scores of a few patterns and noise, d = s (V z + n), with z and n normal. The scores
 of a frame of which some channels are missing are those most likely; a channel is dead where the others foretell it to
-be within so many deviations, and it is not.
+be within so many deviations, and it is not. What it would have read is told from the covariance of all channels, which
+knows more than the patterns do: that reciprocal channels read the same, say.
 """
 
 from dataclasses import dataclass
@@ -17,8 +18,12 @@ from jeit.touch.learnt.neighbourhood import Neighbourhood
 _LEFT, _MOST, _PRESSES_EACH = 1e-3, 60, 4
 # A channel is dead beyond so many times what all but a thousandth of the presses that taught had.
 _BEYOND, _QUANTILE = 2.0, 0.999
+# Of the span of a channel's changes, beyond it: no channel alive reads that.
+_SPANS, _FEW = 2.0, 0.1
 # Of the greatest change: what varies less is rounding.
 _ROUNDING = 1e-13
+# Added to the covariance, of channels whose variance is 1.
+_DIAGONALS = np.logspace(-6, 0, 13)
 # Of channels, before a frame is given up instead.
 _MOST_DEAD = 0.34
 # Frames one after the other that lack channels as no other does, before all are taken one by one.
@@ -31,17 +36,20 @@ _NEAR = 2 / 1.75
 class Channels:
     """M channels, of which some are `used` (M,): neither constant nor without readings.
 
-    For those: `scale` (m,) of changes, `patterns` (m, k), `spread` (k,) of scores, `noise` (m,) in scales; `farthest`
-    (m,): residuals that are still those of a channel alive; `usual`: novelty of all but a hundredth of the presses;
-    `neighbourhood`: how near presses are to each other.
+    For those: `scale` (m,) of changes, `range` (2, m) in scales beyond which none reads that is alive; `patterns`
+    (m, k), `spread` (k,) of scores, `noise` (m,) in scales; `farthest` (m,): residuals that are still those of a
+    channel alive; `precision` (m, m), the inverse of the covariance; `usual`: novelty of all but a hundredth of the
+    presses; `neighbourhood`: how near presses are to each other.
     """
 
     used: Bool[np.ndarray, " M"]
     scale: Float[np.ndarray, " m"]
+    range: Float[np.ndarray, "2 m"]
     patterns: Float[np.ndarray, "m k"]
     spread: Float[np.ndarray, " k"]
     noise: Float[np.ndarray, " m"]
     farthest: Float[np.ndarray, " m"]
+    precision: Float[np.ndarray, "m m"]
     usual: float
     neighbourhood: Neighbourhood
 
@@ -72,14 +80,19 @@ class Channels:
         farthest = _BEYOND * np.nanquantile(left, _QUANTILE, axis=0)
         farthest = np.maximum(farthest, max(6.0, float(np.nanquantile(left, 0.99))))
         every, _ = _explain(scaled, ~missing[:, used], patterns, spread, noise)
+        precision = _precision(np.where(missing[:, used], every @ patterns.T, scaled))
         usual = float(np.quantile(apart, 0.99))
-        return cls(used, scale, patterns, spread, noise, farthest, usual, Neighbourhood.learn(every))
+        least, most = np.nanmin(changes[:, used], axis=0) / scale, np.nanmax(changes[:, used], axis=0) / scale
+        far = np.stack([least - _SPANS * (most - least), most + _SPANS * (most - least)])
+        return cls(used, scale, far, patterns, spread, noise, farthest, precision, usual, Neighbourhood.learn(every))
 
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Changes (n, m) of the channels used, as foretold by the others where one is dead or has no reading; which
         are alive (n, m); and novelty (n,), 1 where a frame is as far from those learnt from as the farthest of them."""
         whole = changes[:, self.used] / self.scale
-        given = ~np.isnan(whole)
+        given, far = ~np.isnan(whole), (whole < self.range[0]) | (whole > self.range[1])
+        # Where many are, it is the frame that is strange.
+        given &= ~far | (far.sum(axis=1, keepdims=True) > max(1, _FEW * whole.shape[1]))
         whole, alive = np.where(given, whole, 0.0), given.copy()
         scores, residual = self._explain_all(whole)
         left, alone = np.flatnonzero((np.abs(residual) > self.farthest).any(axis=1) | ~given.all(axis=1)), 0
@@ -95,7 +108,7 @@ class Channels:
             rows = some[borne]
             alive[rows], scores[rows] = pattern, some_scores[borne]
             residual[rows] = np.where(pattern, some_residual[borne], 0.0)
-            whole[rows] = np.where(pattern, whole[rows], scores[rows] @ self.patterns.T)
+            whole[np.ix_(rows, ~pattern)] = self._foretold(whole[np.ix_(rows, pattern)], pattern)
             left = np.setdiff1d(left, rows, assume_unique=True)
         novelty = _novelty(scores, residual, alive, self.spread) / self.usual
         return whole * self.scale, alive, np.maximum(novelty, _NEAR * self.neighbourhood(scores))
@@ -122,9 +135,14 @@ class Channels:
         gain = weighted @ np.linalg.inv(weighted.T @ self.patterns + np.diag(1 / self.spread**2))
         scores = whole @ gain
         residual = (whole - scores @ self.patterns.T) / self.noise
-        own = 1 - np.einsum("ij,ij->i", self.patterns, gain)  # a channel's say in what foretells it
-        beyond = np.where(given, np.abs(residual) / np.maximum(own, 1e-3) / self.farthest, np.inf)
+        free = 1 - np.einsum("ij,ij->i", self.patterns, gain)  # the residual's variance; the rest, a channel explains
+        beyond = np.where(given, np.abs(residual) / np.sqrt(np.maximum(free, 1e-6)) / self.farthest, np.inf)
         return beyond, scores, residual
+
+    def _foretold(self, alive_readings: Float[np.ndarray, "n a"], alive: np.ndarray) -> Float[np.ndarray, "n m-a"]:
+        """What channels that are not `alive` (m,) would most likely have read."""
+        across = self.precision[np.ix_(~alive, alive)] @ alive_readings.T
+        return -np.linalg.solve(self.precision[np.ix_(~alive, ~alive)], across).T
 
     def _explain_all(self, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Scores and residuals of frames (n, m) of which all channels are alive."""
@@ -148,6 +166,19 @@ def _factors(scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     left = scaled - scaled @ patterns @ patterns.T
     noise = np.sqrt(np.mean(left**2, axis=0) * len(scaled) / max(1, len(scaled) - number))
     return patterns, values[:number] / np.sqrt(len(scaled)), np.maximum(noise, 1e-6)
+
+
+def _precision(scaled: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "m m"]:
+    """Inverse of the covariance and of a diagonal, the one by which each channel is foretold best by the others: in
+    each half of the frames, by what the other half taught."""
+    half, unit = len(scaled) // 2, np.eye(scaled.shape[1])
+    misses = np.zeros(len(_DIAGONALS))
+    for learnt, other in ((scaled[:half], scaled[half:]), (scaled[half:], scaled[:half])):
+        covariance = learnt.T @ learnt / len(learnt)
+        for number, diagonal in enumerate(_DIAGONALS):
+            precision = np.linalg.inv(covariance + diagonal * unit)
+            misses[number] += np.mean((other @ precision / np.diag(precision)) ** 2)
+    return np.linalg.inv(scaled.T @ scaled / len(scaled) + _DIAGONALS[int(misses.argmin())] * unit)
 
 
 def _explain(whole, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndarray]:

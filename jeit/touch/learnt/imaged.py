@@ -38,7 +38,8 @@ class Imaged:
         notes. Which sign touches have is taken from the changes of presses."""
         notes, conductivity, mask = [], 1.0, as_array(used)
         if reference is not None and np.abs(reference[used]).max() > 0:
-            found = calibrate(model, as_array(reference), mask=mask, contact="fixed")
+            turned = np.sign(np.where(used, model.voltages(1.0), 0.0) @ reference)  # -1 where polarity is
+            found = calibrate(model, as_array(turned * reference), mask=mask, contact="fixed")
             if np.isfinite(found.misfit):
                 model, conductivity = found.model, found.conductivity
                 notes += [found.note] if found.note else []

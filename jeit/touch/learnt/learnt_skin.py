@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jeit.arguments import check_kind, check_name, counted
 from jeit.forward import ForwardModel
@@ -26,6 +26,8 @@ from jeit.touch.learnt.touches import Touches
 # A frame is unlike any learnt from beyond so many times the novelty of the farthest of them, or with fewer channels.
 _UNLIKE, _FEWEST = 2.0, 0.66
 _AT_ONCE = 256
+# Frames in which a channel that is alive does not read the same.
+_MANY = 20
 # A reference is another skin's if it is less like those learnt from than this, or of another size.
 _ALIKE, _SIZES = 0.8, 5.0
 # Frames of a session, before it can be standardised by itself.
@@ -137,7 +139,7 @@ class LearntSkin:
         """
         frames = self._check(frames)
         reference = self._reference(frames, reference)
-        changes = _changes(frames, reference)
+        changes = _changes(np.where(_stuck(frames), np.nan, frames), reference)
         if self.per_session:
             changes = standardised(changes, group)
         found = over_threads(self._tell, changes, self._used(reference, changes), at_once=_AT_ONCE)
@@ -230,6 +232,12 @@ class LearntSkin:
                 "them."
             )
         return tuple(notes)
+
+
+def _stuck(frames: Float[np.ndarray, "n M"]) -> Bool[np.ndarray, " M"]:
+    """Channels that read the same in all of many frames, while most others change."""
+    same = (frames == frames[0]).all(axis=0)
+    return same & (len(frames) >= _MANY) & (same.mean() < 0.5)
 
 
 def standardised(changes: np.ndarray, group) -> np.ndarray:

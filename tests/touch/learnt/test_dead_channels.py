@@ -34,6 +34,35 @@ def test_readings_that_are_missing_are_foretold():
     np.testing.assert_allclose(whole, fresh, atol=0.06)
 
 
+def twins(number, seed):
+    """Of ten channels that follow six numbers, not by lines, and ten that read the same, as reciprocal ones do."""
+    rng = np.random.default_rng(seed)
+    mixed = np.tanh(rng.normal(size=(number, 6)) @ np.random.default_rng(6).normal(size=(6, 10)))
+    return np.hstack([mixed, mixed]) + 1e-3 * rng.normal(size=(number, 20))
+
+
+@pytest.mark.parametrize("reading", [np.nan, 9.0])
+def test_a_channel_is_foretold_by_the_one_that_reads_the_same(reading):
+    """Whatever else the patterns know; and its twin is not held for dead for reading what nothing else bears out."""
+    channels, fresh = Channels.learn(twins(300, 0)), twins(60, 1)
+    for channel in range(20):
+        broken = fresh.copy()
+        broken[:, channel] = reading
+        whole, alive, _ = channels.complete(broken)
+        assert not alive[:, channel].any()
+        assert np.delete(alive, channel, axis=1).mean() > 0.995
+        assert np.abs(whole - fresh)[:, channel].max() < 0.02
+
+
+def test_frames_that_lack_different_channels_are_mended_as_each_alone():
+    channels, fresh = Channels.learn(changes(200, 0)), changes(60, 1)
+    fresh[:30, 4], fresh[20:40, 7], fresh[45, 1], fresh[50:, 12] = np.nan, 3.0, np.nan, -4.0
+    together = channels.complete(fresh)
+    alone = [np.concatenate(parts) for parts in zip(*(channels.complete(one[None]) for one in fresh), strict=True)]
+    for one, other in zip(together, alone, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)
+
+
 def test_frames_of_another_kind_are_told():
     channels = Channels.learn(changes(200, 0))
     *_, usual = channels.complete(changes(300, 2))

@@ -54,6 +54,17 @@ def test_a_channel_that_dies_costs_little(quick, reading):
         assert any(f" {channel}" in note for note in told.notes)
 
 
+def test_a_channel_that_is_stuck_is_done_without(quick):
+    """At a value that it might have read: nothing but its constancy tells."""
+    frames = FRESH["frames"].copy()
+    frames[:, 9] = np.median(frames[:, 9])
+    told = quick.predict(frames, FRESH["reference"])
+    assert not told.alive[:, 9].any()
+    assert told.alive.mean() > 0.97
+    still = quick.predict(np.repeat(frames[:1], 30, axis=0), FRESH["reference"][0])
+    assert still.alive.all()
+
+
 def test_frames_unlike_any_are_said_to_be(quick):
     frames = FRESH["frames"].copy()
     frames[:5] = np.random.default_rng(0).normal(size=(5, CHANNELS))
