@@ -29,6 +29,7 @@ import numpy as np
 from jeit import protocol as protocols
 from jeit.arguments import did_you_mean
 from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
+from jeit.forward import ForwardModel
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Domain
 from jeit.mesh.outline import OUTLINES
@@ -121,6 +122,18 @@ class Description:
         if not self.protocol_section:
             return None
         return _protocol(self.protocol_section, self.electrodes, path, self.origin)
+
+    def model(self, path: Path, *, num_points: int) -> ForwardModel:
+        """A model, on a new mesh of about `num_points` nodes, of what the file at `path` was measured on.
+
+        Raises `ValueError` where geometry, electrodes or protocol are not described.
+        """
+        said = {"geometry": self.domain, "electrodes": self.electrodes, "protocol": self.protocol(path)}
+        missing = [f"[{section}]" for section, one in said.items() if one is None]
+        if missing or self.domain is None or self.electrodes is None:
+            raise ValueError(f"{self.origin}: a model needs {', '.join(missing)} too; describe it.")
+        mesh = self.domain.mesh(num_points=num_points, refine=self.electrodes.refinement() or None)
+        return ForwardModel(mesh, self.electrodes, said["protocol"])
 
 
 def load_description(which: str | Path) -> Description:

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from made_skins import record
 
+from jeit.data import load_description
+
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
@@ -54,6 +56,48 @@ def test_from_presses_to_touches(files, run):
     assert (folder / "out" / "touches.png").read_bytes().startswith(b"\x89PNG")
     report = json.loads((folder / "out" / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
     assert report["unlike"] == [3]
+
+
+DISK = """
+[geometry]
+shape = "disk"
+radius = 0.05
+
+[electrodes]
+layout = "ring"
+number = 8
+width = 0.01
+contact_impedance = 0.001
+
+[protocol]
+kind = "adjacent"
+current = 1e-3
+"""
+
+
+def test_a_described_skin_is_imaged(tmp_path, run):
+    """The description is the one that measured tables have."""
+    skin = tmp_path / "skin.toml"
+    skin.write_text(DISK)
+    model = load_description(skin).model(skin, num_points=300)
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-0.03, 0.03, (30, 2))
+    centres = np.asarray(model.mesh.points)[np.asarray(model.mesh.cells)].mean(axis=1)
+    spots = np.exp(-((np.linalg.norm(places[:, None] - centres, axis=2) / 0.01) ** 2))
+    frames = np.stack([np.asarray(model.voltages(1 + 0.3 * spot)) for spot in spots])
+    np.savez(tmp_path / "presses.npz", frames=frames, reference=np.asarray(model.voltages(1.0)), positions=places)
+    fit = ("touch", "fit", tmp_path / "presses.npz", "-o", tmp_path / "out", "--method", "ridge", "--description")
+    status, output, error = run(*fit, skin)
+    assert (status, error) == (0, "")
+    assert "ridge on contacts" in output
+    for wrong, said in (
+        (DISK.replace("number = 8", "number = 16"), "--description: its protocol has 208 channels, and frames have 40"),
+        (DISK[DISK.index("[protocol]") :] + "number = 8", "a model needs [geometry], [electrodes] too"),
+    ):
+        skin.write_text(wrong)
+        status, _, error = run(*fit, skin)
+        assert status == 1
+        assert said in error
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,10 @@ touch = typer.Typer(
 )
 
 
+# Of the mesh of images: contacts are told between its cells.
+_NODES = 400
+
+
 @touch.callback(invoke_without_command=True)
 def _top(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
@@ -40,6 +44,14 @@ def fit(
             "classifiers of labels; auto (default): what errs least on presses held out."
         ),
     ] = None,
+    description: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SKIN.toml",
+            help="Geometry, electrodes and protocol of the skin, if they are known: its images are then learnt from "
+            "too, and fewer presses are enough.",
+        ),
+    ] = None,
     channels: Annotated[
         int | None, typer.Option(help="Use only so many channels, those that tell most (default: all).")
     ] = None,
@@ -55,6 +67,7 @@ def fit(
     from rich.console import Console
 
     from jeit.cli.console import Steps, pairs
+    from jeit.data import load_description
     from jeit.report.learnt_skin import SKIN_FILES, summary, write_learnt_skin
     from jeit.touch import LearntSkin, read_presses
 
@@ -63,10 +76,16 @@ def fit(
     with Steps(console, quiet=quiet) as step:
         step("read")
         recorded = read_presses(presses)
+        model = None if description is None else load_description(description).model(presses, num_points=_NODES)
         step("learn")
-        with naming_options({"num_channels": "--channels", "per_session": "--per-session"}):
+        with naming_options({"num_channels": "--channels", "per_session": "--per-session", "model": "--description"}):
             skin = LearntSkin.fit(
-                recorded, method=method or "auto", num_channels=channels, per_session=per_session, progress=step.tell
+                recorded,
+                method=method or "auto",
+                model=model,
+                num_channels=channels,
+                per_session=per_session,
+                progress=step.tell,
             )
         step("write")
         write_learnt_skin(skin, output)
