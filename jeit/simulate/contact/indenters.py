@@ -176,7 +176,8 @@ class DepthMap(AbstractIndenter):
         """What the surface lacks of its greatest height."""
         middle = (np.array(self.height.shape) - 1) / 2
         place = np.moveaxis(np.asarray(points)[..., ::-1] / self.pixel + middle, -1, 0)
-        height = map_coordinates(self.height, place, order=1, cval=np.nan)
+        flat = map_coordinates(self.height, place.reshape(2, -1), order=1, cval=np.nan)
+        height = flat.reshape(place.shape[1:])
         return np.where(np.isnan(height), np.inf, np.nanmax(self.height) - height)
 
     @property

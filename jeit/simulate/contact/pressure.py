@@ -60,7 +60,8 @@ class PressureRaster(AbstractPressure):
     def at(self, points):
         """Linear between pixels, none beyond."""
         place = np.moveaxis((np.asarray(points) / self.pixel)[..., ::-1] + (len(self.values) - 1) / 2, -1, 0)
-        return map_coordinates(self.values, place, order=1, mode="grid-constant")
+        flat = map_coordinates(self.values, place.reshape(2, -1), order=1, mode="grid-constant")
+        return flat.reshape(place.shape[1:])
 
 
 def raster(half_widths, number: int) -> tuple[Float[np.ndarray, "N N 2"], Float[np.ndarray, "2"]]:

@@ -56,6 +56,7 @@ def test_a_depth_map_is_linear_between_its_pixels():
     indenter = DepthMap(height, 1.0)
     gap = indenter.gap(np.array([[0.0, 0.0], [0.5, -0.5], [1.0, 1.0], [-0.5, 0.5], [1.5, 0.0]]))
     np.testing.assert_allclose(gap, [2.0, 1.5, 0.0, np.inf, np.inf])
+    assert indenter.gap(np.array([0.5, -0.5])) == pytest.approx(1.5)
 
 
 @pytest.mark.parametrize(

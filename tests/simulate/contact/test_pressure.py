@@ -116,6 +116,7 @@ def test_load_is_carried_where_bodies_touch(support, shape):
     # Cells of the sum are cut by edges: a share of pixel / width of the load.
     assert pressure.sum() * pixel.prod() == pytest.approx(load, rel=0.05)
     assert (pressure[np.linalg.norm(points, axis=-1) > found.reach] == 0).all()
+    assert found.at(points[400, 400]) == pressure[400, 400]
     if own:
         assert found.values.sum() * found.pixel.prod() == pytest.approx(load, rel=1e-12)
 
