@@ -140,6 +140,8 @@ def test_bodies_do_not_overlap(shape):
         (lambda: LAYER.pressure(ball(0.01), 0.0), "load must be positive, in newtons"),
         (lambda: RUBBER.pressure(ball(0.01), np.nan), "load must be positive"),
         (lambda: LAYER.pressure(Disc(0.01), 100.0), "takes the indenter 3.8. mm into a layer 3 mm thick"),
+        (lambda: LAYER.pressure(Bar(0.04, 1e-5), 1.0), "thinner than a pixel"),
+        (lambda: RUBBER.pressure(Placed(Disc(1e-5), (0.02, 0.0)), 1.0), "thinner than a pixel"),
         (lambda: Foundation(-1.0, 1e-3), "modulus must be positive"),
         (lambda: Foundation(1e6, 0.0), "thickness must be"),
         (lambda: HalfSpace(1e6, 0.6), "poisson must be"),
