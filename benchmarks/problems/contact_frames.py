@@ -102,8 +102,8 @@ class ContactFrames:
 
 
 def weight(grams: float, place, radius: float = 0.0115) -> Press:
-    """A weight on a flat disc, at a place in metres."""
-    return Press(Disc(radius), 1e-3 * grams * GRAVITY, place)
+    """A weight on a flat disc of a `radius`, at a place, metres."""
+    return Press(Disc(2 * radius), 1e-3 * grams * GRAVITY, place)
 
 
 def _distances(touch: tuple[Press, ...]) -> list[float]:

@@ -5,6 +5,7 @@ One sentence each, before anything is compiled: which argument, what was given, 
 light: nothing of the library is imported here.
 """
 
+from jeit.arguments.arrays import real_array
 from jeit.arguments.counts import counted
 from jeit.arguments.keys import check_key
 from jeit.arguments.kinds import check_kind, is_number, told
@@ -23,5 +24,6 @@ __all__ = [
     "is_number",
     "need",
     "npz_arrays",
+    "real_array",
     "told",
 ]

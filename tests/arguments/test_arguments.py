@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.arguments import check_key, check_kind, check_metres, check_name, did_you_mean, is_number, told
+from jeit.arguments import check_key, check_kind, check_metres, check_name, did_you_mean, is_number, real_array, told
 from jeit.mesh import Disk
 
 
@@ -44,6 +44,19 @@ def test_numbers(given):
 )
 def test_no_numbers(given):
     assert not is_number(given)
+
+
+@pytest.mark.parametrize("given", [[1, 2], np.arange(2.0), jnp.ones(2), 3, [[1.0], [2.0]], []])
+def test_arrays_of_numbers(given):
+    values = real_array("load", given, "newtons")
+    assert values.dtype == float
+    np.testing.assert_array_equal(values, np.asarray(given))
+
+
+@pytest.mark.parametrize("given", ["1", ["1", "2"], None, [[1.0], [2.0, 3.0]], np.ones(2) * 1j, [True], {}])
+def test_no_arrays_of_numbers(given):
+    with pytest.raises(ValueError, match=r"^load must be newtons"):
+        real_array("load", given, "newtons")
 
 
 def test_kinds():

@@ -16,6 +16,7 @@ from types import ModuleType
 
 import numpy as np
 
+from jeit.arguments import check_kind
 from jeit.design.study.contents import Contents, study_contents
 from jeit.design.study.spec import Study
 
@@ -31,6 +32,7 @@ class Store:
         cannot be written."""
         zarr = require("zarr")
         self.contents = work if isinstance(work, Contents) else study_contents(work)
+        check_kind("path", path, (str, os.PathLike), "that of the store, such as 'results.zarr'")
         self.path, kind = Path(path), self.contents.kind
         if not self.path.exists():
             if not create:

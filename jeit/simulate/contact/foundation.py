@@ -5,7 +5,14 @@ from jaxtyping import Float
 
 from jeit.arguments import check_metres, is_number, told
 from jeit.simulate.contact.indenters import AbstractIndenter
-from jeit.simulate.contact.pressure import AbstractPressure, AbstractSupport, check_load, contact_window, raster
+from jeit.simulate.contact.pressure import (
+    AbstractPressure,
+    AbstractSupport,
+    check_load,
+    check_seen,
+    contact_window,
+    raster,
+)
 
 # Pixels along a side: of the raster that finds the contact, and of that which the load is balanced on.
 _COARSE, _FINE = 24, 96
@@ -46,7 +53,8 @@ class Foundation(AbstractSupport):
     def pressure(self, indenter: AbstractIndenter, load: float) -> FoundationPressure:
         """That beneath `indenter` under `load` newtons.
 
-        Raises `ValueError` for a load that is not positive, and one that presses through the layer.
+        Raises `ValueError` for a load that is not positive, one that presses through the layer, and indenters thinner
+        than a pixel.
         """
         check_load(load)
 
@@ -62,8 +70,9 @@ class Foundation(AbstractSupport):
 
         window = contact_window(pressed, indenter.reach, _COARSE)
         gap, approach = balanced(window, _FINE)
-        self._check_approach(approach, load)
         points, pixel = raster(window, _FINE)
+        check_seen(gap < approach, pixel)
+        self._check_approach(approach, load)
         reach = float(np.linalg.norm(points[gap < approach], axis=-1).max() + np.hypot(*pixel))
         return FoundationPressure(float(load), approach, reach, indenter, self.stiffness)
 

@@ -12,7 +12,14 @@ import numpy as np
 from jeit.arguments import is_number, told
 from jeit.simulate.contact.foundation import check_modulus
 from jeit.simulate.contact.indenters import AbstractIndenter
-from jeit.simulate.contact.pressure import AbstractSupport, PressureRaster, check_load, contact_window, raster
+from jeit.simulate.contact.pressure import (
+    AbstractSupport,
+    PressureRaster,
+    check_load,
+    check_seen,
+    contact_window,
+    raster,
+)
 
 # Pixels along a side of the raster that finds the contact.
 _COARSE = 24
@@ -48,7 +55,8 @@ class HalfSpace(AbstractSupport):
     def pressure(self, indenter: AbstractIndenter, load: float) -> PressureRaster:
         """That beneath `indenter` under `load` newtons.
 
-        Raises `ValueError` for a load that is not positive, and `RuntimeError` where the contact is not found.
+        Raises `ValueError` for a load that is not positive and for indenters thinner than a pixel, and `RuntimeError`
+        where the contact is not found.
         """
         check_load(load)
 
@@ -58,6 +66,7 @@ class HalfSpace(AbstractSupport):
         window = contact_window(pressed, indenter.reach, _COARSE)
         values, approach = self._balanced(indenter, load, window, self.pixels)
         points, pixel = raster(window, self.pixels)
+        check_seen(values > 0, pixel)
         reach = float(np.linalg.norm(points[values > 0], axis=-1).max() + np.hypot(*pixel))
         return PressureRaster(float(load), approach, reach, values, pixel)
 
@@ -69,9 +78,10 @@ class HalfSpace(AbstractSupport):
 
     def _balanced(self, indenter: AbstractIndenter, load: float, window, number: int):
         points, pixel = raster(window, number)
-        sink = sinking(number, pixel, self.plane_modulus)
-        pressure, approach = rigid_contact(indenter.gap(points), sink, load / pixel.prod())
-        return pressure, approach
+        gap = indenter.gap(points)
+        if not np.isfinite(gap).any():
+            return np.zeros_like(gap), 0.0
+        return rigid_contact(gap, sinking(number, pixel, self.plane_modulus), load / pixel.prod())
 
 
 def sinking(number: int, pixel, plane_modulus: float):

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import map_coordinates
 
-from jeit.arguments import check_kind, check_metres
+from jeit.arguments import check_kind, check_metres, real_array
 from jeit.design.skin.indentation import AbstractIndentation, Hemisphere
 from jeit_solvers.engines import host
 
@@ -163,7 +163,7 @@ class DepthMap(AbstractIndenter):
     def __init__(self, height, pixel: float):
         """Raises `ValueError` for what is no image of at least 2 × 2 pixels, one that is infinite somewhere or NaN
         throughout, and pixels of no size."""
-        height = np.asarray(height, float)
+        height = real_array("height", height, "an image (rows, columns), in metres")
         if height.ndim != 2 or min(height.shape) < 2 or np.isinf(height).any() or np.isnan(height).all():
             raise ValueError(
                 "height must be an image (rows, columns) of 2 × 2 pixels or more, in metres, NaN where there is "
@@ -176,7 +176,8 @@ class DepthMap(AbstractIndenter):
         """What the surface lacks of its greatest height."""
         middle = (np.array(self.height.shape) - 1) / 2
         place = np.moveaxis(np.asarray(points)[..., ::-1] / self.pixel + middle, -1, 0)
-        height = map_coordinates(self.height, place, order=1, cval=np.nan)
+        flat = map_coordinates(self.height, place.reshape(2, -1), order=1, cval=np.nan)
+        height = flat.reshape(place.shape[1:])
         return np.where(np.isnan(height), np.inf, np.nanmax(self.height) - height)
 
     @property

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from jeit.arguments import is_number, real_array
 from jeit.simulate.contact.indenters import AbstractIndenter, check_indenter
 
 
@@ -56,7 +57,7 @@ class Joined(AbstractIndenter):
 
 def check_position(position) -> Float[np.ndarray, "2"]:
     """A place (x, y) in metres as an array. Raises `ValueError` for what is none."""
-    where = np.asarray(position, float)
+    where = real_array("position", position, "(x, y) in metres")
     if where.shape != (2,) or not np.isfinite(where).all():
         raise ValueError(f"position: give (x, y) in metres, not {position!r}.")
     return where
@@ -64,6 +65,6 @@ def check_position(position) -> Float[np.ndarray, "2"]:
 
 def check_angle(angle) -> float:
     """An angle in radians. Raises `ValueError` for what is none."""
-    if not np.isscalar(angle) or not np.isfinite(angle):
+    if not is_number(angle):
         raise ValueError(f"angle: give radians, not {angle!r}.")
-    return float(angle)  # pyright: ignore[reportArgumentType]
+    return float(angle)

@@ -1,5 +1,7 @@
 """Materials of skins: how conductivity follows pressure, in time, and what else a reading of them holds."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
@@ -45,15 +47,14 @@ class Material(eqx.Module):
         check_metres("thickness", self.thickness)
         check_support("support", self.support)
         for name in ("conductivity", "half_pressure"):
-            _check(name, getattr(self, name), getattr(self, name) > 0, "positive")
-        _check("saturation", self.saturation, self.saturation > -1, "above −1, where nothing conducts")
-        _check("hysteresis", self.hysteresis, 0 <= self.hysteresis < 1, "from 0 to below 1")
+            _check(name, getattr(self, name), lambda value: value > 0, "positive")
+        _check("saturation", self.saturation, lambda value: value > -1, "above −1, where nothing conducts")
+        _check("hysteresis", self.hysteresis, lambda value: 0 <= value < 1, "from 0 to below 1")
         for name in ("conductivity_walk", "contact_walk", "noise", "gain_spread"):
-            _check(name, getattr(self, name), getattr(self, name) >= 0, "zero or more")
+            _check(name, getattr(self, name), lambda value: value >= 0, "zero or more")
         for name in ("conductivity_trend", "contact_trend"):
-            _check(name, getattr(self, name), True, "a number")
-        shares = sum(share for share, _ in self.creep)
-        if any(share < 0 or not 0 < seconds < np.inf for share, seconds in self.creep) or not shares < 1:
+            _check(name, getattr(self, name), lambda _: True, "a number")
+        if not _are_branches(self.creep):
             raise ValueError(
                 f"creep: give (share, seconds) of every branch, shares of sum below 1, such as ((0.1, 1.0), (0.1, "
                 f"60.0)); it is {self.creep!r}."
@@ -65,9 +66,20 @@ class Material(eqx.Module):
         return self.saturation * pressure / (pressure + self.half_pressure)
 
 
-def _check(name: str, value, holds, wanted: str) -> None:
-    if not (is_number(value) and holds):
+def _check(name: str, value, holds: Callable[[float], bool], wanted: str) -> None:
+    if not (is_number(value) and holds(value)):
         raise ValueError(f"{name} must be {wanted}; it is {told(value)}.")
+
+
+def _are_branches(creep) -> bool:
+    """Whether it is pairs of a share and seconds, the shares of a sum below 1."""
+    if not isinstance(creep, (tuple, list)) or not all(
+        isinstance(one, (tuple, list)) and len(one) == 2 for one in creep
+    ):
+        return False
+    if not all(is_number(share) and is_number(seconds) and share >= 0 and seconds > 0 for share, seconds in creep):
+        return False
+    return sum(share for share, _ in creep) < 1
 
 
 # What papers print is named; all else is chosen, so that skins differ as their authors say they do.

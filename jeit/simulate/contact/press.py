@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_kind
+from jeit.arguments import check_kind, real_array
 from jeit.simulate.contact.indenters import AbstractIndenter, check_indenter
 from jeit.simulate.contact.joined import check_angle, check_position
 from jeit.simulate.contact.pressure import check_load
@@ -38,7 +38,13 @@ class MovingPress(eqx.Module):
     def __init__(self, indenter: AbstractIndenter, load, position=(0.0, 0.0), angle=0.0):
         """Raises `ValueError` for what is no indenter, negative loads, and what is not finite or not as long."""
         check_indenter("indenter", indenter)
-        load, position, angle = (np.asarray(values, float) for values in (load, position, angle))
+        load = real_array("load", load, "newtons, one or one a frame (T,)")
+        position = real_array("position", position, "(x, y) in metres, one or one a frame (T, 2)")
+        angle = real_array("angle", angle, "radians, one or one a frame (T,)")
+        if position.shape[-1:] != (2,):
+            raise ValueError(
+                f"position must be (x, y) in metres, one or one a frame (T, 2); it has shape {position.shape}."
+            )
         try:
             (number,) = np.broadcast_shapes(load.shape, position.shape[:-1], angle.shape)
             load, angle = np.broadcast_to(load, number), np.broadcast_to(angle, number)

@@ -5,7 +5,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jeit.arguments import check_key, check_kind
+from jeit.arguments import check_key, check_kind, is_number, real_array, told
 from jeit.mesh import Domain
 from jeit.simulate.contact.indenters import AbstractIndenter, check_indenter
 from jeit.simulate.contact.press import Press
@@ -30,24 +30,31 @@ class PressDraws(eqx.Module):
     def __init__(self, indenters, outline: Domain, load: tuple[float, float], *, margin: float = 0.0, at_once: int = 1):
         """Raises `ValueError` for no indenters, no outline, loads that are not positive and rising, and a margin that
         leaves no place."""
+        check_kind("indenters", indenters, (list, tuple), "a list of them, such as [ball(0.015)]")
         indenters = tuple(indenters)
         if not indenters:
             raise ValueError("indenters: give one at least, such as [ball(0.015)].")
         for number, indenter in enumerate(indenters):
             check_indenter(f"indenters[{number}]", indenter)
         check_kind("outline", outline, Domain, "an outline, such as Disk(0.05)")
-        if len(load) != 2 or not 0 < load[0] <= load[1] < np.inf:
-            raise ValueError(f"load: give the least and the greatest, positive, in newtons; it is {load!r}.")
+        wanted = "the least and the greatest, positive, in newtons, such as (0.3, 10.0)"
+        span = real_array("load", load, wanted)
+        if span.shape != (2,) or not 0 < span[0] <= span[1] < np.inf:
+            raise ValueError(f"load must be {wanted}; it is {load!r}.")
         if not (isinstance(at_once, int) and at_once >= 1):
             raise ValueError(f"at_once must be a whole number, 1 or more; it is {at_once!r}.")
+        if not (is_number(margin) and margin >= 0):
+            raise ValueError(f"margin must be metres, zero or more; it is {told(margin)}.")
         self.indenters, self.outline, self.at_once = indenters, outline, at_once
-        self.load, self.margin = (float(load[0]), float(load[1])), float(margin)
+        self.load, self.margin = (float(span[0]), float(span[1])), float(margin)
         if not self._inside(self._anywhere(np.random.default_rng(0), 1000)).any():
             raise ValueError(f"margin is {1e3 * self.margin:g} mm, which leaves no place on the skin; give less.")
 
     def draw(self, key: Array, number: int) -> list[tuple[Press, ...]]:
-        """So many touches. Raises `ValueError` for what is no key."""
+        """So many touches. Raises `ValueError` for what is no key, and no number."""
         check_key(key)
+        if not (isinstance(number, (int, np.integer)) and not isinstance(number, bool) and number >= 0):
+            raise ValueError(f"number must be a whole number of touches, 0 or more; it is {told(number)}.")
         random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         counts = random.integers(1, self.at_once, number, endpoint=True)
         total = counts.sum()

@@ -12,13 +12,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from jeit.arguments import check_kind
+from jeit.arguments import check_kind, told
 from jeit.design.study.cluster import over_cluster
 from jeit.design.study.contents import Contents
 from jeit.design.study.progress import Progress, Teller
 from jeit.design.study.store import Store, require
 from jeit.simulate.contact.press_draws import PressDraws
-from jeit.simulate.contact.pressed_skin import PressedSkin
+from jeit.simulate.contact.pressed_skin import PressedSkin, check_seconds
 
 # Changes with what the same set is simulated to.
 _VERSION = 1
@@ -49,12 +49,16 @@ class PressSet:
         elapsed: float = 0.0,
         chunk: int = 1000,
     ):
-        """Raises `ValueError` for what is no skin or draws, and numbers below 1."""
+        """Raises `ValueError` for what is no skin, draws, seed or time, and numbers below 1."""
         check_kind("skin", skin, PressedSkin, "a PressedSkin")
         check_kind("draws", draws, PressDraws, "PressDraws, such as PressDraws([ball(0.015)], Disk(0.05), (0.1, 10.0))")
         for name, given in (("number", number), ("chunk", chunk)):
             if not (isinstance(given, int) and given >= 1):
                 raise ValueError(f"{name} must be a whole number, 1 or more; it is {given!r}.")
+        if not (isinstance(seed, int) and 0 <= seed < 2**63):
+            raise ValueError(f"seed must be a whole number, 0 or more; it is {told(seed)}.")
+        check_seconds("held", held)
+        check_seconds("elapsed", elapsed)
         self.skin, self.draws, self.number, self.seed = skin, draws, number, seed
         self.held, self.elapsed, self.chunk = held, elapsed, chunk
 
@@ -96,7 +100,7 @@ class PressSet:
                 group.create_array(
                     name,
                     shape=(self.number, *shape),
-                    chunks=(self.chunk, *shape),
+                    chunks=(min(self.chunk, self.number), *shape),
                     dtype="float64",
                     fill_value=np.nan,
                     dimension_names=("touch", *dimensions),

@@ -5,7 +5,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.arguments import check_key, check_kind, is_number, told
+from jeit.arguments import check_key, check_kind, is_number, real_array, told
 from jeit.design.skin.touched_cells import TouchedCells, padded
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
@@ -66,8 +66,8 @@ class PressedSkin(eqx.Module):
         is no press or time.
         """
         check_key(key)
-        _check_seconds("held", held)
-        _check_seconds("elapsed", elapsed)
+        check_seconds("held", held)
+        check_seconds("elapsed", elapsed)
         exact = self.voltages_under(self.touched(presses, held=held))
         return self._read(key, exact, np.array([float(elapsed)]))
 
@@ -91,7 +91,9 @@ class PressedSkin(eqx.Module):
         return self._read(key, exact, seconds)
 
     def touched_in_time(self, motions, seconds: Float[np.ndarray, " T"]) -> TouchedCells:
-        """What is changed in each of T frames, also by loads that were there before; as of `record`."""
+        """What is changed in each of T frames, also by loads that were there before; as of `record`, whose errors it
+        raises."""
+        seconds = _check_times(seconds)
         motions = motions_of(motions, len(seconds))
         found = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
         touches = [tuple(press for press in some if press is not None) for some in found]
@@ -180,13 +182,14 @@ def _even(number: int) -> int:
     return 2 ** max(4, (number - 1).bit_length())
 
 
-def _check_seconds(name: str, value) -> None:
+def check_seconds(name: str, value) -> None:
+    """Raise `ValueError`, about the argument `name`, for what is no time from zero on."""
     if not (is_number(value) and value >= 0):
         raise ValueError(f"{name} must be seconds, zero or more; it is {told(value)}.")
 
 
 def _check_times(seconds) -> Float[np.ndarray, " T"]:
-    seconds = np.asarray(seconds, float)
+    seconds = real_array("seconds", seconds, "times (T,) of the frames")
     if seconds.ndim != 1 or not seconds.size or not np.isfinite(seconds).all():
         raise ValueError(f"seconds must be times (T,) of the frames; they have shape {seconds.shape}.")
     if seconds[0] < 0 or (np.diff(seconds) < 0).any():

@@ -4,7 +4,7 @@ import abc
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import map_coordinates
 
 from jeit.arguments import check_kind, is_number, told
@@ -60,7 +60,8 @@ class PressureRaster(AbstractPressure):
     def at(self, points):
         """Linear between pixels, none beyond."""
         place = np.moveaxis((np.asarray(points) / self.pixel)[..., ::-1] + (len(self.values) - 1) / 2, -1, 0)
-        return map_coordinates(self.values, place, order=1, mode="grid-constant")
+        flat = map_coordinates(self.values, place.reshape(2, -1), order=1, mode="grid-constant")
+        return flat.reshape(place.shape[1:])
 
 
 def raster(half_widths, number: int) -> tuple[Float[np.ndarray, "N N 2"], Float[np.ndarray, "2"]]:
@@ -74,12 +75,16 @@ def contact_window(pressed, reach: float, number: int) -> Float[np.ndarray, "2"]
     """Half the sides in metres of a rectangle round the origin that holds the contact and little else.
 
     `pressed(half_widths, number)` (N, N): where a raster of that window has contact. The window shrinks until the
-    contact fills more than half of both its sides: a light load on a ball touches a small part of it.
+    contact fills more than half of both its sides: a light load on a ball touches a small part of it. It stays as it is
+    where a contact passes between the pixels.
     """
     window = np.full(2, reach)
     while True:
         points, pixel = raster(window, number)
-        extent = np.abs(points[pressed(window, number)]).max(axis=0, initial=0.0) + pixel
+        touched = points[pressed(window, number)]
+        if not len(touched):
+            return window
+        extent = np.abs(touched).max(axis=0) + pixel
         if (extent > window / 2).all():
             return extent + pixel
         window = np.minimum(window, extent + pixel)
@@ -89,6 +94,15 @@ def check_load(load) -> None:
     """Raise `ValueError` for what is no positive load in newtons."""
     if not (is_number(load) and load > 0):
         raise ValueError(f"load must be positive, in newtons (100 g weigh 0.98 N); it is {told(load)}.")
+
+
+def check_seen(contact: Bool[np.ndarray, "N N"], pixel) -> None:
+    """Raise `ValueError` where a contact lies between the pixels of a raster, of these sides."""
+    if not contact.any():
+        raise ValueError(
+            f"indenter: what touches of it is thinner than a pixel, {1e3 * np.max(pixel):.2g} mm, of the raster that "
+            "pressure is found on; give a wider one, or one with its middle nearer to its frame's origin."
+        )
 
 
 def check_support(name: str, given) -> None:

@@ -54,15 +54,24 @@ def find_contacts(
     """
     check_kind("finder", finder, AbstractFinder, "a finder, such as CellFinder(mesh)")
     change = checked_image(finder, image)
-    if noise is None:
-        noise = ImageNoise.of_image(change)
-    check_kind("noise", noise, ImageNoise, "ImageNoise, such as ImageNoise.of_frames(reconstruction, frames)")
-    if noise.deviation.shape != change.shape:
-        raise ValueError(f"noise is of {noise.deviation.size} cells, and the image of {change.size}; both of one mesh.")
-    found = finder.find(change, noise)
+    return turned(finder, finder.find(change, checked_noise(change, noise)))
+
+
+def turned(finder: AbstractFinder, found: list[Contact]) -> list[Contact]:
+    """Contacts in a change that was turned so that they are positive, as they are in its image; strongest first."""
     if finder.sign < 0:
         found = [eqx.tree_at(lambda one: (one.peak, one.integral), one, (-one.peak, -one.integral)) for one in found]
     return sorted(found, key=lambda one: -abs(one.peak))
+
+
+def checked_noise(change: Float[np.ndarray, " m"], noise: ImageNoise | None) -> ImageNoise:
+    """Noise of a change (m,), of itself if None. Raises `ValueError` for what is none, and noise of another mesh."""
+    if noise is None:
+        return ImageNoise.of_image(change)
+    check_kind("noise", noise, ImageNoise, "ImageNoise, such as ImageNoise.of_frames(reconstruction, frames)")
+    if noise.deviation.shape != change.shape:
+        raise ValueError(f"noise is of {noise.deviation.size} cells, and the image of {change.size}; both of one mesh.")
+    return noise
 
 
 def checked_image(finder: AbstractFinder, image) -> Float[np.ndarray, " m"]:
@@ -85,7 +94,7 @@ def check_finder(mesh: Mesh, sign: int, floor: float) -> None:
     check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
     if mesh.dimension != 2:
         raise ValueError("mesh has three dimensions; contacts are found on sheets: reconstruct on a 2-D mesh.")
-    if sign not in (1, -1):
+    if not (is_number(sign) and sign in (1, -1)):
         raise ValueError(f"sign must be 1, where touched skin conducts better, or -1, where worse; it is {told(sign)}.")
     if not (is_number(floor) and floor >= 0):
         raise ValueError(f"floor must be zero or more, in standard deviations; it is {told(floor)}.")

@@ -1,10 +1,11 @@
 """Noise of linear images: how far each cell strays while nothing touches, and how cells stray together."""
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_kind, counted
+from jeit.arguments import check_kind, counted, real_array
 from jeit.inverse.linear.one_step import LinearReconstruction
 
 # Fewer frames do not say how far the next one may stray.
@@ -20,6 +21,19 @@ class ImageNoise(eqx.Module):
     deviation: Float[np.ndarray, " m"]
     factor: Float[np.ndarray, "r m"] | None = None
 
+    def __check_init__(self):
+        """Raises `ValueError` for deviations that are negative or not finite, and factors of other cells."""
+        wanted = "an array (m,), one number a cell, zero or more and finite, in the unit of the image"
+        check_kind("deviation", self.deviation, (np.ndarray, jax.Array), wanted)
+        deviation = real_array("deviation", self.deviation, wanted)
+        if deviation.ndim != 1:
+            raise ValueError(f"deviation must be {wanted}; it has shape {deviation.shape}.")
+        if not (np.isfinite(deviation).all() and (deviation >= 0).all()):
+            raise ValueError(f"deviation must be {wanted}; some of it is negative or not finite.")
+        if self.factor is not None and np.shape(self.factor)[1:] != deviation.shape:
+            shape = np.shape(self.factor)
+            raise ValueError(f"factor has shape {shape}; give (r, {deviation.size}), a column for each cell.")
+
     @classmethod
     def of_frames(cls, reconstruction: LinearReconstruction, frames: Float[np.ndarray, "n M"]) -> "ImageNoise":
         """From repeated frames (n, M) volts of the skin that nobody touches, ten at least.
@@ -29,16 +43,16 @@ class ImageNoise(eqx.Module):
         that are all the same.
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
-        frames = np.asarray(frames)
+        frames = real_array("frames", frames, "voltages (n, M)")
         if frames.ndim != 2 or len(frames) < _LEAST_FRAMES:
             raise ValueError(
                 f"frames has shape {frames.shape}; give (n, {reconstruction.num_measurements}) volts of an untouched "
                 f"skin, {counted(_LEAST_FRAMES, 'frame')} or more."
             )
-        strayed = frames - frames.mean(axis=0)
-        if not strayed.any():
+        if (frames == frames[0]).all():
             raise ValueError("frames are all the same: they tell no noise. Give what was read, not copies of a frame.")
-        return cls._of_factor(np.asarray(reconstruction.image(strayed)) / np.sqrt(len(frames) - 1))
+        strayed = np.asarray(reconstruction.image(frames - frames.mean(axis=0)))
+        return cls._of_factor(strayed / np.sqrt(len(frames) - 1))
 
     @classmethod
     def of_channels(cls, reconstruction: LinearReconstruction, deviation) -> "ImageNoise":
@@ -48,7 +62,8 @@ class ImageNoise(eqx.Module):
         all zero, or of another number of channels.
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
-        deviation, number = np.asarray(deviation, float), reconstruction.num_measurements
+        number = reconstruction.num_measurements
+        deviation = real_array("deviation", deviation, f"one number, or ({number},), volts")
         if deviation.shape not in ((), (number,)):
             raise ValueError(f"deviation has shape {deviation.shape}; give one number, or ({number},), volts.")
         if not (np.isfinite(deviation).all() and (deviation >= 0).all() and deviation.any()):
@@ -65,7 +80,7 @@ class ImageNoise(eqx.Module):
         that is not (m,), finite and real.
         """
         values = np.asarray(image)
-        if values.ndim != 1 or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
+        if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
             raise ValueError("image must be real and finite, one value a cell (m,).")
         spread = _NORMAL * float(np.median(np.abs(values - np.median(values))))
         return cls(np.full(values.shape, spread))

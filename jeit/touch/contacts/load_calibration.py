@@ -11,13 +11,15 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from jeit.arguments import check_kind, check_metres, told
+from jeit.arguments import check_kind, check_metres, real_array, told
 from jeit.touch.contacts.contact import Contact
 
 # Parameters s, b, c and F½, and what is left to tell how well they fit.
 _FEWEST = 8
 # Calibrated peaks end before the curve's saturation, where any load would do.
 _HIGHEST = 0.98
+# Of the radius: no contact of the skin is farther out, and no image shows any that is narrower.
+_FARTHEST, _NARROWEST = 10.0, 1e-3
 
 
 class Load(eqx.Module):
@@ -53,7 +55,8 @@ class LoadCalibration(eqx.Module):
         that does not fit.
         """
         check_metres("radius", radius)
-        contacts, loads = list(contacts), np.asarray(loads, float)
+        check_kind("contacts", contacts, (list, tuple), "a list of them, one for each load")
+        loads = real_array("loads", loads, "newtons, one for each contact")
         if len(contacts) < _FEWEST or loads.shape != (len(contacts),):
             raise ValueError(
                 f"contacts and loads: give {_FEWEST} or more, one load for each; there are {len(contacts)} "
@@ -66,8 +69,17 @@ class LoadCalibration(eqx.Module):
         peaks = np.array([one.peak for one in contacts])
         if abs(np.sign(peaks).sum()) != len(peaks):
             raise ValueError("contacts: their peaks must all be of one sign, and none zero.")
-        centre = np.asarray(centre, float)
+        centre = real_array("centre", centre, "(x, y) in metres")
+        if centre.shape != (2,) or not np.isfinite(centre).all():
+            raise ValueError(f"centre must be (x, y) in metres, finite; it is {centre.tolist()}.")
         distance = np.array([np.linalg.norm(one.centroid - centre) for one in contacts]) / radius
+        widest = max(float(np.sqrt(one.area)) for one in contacts)
+        if not (distance.max() < _FARTHEST and widest > _NARROWEST * radius):
+            most = 1e3 * radius * distance.max()
+            raise ValueError(
+                f"radius is {1e3 * radius:g} mm, and contacts lie up to {most:.3g} mm from the centre, and are "
+                f"{1e3 * widest:.2g} mm wide; give the skin's radius, and its centre, in metres."
+            )
         logarithm = np.log(np.abs(peaks))
         begin = np.array([logarithm.max(), 0.0, 0.0, np.log(np.median(loads))])
 

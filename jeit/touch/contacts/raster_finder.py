@@ -17,12 +17,14 @@ from jeit.arguments import is_number, told
 from jeit.image import Raster
 from jeit.mesh import Mesh
 from jeit.touch.contacts.contact import Contact
-from jeit.touch.contacts.finder import AbstractFinder, check_finder
+from jeit.touch.contacts.finder import AbstractFinder, check_finder, checked_image, checked_noise, turned
 from jeit.touch.contacts.image_noise import ImageNoise
 from jeit.touch.contacts.smoothing import gaussian_means
 
 # Standard deviation, in pixels, of the blur under which the slope at an edge is taken: a raster of cells has steps.
 _BLUR = 3.0
+# Along a side: with more, memory is short, and no image has as many cells.
+_MOST_PIXELS = 4096
 
 
 class RasterStages(eqx.Module):
@@ -79,10 +81,10 @@ class RasterFinder(AbstractFinder):
         for name, value, least in (("block", block, 3), ("opening", opening, 1)):
             if not (isinstance(value, int) and value >= least and value % 2):
                 raise ValueError(f"{name} must be an odd number of pixels from {least} up; it is {told(value)}.")
-        if not (isinstance(pixels, int) and pixels >= 16):
-            raise ValueError(f"pixels must be a whole number from 16 up; it is {told(pixels)}.")
-        if not is_number(constant):
-            raise ValueError(f"constant must be a number of grey levels; it is {told(constant)}.")
+        if not (isinstance(pixels, int) and 16 <= pixels <= _MOST_PIXELS):
+            raise ValueError(f"pixels must be a whole number from 16 to {_MOST_PIXELS}; it is {told(pixels)}.")
+        if not (is_number(constant) and abs(constant) < 255):
+            raise ValueError(f"constant must be grey levels, between −255 and 255; it is {told(constant)}.")
         self.raster = Raster.create(mesh, shape=(pixels, pixels))
         self.smoothing = gaussian_means(mesh, smoothing)
         self.block, self.constant, self.opening = block, float(constant), opening
@@ -91,10 +93,17 @@ class RasterFinder(AbstractFinder):
     def find(self, change, noise):
         """See `find_contacts`."""
         _, clear = self.above_noise(change, noise)
-        return self.stages(change, noise).contacts if clear.any() else []
+        return self._stages(change, noise).contacts if clear.any() else []
 
-    def stages(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> RasterStages:
-        """What every step makes of a `change` (m,), turned so that contacts are positive."""
+    def stages(self, image: Float[np.ndarray, " m"], noise: ImageNoise | None = None) -> RasterStages:
+        """What every step makes of an image (m,) and its noise; both, and errors, as of `find_contacts`."""
+        change = checked_image(self, image)
+        found = self._stages(change, checked_noise(change, noise))
+        own = self.sign * found.region, turned(self, found.contacts)
+        return eqx.tree_at(lambda stages: (stages.region, stages.contacts), found, own)
+
+    def _stages(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> RasterStages:
+        """Those of a change that was turned so that contacts are positive."""
         opencv = import_opencv()
         cell = np.asarray(self.raster.cell)
         inside = cell >= 0

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from jeit.arguments import check_kind, check_metres, is_number, told
+from jeit.arguments import check_kind, check_metres, is_number, real_array, told
 from jeit.touch.contacts.contact import Contact
 
 # Of what a contact is off its prediction, how much goes into the velocity: half, so that two frames' noise evens out.
@@ -96,6 +96,7 @@ class ContactTracker(eqx.Module):
         """After a frame at `time`, seconds, with these contacts. Raises `ValueError` for a time that is not later."""
         if not (is_number(time) and time > self.time):
             raise ValueError(f"time must be later than the frame before, {self.time:g} s; it is {told(time)}.")
+        check_kind("contacts", contacts, (list, tuple, np.ndarray), "a list of them, those of one frame")
         for number, contact in enumerate(contacts):
             check_kind(f"contacts[{number}]", contact, Contact, "a Contact, as of find_contacts")
         waited = [time - one.seen[-1][0] > self.gap * (_HIDDEN if one.hidden else 1) for one in self.open]
@@ -141,9 +142,15 @@ def track_contacts(
     `tracker` to begin with, `ContactTracker()` unless given. Raises `ValueError` for another number of times, and as
     `ContactTracker.follow` does.
     """
-    if len(times) != len(contacts):
-        raise ValueError(f"times: give one for each of the {len(contacts)} frames; there are {len(times)}.")
+    wanted = "a list with those of every frame, each a list"
+    check_kind("contacts", contacts, (list, tuple, np.ndarray), wanted)
+    for number, found in enumerate(contacts):
+        check_kind(f"contacts[{number}]", found, (list, tuple, np.ndarray), "a list of contacts, those of one frame")
+    times = real_array("times", times, "seconds (F,), one for each frame")
+    if times.shape != (len(contacts),):
+        raise ValueError(f"times: give one for each of the {len(contacts)} frames; they have shape {times.shape}.")
     tracker = ContactTracker() if tracker is None else tracker
+    check_kind("tracker", tracker, ContactTracker, "a ContactTracker(), to begin with")
     for time, found in zip(times, contacts, strict=True):
         tracker = tracker.follow(float(time), found)
     return tracker.touches

@@ -56,6 +56,7 @@ def test_a_depth_map_is_linear_between_its_pixels():
     indenter = DepthMap(height, 1.0)
     gap = indenter.gap(np.array([[0.0, 0.0], [0.5, -0.5], [1.0, 1.0], [-0.5, 0.5], [1.5, 0.0]]))
     np.testing.assert_allclose(gap, [2.0, 1.5, 0.0, np.inf, np.inf])
+    assert indenter.gap(np.array([0.5, -0.5])) == pytest.approx(1.5)
 
 
 @pytest.mark.parametrize(
@@ -72,6 +73,9 @@ def test_a_depth_map_is_linear_between_its_pixels():
         (lambda: Placed(0.01), "indenter must be an indenter"),
         (lambda: Placed(Disc(0.01), (0.0, np.nan)), r"position: give \(x, y\)"),
         (lambda: Placed(Disc(0.01), (0.0, 0.0), np.inf), "angle: give radians"),
+        (lambda: Placed(Disc(0.01), "ab"), r"position must be \(x, y\) in metres, real numbers"),
+        (lambda: Placed(Disc(0.01), (0.0, 0.0), "a"), "angle: give radians"),
+        (lambda: DepthMap([[0.0, 1.0], [2.0]], 1e-3), "height must be an image"),
         (Joined, "parts: give one"),
         (lambda: Joined(Disc(0.01), "ball"), "part 1 must be an indenter"),
     ],

@@ -76,6 +76,39 @@ def test_cells_carry_the_load(model, support):
     assert samples.area.sum() * samples.points.shape[1] == pytest.approx(np.pi * 0.05**2, rel=5e-3)
 
 
+def test_a_ball_beyond_the_edge_is_carried_by_all_that_it_touches(model):
+    """Less of the skin is under it, so that it comes down farther, and touches more."""
+    samples, layer, shape = Samples.of(model.mesh), Foundation(1e6, 2e-3), ball(0.02)
+    found = pressed_cells(samples, layer, [(Press(shape, 2.0, (0.053, 0.0)),)])
+    points = (samples.points - np.array([0.053, 0.0])).reshape(1, -1, 2)
+    area = np.repeat(samples.area, samples.points.shape[1])[None]
+    whole = layer.spread(shape, np.array([2.0]), points, area).reshape(len(samples.area), -1)
+    pressure = np.zeros_like(whole)
+    pressure[found.cells[0]] = found.pressure[0]
+    np.testing.assert_allclose(pressure, whole, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("shape", "place", "spread"),
+    [
+        (Placed(Disc(0.0005), (0.02, 0.0)), (0.02, 0.0), 0.0),
+        (Placed(Bar(0.04, 0.0004), (0.0, 0.003), 0.1), (0.0, 0.003), 0.04 / np.sqrt(12)),
+        (Disc(1e-9), (0.0, 0.0), 0.0),
+    ],
+    ids=["moved in its frame", "an edge", "a point"],
+)
+def test_what_falls_between_samples_presses_where_it_is(model, shape, place, spread):
+    samples = Samples.of(model.mesh)
+    found = pressed_cells(samples, Foundation(1e6, 2e-3), [(Press(shape, 0.01),)])
+    load = np.einsum("cs,c->cs", found.pressure[0], samples.area[found.cells[0]])
+    points = samples.points[found.cells[0]]
+    middle = np.einsum("cs,csd->d", load, points) / load.sum()
+    assert load.sum() == pytest.approx(0.01, rel=1e-12)
+    assert np.linalg.norm(middle - place) < samples.radius
+    along = np.sqrt(np.sum(load * (points[..., 0] - middle[0]) ** 2) / load.sum())
+    assert along == pytest.approx(spread, abs=samples.radius / 2)
+
+
 def test_pressure_on_cells_is_that_under_the_indenter(model):
     samples, support = Samples.of(model.mesh), VELOSTAT.support
     press = PRESSES[0]
@@ -199,12 +232,19 @@ def test_walking_contacts_are_read_by_their_own_channels(model):
         (lambda skin: skin.frames(KEY, PRESSES, held=-1.0), "held must be seconds"),
         (lambda skin: skin.frames(KEY, PRESSES, elapsed=np.nan), "elapsed must be seconds"),
         (lambda skin: skin.frames(KEY, [Press(Disc(0.01), 1.0, (20.0, 0.0))]), "lie off the skin"),
+        (lambda skin: skin.frames(KEY, [Press(Disc(0.01), 1.0, (0.0552, 0.0))]), r"\(55.2, 0\) mm touches no skin"),
+        (lambda skin: skin.frames(KEY, [Press(Disc(1e-4), 100.0)]), "into a layer 2 mm thick"),
         (lambda skin: skin.frames(KEY, [Press(Disc(0.004), 100.0)]), "into a layer 2 mm thick"),
         (lambda skin: skin.record(KEY, MovingPress(Disc(0.01), [1.0, 1.0]), [1.0, 0.0]), "nor fall"),
         (lambda skin: skin.record(KEY, MovingPress(Disc(0.01), [1.0, 1.0]), [1.0]), "has 2 frames"),
         (lambda skin: skin.record(KEY, MovingPress(Disc(0.01), [0.0, 0.0]), [0.0, 1.0]), "no press has any load"),
         (lambda skin: skin.record(KEY, PRESSES[0], [0.0]), "motions"),
         (lambda skin: MovingPress(Disc(0.01), [1.0, -1.0]), "loads, in newtons"),
+        (lambda skin: skin.record(KEY, MovingPress(Disc(0.01), [1.0, 1.0]), ["a", "b"]), "seconds must be times"),
+        (lambda skin: skin.touched_in_time(MovingPress(Disc(0.01), [1.0, 1.0]), [1.0, 0.0]), "nor fall"),
+        (lambda skin: MovingPress(Disc(0.01), [1.0, 1.0], 0.01), r"position must be \(x, y\)"),
+        (lambda skin: MovingPress(Disc(0.01), [1.0, 1.0], np.zeros((2, 1))), r"it has shape \(2, 1\)"),
+        (lambda skin: MovingPress(Disc(0.01), ["1", "2"]), "load must be newtons"),
         (lambda skin: MovingPress(Disc(0.01), [1.0, 1.0], np.zeros((3, 2))), "for T frames"),
         (lambda skin: Press(Disc(0.01), -1.0), "load must be positive"),
         (lambda skin: PressedSkin(KEY, skin, STILL), "model must be"),

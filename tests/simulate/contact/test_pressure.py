@@ -116,6 +116,7 @@ def test_load_is_carried_where_bodies_touch(support, shape):
     # Cells of the sum are cut by edges: a share of pixel / width of the load.
     assert pressure.sum() * pixel.prod() == pytest.approx(load, rel=0.05)
     assert (pressure[np.linalg.norm(points, axis=-1) > found.reach] == 0).all()
+    assert found.at(points[400, 400]) == pressure[400, 400]
     if own:
         assert found.values.sum() * found.pixel.prod() == pytest.approx(load, rel=1e-12)
 
@@ -139,6 +140,8 @@ def test_bodies_do_not_overlap(shape):
         (lambda: LAYER.pressure(ball(0.01), 0.0), "load must be positive, in newtons"),
         (lambda: RUBBER.pressure(ball(0.01), np.nan), "load must be positive"),
         (lambda: LAYER.pressure(Disc(0.01), 100.0), "takes the indenter 3.8. mm into a layer 3 mm thick"),
+        (lambda: LAYER.pressure(Bar(0.04, 1e-5), 1.0), "thinner than a pixel"),
+        (lambda: RUBBER.pressure(Placed(Disc(1e-5), (0.02, 0.0)), 1.0), "thinner than a pixel"),
         (lambda: Foundation(-1.0, 1e-3), "modulus must be positive"),
         (lambda: Foundation(1e6, 0.0), "thickness must be"),
         (lambda: HalfSpace(1e6, 0.6), "poisson must be"),

@@ -157,6 +157,31 @@ def test_stages_lead_from_image_to_contacts(skin):
     assert sum(one.area for one in found) == pytest.approx(finder.raster.pixel_area * stages.opened.sum(), rel=0.01)
 
 
+def test_stages_where_touched_skin_conducts_worse():
+    image = -bump(0.02, 0.01)
+    stages = RasterFinder(MESH, sign=-1).stages(image, QUIET)
+    (found,) = find_contacts(RasterFinder(MESH, sign=-1), image, QUIET)
+    (shown,) = stages.contacts
+    assert shown.peak == found.peak == np.nanmin(stages.region) < 0
+    with pytest.raises(ValueError, match="image has shape"):
+        RasterFinder(MESH).stages(image[:-1], QUIET)
+
+
+@pytest.mark.parametrize(
+    ("deviation", "factor", "wrong"),
+    [
+        (1e-6, None, "deviation must be an array"),
+        (np.full(3, np.nan), None, "not finite"),
+        (-np.ones(3), None, "negative"),
+        (np.ones((3, 2)), None, r"shape \(3, 2\)"),
+        (np.ones(3), np.ones((5, 2)), r"give \(r, 3\)"),
+    ],
+)
+def test_noise_that_is_none(deviation, factor, wrong):
+    with pytest.raises(ValueError, match=wrong):
+        ImageNoise(deviation, factor)
+
+
 def test_an_image_of_nothing_has_no_contact():
     assert find_contacts(CellFinder(MESH), np.zeros(MESH.num_cells)) == []
     assert find_contacts(RasterFinder(MESH), np.zeros(MESH.num_cells)) == []
@@ -173,7 +198,13 @@ def test_noise_of_another_mesh(skin):
 
 @pytest.mark.parametrize(
     ("options", "wrong"),
-    [({"sign": 0}, "sign"), ({"floor": -1}, "floor"), ({"level": 1.0}, "level"), ({"smoothing": 3.0}, "smoothing")],
+    [
+        ({"sign": 0}, "sign"),
+        ({"floor": -1}, "floor"),
+        ({"level": 1.0}, "level"),
+        ({"smoothing": 3.0}, "smoothing"),
+        ({"sign": np.ones(2)}, "sign"),
+    ],
 )
 def test_cell_finders_that_are_none(options, wrong):
     with pytest.raises(ValueError, match=wrong):
@@ -181,7 +212,14 @@ def test_cell_finders_that_are_none(options, wrong):
 
 
 @pytest.mark.parametrize(
-    ("options", "wrong"), [({"block": 100}, "block"), ({"opening": 0}, "opening"), ({"pixels": 3}, "pixels")]
+    ("options", "wrong"),
+    [
+        ({"block": 100}, "block"),
+        ({"opening": 0}, "opening"),
+        ({"pixels": 3}, "pixels"),
+        ({"pixels": 100_000}, "pixels"),
+        ({"constant": 300}, "constant"),
+    ],
 )
 def test_raster_finders_that_are_none(options, wrong):
     with pytest.raises(ValueError, match=wrong):
@@ -197,7 +235,13 @@ def test_frames_that_tell_no_noise(skin):
     with pytest.raises(ValueError, match="10 frames or more"):
         ImageNoise.of_frames(skin.reconstruction, skin.before[:3])
     with pytest.raises(ValueError, match="all the same"):
-        ImageNoise.of_frames(skin.reconstruction, np.zeros((20, 208)))
+        ImageNoise.of_frames(skin.reconstruction, np.tile(skin.before[0], (20, 1)))
+    with pytest.raises(ValueError, match="frames must be voltages"):
+        ImageNoise.of_frames(skin.reconstruction, skin.before.astype(str))
+    with pytest.raises(ValueError, match="frames must be voltages"):
+        ImageNoise.of_frames(skin.reconstruction, skin.before + 0j)
+    with pytest.raises(ValueError, match="deviation must be one number"):
+        ImageNoise.of_channels(skin.reconstruction, "1e-6")
     with pytest.raises(ValueError, match="deviation"):
         ImageNoise.of_channels(skin.reconstruction, np.zeros(7))
     with pytest.raises(ValueError, match="not zero for all"):

@@ -95,5 +95,13 @@ def test_bad_input():
         LoadCalibration.fit(contacts, np.ones(20), radius=RADIUS)
     with pytest.raises(ValueError, match="one sign"):
         LoadCalibration.fit([contact(1.0, 0.0, sign=-1), *contacts[1:]], loads, radius=RADIUS)
-    with pytest.raises(ValueError, match="radius"):
-        LoadCalibration.fit(contacts, loads, radius=0.0)
+    for options in ({"radius": 0.0}, {"radius": 50.0}, {"radius": RADIUS, "centre": (50.0, 0.0)}):
+        with pytest.raises(ValueError, match="radius"):
+            LoadCalibration.fit(contacts, loads, **options)
+    for centre in ((0.0,), "ab", (0.0, np.nan), None):
+        with pytest.raises(ValueError, match=r"centre must be \(x, y\)"):
+            LoadCalibration.fit(contacts, loads, radius=RADIUS, centre=centre)
+    with pytest.raises(ValueError, match="contacts must be a list"):
+        LoadCalibration.fit(loads, contacts, radius=RADIUS)
+    with pytest.raises(ValueError, match="loads must be newtons"):
+        LoadCalibration.fit(contacts, ["a"] * 20, radius=RADIUS)

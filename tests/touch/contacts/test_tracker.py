@@ -79,6 +79,19 @@ def test_bad_input():
         track_contacts(TIMES[:3], [[]])
     with pytest.raises(ValueError, match=r"contacts\[0\]"):
         ContactTracker().follow(0.0, [(0.0, 0.0)])  # pyright: ignore[reportArgumentType]
+    for times, frames, message in (
+        ("abc", [[]] * 3, "times must be seconds"),
+        ([[]] * 3, TIMES[:3], r"contacts\[0\] must be a list"),
+        (TIMES[:3], [contact((0.0, 0.0))] * 3, r"contacts\[0\] must be a list"),
+        (TIMES[:3], None, "contacts must be a list"),
+        (1.0, [[]], "they have shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            track_contacts(times, frames)
+    with pytest.raises(ValueError, match="tracker must be"):
+        track_contacts(TIMES[:1], [[]], ContactTracker)  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="contacts must be a list"):
+        ContactTracker().follow(0.0, contact((0.0, 0.0)))  # pyright: ignore[reportArgumentType]
     for options in ({"gap": 0.0}, {"reach": -1.0}, {"least": 0}):
         with pytest.raises(ValueError, match=next(iter(options))):
             ContactTracker(**options)
