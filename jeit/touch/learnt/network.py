@@ -1,6 +1,9 @@
 """A small fully connected network, trained with equinox and optax, asked in NumPy, where a frame takes microseconds."""
 
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -29,51 +32,54 @@ class Network:
     @classmethod
     def train(cls, features, targets) -> "Network":
         """By Adam with decaying weights and steps, from batches with noise on their features."""
-        import equinox as eqx
         import jax
         import jax.numpy as jnp
-        import optax
 
         size = float(np.sqrt(np.mean(features**2))) or 1.0
         scale = np.full(features.shape[1], size)
         steps = _EPOCHS * max(1, -(-len(features) // _BATCH))
         rng = np.random.default_rng(0)
         order = np.concatenate([rng.permutation(len(features)) for _ in range(_EPOCHS)])
-        keys = jax.random.split(jax.random.key(0))
-        network = eqx.nn.MLP(
-            features.shape[1], targets.shape[1], _WIDTH, 2, activation=jnp.tanh, dtype=jnp.float32, key=keys[0]
-        )
-        network = _trained(
-            network,
-            jnp.asarray(features / scale, jnp.float32),
-            jnp.asarray(targets, jnp.float32),
+        # Rows up to the next batch, of which none is asked for: folds of about one size share what is compiled.
+        more = ((0, -len(features) % _BATCH), (0, 0))
+        layers = _training(steps)(
+            jnp.asarray(np.pad(features / scale, more), jnp.float32),
+            jnp.asarray(np.pad(targets, more), jnp.float32),
             jnp.asarray(np.resize(order, (steps, _BATCH))),
-            keys[1],
-            optax.adamw(optax.cosine_decay_schedule(_RATE, steps), weight_decay=_DECAY),
+            jax.random.split(jax.random.key(0)),
         )
-        layers = [(np.asarray(one.weight, float), np.asarray(one.bias, float)) for one in network.layers]
+        layers = [(np.asarray(one.weight, float), np.asarray(one.bias, float)) for one in layers]
         return cls([weight for weight, _ in layers], [bias for _, bias in layers], scale)
 
 
-def _trained(network, features, targets, batches, key, optimiser):
+@functools.cache
+def _training(steps: int) -> Callable[..., Any]:
+    """What trains a network in so many steps, compiled once for each shape: its layers, from features, targets, the
+    rows of each batch, and two keys."""
     import equinox as eqx
     import jax
     import jax.numpy as jnp
+    import optax
 
-    moving, still = eqx.partition(network, eqx.is_inexact_array)
-
-    def loss(moving, index, key):
-        given = features[index] + _NOISE * jax.random.normal(key, (len(index), features.shape[1]), features.dtype)
-        return jnp.mean((jax.vmap(eqx.combine(moving, still))(given) - targets[index]) ** 2)
-
-    def step(carry, index):
-        moving, state, key = carry
-        key, own = jax.random.split(key)
-        updates, state = optimiser.update(jax.grad(loss)(moving, index, own), state, moving)
-        return (eqx.apply_updates(moving, updates), state, key), None
+    optimiser = optax.adamw(optax.cosine_decay_schedule(_RATE, steps), weight_decay=_DECAY)
 
     @jax.jit
-    def run(moving, state, key, batches):
-        return jax.lax.scan(step, (moving, state, key), batches)[0][0]
+    def train(features, targets, batches, keys):
+        sizes = features.shape[1], targets.shape[1], _WIDTH, 2
+        network = eqx.nn.MLP(*sizes, activation=jnp.tanh, dtype=jnp.float32, key=keys[0])
+        moving, still = eqx.partition(network, eqx.is_inexact_array)
 
-    return eqx.combine(run(moving, optimiser.init(moving), key, batches), still)
+        def loss(moving, index, key):
+            given = features[index] + _NOISE * jax.random.normal(key, (_BATCH, features.shape[1]), features.dtype)
+            return jnp.mean((jax.vmap(eqx.combine(moving, still))(given) - targets[index]) ** 2)
+
+        def step(carry, index):
+            moving, state, key = carry
+            key, own = jax.random.split(key)
+            updates, state = optimiser.update(jax.grad(loss)(moving, index, own), state, moving)
+            return (eqx.apply_updates(moving, updates), state, key), None
+
+        moving = jax.lax.scan(step, (moving, optimiser.init(moving), keys[1]), batches)[0][0]
+        return moving.layers
+
+    return train
