@@ -38,8 +38,8 @@ class Channels:
 
     For those: `scale` (m,) of changes, `range` (2, m) in scales beyond which none reads that is alive; `patterns`
     (m, k), `spread` (k,) of scores, `noise` (m,) in scales; `farthest` (m,): residuals that are still those of a
-    channel alive; `precision` (m, m), the inverse of the covariance; `usual`: novelty of all but a hundredth of the
-    presses; `neighbourhood`: how near presses are to each other.
+    channel alive; `directions` (m, r) of the covariance, and the `weight` (r,) of each beside a diagonal; `usual`:
+    novelty of all but a hundredth of the presses; `neighbourhood`: how near presses are to each other.
     """
 
     used: Bool[np.ndarray, " M"]
@@ -49,7 +49,8 @@ class Channels:
     spread: Float[np.ndarray, " k"]
     noise: Float[np.ndarray, " m"]
     farthest: Float[np.ndarray, " m"]
-    precision: Float[np.ndarray, "m m"]
+    directions: Float[np.ndarray, "m r"]
+    weight: Float[np.ndarray, " r"]
     usual: float
     neighbourhood: Neighbourhood
 
@@ -66,25 +67,28 @@ class Channels:
             raise ValueError("frames: no channel changes; are these frames, and the skin connected?")
         scale = deviation[used]
         scaled = np.where(missing[:, used], 0.0, changes[:, used]) / scale
-        half = len(scaled) // 2
-        patterns, spread, noise = _factors(scaled)
+        there, half = ~missing[:, used], len(scaled) // 2
         # What frames not learnt from leave, which is more than those learnt from do: each half by the other's patterns.
-        left, apart = [], []
+        left, apart, misses = [], [], np.zeros(len(_DIAGONALS))
         for learnt, other in ((slice(None, half), slice(half, None)), (slice(half, None), slice(None, half))):
-            other_patterns, other_spread, other_noise = _factors(scaled[learnt])
-            there = ~missing[other][:, used]
-            scores, residual = _explain(scaled[other], there, other_patterns, other_spread, other_noise)
-            left.append(np.where(there, np.abs(residual), np.nan))
-            apart.append(_novelty(scores, residual, there, other_spread))
+            variance, directions = _variances(scaled[learnt])
+            misses += _missed(scaled[other], variance, directions)
+            model = _factors(scaled[learnt], variance, directions)
+            scores, residual = _explain(scaled[other], there[other], *model)
+            left.append(np.where(there[other], np.abs(residual), np.nan))
+            apart.append(_novelty(scores, residual, there[other], model[1]))
         left, apart = np.concatenate(left), np.concatenate(apart)
         farthest = _BEYOND * np.nanquantile(left, _QUANTILE, axis=0)
         farthest = np.maximum(farthest, max(6.0, float(np.nanquantile(left, 0.99))))
-        every, _ = _explain(scaled, ~missing[:, used], patterns, spread, noise)
-        precision = _precision(np.where(missing[:, used], every @ patterns.T, scaled))
+        variance, directions = _variances(scaled)
+        weight = variance / (variance + _DIAGONALS[int(misses.argmin())])
+        patterns, spread, noise = _factors(scaled, variance, directions)
+        every, _ = _explain(scaled, there, patterns, spread, noise)
         usual = float(np.quantile(apart, 0.99))
         least, most = np.nanmin(changes[:, used], axis=0) / scale, np.nanmax(changes[:, used], axis=0) / scale
         far = np.stack([least - _SPANS * (most - least), most + _SPANS * (most - least)])
-        return cls(used, scale, far, patterns, spread, noise, farthest, precision, usual, Neighbourhood.learn(every))
+        near = Neighbourhood.learn(every)
+        return cls(used, scale, far, patterns, spread, noise, farthest, directions, weight, usual, near)
 
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Changes (n, m) of the channels used, as foretold by the others where one is dead or has no reading; which
@@ -141,8 +145,9 @@ class Channels:
 
     def _foretold(self, alive_readings: Float[np.ndarray, "n a"], alive: np.ndarray) -> Float[np.ndarray, "n m-a"]:
         """What channels that are not `alive` (m,) would most likely have read."""
-        across = self.precision[np.ix_(~alive, alive)] @ alive_readings.T
-        return -np.linalg.solve(self.precision[np.ix_(~alive, ~alive)], across).T
+        dead = self.directions[~alive] * self.weight
+        told = dead @ (alive_readings @ self.directions[alive]).T
+        return np.linalg.solve(np.eye(len(dead)) - dead @ self.directions[~alive].T, told).T
 
     def _explain_all(self, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Scores and residuals of frames (n, m) of which all channels are alive."""
@@ -156,29 +161,37 @@ class Channels:
         return np.linalg.solve(weighted.T @ self.patterns + np.diag(1 / self.spread**2), weighted.T).T
 
 
-def _factors(scaled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "m r"]]:
+    """Variance of frames along each of the directions, principal ones, the greatest first."""
+    number, channels = scaled.shape
+    if channels <= number:
+        squares, directions = np.linalg.eigh(scaled.T @ scaled)
+    else:  # the fewer products
+        squares, combined = np.linalg.eigh(scaled @ scaled.T)
+        directions = scaled.T @ combined / np.sqrt(np.maximum(squares, 1e-300))
+    kept = np.flatnonzero(squares > _ROUNDING * squares[-1])[::-1]
+    return squares[kept] / number, directions[:, kept]
+
+
+def _factors(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Patterns (m, k), deviations of their scores, and of the noise that they leave each channel."""
-    _, values, rows = np.linalg.svd(scaled, full_matrices=False)
-    explained = np.cumsum(values**2) / np.sum(values**2)
+    explained = np.cumsum(variance) / np.sum(variance)
     number = min(int(np.searchsorted(explained, 1 - _LEFT)) + 1, _MOST, max(1, len(scaled) // _PRESSES_EACH))
     number = min(number, max(1, scaled.shape[1] // 2))
-    patterns = rows[:number].T
+    patterns = directions[:, :number]
     left = scaled - scaled @ patterns @ patterns.T
     noise = np.sqrt(np.mean(left**2, axis=0) * len(scaled) / max(1, len(scaled) - number))
-    return patterns, values[:number] / np.sqrt(len(scaled)), np.maximum(noise, 1e-6)
+    return patterns, np.sqrt(variance[:number]), np.maximum(noise, 1e-6)
 
 
-def _precision(scaled: Float[np.ndarray, "N m"]) -> Float[np.ndarray, "m m"]:
-    """Inverse of the covariance and of a diagonal, the one by which each channel is foretold best by the others: in
-    each half of the frames, by what the other half taught."""
-    half, unit = len(scaled) // 2, np.eye(scaled.shape[1])
-    misses = np.zeros(len(_DIAGONALS))
-    for learnt, other in ((scaled[:half], scaled[half:]), (scaled[half:], scaled[:half])):
-        covariance = learnt.T @ learnt / len(learnt)
-        for number, diagonal in enumerate(_DIAGONALS):
-            precision = np.linalg.inv(covariance + diagonal * unit)
-            misses[number] += np.mean((other @ precision / np.diag(precision)) ** 2)
-    return np.linalg.inv(scaled.T @ scaled / len(scaled) + _DIAGONALS[int(misses.argmin())] * unit)
+def _missed(scaled, variance, directions) -> Float[np.ndarray, " D"]:
+    """By how much each channel is missed when it is foretold by the others, of covariances with each diagonal."""
+    scores, found = scaled @ directions, []
+    for diagonal in _DIAGONALS:
+        weight = variance / (variance + diagonal)
+        left = scaled - (scores * weight) @ directions.T
+        found.append(np.mean((left / (1 - np.sum(directions**2 * weight, axis=1))) ** 2))
+    return np.array(found)
 
 
 def _explain(whole, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndarray]:
