@@ -7,7 +7,8 @@ from jaxtyping import Float, Int
 
 from jeit.touch.learnt.extras import over_threads
 
-_AT_ONCE = 256
+# Frames whose distances from all presses are worked out at once.
+_AT_ONCE = 128
 _COUNTS = (3, 5, 8, 12)
 
 
@@ -54,8 +55,12 @@ class Nearest:
         squares = np.sum(self.features**2, axis=1)
 
         def near(some: np.ndarray) -> np.ndarray:
-            squared = squares - 2 * some @ self.features.T  # less the frame's own, the same for all
-            number = np.argpartition(squared, self.count - 1, axis=1)[:, : self.count]
+            squared = (-2 * some) @ self.features.T
+            squared += squares  # less the frame's own, the same for all
+            if self.count == 1:
+                number = squared.argmin(axis=1)[:, None]
+            else:
+                number = np.argpartition(squared, self.count - 1, axis=1)[:, : self.count]
             apart = np.linalg.norm(self.features[number] - some[:, None], axis=2)
             order = np.argsort(apart, axis=1, kind="stable")
             return np.stack([np.take_along_axis(one, order, axis=1) for one in (apart, number)], axis=-1)
