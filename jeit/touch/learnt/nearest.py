@@ -1,6 +1,7 @@
 """Nearest presses by plain products: for one frame, threads of a library wait longer for each other than they work."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -52,11 +53,10 @@ class Nearest:
 
     def _near(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n c"], Int[np.ndarray, "n c"]]:
         """Distances of the nearest presses, the nearest first, and their numbers."""
-        squares = np.sum(self.features**2, axis=1)
 
         def near(some: np.ndarray) -> np.ndarray:
             squared = (-2 * some) @ self.features.T
-            squared += squares  # less the frame's own, the same for all
+            squared += self._squares  # less the frame's own, the same for all
             if self.count == 1:
                 number = squared.argmin(axis=1)[:, None]
             else:
@@ -67,3 +67,8 @@ class Nearest:
 
         found = over_threads(near, features, _AT_ONCE)
         return found[..., 0], found[..., 1].astype(int)
+
+    @cached_property
+    def _squares(self) -> Float[np.ndarray, " N"]:
+        """|x|² of every press's features."""
+        return np.sum(self.features**2, axis=1)
