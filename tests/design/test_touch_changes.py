@@ -43,8 +43,10 @@ def anew(model, conductivity, touched):
     found = []
     for cells, change in zip(np.asarray(touched.cells), np.asarray(touched.change), strict=True):
         values = np.array(conductivity)
-        np.add.at(values, cells, values[cells] * change)
-        found.append(np.asarray(model.voltages(np.maximum(values, 1e-9 * conductivity))) - before)
+        factor = np.ones(len(values))
+        np.add.at(factor, cells, change)
+        factor = np.maximum(factor, 1e-9).reshape(-1, *np.ones(values.ndim - 1, int))
+        found.append(np.asarray(model.voltages(factor * values)) - before)
     return np.array(found)
 
 
@@ -68,6 +70,15 @@ def test_exact_changes_are_those_of_solving_anew(kind, options, models):
         expected = anew(model, conductivity, touched)
         found = touch_changes(model, conductivity, touched)
         np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_touches_scale_the_tensors_of_a_stretched_sheet(models):
+    model = models["sheet"]
+    conductivity = np.broadcast_to([[0.5, 0.1], [0.1, 0.8]], (model.mesh.num_cells, 2, 2))
+    touched = touched_cells(model.mesh, Bell(), PLACES, **SHEET)
+    expected = anew(model, conductivity, touched)
+    found = touch_changes(model, conductivity, touched)
+    np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
 def test_a_touch_that_is_found_at_once_waits_for_a_slow_one(models):
@@ -204,5 +215,9 @@ def test_bad_indentations(models):
         Bell(depth=-1e-3)
     with pytest.raises(ValueError, match="that of a layer is in its mesh"):
         touched_cells(models["layer"].mesh, Bell(), PLACES, thickness=0.01)
-    with pytest.raises(ValueError, match="real, scalar"):
-        touch_changes(models["sheet"], 1.0 + 0.1j, touched_cells(models["sheet"].mesh, Bell(), PLACES, **SHEET))
+    touched = touched_cells(models["sheet"].mesh, Bell(), PLACES, **SHEET)
+    with pytest.raises(ValueError, match="real conductivity"):
+        touch_changes(models["sheet"], 1.0 + 0.1j, touched)
+    tensors = np.tile(np.eye(2), (models["sheet"].mesh.num_cells, 1, 1))
+    with pytest.raises(ValueError, match="scalar one"):
+        touch_changes(models["sheet"], tensors, touched, linear=True)

@@ -50,13 +50,13 @@ def touch_changes(
     had been solved anew for every touch, to 1e-8 of the largest. Raises `ValueError` for touches of another mesh and
     for exact changes under `jit`, `grad` or `vmap`, and `RuntimeError` where exact changes are not found: by conductors
     of contrast above some 1e6, whose limit is reached long before, and where a touch cuts an electrode off.
-    `conductivity` as in `ForwardModel.voltages`, real and scalar, S/m (2-D: S).
+    `conductivity` as in `ForwardModel.voltages`, real, S/m (2-D: S); tensors, which a touch scales, for exact changes.
     """
     check_model(model)
     check_kind("touched", touched, TouchedCells, "TouchedCells, as of skin.touched_cells(places)")
     conductivity = check_conductivity(model.mesh, conductivity)
-    if conductivity.ndim == 3 or jnp.iscomplexobj(conductivity):
-        raise ValueError("touches need a real, scalar conductivity.")
+    if jnp.iscomplexobj(conductivity) or (linear and conductivity.ndim == 3):
+        raise ValueError("touches need a real conductivity, and linear changes a scalar one.")
     if touched.num_cells != model.mesh.num_cells:
         raise ValueError(
             f"the touches are of a mesh of {touched.num_cells} cells, and the model's has {model.mesh.num_cells}; "

@@ -1,5 +1,7 @@
 """`PressedSkin`: a skin of some material, and what it reads while it is pressed."""
 
+from functools import cached_property
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -31,7 +33,7 @@ class PressedSkin(eqx.Module):
     """A sheet, or a layer, of a material that is pressed; readings are exact, by low-rank changes of one factorisation.
 
     **Fields**: `model`, any forward model of a sheet, or of a layer whose top is at its greatest z; `material`;
-    `conductivity` at rest, S/m (2-D: S); `gain` (M,) of every channel.
+    `conductivity` at rest, S/m (2-D: S), also tensors, which presses scale; `gain` (M,) of every channel.
     """
 
     model: ForwardModel
@@ -55,7 +57,7 @@ class PressedSkin(eqx.Module):
 
     def rest(self) -> Float[np.ndarray, " M"]:
         """Voltages (M,) of the skin that nobody touches and nothing disturbs, as its channels read them."""
-        return self.gain * np.asarray(self.model.voltages(self.conductivity))
+        return self.gain * self._at_rest
 
     def frames(self, key: Array, presses, *, held: float = 1.0, elapsed: float = 0.0) -> Float[np.ndarray, "n M"]:
         """Voltages (n, M) of n touches of a skin that has had no load before: one press each, or a tuple of several at
@@ -114,8 +116,7 @@ class PressedSkin(eqx.Module):
 
     def voltages_under(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
         """Voltages (n, M) of the model under n touches, undisturbed. Raises as `touch_changes` does."""
-        rest = np.asarray(self.model.voltages(self.conductivity))
-        voltages = np.tile(rest, (len(touched.places), 1))
+        voltages = np.tile(self._at_rest, (len(touched.places), 1))
         places, cells, change = (np.asarray(one) for one in (touched.places, touched.cells, touched.change))
         for alike in _kinds(self.model.mesh, cells, change):
             for some in np.split(alike, range(_AT_ONCE, len(alike), _AT_ONCE)):
@@ -138,11 +139,16 @@ class PressedSkin(eqx.Module):
         if drift.any() or own.contact_trend or own.contact_walk:
             number = self.model.electrodes.num_electrodes
             contacts = walk(for_contacts, seconds, own.contact_trend, own.contact_walk, number)
-            exact = (exact + (contacts + drift) @ self._contact_slope()) * np.exp(-drift)
-        rest = self.model.voltages(self.conductivity)
-        deviation = own.noise * float(np.sqrt(np.mean(np.asarray(rest) ** 2)))
+            exact = (exact + (contacts + drift) @ self._contact_slope) * np.exp(-drift)
+        deviation = own.noise * float(np.sqrt(np.mean(self._at_rest**2)))
         return self.gain * (exact + white_noise(for_noise, deviation, exact.shape))
 
+    @cached_property
+    def _at_rest(self) -> Float[np.ndarray, " M"]:
+        """Voltages of the model at rest."""
+        return np.asarray(self.model.voltages(self.conductivity))
+
+    @cached_property
     def _contact_slope(self) -> Float[np.ndarray, "L M"]:
         """∂v/∂log z (L, M) of the skin at rest, volts; none for points."""
         electrodes, protocol = self.model.electrodes, self.model.protocol

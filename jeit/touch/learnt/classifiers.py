@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jeit.touch.learnt.forest import Forest
 from jeit.touch.learnt.machine import Machine
 from jeit.touch.learnt.nearest import Nearest
+from jeit_solvers import number_of_cores
 
 # Of the paper's ensembles: members, and leaves of a boosted tree.
 _MEMBERS, _LEAVES = 30, 21
@@ -95,11 +96,16 @@ def boosted_trees(features, label) -> Any:
 
 
 def bagged_trees(features, label) -> Any:
-    """Trees on resampled presses."""
+    """Trees on resampled presses, learnt side by side."""
+    from joblib import parallel_config
     from sklearn.ensemble import BaggingClassifier
     from sklearn.tree import DecisionTreeClassifier
 
-    found = BaggingClassifier(DecisionTreeClassifier(random_state=0), _MEMBERS, random_state=0).fit(features, label)
+    bagged = BaggingClassifier(
+        DecisionTreeClassifier(random_state=0), _MEMBERS, n_jobs=number_of_cores(), random_state=0
+    )
+    with parallel_config("threading"):
+        found = bagged.fit(features, label)
     weights = np.full(_MEMBERS, 1 / _MEMBERS)
     return Forest.of_trees([_renumbered(one) for one in found.estimators_], weights, np.unique(label), votes=False)
 

@@ -1,13 +1,15 @@
 """Nearest presses by plain products: for one frame, threads of a library wait longer for each other than they work."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jeit.touch.learnt.extras import in_parts
 
-_AT_ONCE = 256
+# Frames whose distances from all presses are worked out at once.
+_AT_ONCE = 128
 _COUNTS = (3, 5, 8, 12)
 
 
@@ -51,14 +53,22 @@ class Nearest:
 
     def _near(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n c"], Int[np.ndarray, "n c"]]:
         """Distances of the nearest presses, the nearest first, and their numbers."""
-        squares = np.sum(self.features**2, axis=1)
 
         def near(some: np.ndarray) -> np.ndarray:
-            squared = squares - 2 * some @ self.features.T  # less the frame's own, the same for all
-            number = np.argpartition(squared, self.count - 1, axis=1)[:, : self.count]
+            squared = (-2 * some) @ self.features.T
+            squared += self._squares  # less the frame's own, the same for all
+            if self.count == 1:
+                number = squared.argmin(axis=1)[:, None]
+            else:
+                number = np.argpartition(squared, self.count - 1, axis=1)[:, : self.count]
             apart = np.linalg.norm(self.features[number] - some[:, None], axis=2)
             order = np.argsort(apart, axis=1, kind="stable")
             return np.stack([np.take_along_axis(one, order, axis=1) for one in (apart, number)], axis=-1)
 
         found = in_parts(near, features, _AT_ONCE)
         return found[..., 0], found[..., 1].astype(int)
+
+    @cached_property
+    def _squares(self) -> Float[np.ndarray, " N"]:
+        """|x|² of every press's features."""
+        return np.sum(self.features**2, axis=1)

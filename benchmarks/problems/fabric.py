@@ -1,0 +1,152 @@
+"""A fabric whose squares are pressed, one at a time, simulated after Russo et al. (2017).
+
+A square with electrodes along its edge, opposite drive. A finger presses the squares of a chess board round its middle
+with 10 to 100 kPa, within 1 mm of their middles. Six repetitions of twenty presses of each square, ten minutes apart,
+read as medians of 160 samples, teach; twenty presses of each a day later test, as they are, or with a reference, one
+scan, taken anew up to ten minutes before. What drifts and what is noise is the material's.
+
+**Bent** round a cylinder along y, the sheet conducts as before, but for two things. What conducts lies half of the
+sensor's 1.5 mm outside the layer that keeps its length: at a radius R it is stretched by 0.75 mm / R round the bend,
+and its resistance that way grows 5 times as much, a gauge factor (chosen). And a flat finger touches the ridge first:
+its gap is x² / 2R.
+
+All this was fixed before accuracies were looked at.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.layout import perimeter
+from jeit.mesh import Rectangle
+from jeit.protocol import opposite
+from jeit.simulate import Disc, Press, PressedSkin, material
+from jeit.simulate.contact.indenters import AbstractIndenter
+
+REPETITIONS, PRESSES, TESTS = 6, 20, 20
+SAMPLES, SCAN = 160, 3200  # of a median, and of a scan
+MINUTES, DAY = 10.0, 86400.0  # between repetitions; and to the test, seconds
+PRESSURE, JITTER, CONTACT = (10e3, 100e3), 1e-3, 0.6  # Pa; m; of a finger's width, beside the target's
+OUTSIDE, GAUGE = 0.75e-3, 5.0  # of the layer that keeps its length, m; relative change over strain
+SQUARES = {0.015: (7, 7), 0.010: (10, 10)}
+
+
+class OnCylinder(AbstractIndenter):
+    """An `indenter` on a skin that is bent to `radius`, metres, round a cylinder along y."""
+
+    indenter: AbstractIndenter
+    radius: float
+
+    def gap(self, points):
+        """The indenter's, and x² / 2R."""
+        return self.indenter.gap(points) + np.asarray(points)[..., 0] ** 2 / (2 * self.radius)
+
+    @property
+    def reach(self) -> float:
+        """The indenter's."""
+        return self.indenter.reach
+
+
+class Fabric:
+    """What a fabric of `side` metres with so many `electrodes` reads of C squares as wide as a `target`, metres.
+
+    `squares`: their numbers along x and y; `bend`: radius of a cylinder that the fabric is bent round, metres. All is
+    changes of M voltages from those of the untouched fabric at first, and without noise, whose deviation is `noise`,
+    volts: `features` (T, C + 1, P, M) of T repetitions of P presses, the last class untouched; `tests` (C + 1, P, M) a
+    day later; `middles` (C, 2) of the squares and `places` (L, 2) of the electrodes, metres.
+    """
+
+    def __init__(
+        self,
+        electrodes: int = 16,
+        side: float = 0.13,
+        target: float = 0.015,
+        *,
+        presses: int = PRESSES,
+        nodes: int = 2000,
+        squares: tuple[int, int] | None = None,
+        bend: float = np.inf,
+    ):
+        outline = Rectangle(side, side)
+        self.places = perimeter(outline, electrodes, start=side / (electrodes // 4) / 2)
+        contacts = BoundaryElectrodes(self.places, 0.4 * 4 * side / electrodes, 1e-2)
+        mesh = outline.mesh(num_points=nodes)
+        # The paper has 96 voltages of 16 electrodes, the distinct drives', and 32 of 8, all drives'.
+        model = ForwardModel(mesh, contacts, opposite(electrodes, drives="all" if electrodes == 8 else "distinct"))
+        own = material("conductive fabric")
+        stretched = np.diag([1 / (1 + GAUGE * OUTSIDE / bend), 1.0])
+        conductivity = np.broadcast_to(own.conductivity * own.thickness * stretched, (mesh.num_cells, 2, 2))
+        self._skin = PressedSkin(jax.random.key(0), model, replace(own, noise=0.0), conductivity=conductivity)
+        self._rest = self._skin.rest()
+        # Medians of samples are noisier than means, by a quarter.
+        self.noise = own.noise * float(np.sqrt(np.mean(self._rest**2))) * 1.25 / np.sqrt(SAMPLES)
+        x, y = ((np.arange(count) - (count - 1) / 2) * target for count in squares or SQUARES[target])
+        self.middles = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+        finger: AbstractIndenter = Disc(CONTACT * target)
+        if np.isfinite(bend):
+            finger = OnCylinder(finger, bend)
+        rng = np.random.default_rng(0)
+
+        def read(number: int, elapsed: float) -> np.ndarray:
+            drawn = [_press(rng, finger, middle) for middle in self.middles for _ in range(number)]
+            frames = self._changes(int(elapsed), [*drawn, *[()] * number], elapsed)
+            return frames.reshape(len(self.middles) + 1, number, -1)
+
+        self.features = np.stack([read(presses, 60 * MINUTES * one) for one in range(REPETITIONS)])
+        self.tests = read(TESTS, DAY)
+        self._later = self._drifts(TESTS)
+
+    def observations(
+        self, number: int, *, untouched: bool = False
+    ) -> tuple[Float[np.ndarray, "N M"], Int[np.ndarray, " N"], Int[np.ndarray, " N"]]:
+        """About `number` observations a class, with noise, their classes and repetitions; `untouched` is class C."""
+        features = self.features if untouched else self.features[:, :-1]
+        repetitions, classes, presses, channels = features.shape
+        own = min(presses, max(1, number // repetitions))
+        medians = max(1, number // (repetitions * own))
+        exact = np.repeat(features[:, :, :own], medians, axis=2).reshape(-1, channels)
+        label = np.tile(np.repeat(np.arange(classes), own * medians), repetitions)
+        return self._noisy(exact, 1), label, np.repeat(np.arange(repetitions), classes * own * medians)
+
+    def asked(self, *, anew: bool) -> Float[np.ndarray, "C P M"]:
+        """Presses a day later, with noise; with a reference taken `anew`, up to ten minutes before."""
+        if not anew:
+            return self._noisy(self.tests[:-1], 2)
+        return self._noisy(self.tests[:-1] - self.tests[-1] + self._later, 2) - self._reference()
+
+    def untouched(self, number: int, each: int, *, anew: bool) -> Float[np.ndarray, "n M"]:
+        """The untouched fabric a day later, `each` so often after so many drifts: with noise, as of `asked`."""
+        if not anew:
+            return self._noisy(np.repeat(self.tests[-1, :1], number * each, axis=0), 3)
+        return self._noisy(np.repeat(self._drifts(number), each, axis=0), 3) - self._reference()
+
+    @property
+    def distance(self) -> Float[np.ndarray, " C"]:
+        """Of the squares' middles from the nearest electrode's, metres."""
+        return np.linalg.norm(self.middles[:, None] - self.places, axis=-1).min(axis=1)
+
+    def _drifts(self, number: int) -> Float[np.ndarray, "n M"]:
+        """By what the untouched fabric drifts within ten minutes of its reference, as when it was new, volts."""
+        seconds = np.random.default_rng(4).uniform(0, 60 * MINUTES, number)
+        return np.concatenate([self._changes(int(DAY) + one, [()], each) for one, each in enumerate(seconds, start=1)])
+
+    def _changes(self, key: int, presses: list, elapsed: float) -> Float[np.ndarray, "n M"]:
+        return self._skin.frames(jax.random.key(key), presses, elapsed=float(elapsed)) - self._rest
+
+    def _noisy(self, exact: np.ndarray, seed: int) -> np.ndarray:
+        return exact + self.noise * np.random.default_rng(seed).normal(size=exact.shape)
+
+    def _reference(self) -> Float[np.ndarray, " M"]:
+        """The noise of the mean of a scan's medians, volts."""
+        return self.noise * np.random.default_rng(5).normal(size=self.tests.shape[-1]) / np.sqrt(SCAN / SAMPLES)
+
+
+def _press(rng: np.random.Generator, finger: AbstractIndenter, middle: np.ndarray) -> Press:
+    pressure = np.exp(rng.uniform(*np.log(PRESSURE)))
+    return Press(finger, pressure * np.pi * finger.reach**2, middle + rng.uniform(-JITTER, JITTER, 2))
