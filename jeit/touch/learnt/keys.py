@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.touch.learnt.classifiers import log_odds, probabilities, sharpness_of
+from jeit.touch.learnt.extras import over_folds
 from jeit.touch.learnt.features import FORMS, standardisation
 from jeit.touch.learnt.forest import Forest
 
@@ -75,8 +76,8 @@ def learn_keys(
     reference = np.zeros_like(changes) if reference is None else reference
     number, keys = touched.shape
     odds = {name: np.empty((number, keys)) for name in _candidates()}
-    for fold in range(folds.max() + 1):
-        progress(f"keys, fold {fold + 1} of {folds.max() + 1}")
+
+    def tell(fold: int) -> None:
         out = folds == fold
         for form in _FORMS:
             features = Standardised.learn(form, changes[~out], reference[~out])
@@ -96,6 +97,9 @@ def learn_keys(
                         model = _METHODS[needs](learnt[:, few], answers)
                         said = log_odds(model, asked[:, few])
                         odds[name][out, key] = said[:, 1] - said[:, 0]
+        progress(f"keys, fold {fold + 1} of {folds.max() + 1}")
+
+    over_folds(tell, folds.max() + 1)
     members, methods, held_out = [], [], np.empty((number, keys), bool)
     for key in range(keys):
         right = touched[:, key]

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.touch.learnt.classifiers import CLASSIFIERS, log_odds, probabilities, sharpness_of, shrinkage_of
+from jeit.touch.learnt.extras import over_folds
 from jeit.touch.learnt.features import Features, Forms
 from jeit.touch.learnt.imaged import Imaged
 
@@ -94,10 +95,13 @@ def _error(one: TriedLabels) -> float:
 def _hold_out(method, form, forms: Forms, changes, reference, right, folds) -> TriedLabels:
     number = right.max() + 1
     odds = np.full((len(right), number), -1e3)
-    for fold in range(folds.max() + 1):
+
+    def tell(fold: int) -> None:
         out = folds == fold
         features = forms.learn(form, changes[~out], reference[~out], right[~out, None])
         model = CLASSIFIERS[method](features(changes[~out], reference[~out]), right[~out])
         odds[np.ix_(out, model.classes_)] = log_odds(model, features(changes[out], reference[out]))
+
+    over_folds(tell, folds.max() + 1)
     held_out = odds.argmax(axis=1)
     return TriedLabels(method, form, held_out, odds, float(np.mean(held_out != right)))

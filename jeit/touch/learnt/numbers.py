@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jeit.touch.learnt.extras import over_folds
 from jeit.touch.learnt.features import Features, Forms
 from jeit.touch.learnt.imaged import Imaged
 from jeit.touch.learnt.regressors import OF_CHANNELS, QUICK, REGRESSORS
@@ -132,11 +133,14 @@ class _Cut:
 
     def hold_out(self, method: str, form: str) -> Tried:
         said = np.empty_like(self.targets)
-        for fold in range(self.folds.max() + 1):
+
+        def tell(fold: int) -> None:
             out = self.folds == fold
             learnt, asked = self._scores(form, fold, out, rotated=method not in OF_CHANNELS)
             model = REGRESSORS[method](learnt, (self.targets[~out] - self.mean) / self.scale)
             said[out] = self.mean + self.scale * np.asarray(model.predict(asked)).reshape(int(out.sum()), -1)
+
+        over_folds(tell, self.folds.max() + 1)
         return Tried(method, form, said, _off(said, self.targets))
 
     def _scores(self, form: str, fold: int, out: np.ndarray, *, rotated: bool) -> tuple[np.ndarray, np.ndarray]:
