@@ -5,46 +5,30 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jeit.arguments import check_kind, check_name, counted
 from jeit.forward import ForwardModel
 from jeit.touch.learnt import labels as label_methods
 from jeit.touch.learnt import numbers as number_methods
+from jeit.touch.learnt.answers import METHODS, Standing, learn_answers, places_and_folds
+from jeit.touch.learnt.changes import changes_of, mean_reference, reference_used, standardised, stuck
 from jeit.touch.learnt.channel_choice import choose_channels
 from jeit.touch.learnt.channels import Channels
 from jeit.touch.learnt.extras import need_learning, one_thread, over_threads
-from jeit.touch.learnt.folds import time_folds
 from jeit.touch.learnt.imaged import Imaged, check_imaged
-from jeit.touch.learnt.keys import LearntKeys, learn_keys
-from jeit.touch.learnt.labels import LearntLabels, learn_labels
+from jeit.touch.learnt.keys import LearntKeys
+from jeit.touch.learnt.labels import LearntLabels
 from jeit.touch.learnt.lag import lag_of, shifted
-from jeit.touch.learnt.numbers import LearntNumbers, learn_numbers
+from jeit.touch.learnt.numbers import LearntNumbers
 from jeit.touch.learnt.presses import NO_TOUCH, Presses, check_frames, check_reference
 from jeit.touch.learnt.touches import Touches
 
 # A frame is unlike any learnt from beyond so many times the novelty of the farthest of them, or with fewer channels.
 _UNLIKE, _FEWEST = 2.0, 0.66
 _AT_ONCE = 256
-# Frames in which a channel that is alive does not read the same.
-_MANY = 20
 # A reference is another skin's if it is less like those learnt from than this, or of another size.
 _ALIKE, _SIZES = 0.8, 5.0
-# Frames of a session, before it can be standardised by itself.
-_SESSION = 20
-METHODS = tuple(dict.fromkeys((*number_methods.METHODS, *label_methods.METHODS)))
-
-
-@dataclass(frozen=True)
-class Standing:
-    """How well something was learnt: the `method` chosen, errors of all that were `tried` on presses held out, and what
-    the chosen one said of each press when it was held out; in the units of what was learnt."""
-
-    method: str
-    tried: list[tuple[str, float]]
-    held_out: np.ndarray
-    right: np.ndarray
-    std: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -99,7 +83,7 @@ class LearntSkin:
         notes = list(presses.notes)
         presses, dropped = _usable(presses)
         notes += dropped
-        changes = _changes(presses.frames, presses.reference)
+        changes = changes_of(presses.frames, presses.reference)
         if per_session:
             changes = standardised(changes, presses.group)
         progress("channels")
@@ -119,15 +103,26 @@ class LearntSkin:
             )
         whole, presses, lag, said = _in_step(whole, presses)
         quiet = _quiet(whole / channels.scale, presses)
-        mean = None if presses.reference is None else _mean_reference(presses.reference)
+        mean = None if presses.reference is None else mean_reference(presses.reference)
         imaged = None
         if model is not None:
             progress("images")
             imaged, told = Imaged.create(model, whole, channels.used, mean)
             said += told
-        name, notes = presses.name, notes + said
-        skin = cls(channels, mean, None, None, None, None, quiet, lag, per_session, name, notes)
-        return _learn_all(skin, whole, presses, method, imaged, progress)
+        ours = None if mean is None else reference_used(presses.reference, mean, channels.used, len(whole))
+        found, standing, told = learn_answers(whole, ours, presses, method, imaged, progress)
+        notes = list(dict.fromkeys([*notes, *said, *told]))
+        return cls(
+            channels,
+            mean,
+            **found,
+            quiet=quiet,
+            lag=lag,
+            per_session=per_session,
+            name=presses.name,
+            notes=notes,
+            standing=standing,
+        )
 
     def predict(self, frames, reference=None, group=None) -> Touches:
         """Touches of frames (n, M), with the `reference` (M,) or (n, M) if there was one in the presses learnt from,
@@ -139,10 +134,15 @@ class LearntSkin:
         """
         frames = self._check(frames)
         reference = self._reference(frames, reference)
-        changes = _changes(np.where(_stuck(frames), np.nan, frames), reference)
+        changes = changes_of(np.where(stuck(frames), np.nan, frames), reference)
         if self.per_session:
             changes = standardised(changes, group)
-        found = over_threads(self._tell, changes, self._used(reference, changes), at_once=_AT_ONCE)
+        found = over_threads(
+            self._tell,
+            changes,
+            reference_used(reference, self.mean_reference, self.channels.used, len(changes)),
+            at_once=_AT_ONCE,
+        )
         said: dict[str, Any] = {one.name: found.get(one.name) for one in fields(Touches) if one.name != "notes"}
         return Touches(**said, notes=self._told(found["alive"], found["unlike"]))
 
@@ -195,7 +195,7 @@ class LearntSkin:
             )
         reference = check_reference(given, frames)
         there = np.isfinite(reference).any(axis=0) & self.channels.used
-        own, learnt = _mean_reference(reference)[there], self.mean_reference[there]
+        own, learnt = mean_reference(reference)[there], self.mean_reference[there]
         if not there.any():
             raise ValueError(
                 "reference has no finite reading of a channel that is used; give that of the untouched skin."
@@ -208,13 +208,6 @@ class LearntSkin:
                 "it of this skin, its channels in the same order and units?"
             )
         return reference
-
-    def _used(self, reference: np.ndarray | None, changes: np.ndarray) -> Float[np.ndarray, "n m"]:
-        """The reference of the channels used, the mean of those learnt from where it has no reading; zeros where there
-        is none."""
-        if reference is None or self.mean_reference is None:
-            return np.zeros((len(changes), int(self.channels.used.sum())))
-        return np.where(np.isnan(reference), self.mean_reference, reference)[:, self.channels.used]
 
     def _told(self, alive: np.ndarray, unlike: np.ndarray) -> tuple[str, ...]:
         notes = []
@@ -232,30 +225,6 @@ class LearntSkin:
                 "them."
             )
         return tuple(notes)
-
-
-def _stuck(frames: Float[np.ndarray, "n M"]) -> Bool[np.ndarray, " M"]:
-    """Channels that read the same in all of many frames, while most others change."""
-    same = (frames == frames[0]).all(axis=0)
-    return same & (len(frames) >= _MANY) & (same.mean() < 0.5)
-
-
-def standardised(changes: np.ndarray, group) -> np.ndarray:
-    """Changes (n, M) less their session's median, over their session's deviation; one session unless `group` (n,) says
-    otherwise. Raises `ValueError` for sessions of fewer than 20 frames."""
-    group = np.zeros(len(changes), int) if group is None else np.asarray(group)
-    if group.shape != (len(changes),):
-        raise ValueError(f"group has shape {group.shape}; give ({len(changes)},), the session of each frame.")
-    result = np.empty_like(changes)
-    for session in np.unique(group):
-        own = changes[group == session]
-        if len(own) < _SESSION:
-            raise ValueError(
-                f"group: session {session} has {len(own)} frames; {_SESSION} are needed to standardise one."
-            )
-        deviation = np.nanstd(own, axis=0)
-        result[group == session] = (own - np.nanmedian(own, axis=0)) / np.where(deviation > 0, deviation, np.inf)
-    return result
 
 
 def _check_fit(presses: Presses, method: str, model, num_channels: int | None, per_session: bool) -> None:
@@ -283,7 +252,7 @@ def _check_fit(presses: Presses, method: str, model, num_channels: int | None, p
 
 def _usable(presses: Presses) -> tuple[Presses, list[str]]:
     """Presses of which at least two thirds of the channels that ever have readings have one."""
-    changes = _changes(presses.frames, presses.reference)
+    changes = changes_of(presses.frames, presses.reference)
     there = np.isfinite(changes)
     ever = there.any(axis=0)
     notes = []
@@ -296,10 +265,6 @@ def _usable(presses: Presses) -> tuple[Presses, list[str]]:
     if not fair.all():
         notes.append(f"{int((~fair).sum())} presses lack more than a third of their readings, and are not used.")
     return presses.rows(fair), notes
-
-
-def _changes(frames: np.ndarray, reference: np.ndarray | None) -> np.ndarray:
-    return frames if reference is None else frames - reference
 
 
 def _fewer(channels: Channels, changes: np.ndarray, presses: Presses, number: int) -> tuple[Channels, str]:
@@ -345,17 +310,11 @@ def _quiet(scaled: np.ndarray, presses: Presses) -> float:
     return float(sizes[int(np.argmin(wrong))])
 
 
-def _mean_reference(reference: np.ndarray) -> np.ndarray:
-    """Of every channel; 0 where it has no reading at all."""
-    there = np.isfinite(reference)
-    return np.where(there, reference, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
-
-
 def _in_step(whole: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, int, list[str]]:
     """Frames with the presses that they are of, where they were plainly recorded some rows late; by how many; notes."""
     if presses.positions is None:
         return whole, presses, 0, []
-    rows, folds, _ = _placed(presses)
+    rows, folds, _ = places_and_folds(presses)
     lag, straight, late = lag_of(whole[rows], presses.positions[rows], folds)
     if not lag:
         return whole, presses, 0, []
@@ -367,74 +326,6 @@ def _in_step(whole: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, 
         f"{1e3 * late:.3g} mm off, as recorded {1e3 * straight:.3g} mm): learnt so; check the recording."
     )
     return whole[frames], moved, lag, [said]
-
-
-def _learn_all(skin: LearntSkin, whole, presses: Presses, method: str, imaged: Imaged | None, progress) -> LearntSkin:
-    """The skin with all that presses say learnt from their changes (N, m)."""
-    notes, standing, found = list(skin.notes), {}, {}
-    reference = None if presses.reference is None else skin._used(presses.reference, whole)
-    every = np.arange(len(whole))
-    if presses.positions is not None:
-        rows, folds, told = _placed(presses)
-        notes += told
-        places = presses.positions[rows]
-        found["place"], standing["place"] = _numbers(whole, reference, places, rows, folds, method, imaged, progress)
-    if presses.force is not None:
-        known = presses.positions is not None and np.isfinite(presses.positions).all()
-        alike = presses.positions if known else presses.force[:, None]
-        folds, _ = time_folds(presses.frames, *_when(presses, every), alike=alike)
-        force = presses.force[:, None]
-        found["force"], standing["force"] = _numbers(whole, reference, force, every, folds, method, imaged, progress)
-    if presses.label is not None:
-        folds, told = time_folds(presses.frames, *_when(presses, every), kinds=presses.label)
-        learnt, tried = learn_labels(
-            whole,
-            reference,
-            presses.label,
-            folds,
-            method=_asked(method, label_methods),
-            imaged=imaged,
-            progress=progress,
-        )
-        notes += [*told, *learnt.notes]
-        found["label"] = learnt
-        methods = [(f"{one.method} on {one.form}", one.error) for one in tried]
-        standing["label"] = Standing(methods[0][0], methods, learnt.classes[tried[0].held_out], presses.label)
-    if presses.touched is not None:
-        folds, told = time_folds(presses.frames, *_when(presses, every))
-        notes += told
-        if presses.touched.sum(axis=1).max() < 2:
-            notes.append("no two keys were pressed together: what is said of keys pressed together is a guess.")
-        found["keys"], tried = learn_keys(whole, reference, presses.touched, folds, progress=progress)
-        pairs = zip(tried.methods, tried.errors.tolist(), strict=True)
-        methods = [(f"key {key}: {name}", error) for key, (name, error) in enumerate(pairs)]
-        standing["keys"] = Standing("for each key its own", methods, tried.held_out, presses.touched)
-    return replace(skin, **found, notes=list(dict.fromkeys(notes)), standing=standing)
-
-
-def _placed(presses: Presses) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Rows of presses that have a place, the folds of those, and notes."""
-    positions = np.asarray(presses.positions)
-    rows = np.flatnonzero(~np.isnan(positions).any(axis=1))
-    folds, told = time_folds(presses.frames[rows], *_when(presses, rows), alike=positions[rows])
-    return rows, folds, told
-
-
-def _numbers(whole, reference, targets, rows, folds, method, imaged, progress) -> tuple[LearntNumbers, Standing]:
-    """Numbers (n, d) learnt from the changes of some rows, and how well."""
-    own, asked = None if reference is None else reference[rows], _asked(method, number_methods)
-    learnt, tried = learn_numbers(whole[rows], own, targets, folds, method=asked, imaged=imaged, progress=progress)
-    methods = [(one.name, one.error) for one in tried]
-    said = tried[0].held_out
-    return learnt, Standing(methods[0][0], methods, said, targets, learnt.spread.held_out(said, whole[rows]))
-
-
-def _asked(method: str, methods) -> str:
-    return method if method in methods.METHODS else "auto"
-
-
-def _when(presses: Presses, rows: np.ndarray) -> tuple:
-    return tuple(None if values is None else values[rows] for values in (presses.group, presses.time))
 
 
 def _few(numbers: np.ndarray, most: int = 12) -> str:

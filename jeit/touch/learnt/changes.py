@@ -1,0 +1,54 @@
+"""From frames to changes: less the untouched skin's reference, by session where sessions differ."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+# Frames in which a channel that is alive does not read the same.
+_MANY = 20
+# Frames of a session, before it can be standardised by itself.
+_SESSION = 20
+
+
+def changes_of(frames: Float[np.ndarray, "n M"], reference: np.ndarray | None) -> Float[np.ndarray, "n M"]:
+    """Frames less their reference, if there is one."""
+    return frames if reference is None else frames - reference
+
+
+def standardised(changes: np.ndarray, group) -> np.ndarray:
+    """Changes (n, M) less their session's median, over their session's deviation; one session unless `group` (n,) says
+    otherwise. Raises `ValueError` for sessions of fewer than 20 frames."""
+    group = np.zeros(len(changes), int) if group is None else np.asarray(group)
+    if group.shape != (len(changes),):
+        raise ValueError(f"group has shape {group.shape}; give ({len(changes)},), the session of each frame.")
+    result = np.empty_like(changes)
+    for session in np.unique(group):
+        own = changes[group == session]
+        if len(own) < _SESSION:
+            raise ValueError(
+                f"group: session {session} has {len(own)} frames; {_SESSION} are needed to standardise one."
+            )
+        deviation = np.nanstd(own, axis=0)
+        result[group == session] = (own - np.nanmedian(own, axis=0)) / np.where(deviation > 0, deviation, np.inf)
+    return result
+
+
+def stuck(frames: Float[np.ndarray, "n M"]) -> Bool[np.ndarray, " M"]:
+    """Channels that read the same in all of many frames, while most others change."""
+    same = (frames == frames[0]).all(axis=0)
+    return same & (len(frames) >= _MANY) & (same.mean() < 0.5)
+
+
+def mean_reference(reference: np.ndarray) -> np.ndarray:
+    """Of every channel; 0 where it has no reading at all."""
+    there = np.isfinite(reference)
+    return np.where(there, reference, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+
+
+def reference_used(
+    reference: np.ndarray | None, mean: np.ndarray | None, used: Bool[np.ndarray, " M"], number: int
+) -> Float[np.ndarray, "n m"]:
+    """The reference (n, M) of the channels `used`, the `mean` (M,) of those learnt from where it has no reading; zeros
+    where there is none."""
+    if reference is None or mean is None:
+        return np.zeros((number, int(used.sum())))
+    return np.where(np.isnan(reference), mean, reference)[:, used]
