@@ -16,6 +16,7 @@ NAMES = (
     "hearing",
     "design",
     "contact",
+    "learnt",
     "first_call",
     "contacts",
     "localisation_error",
