@@ -11,6 +11,8 @@ from jeit.touch.learnt.extras import in_parts
 # Frames whose distances from all presses are worked out at once.
 _AT_ONCE = 128
 _COUNTS = (3, 5, 8, 12)
+# Of a comb: distances that are compared before any are ordered.
+_TEETH = 16
 
 
 @dataclass(frozen=True)
@@ -57,10 +59,7 @@ class Nearest:
         def near(some: np.ndarray) -> np.ndarray:
             squared = (-2 * some) @ self.features.T
             squared += self._squares  # less the frame's own, the same for all
-            if self.count == 1:
-                number = squared.argmin(axis=1)[:, None]
-            else:
-                number = np.argpartition(squared, self.count - 1, axis=1)[:, : self.count]
+            number = _least(squared, self.count)
             apart = np.linalg.norm(self.features[number] - some[:, None], axis=2)
             order = np.argsort(apart, axis=1, kind="stable")
             return np.stack([np.take_along_axis(one, order, axis=1) for one in (apart, number)], axis=-1)
@@ -72,3 +71,18 @@ class Nearest:
     def _squares(self) -> Float[np.ndarray, " N"]:
         """|x|² of every press's features."""
         return np.sum(self.features**2, axis=1)
+
+
+def _least(values: Float[np.ndarray, "n N"], count: int) -> Int[np.ndarray, "n c"]:
+    """Where the least of each row are, in any order: in those of its combs whose own least is least."""
+    if count == 1:
+        return values.argmin(axis=1)[:, None]
+    width = values.shape[1] // _TEETH
+    if width <= count:
+        return np.argpartition(values, count - 1, axis=1)[:, :count]
+    combs = values[:, : _TEETH * width].reshape(len(values), _TEETH, width).min(axis=1)
+    comb = np.argpartition(combs, count - 1, axis=1)[:, :count]
+    rest = np.broadcast_to(np.arange(_TEETH * width, values.shape[1]), (len(values), values.shape[1] - _TEETH * width))
+    few = np.hstack([(comb[:, None] + width * np.arange(_TEETH)[:, None]).reshape(len(values), -1), rest])
+    best = np.argpartition(np.take_along_axis(values, few, axis=1), count - 1, axis=1)[:, :count]
+    return np.take_along_axis(few, best, axis=1)
