@@ -149,9 +149,9 @@ class LearntSkin:
     def _tell(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
         """What `Touches` say of some frames, as far as it was learnt."""
         whole, alive, novelty = self.channels.complete(changes)
-        unlike = (novelty > _UNLIKE) | (alive.mean(axis=1) < _FEWEST)
         touching = np.sqrt(np.mean((whole / self.channels.scale) ** 2, axis=1)) > self.quiet
-        unlike &= touching
+        # Small changes are no touch, but missing ones may be any.
+        unlike = (novelty > _UNLIKE) & touching | (alive.mean(axis=1) < _FEWEST)
         found = {"novelty": novelty, "unlike": unlike, "alive": np.zeros(changes.shape, bool)}
         found["alive"][:, self.channels.used] = alive
         if self.label is not None:

@@ -93,6 +93,15 @@ def test_a_touch_that_nothing_told_of_is_unlike(quick):
     assert quick.predict(**ASK).unlike.mean() < 0.02
 
 
+@pytest.mark.parametrize("readings", [0, 10])
+def test_frames_without_most_readings_are_not_taken_for_untouched(quick, readings):
+    frames = FRESH["frames"].copy()
+    frames[:, readings:] = np.nan
+    told = quick.predict(frames, FRESH["reference"])
+    assert told.unlike.all()
+    assert np.isnan(told.force).all()
+
+
 def test_an_untouched_skin_is_at_no_place(quick):
     """Though no untouched frame was recorded."""
     noise = 1e-3 * np.random.default_rng(0).normal(size=FRESH["frames"].shape)
