@@ -230,6 +230,12 @@ def _check_touched(given) -> np.ndarray:
     fixed = np.flatnonzero(touched.all(axis=0) | ~touched.any(axis=0))
     if fixed.size:
         raise ValueError(f"touched: key {fixed[0]} is the same in all presses; leave its column out.")
+    count = np.minimum(touched.sum(axis=0), (~touched).sum(axis=0))
+    if count.min() < _FEWEST_OF_A_KIND:
+        raise ValueError(
+            f"touched: key {count.argmin()} differs in {count.min()} of the presses only; give {_FEWEST_OF_A_KIND} or more "
+            "with it and without, better twenty."
+        )
     return touched
 
 

@@ -46,3 +46,10 @@ def test_kinds_pressed_one_after_the_other_are_in_all_folds():
     kinds = np.repeat(np.arange(4), 15)
     folds, _ = time_folds(FRAMES, kinds=kinds)
     assert all(set(kinds[folds != one]) == {0, 1, 2, 3} for one in range(5))
+
+
+def test_keys_pressed_one_after_the_other_are_in_all_folds():
+    keys = np.repeat(np.eye(4, dtype=bool), 15, axis=0)
+    folds, notes = time_folds(FRAMES, kinds=keys)
+    assert all(keys[folds != one].any(axis=0).all() for one in range(5))
+    assert "keys were given one after the other" in notes[0]

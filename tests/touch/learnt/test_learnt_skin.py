@@ -171,6 +171,18 @@ def test_keys_pressed_together():
     assert np.mean((told.key_probability > 0.5) == told.touched) == 1
 
 
+@pytest.mark.parametrize("group", [None, np.repeat(np.arange(4), 20)])
+def test_keys_pressed_in_turn(group):
+    """Where each person pressed one only, what is held out has a key that nothing else tells of."""
+    rng = np.random.default_rng(0)
+    touched = np.repeat(np.eye(4, dtype=bool), 20, axis=0)
+    frames = touched @ rng.normal(size=(4, 12)) + 0.1 * rng.normal(size=(80, 12))
+    skin = LearntSkin.fit(Presses.create(frames, touched=touched, group=group))
+    wrong = np.mean(skin.standing["keys"].held_out != touched)
+    assert wrong < 0.01 if group is None else wrong >= 0.2
+    assert group is not None or np.array_equal(skin.predict(frames).touched, touched)
+
+
 def test_sessions_that_drift_are_standardised():
     parts = [record(100, seed=seed) for seed in range(3)]
     drift = 0.1 * np.random.default_rng(1).normal(size=(4, CHANNELS))

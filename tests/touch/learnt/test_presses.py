@@ -69,6 +69,7 @@ def test_infinite_readings_are_none():
         ({"label": np.array(["a"] * 12 + [1] * 12, object)}, "label mixes int and str"),
         ({"label": np.linspace(0, 1, 24)}, "label is float64"),
         ({"touched": np.ones((24, 2))}, "key 0 is the same"),
+        ({"touched": np.arange(24)[:, None] == 5}, "key 0 differs in 1 of the presses only"),
         ({"touched": np.full((24, 2), 0.5)}, "true where a key was pressed"),
         ({"time": np.full(24, np.nan)}, "time must be finite"),
         ({"group": np.ones((24, 3))}, "one plain value for each press"),
