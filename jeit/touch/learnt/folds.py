@@ -46,9 +46,11 @@ def time_folds(
     if copies:
         notes.append(f"{copies} frames are copies of others: kept in one fold with them.")
         unit = _joined(unit, same)
+    repeated = False
     if alike is not None and alike.shape[1] > 1 and not grouped:
         places = np.unique(alike, axis=0, return_inverse=True)[1].ravel()
-        if number <= places.max() + 1 < _REPEATED * count:
+        repeated = number <= places.max() + 1 < _REPEATED * count
+        if repeated:
             notes.append(f"{places.max() + 1} places were repeated: held out with all of their presses.")
             unit = _joined(unit, places)
     stretches = number
@@ -58,7 +60,7 @@ def time_folds(
         fold = _dealt(unit, rank, number, stretches)
     if kinds is not None and kinds.ndim == 1 and not grouped and not _covered(fold, None, kinds):
         fold = _dealt_by_kind(rank, kinds, number)
-    if stretches > number:
+    if stretches > number and not repeated:
         what = "labels or keys were given" if alike is None else "places were pressed"
         notes.append(
             f"{what} one after the other: held out in {stretches} short stretches of time, in which drift may pass for "
