@@ -200,8 +200,10 @@ class LearntSkin:
             raise ValueError(
                 "reference has no finite reading of a channel that is used; give that of the untouched skin."
             )
+        if not learnt.any():  # frames that were learnt from were changes already
+            return reference
         alike = float(own @ learnt / np.sqrt((own @ own) * (learnt @ learnt))) if own.any() else 0.0
-        size = np.sqrt((own @ own) / (learnt @ learnt)) if learnt.any() else 1.0
+        size = np.sqrt((own @ own) / (learnt @ learnt))
         if alike < _ALIKE or not 1 / _SIZES < size < _SIZES:
             raise ValueError(
                 f"reference is unlike those that were learnt from (cosine {alike:.2f}, {size:.3g} times as large): is "

@@ -214,6 +214,16 @@ def test_a_reference_that_lacks_readings():
     assert off(skin.predict(FRESH["frames"], lacking), FRESH["positions"]).mean() < 0.03
 
 
+def test_a_reference_of_zeros_can_be_given_again():
+    """As by devices that take it off themselves."""
+    changes = FRESH["frames"] - FRESH["reference"]
+    skin = LearntSkin.fit(
+        Presses.create(changes, reference=np.zeros(CHANNELS), force=FRESH["force"]), method="neighbours"
+    )
+    again = skin.predict(changes, np.zeros(CHANNELS))
+    assert np.nanmean(np.abs(again.force - FRESH["force"])) < 1.0
+
+
 def test_frames_recorded_late_take_their_own_reference_along():
     """And it is their own press that says whether they were touched."""
     recorded = record(240, untouched=40, noise=0.002)
