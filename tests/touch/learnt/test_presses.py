@@ -49,7 +49,8 @@ def test_infinite_readings_are_none():
     [
         ({"positions": 1e3 * GOOD["positions"]}, "are these metres"),
         ({"positions": GOOD["positions"][:20]}, "positions has 20 rows and frames 24"),
-        ({"positions": GOOD["positions"][:, :1]}, r"positions has shape \(24, 1\)"),
+        ({"positions": GOOD["positions"][:, :1]}, r"positions is float64 of shape \(24, 1\)"),
+        ({"positions": GOOD["positions"].astype(object)}, "positions is object of shape"),
         ({"positions": np.where(np.arange(2) == 1, np.nan, GOOD["positions"])}, "positions: row 0"),
         ({"positions": np.ones((24, 2))}, "all the same"),
         ({"positions": None}, "nothing to learn"),
