@@ -24,9 +24,9 @@ def time_folds(
 
     Presses in order of `time`, or as recorded, are cut into `number` stretches. Where that leaves out places (`alike`,
     numbers (N, d)) or `kinds` (N,) or (N, K) altogether, as when one was pressed after the other, into more and shorter
-    ones, dealt out in turn. With a `group`, groups in order of their mean time. Presses with one and the same frame, and at
-    one and the same place (d > 1), go to one fold: they would tell each other's answer, as no press between places
-    could.
+    ones, dealt out in turn. With a `group`, groups in order of their mean time. Presses with one and the same frame,
+    and at one and the same place (d > 1), go to one fold: they would tell each other's answer, as no press between
+    places could.
     """
     count = len(frames)
     order = np.arange(count) if time is None else np.argsort(time, kind="stable")

@@ -162,8 +162,8 @@ def _check_positions(given) -> np.ndarray:
     positions = np.asarray(given)
     if positions.dtype.kind not in "fiu" or positions.ndim != 2 or positions.shape[1] not in (2, 3):
         raise ValueError(
-            f"positions is {positions.dtype} of shape {positions.shape}; give numbers, (presses, 2) or (presses, 3), in "
-            "metres."
+            f"positions is {positions.dtype} of shape {positions.shape}; give numbers, (presses, 2) or (presses, 3), "
+            "in metres."
         )
     positions = positions.astype(float)
     bad = np.isinf(positions).any(axis=1) | (np.isnan(positions).any(axis=1) & ~np.isnan(positions).all(axis=1))
@@ -236,8 +236,8 @@ def _check_touched(given) -> np.ndarray:
     count = np.minimum(touched.sum(axis=0), (~touched).sum(axis=0))
     if count.min() < _FEWEST_OF_A_KIND:
         raise ValueError(
-            f"touched: key {count.argmin()} differs in {count.min()} of the presses only; give {_FEWEST_OF_A_KIND} or more "
-            "with it and without, better twenty."
+            f"touched: key {count.argmin()} differs in {count.min()} of the presses only; give {_FEWEST_OF_A_KIND} or "
+            "more with it and without, better twenty."
         )
     return touched
 
