@@ -69,7 +69,7 @@ def learn_answers(
         methods = [(f"{one.method} on {one.form}", one.error) for one in tried]
         standing["label"] = Standing(methods[0][0], methods, learnt.classes[tried[0].held_out], presses.label)
     if presses.touched is not None:
-        folds, told = time_folds(presses.frames, *_when(presses, every))
+        folds, told = time_folds(presses.frames, *_when(presses, every), kinds=presses.touched)
         notes += told
         if presses.touched.sum(axis=1).max() < 2:
             notes.append("no two keys were pressed together: what is said of keys pressed together is a guess.")

@@ -3,8 +3,6 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
-# Frames in which a channel that is alive does not read the same.
-_MANY = 20
 # Frames of a session, before it can be standardised by itself.
 _SESSION = 20
 
@@ -30,12 +28,6 @@ def standardised(changes: np.ndarray, group) -> np.ndarray:
         deviation = np.nanstd(own, axis=0)
         result[group == session] = (own - np.nanmedian(own, axis=0)) / np.where(deviation > 0, deviation, np.inf)
     return result
-
-
-def stuck(frames: Float[np.ndarray, "n M"]) -> Bool[np.ndarray, " M"]:
-    """Channels that read the same in all of many frames, while most others change."""
-    same = (frames == frames[0]).all(axis=0)
-    return same & (len(frames) >= _MANY) & (same.mean() < 0.5)
 
 
 def mean_reference(reference: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ from jeit.touch.learnt.numbers import LearntNumbers
 from jeit.touch.learnt.spread import Spread
 from jeit.touch.learnt.whitening import Whitened
 
-_KIND, _VERSION = "a jeit learnt skin", 1
+_KIND, _VERSION = "a jeit learnt skin", 2
 _OURS = {
     one.__name__: one
     for one in (

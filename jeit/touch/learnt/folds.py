@@ -23,10 +23,10 @@ def time_folds(
     """The fold (N,) that each press is held out in, and notes.
 
     Presses in order of `time`, or as recorded, are cut into `number` stretches. Where that leaves out places (`alike`,
-    numbers (N, d)) or `kinds` (N,) altogether, as when one was pressed after the other, into more and shorter ones,
-    dealt out in turn. With a `group`, groups in order of their mean time. Presses with one and the same frame, and at
-    one and the same place (d > 1), go to one fold: they would tell each other's answer, as no press between places
-    could.
+    numbers (N, d)) or `kinds` (N,) or (N, K) altogether, as when one was pressed after the other, into more and shorter
+    ones, dealt out in turn. With a `group`, groups in order of their mean time. Presses with one and the same frame,
+    and at one and the same place (d > 1), go to one fold: they would tell each other's answer, as no press between
+    places could.
     """
     count = len(frames)
     order = np.arange(count) if time is None else np.argsort(time, kind="stable")
@@ -46,9 +46,11 @@ def time_folds(
     if copies:
         notes.append(f"{copies} frames are copies of others: kept in one fold with them.")
         unit = _joined(unit, same)
+    repeated = False
     if alike is not None and alike.shape[1] > 1 and not grouped:
         places = np.unique(alike, axis=0, return_inverse=True)[1].ravel()
-        if number <= places.max() + 1 < _REPEATED * count:
+        repeated = number <= places.max() + 1 < _REPEATED * count
+        if repeated:
             notes.append(f"{places.max() + 1} places were repeated: held out with all of their presses.")
             unit = _joined(unit, places)
     stretches = number
@@ -56,10 +58,10 @@ def time_folds(
     while not grouped and stretches < count / 4 and not _covered(fold, alike, kinds):
         stretches *= 2
         fold = _dealt(unit, rank, number, stretches)
-    if kinds is not None and not grouped and not _covered(fold, None, kinds):
+    if kinds is not None and kinds.ndim == 1 and not grouped and not _covered(fold, None, kinds):
         fold = _dealt_by_kind(rank, kinds, number)
-    if stretches > number:
-        what = "labels were given" if alike is None else "places were pressed"
+    if stretches > number and not repeated:
+        what = "labels or keys were given" if alike is None else "places were pressed"
         notes.append(
             f"{what} one after the other: held out in {stretches} short stretches of time, in which drift may pass for "
             "what was learnt."
@@ -88,6 +90,8 @@ def _dealt_by_kind(rank: np.ndarray, kinds: np.ndarray, number: int) -> Int[np.n
 
 def _covered(fold: np.ndarray, alike: np.ndarray | None, kinds: np.ndarray | None) -> bool:
     """Whether what is held out is like what is not."""
+    if kinds is not None and kinds.ndim == 2:
+        return all(_covered(fold, None, column) for column in kinds.T)
     if kinds is not None:
         return all(set(kinds[fold == one]) <= set(kinds[fold != one]) for one in np.unique(fold))
     if alike is None:

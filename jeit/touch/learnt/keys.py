@@ -86,6 +86,10 @@ def learn_keys(
             linear = learnt @ rotation, asked @ rotation
             for key in range(keys):
                 answers = touched[~out, key].astype(int)
+                if answers.min() == answers.max():  # all its presses, or all without, are held out
+                    for name in odds:
+                        odds[name][out, key] = 2.0 * answers[0] - 1
+                    continue
                 for name, (needs, strength) in _candidates().items():
                     if name.partition(" on ")[2] != form:
                         continue

@@ -12,7 +12,7 @@ from jeit.forward import ForwardModel
 from jeit.touch.learnt import labels as label_methods
 from jeit.touch.learnt import numbers as number_methods
 from jeit.touch.learnt.answers import METHODS, Standing, learn_answers, places_and_folds
-from jeit.touch.learnt.changes import changes_of, mean_reference, reference_used, standardised, stuck
+from jeit.touch.learnt.changes import changes_of, mean_reference, reference_used, standardised
 from jeit.touch.learnt.channel_choice import choose_channels
 from jeit.touch.learnt.channels import Channels
 from jeit.touch.learnt.extras import need_learning, one_thread, over_threads
@@ -27,6 +27,8 @@ from jeit.touch.learnt.touches import Touches
 # A frame is unlike any learnt from beyond so many times the novelty of the farthest of them, or with fewer channels.
 _UNLIKE, _FEWEST = 2.0, 0.66
 _AT_ONCE = 256
+# Touched frames in which a channel that is alive does not read the same.
+_MANY = 20
 # A reference is another skin's if it is less like those learnt from than this, or of another size.
 _ALIKE, _SIZES = 0.8, 5.0
 
@@ -134,9 +136,10 @@ class LearntSkin:
         """
         frames = self._check(frames)
         reference = self._reference(frames, reference)
-        changes = changes_of(np.where(stuck(frames), np.nan, frames), reference)
+        changes = changes_of(frames, reference)
         if self.per_session:
             changes = standardised(changes, group)
+        changes = np.where(self._stuck(frames, changes), np.nan, changes)
         found = over_threads(
             self._tell,
             changes,
@@ -146,12 +149,21 @@ class LearntSkin:
         said: dict[str, Any] = {one.name: found.get(one.name) for one in fields(Touches) if one.name != "notes"}
         return Touches(**said, notes=self._told(found["alive"], found["unlike"]))
 
+    def _stuck(self, frames: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Channels (M,) that read the same in all of many touched frames, though others change; when nothing touches, a
+        coarse converter may read the same for long."""
+        same = (frames == frames[0]).all(axis=0)
+        if same.all() or not same.any() or len(frames) < _MANY:
+            return np.zeros_like(same)
+        told = np.where(same, 0.0, np.nan_to_num(changes))[:, self.channels.used] / self.channels.scale
+        return same & (np.count_nonzero(np.sqrt(np.mean(told**2, axis=1)) > self.quiet) >= _MANY)
+
     def _tell(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
         """What `Touches` say of some frames, as far as it was learnt."""
         whole, alive, novelty = self.channels.complete(changes)
-        unlike = (novelty > _UNLIKE) | (alive.mean(axis=1) < _FEWEST)
         touching = np.sqrt(np.mean((whole / self.channels.scale) ** 2, axis=1)) > self.quiet
-        unlike &= touching
+        # Small changes are no touch, but missing ones may be any.
+        unlike = (novelty > _UNLIKE) & touching | (alive.mean(axis=1) < _FEWEST)
         found = {"novelty": novelty, "unlike": unlike, "alive": np.zeros(changes.shape, bool)}
         found["alive"][:, self.channels.used] = alive
         if self.label is not None:
@@ -200,8 +212,10 @@ class LearntSkin:
             raise ValueError(
                 "reference has no finite reading of a channel that is used; give that of the untouched skin."
             )
+        if not learnt.any():  # frames that were learnt from were changes already
+            return reference
         alike = float(own @ learnt / np.sqrt((own @ own) * (learnt @ learnt))) if own.any() else 0.0
-        size = np.sqrt((own @ own) / (learnt @ learnt)) if learnt.any() else 1.0
+        size = np.sqrt((own @ own) / (learnt @ learnt))
         if alike < _ALIKE or not 1 / _SIZES < size < _SIZES:
             raise ValueError(
                 f"reference is unlike those that were learnt from (cosine {alike:.2f}, {size:.3g} times as large): is "

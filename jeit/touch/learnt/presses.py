@@ -161,7 +161,10 @@ def check_reference(given, frames) -> Float[np.ndarray, "N M"]:
 def _check_positions(given) -> np.ndarray:
     positions = np.asarray(given)
     if positions.dtype.kind not in "fiu" or positions.ndim != 2 or positions.shape[1] not in (2, 3):
-        raise ValueError(f"positions has shape {positions.shape}; give (presses, 2) or (presses, 3), in metres.")
+        raise ValueError(
+            f"positions is {positions.dtype} of shape {positions.shape}; give numbers, (presses, 2) or (presses, 3), "
+            "in metres."
+        )
     positions = positions.astype(float)
     bad = np.isinf(positions).any(axis=1) | (np.isnan(positions).any(axis=1) & ~np.isnan(positions).all(axis=1))
     if bad.any():
@@ -230,6 +233,12 @@ def _check_touched(given) -> np.ndarray:
     fixed = np.flatnonzero(touched.all(axis=0) | ~touched.any(axis=0))
     if fixed.size:
         raise ValueError(f"touched: key {fixed[0]} is the same in all presses; leave its column out.")
+    count = np.minimum(touched.sum(axis=0), (~touched).sum(axis=0))
+    if count.min() < _FEWEST_OF_A_KIND:
+        raise ValueError(
+            f"touched: key {count.argmin()} differs in {count.min()} of the presses only; give {_FEWEST_OF_A_KIND} or "
+            "more with it and without, better twenty."
+        )
     return touched
 
 

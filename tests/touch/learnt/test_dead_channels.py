@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.touch.learnt.channel_choice import choose_channels
-from jeit.touch.learnt.channels import Channels
+from jeit.touch.learnt.channels import _DIAGONALS, Channels, _missed, _variances
 
 
 def changes(number, seed, *, noise=0.01):
@@ -41,7 +41,7 @@ def twins(number, seed):
     return np.hstack([mixed, mixed]) + 1e-3 * rng.normal(size=(number, 20))
 
 
-@pytest.mark.parametrize("reading", [np.nan, 9.0])
+@pytest.mark.parametrize("reading", [np.nan, 9.0, -9.0])
 def test_a_channel_is_foretold_by_the_one_that_reads_the_same(reading):
     """Whatever else the patterns know; and its twin is not held for dead for reading what nothing else bears out."""
     channels, fresh = Channels.learn(twins(300, 0)), twins(60, 1)
@@ -52,6 +52,27 @@ def test_a_channel_is_foretold_by_the_one_that_reads_the_same(reading):
         assert not alive[:, channel].any()
         assert np.delete(alive, channel, axis=1).mean() > 0.995
         assert np.abs(whole - fresh)[:, channel].max() < 0.02
+
+
+def test_channels_that_are_alive_are_not_held_for_dead_beside_four_that_are():
+    channels, fresh = Channels.learn(changes(200, 0)), changes(200, 1)
+    broken = fresh.copy()
+    broken[:, [4, 11, 7, 15]] = [8.0, -8.0, 8.0, 8.0]
+    _, alive, _ = channels.complete(broken)
+    assert not alive[:, [4, 11, 7, 15]].any()
+    assert np.delete(alive, [4, 11, 7, 15], axis=1).mean() > 0.99
+
+
+def test_what_is_missed_is_what_the_other_channels_leave():
+    learnt, other = changes(60, 0, noise=0.3)[:, :6], changes(40, 1, noise=0.3)[:, :6]
+    variance, directions = _variances(learnt)
+    covariance = (directions * variance) @ directions.T + _DIAGONALS[8] * np.eye(6)
+    left = []
+    for one in range(6):
+        rest = np.arange(6) != one
+        told = other[:, rest] @ np.linalg.solve(covariance[np.ix_(rest, rest)], covariance[rest, one])
+        left.append(other[:, one] - told)
+    np.testing.assert_allclose(_missed(other, variance, directions)[8], np.mean(np.square(left)), rtol=1e-9)
 
 
 def test_frames_that_lack_different_channels_are_mended_as_each_alone():

@@ -46,3 +46,20 @@ def test_kinds_pressed_one_after_the_other_are_in_all_folds():
     kinds = np.repeat(np.arange(4), 15)
     folds, _ = time_folds(FRAMES, kinds=kinds)
     assert all(set(kinds[folds != one]) == {0, 1, 2, 3} for one in range(5))
+
+
+def test_keys_pressed_one_after_the_other_are_in_all_folds():
+    keys = np.repeat(np.eye(5, dtype=bool), 12, axis=0)
+    folds, notes = time_folds(FRAMES, kinds=keys)
+    assert all(keys[folds != one].any(axis=0).all() for one in range(5))
+    assert "keys were given one after the other" in notes[0]
+
+
+def test_places_repeated_in_any_order_are_not_said_to_be_in_turn():
+    """Of a place held out no press is left, in whatever order they were pressed."""
+    places = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), axis=-1).reshape(-1, 2)
+    places = places[np.random.default_rng(2).integers(0, 25, 300)]
+    folds, notes = time_folds(RNG.normal(size=(300, 4)), alike=places)
+    assert all(len({*folds[(places == one).all(axis=1)]}) == 1 for one in np.unique(places, axis=0))
+    assert len(notes) == 1
+    assert "25 places were repeated" in notes[0]

@@ -78,6 +78,16 @@ def test_contacts_of_an_image_in_hand():
     assert np.isfinite(imaged.contacts(-np.ones((1, 9)))).all()
 
 
+def test_what_is_far_from_the_peak_is_another_contact():
+    changes = LEARNT["frames"] - LEARNT["reference"]
+    imaged, _ = Imaged.create(MODEL, changes, np.ones(108, bool), LEARNT["reference"])
+    image = sum(
+        height * np.exp(-((np.linalg.norm(imaged.centres - [place, 0], axis=1) / 0.006) ** 2))
+        for height, place in ((1.0, -0.03), (0.95, 0.03))
+    )
+    np.testing.assert_allclose(imaged.contacts(image[None])[0, :2], [-0.03, 0.0], atol=3e-3)
+
+
 def test_images_are_relative_to_their_size():
     imaged, _ = Imaged.create(MODEL, LEARNT["frames"] - LEARNT["reference"], np.ones(108, bool), LEARNT["reference"])
     changes = LEARNT["frames"] - LEARNT["reference"]

@@ -63,6 +63,11 @@ def test_a_channel_that_is_stuck_is_done_without(quick):
     assert told.alive.mean() > 0.97
     still = quick.predict(np.repeat(frames[:1], 30, axis=0), FRESH["reference"][0])
     assert still.alive.all()
+    coarse = np.round(FRESH["reference"][:40], 2)  # untouched: nearly all channels read the same
+    coarse[::7, 3] += 0.01
+    assert quick.predict(coarse, FRESH["reference"][0]).alive.all()
+    frames[:, :25] = frames[0, :25]  # most of the skin
+    assert quick.predict(frames, FRESH["reference"]).unlike.all()
 
 
 def test_frames_unlike_any_are_said_to_be(quick):
@@ -91,6 +96,15 @@ def test_a_touch_that_nothing_told_of_is_unlike(quick):
     told = quick.predict(2 * FRESH["reference"] - FRESH["frames"], FRESH["reference"])
     assert told.unlike.all()
     assert quick.predict(**ASK).unlike.mean() < 0.02
+
+
+@pytest.mark.parametrize("readings", [0, 10])
+def test_frames_without_most_readings_are_not_taken_for_untouched(quick, readings):
+    frames = FRESH["frames"].copy()
+    frames[:, readings:] = np.nan
+    told = quick.predict(frames, FRESH["reference"])
+    assert told.unlike.all()
+    assert np.isnan(told.force).all()
 
 
 def test_an_untouched_skin_is_at_no_place(quick):
@@ -162,6 +176,18 @@ def test_keys_pressed_together():
     assert np.mean((told.key_probability > 0.5) == told.touched) == 1
 
 
+@pytest.mark.parametrize("group", [None, np.repeat(np.arange(4), 20)])
+def test_keys_pressed_in_turn(group):
+    """Where each person pressed one only, what is held out has a key that nothing else tells of."""
+    rng = np.random.default_rng(0)
+    touched = np.repeat(np.eye(4, dtype=bool), 20, axis=0)
+    frames = touched @ rng.normal(size=(4, 12)) + 0.1 * rng.normal(size=(80, 12))
+    skin = LearntSkin.fit(Presses.create(frames, touched=touched, group=group))
+    wrong = np.mean(skin.standing["keys"].held_out != touched)
+    assert wrong < 0.01 if group is None else wrong >= 0.2
+    assert group is not None or np.array_equal(skin.predict(frames).touched, touched)
+
+
 def test_sessions_that_drift_are_standardised():
     parts = [record(100, seed=seed) for seed in range(3)]
     drift = 0.1 * np.random.default_rng(1).normal(size=(4, CHANNELS))
@@ -191,6 +217,16 @@ def test_a_reference_that_lacks_readings():
     lacking = FRESH["reference"].copy()
     lacking[:, 9] = np.nan
     assert off(skin.predict(FRESH["frames"], lacking), FRESH["positions"]).mean() < 0.03
+
+
+def test_a_reference_of_zeros_can_be_given_again():
+    """As by devices that take it off themselves."""
+    changes = FRESH["frames"] - FRESH["reference"]
+    skin = LearntSkin.fit(
+        Presses.create(changes, reference=np.zeros(CHANNELS), force=FRESH["force"]), method="neighbours"
+    )
+    again = skin.predict(changes, np.zeros(CHANNELS))
+    assert np.nanmean(np.abs(again.force - FRESH["force"])) < 1.0
 
 
 def test_frames_recorded_late_take_their_own_reference_along():

@@ -49,7 +49,8 @@ def test_infinite_readings_are_none():
     [
         ({"positions": 1e3 * GOOD["positions"]}, "are these metres"),
         ({"positions": GOOD["positions"][:20]}, "positions has 20 rows and frames 24"),
-        ({"positions": GOOD["positions"][:, :1]}, r"positions has shape \(24, 1\)"),
+        ({"positions": GOOD["positions"][:, :1]}, r"positions is float64 of shape \(24, 1\)"),
+        ({"positions": GOOD["positions"].astype(object)}, "positions is object of shape"),
         ({"positions": np.where(np.arange(2) == 1, np.nan, GOOD["positions"])}, "positions: row 0"),
         ({"positions": np.ones((24, 2))}, "all the same"),
         ({"positions": None}, "nothing to learn"),
@@ -69,6 +70,7 @@ def test_infinite_readings_are_none():
         ({"label": np.array(["a"] * 12 + [1] * 12, object)}, "label mixes int and str"),
         ({"label": np.linspace(0, 1, 24)}, "label is float64"),
         ({"touched": np.ones((24, 2))}, "key 0 is the same"),
+        ({"touched": np.arange(24)[:, None] == 5}, "key 0 differs in 1 of the presses only"),
         ({"touched": np.full((24, 2), 0.5)}, "true where a key was pressed"),
         ({"time": np.full(24, np.nan)}, "time must be finite"),
         ({"group": np.ones((24, 3))}, "one plain value for each press"),

@@ -67,11 +67,14 @@ def test_other_files_are_refused_and_nothing_runs(tmp_path, monkeypatch):
         file.writestr("schema.json", "{}")
     dump({"kind": "another"}, "another")
     dump({"kind": "a jeit learnt skin", "version": 9, "skin": {}}, "newer")
-    dump({"kind": "a jeit learnt skin", "version": 1, "skin": {"jeit": "Presses"}}, "strange")
-    dump({"kind": "a jeit learnt skin", "version": 1, "skin": {"channels": 1}}, "less")
-    dump({"kind": "a jeit learnt skin", "version": 1, "skin": {"channels": Payload()}}, "payload")
-    dump({"kind": "a jeit learnt skin", "version": 1, "skin": {"channels": np.random.default_rng}}, "function")
-    for name in ("text", "zip", "another", "newer", "strange", "less", "payload", "function"):
+    dump({"kind": "a jeit learnt skin", "version": 1, "skin": {}}, "older")
+    dump({"kind": "a jeit learnt skin", "version": 2, "skin": {"jeit": "Presses"}}, "strange")
+    dump({"kind": "a jeit learnt skin", "version": 2, "skin": {"channels": 1}}, "less")
+    dump({"kind": "a jeit learnt skin", "version": 2, "skin": {"channels": Payload()}}, "payload")
+    dump({"kind": "a jeit learnt skin", "version": 2, "skin": {"channels": np.random.default_rng}}, "function")
+    for name in ("text", "zip", "another", "newer", "older", "strange", "less", "payload", "function"):
         with pytest.raises(ValueError, match="not a learnt skin that can be read"):
             read_skin(name)
+    with pytest.raises(ValueError, match="of version 1, and this jeit reads 2"):
+        read_skin("older")
     assert not (tmp_path / "ran").exists()
