@@ -2,10 +2,17 @@
 
 import sys
 
+import jax
 import numpy as np
 import pytest
 
-from jeit.mesh import centroids, disk, layer, measures
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.inverse import one_step
+from jeit.layout import ring
+from jeit.mesh import Disk, centroids, disk, layer, measures
+from jeit.protocol import adjacent
+from jeit.simulate import Disc, Press, PressedSkin, material
 from jeit.touch.contacts import CellFinder, ImageNoise, RasterFinder, find_contacts
 from jeit.touch.contacts.cell_outline import outline_of_cells
 
@@ -120,6 +127,24 @@ def test_noise_unknown_is_taken_from_the_image(skin):
     found = find_contacts(CellFinder(skin.mesh), skin.one)
     assert len(found) == 1
     assert np.linalg.norm(found[0].centroid - [0.01, 0.005]) < 0.003
+
+
+def test_large_artefacts_are_no_noise():
+    """Two touches on eight electrodes leave artefacts all over; the median distance from the median hid both."""
+    electrodes = BoundaryElectrodes(ring(0.05, 8), 0.008, 300.0)
+    fine, coarse = (ForwardModel(Disk(0.05).mesh(num_points=n), electrodes, adjacent(8)) for n in (3000, 900))
+    skin = PressedSkin(jax.random.key(0), fine, material("velostat"))
+    empty = skin.frames(jax.random.key(1), [()] * 400)
+    reference = empty[:100].mean(axis=0)
+    linear = one_step(coarse, float(skin.conductivity[0]), noise=empty[:100].std(axis=0))
+    finder = CellFinder(coarse.mesh)
+    drawn = np.random.default_rng(0).uniform(-0.026, 0.026, (40, 2, 2))
+    pairs = [two for two in drawn if np.linalg.norm(two[0] - two[1]) > 0.03]
+    presses = [tuple(Press(Disc(0.01), 5.0, place) for place in two) for two in pairs]
+    images = np.asarray(linear.image(skin.frames(jax.random.key(2), presses) - reference))
+    assert sum(len(find_contacts(finder, image)) == 2 for image in images) >= 8  # of 17; 5 were
+    untouched = np.asarray(linear.image(empty[100:] - reference))
+    assert sum(bool(find_contacts(finder, image)) for image in untouched) <= 9  # of 300
 
 
 def test_smoothing_is_a_mean(skin):

@@ -70,7 +70,7 @@ def test_a_stroke_is_one_touch_of_its_length(rate, speed, side):
     """With a reach of 12 mm at any rate, the first came back as 17 mm of it and the second not at all."""
     along = np.arange(0, side, speed / rate)
     stray = np.random.default_rng(0).normal(0, 5e-4, (len(along), 2))
-    frames = [[contact((x, 0.0) + off)] for x, off in zip(along, stray, strict=True)]
+    frames = [[contact(place)] for place in stray + np.stack([along, 0 * along], axis=-1)]
     frames[len(along) // 2] = []  # missed
     (path,) = track_contacts(np.arange(len(along)) / rate, frames)
     assert path.position[-1, 0] - path.position[0, 0] == pytest.approx(along[-1], abs=3e-3)
