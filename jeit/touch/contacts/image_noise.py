@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
+from scipy import sparse
 
 from jeit.arguments import check_kind, counted, real_array
 from jeit.inverse.linear.one_step import LinearReconstruction
@@ -97,6 +98,13 @@ class ImageNoise(eqx.Module):
         if self.factor is None:
             return float(np.linalg.norm(self.deviation @ np.abs(slope)))
         return float(np.linalg.norm(self.factor @ slope))
+
+    def smoothed(self, smoothing: sparse.csr_array) -> Float[np.ndarray, " m"]:
+        """Standard deviation (m,) of the image once smoothed by a matrix (m, m), which is the most that it can be where
+        it is not known how cells stray together."""
+        if self.factor is None:
+            return smoothing @ self.deviation
+        return np.sqrt(((smoothing @ self.factor.T) ** 2).sum(axis=1))
 
 
 def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
