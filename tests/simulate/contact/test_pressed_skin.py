@@ -222,6 +222,16 @@ def test_walking_contacts_are_read_by_their_own_channels(model):
     )
 
 
+def test_an_untouched_skin_drifts_in_time(model):
+    skin, seconds = PressedSkin(KEY, model, material("velostat")), np.arange(20) * 5.0
+    film = skin.record(KEY, [], seconds)
+    assert film.shape == (20, model.protocol.num_measurements)
+    gone = np.linalg.norm(film - skin.rest(), axis=1)
+    assert gone[-5:].mean() > 3 * gone[0]  # drift, not noise alone
+    light = skin.record(KEY, MovingPress(Disc(0.01), np.full(20, 1e-9)), seconds)
+    np.testing.assert_allclose(film, light, rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
