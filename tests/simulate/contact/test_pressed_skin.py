@@ -232,6 +232,14 @@ def test_an_untouched_skin_drifts_in_time(model):
     np.testing.assert_allclose(film, light, rtol=1e-6, atol=1e-9)
 
 
+def test_a_half_space_is_not_pressed_beside_its_edge(model):
+    """Its free contact is cut off at the edge: what is left of it would be scaled up to carry all of the load."""
+    skin = PressedSkin(KEY, model, dataclasses.replace(STILL, support=HalfSpace(3e5, pixels=24)))
+    with pytest.raises(ValueError, match="of its pressure would lie on the skin"):
+        skin.touched([Press(ball(0.02), 2.0, (0.052, 0.0))])
+    skin.touched([Press(ball(0.02), 2.0, (0.0495, 0.0)), Press(ball(0.001), 1e-3, (0.03, 0.0)), Press(Disc(1e-9), 1.0)])
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
