@@ -51,8 +51,8 @@ def main() -> float:
         (weight(100, (-0.025, 0.0), 0.008), weight(200, (0.025, 0.0), 0.008)),
     ]
     frames = skin.frames(jax.random.key(2), presses)
-    figure = plt.figure(figsize=(15, 10), layout="constrained")
-    stages, graphs = figure.subfigures(2, 1)
+    figure = plt.figure(figsize=(15, 8), layout="constrained")
+    stages, graphs = figure.subfigures(2, 1, height_ratios=(3, 5))
     of_place, of_load, two, moved = graphs.subplots(1, 4)
     ends = np.cumsum([len(places), len(GRAMS), 16])
     worst = 0.0
@@ -82,9 +82,11 @@ def main() -> float:
     touches = track_contacts(seconds, found("one-step", skin.record(jax.random.key(4), strokes, seconds))[1])
     for path in touches:
         moved.plot(*1e3 * path.position.T, ".-", label=f"touch {path.number + 1}, {1e3 * path.length:.0f} mm")
+    for number, stroke in enumerate(strokes):
+        moved.plot(*1e3 * stroke.position.T, "k--", linewidth=1, label=None if number else "true paths, 50 mm each")
     of_place.set(xlabel="from the middle, mm", ylabel="error, mm (three directions, 100 g)")
     of_load.set(xlabel="load, kg", ylabel="peak over that of 100 g")
-    moved.set(xlabel="mm", ylabel="mm", aspect="equal", title="two strokes at once")
+    moved.set(xlabel="mm", ylabel="mm", aspect="equal", title="two strokes at once", xlim=(-32, 32), ylim=(-32, 32))
     for ax in (of_place, of_load, moved):
         ax.legend(frameon=False)
     figure.savefig("contacts_from_images.png")

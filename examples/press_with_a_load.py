@@ -21,15 +21,18 @@ def main() -> float:
     # Pressed for four seconds, held, lifted; read 20 times a second.
     seconds = np.arange(0, 12, 0.05)
     load = np.interp(seconds, [0, 1, 5, 7, 8], [0, 0, 20, 20, 0])
-    press = MovingPress(tool, load, position=(0.008, 0.01), angle=0.4)
+    position, angle = (0.008, 0.01), 0.4
+    press = MovingPress(tool, load, position, angle)
     frames = skin.record(jax.random.key(1), press, seconds)
     touched = skin.touched_in_time(press, seconds)
 
     figure, (shape, under, changed, read) = plt.subplots(1, 4, figsize=(15, 3.6), layout="constrained")
-    x, y = np.meshgrid(*2 * (np.linspace(-0.024, 0.024, 241),))
-    places = np.stack([x, y], axis=-1)
+    # All three where they are on the skin: the tool's own frame is moved and turned there.
+    x, y = np.meshgrid(np.linspace(-0.02, 0.036, 281), np.linspace(-0.018, 0.038, 281))
+    cos, sin = np.cos(angle), np.sin(angle)
+    places = (np.stack([x, y], axis=-1) - position) @ np.array([[cos, -sin], [sin, cos]])
     pressure = skin.material.support.pressure(tool, load.max()).at(places)
-    extent = (-24, 24, -24, 24)
+    extent = (-20, 36, -18, 38)
     drawn = shape.imshow(1e3 * tool.gap(places), origin="lower", extent=extent, cmap="viridis_r")
     figure.colorbar(drawn, ax=shape, label="mm above its lowest point")
     drawn = under.imshow(1e-3 * pressure, origin="lower", extent=extent, cmap="magma")
@@ -39,15 +42,17 @@ def main() -> float:
     np.add.at(change, np.asarray(touched.cells)[held], np.asarray(touched.change)[held])
     drawn = changed.tripcolor(*1e3 * np.asarray(model.mesh.points).T, np.asarray(model.mesh.cells), 100 * change)
     figure.colorbar(drawn, ax=changed, label="% more conductivity")
-    changed.set_aspect("equal")
+    changed.set(aspect="equal", xlim=extent[:2], ylim=extent[2:])
     most = np.argsort(-np.abs(frames[held] - skin.rest()))[:3]
-    read.plot(seconds, 1e3 * (frames - skin.rest())[:, most], linewidth=1)
+    for channel in most:
+        read.plot(seconds, 1e3 * (frames - skin.rest())[:, channel], linewidth=1, label=f"channel {channel}")
+    read.legend(frameon=False, loc=(0.21, 0.06), fontsize=8)
     above = read.twinx()
     above.plot(seconds, load, "k--", linewidth=1)
     above.set_ylabel("load, N (dashed)")
-    read.set(xlabel="s", ylabel="change of three voltages, mV", title="a frame in time")
+    read.set(xlabel="s", ylabel="change of three voltages, mV", title="three channels in time")
     for ax, title in ((shape, "indenter"), (under, "pressure"), (changed, "conductivity")):
-        ax.set(title=title, xlabel="mm")
+        ax.set(title=f"{title}, on the skin", xlabel="mm")
     figure.savefig("press_with_a_load.png")
 
     # As exact as solving the model anew.

@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from benchmarks.harness.case import Case, Options, Result, Table, judged
 from benchmarks.harness.timing import say
 from benchmarks.problems.contact_frames import RADIUS, SINGLE, ContactFrames, weight
+from jeit.mesh import measures
 from jeit.simulate import Disc, Press
 from jeit.touch.contacts import CellFinder, RasterFinder, find_contacts
 
@@ -100,12 +101,18 @@ def _round(frames, images, finder, quick):
 def _areas(frames, images, finder, quick):
     presses = [weight(800, (0.0, 0.0), np.sqrt(1e-6 * area / np.pi)) for area in AREAS]
     read = frames.frames(400, presses)
+    cells = np.asarray(measures(frames.models[1].mesh))
     figures, met = [], []
     for method in METHODS:
         peaks = np.array([one[0].peak if one else 0.0 for one in images[method].found(finder, read)])
-        figures.append(" : ".join(f"{value:.2f}" for value in peaks / peaks[0]))
+        whole = frames.images(images[method].reconstruction, read) @ cells
+        figures.append(f"{_ratios(peaks)}; whole images {_ratios(whole)}")
         met.append(bool((np.abs(peaks / peaks[0] / RATIOS - 1) < 0.2).all()))
     return "800 g on 415.5, 615.8, 1,134.1 mm²: peaks 1 : 1.35 : 2.68", figures, met[0]
+
+
+def _ratios(values: np.ndarray) -> str:
+    return " : ".join(f"{value:.2f}" for value in values / values[0])
 
 
 def _two(frames, images, finder, quick):

@@ -1,6 +1,7 @@
 """Axes: of plane pictures, no ticks but a scale bar and a colour bar; of graphs, no more lines than needed."""
 
 import math
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -79,12 +80,12 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
     ax.text(x, y, f"{millimetres:g} mm", transform=below, ha="left", va="top", color=INK, fontsize=9)
 
 
-def draw_colour_bar(ax: Axes, drawn: ScalarMappable, label: str, *, signed: bool = False) -> None:
-    """A slim colour bar at the right, its ticks signed if the quantity is a difference."""
-    figure = ax.figure
-    bar = figure.colorbar(
-        drawn, ax=ax, shrink=0.72, aspect=28, pad=0.02, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10])
-    )
+def draw_colour_bar(
+    ax: Axes, drawn: ScalarMappable, label: str, *, signed: bool = False, place: Axes | None = None
+) -> None:
+    """A slim colour bar at the right, or on the axes `place`; its ticks signed if the quantity is a difference."""
+    where: dict[str, Any] = {"ax": ax, "shrink": 0.72, "aspect": 28, "pad": 0.02} if place is None else {"cax": place}
+    bar = ax.figure.colorbar(drawn, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **where)
     if signed:
         bar.ax.yaxis.set_major_formatter(
             lambda value, _: "0" if abs(value) < 1e-12 else f"{value:+g}".replace("-", "−")

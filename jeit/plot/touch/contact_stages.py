@@ -27,7 +27,9 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     strongest = factor * largest(stages.region) or 1.0
     keywords = {"cmap": "RdBu_r", "vmin": -strongest, "vmax": strongest}
     region = _drawn(axes[0], factor * stages.region, stages, keywords)
-    draw_colour_bar(axes[0], region, f"Change ({with_prefix})", signed=True)
+    # No taller than its image, however tall the axes are that six images share.
+    bar = axes[0].inset_axes((1.02, 0.1, 0.035, 0.8))
+    draw_colour_bar(axes[0], region, f"Change ({with_prefix})", signed=True, place=bar)
     black = {"cmap": "gray", "vmin": 0, "vmax": 255}
     greys = (stages.grey, 255.0 * stages.threshold, 255.0 * stages.opened, stages.grey)
     for ax, pixels in zip(axes[1:5], greys, strict=True):
@@ -40,7 +42,7 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     for ax, title in zip(axes, _TITLES, strict=True):
         bare(ax, stages.extent, numbered=False)
         ax.set_title(title, fontsize=10)
-    draw_scale_bar(axes[5], stages.extent)
+        draw_scale_bar(ax, stages.extent)
     return axes
 
 

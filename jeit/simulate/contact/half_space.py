@@ -8,6 +8,7 @@ is seen.
 """
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from jeit.arguments import is_number, told
 from jeit.simulate.contact.foundation import check_modulus
@@ -23,6 +24,9 @@ from jeit.simulate.contact.pressure import (
 
 # Pixels along a side of the raster that finds the contact.
 _COARSE = 24
+# Of a free contact's pressure: with less on the skin, the rest of it says nothing of the pressure there; and what the
+# points have to carry of it not to be asked.
+_LEAST_SHARE, _DOUBTED = 0.2, 0.5
 # Of the load, that a step moves when it is the last; and steps.
 _TOLERANCE, _MOST_STEPS = 1e-8, 2000
 
@@ -71,9 +75,13 @@ class HalfSpace(AbstractSupport):
         return PressureRaster(float(load), approach, reach, values, pixel)
 
     def spread(self, indenter: AbstractIndenter, loads, points, areas):
-        """Each load's own pressure at these points, scaled to carry it."""
-        pressures = np.stack([self.pressure(indenter, load).at(own) for load, own in zip(loads, points, strict=True)])
+        """Each load's own pressure at these points, scaled to carry it: over an edge, what is cut off is made up for by
+        what is left. Raises `ValueError` also where less than a fifth is left."""
+        free = [self.pressure(indenter, load) for load in loads]
+        pressures = np.stack([one.at(own) for one, own in zip(free, points, strict=True)])
         carried = np.sum(pressures * areas, axis=1)
+        for number in np.flatnonzero((carried > 0) & (carried < _DOUBTED * np.asarray(loads))):
+            _check_on_skin(free[number], points[number], areas[number])
         return pressures * np.where(carried > 0, loads / np.where(carried > 0, carried, 1.0), 0.0)[:, None]
 
     def _balanced(self, indenter: AbstractIndenter, load: float, window, number: int):
@@ -82,6 +90,20 @@ class HalfSpace(AbstractSupport):
         if not np.isfinite(gap).any():
             return np.zeros_like(gap), 0.0
         return rigid_contact(gap, sinking(number, pixel, self.plane_modulus), load / pixel.prod())
+
+
+def _check_on_skin(pressure: PressureRaster, points, areas) -> None:
+    """Raise `ValueError` where less than a fifth of a pressure lies on the skin, of which there are these points."""
+    there = areas > 0
+    places, pixel = raster(pressure.pixel * len(pressure.values) / 2, len(pressure.values))
+    distance, nearest = KDTree(points[there]).query(places[pressure.values > 0])
+    forces = pressure.values[pressure.values > 0] * pixel.prod()
+    share = forces[distance < np.sqrt(areas[there][nearest])].sum() / pressure.load
+    if share < _LEAST_SHARE:
+        raise ValueError(
+            f"position: of {pressure.load:g} N on a half-space, {100 * share:.0f} % of its pressure would lie on the "
+            f"skin, less than {100 * _LEAST_SHARE:.0f} %; press farther from the edge, or take a Foundation."
+        )
 
 
 def sinking(number: int, pixel, plane_modulus: float):

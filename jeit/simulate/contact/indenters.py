@@ -9,6 +9,7 @@ from scipy.ndimage import map_coordinates
 
 from jeit.arguments import check_kind, check_metres, real_array
 from jeit.design.skin.indentation import AbstractIndentation, Hemisphere
+from jeit.mesh.outline.domain import check_length
 from jeit_solvers.engines import host
 
 
@@ -33,7 +34,7 @@ class Disc(AbstractIndenter):
 
     def __init__(self, diameter: float):
         """Raises `ValueError` for a diameter that is not positive."""
-        check_metres("diameter", diameter)
+        _check_size("diameter", diameter)
         self.diameter = float(diameter)
 
     def gap(self, points):
@@ -54,8 +55,8 @@ class Ring(AbstractIndenter):
 
     def __init__(self, outer_diameter: float, inner_diameter: float):
         """Raises `ValueError` for diameters that are not positive, or a hole that leaves nothing."""
-        check_metres("outer_diameter", outer_diameter)
-        check_metres("inner_diameter", inner_diameter, outer_diameter, "the outer diameter")
+        _check_size("outer_diameter", outer_diameter)
+        _check_size("inner_diameter", inner_diameter, outer_diameter, "the outer diameter")
         if inner_diameter == outer_diameter:
             raise ValueError(
                 f"inner_diameter is the outer one, {1e3 * outer_diameter:g} mm: nothing is left; give less."
@@ -81,8 +82,8 @@ class Bar(AbstractIndenter):
 
     def __init__(self, length: float, width: float):
         """Raises `ValueError` for sides that are not positive."""
-        check_metres("length", length)
-        check_metres("width", width)
+        _check_size("length", length)
+        _check_size("width", width)
         self.length, self.width = float(length), float(width)
 
     def gap(self, points):
@@ -104,9 +105,9 @@ class Prism(AbstractIndenter):
 
     def __init__(self, length: float, width: float, height: float):
         """Raises `ValueError` for sides that are not positive."""
-        check_metres("length", length)
-        check_metres("width", width)
-        check_metres("height", height)
+        _check_size("length", length)
+        _check_size("width", width)
+        _check_size("height", height)
         self.length, self.width, self.height = float(length), float(width), float(height)
 
     def gap(self, points):
@@ -189,6 +190,12 @@ class DepthMap(AbstractIndenter):
 def check_indenter(name: str, given) -> None:
     """Raise `ValueError`, about the argument `name`, for what is no indenter."""
     check_kind(name, given, AbstractIndenter, "an indenter, such as Disc(0.02) or ball(0.015)")
+
+
+def _check_size(name: str, value, most: float = np.inf, limit: str = "") -> None:
+    """Raise `ValueError` as `check_metres` does, and warn of a length that looks like millimetres."""
+    check_metres(name, value, most, limit)
+    check_length(name, value)
 
 
 def _distance(points):

@@ -81,14 +81,16 @@ def touches_of(presses) -> list[tuple[Press, ...]]:
 
 
 def motions_of(motions, frames: int) -> list[MovingPress]:
-    """One motion, or those of a list. Raises `ValueError` for none, for what is none, and those of another number of
-    frames."""
+    """One motion, or those of a list, which may have none: nothing touches. Raises `ValueError` for what is none, those
+    of another number of frames, and motions without any load."""
     motions = [motions] if isinstance(motions, MovingPress) else motions
-    check_kind("motions", motions, (list, tuple), "a MovingPress, or a list of those that are there at once")
+    check_kind(
+        "motions", motions, (list, tuple), "a MovingPress, or a list of those that are there at once, [] for none"
+    )
     for number, motion in enumerate(motions):
         check_kind(f"motions[{number}]", motion, MovingPress, "a MovingPress")
         if len(motion.load) != frames:
             raise ValueError(f"motions[{number}] has {len(motion.load)} frames, and seconds {frames} times.")
-    if not any(motion.load.any() for motion in motions):
-        raise ValueError("motions: no press has any load; give some, in newtons.")
+    if motions and not any(motion.load.any() for motion in motions):
+        raise ValueError("motions: no press has any load; give some, in newtons, or [] for an untouched skin.")
     return list(motions)

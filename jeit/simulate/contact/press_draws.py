@@ -72,6 +72,11 @@ class PressDraws(eqx.Module):
         ends = np.cumsum(counts)
         return [tuple(presses[end - count : end]) for end, count in zip(ends, counts, strict=True)]
 
+    def innermost(self) -> np.ndarray:
+        """Of a thousand places (x, y), metres, on the skin, that which is farthest from its edge."""
+        places = self._anywhere(np.random.default_rng(0), 1000)
+        return places[np.asarray(self.outline.signed_distance(places)).argmax()]
+
     def _anywhere(self, random: np.random.Generator, number: int) -> np.ndarray:
         low_x, high_x, low_y, high_y = map(float, self.outline.extent)
         return random.uniform((low_x, low_y), (high_x, high_y), (number, 2))

@@ -17,6 +17,7 @@ from jeit.design.study.cluster import over_cluster
 from jeit.design.study.contents import Contents
 from jeit.design.study.progress import Progress, Teller
 from jeit.design.study.store import Store, require
+from jeit.simulate.contact.press import Press
 from jeit.simulate.contact.press_draws import PressDraws
 from jeit.simulate.contact.pressed_skin import PressedSkin, check_seconds
 
@@ -49,7 +50,8 @@ class PressSet:
         elapsed: float = 0.0,
         chunk: int = 1000,
     ):
-        """Raises `ValueError` for what is no skin, draws, seed or time, and numbers below 1."""
+        """Raises `ValueError` for what is no skin, draws, seed or time, numbers below 1, and greatest loads that the
+        skin does not carry, each indenter in the middle of it; what hangs over its edge goes deeper."""
         check_kind("skin", skin, PressedSkin, "a PressedSkin")
         check_kind("draws", draws, PressDraws, "PressDraws, such as PressDraws([ball(0.015)], Disk(0.05), (0.1, 10.0))")
         for name, given in (("number", number), ("chunk", chunk)):
@@ -61,6 +63,8 @@ class PressSet:
         check_seconds("elapsed", elapsed)
         self.skin, self.draws, self.number, self.seed = skin, draws, number, seed
         self.held, self.elapsed, self.chunk = held, elapsed, chunk
+        middle = draws.innermost()
+        skin.touched([Press(indenter, draws.load[1], middle) for indenter in draws.indenters])
 
     @property
     def chunks(self) -> list[range]:

@@ -82,7 +82,8 @@ class PressedSkin(eqx.Module):
         return _touched(places, pressed.cells, change, self.model.mesh.num_cells)
 
     def record(self, key: Array, motions, seconds: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T M"]:
-        """Voltages (T, M) at times `seconds` (T,) of a skin under moving presses, a `MovingPress` or several at once.
+        """Voltages (T, M) at times `seconds` (T,) of a skin under moving presses, a `MovingPress` or several at once,
+        or `[]`: nothing touches it.
 
         The skin has had no load before the first frame, and drifts from time 0. Raises `ValueError` for times that are
         negative or fall, motions of other lengths, and as `frames` does.
@@ -101,7 +102,7 @@ class PressedSkin(eqx.Module):
         touches = [tuple(press for press in some if press is not None) for some in found]
         pressed = pressed_cells(Samples.of(self.model.mesh), self.material.support, touches)
         there = [own.any(axis=-1) for own in pressed.pressure]
-        cells = np.unique(pressed.cells[np.array(there)])
+        cells = np.unique(pressed.cells[np.array(there)]) if motions else np.zeros(1, int)
         place = np.searchsorted(cells, pressed.cells)
         shape = len(cells), pressed.pressure.shape[-1]
         strain, before = unstrained(self.material, cells.size * shape[1]), seconds[0]

@@ -4,14 +4,18 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
+from scipy import sparse
 
 from jeit.arguments import check_kind, counted, real_array
 from jeit.inverse.linear.one_step import LinearReconstruction
 
 # Fewer frames do not say how far the next one may stray.
 _LEAST_FRAMES = 10
-# Of normal noise: the standard deviation over the median of the absolute value.
-_NORMAL = 1.4826
+# Of normal noise: the standard deviation over the median of the absolute value; deviations that a cell may lie off, and
+# the standard deviation over that of what lies within them.
+_NORMAL, _OFF, _WITHIN = 1.4826, 3.0, 1.0136
+# Rounds of clipping, at most.
+_ROUNDS = 20
 
 
 class ImageNoise(eqx.Module):
@@ -72,8 +76,8 @@ class ImageNoise(eqx.Module):
 
     @classmethod
     def of_image(cls, image: Float[np.ndarray, " m"]) -> "ImageNoise":
-        """From an image (m,) alone, contacts in it or not: 1.48 times the median distance from its median, for all
-        cells alike.
+        """From an image (m,) alone, contacts in it or not: the standard deviation, for all cells alike, once cells are
+        left out that lie more than three from the median, again and again (sigma clipping).
 
         What a contact leaves all over an image, and ringing, count as noise, so that weak contacts beside strong ones
         go unseen; and cells that stray further than most are taken for contacts. Raises `ValueError` for an image
@@ -82,8 +86,7 @@ class ImageNoise(eqx.Module):
         values = np.asarray(image)
         if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
             raise ValueError("image must be real and finite, one value a cell (m,).")
-        spread = _NORMAL * float(np.median(np.abs(values - np.median(values))))
-        return cls(np.full(values.shape, spread))
+        return cls(np.full(values.shape, _clipped_deviation(values)))
 
     @classmethod
     def _of_factor(cls, factor: np.ndarray) -> "ImageNoise":
@@ -95,3 +98,23 @@ class ImageNoise(eqx.Module):
         if self.factor is None:
             return float(np.linalg.norm(self.deviation @ np.abs(slope)))
         return float(np.linalg.norm(self.factor @ slope))
+
+    def smoothed(self, smoothing: sparse.csr_array) -> Float[np.ndarray, " m"]:
+        """Standard deviation (m,) of the image once smoothed by a matrix (m, m), which is the most that it can be where
+        it is not known how cells stray together."""
+        if self.factor is None:
+            return smoothing @ self.deviation
+        return np.sqrt(((smoothing @ self.factor.T) ** 2).sum(axis=1))
+
+
+def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
+    """Standard deviation of those values that lie within three of the median, begun with the median distance."""
+    kept = values
+    for _ in range(_ROUNDS):
+        middle = np.median(kept)
+        spread = _NORMAL * np.median(np.abs(kept - middle))
+        within = values[np.abs(values - middle) <= _OFF * spread]
+        if len(within) == len(kept):
+            break
+        kept = within
+    return float(_WITHIN * kept.std())

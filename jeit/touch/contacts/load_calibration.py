@@ -33,14 +33,16 @@ class LoadCalibration(eqx.Module):
     """How peaks follow loads.
 
     **Fields**: `centre` (2,) and `radius` of the skin, metres; `parameters` (4,): log s, b, c and log F½, with their
-    `covariance` (4, 4); `scatter`, standard deviation of the logarithm of a peak about the curve; of what was
-    calibrated, `loads`, least and greatest, newtons, `farthest` ρ, and `highest`, the greatest share of saturation.
+    `covariance` (4, 4); `sign` of the peaks, 1 or -1; `scatter`, standard deviation of the logarithm of a peak about
+    the curve; of what was calibrated, `loads`, least and greatest, newtons, `farthest` ρ, and `highest`, the greatest
+    share of saturation.
     """
 
     centre: Float[np.ndarray, "2"]
     radius: float
     parameters: Float[np.ndarray, "4"]
     covariance: Float[np.ndarray, "4 4"]
+    sign: int
     scatter: float
     loads: tuple[float, float]
     farthest: float
@@ -95,15 +97,21 @@ class LoadCalibration(eqx.Module):
         covariance = scatter**2 * np.linalg.inv(found.jac.T @ found.jac)
         highest = float((loads / (loads + np.exp(found.x[3]))).max())
         span = float(loads.min()), float(loads.max())
-        return cls(centre, float(radius), found.x, covariance, scatter, span, float(distance.max()), highest)
+        sign = int(np.sign(peaks[0]))
+        return cls(centre, float(radius), found.x, covariance, sign, scatter, span, float(distance.max()), highest)
 
     def load(self, contact: Contact) -> Load:
         """The load of a contact, newtons, and its standard deviation: of the fit, and of the scatter about it.
 
-        Raises `ValueError` for a peak beyond those calibrated, where the curve says nothing of the load, and for a
-        place farther out.
+        Raises `ValueError` for a peak beyond those calibrated, where the curve says nothing of the load, for one of the
+        other sign, and for a place farther out.
         """
         check_kind("contact", contact, Contact, "a Contact, as of find_contacts")
+        if contact.peak * self.sign <= 0:
+            raise ValueError(
+                f"contact: its peak {told(contact.peak)} is not {'positive' if self.sign > 0 else 'negative'}, as "
+                "those calibrated are; it is no load. Give the finder the sign that it had for calibration."
+            )
         distance = float(np.linalg.norm(contact.centroid - self.centre)) / self.radius
         if distance > self.farthest + 0.05:
             raise ValueError(

@@ -12,6 +12,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy import sparse
+from scipy.special import ndtr
 
 from jeit.arguments import is_number, told
 from jeit.image import Raster
@@ -21,8 +22,8 @@ from jeit.touch.contacts.finder import AbstractFinder, check_finder, checked_ima
 from jeit.touch.contacts.image_noise import ImageNoise
 from jeit.touch.contacts.smoothing import gaussian_means
 
-# Standard deviation, in pixels, of the blur under which the slope at an edge is taken: a raster of cells has steps.
-_BLUR = 3.0
+# Pixels across the band, along a contact's edge, in which cells may join it or leave.
+_EDGE = 15
 # Along a side: with more, memory is short, and no image has as many cells.
 _MOST_PIXELS = 4096
 
@@ -114,7 +115,8 @@ class RasterFinder(AbstractFinder):
         # OpenCV takes pixels above the mean less its constant. Beside the skin stands what is near on it: beside black,
         # all of its rim would stand out.
         size = (self.block, self.block)
-        near = opencv.GaussianBlur(grey * 1.0, size, 0) / np.maximum(opencv.GaussianBlur(inside * 1.0, size, 0), 1e-12)
+        weight = np.maximum(opencv.GaussianBlur(inside * 1.0, size, 0), 1e-12)
+        near = opencv.GaussianBlur(grey * 1.0, size, 0) / weight
         threshold = opencv.adaptiveThreshold(
             np.where(inside, grey, near).astype(np.uint8),
             255,
@@ -126,42 +128,60 @@ class RasterFinder(AbstractFinder):
         ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (self.opening, self.opening))
         opened = opencv.morphologyEx(threshold, opencv.MORPH_OPEN, ellipse)
         contours, _ = opencv.findContours(opened, opencv.RETR_EXTERNAL, opencv.CHAIN_APPROX_NONE)
-        steepness = _steepness(opencv, np.where(inside, region, 0.0), self._pixel())
-        place = self.raster.pixel_centres()
-        contacts = [self._contact(opencv, region, place, steepness, contour[:, 0], noise) for contour in contours]
+        stray = self._stray(cell[inside], (grey - near - self.constant)[inside] * highest / 255, noise)
+        contacts = [
+            self._contact(opencv, region, contour[:, 0], stray, weight, clear > 0, noise) for contour in contours
+        ]
         kept = sorted((one for one in contacts if one is not None), key=lambda one: -one.peak)
         return RasterStages(region, grey, threshold > 0, opened > 0, kept, self.raster.extent)
 
-    def _contact(self, opencv, region, place, steepness, contour: np.ndarray, noise: ImageNoise) -> Contact | None:
-        """What a contour (k, 2) of columns and rows encloses."""
+    def _contact(
+        self, opencv, region, contour: np.ndarray, stray: tuple, weight, clear, noise: ImageNoise
+    ) -> Contact | None:
+        """What a contour (k, 2) of columns and rows encloses. `stray`: see `_stray`; `weight` (rows, columns) of the
+        skin in the means that pixels stand out from, of those that are `clear` of noise."""
         filled = np.zeros(region.shape, np.uint8)
         opencv.drawContours(filled, [contour[:, None]], -1, 1, opencv.FILLED)
         within = (filled > 0) & np.isfinite(region)
         if not within.any():
             return None
+        place = self.raster.pixel_centres()
         centroid, area = place[within].mean(axis=0), float(self.raster.pixel_area * within.sum())
+        (together, alone), size = stray, (self.block, self.block)
+        # Only at the edge do cells join and leave: what is inside a contour counts whatever its grey level.
+        ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (_EDGE, _EDGE))
+        edge = (opencv.dilate(filled, ellipse) > opencv.erode(filled, ellipse)) & np.isfinite(region)
+        cell = np.asarray(self.raster.cell)
+        lever = np.where(edge[..., None], (place - centroid) * self.raster.pixel_area / area, 0.0)
+        follows = np.where(edge, together[cell], 0.0)[..., None] * lever
+        # The threshold moves too: with the mean of what is near.
+        slope = self._on_cells(follows - opencv.GaussianBlur(follows / weight[..., None], size, 0) * clear[..., None])
+        moved = noise.distance(self.smoothing.T @ slope), np.linalg.norm(alone[:, None] * self._on_cells(lever))
         column, row = contour.T
-        edge = place[row, column]
-        # A change δv moves the edge by δv / |∇v|, and with it the centroid by ∮ (x − c) δv / |∇v| ds / area.
-        length = np.linalg.norm(np.roll(edge, -1, axis=0) - np.roll(edge, 1, axis=0), axis=1) / 2
-        share = (length / (steepness[row, column] * area))[:, None] * (edge - centroid)
-        cell = np.asarray(self.raster.cell)[row, column]
-        slope = np.zeros((self.num_cells, 2))
-        np.add.at(slope, cell[cell >= 0], share[cell >= 0])
         change = region[within]
         integral = float(self.raster.pixel_area * change.sum())
-        return Contact(centroid, area, float(change.max()), integral, edge, noise.distance(self.smoothing.T @ slope))
+        return Contact(centroid, area, float(change.max()), integral, place[row, column], float(np.hypot(*moved)))
 
-    def _pixel(self) -> float:
-        x_min, x_max = self.raster.extent[:2]
-        return (x_max - x_min) / self.raster.cell.shape[1]
+    def _on_cells(self, values: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "m 2"]:
+        """Sums over each cell's pixels."""
+        cell = np.asarray(self.raster.cell)
+        sums = np.zeros((self.num_cells, 2))
+        np.add.at(sums, cell[cell >= 0], values[cell >= 0])
+        return sums
 
+    def _stray(self, cell: np.ndarray, above: np.ndarray, noise: ImageNoise) -> tuple[np.ndarray, np.ndarray]:
+        """How far the membership of every cell strays: by its smoothed value (m,), and besides (m,).
 
-def _steepness(opencv: Any, region: np.ndarray, pixel: float) -> np.ndarray:
-    """|∇v| on every pixel, over metres, and nowhere less than a thousandth of the greatest."""
-    smooth = opencv.GaussianBlur(region, (0, 0), _BLUR)
-    steep = np.hypot(*np.gradient(smooth, pixel))
-    return np.maximum(steep, 1e-3 * steep.max(initial=0.0) + np.finfo(float).tiny)
+        A raster steps by cells: one of mean `above` over the threshold, whose smoothed value strays by σ, is in with
+        probability p = Φ(z), z = above / σ. Its membership follows the value by φ(z) / σ on the whole, and strays about
+        that by √(p (1 − p) − φ(z)²), each cell for itself.
+        """
+        number = np.bincount(cell, minlength=self.num_cells)
+        mean = np.bincount(cell, above, minlength=self.num_cells) / np.maximum(number, 1)
+        deviation = np.maximum(noise.smoothed(self.smoothing), np.finfo(float).tiny)
+        off = mean / deviation
+        chance, density = ndtr(off), np.exp(-(off**2) / 2) / np.sqrt(2 * np.pi)
+        return density / deviation, np.sqrt(np.maximum(chance * (1 - chance) - density**2, 0.0))
 
 
 def import_opencv() -> Any:

@@ -68,16 +68,18 @@ class ContactTracker(eqx.Module):
     """Touches up to now. `tracker.follow(time, contacts)` gives the tracker after the next frame; this one stays.
 
     A frame's contacts go to the touches whose predicted places (place + velocity · time) are nearest, all distances
-    together as small as can be, none more than `reach` metres. What no contact is left for is waited for `gap` seconds.
-    Where it may be hidden in another's contact, as when two fingers cross, it is taken to move on as it did, for four
-    gaps at most.
+    together as small as can be, none more than `reach` metres, for what places stray by, and what a touch as fast as
+    `fastest`, m/s, may have gone since the frame before. What no contact is left for is waited for `gap` seconds from
+    the first frame without it. Where it may be hidden in another's contact, as when two fingers cross, it is taken to
+    move on as it did, for four gaps at most.
 
     **Fields**: those; `least` frames of a touch, fewer are not told of; `time` of the last frame, -inf before the
     first; `open` and `closed` touches; `number`, so many were begun.
     """
 
     gap: float = 0.15
-    reach: float = 0.012
+    reach: float = 0.015
+    fastest: float = 1.0
     least: int = 2
     time: float = -np.inf
     open: tuple[_Followed, ...] = ()
@@ -85,8 +87,11 @@ class ContactTracker(eqx.Module):
     number: int = 0
 
     def __check_init__(self):
-        """Raises `ValueError` for a gap and a reach that are not positive, and numbers of frames that are none."""
+        """Raises `ValueError` for a gap and a reach that are not positive, a negative speed, and numbers of frames that
+        are none."""
         check_metres("reach", self.reach)
+        if not (is_number(self.fastest) and self.fastest >= 0):
+            raise ValueError(f"fastest must be zero or more, in metres a second; it is {told(self.fastest)}.")
         if not (is_number(self.gap) and self.gap > 0):
             raise ValueError(f"gap must be positive, in seconds; it is {told(self.gap)}.")
         if not (isinstance(self.least, int) and self.least >= 1):
@@ -99,15 +104,19 @@ class ContactTracker(eqx.Module):
         check_kind("contacts", contacts, (list, tuple, np.ndarray), "a list of them, those of one frame")
         for number, contact in enumerate(contacts):
             check_kind(f"contacts[{number}]", contact, Contact, "a Contact, as of find_contacts")
-        waited = [time - one.seen[-1][0] > self.gap * (_HIDDEN if one.hidden else 1) for one in self.open]
+        passed = time - self.time
+        # A touch was gone a frame after it was seen at the earliest: a slow stream's single frame is bridged too.
+        spare = min(passed, self.gap)
+        waited = [time - one.seen[-1][0] > self.gap * (_HIDDEN if one.hidden else 1) + spare for one in self.open]
         late = [one for one, over in zip(self.open, waited, strict=True) if over]
         going = [one for one, over in zip(self.open, waited, strict=True) if not over]
         expected = np.array([one.at(time) for one in going]).reshape(-1, 1, 2)
         places = np.array([one.centroid for one in contacts]).reshape(1, -1, 2)
         distance = np.linalg.norm(expected - places, axis=-1)
-        # Beyond reach any two are as good as none: no pair within it is given up for another's sake.
-        rows, columns = linear_sum_assignment(np.where(distance <= self.reach, distance, 1e3 * self.reach))
-        pairs = {int(row): int(one) for row, one in zip(rows, columns, strict=True) if distance[row, one] <= self.reach}
+        most = self.reach + self.fastest * passed if going else 0.0
+        # Farther apart any two are as good as none: no pair within it is given up for another's sake.
+        rows, columns = linear_sum_assignment(np.where(distance <= most, distance, 1e3 * most))
+        pairs = {int(row): int(one) for row, one in zip(rows, columns, strict=True) if distance[row, one] <= most}
         wide = self.reach + np.sqrt(np.array([one.area for one in contacts]) / np.pi)
         lost = [row for row in range(len(going)) if row not in pairs]
         hidden = {row for row in lost for one in pairs.values() if distance[row, one] <= wide[one]}
@@ -118,12 +127,12 @@ class ContactTracker(eqx.Module):
             for row, one in enumerate(going)
         ]
         new = [contacts[one] for one in range(len(contacts)) if one not in pairs.values()]
-        begun = [
+        first = [
             _Followed(self.number + k, time, one.centroid, np.zeros(2), ((time, one),)) for k, one in enumerate(new)
         ]
         closed = self.closed + self._told_of(late)
-        values = (time, (*followed, *begun), closed, self.number + len(new))
-        return ContactTracker(self.gap, self.reach, self.least, *values)
+        values = (time, (*followed, *first), closed, self.number + len(new))
+        return ContactTracker(self.gap, self.reach, self.fastest, self.least, *values)
 
     @property
     def touches(self) -> list[TouchPath]:

@@ -60,6 +60,15 @@ def test_a_depth_map_is_linear_between_its_pixels():
 
 
 @pytest.mark.parametrize(
+    "make",
+    [lambda: Disc(15), lambda: Ring(15, 10), lambda: Bar(15, 0.01), lambda: Prism(0.01, 15, 0.01), lambda: ball(15)],
+)
+def test_sizes_in_millimetres_are_noticed(make):
+    with pytest.warns(UserWarning, match="If the lengths are millimetres"):
+        make()
+
+
+@pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: Disc(0.0), "diameter must be a positive length"),

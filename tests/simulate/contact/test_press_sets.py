@@ -162,6 +162,7 @@ def test_workers_simulate_the_same(presses, whole, tmp_path):
         (lambda path: PressDraws([ball(0.01)], Disk(0.05), (0.1, 1.0), margin=-0.01), "margin must be metres"),
         (lambda path: small_set().draws.draw(jax.random.key(0), 2.5), "number must be a whole number of touches"),
         (lambda path: PressSet(None, None, 1), "skin must be"),
+        (lambda path: PressSet(small_set().skin, PressDraws([ball(0.01)], Disk(0.05), (0.1, 1e4)), 1), "into a layer"),
         (lambda path: PressSet(small_set().skin, None, 1), "draws must be"),
         (lambda path: PressSet(small_set().skin, small_set().draws, 0), "number must be"),
         (lambda path: small_set(seed=1.5), "seed must be a whole number"),

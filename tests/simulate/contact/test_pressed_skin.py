@@ -222,6 +222,24 @@ def test_walking_contacts_are_read_by_their_own_channels(model):
     )
 
 
+def test_an_untouched_skin_drifts_in_time(model):
+    skin, seconds = PressedSkin(KEY, model, material("velostat")), np.arange(20) * 5.0
+    film = skin.record(KEY, [], seconds)
+    assert film.shape == (20, model.protocol.num_measurements)
+    gone = np.linalg.norm(film - skin.rest(), axis=1)
+    assert gone[-5:].mean() > 3 * gone[0]  # drift, not noise alone
+    light = skin.record(KEY, MovingPress(Disc(0.01), np.full(20, 1e-9)), seconds)
+    np.testing.assert_allclose(film, light, rtol=1e-6, atol=1e-9)
+
+
+def test_a_half_space_is_not_pressed_beside_its_edge(model):
+    """Its free contact is cut off at the edge: what is left of it would be scaled up to carry all of the load."""
+    skin = PressedSkin(KEY, model, dataclasses.replace(STILL, support=HalfSpace(3e5, pixels=24)))
+    with pytest.raises(ValueError, match="of its pressure would lie on the skin"):
+        skin.touched([Press(ball(0.02), 2.0, (0.052, 0.0))])
+    skin.touched([Press(ball(0.02), 2.0, (0.0495, 0.0)), Press(ball(0.001), 1e-3, (0.03, 0.0)), Press(Disc(1e-9), 1.0)])
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

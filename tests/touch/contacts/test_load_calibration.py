@@ -87,6 +87,15 @@ def test_a_skin_is_calibrated_over_its_radius(skin):
     np.testing.assert_allclose([one.force for one in found], others, rtol=0.15)
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_peak_of_the_other_sign_is_no_load(sign):
+    contacts, loads = drawn(np.random.default_rng(0), 20, 0.01, sign)
+    calibration = LoadCalibration.fit(contacts, loads, radius=RADIUS)
+    assert calibration.load(contact(2.0, 0.0, sign=sign)).force == pytest.approx(2.0, rel=0.1)
+    with pytest.raises(ValueError, match=r"is not (positive|negative), as those"):
+        calibration.load(contact(2.0, 0.0, sign=-sign))
+
+
 def test_bad_input():
     contacts, loads = drawn(np.random.default_rng(4), 20, 0.05)
     with pytest.raises(ValueError, match="8 or more"):

@@ -28,8 +28,12 @@ def test_every_stage_has_its_axes(skin):
     assert titles == ["region of interest", "grey", "adaptive threshold", "opened", "contours", "centroids"]
     shown = np.ma.filled(axes[2].images[0].get_array(), 0)
     np.testing.assert_array_equal(shown > 0, stages.threshold)
+    assert all(any(text.get_text() == "20 mm" for text in ax.texts) for ax in axes)
+    (bar,) = axes[0].child_axes
+    axes[0].figure.draw_without_rendering()
+    assert bar.get_window_extent().height < axes[0].get_window_extent().height
     assert len([line for line in axes[4].lines if len(line.get_xdata()) > 10]) == 2
-    assert "µS)" in axes[0].figure.axes[-1].get_ylabel() or "nS)" in axes[0].figure.axes[-1].get_ylabel()
+    assert "µS)" in bar.get_ylabel() or "nS)" in bar.get_ylabel()
 
 
 def test_things_of_another_kind(skin):

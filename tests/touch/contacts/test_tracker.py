@@ -61,8 +61,33 @@ def test_a_touch_of_one_frame_is_not_told_of():
 
 
 def test_far_contacts_are_another_touch():
-    frames = [[contact((0.0, 0.0))]] * 10 + [[contact((0.03, 0.0))]] * 10
+    frames = [[contact((0.0, 0.0))]] * 10 + [[contact((0.04, 0.0))]] * 10
     assert len(track_contacts(TIMES[:20], frames)) == 2
+
+
+@pytest.mark.parametrize(("rate", "speed", "side"), [(30, 0.4, 0.07), (30, 0.6, 0.8), (10, 0.1, 0.1), (200, 1.0, 0.05)])
+def test_a_stroke_is_one_touch_of_its_length(rate, speed, side):
+    """With a reach of 12 mm at any rate, the first came back as 17 mm of it and the second not at all."""
+    along = np.arange(0, side, speed / rate)
+    stray = np.random.default_rng(0).normal(0, 5e-4, (len(along), 2))
+    frames = [[contact(place)] for place in stray + np.stack([along, 0 * along], axis=-1)]
+    frames[len(along) // 2] = []  # missed
+    (path,) = track_contacts(np.arange(len(along)) / rate, frames)
+    assert path.position[-1, 0] - path.position[0, 0] == pytest.approx(along[-1], abs=3e-3)
+
+
+@pytest.mark.parametrize("rate", [10, 30, 200])
+def test_two_fingers_side_by_side_stay_two(rate):
+    """Three centimetres apart at 0.3 m/s, one behind the other: farther in a frame, at 10 frames/s, than apart."""
+    along = np.arange(0, 0.3, 0.3 / rate)
+    frames = [[contact((x, 0.0), 1.0), contact((x + 0.03, 0.0), 2.0)] for x in along]
+    touches = track_contacts(np.arange(len(along)) / rate, frames)
+    assert [set(path.peak) for path in touches] == [{1.0}, {2.0}]
+
+
+def test_missed_frames_of_a_slow_stream_are_bridged():
+    frames = [[] if k == 5 else [contact((0.01 * k, 0.0))] for k in range(10)]
+    assert len(track_contacts(np.arange(10) / 10, frames)) == 1
 
 
 def test_a_tracker_stays_as_it_was():
@@ -92,6 +117,6 @@ def test_bad_input():
         track_contacts(TIMES[:1], [[]], ContactTracker)  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="contacts must be a list"):
         ContactTracker().follow(0.0, contact((0.0, 0.0)))  # pyright: ignore[reportArgumentType]
-    for options in ({"gap": 0.0}, {"reach": -1.0}, {"least": 0}):
+    for options in ({"gap": 0.0}, {"reach": -1.0}, {"fastest": -1.0}, {"least": 0}):
         with pytest.raises(ValueError, match=next(iter(options))):
             ContactTracker(**options)
