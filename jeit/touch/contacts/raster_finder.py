@@ -155,7 +155,8 @@ class RasterFinder(AbstractFinder):
         lever = np.where(edge[..., None], (place - centroid) * self.raster.pixel_area / area, 0.0)
         follows = np.where(edge, together[cell], 0.0)[..., None] * lever
         # The threshold moves too: with the mean of what is near.
-        slope = self._on_cells(follows - opencv.GaussianBlur(follows / weight[..., None], size, 0) * clear[..., None])
+        spread = opencv.GaussianBlur((follows / weight[..., None]).astype(np.float32), size, 0)
+        slope = self._on_cells(follows - spread * clear[..., None])
         moved = noise.distance(self.smoothing.T @ slope), np.linalg.norm(alone[:, None] * self._on_cells(lever))
         column, row = contour.T
         change = region[within]
@@ -165,9 +166,8 @@ class RasterFinder(AbstractFinder):
     def _on_cells(self, values: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "m 2"]:
         """Sums over each cell's pixels."""
         cell = np.asarray(self.raster.cell)
-        sums = np.zeros((self.num_cells, 2))
-        np.add.at(sums, cell[cell >= 0], values[cell >= 0])
-        return sums
+        own, weights = cell[cell >= 0], values[cell >= 0].T
+        return np.stack([np.bincount(own, one, minlength=self.num_cells) for one in weights], axis=-1)
 
     def _stray(self, cell: np.ndarray, above: np.ndarray, noise: ImageNoise) -> tuple[np.ndarray, np.ndarray]:
         """How far the membership of every cell strays: by its smoothed value (m,), and besides (m,).

@@ -38,8 +38,9 @@ class Channels:
 
     For those: `scale` (m,) of changes, `range` (2, m) in scales beyond which none reads that is alive; `patterns`
     (m, k), `spread` (k,) of scores, `noise` (m,) in scales; `farthest` (m,): residuals that are still those of a
-    channel alive; `directions` (m, r) of the covariance, and the `weight` (r,) of each beside a diagonal; `usual`:
-    novelty of all but a hundredth of the presses; `neighbourhood`: how near presses are to each other.
+    channel alive; `directions` (m, r) of the covariance, the `weight` (r,) of each beside a diagonal, and the variance
+    (m,) that channels have about all others, `unforetold`; `usual`: novelty of all but a hundredth of the presses;
+    `neighbourhood`: how near presses are to each other.
     """
 
     used: Bool[np.ndarray, " M"]
@@ -51,6 +52,7 @@ class Channels:
     farthest: Float[np.ndarray, " m"]
     directions: Float[np.ndarray, "m r"]
     weight: Float[np.ndarray, " r"]
+    unforetold: Float[np.ndarray, " m"]
     usual: float
     neighbourhood: Neighbourhood
 
@@ -69,7 +71,7 @@ class Channels:
         scaled = np.where(missing[:, used], 0.0, changes[:, used]) / scale
         there, half = ~missing[:, used], len(scaled) // 2
         # What frames not learnt from leave, which is more than those learnt from do: each half by the other's patterns.
-        left, apart, misses = [], [], np.zeros(len(_DIAGONALS))
+        left, apart, misses = [], [], np.zeros((2, len(_DIAGONALS), int(used.sum())))
         for learnt, other in ((slice(None, half), slice(half, None)), (slice(half, None), slice(None, half))):
             variance, directions = _variances(scaled[learnt])
             misses += _missed(scaled[other], variance, directions)
@@ -81,14 +83,15 @@ class Channels:
         farthest = _BEYOND * np.nanquantile(left, _QUANTILE, axis=0)
         farthest = np.maximum(farthest, max(6.0, float(np.nanquantile(left, 0.99))))
         variance, directions = _variances(scaled)
-        weight = variance / (variance + _DIAGONALS[int(misses.argmin())])
+        best = int(misses[0].sum(axis=1).argmin())
+        weight, unforetold = variance / (variance + _DIAGONALS[best]), misses[1, best] / 2
         patterns, spread, noise = _factors(scaled, variance, directions)
         every, _ = _explain(scaled, there, patterns, spread, noise)
         usual = float(np.quantile(apart, 0.99))
         least, most = np.nanmin(changes[:, used], axis=0) / scale, np.nanmax(changes[:, used], axis=0) / scale
         far = np.stack([least - _SPANS * (most - least), most + _SPANS * (most - least)])
         near = Neighbourhood.learn(every)
-        return cls(used, scale, far, patterns, spread, noise, farthest, directions, weight, usual, near)
+        return cls(used, scale, far, patterns, spread, noise, farthest, directions, weight, unforetold, usual, near)
 
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Changes (n, m) of the channels used, as foretold by the others where one is dead or has no reading; which
@@ -149,6 +152,21 @@ class Channels:
         told = dead @ (alive_readings @ self.directions[alive]).T
         return np.linalg.solve(np.eye(len(dead)) - dead @ self.directions[~alive].T, told).T
 
+    def unsure(self, alive: Bool[np.ndarray, "n m"], number: int) -> Float[np.ndarray, "q n m"]:
+        """By what the readings foretold may be off, of frames with some channels `alive`: the q ≤ `number` greatest
+        independent deviations, in the unit of changes."""
+        found = np.zeros((min(number, int((~alive).sum(axis=1).max(initial=0))), *alive.shape))
+        patterns, kind = np.unique(alive, axis=0, return_inverse=True)
+        for one, pattern in enumerate(patterns):
+            dead, doubt = self.directions[~pattern], np.sqrt(self.unforetold[~pattern])
+            inverse = np.linalg.inv(np.eye(len(dead)) - (dead * self.weight) @ dead.T)
+            variance, vectors = np.linalg.eigh(doubt[:, None] * inverse * doubt)
+            columns = vectors[:, ::-1] * np.sqrt(np.maximum(variance[::-1], 0.0))
+            frames, channels = np.flatnonzero(kind.ravel() == one), np.flatnonzero(~pattern)
+            for way in range(min(len(found), len(channels))):
+                found[np.ix_(np.array([way]), frames, channels)] = columns[:, way] * self.scale[channels]
+        return found
+
     def _explain_all(self, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Scores and residuals of frames (n, m) of which all channels are alive."""
         scores = whole @ self._gain
@@ -184,14 +202,16 @@ def _factors(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.n
     return patterns, np.sqrt(variance[:number]), np.maximum(noise, 1e-6)
 
 
-def _missed(scaled, variance, directions) -> Float[np.ndarray, " D"]:
-    """By how much each channel is missed when it is foretold by the others, of covariances with each diagonal."""
+def _missed(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
+    """Mean squares by which each channel is missed when it is foretold by the others, of covariances with each
+    diagonal; and, second, of what it has about them: the same times what it varies by freely."""
     scores, found = scaled @ directions, []
     for diagonal in _DIAGONALS:
         weight = variance / (variance + diagonal)
-        left = scaled - (scores * weight) @ directions.T
-        found.append(np.mean((left / (1 - np.sum(directions**2 * weight, axis=1))) ** 2))
-    return np.array(found)
+        free = 1 - np.sum(directions**2 * weight, axis=1)
+        square = np.mean((scaled - (scores * weight) @ directions.T) ** 2, axis=0)
+        found.append((square / free**2, square / free))
+    return np.swapaxes(np.array(found), 0, 1)
 
 
 def _explain(whole, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndarray]:

@@ -27,6 +27,8 @@ from jeit.touch.learnt.touches import Touches
 # A frame is unlike any learnt from beyond so many times the novelty of the farthest of them, or with fewer channels.
 _UNLIKE, _FEWEST = 2.0, 0.66
 _AT_ONCE = 256
+# Ways in which readings that are foretold may be off, whose effect is looked at: those that matter most.
+_UNSURE = 4
 # Touched frames in which a channel that is alive does not read the same.
 _MANY = 20
 # A reference is another skin's if it is less like those learnt from than this, or of another size.
@@ -173,10 +175,10 @@ class LearntSkin:
             touching &= label != NO_TOUCH
         shown = (touching & ~unlike)[:, None]
         if self.place is not None:
-            said, std = self.place.predict(whole, reference)
+            said, std = self._numbers(self.place, whole, reference, alive)
             found |= {"position": np.where(shown, said, np.nan), "position_std": np.where(shown, std, np.nan)}
         if self.force is not None:
-            said, std = self.force.predict(whole, reference)
+            said, std = self._numbers(self.force, whole, reference, alive)
             still = ~touching & ~unlike
             pressed = np.where(shown, np.maximum(said, 0.0), np.nan)[:, 0]
             found |= {"force": np.where(still, 0.0, pressed), "force_std": np.where(shown, std, np.nan)[:, 0]}
@@ -185,6 +187,15 @@ class LearntSkin:
             found["touched"] = touched & shown
             found["key_probability"] = np.where(unlike[:, None], np.nan, np.where(touching[:, None], probability, 0.0))
         return found
+
+    def _numbers(self, learnt: LearntNumbers, whole, reference, alive) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers (n, d) told, and their deviations, also by what readings foretold may be off."""
+        said, std = learnt.predict(whole, reference)
+        lacking = np.flatnonzero(~alive.all(axis=1))
+        for moved in self.channels.unsure(alive[lacking], _UNSURE):
+            off = learnt.predict(whole[lacking] + moved, reference[lacking])[0] - said[lacking]
+            std[lacking] = np.hypot(std[lacking], off)
+        return said, std
 
     def _check(self, frames) -> np.ndarray:
         frames = np.asarray(frames)

@@ -54,6 +54,29 @@ def test_a_channel_that_dies_costs_little(quick, reading):
         assert any(f" {channel}" in note for note in told.notes)
 
 
+def few_channels(number, seed):
+    """Changes of eight channels, each of which says what no other does, and places."""
+    rng, centres = np.random.default_rng(seed), np.random.default_rng(3).uniform(-0.06, 0.06, (8, 2))
+    place, force = rng.uniform(-0.05, 0.05, (number, 2)), rng.uniform(0.5, 4.0, number)
+    near = np.exp(-((np.linalg.norm(place[:, None] - centres, axis=2) / 0.035) ** 2))
+    return near * (force / (force + 2))[:, None] + 2e-3 * rng.normal(size=near.shape), place
+
+
+@pytest.mark.parametrize("dead", [[2], [1, 6]])
+def test_deviations_hold_where_channels_are_dead(dead):
+    changes, place = few_channels(300, 0)
+    skin = LearntSkin.fit(Presses.create(changes, positions=place), method="gaussian-process")
+    fresh, right = few_channels(300, 1)
+    sound = skin.predict(fresh)
+    fresh[:, dead] = np.nan
+    told = skin.predict(fresh)
+    assert np.nanmean(off(told, right)) > 2 * np.nanmean(off(sound, right))
+    ratio = (np.abs(told.position - right) / told.position_std)[np.isfinite(told.position).all(axis=1)]
+    assert len(ratio) > 250
+    assert 0.55 < np.mean(ratio < 1) < 0.9
+    assert np.mean(ratio < 1.96) > 0.88
+
+
 def test_a_channel_that_is_stuck_is_done_without(quick):
     """At a value that it might have read: nothing but its constancy tells."""
     frames = FRESH["frames"].copy()
