@@ -192,6 +192,8 @@ class LearntSkin:
         """Numbers (n, d) told, and their deviations, also by what readings foretold may be off."""
         said, std = learnt.predict(whole, reference)
         lacking = np.flatnonzero(~alive.all(axis=1))
+        if not lacking.size:
+            return said, std
         for moved in self.channels.unsure(alive[lacking], _UNSURE):
             off = learnt.predict(whole[lacking] + moved, reference[lacking])[0] - said[lacking]
             std[lacking] = np.hypot(std[lacking], off)
