@@ -13,7 +13,7 @@ import time
 import jax
 import numpy as np
 
-from benchmarks.harness.case import Case, Headline, Options, Result, Table, judged
+from benchmarks.harness.case import Case, Options, Result, Table, judged
 from benchmarks.harness.tables import duration, times
 from benchmarks.harness.timing import say, timed
 from benchmarks.opponents.scipy_touches import PlainTouches
@@ -44,7 +44,7 @@ def run(options: Options) -> Result:
         MIXED: PressDraws(shapes, Disk(RADIUS), LOADS, margin=0.01),
         PAIRS: PressDraws(shapes, Disk(RADIUS), LOADS, margin=0.01, at_once=2),
     }
-    rows, asked, wrong, headline = [], [], [], None
+    rows, asked, wrong = [], [], []
     for name, draws in sets.items():
         touches = draws.draw(KEY, number)
         spent = timed(lambda touches=touches: skin.frames(KEY, touches), rounds)
@@ -57,13 +57,10 @@ def run(options: Options) -> Result:
             asked.append(judged(f"{name}: ≥ 500 touches a second", f"{rate:,.0f} /s", rate >= FAST))
         if name == BALLS:
             asked.append(judged(f"{name}: ≥ 50× one factorisation a touch", f"{ratio:.0f}×", ratio >= FASTER))
-            job = f"exact frames of {number:,} presses, {mesh.num_points:,} nodes"
-            other = f"SciPy: {duration(number * theirs)}"
-            headline = Headline(job, duration(spent.median), other, times(ratio), f"same to {worst:.0e}")
         if not worst < SAME:
             wrong.append(f"{name}: jeit and SciPy differ by {worst:.0e}")
     rows += [_stroke(skin, 16 if options.quick else 500, rounds), _half_space(rounds)]
-    return Result([Table(HEADER, rows)], asked, headline=headline, wrong=wrong)
+    return Result([Table(HEADER, rows)], asked, wrong=wrong)
 
 
 def _plainly(skin: PressedSkin, touches: list, sample: int) -> tuple[float, float]:
