@@ -128,12 +128,13 @@ class Description:
 
         Raises `ValueError` where geometry, electrodes or protocol are not described.
         """
-        said = {"geometry": self.domain, "electrodes": self.electrodes, "protocol": self.protocol(path)}
-        missing = [f"[{section}]" for section, one in said.items() if one is None]
-        if missing or self.domain is None or self.electrodes is None:
-            raise ValueError(f"{self.origin}: a model needs {', '.join(missing)} too; describe it.")
-        mesh = self.domain.mesh(num_points=num_points, refine=self.electrodes.refinement() or None)
-        return ForwardModel(mesh, self.electrodes, said["protocol"])
+        domain, electrodes, protocol = self.domain, self.electrodes, self.protocol(path)
+        if domain is None or electrodes is None or protocol is None:
+            said = {"geometry": domain, "electrodes": electrodes, "protocol": protocol}
+            missing = ", ".join(f"[{section}]" for section, one in said.items() if one is None)
+            raise ValueError(f"{self.origin}: a model needs {missing} too; describe it.")
+        mesh = domain.mesh(num_points=num_points, refine=electrodes.refinement() or None)
+        return ForwardModel(mesh, electrodes, protocol)
 
 
 def load_description(which: str | Path) -> Description:

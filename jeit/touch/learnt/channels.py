@@ -203,8 +203,8 @@ def _factors(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _missed(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
-    """Mean squares by which each channel is missed when it is foretold by the others, of covariances with each
-    diagonal; and, second, of what it has about them: the same times what it varies by freely."""
+    """Mean squares, of covariances with each diagonal: first, of what each channel is missed by when others foretell
+    it; second, of that times its share `free` of the others, the variance that `unsure` takes."""
     scores, found = scaled @ directions, []
     for diagonal in _DIAGONALS:
         weight = variance / (variance + diagonal)

@@ -48,7 +48,7 @@ def over_threads(
 
 
 def over_folds(function: Callable[[int], Any], number: int) -> list[Any]:
-    """`function` of 0 … `number` - 1, side by side, each of them with one thread."""
+    """`function` of 0 … `number` - 1, side by side, each of them with one thread: OpenMP counts each thread's own."""
 
     def alone(fold: int) -> Any:
         with one_thread():

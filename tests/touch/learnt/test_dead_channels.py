@@ -26,6 +26,18 @@ def test_dead_channels_are_found_and_replaced():
     assert novelty.max() < 2
 
 
+def test_healthy_channels_that_were_left_out_beside_a_dead_one_are_taken_back():
+    """A dead channel bends what is foretold of those beside it, until it is left out."""
+    rng, mixed = np.random.default_rng(1), np.random.default_rng(7).normal(size=(5, 12))
+    given, fresh = (rng.normal(size=(number, 5)) @ mixed for number in (400, 200))
+    channels = Channels.learn(given + 0.01 * rng.normal(size=given.shape))
+    dead = rng.integers(0, 12, len(fresh))
+    fresh[np.arange(len(fresh)), dead] += 3 * given.std(axis=0)[dead]
+    _, alive, _ = channels.complete(fresh)
+    assert not alive[np.arange(len(fresh)), dead].any()
+    assert np.count_nonzero(~alive) < 1.05 * len(fresh)
+
+
 def test_readings_that_are_missing_are_foretold():
     channels, fresh = Channels.learn(changes(200, 0)), changes(50, 1)
     holed = np.where(np.random.default_rng(0).random(fresh.shape) < 0.1, np.nan, fresh)
