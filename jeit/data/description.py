@@ -133,7 +133,7 @@ class Description:
             said = {"geometry": domain, "electrodes": electrodes, "protocol": protocol}
             missing = ", ".join(f"[{section}]" for section, one in said.items() if one is None)
             raise ValueError(f"{self.origin}: a model needs {missing} too; describe it.")
-        mesh = domain.mesh(num_points=num_points, refine=electrodes.refinement() or None)
+        mesh = domain.mesh(num_points=num_points, refine=electrodes.refinement(domain) or None)
         return ForwardModel(mesh, electrodes, protocol)
 
 

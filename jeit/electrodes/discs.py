@@ -14,7 +14,7 @@ from jeit.electrodes.electrodes import (
     check_dimension,
 )
 from jeit.electrodes.window import EDGE, nearest_electrodes, smooth_step, triangle_quadrature, window_contact
-from jeit.mesh import Mesh, Refine, measures
+from jeit.mesh import Domain, Mesh, Refine, measures
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated
 
@@ -51,7 +51,7 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position, self.radius, self.contact_impedance = _as_discs(position, 2, radius, contact_impedance)
 
-    def refinement(self) -> tuple[Refine, ...]:
+    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
         """Cells of 0.7 of the smallest radius on them."""
         radius = np.asarray(self.radius)
         return (Refine(np.asarray(self.position), cell_size=0.7 * radius.min(), distance=float(radius.max())),)
@@ -95,7 +95,7 @@ class FaceDiscs(AbstractDiscs):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position, self.radius, self.contact_impedance = _as_discs(position, 3, radius, contact_impedance)
 
-    def refinement(self) -> tuple[Refine, ...]:
+    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
         """None: they are not of a plane mesh."""
         return ()
 

@@ -13,7 +13,7 @@ from jeit.electrodes.electrodes import (
     check_dimension,
 )
 from jeit.electrodes.window import EDGE, smooth_step, triangle_quadrature, window_contact
-from jeit.mesh import Mesh, Refine
+from jeit.mesh import Domain, Mesh, Refine
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated
 
@@ -56,7 +56,7 @@ class FacePatches(AbstractPlacedElectrodes):
             else:
                 pen.dot(place)
 
-    def refinement(self) -> tuple[Refine, ...]:
+    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
         """None: they are not of a plane mesh."""
         return ()
 

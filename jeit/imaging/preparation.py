@@ -156,7 +156,7 @@ def check_measurement(name: str, given: Measurement) -> None:
 
 def imaging_mesh(domain: Domain, electrodes: AbstractElectrodes, num_points: int) -> Mesh:
     """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep."""
-    return domain.mesh(num_points=num_points, refine=electrodes.refinement() or None)
+    return domain.mesh(num_points=num_points, refine=electrodes.refinement(domain) or None)
 
 
 def default_contact(measurement: Measurement) -> str:
