@@ -7,6 +7,7 @@ import numpy as np
 from jeit.arguments import counted
 from jeit.data.measurement import Measurement
 from jeit.data.quality import NoiseEstimate, estimate_noise, impossible_signs, reciprocity_error
+from jeit.inverse import relative_noise
 
 # A quarter of the signs wrong means that half of the voltages are noise (noise is wrong half the time).
 MOST_IMPOSSIBLE_SIGNS = 0.25
@@ -93,7 +94,8 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
 
     - it, or the reference, has an impossible sign in more than a quarter of its voltages
       (`impossible_signs`): half of the voltages or more then lie below the instrument's noise or offset;
-    - the difference breaks reciprocity by more than 0.63, i.e. its noise is over half its signal;
+    - the difference breaks reciprocity by more than 0.63, i.e. its noise is over half its signal, each channel trusted
+      as images trust it (`jeit.inverse.relative_noise`): what is read on driven electrodes is large, and mostly contact;
     - it does not differ from the reference at all;
     - fewer channels than electrodes are usable.
 
@@ -105,6 +107,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
     check_same_setup(measurement, reference)
     mean = reference.mean_frame()
     reference_signs = impossible_signs(mean)
+    trusted = np.asarray(relative_noise(np.abs(np.asarray(mean.voltages)[0]), np.asarray(mean.mask)[0]))
     results = []
     for index in range(measurement.num_frames):
         frame = measurement.frame(index)
@@ -116,7 +119,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
         relative = size / float(np.linalg.norm(np.where(both, np.asarray(mean.filled()), 0)) or np.inf)
         signs = [float(s[0]) for s in (impossible_signs(frame), reference_signs) if s is not None]
         usable = int(both.sum())
-        error = reciprocity_error(change) if usable and size > 0 else None
+        error = reciprocity_error(change, trusted) if usable and size > 0 else None
         wrong = max(signs) if signs else None
         results.append(
             FrameQuality(

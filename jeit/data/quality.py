@@ -32,8 +32,11 @@ class NoiseEstimate:
     method: str
 
 
-def reciprocity_error(measurement: Measurement) -> float | None:
+def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M"] | None = None) -> float | None:
     """Relative departure from reciprocity: ‖T - Tᵀ‖ / ‖T‖ with T the transfer between drives.
+
+    `deviation` (M,): what channels may be off by, relative to each other; T is divided by what that makes of it. All
+    alike unless given.
 
     T_ij is what drive pattern i would read while drive j flows, combined from the measured channels (see
     `jeit.protocol.reciprocity.transfer_between_drives`); it is symmetric for every body, so that what is left is
@@ -41,9 +44,11 @@ def reciprocity_error(measurement: Measurement) -> float | None:
 
     Returns None when the protocol ties no two usable channels together.
     """
-    error, signal, _ = _asymmetry(measurement)
+    error, signal, noise = _asymmetry(measurement, deviation)
     if error.size == 0:
         return None
+    if deviation is not None:
+        error, signal = error / noise, signal / noise
     size = np.linalg.norm(signal)
     return float(np.linalg.norm(error) / size) if size > 0 else 0.0
 
@@ -140,8 +145,11 @@ def _boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
     return np.argsort(along(np.asarray(electrodes.position), np.asarray(domain.loops()[0])), kind="stable")
 
 
-def _asymmetry(measurement: Measurement) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Entries of T - Tᵀ (watts), of T, and what one volt of noise per channel adds to the first."""
+def _asymmetry(
+    measurement: Measurement, deviation: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Entries of T - Tᵀ (watts), of T, and what noise of such `deviation`, or of one volt per channel, adds to the
+    first."""
     protocol = measurement.protocol
     frames = np.unique(np.linspace(0, measurement.num_frames - 1, _MOST_FRAMES).round().astype(int))
     voltages = np.nan_to_num(np.asarray(measurement.voltages)[frames])
@@ -155,6 +163,7 @@ def _asymmetry(measurement: Measurement) -> tuple[np.ndarray, np.ndarray, np.nda
             np.asarray(protocol.measurement_index),
             voltages[np.all(masks == mask, axis=1)],
             mask,
+            deviation,
         )
         row, column = np.nonzero(np.triu(known & known.T, k=1))
         upper, lower = transfer[:, row, column], transfer[:, column, row]

@@ -49,29 +49,33 @@ def transfer_between_drives(
     measurement_index: np.ndarray,
     voltages: np.ndarray,
     mask: np.ndarray,
+    deviation: np.ndarray | None = None,
 ) -> tuple[Inexact[np.ndarray, "F S S"], Bool[np.ndarray, "S S"], Float[np.ndarray, "S S"]]:
     """What every drive pattern would read while every other drive flows: symmetric for any body.
 
-    `voltages` (F, M) volts and `mask` (M,) usable channels; the other arguments are those of `Protocol`.
+    `voltages` (F, M) volts and `mask` (M,) usable channels; `deviation` (M,) of each channel's independent noise, one
+    volt unless given; the other arguments are those of `Protocol`.
     Returns
 
     - `transfer` (F, S, S) watts: `drive[i] @ S @ drive[j]` in entry (i, j), combined from the channels read
       while j flows. A drive of skip-1 read by neighbours, for instance, is the sum of two neighbours.
     - `known` (S, S): where the measurement patterns of drive j do span drive i.
-    - `gain` (S, S) amperes: one volt of independent noise in each channel is `gain` watts in `transfer`.
+    - `noise` (S, S) watts: the standard deviation of `transfer`.
     """
     num_drives = drive.shape[0]
     transfer = np.zeros((voltages.shape[0], num_drives, num_drives), dtype=voltages.dtype)
     known = np.zeros((num_drives, num_drives), dtype=bool)
-    gain = np.zeros((num_drives, num_drives))
+    noise = np.zeros((num_drives, num_drives))
+    deviation = np.ones(len(mask)) if deviation is None else deviation
     size = np.linalg.norm(drive, axis=1)
     for flowing in range(num_drives):
         channels = np.flatnonzero((drive_index == flowing) & mask)
         if channels.size == 0:
             continue
-        rows = measurement[measurement_index[channels]]
-        combination = drive @ np.linalg.pinv(rows, rcond=1e-10)
+        rows, scale = measurement[measurement_index[channels]], deviation[channels]
+        # Of all combinations that read a drive, the one of least noise.
+        combination = drive @ np.linalg.pinv(rows / scale[:, None], rcond=1e-10) / scale
         known[:, flowing] = np.linalg.norm(combination @ rows - drive, axis=1) <= 1e-8 * size
         transfer[:, :, flowing] = voltages[:, channels] @ combination.T
-        gain[:, flowing] = np.linalg.norm(combination, axis=1)
-    return transfer, known, gain
+        noise[:, flowing] = np.linalg.norm(combination * scale, axis=1)
+    return transfer, known, noise

@@ -7,6 +7,7 @@ import pytest
 from jeit import data, protocol
 from jeit.data.imageable import assess
 from jeit.data.quality import channel_reciprocity_error, expected_signs
+from jeit.inverse import relative_noise
 
 
 def test_missing_saturated_and_dead_channels_are_masked_and_noted(tank, setup):
@@ -117,17 +118,31 @@ def test_signs_of_noise_are_wrong_half_the_time(tank, setup):
 def test_noise_in_the_difference_is_refused(tank, setup):
     chosen = protocol.adjacent(16)
     clean, other = tank(chosen), tank(chosen, change=0.02)
-    size = np.sqrt(np.mean((other - clean) ** 2))
-    rng = np.random.default_rng(6)
+    trusted = np.asarray(relative_noise(clean))
+    size = np.sqrt(np.mean(((other - clean) / trusted) ** 2))
+    noise = size * trusted * np.random.default_rng(6).normal(size=208)
     reference = data.screen(clean, chosen, **setup(16))
-    little = data.screen(other + 0.1 * size * rng.normal(size=208), chosen, **setup(16))
+    little = data.screen(other + 0.1 * noise, chosen, **setup(16))
     (quality,) = data.check_imageable(little, reference)
     # Independent noise of relative size 0.1 breaks reciprocity by about √2 times as much.
     assert quality.difference_reciprocity_error == pytest.approx(0.14, rel=0.2)
-    much = data.screen(other + 1.0 * size * rng.normal(size=208), chosen, **setup(16))
+    much = data.screen(other + noise, chosen, **setup(16))
     with pytest.raises(ValueError, match="breaks reciprocity"):
         data.check_imageable(much, reference)
     assert [q.imageable for q in assess(much, reference)] == [False]
+
+
+def test_large_voltages_of_driven_electrodes_do_not_pass_for_noise(tank, setup):
+    """One per cent of what is read on driven electrodes, mostly contact, is more than what other channels change by."""
+    chosen = protocol.adjacent(16, driven_electrodes=True)
+    shared = (np.asarray(chosen.channel_drive) * np.asarray(chosen.channel_measurement)).sum(axis=1)
+    contact = 30 * np.abs(tank(chosen)).max() * shared / np.abs(shared).max()
+    rng = np.random.default_rng(0)
+    frames = [(tank(chosen, change=change) + contact) * (1 + 0.01 * rng.normal(size=256)) for change in (0.5, 0.0)]
+    assert data.reciprocity_error(data.screen(frames[0] - frames[1], chosen)) > 0.63
+    noisy = [data.screen(one, chosen, **setup(16)) for one in frames]
+    (quality,) = data.check_imageable(*noisy)
+    assert quality.difference_reciprocity_error < 0.3
 
 
 def test_too_few_channels_are_refused(tank, setup):
