@@ -1,9 +1,13 @@
 """What the commands print: steps as they go, and tables of results."""
 
+import math
 import time
 
 from rich.console import Console
 from rich.table import Table
+
+# Below it nobody cares how little it is.
+_LEAST_PERCENT = 0.001
 
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
@@ -78,5 +82,12 @@ def in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
 
 
 def percent(value: float | None) -> str:
-    """A ratio in per cent."""
-    return "not known" if value is None else f"{100 * value:.2g} %"
+    """A ratio in per cent with two digits, all of those before the point, and never an exponent."""
+    if value is None:
+        return "not known"
+    share = 100 * float(value)
+    if not math.isfinite(share) or abs(share) >= 99.5:
+        return f"{share:.0f} %"
+    if 0 < abs(share) < _LEAST_PERCENT:
+        return f"less than {_LEAST_PERCENT:g} %"
+    return f"{share:.2g} %"

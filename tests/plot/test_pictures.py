@@ -14,6 +14,7 @@ from jeit.mesh import Polygon, Rectangle, centroids, disk, layer, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import plot_raster
+from jeit.plot.imaging.inclusions import draw_inclusions
 from jeit.plot.imaging.sensitivity import plot_sensitivity
 from jeit.plot.imaging.voltages import plot_voltages
 from jeit.protocol import adjacent
@@ -108,6 +109,12 @@ def test_numbers_in_a_narrow_notch_stand_inside_in_a_rim(ax):
     assert np.linalg.norm(np.array(inside.get_position()) - (0.102, 0.06)) < 0.015
     assert inside.get_path_effects()
     assert not outside.get_path_effects()
+
+
+def test_circles_of_inclusions_are_of_their_area_or_volume(ax):
+    flat, round_ = Inclusion(1, (0.0, 0.0), np.pi * 0.02**2, 1.0), Inclusion(-1, (0.0, 0.0, 0.1), 4e-6 * np.pi / 3, 1.0)
+    draw_inclusions([flat, round_], ax=ax)
+    assert [patch.radius for patch in ax.patches] == pytest.approx([0.02, 0.01])
 
 
 def test_an_electrode_over_the_start_of_the_outline_is_one_piece(mesh, ax):
