@@ -2,9 +2,14 @@
 
 import math
 import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
+
+if TYPE_CHECKING:
+    from jeit.image import Inclusion
 
 # Below it nobody cares how little it is.
 _LEAST_PERCENT = 0.001
@@ -79,6 +84,23 @@ def in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
     largest = max((abs(value) for value in values), default=0.0)
     exponent, prefix = next((pair for pair in _PREFIXES if largest >= 10.0 ** pair[0]), _PREFIXES[0])
     return f"{prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
+
+
+def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str) -> Table:
+    """A row for each inclusion, of a sheet (or the slice through a solid) or of a solid: kind, place, size and peak;
+    `unit` is that of conductivity."""
+    unit, peaks = in_one_unit([one.peak for one in inclusions], unit)
+    dimension = max((len(one.centroid) for one in inclusions), default=2)
+    places = [f"{axis} / mm" for axis in "xyz"[:dimension]]
+    # A million times either: square metres in mm², cubic metres in cm³.
+    size, digits = ("area / mm²", 0) if dimension == 2 else ("volume / cm³", 2)
+    table = Table("inclusion", *places, size, f"peak / {unit}", box=None, padding=(0, 2))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for inclusion, peak in zip(inclusions, peaks, strict=True):
+        place = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
+        table.add_row(inclusion.kind, *place, f"{1e6 * inclusion.area:.{digits}f}", peak)
+    return table
 
 
 def percent(value: float | None) -> str:

@@ -137,7 +137,10 @@ def _boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
     electrodes, domain = measurement.electrodes, measurement.domain
     if not isinstance(electrodes, BoundaryElectrodes) or domain is None:
         return None
-    return np.argsort(along(np.asarray(electrodes.position), np.asarray(domain.loops()[0])), kind="stable")
+    loops = domain.loops()
+    if not loops:
+        return None
+    return np.argsort(along(np.asarray(electrodes.position), np.asarray(loops[0])), kind="stable")
 
 
 def _asymmetry(measurement: Measurement) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jeit.data.measurement import Measurement
-from jeit.mesh import Domain
+from jeit.mesh import Body, Mesh
 from jeit.protocol import Protocol
 
 
@@ -13,7 +13,7 @@ def screen(
     protocol: Protocol,
     *,
     electrodes=None,
-    domain: Domain | None = None,
+    domain: Body | Mesh | None = None,
     mask=None,
     saturation: float | None = None,
     name: str = "measurement",

@@ -39,8 +39,8 @@ class PointElectrodes(AbstractPointElectrodes):
             pen.dot(place)
 
     def refinement(self) -> tuple[Refine, ...]:
-        """Half the size of cells at their places."""
-        return (Refine(np.asarray(self.position), factor=2.0),)
+        """Half the size of cells at their places, seen from above."""
+        return (Refine(np.asarray(self.position)[:, :2], factor=2.0),)
 
     def contact(self, mesh: Mesh) -> Contact:
         """`load` (n, L): values of the basis functions at the electrodes; no mass."""

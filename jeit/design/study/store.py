@@ -127,19 +127,18 @@ class Store:
 
     def _check(self, expected: Mapping[str, ArrayShape]) -> None:
         """Before Zarr looks at any of it."""
-        reason = danger(self.path)
+        try:
+            reason, wrong = danger(self.path), damage(self.path, expected)
+        except OSError as error:
+            raise self._damaged(error) from None
         if reason:
             raise ValueError(
                 f"{self.path} is not opened, because it might run code or write elsewhere: {reason}. No "
                 f"{self.contents.kind} that jeit wrote is like that. Delete it if it came from somebody else, and run "
                 f"the {self.contents.kind} yourself, to another place."
             )
-        try:
-            reason = damage(self.path, expected)
-        except (OSError, ValueError) as error:
-            raise self._damaged(error) from None
-        if reason:
-            raise self._damaged(reason)
+        if wrong:
+            raise self._damaged(wrong)
 
     def _attributes(self) -> dict:
         """Those of a study's store; none if it is something else. Raises `ValueError` if they cannot be read."""

@@ -18,6 +18,7 @@ _NUMBERS = tuple(f"{kind}{bits}" for kind in ("int", "uint", "float") for bits i
 _TYPES = frozenset({"bool", "string", *_NUMBERS})
 _FORMAT_2 = (".zarray", ".zattrs", ".zgroup", ".zmetadata")
 _METADATA = "zarr.json"
+_UNREADABLE = f"has a {_METADATA} that is no JSON object, or nested too deep"
 
 
 class ArrayShape(NamedTuple):
@@ -29,7 +30,8 @@ class ArrayShape(NamedTuple):
 
 
 def danger(path: Path) -> str | None:
-    """Why the store must not be opened, whatever it should hold; None where nothing in it can run or lead elsewhere."""
+    """Why the store must not be opened, whatever it should hold; None where nothing in it can run or lead elsewhere.
+    Raises `OSError` for files that cannot be read."""
     for folder, folders, files in os.walk(path):
         for name in [*folders, *files]:
             place = Path(folder, name)
@@ -38,11 +40,8 @@ def danger(path: Path) -> str | None:
             if name in _FORMAT_2:
                 return f"'{place.relative_to(path)}' is of Zarr's format 2, which jeit does not write"
     for file in path.rglob(_METADATA):
-        try:
-            nodes = [*_nodes(_read(file), str(file.relative_to(path)))]
-        except (OSError, ValueError):
-            continue  # damage, not danger: Zarr cannot read it either
-        for where, node in nodes:
+        content = _read(file)  # what Zarr cannot read is damage, not danger
+        for where, node in [] if content is None else _nodes(content, str(file.relative_to(path))):
             reason = _node_danger(node)
             if reason:
                 return f"{where} {reason}"
@@ -50,9 +49,11 @@ def danger(path: Path) -> str | None:
 
 
 def damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
-    """What is not as in a store of the arrays `expected`, by name; None where all is. Raises `OSError`, `ValueError`
-    for metadata that cannot be read."""
+    """What is not as in a store of the arrays `expected`, by name; None where all is. Raises `OSError` for files
+    that cannot be read."""
     content = _read(path / _METADATA)
+    if content is None:
+        return _UNREADABLE
     found = {folder.name for folder in path.iterdir() if folder.is_dir()}
     if found != set(expected):
         return f"its arrays are not those of its contents: {_told(found ^ set(expected))}"
@@ -65,10 +66,10 @@ def damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
     for name, array in expected.items():
         if [*(path / name).rglob(_METADATA)] != [path / name / _METADATA]:
             return f"array '{name}' has not one {_METADATA}"
-        for node in (named[name], _read(path / name / _METADATA)):
-            reason = _node_damage(node, array)
-            if reason:
-                return f"array '{name}' {reason}"
+        own = _read(path / name / _METADATA)
+        reason = _UNREADABLE if own is None else _node_damage(named[name], array) or _node_damage(own, array)
+        if reason:
+            return f"array '{name}' {reason}"
     return None
 
 
@@ -83,7 +84,7 @@ def _nodes(content: Any, where: str) -> Iterator[tuple[str, Any]]:
 
 def _node_danger(node: Any) -> str | None:
     if not isinstance(node, dict):
-        return "is no description of a group or an array"
+        return "describes neither a group nor an array"
     if any(name in node for name in ("dtype", "filters", "compressor")) or node.get("zarr_format") == 2:
         return "is of Zarr's format 2, which jeit does not write"
     if node.get("storage_transformers"):
@@ -110,15 +111,13 @@ def _node_damage(node: Any, expected: ArrayShape) -> str | None:
     return None
 
 
-def _read(file: Path) -> dict[str, Any]:
-    """Raises `ValueError` for what is no JSON object, `OSError`."""
+def _read(file: Path) -> dict[str, Any] | None:
+    """The JSON object in a file; None for anything else. Raises `OSError`."""
     try:
         content = json.loads(file.read_bytes())
-    except RecursionError:
-        raise ValueError("it is nested too deep") from None
-    if not isinstance(content, dict):
-        raise ValueError("it is no JSON object")
-    return content
+    except (ValueError, RecursionError):
+        return None
+    return content if isinstance(content, dict) else None
 
 
 def _listed(values: Any) -> list[Any]:
