@@ -139,6 +139,10 @@ def objects(store):
     edit(store / "zarr.json", lambda content: named(content)["layout"].update(data_type="object"))
 
 
+def no_description(store):
+    edit(store / "zarr.json", lambda content: named(content).update(minimum=5))
+
+
 def a_link(store):
     outside = store.with_name("outside")
     os.rename(store / "minimum", outside)
@@ -161,6 +165,7 @@ PLANTS = (
     a_codec_of_the_array_alone,
     a_codec_within_another,
     objects,
+    no_description,
     a_link,
     a_linked_chunk,
 )

@@ -128,7 +128,8 @@ class Store:
     def _check(self, expected: Mapping[str, ArrayShape]) -> None:
         """Before Zarr looks at any of it."""
         try:
-            reason, wrong = danger(self.path), damage(self.path, expected)
+            reason = danger(self.path)
+            wrong = None if reason else damage(self.path, expected)
         except OSError as error:
             raise self._damaged(error) from None
         if reason:
