@@ -136,6 +136,7 @@ def show(console, result: "ImagedDifference") -> None:
     elif result.lowest < -1:
         fall = f"falls to {percent(result.lowest)} of the background: of changes so large only place and sign are right"
         rows.append(("linear image", fall))
+    rows += [("note", note) for note in dict.fromkeys((*result.measurement.notes, *result.reference.notes))]
     console.print()
     console.print(pairs(result.measurement.name, rows))
     console.print()
