@@ -99,16 +99,16 @@ class Description:
     notes: tuple[str, ...]
     protocol_section: dict[str, Any] = field(repr=False)
 
-    def protocol(self, path: Path) -> Protocol | None:
+    def protocol(self, path: str | Path) -> Protocol | None:
         """The protocol of the file at `path` (whose name may hold the current), or None if not described.
 
         Raises `ValueError`, with file and section named, if what is described makes no protocol.
         """
         if not self.protocol_section:
             return None
-        return _protocol(self.protocol_section, self.electrodes, path, self.origin)
+        return _protocol(self.protocol_section, self.electrodes, Path(path), self.origin)
 
-    def model(self, path: Path, *, num_points: int) -> ForwardModel:
+    def model(self, path: str | Path, *, num_points: int) -> ForwardModel:
         """A model, on a new mesh of about `num_points` nodes, of what the file at `path` was measured on.
 
         Raises `ValueError` where geometry, electrodes or protocol are not described.
