@@ -1,9 +1,18 @@
 """What the commands print: steps as they go, and tables of results."""
 
+import math
 import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
+
+if TYPE_CHECKING:
+    from jeit.image import Inclusion
+
+# Below it nobody cares how little it is.
+_LEAST_PERCENT = 0.001
 
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
@@ -77,6 +86,30 @@ def in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
     return f"{prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
 
 
+def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str) -> Table:
+    """A row for each inclusion, of a sheet (or the slice through a solid) or of a solid: kind, place, size and peak;
+    `unit` is that of conductivity."""
+    unit, peaks = in_one_unit([one.peak for one in inclusions], unit)
+    dimension = max((len(one.centroid) for one in inclusions), default=2)
+    places = [f"{axis} / mm" for axis in "xyz"[:dimension]]
+    # A million times either: square metres in mm², cubic metres in cm³.
+    size, digits = ("area / mm²", 0) if dimension == 2 else ("volume / cm³", 2)
+    table = Table("inclusion", *places, size, f"peak / {unit}", box=None, padding=(0, 2))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for inclusion, peak in zip(inclusions, peaks, strict=True):
+        place = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
+        table.add_row(inclusion.kind, *place, f"{1e6 * inclusion.area:.{digits}f}", peak)
+    return table
+
+
 def percent(value: float | None) -> str:
-    """A ratio in per cent."""
-    return "not known" if value is None else f"{100 * value:.2g} %"
+    """A ratio in per cent with two digits, all of those before the point, and never an exponent."""
+    if value is None:
+        return "not known"
+    share = 100 * float(value)
+    if not math.isfinite(share) or abs(share) >= 99.5:
+        return f"{share:.0f} %"
+    if 0 < abs(share) < _LEAST_PERCENT:
+        return f"less than {_LEAST_PERCENT:g} %"
+    return f"{share:.2g} %"

@@ -3,10 +3,14 @@
 Sections (`tank6cm.toml` in this folder is an example; only `[protocol]` must be there):
 
 - `[geometry]`: `shape` = "disk" (`radius`, `centre`), "rectangle" (`width`, `height`, `centre`) or "polygon"
-  (`vertices`, `holes`). Metres.
-- `[electrodes]`: `kind` = "boundary" (`width`), "disc" (`radius`) or "point"; `contact_impedance`; and where
-  they are: `layout` = "ring" (disk: `number`, `start_angle_degrees`, `clockwise`), "perimeter" (`number`,
-  `start`) or `positions`.
+  (`vertices`, `holes`), each with `thickness` a solid from z = 0 up; "box" (`width`, `depth`, `height`) or "cylinder"
+  (`radius`, `height`). Metres. Or `mesh` = "tank.msh", a file beside the description, any that `jeit.mesh.read` knows,
+  and `scale`, the length of its unit in metres (1e-3 for millimetres).
+- `[electrodes]`: `kind` = "boundary" (`width`), "disc" (`radius`; in a sheet or on a solid's surface), "patch" (on a
+  solid: `width`, `height`), "point", or "facets" (`tags`, the names of groups of a mesh's facets); `contact_impedance`,
+  ohm·m² (on the edge of a sheet ohm·m); and where they are: `layout` = "ring" (disk, cylinder: `number`,
+  `start_angle_degrees`, `clockwise`) or "perimeter" (`number`, `start`), on a solid at each height z of `levels`, one
+  level after the other; or `positions`, of two or three coordinates.
 - `[protocol]`: `kind` = name of a constructor in `jeit.protocol` with its arguments, or "matrices" with
   `drive` (S, L) in amperes and `measurement` (K, L), or "channels" with those and `drive_index` (M,) and
   `measurement_index` (M,), from 0. `current` in amperes, or `current_unit`; `current_from_name`, a regular
@@ -16,7 +20,6 @@ Sections (`tank6cm.toml` in this folder is an example; only `[protocol]` must be
 - `[notes]`: `text`, a list of sentences to carry along.
 """
 
-import inspect
 import re
 import tomllib
 from dataclasses import dataclass, field
@@ -27,39 +30,21 @@ from typing import Any
 import numpy as np
 
 from jeit import protocol as protocols
-from jeit.arguments import did_you_mean
-from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
+from jeit.data._sections import choice, located, need, refuse_unknown
+from jeit.data.described_body import KEYS as BODY_KEYS
+from jeit.data.described_body import described_body, described_electrodes
+from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
-from jeit.layout import perimeter, ring
-from jeit.mesh import Disk, Domain
-from jeit.mesh.outline import OUTLINES
+from jeit.mesh import Body
 from jeit.protocol import Protocol
 
 CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
 VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
-ELECTRODES = {"boundary": BoundaryElectrodes, "disc": SheetDiscs, "point": PointElectrodes}
 BUNDLED = ("tank6cm",)
 PROTOCOL_ARRAYS = ("drive", "measurement", "drive_index", "measurement_index")
 
-# What makes each outline, and whether it must be told.
-_OUTLINE_ARGUMENTS = {
-    shape: {name: one.default is one.empty for name, one in inspect.signature(outline).parameters.items()}
-    for shape, outline in OUTLINES.items()
-}
 _KEYS = {
-    "geometry": {"shape"}.union(*_OUTLINE_ARGUMENTS.values()),
-    "electrodes": {
-        "kind",
-        "layout",
-        "number",
-        "start_angle_degrees",
-        "clockwise",
-        "start",
-        "positions",
-        "width",
-        "radius",
-        "contact_impedance",
-    },
+    **BODY_KEYS,
     "data": {
         "frames_in",
         "delimiter",
@@ -108,22 +93,22 @@ class Description:
 
     origin: str
     title: str
-    domain: Domain | None
-    electrodes: Any
+    domain: Body | None
+    electrodes: AbstractElectrodes | None
     layout: TableLayout
     notes: tuple[str, ...]
     protocol_section: dict[str, Any] = field(repr=False)
 
-    def protocol(self, path: Path) -> Protocol | None:
+    def protocol(self, path: str | Path) -> Protocol | None:
         """The protocol of the file at `path` (whose name may hold the current), or None if not described.
 
         Raises `ValueError`, with file and section named, if what is described makes no protocol.
         """
         if not self.protocol_section:
             return None
-        return _protocol(self.protocol_section, self.electrodes, path, self.origin)
+        return _protocol(self.protocol_section, self.electrodes, Path(path), self.origin)
 
-    def model(self, path: Path, *, num_points: int) -> ForwardModel:
+    def model(self, path: str | Path, *, num_points: int) -> ForwardModel:
         """A model, on a new mesh of about `num_points` nodes, of what the file at `path` was measured on.
 
         Raises `ValueError` where geometry, electrodes or protocol are not described.
@@ -144,123 +129,54 @@ def load_description(which: str | Path) -> Description:
     """
     if str(which) in BUNDLED:
         origin = f"{which}.toml"
-        text = resources.files("jeit.data").joinpath(origin).read_text("utf-8")
+        text, folder = resources.files("jeit.data").joinpath(origin).read_text("utf-8"), Path()
     else:
         path = Path(which)
         if not path.is_file():
             raise ValueError(
                 f"description {path}: there is no such file. Give a TOML file, or one of {', '.join(BUNDLED)}."
             )
-        text, origin = path.read_text("utf-8"), path.name
+        text, origin, folder = path.read_text("utf-8"), path.name, path.parent
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ValueError(f"{origin} is not valid TOML: {error}.") from None
-    return parse_description(table, origin)
+    return parse_description(table, origin, folder)
 
 
-def parse_description(table: dict[str, Any], origin: str) -> Description:
-    """Check a description given as nested dictionaries.
+def parse_description(table: dict[str, Any], origin: str, folder: str | Path = ".") -> Description:
+    """Check a description given as nested dictionaries; files that it names are looked for in `folder`.
 
     Raises `ValueError` with the section and key at fault.
     """
     known = {"title", "protocol", *_KEYS}
-    _refuse_unknown(table, known, origin, "the file")
+    refuse_unknown(table, known, origin, "the file")
     sections = {name: table.get(name, {}) for name in (*_KEYS, "protocol")}
     for name, section in sections.items():
         if not isinstance(section, dict):
             raise ValueError(f"{origin}: '{name}' must be a section, [{name}].")
         if name in _KEYS:
-            _refuse_unknown(section, _KEYS[name], origin, f"[{name}]")
-    domain = _domain(sections["geometry"], origin) if sections["geometry"] else None
+            refuse_unknown(section, _KEYS[name], origin, f"[{name}]")
+    domain = described_body(sections["geometry"], Path(folder), origin) if sections["geometry"] else None
     return Description(
         origin=origin,
         title=str(table.get("title", "")),
         domain=domain,
-        electrodes=_electrodes(sections["electrodes"], domain, origin) if sections["electrodes"] else None,
+        electrodes=described_electrodes(sections["electrodes"], domain, origin) if sections["electrodes"] else None,
         layout=_layout(sections["data"], origin),
         notes=tuple(str(note) for note in sections["notes"].get("text", ())),
         protocol_section=sections["protocol"],
     )
 
 
-def _refuse_unknown(section: dict, known: set[str], origin: str, where: str) -> None:
-    unknown = sorted(set(section) - known)
-    if unknown:
-        raise ValueError(f"{origin}: {where} has no '{unknown[0]}'. Known there: {', '.join(sorted(known))}.")
-
-
-def _need(section: dict, key: str, origin: str, where: str) -> Any:
-    if key not in section:
-        raise ValueError(f"{origin}: {where} needs '{key}'.")
-    return section[key]
-
-
-def _choice(value: Any, choices, origin: str, where: str) -> Any:
-    if value not in choices:
-        meant = did_you_mean(value, map(str, choices))
-        raise ValueError(f"{origin}: {where} must be one of {', '.join(map(str, choices))}; got {value!r}{meant}.")
-    return value
-
-
-def _domain(section: dict, origin: str) -> Domain:
-    where = "[geometry]"
-    shape = _choice(_need(section, "shape", origin, where), OUTLINES, origin, f"{where} shape")
-    arguments = {
-        name: _need(section, name, origin, where) if needed else section[name]
-        for name, needed in _OUTLINE_ARGUMENTS[shape].items()
-        if needed or name in section
-    }
-    try:
-        return OUTLINES[shape](**arguments)
-    except ValueError as error:
-        raise _located(error, origin, where) from None
-
-
-def _electrodes(section: dict, domain: Domain | None, origin: str):
-    where = "[electrodes]"
-    kind = _choice(section.get("kind", "boundary"), ELECTRODES, origin, f"{where} kind")
-    try:
-        position = _positions(section, domain, origin)
-        if kind == "point":
-            return PointElectrodes(position)
-        size = _need(section, "width" if kind == "boundary" else "radius", origin, where)
-        contact_impedance = _need(section, "contact_impedance", origin, where)
-        return ELECTRODES[kind](position, np.asarray(size, float), np.asarray(contact_impedance, float))
-    except (ValueError, TypeError) as error:
-        raise _located(error, origin, where) from None
-
-
-def _positions(section: dict, domain: Domain | None, origin: str) -> np.ndarray:
-    where = "[electrodes]"
-    if "positions" in section:
-        return np.asarray(section["positions"], dtype=float)
-    layout = _need(section, "layout", origin, f"{where} (or 'positions')")
-    _choice(layout, ("ring", "perimeter"), origin, f"{where} layout")
-    number = _need(section, "number", origin, where)
-    if domain is None:
-        raise ValueError(f"{origin}: {where} layout = {layout!r} needs [geometry] to lie on.")
-    if layout == "perimeter":
-        return perimeter(domain, number, start=section.get("start", 0.0))
-    if not isinstance(domain, Disk):
-        raise ValueError(f'{origin}: {where} layout = "ring" needs a disk; use "perimeter" for other shapes.')
-    return ring(
-        domain.radius,
-        number,
-        start_angle=np.radians(section.get("start_angle_degrees", 90.0)),
-        clockwise=section.get("clockwise", False),
-        centre=domain.centre,
-    )
-
-
 def _layout(section: dict, origin: str) -> TableLayout:
     where = "[data]"
-    unit = _choice(section.get("unit", "V"), VOLTAGE_UNITS, origin, f"{where} unit")
+    unit = choice(section.get("unit", "V"), VOLTAGE_UNITS, origin, f"{where} unit")
     gain = section.get("gain", 1.0)
     if not isinstance(gain, (int, float)) or not np.isfinite(gain) or gain <= 0:
         raise ValueError(f"{origin}: {where} gain must be a positive number; got {gain!r}. For signs, use polarity.")
-    polarity = _choice(section.get("polarity", "normal"), ("normal", "reversed"), origin, f"{where} polarity")
-    frames_in = _choice(section.get("frames_in", "rows"), ("rows", "columns"), origin, f"{where} frames_in")
+    polarity = choice(section.get("polarity", "normal"), ("normal", "reversed"), origin, f"{where} polarity")
+    frames_in = choice(section.get("frames_in", "rows"), ("rows", "columns"), origin, f"{where} frames_in")
     components = ("real", "imaginary", "magnitude", "complex")
     scale = VOLTAGE_UNITS[unit] / gain * (-1 if polarity == "reversed" else 1)
     saturation = section.get("saturation")
@@ -269,7 +185,7 @@ def _layout(section: dict, origin: str) -> TableLayout:
         delimiter=section.get("delimiter", ","),
         skip_rows=int(section.get("skip_rows", 0)),
         complex_pairs=bool(section.get("complex_pairs", False)),
-        component=_choice(section.get("component", "real"), components, origin, f"{where} component"),
+        component=choice(section.get("component", "real"), components, origin, f"{where} component"),
         scale=scale,
         # Given as the instrument reads it, compared after the gain is taken out.
         saturation=None if saturation is None else float(saturation) * abs(scale),
@@ -281,7 +197,7 @@ def _layout(section: dict, origin: str) -> TableLayout:
 def _protocol(section: dict, electrodes, path: Path, origin: str) -> Protocol:
     where = "[protocol]"
     kinds = (*_PROTOCOL_OPTIONS, "matrices", "channels")
-    kind = _choice(_need(section, "kind", origin, where), kinds, origin, f"{where} kind")
+    kind = choice(need(section, "kind", origin, where), kinds, origin, f"{where} kind")
     try:
         if kind == "matrices":
             return _from_matrices(section, origin)
@@ -289,16 +205,16 @@ def _protocol(section: dict, electrodes, path: Path, origin: str) -> Protocol:
             return _from_channels(section, origin)
         return _constructed(kind, section, electrodes, path, origin)
     except (ValueError, TypeError) as error:
-        raise _located(error, origin, where) from None
+        raise located(error, origin, where) from None
 
 
 def _from_matrices(section: dict, origin: str) -> Protocol:
     where = "[protocol]"
-    _refuse_unknown(section, {"kind", "name", "drive", "measurement", "select"}, origin, f"{where} matrices")
+    refuse_unknown(section, {"kind", "name", "drive", "measurement", "select"}, origin, f"{where} matrices")
     select = section.get("select")
     return protocols.from_matrices(
-        _need(section, "drive", origin, where),
-        _need(section, "measurement", origin, where),
+        need(section, "drive", origin, where),
+        need(section, "measurement", origin, where),
         None if select is None else np.asarray(select, bool),
         name=section.get("name", "matrices"),
     )
@@ -306,8 +222,8 @@ def _from_matrices(section: dict, origin: str) -> Protocol:
 
 def _from_channels(section: dict, origin: str) -> Protocol:
     where = "[protocol]"
-    _refuse_unknown(section, {"kind", "name", *PROTOCOL_ARRAYS}, origin, f"{where} channels")
-    arrays = {part: np.asarray(_need(section, part, origin, where)) for part in PROTOCOL_ARRAYS}
+    refuse_unknown(section, {"kind", "name", *PROTOCOL_ARRAYS}, origin, f"{where} channels")
+    arrays = {part: np.asarray(need(section, part, origin, where)) for part in PROTOCOL_ARRAYS}
     return Protocol(**arrays, name=section.get("name", "channels"))
 
 
@@ -315,7 +231,7 @@ def _constructed(kind: str, section: dict, electrodes, path: Path, origin: str) 
     """By the constructor of that name."""
     where = "[protocol]"
     common = {"kind", "number", "current", "current_from_name", "current_unit", "name"}
-    _refuse_unknown(section, common | _PROTOCOL_OPTIONS[kind], origin, f"{where} {kind}")
+    refuse_unknown(section, common | _PROTOCOL_OPTIONS[kind], origin, f"{where} {kind}")
     number = section.get("number", None if electrodes is None else electrodes.num_electrodes)
     if number is None:
         raise ValueError(f"{origin}: {where} needs 'number' (of electrodes), or an [electrodes] section.")
@@ -326,7 +242,7 @@ def _constructed(kind: str, section: dict, electrodes, path: Path, origin: str) 
 
 
 def _current(section: dict, path: Path, origin: str) -> float:
-    name = _choice(section.get("current_unit", "A"), CURRENT_UNITS, origin, "[protocol] current_unit")
+    name = choice(section.get("current_unit", "A"), CURRENT_UNITS, origin, "[protocol] current_unit")
     unit = CURRENT_UNITS[name]
     if "current_from_name" in section:
         found = re.search(section["current_from_name"], path.name)
@@ -336,9 +252,4 @@ def _current(section: dict, path: Path, origin: str) -> float:
                 f"in the name {path.name!r}. Give 'current' instead."
             )
         return float(found.group(1)) * unit
-    return _need(section, "current", origin, "[protocol]") * unit
-
-
-def _located(error: Exception, origin: str, where: str) -> ValueError:
-    text = str(error)
-    return ValueError(text if text.startswith(origin) else f"{origin}: {where}: {text}")
+    return need(section, "current", origin, "[protocol]") * unit

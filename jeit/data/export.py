@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from jeit.data.description import ELECTRODES, PROTOCOL_ARRAYS
+from jeit.data.described_body import ELECTRODES
+from jeit.data.description import PROTOCOL_ARRAYS
 from jeit.data.measurement import Measurement
 from jeit.electrodes import AbstractElectrodes
-from jeit.mesh import Domain
+from jeit.mesh import Body
 from jeit.mesh.outline import OUTLINES
 from jeit.protocol import Protocol
 
@@ -22,8 +23,8 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
     geometry, electrodes and protocol, and so describes any table of the same sensor. `read` gives the same measurement
     back.
 
-    Raises `ValueError` for another suffix, and for electrodes or domains that a description cannot say (3-D, an
-    outline of your own).
+    Raises `ValueError` for another suffix, and for electrodes or bodies that cannot be written into a description (a
+    mesh or an outline of your own, and what lies on its facets).
     """
     file = Path(path)
     if file.suffix.lower() != ".npz":
@@ -52,24 +53,24 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
     return file, description
 
 
-def _geometry(domain: Domain) -> dict:
+def _geometry(domain: Body) -> dict:
     described = domain.describe()
     if described["shape"] not in OUTLINES:
         raise ValueError(
-            f"write_table: a description cannot say {domain!r}; it knows {', '.join(OUTLINES)}. Set domain to None, or "
-            "save the mesh instead."
+            f"write_table: a description cannot say {type(domain).__name__}; it knows {', '.join(OUTLINES)} and solids "
+            "above them. Set domain to None; save a mesh with jeit.mesh.write, and name it in [geometry] mesh."
         )
     return described
 
 
 def _electrodes(electrodes: AbstractElectrodes) -> dict:
-    kind = next((name for name, known in ELECTRODES.items() if type(electrodes) is known), None)
+    kind = next((name for name, known in ELECTRODES.items() if type(electrodes) in known.values()), None)
     geometry = {name: np.asarray(values).tolist() for name, values in electrodes.geometry().items()} if kind else {}
     positions = geometry.pop("position", None)
-    if positions is None or len(positions[0]) != 2:
+    if positions is None:
         raise ValueError(
-            f"write_table: a description cannot say {type(electrodes).__name__}; it knows 2-D boundary, disc "
-            "and point electrodes. Set electrodes to None, or save the model instead."
+            f"write_table: a description cannot say {type(electrodes).__name__}; it knows {', '.join(ELECTRODES)}. Set "
+            "electrodes to None, or save the model instead."
         )
     described = {"kind": kind, **geometry, "positions": positions}
     if electrodes.is_point:

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Inexact
 
 from jeit.arguments import counted, did_you_mean
-from jeit.mesh import Domain
+from jeit.mesh import Body, Mesh
+from jeit.mesh.solid_body import as_body
 from jeit.protocol import Protocol
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
 
@@ -25,7 +26,8 @@ class Measurement(eqx.Module):
     - `protocol`: what the M channels are.
     - `electrodes`: where the electrodes are (an object of `jeit.electrodes`), or None when the file does not
       say.
-    - `domain`: the outline of the body (`jeit.mesh.Disk` ...), or None when the file does not say.
+    - `domain`: the body: its outline (`jeit.mesh.Disk` ...), a `jeit.mesh.Solid`, or a mesh (`jeit.mesh.OwnMesh`, or a
+      plain `Mesh`, which is made one); None when the file does not say.
     - `name`, `source`: what and where it comes from; `frame_names`: one for each frame, or empty.
     - `notes`: what was assumed, and what was masked and why; one sentence each.
     """
@@ -34,7 +36,7 @@ class Measurement(eqx.Module):
     mask: Bool[Array, "F M"]
     protocol: Protocol
     electrodes: Any
-    domain: Domain | None
+    domain: Body | None
     name: str = eqx.field(static=True)
     source: str = eqx.field(static=True)
     frame_names: tuple[str, ...] = eqx.field(static=True)
@@ -47,18 +49,19 @@ class Measurement(eqx.Module):
         protocol: Protocol,
         *,
         electrodes=None,
-        domain: Domain | None = None,
+        domain: Body | Mesh | None = None,
         name: str = "measurement",
         source: str = "",
         frame_names: tuple[str, ...] = (),
         notes: tuple[str, ...] = (),
     ):
-        """`voltages` and `mask` (F, M), or (M,) for one frame. Raises `ValueError` where shapes disagree."""
+        """`voltages` and `mask` (F, M), or (M,) for one frame. Raises `ValueError` where shapes disagree, and for what
+        is no body."""
         self.voltages = as_array(_frames(voltages))
         self.mask = as_array(_frames(mask))
         self.protocol = protocol
         self.electrodes = electrodes
-        self.domain = domain
+        self.domain = None if domain is None else as_body(domain)
         self.name = name
         self.source = source
         self.frame_names = tuple(frame_names)

@@ -119,14 +119,17 @@ def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.n
     return np.where(pairs, np.where(rising, np.sign(plus - minus), signs), 0)
 
 
-def impossible_signs(measurement: Measurement) -> Float[np.ndarray, " F"] | None:
+def impossible_signs(
+    measurement: Measurement, order: Int[np.ndarray, " L"] | None = None
+) -> Float[np.ndarray, " F"] | None:
     """(F,) fraction of the usable voltages whose sign no passive body gives (real part of complex voltages).
 
     Voltages that are nothing but noise have the wrong sign half the time: the fraction of such channels is
-    about twice the value returned. None when the electrodes are not known to lie around the boundary of an
+    about twice the value returned. `order` lists the electrodes as they follow each other along the boundary; by their
+    positions unless given. None when the electrodes are not known to lie around the boundary of an
     outline, or no channel has a known sign. See `expected_signs`.
     """
-    order = _boundary_order(measurement)
+    order = boundary_order(measurement) if order is None else order
     if order is None:
         return None
     signs = expected_signs(measurement.protocol, order)
@@ -138,11 +141,16 @@ def impossible_signs(measurement: Measurement) -> Float[np.ndarray, " F"] | None
     return wrong.sum(axis=1) / np.maximum(count, 1)
 
 
-def _boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
+def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
+    """(L,) the electrodes as they follow each other along the outer edge, by their positions; None where they are not
+    known to lie on it."""
     electrodes, domain = measurement.electrodes, measurement.domain
     if not isinstance(electrodes, BoundaryElectrodes) or domain is None:
         return None
-    return np.argsort(along(np.asarray(electrodes.position), np.asarray(domain.loops()[0])), kind="stable")
+    loops = domain.loops()
+    if not loops:
+        return None
+    return np.argsort(along(np.asarray(electrodes.position), np.asarray(loops[0])), kind="stable")
 
 
 def _asymmetry(

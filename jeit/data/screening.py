@@ -1,10 +1,13 @@
 """From raw voltages to a `Measurement`: what is unusable is masked, and said."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Bool
 
+from jeit.data.electrode_order import order_note
 from jeit.data.measurement import Measurement
-from jeit.mesh import Domain
+from jeit.mesh import Body, Mesh
 from jeit.protocol import Protocol
 
 
@@ -13,7 +16,7 @@ def screen(
     protocol: Protocol,
     *,
     electrodes=None,
-    domain: Domain | None = None,
+    domain: Body | Mesh | None = None,
     mask=None,
     saturation: float | None = None,
     name: str = "measurement",
@@ -22,6 +25,8 @@ def screen(
     notes: tuple[str, ...] = (),
 ) -> Measurement:
     """A `Measurement` of raw voltages (M,) or (F, M) in volts: masks what cannot be used, and notes why.
+
+    Noted too are electrodes that are not numbered as they follow each other along the edge.
 
     Masked are: what `mask` (True = usable) excludes; NaN and infinity; saturated voltages (at or beyond
     `saturation` volts, or, when that is not given, stuck at exactly the same extreme value); drives that read
@@ -58,17 +63,10 @@ def screen(
     exclude(_without_current(values, usable, protocol), "their drive's current did not flow.")
     if not usable.any():
         raise ValueError(f"{name}: no usable voltage is left. {' '.join(found)}")
-    return Measurement(
-        values,
-        usable,
-        protocol,
-        electrodes=electrodes,
-        domain=domain,
-        name=name,
-        source=source,
-        frame_names=frame_names,
-        notes=tuple(found),
-    )
+    described = {"electrodes": electrodes, "domain": domain, "name": name, "source": source, "frame_names": frame_names}
+    measurement = Measurement(values, usable, protocol, notes=tuple(found), **described)
+    note = order_note(measurement)
+    return measurement if note is None else replace(measurement, notes=(*measurement.notes, note))
 
 
 def _as_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:

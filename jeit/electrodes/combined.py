@@ -14,7 +14,7 @@ from jeit.electrodes.electrodes import (
     ElectrodePen,
     as_electrode_values,
 )
-from jeit.mesh import Domain, Mesh, Refine
+from jeit.mesh import Body, Mesh, Refine
 from jeit_solvers.engines import namespace
 
 
@@ -60,9 +60,9 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         for part in self.parts:
             part.draw(mesh, pen)
 
-    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
         """That of all parts."""
-        return tuple(refine for part in self.parts for refine in part.refinement(domain))
+        return tuple(refine for part in self.parts for refine in part.refinement(body))
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The facets and cells of all parts."""

@@ -2,7 +2,8 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import KDTree
 
 from jeit.electrodes.electrodes import (
     AbstractMovableElectrodes,
@@ -14,7 +15,7 @@ from jeit.electrodes.electrodes import (
     check_dimension,
 )
 from jeit.electrodes.window import EDGE, nearest_electrodes, smooth_step, triangle_quadrature, window_contact
-from jeit.mesh import Domain, Mesh, Refine, measures
+from jeit.mesh import Body, Mesh, Refine, measures
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated
 
@@ -29,9 +30,13 @@ class AbstractDiscs(AbstractPlacedElectrodes):
         return {"position": self.position, "radius": self.radius}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Discs."""
-        for place, radius in zip(np.asarray(self.position), np.asarray(self.radius), strict=True):
-            pen.disc(place, radius)
+        """Discs, and dots for those on walls."""
+        flat = seen_flat(mesh, self.position)
+        for place, radius, whole in zip(np.asarray(self.position), np.asarray(self.radius), flat, strict=True):
+            if whole:
+                pen.disc(place, radius)
+            else:
+                pen.dot(place)
 
 
 class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
@@ -51,7 +56,7 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position, self.radius, self.contact_impedance = _as_discs(position, 2, radius, contact_impedance)
 
-    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Cells of 0.7 of the smallest radius on them."""
         radius = np.asarray(self.radius)
         return (Refine(np.asarray(self.position), cell_size=0.7 * radius.min(), distance=float(radius.max())),)
@@ -95,7 +100,7 @@ class FaceDiscs(AbstractDiscs):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position, self.radius, self.contact_impedance = _as_discs(position, 3, radius, contact_impedance)
 
-    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
         """None: they are not of a plane mesh."""
         return ()
 
@@ -145,6 +150,14 @@ def facet_normals(mesh: Mesh) -> Float[Array, "b 3"]:
     xp = namespace(corners)
     normal = xp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return normal / xp.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def seen_flat(mesh: Mesh, position: Float[Array, "L d"]) -> Bool[np.ndarray, " L"]:
+    """Whether what lies at each position is seen at its full size from above: in a sheet, and on horizontal faces."""
+    if mesh.dimension == 2:
+        return np.ones(len(position), bool)
+    centres, normals = np.asarray(mesh.points)[np.asarray(mesh.facets)].mean(axis=1), np.asarray(facet_normals(mesh))
+    return np.abs(normals[KDTree(centres).query(np.asarray(position))[1], 2]) > 0.9
 
 
 def same_face(mesh: Mesh, position: Float[Array, "L 3"], tolerance: Float[Array, " L"]) -> Float[Array, "b L"]:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.mesh import Domain, Mesh, Refine
+from jeit.mesh import Body, Mesh, Refine
 from jeit_solvers.engines import as_array, has_values, namespace
 
 
@@ -92,7 +92,7 @@ class AbstractElectrodes(eqx.Module):
         """Draw every electrode on `mesh` in one stroke, in their order, as seen from above."""
 
     @abc.abstractmethod
-    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Where a plane mesh made for them should be finer; nothing where that is not known."""
 
     def describe(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from jeit.electrodes.electrodes import (
     as_electrode_values,
     replace_contact_impedance,
 )
-from jeit.mesh import Domain, Mesh, Refine
+from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, namespace, sum_into
 
@@ -73,7 +73,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
             else:
                 pen.dot(middle)
 
-    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
         """None: they have a mesh."""
         return ()
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.electrodes.discs import facet_normals
+from jeit.electrodes.discs import facet_normals, seen_flat
 from jeit.electrodes.electrodes import (
     AbstractPlacedElectrodes,
     Contact,
@@ -13,7 +13,7 @@ from jeit.electrodes.electrodes import (
     check_dimension,
 )
 from jeit.electrodes.window import EDGE, smooth_step, triangle_quadrature, window_contact
-from jeit.mesh import Domain, Mesh, Refine
+from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated
 
@@ -47,16 +47,16 @@ class FacePatches(AbstractPlacedElectrodes):
         return {"position": self.position, "width": self.width, "height": self.height}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Rectangles where all lie on one horizontal face, dots elsewhere."""
-        places = np.asarray(self.position)
-        flat = np.ptp(places[:, 2]) < 1e-9
-        for place, width, height in zip(places, np.asarray(self.width), np.asarray(self.height), strict=True):
-            if flat:
+        """Rectangles on horizontal faces, dots elsewhere."""
+        places, flat = np.asarray(self.position), seen_flat(mesh, self.position)
+        sizes = np.asarray(self.width), np.asarray(self.height)
+        for place, width, height, whole in zip(places, *sizes, flat, strict=True):
+            if whole:
                 pen.rectangle(place, width, height)
             else:
                 pen.dot(place)
 
-    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
         """None: they are not of a plane mesh."""
         return ()
 

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.electrodes.electrodes import AbstractPointElectrodes, Contact, ElectrodePen, as_positions
-from jeit.mesh import Domain, Mesh, Refine, gradients
+from jeit.mesh import Body, Mesh, Refine, gradients
 from jeit_solvers.engines import either_engine, has_values, namespace, sum_into, undifferentiated
 
 
@@ -38,9 +38,9 @@ class PointElectrodes(AbstractPointElectrodes):
         for place in np.asarray(self.position):
             pen.dot(place)
 
-    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
-        """Half the size of cells at their places."""
-        return (Refine(np.asarray(self.position), factor=2.0),)
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
+        """Half the size of cells at their places, seen from above."""
+        return (Refine(np.asarray(self.position)[:, :2], factor=2.0),)
 
     def contact(self, mesh: Mesh) -> Contact:
         """`load` (n, L): values of the basis functions at the electrodes; no mass."""
@@ -101,7 +101,7 @@ class NodeElectrodes(AbstractPointElectrodes):
         for place in np.asarray(mesh.points)[np.asarray(self.nodes)]:
             pen.dot(place)
 
-    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
         """None: they have a mesh."""
         return ()
 

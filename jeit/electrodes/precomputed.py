@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jeit.electrodes.electrodes import AbstractElectrodes, Contact, ElectrodePen
-from jeit.mesh import Domain, Mesh, Refine
+from jeit.mesh import Body, Mesh, Refine
 from jeit_solvers.engines import has_values, namespace, on_device, on_host
 
 
@@ -56,7 +56,7 @@ class IntegratedElectrodes(AbstractElectrodes):
         """Raises `ValueError`: where they are is not known any more."""
         raise ValueError("IntegratedElectrodes do not say where they are; draw the electrodes that they were made of.")
 
-    def refinement(self, domain: Domain) -> tuple[Refine, ...]:
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
         """None: they have a mesh."""
         return ()
 

@@ -25,6 +25,13 @@ class Inclusion(eqx.Module):
         """'conductive' or 'resistive'."""
         return "conductive" if self.sign > 0 else "resistive"
 
+    @property
+    def radius(self) -> float:
+        """Of the disk of the same area, or in 3-D of the ball of the same volume, metres."""
+        if len(self.centroid) == 3:
+            return float(np.cbrt(3 * self.area / (4 * np.pi)))
+        return float(np.sqrt(self.area / np.pi))
+
 
 def find_inclusions(
     mesh: Mesh,

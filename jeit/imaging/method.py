@@ -16,7 +16,7 @@ from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.nonlinear.solvers import AbstractSolver
 from jeit.inverse.prior.defaults import PRIORS
 from jeit.inverse.prior.priors import AbstractPrior
-from jeit.mesh import Domain
+from jeit.mesh import Body
 from jeit_solvers import Status
 from jeit_solvers.engines import host
 
@@ -46,7 +46,7 @@ class Method:
     number: float | None = None
 
 
-def prior_for(prior: NamedPrior, domain: Domain) -> AbstractPrior:
+def prior_for(prior: NamedPrior, domain: Body) -> AbstractPrior:
     """The prior itself, or the one of that name in `jeit.inverse.prior.defaults.PRIORS`, made for the body's size."""
     if not isinstance(prior, str):
         return prior

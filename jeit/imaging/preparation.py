@@ -15,7 +15,7 @@ from jeit.forward import ForwardModel
 from jeit.imaging.clock import Clock
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
-from jeit.mesh import Domain, Mesh
+from jeit.mesh import Body, Mesh
 from jeit_solvers.engines import as_array
 
 
@@ -25,7 +25,7 @@ class PreparedDifference:
 
     - `measurement`, `reference`: the two frames compared, one frame each.
     - `quality`: what was found about the data.
-    - `domain`: the outline of the body.
+    - `domain`: the body.
     - `contact`: how the contact impedance was calibrated: "each", "common" or "fixed".
     - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
     - `difference`: (M,) volts, zero in masked channels; `mask` (M,), True for channels usable in both frames.
@@ -34,7 +34,7 @@ class PreparedDifference:
     measurement: Measurement
     reference: Measurement
     quality: FrameQuality
-    domain: Domain
+    domain: Body
     contact: str
     calibration: Calibration
     difference: Float[Array, " M"]
@@ -94,7 +94,7 @@ def prepare_difference(
 
 def calibrated_model(
     base: Measurement,
-    domain: Domain,
+    domain: Body,
     electrodes: AbstractElectrodes,
     *,
     contact: str | None = None,
@@ -154,7 +154,7 @@ def check_measurement(name: str, given: Measurement) -> None:
     check_kind(name, given, Measurement, "a Measurement, as of jeit.read(path)")
 
 
-def imaging_mesh(domain: Domain, electrodes: AbstractElectrodes, num_points: int) -> Mesh:
+def imaging_mesh(domain: Body, electrodes: AbstractElectrodes, num_points: int) -> Mesh:
     """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep."""
     return domain.mesh(num_points=num_points, refine=electrodes.refinement(domain) or None)
 
@@ -168,8 +168,8 @@ def default_contact(measurement: Measurement) -> str:
     return "each" if measurement.protocol.channels_on_driven_electrodes().any() else "fixed"
 
 
-def body_of(measurement: Measurement, reference: Measurement) -> tuple[Domain, AbstractElectrodes]:
-    """Outline and electrodes, from whichever of the two says them; raises `ValueError` where neither does."""
+def body_of(measurement: Measurement, reference: Measurement) -> tuple[Body, AbstractElectrodes]:
+    """Body and electrodes, from whichever of the two says them; raises `ValueError` where neither does."""
     domain = measurement.domain if measurement.domain is not None else reference.domain
     electrodes = measurement.electrodes if measurement.electrodes is not None else reference.electrodes
     if domain is None or electrodes is None:

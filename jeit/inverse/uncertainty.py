@@ -71,12 +71,16 @@ class Posterior(eqx.Module):
         return float(mean), float(jnp.sqrt(variance))
 
     def unknowns(self) -> dict[str, Float[Array, " k"]]:
-        """Standard deviations of what was estimated along with the conductivity, as in `Reconstruction.unknowns`."""
+        """Standard deviations of what was estimated along with the conductivity, in the units of
+        `Reconstruction.unknowns`; to first order where a logarithm was estimated."""
+        model, values = self.inversion.model, self.inversion.values(self.coefficients)
         start = self.inversion.basis.num_coefficients
         deviation = jnp.sqrt(1 - jnp.sum((self.root @ self.jacobian) ** 2, axis=0))
         found = {}
-        for unknown in self.inversion.unknowns:
-            found[type(unknown).__name__] = unknown.deviation * deviation[start : start + unknown.size]
+        for unknown, value in zip(self.inversion.unknowns, values, strict=True):
+            ones = jnp.ones_like(value)
+            _, slope = jax.jvp(lambda values, one=unknown: one.quantity(model, values), (value,), (ones,))
+            found[type(unknown).__name__] = slope * unknown.deviation * deviation[start : start + unknown.size]
             start += unknown.size
         return found
 

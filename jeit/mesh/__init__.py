@@ -1,10 +1,12 @@
 """The mesh room: outlines, meshes of them, their geometry, their quality, and files.
 
 Outlines without a mesh: `Disk`, `Rectangle`, `Polygon`. Plane meshes: `disk`, `rectangle`, `polygon`, made finer
-where a `Refine` asks. Solids: `layer`, `box`, `cylinder`. From elsewhere: `Mesh.create`, `read`, `from_gmsh`.
+where a `Refine` asks. Solids: `layer`, `box`, `cylinder`. From elsewhere: `Mesh.create`, `read`, `from_gmsh`. What was
+measured on, any of these: a `Body`, which is an outline, a `Solid` or an `OwnMesh`.
 """
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
+from jeit.mesh.body import Body
 from jeit.mesh.cell_quality import quality
 from jeit.mesh.files import read, write
 from jeit.mesh.generate.refine import Refine
@@ -13,17 +15,21 @@ from jeit.mesh.gmsh import from_gmsh
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Disk, Domain, Polygon, Rectangle
 from jeit.mesh.shapes import disk, polygon, rectangle
+from jeit.mesh.solid_body import OwnMesh, Solid
 from jeit.mesh.solids import box, cylinder, layer
 
 _tell_old_names(__name__)
 
 __all__ = [
+    "Body",
     "Disk",
     "Domain",
     "Mesh",
+    "OwnMesh",
     "Polygon",
     "Rectangle",
     "Refine",
+    "Solid",
     "box",
     "centroids",
     "cylinder",

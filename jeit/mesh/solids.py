@@ -81,7 +81,7 @@ def box(
     """
     width, depth = check_length("width", width), check_length("depth", depth)
     height = check_length("height", height)
-    base_points, layers = _stack(width * depth, height, num_points, cell_size, num_layers)
+    base_points, layers = choose_layers(width * depth, height, num_points, cell_size, num_layers)
     base = rectangle(width, depth, num_points=base_points, cell_size=cell_size, refine=refine)
     return layer(base, height, layers)
 
@@ -105,7 +105,7 @@ def cylinder(
     contradicting arguments.
     """
     radius, height = check_length("radius", radius), check_length("height", height)
-    base_points, layers = _stack(np.pi * radius**2, height, num_points, cell_size, num_layers)
+    base_points, layers = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)
     base = disk(
         radius,
         num_points=base_points,
@@ -117,10 +117,10 @@ def cylinder(
     return layer(base, height, layers)
 
 
-def _stack(
+def choose_layers(
     area: float, height: float, num_points: int | None, cell_size: float | None, num_layers: int | None
 ) -> tuple[int | None, int]:
-    """Nodes of the base (None if a cell size is given) and number of layers."""
+    """Nodes of the base of `area` m² (None if a cell size is given), and number of layers up to `height` metres."""
     target = unstructured.Target.create(num_points, cell_size)
     if num_layers is not None:
         num_layers = unstructured.check_count("num_layers", num_layers, 1)

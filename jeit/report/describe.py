@@ -8,7 +8,7 @@ import numpy as np
 
 from jeit.data import Measurement
 from jeit.electrodes import AbstractElectrodes
-from jeit.mesh import Domain
+from jeit.mesh import Body
 
 
 def describe_measurement(measurement: Measurement) -> dict[str, Any]:
@@ -24,8 +24,8 @@ def describe_measurement(measurement: Measurement) -> dict[str, Any]:
     }
 
 
-def describe_domain(domain: Domain | None) -> dict[str, Any]:
-    """Shape and size in metres of an outline."""
+def describe_domain(domain: Body | None) -> dict[str, Any]:
+    """Shape and size in metres of a body."""
     return {"shape": "not known"} if domain is None else {**domain.describe(), "unit": "m"}
 
 

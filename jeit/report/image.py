@@ -22,11 +22,11 @@ _PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix",
 def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[float, float] | None = None) -> None:
     """Write `image.png`, `image.npz` and `report.json` into `folder`, made if need be.
 
-    The NPZ holds `raster` (rows, columns), the change of conductivity (S; 3-D: S/m), NaN outside the body, row 0 at the
-    top, column 0 at the left; `extent` (x_min, x_max, y_min, y_max) in metres; `conductivity` (m,), the same change per
-    cell; `background`, the conductivity it is a change of; `points` (n, d) and `cells` (m, d + 1); and `labels` (rows,
-    columns), if the image was segmented: 0 background, 1 resistive, 2 conductive. `truth`: a known position (x, y) in
-    metres, marked in the picture. Raises `ValueError` for what cannot be a folder.
+    The NPZ holds `raster` (rows, columns), the change of conductivity (S; 3-D: S/m, half way up), NaN outside the body,
+    row 0 at the top, column 0 at the left; `extent` (x_min, x_max, y_min, y_max) in metres; `conductivity` (m,), the
+    same change per cell; `background`, the conductivity it is a change of; `points` (n, d) and `cells` (m, d + 1); and
+    `labels` (rows, columns), if the image was segmented: 0 background, 1 resistive, 2 conductive. `truth`: a known
+    position (x, y) in metres, marked in the picture. Raises `ValueError` for what cannot be a folder.
     """
     folder = results_folder(folder, ("image.png", "image.npz", "report.json"))
     draw_image(result, truth=truth).savefig(folder / "image.png", dpi=150)
@@ -53,14 +53,15 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     from jeit.plot.imaging.image import plot_image
     from jeit.plot.imaging.labels import draw_labels
 
-    figure = Figure(figsize=(6.4, 5.6), layout="constrained")
+    figure, height = Figure(figsize=(6.4, 5.6), layout="constrained"), picture_height(result)
     # Iterative images reach from a hundredth to a hundred times the background: on the logarithm's scale both show.
     ax = plot_image(
         result.mesh,
         np.asarray(result.departure) / (math.log(10) if result.iterative else 1),
         result.calibration.model.electrodes,
         inclusions=result.inclusions if result.labels is None else (),
-        title=result.measurement.name,
+        title=result.measurement.name + ("" if height is None else f", slice at z = {1e3 * height:.1f} mm"),
+        height=height,
         scale=ColourScale(quantity="log₁₀ of conductivity over background", unit="") if result.iterative else CHANGE,
         ax=figure.subplots(),
     )
@@ -70,10 +71,22 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     if result.labels is not None:
         draw_labels(result.labels, result.extent, ax=ax)
     elif result.inclusions:
-        ax.plot([], [], color="black", linewidth=1, linestyle=(0, (4, 3)), label="found: sign and area")
+        found = "found: sign and area" if height is None else "found: sign, and a ball of its volume"
+        ax.plot([], [], color="black", linewidth=1, linestyle=(0, (4, 3)), label=found)
     if ax.get_legend_handles_labels()[1]:
         ax.legend(loc="upper left", bbox_to_anchor=(0, 0), frameon=False, borderaxespad=0)
     return figure
+
+
+def picture_height(result: ImagedDifference) -> float | None:
+    """Height z in metres of the slice that the picture of a solid shows: through the strongest inclusion, or half way
+    up where there is none, or labels are shown; None for a sheet."""
+    if result.mesh.dimension == 2:
+        return None
+    if result.inclusions and result.labels is None:
+        return result.inclusions[0].centroid[2]
+    z = np.asarray(result.mesh.points)[:, 2]
+    return float(z.min() + z.max()) / 2
 
 
 def report_image(result: ImagedDifference) -> dict[str, Any]:
@@ -166,7 +179,7 @@ def _inclusion(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]
         "centroid": list(inclusion.centroid),
         "centroid_unit": "m",
         "area": inclusion.area,
-        "area_unit": "m²" if result.mesh.dimension == 2 else "m³",
+        "area_unit": "m²" if len(inclusion.centroid) == 2 else "m³",
         "peak": inclusion.peak,
         "peak_unit": _unit(result),
         "peak_relative_to_background": inclusion.peak / float(result.calibration.conductivity),

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 
+from jeit.cli import main
 from jeit.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -121,6 +122,34 @@ def test_a_page_runs(page, tmp_path, monkeypatch, capsys, request):
     for block in blocks(page, "python"):
         exec(compile(block, page.name, "exec"), names)
     HOLDS.get(page.name, lambda *_: None)(names, tmp_path, capsys.readouterr().out.splitlines())
+    pyplot.close("all")
+
+
+# Pages whose files those after them use too, and then what a reader types first.
+TYPED = ["docs/data.md", "docs/hearing.md", "docs/learning.md", "docs/choosing-a-hyperparameter.md", "README.md"]
+LONG = ("jeit layout optimise", "jeit study run")  # minutes; each has tests of its own
+
+
+@pytest.mark.slow
+def test_commands_run_as_they_are_written(data_folder, tmp_path, monkeypatch, capsys):
+    """What the pages have a reader type, Python and commands, in their order, in one folder that is empty but for the
+    measured files and the examples."""
+    pytest.importorskip("skops")
+    for file in (*data_folder.glob("kit4/datamat_*.mat"), *data_folder.glob("ktc2023/*.mat")):
+        (tmp_path / file.name).symlink_to(file)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    matplotlib.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    for page in (ROOT / name for name in TYPED):
+        names: dict = {}
+        for language, block in re.findall(r"^```(\w*)\n(.*?)^```", page.read_text("utf-8"), re.DOTALL | re.MULTILINE):
+            if language == "python":
+                exec(compile(block, page.name, "exec"), names)
+            for line in [] if language else block.splitlines():
+                if line.startswith("jeit ") and not line.startswith(LONG):
+                    status, error = main(shlex.split(line, comments=True)[1:]), capsys.readouterr().err
+                    assert (status, error) == (0, ""), f"{page.name}: {line}: {error}"
+    assert all(Path(line.split()[3]).is_file() for line in commands(ROOT / "README.md") if line.startswith(LONG[1]))
     pyplot.close("all")
 
 

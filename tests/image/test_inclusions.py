@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jeit.image import find_inclusions
-from jeit.mesh import centroids, disk
+from jeit.image import Inclusion, find_inclusions
+from jeit.mesh import box, centroids, disk
 
 MESH = disk(0.1, num_points=1500)
 CENTRE = np.asarray(centroids(MESH))
@@ -22,6 +22,14 @@ def test_two_bumps_of_either_sign():
     # Half height of a Gaussian bump is a disc of area 2π ln 2 · width².
     assert found[0].area == pytest.approx(2 * np.pi * np.log(2) * 0.015**2, rel=0.1)
     assert found[1].peak == pytest.approx(-0.6, rel=0.05)
+
+
+def test_radius_is_that_of_a_disk_or_a_ball():
+    assert Inclusion(1, (0.0, 0.0), np.pi * 0.02**2, 1.0).radius == pytest.approx(0.02)
+    solid = box(0.2, 0.2, 0.2, num_points=3000)
+    offset = np.linalg.norm(np.asarray(centroids(solid)) - [0.02, 0.0, 0.1], axis=1)
+    (found,) = find_inclusions(solid, (offset < 0.05).astype(float))
+    assert found.radius == pytest.approx(0.05, rel=0.05)
 
 
 def test_touching_bumps_are_told_apart_and_a_shoulder_is_not():

@@ -79,13 +79,14 @@ def test_contact_impedances(model):
         parametrisation=Parametrisation(unknowns=[ContactImpedance(model)]),
     )  # fmt: skip
     assert result.status == "converged"
-    found = np.exp(np.asarray(result.unknowns["ContactImpedance"]))
+    found = np.asarray(result.unknowns["ContactImpedance"]) / 1e-3
+    np.testing.assert_allclose(result.model.electrodes.contact_impedance, 1e-3 * found, rtol=1e-12)
     assert np.corrcoef(found, factor)[0, 1] > 0.98
     # A common factor is what a coarse mesh is off by at the electrodes' ends.
     ratio = found / factor
     assert np.abs(ratio / ratio.mean() - 1).max() < 0.12
     deviation = posterior(result).unknowns()["ContactImpedance"]
-    assert (np.asarray(deviation) < 0.2).all()
+    assert (np.asarray(deviation) < 0.2 * 1e-3 * found).all()
 
 
 @pytest.mark.slow
@@ -100,7 +101,7 @@ def test_background_and_scale(model):
     assert float(background.unknowns["Background"][0]) == pytest.approx(np.log(1.3), abs=0.02)
     np.testing.assert_allclose(background.conductivity, 1.3, rtol=5e-3)
     doubled = reconstruct(known, 2 * voltages, 1.3, parametrisation=also[1], **options)
-    assert float(doubled.unknowns["Scale"][0]) == pytest.approx(np.log(2), abs=0.02)
+    assert float(doubled.unknowns["Scale"][0]) == pytest.approx(2, rel=0.02)
     np.testing.assert_allclose(doubled.conductivity, 1.3, rtol=5e-3)
     np.testing.assert_allclose(doubled.model.protocol.drive, 2 * known.protocol.drive, rtol=0.02)
 
@@ -123,6 +124,24 @@ def test_derivative_with_all_unknowns(model):
     steps = 1e-2 * 0.5 ** np.arange(4)
     errors = [np.linalg.norm(inversion.residual(point + h * direction) - residual - h * tangent) for h in steps]
     assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2, abs=0.1)
+
+
+def test_what_is_estimated_by_logarithms_is_told_as_itself(model):
+    """Contact impedances in ohm·m and a factor; deviations in the same units: those of the logarithms times them."""
+    model = model_of(300, contact=2e-3, driven=True)
+    voltages, noise = noisy(model_of(300, contact=3e-3, driven=True).voltages(1.0))
+    result = reconstruct(
+        model, voltages, 1.0, prior=Gaussian(0.02), noise=noise, hyperparameter=10.0,
+        parametrisation=Parametrisation(unknowns=[ContactImpedance(model, 0.4), Scale(0.05)]),
+    )  # fmt: skip
+    impedance, factor = (np.asarray(result.unknowns[name]) for name in ("ContactImpedance", "Scale"))
+    np.testing.assert_allclose(impedance, 3e-3, rtol=0.1)
+    np.testing.assert_allclose(impedance, result.model.electrodes.contact_impedance, rtol=1e-12)
+    np.testing.assert_allclose(result.model.protocol.drive, factor * model.protocol.drive, rtol=1e-12)
+    found = posterior(result)
+    share = np.sqrt(1 - ((found.root @ found.jacobian) ** 2).sum(axis=0))[result.inversion.basis.num_coefficients :]
+    np.testing.assert_allclose(found.unknowns()["ContactImpedance"], 0.4 * share[:16] * impedance, rtol=1e-9)
+    np.testing.assert_allclose(found.unknowns()["Scale"], 0.05 * share[16:] * factor, rtol=1e-9)
 
 
 def test_discs_in_a_sheet_move_both_ways():

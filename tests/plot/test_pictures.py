@@ -4,16 +4,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 
-from jeit.electrodes import BoundaryElectrodes, CombinedElectrodes, FaceDiscs, PointElectrodes, SheetDiscs, plates
+from jeit.electrodes import (
+    BoundaryElectrodes,
+    CombinedElectrodes,
+    FaceDiscs,
+    FacePatches,
+    PointElectrodes,
+    SheetDiscs,
+    plates,
+)
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion
 from jeit.layout import perimeter, ring
-from jeit.mesh import Polygon, Rectangle, centroids, disk, layer, rectangle
+from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import plot_raster
+from jeit.plot.imaging.inclusions import draw_inclusions
 from jeit.plot.imaging.sensitivity import plot_sensitivity
 from jeit.plot.imaging.voltages import plot_voltages
 from jeit.protocol import adjacent
@@ -110,6 +120,12 @@ def test_numbers_in_a_narrow_notch_stand_inside_in_a_rim(ax):
     assert not outside.get_path_effects()
 
 
+def test_circles_of_inclusions_are_of_their_area_or_volume(ax):
+    flat, round_ = Inclusion(1, (0.0, 0.0), np.pi * 0.02**2, 1.0), Inclusion(-1, (0.0, 0.0, 0.1), 4e-6 * np.pi / 3, 1.0)
+    draw_inclusions([flat, round_], ax=ax)
+    assert [patch.radius for patch in ax.patches] == pytest.approx([0.02, 0.01])
+
+
 def test_an_electrode_over_the_start_of_the_outline_is_one_piece(mesh, ax):
     across = BoundaryElectrodes(jnp.array([[RADIUS, 0.0], [-RADIUS, 0.0]]), 0.02, 0.1)
     draw_electrodes(mesh, across, ax=ax)
@@ -117,6 +133,23 @@ def test_an_electrode_over_the_start_of_the_outline_is_one_piece(mesh, ax):
     arc = arcs.get_segments()[0]
     assert np.linalg.norm(np.diff(arc, axis=0), axis=1).max() < 0.02
     assert arc[:, 1].min() == pytest.approx(-arc[:, 1].max(), rel=1e-6)
+
+
+def test_rings_round_a_tank_share_the_places_of_their_numbers(ax):
+    tank = Solid(Disk(RADIUS), 0.04).mesh(num_points=1200)
+    rings = np.concatenate([ring(RADIUS, 4, height=height) for height in (0.01, 0.03)])
+    draw_electrodes(tank, FaceDiscs(rings, 0.008, 0.1), ax=ax)
+    assert [text.get_text() for text in ax.texts] == ["1, 5", "2, 6", "3, 7", "4, 8"]
+    assert not [c for c in ax.collections if isinstance(c, PatchCollection)]  # on the wall a disc is seen from its side
+    draw_electrodes(tank, FacePatches(rings[:4], 0.01, 0.01, 0.1), ax=ax)
+    assert not [c for c in ax.collections if isinstance(c, PatchCollection)]
+
+
+def test_a_slice_through_a_solid_has_its_outline(ax):
+    tank = Solid(Disk(RADIUS), 0.04).mesh(num_points=1200)
+    plot_image(tank, np.zeros(tank.num_cells), ax=ax)
+    (outline,) = [c for c in ax.collections if isinstance(c, ContourSet)]
+    np.testing.assert_allclose(np.linalg.norm(outline.get_paths()[0].vertices, axis=1), RADIUS, rtol=0.02)
 
 
 def test_other_electrodes(ax):

@@ -26,8 +26,10 @@ def info(
     body, noise = found["body"], found["noise"]
     names = f" ({', '.join(found['frame_names'])})" if found["frame_names"] else ""
     size = ", ".join(
-        f"{key.replace('_', ' ')} {1e3 * body[key]:g} mm" for key in ("radius", "width", "height") if key in body
+        f"{key} {1e3 * body[key]:g} mm" for key in ("radius", "width", "height", "thickness") if key in body
     )
+    if body["shape"] == "mesh":
+        size = f"{body['dimension']}-D, {counted(body['points'], 'node')}"
     known = noise and f"{scaled(noise['standard_deviation'], 'V')}, from {noise['method']}"
     rows = [
         ("frames", f"{found['frames']}{names}"),

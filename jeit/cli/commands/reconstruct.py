@@ -104,10 +104,8 @@ def reconstruct(
 
 def show(console, result: "ImagedDifference") -> None:
     """Print what was found."""
-    from rich.table import Table
-
     from jeit.arguments import counted
-    from jeit.cli.console import in_one_unit, pairs, percent, scaled
+    from jeit.cli.console import inclusion_table, pairs, percent, scaled
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
     from jeit_solvers import Status
 
@@ -138,15 +136,10 @@ def show(console, result: "ImagedDifference") -> None:
     elif result.lowest < -1:
         fall = f"falls to {percent(result.lowest)} of the background: of changes so large only place and sign are right"
         rows.append(("linear image", fall))
+    rows += [("note", note) for note in dict.fromkeys((*result.measurement.notes, *result.reference.notes))]
     console.print()
     console.print(pairs(result.measurement.name, rows))
     console.print()
-    peak_unit, peaks = in_one_unit([inclusion.peak for inclusion in result.inclusions], unit)
-    table = Table("inclusion", "x / mm", "y / mm", "area / mm²", f"peak / {peak_unit}", box=None, padding=(0, 2))
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for inclusion, peak in zip(result.inclusions, peaks, strict=True):
-        x, y = inclusion.centroid[:2]
-        table.add_row(inclusion.kind, f"{1e3 * x:.1f}", f"{1e3 * y:.1f}", f"{1e6 * inclusion.area:.0f}", peak)
+    table = inclusion_table(result.inclusions, unit)
     console.print(table if result.inclusions else "  no inclusion found")
     console.print()

@@ -19,6 +19,7 @@ import numpy as np
 from jeit.arguments import check_kind
 from jeit.design.study.contents import Contents, study_contents
 from jeit.design.study.spec import Study
+from jeit.design.study.store_check import ArrayShape, damage, danger
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 
@@ -28,8 +29,8 @@ class Store:
 
     def __init__(self, work: Study | Contents, path: str | Path, *, create: bool = True):
         """Raises `FileNotFoundError` if there is no store and none is to be made, `ValueError` if there is something
-        else, or another study's, or if it is damaged, `ImportError` without the extra `cluster`, and `OSError` if it
-        cannot be written."""
+        else, or another study's, or if it is damaged, or might run code when it is opened, `ImportError` without the
+        extra `cluster`, and `OSError` if it cannot be written."""
         zarr = require("zarr")
         self.contents = work if isinstance(work, Contents) else study_contents(work)
         check_kind("path", path, (str, os.PathLike), "that of the store, such as 'results.zarr'")
@@ -54,8 +55,9 @@ class Store:
                 f"{self.path} holds the results of another {kind}, or of this one before it was changed; move it away "
                 "or choose another path."
             )
+        self._check(_shapes(zarr, self.contents))
         try:
-            self._group = zarr.open_group(str(self.path), mode="r+")
+            self._group = zarr.open_group(str(self.path), mode="r+", zarr_format=3)
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise self._damaged(error) from None
 
@@ -119,6 +121,26 @@ class Store:
         except (OSError, ValueError, RuntimeError):
             return None  # a file that cannot be decoded
 
+    def open_dataset(self):
+        """The whole store as an `xarray.Dataset`, read when it is asked for."""
+        return require("xarray").open_zarr(str(self.path), chunks=None, zarr_format=3)
+
+    def _check(self, expected: Mapping[str, ArrayShape]) -> None:
+        """Before Zarr looks at any of it."""
+        try:
+            reason = danger(self.path)
+            wrong = None if reason else damage(self.path, expected)
+        except OSError as error:
+            raise self._damaged(error) from None
+        if reason:
+            raise ValueError(
+                f"{self.path} is not opened, because it might run code or write elsewhere: {reason}. No "
+                f"{self.contents.kind} that jeit wrote is like that. Delete it if it came from somebody else, and run "
+                f"the {self.contents.kind} yourself, to another place."
+            )
+        if wrong:
+            raise self._damaged(wrong)
+
     def _attributes(self) -> dict:
         """Those of a study's store; none if it is something else. Raises `ValueError` if they cannot be read."""
         try:
@@ -145,8 +167,8 @@ class Store:
 def open_results(study: Study, path: str | Path):
     """The results as an `xarray.Dataset` with dimensions point and place; what is not finished is NaN.
 
-    `xarray.open_zarr(path)` opens the same store, but cannot tell what an interrupted run left half-written. Raises as
-    `Store` does.
+    `xarray.open_zarr(path)` opens the same store, but cannot tell what an interrupted run left half-written, nor what
+    somebody else's may run. Raises as `Store` does.
     """
     xarray = require("xarray")
     store = Store(study, path, create=False)
@@ -154,7 +176,7 @@ def open_results(study: Study, path: str | Path):
     for number in store.sound():
         done[list(study.chunks[number])] = True
     variables = {}
-    with xarray.open_zarr(str(path)) as found:
+    with store.open_dataset() as found:
         for name, variable in found.data_vars.items():
             values = np.full(variable.shape, np.nan)
             values[done] = variable[np.flatnonzero(done)]
@@ -171,6 +193,16 @@ def require(name: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError:
         raise ImportError(f"Studies need {name}: pip install 'jeit[cluster]'.") from None
+
+
+def _shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:
+    """Of the arrays that `contents` fills a store with: of one in memory, which has no values."""
+    group = zarr.open_group(zarr.storage.MemoryStore(), mode="w", zarr_format=3)
+    contents.fill(group)
+    return {
+        name: ArrayShape(array.shape, array.chunks, array.metadata.to_dict()["data_type"])
+        for name, array in group.arrays()
+    }
 
 
 def _runs(points: Sequence[int]) -> list[slice]:
@@ -209,4 +241,7 @@ def _checksum(results: Mapping[str, np.ndarray]) -> str:
 
 
 def _read_json(path: Path) -> dict:
-    return json.loads((path / "zarr.json").read_text("utf-8"))
+    try:
+        return json.loads((path / "zarr.json").read_bytes())
+    except RecursionError:
+        raise ValueError("it is nested too deep") from None

@@ -56,7 +56,7 @@ class Inversion(eqx.Module):
         return model
 
     def values(self, coefficients: Float[Array, " n"]) -> tuple[Float[Array, " k"], ...]:
-        """The estimated values of every unknown, in its own unit."""
+        """The estimated values of every unknown, as `AbstractUnknown.apply` takes them."""
         return self._parts(coefficients)[1]
 
     def voltages(self, coefficients: Float[Array, " n"]) -> Float[Array, " r"]:

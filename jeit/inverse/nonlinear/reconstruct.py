@@ -59,9 +59,16 @@ class Reconstruction(eqx.Module):
 
     @property
     def unknowns(self) -> dict[str, Float[Array, " k"]]:
-        """What was estimated along with the conductivity, by the name of its class, in its own unit."""
-        values = self.inversion.values(self.coefficients)
-        return {type(one).__name__: value for one, value in zip(self.inversion.unknowns, values, strict=True)}
+        """What was estimated along with the conductivity, by the name of its class.
+
+        `ContactImpedance`: (L,), ohm·m² (2-D: ohm·m); `ElectrodePosition`: how far from the model's, metres; `Scale`:
+        the factor; `Background`: what is added to the image, on the link's scale.
+        """
+        model, values = self.inversion.model, self.inversion.values(self.coefficients)
+        return {
+            type(one).__name__: one.quantity(model, value)
+            for one, value in zip(self.inversion.unknowns, values, strict=True)
+        }
 
 
 def reconstruct(

@@ -1,7 +1,8 @@
 """Unknowns: what else is not known exactly, and may be estimated along with the conductivity.
 
 Each has a prior of zero mean and the given standard deviation, and changes the forward model or the image; what it does
-to the voltages is found by automatic differentiation.
+to the voltages is found by automatic differentiation. What stays positive is estimated by its logarithm, and told as
+itself.
 """
 
 import abc
@@ -36,9 +37,13 @@ class AbstractUnknown(eqx.Module):
     ) -> tuple[ForwardModel, Float[Array, " m"]]:
         """The model and the image (on the link's scale) with these values in place of zeros."""
 
+    def quantity(self, model: ForwardModel, values: Float[Array, " k"]) -> Float[Array, " k"]:
+        """What the values mean, each for itself, in the unit of what is estimated; themselves unless said."""
+        return values
+
 
 class ContactImpedance(AbstractUnknown):
-    """The logarithm of every electrode's contact impedance over the model's."""
+    """Every electrode's contact impedance, by the logarithm of it over the model's."""
 
     deviation: Float[Array, " L"]
 
@@ -54,8 +59,12 @@ class ContactImpedance(AbstractUnknown):
 
     def apply(self, model, estimate, values):
         """z exp(values)."""
-        impedance = model.electrodes.contact_impedance * jnp.exp(values)
+        impedance = self.quantity(model, values)
         return model.with_electrodes(model.electrodes.with_contact_impedance(impedance)), estimate
+
+    def quantity(self, model, values):
+        """Contact impedances z exp(values), ohm·m² (2-D: ohm·m)."""
+        return model.electrodes.contact_impedance * jnp.exp(values)
 
 
 class ElectrodePosition(AbstractUnknown):
@@ -108,7 +117,7 @@ class Background(AbstractUnknown):
 
 
 class Scale(AbstractUnknown):
-    """The logarithm of a factor on all voltages: a current or a gain that is not known.
+    """A factor on all voltages, by its logarithm: a current or a gain that is not known.
 
     Raises `ValueError` for a deviation that is not positive.
     """
@@ -120,8 +129,12 @@ class Scale(AbstractUnknown):
 
     def apply(self, model, estimate, values):
         """Currents times exp(value)."""
-        drive = model.protocol.drive * jnp.exp(values[0])
+        drive = model.protocol.drive * self.quantity(model, values)[0]
         return eqx.tree_at(lambda m: m.protocol.drive, model, drive), estimate
+
+    def quantity(self, model, values):
+        """The factor, exp(value)."""
+        return jnp.exp(values)
 
 
 def _deviation(name: str, deviation, size: int) -> Float[Array, " k"]:

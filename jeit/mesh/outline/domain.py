@@ -5,13 +5,13 @@ from __future__ import annotations
 import abc
 from typing import Any, Protocol
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.mesh._checks import warn_large
+from jeit.mesh.body import Body
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
 from jeit_solvers.engines import has_values
@@ -27,7 +27,7 @@ class Pen(Protocol):
         """A closed loop of straight sides with these `vertices` (k, 2) in metres, the first not repeated."""
 
 
-class Domain(eqx.Module):
+class Domain(Body):
     """An outline in metres, without a mesh: `Disk`, `Rectangle`, `Polygon`, or one of your own.
 
     Readers, layouts, rasters and mesh builders ask for nothing but what stands here, so that a new outline is one

@@ -20,7 +20,8 @@ def draw_numbers(
     """Number electrodes at `places`, counted from `first`: on them, or where that would hide them `beside` them.
 
     Beside one on the edge of a sheet is outward along the normal, or inward where a notch is too narrow; beside one
-    inside it is above; and beside one of a solid, seen from above, away from the middle.
+    inside it is above; and beside one of a solid, seen from above, away from the middle. Electrodes above each other
+    share a place for their numbers.
     """
     corners = np.asarray(mesh.points)[:, :2]
     away = _AWAY * np.ptp(corners, axis=0).max()
@@ -31,10 +32,25 @@ def draw_numbers(
     shift[~beside] = 0
     fontsize = 9 if len(places) <= 20 else 7
     rim = [withStroke(linewidth=2, foreground="white")]
-    for k, (x, y) in enumerate(places + shift):
+    for one in _at_one_place(places, 0.1 * away):
+        k = one[0]
         effects = rim if inside[k] or not beside[k] else None  # the image lies behind
         style = {"ha": "center", "va": "center", "fontsize": fontsize, "color": INK, "zorder": 4}
-        ax.text(x, y, str(k + first), path_effects=effects, **style)
+        (x, y), told = places[k] + shift[k], ", ".join(str(k + first) for k in one)
+        ax.text(x, y, told, path_effects=effects, **style)
+
+
+def _at_one_place(places, near: float) -> list[list[int]]:
+    """Electrodes above each other, as rings round a tank have them, seen from above: together."""
+    together: list[list[int]] = []
+    for k, place in enumerate(places):
+        for one in together:
+            if np.linalg.norm(places[one[0]] - place) < near:
+                one.append(k)
+                break
+        else:
+            together.append([k])
+    return together
 
 
 def _off_the_edge(mesh: Mesh, places, away: float) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:

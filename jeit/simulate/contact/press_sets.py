@@ -152,12 +152,12 @@ def simulate_presses(
 def open_presses(presses: PressSet, path: str | Path):
     """The set in a store as an `xarray.Dataset` with dimensions touch, channel and press, read when it is asked for;
     `finished` (touch,) says which touches are. Raises as `jeit.design.study.store.Store` does."""
-    xarray = require("xarray")
+    require("xarray")
     store = Store(presses.contents(), path, create=False)
     finished = np.zeros(presses.number, bool)
     for number in store.sound():
         finished[list(presses.chunks[number])] = True
-    return xarray.open_zarr(str(path), chunks=None).assign_coords(finished=("touch", finished))
+    return store.open_dataset().assign_coords(finished=("touch", finished))
 
 
 def solve_presses(presses: PressSet, number: int) -> dict[str, np.ndarray]:

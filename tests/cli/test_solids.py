@@ -1,0 +1,65 @@
+"""A tank described as a solid, and one as a mesh of one's own, from a table of numbers to a picture."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jeit.data import load_description
+from jeit.mesh import Disk, centroids, write
+
+PROTOCOL = """
+[protocol]
+kind = "adjacent"
+current = 1e-3
+"""
+BODIES = {
+    "solid": """
+[geometry]
+shape = "cylinder"
+radius = 0.05
+height = 0.04
+[electrodes]
+kind = "disc"
+layout = "ring"
+number = 8
+levels = [0.02]
+radius = 0.006
+contact_impedance = 1e-3
+""",
+    "mesh": f"""
+[geometry]
+mesh = "tank.vtu"
+[electrodes]
+kind = "point"
+positions = {[[0.049 * float(f(k)) for f in (np.cos, np.sin)] for k in np.arange(8) * np.pi / 4]}
+""",
+}
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_from_description_to_picture(body, run, tmp_path):
+    write(Disk(0.05).mesh(num_points=400), tmp_path / "tank.vtu")
+    (tmp_path / "full.toml").write_text(BODIES[body] + PROTOCOL)
+    model = load_description(tmp_path / "full.toml").model(tmp_path / "full.csv", num_points=4000)
+    where = np.asarray(centroids(model.mesh)) - np.array([0.02, 0.0, 0.02])[: model.mesh.dimension]
+    for name, change in (("empty", 1.0), ("full", 3.0)):
+        conductivity = np.where(np.linalg.norm(where, axis=1) < 0.012, change, 1.0)
+        np.savetxt(tmp_path / f"{name}.csv", np.asarray(model.voltages(conductivity))[None], delimiter=",")
+    status, told, error = run(
+        "reconstruct", tmp_path / "full.csv", "--reference", tmp_path / "empty.csv",
+        "--description", tmp_path / "full.toml", "--output", tmp_path / "out", "--num-points", 1200,
+    )  # fmt: skip
+    assert (status, error) == (0, "")
+    assert ("volume / cm³" in told) == (body == "solid")
+    assert ("area / mm²" in told) == (body == "mesh")
+    assert (tmp_path / "out" / "image.png").stat().st_size > 10_000
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    (found,) = report["inclusions"]
+    assert found["kind"] == "conductive"
+    assert found["area_unit"] == ("m³" if body == "solid" else "m²")
+    np.testing.assert_allclose(found["centroid"], [0.02, 0.0, 0.02][: model.mesh.dimension], atol=0.005)
+    if body == "solid":
+        assert report["geometry"]["thickness"] == 0.04
+    else:
+        assert report["geometry"]["mesh"]["points"] == model.mesh.num_points

@@ -1,0 +1,137 @@
+"""Descriptions of solids and of meshes of one's own, from the TOML to the electrodes on them."""
+
+import numpy as np
+import pytest
+
+from jeit.data import Measurement, read, screen, write_table
+from jeit.data.description import parse_description
+from jeit.electrodes import BoundaryElectrodes, FaceDiscs, FacePatches, FacetElectrodes, PointElectrodes
+from jeit.layout import perimeter, ring
+from jeit.mesh import Disk, Mesh, OwnMesh, Polygon, Rectangle, Solid, cylinder, write
+from jeit.protocol import adjacent
+
+RING = {"kind": "disc", "layout": "ring", "number": 8, "levels": [0.02], "radius": 0.005, "contact_impedance": 1e-3}
+CYLINDER = {"shape": "cylinder", "radius": 0.05, "height": 0.04}
+SQUARE = [[0.0, 0.0], [0.1, 0.0], [0.1, 0.1], [0.0, 0.1]]
+
+
+def described(geometry, electrodes=RING, folder="."):
+    return parse_description({"geometry": geometry, "electrodes": electrodes}, "d.toml", folder)
+
+
+def test_a_cylinder_with_a_ring_of_discs():
+    found = described(CYLINDER)
+    assert found.domain.describe() == {"shape": "disk", "radius": 0.05, "centre": [0.0, 0.0], "thickness": 0.04}
+    mesh = found.domain.mesh(num_points=2000)
+    assert mesh.num_points == pytest.approx(2000, rel=0.1)
+    np.testing.assert_allclose(np.ptp(np.asarray(mesh.points), axis=0), [0.1, 0.1, 0.04], rtol=1e-3)
+    assert isinstance(found.electrodes, FaceDiscs)
+    np.testing.assert_allclose(found.electrodes.position, ring(0.05, 8, height=0.02), atol=1e-12)
+    found.electrodes.check(mesh)
+
+
+def test_a_box_with_patches_in_two_levels():
+    patches = {"kind": "patch", "layout": "perimeter", "number": 6, "start": 0.02, "levels": [0.01, 0.03]}
+    patches |= {"width": 0.01, "height": 0.008, "contact_impedance": 1e-3}
+    found = described({"shape": "box", "width": 0.1, "depth": 0.08, "height": 0.04}, patches)
+    assert isinstance(found.electrodes, FacePatches)
+    around = perimeter(Rectangle(0.1, 0.08), 6, start=0.02)
+    np.testing.assert_allclose(found.electrodes.position[:6], np.column_stack([around, np.full(6, 0.01)]))
+    np.testing.assert_allclose(found.electrodes.position[6:], np.column_stack([around, np.full(6, 0.03)]))
+    found.electrodes.check(found.domain.mesh(num_points=4000))
+
+
+def test_any_outline_with_a_thickness_is_a_solid():
+    corner = {"kind": "point", "positions": [[0.01, 0.01, 0.0], [0.09, 0.01, 0.0]]}
+    found = described({"shape": "polygon", "vertices": SQUARE, "thickness": 0.01}, corner)
+    assert isinstance(found.domain, Solid)
+    assert isinstance(found.domain.outline, Polygon)
+    assert found.electrodes.refinement()[0].points.shape == (2, 2)  # seen from above, for the plane mesh
+    assert found.domain.mesh(num_points=500, refine=found.electrodes.refinement()).dimension == 3
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two meshes in centimetres: a disk, and a cylinder with two named plates."""
+    solid = cylinder(5.0, 4.0, num_points=400)
+    facets, middle = np.asarray(solid.facets), np.asarray(solid.points)[np.asarray(solid.facets)].mean(axis=1)
+    plates = {"east": facets[middle[:, 0] > 4], "west": facets[middle[:, 0] < -4]}
+    write(Disk(5.0).mesh(num_points=200), tmp_path / "disk.vtu")
+    write(Mesh.create(solid.points, solid.cells, tags=plates), tmp_path / "plates.msh")
+    return tmp_path
+
+
+def test_a_mesh_beside_the_description(folder):
+    arcs = {"kind": "boundary", "positions": ring(0.05, 8).tolist(), "width": 0.01, "contact_impedance": 0.1}
+    (folder / "frames.csv").write_text(",".join(["1"] * 39 + ["2"]))
+    (folder / "frames.toml").write_text(
+        f'[geometry]\nmesh = "disk.vtu"\nscale = 1e-2\n[electrodes]\npositions = {arcs["positions"]}\nwidth = 0.01\n'
+        'contact_impedance = 0.1\n[protocol]\nkind = "adjacent"\ncurrent = 1e-3\n'
+    )
+    body = read(folder / "frames.csv").domain
+    assert isinstance(body, OwnMesh)
+    assert body.mesh(num_points=5000) is body.given
+    assert body.given.dimension == 2
+    assert body.extent == pytest.approx((-0.05, 0.05, -0.05, 0.05), rel=1e-2)
+    (edge,) = body.loops()
+    np.testing.assert_allclose(np.linalg.norm(edge, axis=1), 0.05, rtol=1e-6)
+
+
+def test_named_facets_of_a_mesh(folder):
+    facets = {"kind": "facets", "tags": ["east", "west"], "contact_impedance": [1e-3, 2e-3]}
+    found = described({"mesh": "plates.msh", "scale": 1e-2}, facets, folder)
+    assert isinstance(found.electrodes, FacetElectrodes)
+    assert found.domain.loops() == ()
+    found.electrodes.check(found.domain.mesh())
+
+
+WRONG = {
+    "no height": ({"shape": "cylinder", "radius": 0.05}, RING, r"\[geometry\] cylinder needs 'height'"),
+    "two shapes": (CYLINDER | {"mesh": "a.msh"}, RING, r"\[geometry\] with a mesh has no '(height|radius|shape)'"),
+    "two heights": (CYLINDER | {"thickness": 0.1}, RING, r"\[geometry\] cylinder has no 'thickness'"),
+    "another's size": ({"shape": "disk", "radius": 0.1, "width": 0.1}, RING, r"\[geometry\] disk has no 'width'"),
+    "no thickness": ({"shape": "disk", "radius": 0.1, "thickness": -1.0}, RING, r"\[geometry\]: thickness.*positive"),
+    "no mesh": ({"mesh": "none.msh"}, RING, r"mesh: there is no file .*none\.msh; name it from where d\.toml is"),
+    "no levels": (CYLINDER, {k: v for k, v in RING.items() if k != "levels"}, "on a solid needs 'levels'"),
+    "above": (CYLINDER, RING | {"levels": [0.05]}, r"levels must be heights from 0 to 0\.04 m"),
+    "arcs": (CYLINDER, RING | {"kind": "boundary", "width": 0.01}, "3 coordinates are not those of kind = 'boundary'"),
+    "flat patch": ({"shape": "disk", "radius": 0.1}, RING | {"kind": "patch"}, "give x, y and z"),
+    "facets": (
+        CYLINDER,
+        {"kind": "facets", "tags": ["a"]},
+        r"facets that a mesh has names for: give \[geometry\] mesh",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_is_wrong_is_said(name):
+    geometry, electrodes, message = WRONG[name]
+    with pytest.raises(ValueError, match=rf"^d\.toml.*{message}"):
+        described(geometry, electrodes)
+
+
+def test_a_layout_on_a_mesh_is_refused(folder):
+    with pytest.raises(ValueError, match="needs a shape to lie on; on a mesh of your own give 'positions'"):
+        described({"mesh": "plates.msh", "scale": 1e-2}, RING, folder)
+
+
+@pytest.mark.parametrize("kind", [FaceDiscs, PointElectrodes])
+def test_solids_are_written_and_read_again(tmp_path, kind):
+    places = ring(0.05, 8, height=0.02)
+    electrodes = FaceDiscs(places, 0.005, 1e-3) if kind is FaceDiscs else PointElectrodes(places)
+    body = Solid(Disk(0.05), 0.04)
+    write_table(screen(np.arange(40.0) + 1, adjacent(8), electrodes=electrodes, domain=body), tmp_path / "a.npz")
+    again = read(tmp_path / "a.npz")
+    assert again.domain == body
+    assert type(again.electrodes) is kind
+    np.testing.assert_array_equal(again.electrodes.position, places)
+
+
+def test_a_plain_mesh_is_a_body_and_a_path_is_none():
+    mesh = Disk(0.05).mesh(num_points=200)
+    body = Measurement(np.ones((1, 40)), np.ones((1, 40), bool), adjacent(8), domain=mesh).domain
+    assert isinstance(body, OwnMesh)
+    electrodes = BoundaryElectrodes(ring(0.05, 8), 0.005, 0.1)
+    with pytest.raises(ValueError, match=r"domain must be an outline such as Disk\(0.05\), a Solid, or a Mesh"):
+        screen(np.arange(40.0) + 1, adjacent(8), electrodes=electrodes, domain="tank.msh")
