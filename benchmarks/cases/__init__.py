@@ -20,6 +20,7 @@ NAMES = (
     "first_call",
     "contacts",
     "localisation_error",
+    "mixed_tanks",
     "ktc2023",
     "real_skins",
     "discriminants",

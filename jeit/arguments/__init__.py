@@ -6,7 +6,7 @@ light: nothing of the library is imported here.
 """
 
 from jeit.arguments.arrays import real_array
-from jeit.arguments.counts import counted
+from jeit.arguments.counts import counted, percent
 from jeit.arguments.keys import check_key
 from jeit.arguments.kinds import check_kind, is_number, told
 from jeit.arguments.lengths import IN_MILLIMETRES, check_metres
@@ -24,6 +24,7 @@ __all__ = [
     "is_number",
     "need",
     "npz_arrays",
+    "percent",
     "real_array",
     "told",
 ]

@@ -1,6 +1,5 @@
 """What the commands print: steps as they go, and tables of results."""
 
-import math
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -11,8 +10,6 @@ from rich.table import Table
 if TYPE_CHECKING:
     from jeit.image import Inclusion
 
-# Below it nobody cares how little it is.
-_LEAST_PERCENT = 0.001
 
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
@@ -101,15 +98,3 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str) -> Table:
         place = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
         table.add_row(inclusion.kind, *place, f"{1e6 * inclusion.area:.{digits}f}", peak)
     return table
-
-
-def percent(value: float | None) -> str:
-    """A ratio in per cent with two digits, all of those before the point, and never an exponent."""
-    if value is None:
-        return "not known"
-    share = 100 * float(value)
-    if not math.isfinite(share) or abs(share) >= 99.5:
-        return f"{share:.0f} %"
-    if 0 < abs(share) < _LEAST_PERCENT:
-        return f"less than {_LEAST_PERCENT:g} %"
-    return f"{share:.2g} %"

@@ -27,6 +27,10 @@ Contact = Annotated[
     typer.Option(help="Contact impedance in the calibration: each, common or fixed; found from the protocol."),
 ]
 Nodes = Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000).")]
+AsIs = Annotated[
+    bool,
+    typer.Option("--as-is", help="Go on though electrodes, channels or signs look wired otherwise than described."),
+]
 Frame = Annotated[
     str | None, typer.Option(help="Frame of DATA to image, by number from 0 or by name; the first unless given.")
 ]

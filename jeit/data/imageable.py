@@ -6,7 +6,13 @@ import numpy as np
 
 from jeit.arguments import counted
 from jeit.data.measurement import Measurement
-from jeit.data.quality import NoiseEstimate, estimate_noise, impossible_signs, reciprocity_error
+from jeit.data.quality import (
+    NoiseEstimate,
+    estimate_noise,
+    impossible_signs,
+    reciprocity_error,
+    reciprocity_noise,
+)
 from jeit.inverse import relative_noise
 
 # A quarter of the signs wrong means that half of the voltages are noise (noise is wrong half the time).
@@ -21,6 +27,8 @@ class FrameQuality:
 
     - `difference`: ‖v - v_reference‖ / ‖v_reference‖ over usable channels.
     - `difference_noise`: noise of the difference in volts, and relative to it; None when it cannot be told.
+    - `trusted_noise`: noise of the difference in units of `jeit.inverse.relative_noise` of the reference, what channels
+      may be off by relative to each other; None when it cannot be told.
     - `difference_reciprocity_error`: relative reciprocity error of the difference, or None.
     - `impossible_signs`: the larger fraction, of frame and reference, of voltages of a sign that no passive
       body gives; or None.
@@ -30,6 +38,7 @@ class FrameQuality:
 
     difference: float
     difference_noise: NoiseEstimate | None
+    trusted_noise: float | None
     difference_reciprocity_error: float | None
     impossible_signs: float | None
     usable_channels: int
@@ -95,7 +104,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
     - it, or the reference, has an impossible sign in more than a quarter of its voltages
       (`impossible_signs`): half of the voltages or more then lie below the instrument's noise or offset;
     - the difference breaks reciprocity by more than 0.63, i.e. its noise is over half its signal, each channel trusted
-      as images trust it (`jeit.inverse.relative_noise`): what is read on driven electrodes is large, and mostly contact;
+      as images trust it (`jeit.inverse.relative_noise`): driven electrodes read large voltages, mostly of contacts;
     - it does not differ from the reference at all;
     - fewer channels than electrodes are usable.
 
@@ -125,6 +134,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
             FrameQuality(
                 difference=relative,
                 difference_noise=estimate_noise(change) if usable and size > 0 else None,
+                trusted_noise=reciprocity_noise(change, trusted) if usable and size > 0 else None,
                 difference_reciprocity_error=error,
                 impossible_signs=wrong,
                 usable_channels=usable,

@@ -153,6 +153,13 @@ def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
     return np.argsort(along(np.asarray(electrodes.position), np.asarray(loops[0])), kind="stable")
 
 
+def reciprocity_noise(measurement: Measurement, deviation: Float[np.ndarray, " M"]) -> float | None:
+    """The noise of channels by reciprocity, in units of `deviation` (M,), what they may be off by relative to each
+    other; None where the protocol ties no two usable channels together. Robust, as `estimate_noise` is."""
+    error, _, noise = _asymmetry(measurement, deviation)
+    return _robust_deviation(error / noise) if error.size else None
+
+
 def _asymmetry(
     measurement: Measurement, deviation: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

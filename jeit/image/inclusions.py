@@ -41,13 +41,16 @@ def find_inclusions(
     least_peak: float = 0.3,
     least_prominence: float = 0.1,
     least_area: float = 0.004,
+    noise: Float[Array, " m"] | None = None,
+    least_significance: float = 5.5,
 ) -> list[Inclusion]:
     """Peaks of an image, each with the region round it where the change exceeds `level` times that peak.
 
     `image` (m,): change of conductivity in every cell. A peak counts if it is at least `least_peak` times the
     strongest change of either sign, stands at least `least_prominence` times its own height above the saddle to a
-    higher one, and its region covers at least `least_area` of the mesh; the rest are artefacts. Strongest first.
-    Raises `ValueError` for an image of another size or with NaN.
+    higher one, and its region covers at least `least_area` of the mesh; the rest are artefacts. So are, where `noise`
+    (m,) is given, the standard deviation of the image, peaks of less than `least_significance` times that. Strongest
+    first. Raises `ValueError` for an image of another size or with NaN.
     """
     values = np.asarray(image)
     if values.shape != (mesh.num_cells,):
@@ -58,6 +61,8 @@ def find_inclusions(
         raise ValueError(f"level must lie between 0 and 1 and least_peak too; they are {level} and {least_peak}.")
     if not np.isfinite(values).all():
         raise ValueError("image has NaN or infinite values; reconstruct it from unmasked channels first.")
+    if noise is not None and np.shape(noise) != values.shape:
+        raise ValueError(f"noise has shape {np.shape(noise)}; give one value for each of the {mesh.num_cells} cells.")
     strongest = np.abs(values).max()
     if strongest == 0:
         return []
@@ -70,6 +75,8 @@ def find_inclusions(
         for label in np.unique(basin[basin >= 0]):
             peak = change[label]
             region = (basin == label) & (change >= level * peak)
+            if noise is not None and peak < least_significance * noise[label]:
+                continue
             if peak < least_peak * strongest or measure[region].sum() < least_area * measure.sum():
                 continue
             weight = (measure * change)[region]

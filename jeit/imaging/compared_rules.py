@@ -81,7 +81,13 @@ def compare_on_data(
         raise ValueError(f"rules: none is named; give some of {', '.join(RULES)}.")
     clock = Clock(progress)
     prepared = prepare_difference(
-        measurement, reference, frame=frame, contact=settings.contact, num_points=settings.num_points, clock=clock
+        measurement,
+        reference,
+        frame=frame,
+        contact=settings.contact,
+        num_points=settings.num_points,
+        as_is=settings.as_is,
+        clock=clock,
     )
     mesh = prepared.mesh
     with clock("linearise"):

@@ -13,11 +13,14 @@ from jaxtyping import Array, Float, UInt8
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
 from jeit.image import Inclusion, Raster, find_inclusions, labelled_inclusions, segment
+from jeit.imaging.automatic import image_automatically
 from jeit.imaging.clock import Clock
 from jeit.imaging.method import METHODS
 from jeit.imaging.preparation import prepare_difference
-from jeit.imaging.settings import ImagingSettings, as_settings
+from jeit.imaging.settings import AUTO, ImagingSettings, as_settings
+from jeit.imaging.wiring import Wiring
 from jeit.inverse.calibration import Calibration
+from jeit.inverse.image_noise import image_noise
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.mesh import Mesh
@@ -30,14 +33,16 @@ class ImagedDifference:
 
     - `measurement`, `reference`: the two frames compared, one frame each.
     - `quality`: what was found about the data before imaging.
-    - `settings`: how it was imaged, with what was decided on the way filled in.
+    - `settings`: how it was imaged, with what was decided on the way filled in; `why` the method, if that was decided.
+    - `wiring`: how electrodes and channels seem to be connected.
     - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
     - `reconstruction`: the reconstruction matrix, or what the iteration found; with the hyperparameter used and the
       rule that chose it.
     - `change`: change of conductivity in every cell (m,), S/m (2-D: S); against `calibration.conductivity`.
     - `raster`: `change` on a grid, NaN outside the mesh; `extent` (x_min, x_max, y_min, y_max) in metres.
     - `inclusions`: regions of changed conductivity, strongest first; iterative images are looked at on the scale of the
-      logarithm, which weighs both signs alike. Of an image that was segmented, those of the `labels`.
+      logarithm, which weighs both signs alike, and for what stands out of the noise. Of an image that was
+      segmented, those of the `labels`.
     - `labels`: 0 background, 1 resistive, 2 conductive for every pixel of the raster, if asked for.
     - `timings`: seconds of each step.
     """
@@ -52,6 +57,8 @@ class ImagedDifference:
     raster: Float[Array, "rows columns"]
     extent: tuple[float, float, float, float]
     inclusions: tuple[Inclusion, ...]
+    wiring: Wiring
+    why: str = ""
     labels: UInt8[np.ndarray, "rows columns"] | None = None
     timings: dict[str, float] = field(default_factory=dict)
 
@@ -110,12 +117,18 @@ def image_difference(
         frame=frame,
         contact=settings.contact,
         num_points=settings.num_points,
+        as_is=settings.as_is,
         clock=clock,
     )
     calibration, mesh = prepared.calibration, prepared.mesh
     with clock("image"):
-        method = METHODS[settings.method]
-        reconstruction, change = method.image(prepared, settings.prior, settings.hyperparameter)
+        why = ""
+        if settings.method == AUTO:
+            chosen, why, (reconstruction, change) = image_automatically(prepared, settings.prior)
+            settings = replace(settings, method=chosen)
+        else:
+            method = METHODS[settings.method]
+            reconstruction, change = method.image(prepared, settings.prior, settings.hyperparameter)
         largest = float(np.abs(change).max())
         if not largest > 1e-9 * float(calibration.conductivity):
             raise ValueError(
@@ -136,6 +149,8 @@ def image_difference(
             raster=grid.sample(change),
             extent=grid.extent,
             inclusions=(),
+            wiring=prepared.wiring,
+            why=why,
             timings=clock.seconds,
         )
         departure, labels = found.departure, None
@@ -144,7 +159,12 @@ def image_difference(
             labels = segment(pixels)
             inclusions = labelled_inclusions(labels, pixels, grid)
         else:
-            inclusions = find_inclusions(mesh, departure, level=settings.level, least_peak=settings.least_peak)
+            noise = None
+            if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
+                noise = as_array(image_noise(reconstruction))
+            inclusions = find_inclusions(
+                mesh, departure, level=settings.level, least_peak=settings.least_peak, noise=noise
+            )
         if found.iterative:
             inclusions = [_with_change(one, calibration.conductivity) for one in inclusions]
     return replace(found, inclusions=tuple(inclusions), labels=labels)

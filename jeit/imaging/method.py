@@ -115,7 +115,7 @@ def _iterated(
         background,
         prior=prior_for(prior, prepared.domain) if own is None else own,
         hyperparameter=_weight(prepared, hyperparameter),
-        noise=prepared.relative_noise,
+        noise=prepared.modelled_noise if own is None else prepared.relative_noise,
         mask=prepared.mask,
         solver=solver,
     )

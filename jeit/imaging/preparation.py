@@ -8,15 +8,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jeit.arguments import check_kind
-from jeit.data import Measurement, check_imageable
-from jeit.data.imageable import FrameQuality
+from jeit.data import Measurement
+from jeit.data.imageable import FrameQuality, assess
 from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.imaging.clock import Clock
+from jeit.imaging.wiring import Wiring, find_wiring
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.mesh import Body, Mesh
 from jeit_solvers.engines import as_array
+
+# Of a difference, what no model is taken to explain better than.
+_LEAST_MISFIT = 0.03
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,7 @@ class PreparedDifference:
     - `quality`: what was found about the data.
     - `domain`: the body.
     - `contact`: how the contact impedance was calibrated: "each", "common" or "fixed".
+    - `wiring`: how electrodes and channels seem to be connected.
     - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
     - `difference`: (M,) volts, zero in masked channels; `mask` (M,), True for channels usable in both frames.
     """
@@ -36,6 +41,7 @@ class PreparedDifference:
     quality: FrameQuality
     domain: Body
     contact: str
+    wiring: Wiring
     calibration: Calibration
     difference: Float[Array, " M"]
     mask: Bool[Array, " M"]
@@ -58,10 +64,19 @@ class PreparedDifference:
     @property
     def noise(self) -> float | None:
         """Standard deviation of the noise found in the difference, in units of `relative_noise`; None if not known."""
-        found = self.quality.difference_noise
-        if found is None:
-            return None
-        return found.standard_deviation / float(np.sqrt(np.mean(np.asarray(self.relative_noise)[self.mask] ** 2)))
+        return self.quality.trusted_noise
+
+    @property
+    def modelled_noise(self) -> Float[Array, " M"]:
+        """What channels of the difference may be off by when the model explains it, volts: the noise found in it, and
+        of itself the share that the model misses of the reference, but not less than 3 %.
+
+        Where no noise can be found, a tenth of the difference, at most 1 % of what channels read, is taken for it.
+        """
+        shape, used = np.asarray(self.relative_noise), np.asarray(self.mask)
+        size = np.sqrt(np.mean((np.asarray(self.difference)[used] / shape[used]) ** 2))
+        noise = min(1.0, 0.1 * size) if self.noise is None else self.noise
+        return as_array(shape * np.hypot(noise, max(float(self.calibration.misfit), _LEAST_MISFIT) * size))
 
 
 def prepare_difference(
@@ -71,45 +86,53 @@ def prepare_difference(
     frame: int | str | None = None,
     contact: str | None = None,
     num_points: int = 2000,
+    as_is: bool = False,
     clock: Clock | None = None,
 ) -> PreparedDifference:
     """Check a frame against its reference, make a mesh, and calibrate a model of the body on the reference.
 
     Arguments as in `jeit.imaging.image_difference` and its settings; `clock` takes the time of each step. Raises
     `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`), that do not say where the electrodes
-    are, that are complex, or on which the calibration fails.
+    are, that are complex, whose wiring is not as described (see `jeit.imaging.wiring`) unless `as_is`, or on which the
+    calibration fails.
     """
     clock = Clock(None) if clock is None else clock
     with clock("check"):
         one, base = select_frames(measurement, reference, frame)
-        (quality,) = check_imageable(one, base)
+        (quality,) = assess(one, base)
         domain, electrodes = body_of(one, base)
         both = np.asarray(one.mask)[0] & np.asarray(base.mask)[0]
         difference = as_array(np.where(both, np.asarray(one.voltages)[0] - np.asarray(base.voltages)[0], 0))
-    calibration, chosen = calibrated_model(
-        base, domain, electrodes, contact=contact, num_points=num_points, clock=clock
-    )
-    return PreparedDifference(one, base, quality, domain, chosen, calibration, difference, both)
+    with clock("mesh"):
+        model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
+    with clock("wiring"):
+        wiring = find_wiring(model, base)
+        if wiring.told or quality.imageable:  # noise may look like another wiring, but not be explained by it
+            check_wiring(wiring, base, as_is)
+        if not quality.imageable:
+            raise ValueError(f"'{one.name}' cannot be imaged: {quality.reason}")
+    calibration, chosen = calibrated_model(model, base, contact=contact, clock=clock)
+    return PreparedDifference(one, base, quality, domain, chosen, wiring, calibration, difference, both)
+
+
+def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
+    """Raise `ValueError` for a wiring that is not as described, as found on `reference`; not if taken `as_is`."""
+    if wiring.fault and not as_is:
+        raise ValueError(
+            f"'{reference.name}' does not fit its description: {wiring.fault} Mend the wires or the description; or go "
+            "on as it is (as_is=True, --as-is)."
+        )
 
 
 def calibrated_model(
-    base: Measurement,
-    domain: Body,
-    electrodes: AbstractElectrodes,
-    *,
-    contact: str | None = None,
-    num_points: int = 2000,
-    clock: Clock | None = None,
+    model: ForwardModel, base: Measurement, *, contact: str | None = None, clock: Clock | None = None
 ) -> tuple[Calibration, str]:
-    """A forward model on a new mesh, calibrated on a frame of the undisturbed body; and which `contact` was
-    fitted.
+    """The forward model, calibrated on a frame of the undisturbed body; and which `contact` was fitted.
 
     `contact`: "each", "common" or "fixed"; decided by the protocol, and by what converges, unless given. Raises
     `ValueError` if the calibration fails.
     """
     clock = Clock(None) if clock is None else clock
-    with clock("mesh"):
-        model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
     with clock("calibrate"):
         chosen = contact or default_contact(base)
         voltages, mask = np.asarray(base.voltages)[0], np.asarray(base.mask)[0]

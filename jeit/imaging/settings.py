@@ -10,29 +10,33 @@ from jeit.inverse.prior.defaults import MEASURED, PRIORS
 from jeit.inverse.prior.priors import AbstractPrior
 
 CONTACTS = ("each", "common", "fixed")
+AUTO = "auto"
 
 
 @dataclass(frozen=True)
 class ImagingSettings:
     """How to image. The defaults here are jeit's defaults, for Python and command line alike.
 
-    - `method`: one of `METHODS`: linear ones, and iterative ones that solve for conductivity itself.
+    - `method`: "auto", the one-step image where it is sound and Gauss-Newton's where it is not; or one of `METHODS`:
+      linear ones, and iterative ones that solve for conductivity itself.
     - `prior`: a name in `jeit.inverse.prior.defaults.PRIORS`, or a quadratic prior; used by one-step, Gauss-Newton and
       Levenberg-Marquardt imaging.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; a number for total variation and filtered
-      back-projection; not used by plain back-projection. None: "noise-figure" for one-step images, 5 for Gauss-Newton
-      and Levenberg-Marquardt, 300 for total variation, what served on measured tanks.
+      back-projection; not used by plain back-projection. With "auto" it asks for a one-step image. None:
+      "noise-figure" for one-step images, 5 for Gauss-Newton and Levenberg-Marquardt, 300 for total variation, what
+      served on measured tanks.
     - `contact`: how the contact impedance is calibrated ("each", "common", "fixed"); None decides by the protocol: each
       electrode's own where voltages are read on driven electrodes, else fixed, for then nothing shows it.
     - `num_points`: nodes of the mesh, about.
     - `raster_shape`: (rows, columns) of the raster.
     - `level`, `least_peak`: see `jeit.image.find_inclusions`.
+    - `as_is`: image even where the wiring is found to be another than described, see `jeit.imaging.wiring`.
     - `segment`: whether to cut the image up into background, resistive and conductive, see `jeit.image.segment`.
 
     Raises `ValueError`, naming the setting, for what there is not or what does not go together.
     """
 
-    method: str = "one-step"
+    method: str = AUTO
     prior: str | AbstractPrior = MEASURED
     hyperparameter: float | str | None = None
     contact: str | None = None
@@ -41,16 +45,20 @@ class ImagingSettings:
     level: float = 0.65
     least_peak: float = 0.3
     segment: bool = False
+    as_is: bool = False
 
     def __post_init__(self):
-        check_name("method", self.method, METHODS)
+        check_name("method", self.method, (AUTO, *METHODS))
         if not isinstance(self.prior, AbstractPrior):
             otherwise = "" if isinstance(self.prior, str) else ", or an object such as Noser()"
             check_name("prior", self.prior, PRIORS, otherwise)
         elif not self.prior.is_quadratic:
             raise ValueError("prior: total variation is a method of its own; give method='total-variation'.")
+        if self.method == AUTO and self.hyperparameter is not None:
+            object.__setattr__(self, "method", "one-step")
         if self.hyperparameter is None:
-            object.__setattr__(self, "hyperparameter", METHODS[self.method].hyperparameter)
+            if self.method != AUTO:
+                object.__setattr__(self, "hyperparameter", METHODS[self.method].hyperparameter)
         else:
             check_hyperparameter(self.hyperparameter)
             if isinstance(self.hyperparameter, str) and (number := METHODS[self.method].number) is not None:

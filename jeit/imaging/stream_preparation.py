@@ -8,9 +8,18 @@ from jaxtyping import Float
 
 from jeit.arguments import check_kind
 from jeit.data import Measurement
+from jeit.forward import ForwardModel
 from jeit.imaging.clock import Clock
-from jeit.imaging.preparation import body_of, calibrated_model, check_measurement, select_frames
+from jeit.imaging.preparation import (
+    body_of,
+    calibrated_model,
+    check_measurement,
+    check_wiring,
+    imaging_mesh,
+    select_frames,
+)
 from jeit.imaging.settings import check_body, check_hyperparameter
+from jeit.imaging.wiring import find_wiring
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import GaussNewton
@@ -27,7 +36,7 @@ class StreamSettings:
       has none of its own; as an `Imager` has it, 4, unless given.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; "noise-figure" unless given.
     - `memory`: frames over which an image changes, see `jeit.inverse.Imager`; 0 takes every frame alone.
-    - `contact`, `num_points`: as in `jeit.imaging.ImagingSettings`.
+    - `contact`, `num_points`, `as_is`: as in `jeit.imaging.ImagingSettings`.
 
     Raises `ValueError` for a solver that does not image frames, a memory that is no number of them, and as
     `jeit.imaging.ImagingSettings`.
@@ -39,6 +48,7 @@ class StreamSettings:
     memory: float = 0.0
     contact: str | None = None
     num_points: int = 1200
+    as_is: bool = False
 
     def __post_init__(self):
         object.__setattr__(self, "solver", as_solver(self.solver, frames=True).for_frames(self.max_steps))
@@ -69,9 +79,11 @@ def prepare_imager(
         raise ValueError(f"'{measured.name}' was measured with another protocol than the reference '{base.name}'.")
     domain, electrodes = body_of(measured, base)
     clock = Clock(progress)
-    calibration, _ = calibrated_model(
-        base, domain, electrodes, contact=settings.contact, num_points=settings.num_points, clock=clock
-    )
+    with clock("mesh"):
+        model = ForwardModel(imaging_mesh(domain, electrodes, settings.num_points), electrodes, base.protocol)
+    with clock("wiring"):
+        check_wiring(find_wiring(model, base), base, settings.as_is)
+    calibration, _ = calibrated_model(model, base, contact=settings.contact, clock=clock)
     with clock("prepare"):
         imager = Imager.create(
             calibration.model,

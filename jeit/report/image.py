@@ -111,6 +111,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "relative_to_difference": noise.relative,
             "method": noise.method,
         },
+        "wiring": {"fault": result.wiring.fault or None, "misfit": result.wiring.described},
         "quality": {
             "relative_difference": quality.difference,
             "difference_reciprocity_error": quality.difference_reciprocity_error,
@@ -120,6 +121,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         "reconstruction": {
             "quantity": f"change of conductivity against the reference, {_unit(result)}",
             "method": settings.method,
+            "why": result.why or None,
             "least_change_relative_to_background": result.lowest,
             "prior": _prior(settings),
             **_iteration(result),

@@ -5,7 +5,13 @@ from typing import Any
 import numpy as np
 
 from jeit.data import Measurement, estimate_noise, impossible_signs, reciprocity_error
+from jeit.forward import ForwardModel
+from jeit.imaging import imaging_mesh
+from jeit.imaging.wiring import find_wiring
 from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain
+
+# Of the mesh on which wirings are compared.
+_NODES = 1000
 
 
 def report_measurement(measurement: Measurement) -> dict[str, Any]:
@@ -26,5 +32,17 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
         "reciprocity_error": reciprocity_error(measurement),
         "noise": None if noise is None else {"standard_deviation": noise.standard_deviation, "method": noise.method},
         "impossible_signs": None if signs is None else float(signs.max()),
+        "wiring": _wiring(measurement),
     }
     return plain(content)
+
+
+def _wiring(measurement: Measurement) -> str | None:
+    """How electrodes and channels seem to be wired, from the reference, or else the first frame; None where the file
+    does not say where electrodes are."""
+    domain, electrodes = measurement.domain, measurement.electrodes
+    if domain is None or electrodes is None:
+        return None
+    _, reference = measurement.split_reference() if "reference" in measurement.frame_names else (None, measurement)
+    model = ForwardModel(imaging_mesh(domain, electrodes, _NODES), electrodes, measurement.protocol)
+    return find_wiring(model, reference).told or "nothing speaks against the description"

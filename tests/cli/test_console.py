@@ -2,7 +2,7 @@
 
 import pytest
 
-from jeit.cli.console import percent
+from jeit.arguments import percent
 
 SAID = {
     0.0: "0 %",

@@ -51,7 +51,8 @@ def test_help_tells_the_defaults(run):
     _, output, _ = run("reconstruct", "--help")
     told = " ".join(output.replace("│", " ").split())
     settings = jeit.imaging.ImagingSettings()
-    for value in (settings.method, settings.prior, settings.hyperparameter):
+    rule = jeit.imaging.ImagingSettings(method="one-step").hyperparameter
+    for value in (settings.method, settings.prior, rule):
         assert f"{value} (default)" in told
     assert f"(default {settings.num_points})" in told
 

@@ -46,8 +46,8 @@ def test_any_outline_with_a_thickness_is_a_solid():
     found = described({"shape": "polygon", "vertices": SQUARE, "thickness": 0.01}, corner)
     assert isinstance(found.domain, Solid)
     assert isinstance(found.domain.outline, Polygon)
-    assert found.electrodes.refinement()[0].points.shape == (2, 2)  # seen from above, for the plane mesh
-    assert found.domain.mesh(num_points=500, refine=found.electrodes.refinement()).dimension == 3
+    assert found.electrodes.refinement(found.domain)[0].points.shape == (2, 2)  # seen from above, for the plane mesh
+    assert found.domain.mesh(num_points=500, refine=found.electrodes.refinement(found.domain)).dimension == 3
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jeit.cli.options import (
+    AsIs,
     Contact,
     Data,
     Description,
@@ -41,6 +42,7 @@ def choose(
     contact: Contact = None,
     num_points: Nodes = None,
     frame: Frame = None,
+    as_is: AsIs = False,
     quiet: Quiet = False,
 ) -> None:
     """Compare the rules that choose the hyperparameter of DATA's image; writes choice.png and choice.json."""
@@ -51,7 +53,7 @@ def choose(
     from jeit.imaging import ImagingSettings, compare_on_data
     from jeit.report import write_choice
 
-    given = {"prior": prior, "contact": contact, "num_points": num_points}
+    given = {"prior": prior, "contact": contact, "num_points": num_points, "as_is": as_is}
     settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})
     make_folder(output, ("choice.png", "choice.json"))
     console = Console(highlight=False)
@@ -73,7 +75,7 @@ def show(console, result: "ComparedRules") -> None:
     """Print a row for every rule, and what speaks against its choice."""
     from rich.table import Table
 
-    from jeit.cli.console import percent
+    from jeit.arguments import percent
 
     table = Table("rule", "λ", "residual", "noise figure", "inclusions", box=None, padding=(0, 2))
     for column in table.columns[1:]:

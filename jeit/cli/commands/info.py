@@ -16,8 +16,8 @@ def info(
     """Say what DATA holds: frames, electrodes, protocol, noise, and what was assumed or masked."""
     from rich.console import Console
 
-    from jeit.arguments import counted
-    from jeit.cli.console import pairs, percent, scaled
+    from jeit.arguments import counted, percent
+    from jeit.cli.console import pairs, scaled
     from jeit.data import read
     from jeit.report import report_measurement
 
@@ -44,5 +44,6 @@ def info(
         ("noise", known or "not known"),
         ("impossible signs", percent(found["impossible_signs"])),
     ]
+    rows.append(("wiring", found["wiring"] or "not known: the file does not say where electrodes are"))
     rows += [("note", note) for note in found["notes"]]
     Console(highlight=False).print(pairs(measurement.name, rows))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jeit.cli.options import (
+    AsIs,
     Contact,
     Data,
     Description,
@@ -33,8 +34,8 @@ def reconstruct(
     method: Annotated[
         str | None,
         typer.Option(
-            help="one-step (default), back-projection, filtered-back-projection; gauss-newton, levenberg-marquardt, "
-            "total-variation (default with --segment)."
+            help="auto (default): one-step, or gauss-newton where that is unsound; one-step, back-projection, "
+            "filtered-back-projection; gauss-newton, levenberg-marquardt, total-variation (default with --segment)."
         ),
     ] = None,
     prior: Annotated[
@@ -47,8 +48,8 @@ def reconstruct(
         str | None,
         typer.Option(
             help="A number, or the rule that chooses it: noise-figure (default), l-curve, gcv, discrepancy, "
-            "best-resolution, see jeit choose; unless given 5 for gauss-newton and levenberg-marquardt, 300 for "
-            "total-variation.",
+            "best-resolution, see jeit choose; of a one-step image unless a method is given. Unless given 5 for "
+            "gauss-newton and levenberg-marquardt, 300 for total-variation.",
             metavar="VALUE|RULE",
         ),
     ] = None,
@@ -58,6 +59,7 @@ def reconstruct(
     ] = False,
     num_points: Nodes = None,
     frame: Frame = None,
+    as_is: AsIs = False,
     quiet: Quiet = False,
 ) -> None:
     """Image what changed between REFERENCE and DATA; writes image.png, image.npz and report.json.
@@ -80,9 +82,10 @@ def reconstruct(
         "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
         "contact": contact,
         "num_points": num_points,
+        "as_is": as_is,
     }
     settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})
-    chosen_method = METHODS[settings.method]
+    chosen_method = METHODS.get(settings.method, METHODS["one-step"])
     if prior is not None and not chosen_method.takes_prior:
         raise ValueError(f"--prior does not go with --method {method}; leave it out, or choose another method.")
     if hyperparameter is not None and not chosen_method.takes_hyperparameter:
@@ -104,8 +107,8 @@ def reconstruct(
 
 def show(console, result: "ImagedDifference") -> None:
     """Print what was found."""
-    from jeit.arguments import counted
-    from jeit.cli.console import inclusion_table, pairs, percent, scaled
+    from jeit.arguments import counted, percent
+    from jeit.cli.console import inclusion_table, pairs, scaled
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
     from jeit_solvers import Status
 
@@ -134,8 +137,15 @@ def show(console, result: "ImagedDifference") -> None:
         if reconstruction.status != Status.CONVERGED:
             rows.append(("", reconstruction.reason))
     elif result.lowest < -1:
-        fall = f"falls to {percent(result.lowest)} of the background: of changes so large only place and sign are right"
+        fall = (
+            f"falls to {percent(result.lowest)} of the background, below -100 %: bodies may be out of place, missing, "
+            "or shown where none are; leave out --method, or take gauss-newton"
+        )
         rows.append(("linear image", fall))
+    if result.why:
+        rows.append(("chosen, for", result.why))
+    if result.wiring.fault:
+        rows.append(("wiring", result.wiring.fault))
     rows += [("note", note) for note in dict.fromkeys((*result.measurement.notes, *result.reference.notes))]
     console.print()
     console.print(pairs(result.measurement.name, rows))

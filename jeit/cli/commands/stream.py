@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.options import Contact, Description, Format, Quiet, make_folder, naming_options, number_or_name
+from jeit.cli.options import AsIs, Contact, Description, Format, Quiet, make_folder, naming_options, number_or_name
 
 
 def stream(
@@ -43,6 +43,7 @@ def stream(
     ] = None,
     contact: Contact = None,
     num_points: Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 1200).")] = None,
+    as_is: AsIs = False,
     quiet: Quiet = False,
 ) -> None:
     """Image every frame of DATA as it comes; bad frames are refused with the reason, and the stream goes on.
@@ -68,6 +69,7 @@ def stream(
         "memory": memory,
         "contact": contact,
         "num_points": num_points,
+        "as_is": as_is,
     }
     with naming_options({"solver": "--method", "max_steps": "--steps"}):
         settings = StreamSettings(**{name: value for name, value in given.items() if value is not None})

@@ -1,0 +1,72 @@
+"""One to three strong bodies in a tank, metal, plastic or both: what the default image finds, and what one step finds.
+
+Tanks are those of `problems/mixed_tanks.py`, solved without jeit, 1 % noise on every voltage; none of them was looked
+at when the defaults were set.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.harness.case import Case, Options, Result, Table, judged
+from benchmarks.harness.tables import duration
+from benchmarks.harness.timing import say
+from benchmarks.problems.mixed_tanks import draw, matched
+from jeit import image_difference
+from jeit.imaging import ImagingSettings
+
+TANKS, FIRST = 200, 100_000
+FAR, MEDIAN = 0.12, 0.045
+METHODS = ("auto", "one-step")
+HEADER = ["channels", "image", "tanks", "bodies", "median / R", "beyond 0.12 R", "missed", "spurious", "time of one"]
+
+
+def run(options: Options) -> Result:
+    """All tanks, by the kind of channels and together."""
+    seeds = range(FIRST, FIRST + (3 if options.quick else TANKS))
+    rows: dict[tuple[str, str], list[tuple[np.ndarray, int, float]]] = {}
+    refused = []
+    for seed in seeds:
+        tank = draw(seed)
+        channels = tank.frame.protocol.name.split(",")[0].split(" electrode")[0]
+        for method in METHODS:
+            try:
+                found = image_difference(
+                    tank.frame,
+                    tank.reference,
+                    ImagingSettings(method=method, num_points=800 if options.quick else 2000),
+                )
+            except ValueError as error:
+                refused.append(f"tank {seed}, {channels}: {error}")
+                break
+            distances, spurious = matched(tank, found.inclusions)
+            outcome = distances, spurious, sum(found.timings.values())
+            for name in (channels, "all"):
+                rows.setdefault((name, method), []).append(outcome)
+            say(f"{seed} {channels} {method} {found.settings.method} {np.round(distances, 3)} {spurious} spurious")
+    names = sorted({name for name, _ in rows}, key=lambda name: (name == "all", name))
+    table = [_row(name, method, rows[name, method]) for name in names for method in METHODS]
+    distances, spurious, _ = _together(rows["all", "auto"])
+    asked = [
+        judged(f"median ≤ {MEDIAN} R", f"{np.median(distances):.3f} R", bool(np.median(distances) <= MEDIAN)),
+        judged(f"all ≤ {FAR} R", f"{np.mean(distances <= FAR):.1%}", bool((distances <= FAR).all())),
+        judged("none missed", f"{np.isinf(distances).sum()}", bool(np.isfinite(distances).all())),
+        judged("none spurious", f"{spurious}", spurious == 0),
+    ]
+    notes = [f"{len(refused)} of {len(seeds)} tanks refused as too noisy", *(one[:160] for one in refused)]
+    return Result([Table(HEADER, table)], asked, notes)
+
+
+def _together(outcomes) -> tuple[np.ndarray, int, float]:
+    distances, spurious, seconds = zip(*outcomes, strict=True)
+    return np.concatenate(distances), sum(spurious), float(np.median(seconds))
+
+
+def _row(name: str, method: str, outcomes) -> list[str]:
+    distances, spurious, seconds = _together(outcomes)
+    missed = np.isinf(distances)
+    figures = [f"{np.median(distances):.3f}", str((distances[~missed] > FAR).sum()), str(missed.sum()), str(spurious)]
+    return [name, method, str(len(outcomes)), str(len(distances)), *figures, duration(seconds)]
+
+
+CASE = Case("mixed_tanks", "strong bodies in simulated tanks that no default was set on", run, 5, timed=False)

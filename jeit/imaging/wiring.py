@@ -1,0 +1,208 @@
+"""Wires exchanged, channels in another order, signs turned: which way of wiring explains a frame of the empty body.
+
+A uniform body is known but for its conductivity and its contacts. Its transfer impedance Z (L, L) is computed once for
+each of a few contact impedances; with electrode k standing where p(k) should, it is Z[p, p], and all ways of wiring are
+compared by how well they explain the frame, whatever its size.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jeit.arguments import percent
+from jeit.data import Measurement
+from jeit.forward import ForwardModel
+from jeit.forward.model import select_channels
+from jeit.protocol import Protocol
+from jeit_solvers.engines import on_host
+
+MOST_MISFIT = 0.15
+"""Relative misfit of the empty body above which something is taken to be wrong."""
+# What another wiring must lower the misfit to: each exchange, and all that is told of.
+_STEP, _BETTER = 0.85, 0.6
+_MOST_EXCHANGES = 4
+# A misfit of the empty body with which no image is to be had, though nothing explains it.
+_HOPELESS = 0.5
+# Contact impedance times conductivity, in units of the body's size: from hardly any to what drowns the body.
+_CONTACTS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """How electrodes and channels seem to be connected.
+
+    - `places`: electrode k stands where electrode `places[k]` should, counted from 0.
+    - `order`: how channels follow each other, where not as described: a name in `channel_orders`; else empty.
+    - `reversed_signs`: whether all voltages have the other sign.
+    - `misfit`: what a uniform body wired so misses of the frame, relative to it; `described`, wired as described.
+    """
+
+    places: tuple[int, ...]
+    order: str = ""
+    reversed_signs: bool = False
+    misfit: float = field(default=np.inf, compare=False)
+    described: float = field(default=np.inf, compare=False)
+
+    @property
+    def as_described(self) -> bool:
+        """Whether nothing else explains the frame far better."""
+        return not (self.order or self.reversed_signs or self._cycles())
+
+    @property
+    def fault(self) -> str:
+        """What is wrong, in a sentence; empty where nothing is, or nothing that would not do for an image."""
+        if self.told or self.described < _HOPELESS:
+            return self.told
+        return (
+            f"the model misses {percent(self.described)} of it, and no order of channels, sign, or exchange of a few "
+            "electrodes explains it: are geometry, electrodes, protocol and the order of the channels as described?"
+        )
+
+    @property
+    def told(self) -> str:
+        """What was found, in a sentence, electrodes counted from 1; empty where all is as described."""
+        found = [_told_places(self.places, self._cycles())]
+        found.append(self.order and f"the channels look ordered {self.order}")
+        found.append("all voltages look to have the opposite sign" if self.reversed_signs else "")
+        said = ", and ".join(one for one in found if one)
+        return (
+            said and f"{said}: so taken the misfit is {percent(self.misfit)}, as described {percent(self.described)}."
+        )
+
+    def _cycles(self) -> list[list[int]]:
+        """Electrodes that stand in each other's places."""
+        cycles, left = [], {k for k, place in enumerate(self.places) if place != k}
+        while left:
+            cycle = [min(left)]
+            while self.places[cycle[-1]] != cycle[0]:
+                cycle.append(self.places[cycle[-1]])
+            left -= set(cycle)
+            cycles.append(cycle)
+        return cycles
+
+
+def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
+    """The wiring that explains a frame of the empty body, `measurement`'s first: as described, unless another misses
+    far less of it.
+
+    Tried are channels in another order, voltages of the opposite sign, electrodes counted from another one or the other
+    way round, and up to four exchanges of two electrodes, one after the other. What a body cannot show, such as turning
+    a round and even one, is not found.
+    """
+    count, orders = model.protocol.num_electrodes, channel_orders(model.protocol)
+    misfit_of = _comparison(model, measurement, orders)
+
+    def least(tried: Iterable[Wiring], so_far: Wiring) -> Wiring:
+        best = min((misfit_of(one) for one in tried), key=lambda one: one.misfit)
+        return best if best.misfit < _STEP * so_far.misfit else so_far
+
+    def with_exchanges(best: Wiring) -> Wiring:
+        for _ in range(_MOST_EXCHANGES):
+            pairs = combinations(range(count), 2)
+            so_far = best
+            best = least([replace(best, places=_exchanged(best.places, *pair)) for pair in pairs], best)
+            if best is so_far:
+                break
+        return best
+
+    plain = Wiring(tuple(range(count)))
+    best = misfit_of(plain)
+    described = 1.0 if best.reversed_signs else best.misfit
+    if described < MOST_MISFIT:
+        return replace(best, described=described)
+    best = with_exchanges(least([replace(plain, order=order) for order in orders], best))
+    turned = [Wiring(places, order) for places in _turns(count) for order in orders]
+    best = least([with_exchanges(least(turned, misfit_of(plain)))], best)
+    if best.misfit > _BETTER * described:
+        best = replace(plain, misfit=described)
+    return replace(best, described=described)
+
+
+def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
+    """Ways in which channels (M,) may be ordered in a file, by what they are called: where each of the protocol's
+    channels is found then. As it is described comes first, under no name."""
+    drive, measurement = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
+    channels = np.arange(len(drive))
+    first = np.asarray(protocol.measurement).argmax(axis=1)[measurement]
+    source, sink = (choose(np.asarray(protocol.drive), axis=1)[drive] for choose in (np.argmax, np.argmin))
+    ways = {
+        "from electrode 1 on in every drive (fixed)": (first, drive),
+        "from the driven electrodes on in every drive (rotating)": ((first - source) % protocol.num_electrodes, drive),
+        "from the second driven electrode on in every drive (rotating)": (
+            (first - sink) % protocol.num_electrodes,
+            drive,
+        ),
+        "measurement by measurement, not drive by drive": (drive, first),
+    }
+    orders = {"": channels}
+    for name, keys in ways.items():
+        order = np.empty_like(channels)
+        order[np.lexsort(keys)] = channels
+        if not any(np.array_equal(order, known) for known in orders.values()):
+            orders[name] = order
+    return orders
+
+
+def _comparison(model: ForwardModel, measurement: Measurement, orders) -> Callable[[Wiring], Wiring]:
+    """A function that gives a wiring its misfit, and the sign with which it is least."""
+    protocol = on_host(model.protocol)
+    voltages, mask = np.real(np.asarray(measurement.filled())[0]), np.asarray(measurement.mask)[0]
+    impedances = _impedances(model)
+
+    def misfit_of(wiring: Wiring) -> Wiring:
+        places, order = np.array(wiring.places), orders[wiring.order]
+        measured, used = voltages[order], mask[order]
+        size, best = np.linalg.norm(measured), wiring
+        for impedance in impedances:
+            expected = np.where(used, select_channels(protocol, impedance[np.ix_(places, places)]), 0)
+            scale = expected @ measured / (expected @ expected)
+            misfit = float(np.linalg.norm(measured - scale * expected) / size)
+            if misfit < best.misfit or best is wiring:
+                best = replace(wiring, misfit=misfit, reversed_signs=bool(scale < 0))
+        return best
+
+    return misfit_of
+
+
+def _impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
+    """Transfer impedances of the uniform body of unit conductivity, for the contacts there may be."""
+    electrodes = model.electrodes
+    if electrodes.is_point:
+        return [np.asarray(model.transfer_impedance(1.0))]
+    size = np.ptp(np.asarray(model.mesh.points), axis=0).max()
+    relative = np.asarray(electrodes.contact_impedance) / np.mean(electrodes.contact_impedance)
+    models = (model.with_electrodes(electrodes.with_contact_impedance(one * size * relative)) for one in _CONTACTS)
+    return [np.asarray(one.transfer_impedance(1.0)) for one in models]
+
+
+def _turns(count: int) -> Iterator[tuple[int, ...]]:
+    """Places of electrodes counted from another one, and the other way round."""
+    for shift in range(count):
+        for way in (1, -1):
+            if (shift, way) != (0, 1):
+                yield tuple((shift + way * k) % count for k in range(count))
+
+
+def _exchanged(places: tuple[int, ...], first: int, second: int) -> tuple[int, ...]:
+    changed = list(places)
+    changed[first], changed[second] = changed[second], changed[first]
+    return tuple(changed)
+
+
+def _told_places(places: tuple[int, ...], cycles: list[list[int]]) -> str:
+    """Which electrodes stand where, in words."""
+    if cycles and places in _turns(len(places)):
+        way = "the other way round, " if (places[1] - places[0]) % len(places) != 1 else ""
+        return f"the electrodes look counted {way}electrode 1 standing where {places[0] + 1} should"
+    pairs = [f"{first + 1} and {second + 1}" for first, second in (one for one in cycles if len(one) == 2)]
+    found = [f"electrodes {', '.join(pairs)} look exchanged"] if pairs else []
+    found += [
+        f"electrodes {' → '.join(str(k + 1) for k in [*cycle, cycle[0]])} each look as if they stood where the next "
+        "one should"
+        for cycle in cycles
+        if len(cycle) > 2
+    ]
+    return ", and ".join(found)

@@ -1,0 +1,163 @@
+"""Wires exchanged, channels in another order, signs turned: found on simulated and measured tanks, and nowhere else."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from jeit.data import Measurement, read
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.imaging import ImagingSettings, image_difference, prepare_difference
+from jeit.imaging.preparation import imaging_mesh
+from jeit.imaging.wiring import channel_orders, find_wiring
+from jeit.layout import perimeter, ring
+from jeit.mesh import Disk, Polygon, centroids
+from jeit.protocol import adjacent, skip
+from jeit.report.image import report_image
+
+RADIUS, COUNT = 0.05, 16
+DISK = Disk(RADIUS)
+ELECTRODES = BoundaryElectrodes(ring(RADIUS, COUNT), 0.01, 0.05)
+MODEL = ForwardModel(imaging_mesh(DISK, ELECTRODES, 700), ELECTRODES, adjacent(COUNT))
+PLACES = tuple(range(COUNT))
+
+
+def measured(model=MODEL, domain=DISK, places=PLACES, order="", sign=1, conductivity=0.02, name="empty") -> Measurement:
+    """A frame with 1 % noise, electrode k standing where `places[k]` should, its channels in another order."""
+    electrodes = model.electrodes
+    there = np.asarray(electrodes.position)[list(places)]
+    turned = model.with_electrodes(
+        BoundaryElectrodes(there, np.asarray(electrodes.width), np.asarray(electrodes.contact_impedance))
+    )
+    voltages = np.asarray(turned.voltages(conductivity))
+    noisy = sign * voltages * (1 + 0.01 * np.random.default_rng(0).normal(size=voltages.shape))
+    frame = np.empty_like(noisy)
+    frame[channel_orders(model.protocol)[order]] = noisy
+    return Measurement(
+        frame, np.ones(frame.shape, bool), model.protocol, electrodes=electrodes, domain=domain, name=name
+    )
+
+
+def exchanged(*pairs):
+    places = list(PLACES)
+    for first, second in pairs:
+        places[first], places[second] = places[second], places[first]
+    return tuple(places)
+
+
+@pytest.mark.parametrize("protocol", [adjacent(COUNT), skip(COUNT, 2), adjacent(COUNT, driven_electrodes=True)])
+def test_a_sound_tank_raises_no_alarm(protocol):
+    for impedance in (1e-4, 0.05, 1.0):
+        electrodes = ELECTRODES.with_contact_impedance(impedance)
+        model = ForwardModel(MODEL.mesh, electrodes, protocol)
+        wiring = find_wiring(model, measured(model))
+        assert wiring.as_described
+        assert wiring.fault == ""
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (2, 6), (4, 12), (0, 15), (7, 9)])
+def test_two_exchanged_electrodes_are_found(pair):
+    wiring = find_wiring(MODEL, measured(places=exchanged(pair)))
+    assert wiring.places == exchanged(pair)
+    assert f"electrodes {pair[0] + 1} and {pair[1] + 1} look exchanged" in wiring.told
+    assert wiring.misfit < 0.02 < 0.15 < wiring.described
+
+
+def test_two_exchanges_and_a_ring_of_three_are_found():
+    assert find_wiring(MODEL, measured(places=exchanged((1, 5), (8, 11)))).places == exchanged((1, 5), (8, 11))
+    turned = exchanged((3, 4), (4, 5))
+    wiring = find_wiring(MODEL, measured(places=turned))
+    assert wiring.places == turned
+    assert "each look as if they stood where the next one should" in wiring.told
+
+
+@pytest.mark.parametrize("order", list(channel_orders(adjacent(COUNT)))[1:])
+def test_another_order_of_channels_is_found(order):
+    wiring = find_wiring(MODEL, measured(order=order))
+    assert (wiring.order, wiring.reversed_signs, wiring.places) == (order, False, PLACES)
+    assert f"the channels look ordered {order}" in wiring.told
+
+
+def test_a_fixed_order_described_as_rotating_is_the_protocols_own_fixed_order():
+    fixed = ForwardModel(MODEL.mesh, ELECTRODES, adjacent(COUNT, order="fixed")).voltages(1.0)
+    name = next(name for name in channel_orders(MODEL.protocol) if "fixed" in name)
+    np.testing.assert_allclose(np.asarray(fixed)[channel_orders(MODEL.protocol)[name]], MODEL.voltages(1.0))
+
+
+def test_the_opposite_sign_is_found_also_beside_an_exchange():
+    wiring = find_wiring(MODEL, measured(sign=-1, places=exchanged((2, 6))))
+    assert (wiring.reversed_signs, wiring.places) == (True, exchanged((2, 6)))
+    assert "opposite sign" in wiring.told
+
+
+def test_electrodes_counted_from_another_one_are_found_where_the_body_shows_it():
+    domain = Polygon(np.array([[0, 0], [0.1, 0], [0.08, 0.06], [0, 0.05]]))
+    electrodes = BoundaryElectrodes(perimeter(domain, COUNT, start=0.013), 0.008, 0.05)
+    model = ForwardModel(imaging_mesh(domain, electrodes, 700), electrodes, adjacent(COUNT))
+    shifted, mirrored = (tuple((3 + way * k) % COUNT for k in range(COUNT)) for way in (1, -1))
+    for places in (shifted, mirrored):
+        wiring = find_wiring(model, measured(model, domain, places))
+        assert wiring.places == places
+        assert "electrode 1 standing where 4 should" in wiring.told
+    # A round, even tank looks alike from all electrodes.
+    assert find_wiring(MODEL, measured(places=shifted)).as_described
+
+
+def test_what_nothing_explains_is_refused_too():
+    frame = measured()
+    voltages = np.random.default_rng(1).permutation(np.asarray(frame.voltages)[0])
+    wiring = find_wiring(
+        MODEL, Measurement(voltages, np.ones(208, bool), frame.protocol, electrodes=ELECTRODES, domain=DISK)
+    )
+    assert wiring.as_described
+    assert "no order of channels, sign, or exchange" in wiring.fault
+
+
+def test_an_image_is_refused_with_what_was_found_and_made_as_it_is_if_asked():
+    places = exchanged((2, 6))
+    near = np.linalg.norm(np.asarray(centroids(MODEL.mesh)) - [0.02, 0.01], axis=1) < 0.012
+    object_ = measured(places=places, conductivity=np.where(near, 0.04, 0.02), name="object")
+    with pytest.raises(ValueError, match=r"'empty' does not fit .* electrodes 3 and 7 look exchanged.*as_is=True"):
+        prepare_difference(object_, measured(places=places))
+    result = image_difference(object_, measured(places=places), ImagingSettings(as_is=True, num_points=700))
+    assert "electrodes 3 and 7 look exchanged" in report_image(result)["wiring"]["fault"]
+    assert (
+        report_image(image_difference(measured(conductivity=np.where(near, 0.04, 0.02)), measured()))["wiring"]["fault"]
+        is None
+    )
+
+
+def measured_tanks(data_folder):
+    yield read(data_folder / "kit4" / "datamat_1_0.mat")
+    for file in sorted((data_folder / "tank6cm").glob("*/*.csv")):
+        yield read(file).split_reference()[1]
+
+
+def model_of(frame: Measurement) -> ForwardModel:
+    mesh = imaging_mesh(frame.domain, frame.electrodes, 1000)
+    return ForwardModel(mesh, frame.electrodes, frame.protocol)
+
+
+def test_measured_tanks_raise_no_alarm(data_folder):
+    for frame in measured_tanks(data_folder):
+        assert find_wiring(model_of(frame), frame).fault == ""
+    frame = read(data_folder / "ktc2023" / "ref.mat")
+    assert find_wiring(model_of(frame), frame).fault == ""
+
+
+@pytest.mark.slow
+def test_all_exchanges_of_two_electrodes_are_found_on_measured_tanks(data_folder):
+    kit4, small, *_ = measured_tanks(data_folder)
+    for frame in (kit4, small):
+        model = model_of(frame)
+        for pair in combinations(range(COUNT), 2):
+            places = list(exchanged(pair))
+            electrodes = BoundaryElectrodes(
+                np.asarray(frame.electrodes.position)[places],
+                np.asarray(frame.electrodes.width),
+                np.asarray(frame.electrodes.contact_impedance),
+            )
+            wiring = find_wiring(model.with_electrodes(electrodes), frame)
+            assert wiring.places == tuple(places), pair
+            assert (wiring.order, wiring.reversed_signs) == ("", False), pair
