@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
 
 from jeit.forward import ForwardModel
 from jeit.inverse.hyperparameter.choice import Choice
@@ -14,7 +15,7 @@ from jeit.inverse.prior.priors import AbstractPrior
 
 def choose_hyperparameter(
     model: ForwardModel,
-    conductivity,
+    conductivity: ArrayLike,
     *,
     rule: str | Rule = RULE,
     prior: AbstractPrior | None = None,
@@ -38,7 +39,7 @@ def choose_hyperparameter(
 
 def compare_rules(
     model: ForwardModel,
-    conductivity,
+    conductivity: ArrayLike,
     *,
     difference: Float[Array, " M"],
     prior: AbstractPrior | None = None,

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jeit.simulate.acoustic.bursts import ONSET, VIBRATOR, Burst, check_burst
 from jeit.simulate.acoustic.checks import check_not_negative
@@ -38,7 +39,7 @@ class CalibrationTaps(eqx.Module):
 def calibration_taps(
     skin: SoundingSkin,
     key: Array,
-    positions,
+    positions: ArrayLike,
     *,
     repeats: int = 3,
     burst: Burst = VIBRATOR,

@@ -1,11 +1,13 @@
 """`PressedSkin`: a skin of some material, and what it reads while it is pressed."""
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from jeit.arguments import check_key, check_kind, is_number, real_array, told
 from jeit.design.skin.touched_cells import TouchedCells, padded
@@ -18,7 +20,7 @@ from jeit.mesh import Mesh, centroids, measures
 from jeit.simulate.contact.cell_pressure import Samples, pressed_cells
 from jeit.simulate.contact.drift import gains, walk, white_noise
 from jeit.simulate.contact.materials import Material
-from jeit.simulate.contact.press import motions_of, touches_of
+from jeit.simulate.contact.press import MovingPress, Press, motions_of, touches_of
 from jeit.simulate.contact.response import advance, held_pressure, unstrained
 from jeit_solvers.engines import as_array
 
@@ -41,7 +43,7 @@ class PressedSkin(eqx.Module):
     conductivity: Float[np.ndarray, "..."]
     gain: Float[np.ndarray, " M"]
 
-    def __init__(self, key: Array, model: ForwardModel, material: Material, *, conductivity=None):
+    def __init__(self, key: Array, model: ForwardModel, material: Material, *, conductivity: ArrayLike | None = None):
         """A skin whose gains are drawn from `key`. `conductivity` at rest, S/m (2-D: S): the material's unless given.
 
         Raises `ValueError` for what is no key, model, material or conductivity.
@@ -59,7 +61,9 @@ class PressedSkin(eqx.Module):
         """Voltages (M,) of the skin that nobody touches and nothing disturbs, as its channels read them."""
         return self.gain * self._at_rest
 
-    def frames(self, key: Array, presses, *, held: float = 1.0, elapsed: float = 0.0) -> Float[np.ndarray, "n M"]:
+    def frames(
+        self, key: Array, presses: Sequence[Press | Sequence[Press]], *, held: float = 1.0, elapsed: float = 0.0
+    ) -> Float[np.ndarray, "n M"]:
         """Voltages (n, M) of n touches of a skin that has had no load before: one press each, or a tuple of several at
         once.
 
@@ -73,7 +77,7 @@ class PressedSkin(eqx.Module):
         exact = self.voltages_under(self.touched(presses, held=held))
         return self._read(key, exact, np.array([float(elapsed)]))
 
-    def touched(self, presses, *, held: float = 1.0) -> TouchedCells:
+    def touched(self, presses: Sequence[Press | Sequence[Press]], *, held: float = 1.0) -> TouchedCells:
         """The cells whose conductivity n touches change, and by how much; as of `frames`, whose errors it raises."""
         touches = touches_of(presses)
         pressed = pressed_cells(Samples.of(self.model.mesh), self.material.support, touches)
@@ -81,7 +85,9 @@ class PressedSkin(eqx.Module):
         places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])
         return _touched(places, pressed.cells, change, self.model.mesh.num_cells)
 
-    def record(self, key: Array, motions, seconds: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T M"]:
+    def record(
+        self, key: Array, motions: MovingPress | Sequence[MovingPress], seconds: Float[np.ndarray, " T"]
+    ) -> Float[np.ndarray, "T M"]:
         """Voltages (T, M) at times `seconds` (T,) of a skin under moving presses, a `MovingPress` or several at once,
         or `[]`: nothing touches it.
 
@@ -93,7 +99,9 @@ class PressedSkin(eqx.Module):
         exact = self.voltages_under(self.touched_in_time(motions, seconds))
         return self._read(key, exact, seconds)
 
-    def touched_in_time(self, motions, seconds: Float[np.ndarray, " T"]) -> TouchedCells:
+    def touched_in_time(
+        self, motions: MovingPress | Sequence[MovingPress], seconds: Float[np.ndarray, " T"]
+    ) -> TouchedCells:
         """What is changed in each of T frames, also by loads that were there before; as of `record`, whose errors it
         raises."""
         seconds = _check_times(seconds)

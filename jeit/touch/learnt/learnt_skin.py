@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, check_name, counted
 from jeit.forward import ForwardModel
@@ -128,7 +129,7 @@ class LearntSkin:
             standing=standing,
         )
 
-    def predict(self, frames, reference=None, group=None) -> Touches:
+    def predict(self, frames: ArrayLike, reference: ArrayLike | None = None, group: ArrayLike | None = None) -> Touches:
         """Touches of frames (n, M), with the `reference` (M,) or (n, M) if there was one in the presses learnt from,
         and the session of each (`group`) if sessions are standardised.
 
