@@ -68,20 +68,21 @@ class LearntSkin:
         model: ForwardModel | None = None,
         num_channels: int | None = None,
         per_session: bool = False,
-        progress: Callable[[str], None] = lambda said: None,
+        progress: Callable[[str], None] | None = None,
     ) -> "LearntSkin":
         """Learn from recorded presses.
 
         `method`: "auto" takes what errs least on presses held out, in stretches of time; or one of `METHODS`, for what
         it can learn. `model` of the skin, if one is known, of some hundred nodes: its images of the changes, and the
         contacts in them, are learnt from too. `num_channels`: only so many, those that tell most, are used.
-        `per_session`: changes of each `group` are standardised by themselves, against drift. Raises `ValueError` for
-        another method, one that cannot learn what the presses say, presses that nothing can be learnt from, and a model
-        of another number of channels.
+        `per_session`: changes of each `group` are standardised by themselves, against drift. `progress` is called with
+        what is being tried. Raises `ValueError` for another method, one that cannot learn what the presses say, presses
+        that nothing can be learnt from, and a model of another number of channels.
         """
         _check_fit(presses, method, model, num_channels, per_session)
         with one_thread():
-            return cls._fit(presses, method, model, num_channels, per_session, progress)
+            tell = progress or (lambda said: None)
+            return cls._fit(presses, method, model, num_channels, per_session, tell)
 
     @classmethod
     def _fit(cls, presses: Presses, method, model, num_channels, per_session, progress) -> "LearntSkin":
