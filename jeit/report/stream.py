@@ -38,6 +38,7 @@ def write_stream(
     film: str | None = "film.gif",
     rate: float | None = None,
     progress: Callable[[FrameImage], None] | None = None,
+    drawing: Callable[[str], None] | None = None,
 ) -> WrittenStream:
     """Write `frames.csv`, a line for every image as it comes, and at the end `images.npz`, `frames.png`, a contact
     sheet, and a film, into `folder`.
@@ -47,8 +48,9 @@ def write_stream(
     `conductivity` (frames, cells), NaN for frames that were refused, `background`, `points` and `cells`. `film`: the
     name of its file, ending in .gif or, where ffmpeg is installed, .mp4; None for none. `rate`: frames in a second, for
     times in place of numbers, and the pace of the film. Pictures show refused frames as such; where all are, there is
-    none. `progress` is called with every image. An earlier stream's images and pictures are taken away first. Raises
-    `ValueError`, with the `name` of the stream, if no frame came, and for what cannot be a folder, a film or a rate.
+    none. `progress` is called with every image, and `drawing` then with what is drawn. An earlier stream's images and
+    pictures are taken away first. Raises `ValueError`, with the `name` of the stream, if no frame came, and for what
+    cannot be a folder, a film or a rate.
     """
     if film is not None:
         check_film(film)
@@ -84,19 +86,31 @@ def write_stream(
         cells=np.asarray(mesh.cells),
     )
     if latency:
-        _draw(np.stack(kept) - np.float32(background), calibration, folder, film, rate)
+        pictures = _Pictures(folder, film, rate, drawing or (lambda said: None))
+        pictures.draw(np.stack(kept) - np.float32(background), calibration)
     return WrittenStream(len(kept), counts, np.array(latency), refusals[0] if refusals else "")
 
 
-def _draw(changes: np.ndarray, calibration: Calibration, folder: Path, film: str | None, rate: float | None) -> None:
-    """The contact sheet, and the film."""
-    from jeit.plot import plot_frames
+@dataclass(frozen=True)
+class _Pictures:
+    """Which are drawn into a folder, and who is told."""
 
-    model, number = calibration.model, len(changes)
-    titles = [f"frame {frame}" if rate is None else f"{frame / rate:.2f} s" for frame in range(number)]
-    plot_frames(model.mesh, changes, model.electrodes, titles=titles).savefig(folder / "frames.png", dpi=120)
-    if film is not None:
-        write_film(folder / film, model.mesh, changes, model.electrodes, titles=titles, rate=rate)
+    folder: Path
+    film: str | None
+    rate: float | None
+    tell: Callable[[str], None]
+
+    def draw(self, changes: Float[np.ndarray, "F m"], calibration: Calibration) -> None:
+        """The contact sheet, and the film."""
+        from jeit.plot import plot_frames
+
+        model, rate = calibration.model, self.rate
+        titles = [f"frame {one}" if rate is None else f"{one / rate:.2f} s" for one in range(len(changes))]
+        self.tell("contact sheet")
+        plot_frames(model.mesh, changes, model.electrodes, titles=titles).savefig(self.folder / "frames.png", dpi=120)
+        if self.film is not None:
+            path, told = self.folder / self.film, lambda far: self.tell(f"film: {far}")
+            write_film(path, model.mesh, changes, model.electrodes, titles=titles, rate=rate, progress=told)
 
 
 def _row(one: FrameImage, centre, background: float) -> list[object]:

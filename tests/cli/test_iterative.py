@@ -101,6 +101,7 @@ def test_a_stream_from_a_file(method, tank, run, tmp_path):
     assert (output / "frames.png").stat().st_size > 10_000
     assert (output / "film.gif").stat().st_size > 10_000
     assert "frames.png, film.gif" in text
+    assert text.index("4 frames") > text.index("  draw ")
 
 
 def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):

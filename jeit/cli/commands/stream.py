@@ -96,9 +96,17 @@ def stream(
             console.print(f"  frame {one.number}: {one.status}. {one.reason}", soft_wrap=True)
 
     frames = parse_frames(sys.stdin) if data == "-" else frames_of(measured)
-    with naming_options({"rate": "--rate"}):
-        images = images_of(imager, frames)
-        written = write_stream(images, calibration, output, name=data, film=wanted, rate=rate, progress=show)
+    with naming_options({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
+
+        def draw(what: str) -> None:
+            if not step.under_way:
+                step("draw")
+            step.tell(what)
+
+        told = {"progress": show, "drawing": draw}
+        written = write_stream(
+            images_of(imager, frames), calibration, output, name=data, film=wanted, rate=rate, **told
+        )
     if not written.latency.size:
         raise ValueError(
             f"'{data}': {counted(written.number, 'frame')}, and none could be imaged; the first: {written.first_reason}"
