@@ -34,6 +34,11 @@ class Steps:
             self._status = self.console.status(f"{step} …")
             self._status.start()
 
+    @property
+    def under_way(self) -> bool:
+        """Whether a step has begun and not ended."""
+        return self._status is not None
+
     def tell(self, detail: str) -> None:
         """Say how far the step under way is, beside its spinner."""
         if self._status is not None:

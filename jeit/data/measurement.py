@@ -1,13 +1,16 @@
 """A measurement: frames of voltages, with all that is needed to make sense of them."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Inexact
+from numpy.typing import ArrayLike
 
 from jeit.arguments import counted, did_you_mean
+from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh
 from jeit.mesh.solid_body import as_body
 from jeit.protocol import Protocol
@@ -44,11 +47,11 @@ class Measurement(eqx.Module):
 
     def __init__(
         self,
-        voltages,
-        mask,
+        voltages: ArrayLike,
+        mask: ArrayLike,
         protocol: Protocol,
         *,
-        electrodes=None,
+        electrodes: AbstractElectrodes | None = None,
         domain: Body | Mesh | None = None,
         name: str = "measurement",
         source: str = "",
@@ -137,7 +140,7 @@ class Measurement(eqx.Module):
         """(F, M) voltages with `value` in place of what is masked."""
         return _filled(self.voltages, self.mask, value)
 
-    def masked(self, usable, reason: str) -> "Measurement":
+    def masked(self, usable: ArrayLike, reason: str) -> "Measurement":
         """The same measurement with fewer usable channels.
 
         `usable` is boolean, (M,) or (F, M); `reason` goes into the notes. Raises `ValueError` for another shape.
@@ -155,7 +158,7 @@ class Measurement(eqx.Module):
             note = f"{counted(number, 'voltage')} masked: {reason}"
         return self._replace(self.voltages, mask, notes=(*self.notes, note))
 
-    def without_electrodes(self, electrodes) -> "Measurement":
+    def without_electrodes(self, electrodes: int | Sequence[int]) -> "Measurement":
         """Mask channels that drive or measure any of `electrodes` (0-based): missing or broken ones.
 
         Raises `ValueError` for electrodes that are not there.

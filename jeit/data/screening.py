@@ -4,20 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool
+from numpy.typing import ArrayLike
 
 from jeit.data.electrode_order import order_note
 from jeit.data.measurement import Measurement
+from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh
 from jeit.protocol import Protocol
 
 
 def screen(
-    voltages,
+    voltages: ArrayLike,
     protocol: Protocol,
     *,
-    electrodes=None,
+    electrodes: AbstractElectrodes | None = None,
     domain: Body | Mesh | None = None,
-    mask=None,
+    mask: ArrayLike | None = None,
     saturation: float | None = None,
     name: str = "measurement",
     source: str = "",

@@ -1,6 +1,7 @@
 """A better layout for a sheet: optimised on a coarse mesh, and judged with the one given on a finer one."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -56,7 +57,7 @@ def improve_layout(
     num_points: int = NUM_POINTS,
     progress: Callable[[str], None] | None = None,
     callback: Callable[[int, np.ndarray], None] | None = None,
-    **material,
+    **material: Any,
 ) -> ImprovedLayout:
     """Move the electrodes of `layout` until its worst sensitivity and mean variance are as good as they get; as
     `jeit layout optimise`.

@@ -19,6 +19,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jeit.design.defaults import TEMPERATURE
 from jeit.design.sensitivity import uniformity
@@ -42,7 +43,7 @@ class TouchPrior(eqx.Module):
     factor: Float[Array, "n r"]
 
     @classmethod
-    def create(cls, places, *, correlation: float, deviation: float = 1.0) -> "TouchPrior":
+    def create(cls, places: ArrayLike, *, correlation: float, deviation: float = 1.0) -> "TouchPrior":
         """deviation² exp(-d² / 2 correlation²) between places (n, 2) at a distance d, metres.
 
         What holds less than a millionth of the largest variance is left out. Raises `ValueError` for a correlation or
@@ -106,11 +107,11 @@ Score = Callable[[Scores], Float[Array, ""]]
 
 def layout_scores(
     model: ForwardModel,
-    conductivity,
+    conductivity: ArrayLike,
     touches: SheetTouches,
     *,
     prior: TouchPrior,
-    noise,
+    noise: ArrayLike,
     temperature: float = TEMPERATURE,
 ) -> Scores:
     """All scores of the layout of a model on a sheet, from one factorisation and the Jacobian.

@@ -3,6 +3,7 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jeit.design.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation, Bell
@@ -79,7 +80,7 @@ class SensitivityMap(eqx.Module):
 
 def sensitivity_map(
     model: ForwardModel,
-    conductivity,
+    conductivity: ArrayLike,
     grid: TouchGrid,
     *,
     indentation: AbstractIndentation | None = None,

@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from jeit.electrodes.electrodes import (
     AbstractMovableElectrodes,
@@ -33,7 +34,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
     width: Float[Array, " L"]
     contact_impedance: Float[Array, " L"]
 
-    def __init__(self, position, width, contact_impedance):
+    def __init__(self, position: ArrayLike, width: ArrayLike, contact_impedance: ArrayLike):
         """`width` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position = as_positions(position, (2,))
         self.width = as_electrode_values("width", width, len(self.position), unit="metres")

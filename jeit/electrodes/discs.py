@@ -3,6 +3,7 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jeit.electrodes.electrodes import (
@@ -52,7 +53,7 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
     radius: Float[Array, " L"]
     contact_impedance: Float[Array, " L"]
 
-    def __init__(self, position, radius, contact_impedance):
+    def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position, self.radius, self.contact_impedance = _as_discs(position, 2, radius, contact_impedance)
 
@@ -96,7 +97,7 @@ class FaceDiscs(AbstractDiscs):
     radius: Float[Array, " L"]
     contact_impedance: Float[Array, " L"]
 
-    def __init__(self, position, radius, contact_impedance):
+    def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position, self.radius, self.contact_impedance = _as_discs(position, 3, radius, contact_impedance)
 

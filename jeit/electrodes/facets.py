@@ -30,7 +30,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
     covers: Float[Array, "b L"]
     contact_impedance: Float[Array, " L"]
 
-    def __init__(self, mesh: Mesh, facets: Sequence, contact_impedance):
+    def __init__(self, mesh: Mesh, facets: Sequence, contact_impedance: ArrayLike):
         """`facets`: for each electrode the indices into `mesh.facets` that it covers. Raises `ValueError`."""
         if not facets:
             raise ValueError("facets is empty; give one list of facet indices for each electrode.")
@@ -103,7 +103,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
             )
 
 
-def plates(mesh: Mesh, tags: Sequence[str], contact_impedance) -> FacetElectrodes:
+def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> FacetElectrodes:
     """Electrodes that cover whole named faces of a mesh, such as `plates(box(…), ["left", "right"], 0.01)`.
 
     `tags`: names in `mesh.tags`, one for each electrode. `contact_impedance`: ohm·m² (2-D: ohm·m), one number or
@@ -116,7 +116,7 @@ def plates(mesh: Mesh, tags: Sequence[str], contact_impedance) -> FacetElectrode
     return FacetElectrodes(mesh, [np.asarray(mesh.tags[tag]) for tag in tags], contact_impedance)
 
 
-def electrodes_from_nodes(mesh: Mesh, nodes: Sequence, contact_impedance) -> FacetElectrodes:
+def electrodes_from_nodes(mesh: Mesh, nodes: Sequence, contact_impedance: ArrayLike) -> FacetElectrodes:
     """Complete electrodes that cover the boundary facets whose nodes all belong to them.
 
     `nodes`: for each electrode its node indices, counted from 0. `contact_impedance` as in `FacetElectrodes`.

@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from jeit.electrodes.discs import facet_normals, seen_flat
 from jeit.electrodes.electrodes import (
@@ -33,7 +34,7 @@ class FacePatches(AbstractPlacedElectrodes):
     height: Float[Array, " L"]
     contact_impedance: Float[Array, " L"]
 
-    def __init__(self, position, width, height, contact_impedance):
+    def __init__(self, position: ArrayLike, width: ArrayLike, height: ArrayLike, contact_impedance: ArrayLike):
         """Sizes and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
         self.position = as_positions(position, (3,))
         self.width = as_electrode_values("width", width, len(self.position), unit="metres")

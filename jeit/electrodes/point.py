@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from jeit.electrodes.electrodes import AbstractPointElectrodes, Contact, ElectrodePen, as_positions
 from jeit.mesh import Body, Mesh, Refine, gradients
@@ -20,7 +21,7 @@ class PointElectrodes(AbstractPointElectrodes):
 
     position: Float[Array, "L d"]
 
-    def __init__(self, position):
+    def __init__(self, position: ArrayLike):
         """Raises `ValueError` for anything but finite (L, 2) or (L, 3) positions."""
         self.position = as_positions(position, (2, 3))
 
@@ -78,7 +79,7 @@ class NodeElectrodes(AbstractPointElectrodes):
 
     nodes: Int[Array, " L"]
 
-    def __init__(self, nodes):
+    def __init__(self, nodes: ArrayLike):
         """Raises `ValueError` for anything but L distinct non-negative integers."""
         array = np.asarray(nodes)
         if array.ndim != 1 or array.size == 0 or not np.issubdtype(array.dtype, np.integer):

@@ -10,6 +10,7 @@ import jax
 import lineax as lx
 import numpy as np
 from jaxtyping import Array, Inexact
+from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
@@ -80,18 +81,18 @@ class ForwardModel(eqx.Module):
         _check(self.mesh, self.electrodes, protocol)
         return eqx.tree_at(lambda model: model.protocol, self, protocol)
 
-    def voltages(self, conductivity) -> Inexact[Array, " M"]:
+    def voltages(self, conductivity: ArrayLike) -> Inexact[Array, " M"]:
         """Voltages (M,) of the protocol's channels, in volts. `conductivity` in S/m (2-D: S); raises `ValueError`."""
         return evaluate(self, voltages_of, check_conductivity(self.mesh, conductivity))
 
-    def transfer_impedance(self, conductivity) -> Inexact[Array, "L L"]:
+    def transfer_impedance(self, conductivity: ArrayLike) -> Inexact[Array, "L L"]:
         """Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero.
 
         `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
         """
         return evaluate(self, transfer_impedance_of, check_conductivity(self.mesh, conductivity))
 
-    def fields(self, conductivity) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
+    def fields(self, conductivity: ArrayLike) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
         """Potentials F (n, L) of the nodes for a unit current into each electrode that leaves evenly through all, in
         ohms, and the transfer impedance Z (L, L).
 
@@ -99,14 +100,14 @@ class ForwardModel(eqx.Module):
         """
         return evaluate(self, fields_of, check_conductivity(self.mesh, conductivity))
 
-    def potentials(self, conductivity) -> Inexact[Array, "S n"]:
+    def potentials(self, conductivity: ArrayLike) -> Inexact[Array, "S n"]:
         """Potential at the nodes for every drive pattern, in volts; the mean over the electrodes is zero.
 
         `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
         """
         return evaluate(self, potentials_of, check_conductivity(self.mesh, conductivity))
 
-    def jacobian(self, conductivity) -> Inexact[Array, "M m"]:
+    def jacobian(self, conductivity: ArrayLike) -> Inexact[Array, "M m"]:
         """∂(voltage)/∂(conductivity), volts per siemens per metre (2-D: per siemens).
 
         With respect to the cells (M, m); with respect to the nodes (M, n) if `conductivity` is given per node. Raises
@@ -114,7 +115,7 @@ class ForwardModel(eqx.Module):
         """
         return self.voltages_and_jacobian(conductivity)[1]
 
-    def voltages_and_jacobian(self, conductivity) -> tuple[Inexact[Array, " M"], Inexact[Array, "M m"]]:
+    def voltages_and_jacobian(self, conductivity: ArrayLike) -> tuple[Inexact[Array, " M"], Inexact[Array, "M m"]]:
         """`voltages` and `jacobian` from one factorisation and one solve per electrode.
 
         `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one, and for tensors.

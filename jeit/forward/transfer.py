@@ -17,6 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
+from numpy.typing import ArrayLike
 
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrodes import Contact
@@ -27,7 +28,7 @@ from jeit_solvers import NearInverse, SparseSymmetric, Strips, near_inverse, sym
 from jeit_solvers.engines import namespace
 
 
-def transfer_impedance(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
+def transfer_impedance(mesh: Mesh, conductivity: ArrayLike, electrodes: AbstractElectrodes, system: System):
     """Transfer impedance Z (L, L) in ohms: electrode potentials U = Z I for currents I that sum to zero.
 
     `conductivity` in S/m (2-D: S), (m,), (n,) or (m, d, d). Rows and columns of Z sum to zero, i.e. the mean electrode

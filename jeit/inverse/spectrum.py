@@ -12,8 +12,8 @@ residual is v - JR_λv = λ²P_λv = QU diag(λ²/(Λ + λ²)) UᵀQᵀv, whatev
 
 import equinox as eqx
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jeit_solvers import symmetric_eigen
 from jeit_solvers.engines import either_engine, namespace

@@ -1,5 +1,7 @@
 """Layouts: positions for electrodes of any kind, as arrays (L, d) in metres."""
 
+from typing import Any
+
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -29,7 +31,7 @@ def ring(
     return position if height is None else np.column_stack([position, np.full(num_electrodes, float(height))])
 
 
-def ring_and_centre(radius: float, num_electrodes: int, **options) -> np.ndarray:
+def ring_and_centre(radius: float, num_electrodes: int, **options: Any) -> np.ndarray:
     """A `ring` of electrodes and one more in its centre, which comes last: (num_electrodes + 1, d) metres.
 
     For `jeit.protocol.reference_electrode`. `options` and errors are those of `ring`.

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
 from jeit.electrodes.discs import SheetDiscs
@@ -40,10 +41,10 @@ class Layout(eqx.Module):
 
     def __init__(
         self,
-        centres,
-        diameters,
+        centres: ArrayLike,
+        diameters: ArrayLike,
         *,
-        contact_impedance=None,
+        contact_impedance: ArrayLike | None = None,
         outline: Domain | None = None,
         labels: Sequence[str] | None = None,
         name: str = "layout",
@@ -89,7 +90,7 @@ class Layout(eqx.Module):
             return self.outline.extent
         return bounds(np.asarray(self.centres), np.asarray(self.diameters))
 
-    def sheet_discs(self, contact_impedance=None) -> SheetDiscs:
+    def sheet_discs(self, contact_impedance: ArrayLike | None = None) -> SheetDiscs:
         """The electrodes for a forward model on a sheet; `contact_impedance` in ohm·m² replaces the layout's.
 
         Raises `ValueError` if neither is known.

@@ -15,6 +15,7 @@ from jeit.plot.design.sensitivity_map import plot_sensitivity_histograms, plot_s
 from jeit.plot.design.taxels import plot_taxel_areas, plot_taxels
 from jeit.plot.design.travel import plot_travel
 from jeit.plot.imaging.figures_of_merit import plot_figures_of_merit
+from jeit.plot.imaging.frames import plot_frames
 from jeit.plot.imaging.hyperparameter import plot_choice
 from jeit.plot.imaging.image import plot_image
 from jeit.plot.imaging.mesh import plot_mesh
@@ -36,6 +37,7 @@ __all__ = [
     "plot_error_curve",
     "plot_figures_of_merit",
     "plot_force_errors",
+    "plot_frames",
     "plot_image",
     "plot_key_errors",
     "plot_loss_map",

@@ -1,13 +1,23 @@
 """Protocols from matrices: of one's own design, or as found in a data file."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jeit.protocol._check import check_amplitude
 from jeit.protocol.protocol import Protocol
 from jeit_solvers.engines import has_values
 
 
-def from_matrices(drive, measurement, select=None, *, name: str = "custom", large_currents: bool = False) -> Protocol:
+def from_matrices(
+    drive: ArrayLike,
+    measurement: ArrayLike,
+    select: ArrayLike | None = None,
+    *,
+    name: str = "custom",
+    large_currents: bool = False,
+) -> Protocol:
     """Every drive pattern crossed with every measurement pattern, drive by drive.
 
     - `drive`: (S, L) currents in amperes, one row per drive.
@@ -37,7 +47,12 @@ def from_matrices(drive, measurement, select=None, *, name: str = "custom", larg
 
 
 def from_channels(
-    drive, channel_measurement, drive_index, *, name: str = "custom", large_currents: bool = False
+    drive: ArrayLike,
+    channel_measurement: ArrayLike,
+    drive_index: ArrayLike,
+    *,
+    name: str = "custom",
+    large_currents: bool = False,
 ) -> Protocol:
     """One measurement row and one drive number per channel, as measured data often come.
 
@@ -67,7 +82,7 @@ def from_channels(
     return Protocol(drive, rows[first[appearance]], index, rank[inverse.ravel()], name)
 
 
-def _as_matrix(values, what: str):
+def _as_matrix(values: Any, what: str) -> np.ndarray:
     if not has_values(values):
         return values
     if hasattr(values, "toarray"):  # a scipy.sparse matrix, as loadmat returns EIDORS patterns

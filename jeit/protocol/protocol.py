@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from jeit.protocol._check import (
     check_indices,
@@ -122,7 +123,7 @@ class Protocol(eqx.Module):
         shared = shares_electrode(np.asarray(self.drive), np.asarray(self.measurement))
         return shared[np.asarray(self.drive_index), np.asarray(self.measurement_index)]
 
-    def subset(self, keep) -> "Protocol":
+    def subset(self, keep: ArrayLike) -> "Protocol":
         """The protocol of the channels kept, with the drives and measurement patterns they use.
 
         `keep` is a boolean mask (M,) or a sequence of channel indices. Voltages follow as `voltages[...,

@@ -4,6 +4,7 @@ calibrations of microphones, tracks, layouts, studies, learnt skins."""
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.report.calibration import draw_calibration, write_calibration
 from jeit.report.compared_rules import draw_choice, report_choice, write_choice
+from jeit.report.film import write_film
 from jeit.report.image import draw_image, report_image, write_image
 from jeit.report.layout_comparison import draw_layout_comparison, report_layout_comparison, write_layout_comparison
 from jeit.report.layout_improvement import draw_improved_layout, report_improved_layout, write_improved_layout
@@ -31,6 +32,7 @@ __all__ = [
     "report_track",
     "write_calibration",
     "write_choice",
+    "write_film",
     "write_image",
     "write_improved_layout",
     "write_layout_comparison",

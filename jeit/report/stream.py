@@ -1,4 +1,4 @@
-"""What is left of a stream on disk: a line for every frame as it comes, and all images at the end."""
+"""What is left of a stream on disk: a line for every frame as it comes, and at the end all images and pictures."""
 
 import csv
 from collections.abc import Callable, Iterable
@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jeit.arguments import is_number, told
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.streaming.stream import FrameImage
 from jeit.mesh import centroids
+from jeit.report.film import check_film, write_film
 from jeit.report.folder import results_folder
 
 _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
@@ -33,18 +35,31 @@ def write_stream(
     folder: str | Path,
     *,
     name: str = "stream",
+    film: str | None = "film.gif",
+    rate: float | None = None,
     progress: Callable[[FrameImage], None] | None = None,
+    drawing: Callable[[str], None] | None = None,
 ) -> WrittenStream:
-    """Write `frames.csv`, a line for every image as it comes, and at the end `images.npz`, into `folder`.
+    """Write `frames.csv`, a line for every image as it comes, and at the end `images.npz`, `frames.png`, a contact
+    sheet, and a film, into `folder`.
 
     `images`: those of `jeit.inverse.stream`, of an imager made with `calibration`, see `jeit.imaging.prepare_imager`.
     The table has the place in metres and the height, S (3-D: S/m), of each image's strongest change. The NPZ holds
-    `conductivity` (frames, cells), NaN for frames that were refused, `background`, `points` and `cells`. `progress` is
-    called with every image. An earlier stream's images are taken away first. Raises `ValueError`, with the `name` of
-    the stream, if no frame came, and for what cannot be a folder.
+    `conductivity` (frames, cells), NaN for frames that were refused, `background`, `points` and `cells`. `film`: the
+    name of its file, ending in .gif or, where ffmpeg is installed, .mp4; None for none. `rate`: frames in a second, for
+    times in place of numbers, and the pace of the film. Pictures show refused frames as such; where all are, there is
+    none. `progress` is called with every image, and `drawing` then with what is drawn. An earlier stream's images and
+    pictures are taken away first. Raises `ValueError`, with the `name` of the stream, if no frame came, and for what
+    cannot be a folder, a film or a rate.
     """
-    folder = results_folder(folder, ("frames.csv", "images.npz"))
-    (folder / "images.npz").unlink(missing_ok=True)  # would not go with these frames
+    if film is not None:
+        check_film(film)
+    if rate is not None and not (is_number(rate) and rate > 0):
+        raise ValueError(f"rate must be positive, frames in a second; it is {told(rate)}.")
+    made = ("frames.csv", "images.npz", "frames.png", *([] if film is None else [film]))
+    folder = results_folder(folder, made)
+    for earlier in made[1:]:
+        (folder / earlier).unlink(missing_ok=True)  # would not go with these frames
     mesh, background = calibration.model.mesh, float(calibration.conductivity)
     centre = np.asarray(centroids(mesh))[:, :2]
     nothing = np.full(mesh.num_cells, np.nan, np.float32)
@@ -70,7 +85,32 @@ def write_stream(
         points=np.asarray(mesh.points),
         cells=np.asarray(mesh.cells),
     )
+    if latency:
+        pictures = _Pictures(folder, film, rate, drawing or (lambda said: None))
+        pictures.draw(np.stack(kept) - np.float32(background), calibration)
     return WrittenStream(len(kept), counts, np.array(latency), refusals[0] if refusals else "")
+
+
+@dataclass(frozen=True)
+class _Pictures:
+    """Which are drawn into a folder, and who is told."""
+
+    folder: Path
+    film: str | None
+    rate: float | None
+    tell: Callable[[str], None]
+
+    def draw(self, changes: Float[np.ndarray, "F m"], calibration: Calibration) -> None:
+        """The contact sheet, and the film."""
+        from jeit.plot import plot_frames
+
+        model, rate = calibration.model, self.rate
+        titles = [f"frame {one}" if rate is None else f"{one / rate:.2f} s" for one in range(len(changes))]
+        self.tell("contact sheet")
+        plot_frames(model.mesh, changes, model.electrodes, titles=titles).savefig(self.folder / "frames.png", dpi=120)
+        if self.film is not None:
+            path, told = self.folder / self.film, lambda far: self.tell(f"film: {far}")
+            write_film(path, model.mesh, changes, model.electrodes, titles=titles, rate=rate, progress=told)
 
 
 def _row(one: FrameImage, centre, background: float) -> list[object]:

@@ -98,6 +98,10 @@ def test_a_stream_from_a_file(method, tank, run, tmp_path):
     assert np.isnan(images[1]).all()
     assert np.isfinite(images[[0, 2, 3]]).all()
     np.testing.assert_allclose(images[0], images[3], rtol=0.02)
+    assert (output / "frames.png").stat().st_size > 10_000
+    assert (output / "film.gif").stat().st_size > 10_000
+    assert "frames.png, film.gif" in text
+    assert text.index("4 frames") > text.index("  draw ")
 
 
 def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
@@ -143,6 +147,13 @@ def test_a_stream_borrows_the_description_of_its_reference(tank, run, tmp_path):
     status, text, error = run("stream", tmp_path / "live" / "frames.csv", *options)
     assert (status, error) == (0, "")
     assert "1 frame: 1 imaged" in text
+    (tmp_path / "out" / "film.gif").unlink()
+    assert run("stream", tmp_path / "live" / "frames.csv", *options, "--film", "none", "--quiet")[0] == 0
+    assert not (tmp_path / "out" / "film.gif").exists()
+    status, _, error = run("stream", tmp_path / "live" / "frames.csv", *options, "--film", "a.avi")
+    assert (status, "--film must be a name that ends in .gif or .mp4" in error) == (1, True)
+    status, _, error = run("stream", tmp_path / "live" / "frames.csv", *options, "--rate", "-1")
+    assert (status, "--rate must be positive" in error) == (1, True)
 
 
 def test_the_help_of_a_stream_tells_the_defaults(run):

@@ -4,6 +4,8 @@ Robust least squares fit them; here it is judged which microphones they are good
 with are left out, and said.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
@@ -82,11 +84,13 @@ def calibrate_microphones(
     *,
     decay: str | type[AbstractDecay] = "inverse-square",
     intensity: IntensitySettings | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> CalibrationFit:
     """Fit the decay model of every microphone to `taps`.
 
     `decay`: "inverse-square", a / (r² + b), the paper's; "exponential", a exp(−r / l); or "attenuated",
-    a exp(−r / l) / (r² + b). `intensity`: band and window, for taps that come as samples.
+    a exp(−r / l) / (r² + b). `intensity`: band and window, for taps that come as samples. `progress` is called with the
+    name of each step as it begins.
 
     What `jeit calibrate-microphones` does; `jeit.report.write_calibration` writes what it writes. Raises `ValueError`
     where fewer than three microphones can be calibrated, where most do not hear what is said to be tapped, for another
@@ -94,7 +98,7 @@ def calibrate_microphones(
     """
     check_kind("taps", taps, Taps, "Taps, as of read_taps(path)")
     check_settings("intensity", intensity)
-    kind = find_decay(decay)
+    kind, tell = find_decay(decay), progress or (lambda step: None)
     if intensity is not None and taps.samples is None:
         raise ValueError("intensity: band and window are for taps that come as samples; these are intensities.")
     surface = make_surface(taps.outline, taps.positions)
@@ -106,6 +110,7 @@ def calibrate_microphones(
         known_noise = False
     else:
         settings = intensity if intensity is not None else IntensitySettings()
+        tell("measure intensities")
         power, floor, freedom, usable, faults = tap_intensities(taps, settings)
         noise = IntensityNoise.create(power.shape[1], floor=floor, freedom=np.median(freedom))
         known_noise = True
@@ -113,8 +118,10 @@ def calibrate_microphones(
     distance = np.linalg.norm(difference, axis=-1)
     enough = _check(kind, distance.T, np.where(usable, power, np.nan).T, faults)
     squared, power = np.sum(difference**2, axis=-1).T, np.where(usable, power, np.nan).T
+    tell("fit")
     fit = fit_taps(kind, taps.microphones, squared, power, noise, known_noise)
     tried = fit.use.T
+    tell("leave out")
     fit, good, reasons, explained = _leave_out(fit, faults)
     told = describe_faults(reasons)
     if good.sum() < max(3, _LEAST_SHARE * enough.sum()):

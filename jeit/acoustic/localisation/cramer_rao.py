@@ -16,7 +16,7 @@ def cramer_rao(
     position: ArrayLike,
     strength: ArrayLike = 1.0,
     *,
-    use=None,
+    use: ArrayLike | None = None,
 ) -> Float[Array, "N d d"]:
     """Least covariance (m²) with which sources of unknown `strength`, (N,) or one, at `position` (N, d), in
     metres, can be located.

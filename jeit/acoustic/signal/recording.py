@@ -6,6 +6,7 @@ it.
 """
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from struct import error as StructError
 
@@ -49,7 +50,9 @@ class Recording(eqx.Module):
     full_scale: float | None
     name: str = eqx.field(static=True)
 
-    def __init__(self, samples, rate, *, full_scale=None, name: str = "recording"):
+    def __init__(
+        self, samples: ArrayLike, rate: ArrayLike, *, full_scale: ArrayLike | None = None, name: str = "recording"
+    ):
         """Raises `ValueError` for what is not real, not (M, S), transposed, or sampled at no plausible rate."""
         self.samples = real(samples, "samples", "microphones, samples")
         count, length = self.samples.shape
@@ -88,16 +91,16 @@ class Intensities(eqx.Module):
 
     def __init__(
         self,
-        times,
-        power,
+        times: ArrayLike,
+        power: ArrayLike,
         *,
-        floor=None,
+        floor: ArrayLike | None = None,
         freedom: ArrayLike = np.inf,
         overlap: ArrayLike = 1.0,
-        usable=None,
-        faults=None,
-        name="intensities",
-        notes=(),
+        usable: ArrayLike | None = None,
+        faults: Sequence[str] | np.ndarray | None = None,
+        name: str = "intensities",
+        notes: Sequence[str] | np.ndarray = (),
     ):
         """`usable` and `faults` are worked out from NaN and dead channels when not given.
 
@@ -156,7 +159,16 @@ class Taps(eqx.Module):
     name: str = eqx.field(static=True)
 
     def __init__(
-        self, microphones, outline, positions, *, power=None, samples=None, rate=None, full_scale=None, name="taps"
+        self,
+        microphones: ArrayLike,
+        outline: ArrayLike,
+        positions: ArrayLike,
+        *,
+        power: ArrayLike | None = None,
+        samples: ArrayLike | None = None,
+        rate: ArrayLike | None = None,
+        full_scale: ArrayLike | None = None,
+        name: str = "taps",
     ):
         """Give either `power`, or `samples` and `rate`.
 

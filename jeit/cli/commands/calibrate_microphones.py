@@ -67,8 +67,7 @@ def calibrate_microphones(
         with Steps(console, quiet=quiet) as step:
             step("read")
             touched = read_taps(taps)
-            step("fit")
-            fit = calibrate(touched, decay=kind, intensity=settings)
+            fit = calibrate(touched, decay=kind, intensity=settings, progress=step)
             step("write")
             write_calibration(fit, output)
     if not quiet:

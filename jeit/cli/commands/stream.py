@@ -23,7 +23,7 @@ def stream(
         typer.Option(help="Measured file of the undisturbed body; says protocol and electrodes.", show_default=False),
     ],
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder for frames.csv and images.npz.", show_default=False)
+        Path, typer.Option("--output", "-o", help="Folder for frames.csv, images.npz and pictures.", show_default=False)
     ],
     format: Format = None,
     description: Description = None,
@@ -44,13 +44,21 @@ def stream(
     contact: Contact = None,
     num_points: Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 1200).")] = None,
     as_is: AsIs = False,
+    film: Annotated[
+        str,
+        typer.Option(help="Film's name: .gif, or .mp4 where ffmpeg is installed (default film.gif); none for none."),
+    ] = "film.gif",
+    rate: Annotated[
+        float | None,
+        typer.Option(help="Frames in a second: times in place of numbers, and the film's pace (default 10)."),
+    ] = None,
     quiet: Quiet = False,
 ) -> None:
     """Image every frame of DATA as it comes; bad frames are refused with the reason, and the stream goes on.
 
     Writes frames.csv line by line (x, y and peak of the strongest change, metres and S), and at the end images.npz with
-    `conductivity` (frames, cells), NaN for frames that were refused, `points`, `cells` and `background`. If all were
-    refused, the exit status is 1.
+    `conductivity` (frames, cells), NaN for frames that were refused, `points`, `cells` and `background`; frames.png,
+    some frames on one colour scale; and a film. If all were refused, the exit status is 1.
     """
     import numpy as np
     from rich.console import Console
@@ -61,6 +69,7 @@ def stream(
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as images_of
     from jeit.report import write_stream
+    from jeit.report.film import check_film
 
     given = {
         "solver": method,
@@ -73,7 +82,10 @@ def stream(
     }
     with naming_options({"solver": "--method", "max_steps": "--steps"}):
         settings = StreamSettings(**{name: value for name, value in given.items() if value is not None})
-    make_folder(output, ("frames.csv", "images.npz"))
+    wanted = None if film == "none" else film
+    with naming_options({"film": "--film"}):
+        films = () if wanted is None else (check_film(wanted),)
+    make_folder(output, ("frames.csv", "images.npz", "frames.png", *films))
     console = Console(highlight=False)
     with Steps(console, quiet=quiet) as step:
         step("read")
@@ -86,7 +98,17 @@ def stream(
             console.print(f"  frame {one.number}: {one.status}. {one.reason}", soft_wrap=True)
 
     frames = parse_frames(sys.stdin) if data == "-" else frames_of(measured)
-    written = write_stream(images_of(imager, frames), calibration, output, name=data, progress=show)
+    with naming_options({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
+
+        def draw(what: str) -> None:
+            if not step.under_way:
+                step("draw")
+            step.tell(what)
+
+        told = {"progress": show, "drawing": draw}
+        written = write_stream(
+            images_of(imager, frames), calibration, output, name=data, film=wanted, rate=rate, **told
+        )
     if not written.latency.size:
         raise ValueError(
             f"'{data}': {counted(written.number, 'frame')}, and none could be imaged; the first: {written.first_reason}"
@@ -94,8 +116,11 @@ def stream(
     if quiet:
         return
     said = ", ".join(f"{number} {status}" for status, number in sorted(written.counts.items()))
-    background = scaled(float(calibration.conductivity), "S")
+    background = scaled(float(calibration.conductivity), "S" if calibration.model.mesh.dimension == 2 else "S/m")
     console.print(f"\n{counted(written.number, 'frame')}: {said}; background {background}")
     middle, high = 1e3 * np.quantile(written.latency, (0.5, 0.99))
     console.print(f"latency: median {middle:.2f} ms, 99 % within {high:.2f} ms")
-    console.print(f"[dim]Written:[/dim] {output / 'frames.csv'}, images.npz", soft_wrap=True)
+    console.print(
+        f"[dim]Written:[/dim] {', '.join([str(output / 'frames.csv'), 'images.npz', 'frames.png', *films])}",
+        soft_wrap=True,
+    )

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jeit_solvers.engines import has_values
 
@@ -24,7 +25,9 @@ class Candidates(eqx.Module):
     weight: Float[Array, "r r"]
 
     @classmethod
-    def create(cls, jacobian, product, noise, *, weights=None) -> "Candidates":
+    def create(
+        cls, jacobian: ArrayLike, product: ArrayLike, noise: ArrayLike, *, weights: ArrayLike | None = None
+    ) -> "Candidates":
         """Candidates with these `jacobian` and `noise` under a prior with covariance Γ.
 
         - `jacobian`: J (M, m) of all candidate measurements, as of `ForwardModel.jacobian`.
@@ -42,7 +45,9 @@ class Candidates(eqx.Module):
         return _from_product(jacobian, product, noise, weights)
 
     @classmethod
-    def from_factor(cls, jacobian, factor, noise, *, weights=None) -> "Candidates":
+    def from_factor(
+        cls, jacobian: ArrayLike, factor: ArrayLike, noise: ArrayLike, *, weights: ArrayLike | None = None
+    ) -> "Candidates":
         """Candidates under a prior with covariance SSᵀ, `factor` S (m, r); the rest as in `create`.
 
         For any number of candidates: all drives with all measurements. Where S leaves out small parts of the variance

@@ -1,8 +1,11 @@
 """What a search makes large: a score of a sheet's layout."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, told
 from jeit.design.defaults import CONTRAST, CORRELATION, NOISE, TEMPERATURE
@@ -43,12 +46,12 @@ class Objective(eqx.Module):
     def create(
         cls,
         skin: Skin,
-        places,
+        places: ArrayLike,
         indentation: AbstractIndentation | None = None,
         *,
         contrast: float = CONTRAST,
         correlation: float = CORRELATION,
-        **options,
+        **options: Any,
     ) -> "Objective":
         """Of touches of a `skin` at `places` (n, 2), metres, as in `Skin.sheet_touches`, whose amplitudes are
         correlated over `correlation` metres; `options`: `noise`, `score`, `temperature`. Raises `ValueError` as

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, check_metres
 from jeit.design.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
@@ -56,7 +57,7 @@ class Skin(eqx.Module):
         model: ForwardModel,
         *,
         thickness: float,
-        conductivity,
+        conductivity: ArrayLike,
         num_layers: int = 0,
         cell_size: float | None = None,
     ):
@@ -84,8 +85,8 @@ class Skin(eqx.Module):
         layout: Layout,
         *,
         thickness: float = THICKNESS,
-        conductivity=CONDUCTIVITY,
-        contact_impedance=None,
+        conductivity: ArrayLike = CONDUCTIVITY,
+        contact_impedance: ArrayLike | None = None,
         num_layers: int = NUM_LAYERS,
         cell_size: float | None = None,
         num_points: int | None = None,
@@ -126,7 +127,7 @@ class Skin(eqx.Module):
         """What the model takes: the material's in S/m for a layer, a sheet's in siemens."""
         return model_conductivity(self.conductivity, self.thickness, self.num_layers)
 
-    def with_layout(self, layout: Layout, contact_impedance=None) -> "Skin":
+    def with_layout(self, layout: Layout, contact_impedance: ArrayLike | None = None) -> "Skin":
         """The same skin, on the same mesh and with the same protocol, with as many electrodes of another layout.
 
         `contact_impedance` as in `create`. Raises `ValueError` for electrodes off the mesh or too small for it.
@@ -140,7 +141,7 @@ class Skin(eqx.Module):
         return eqx.tree_at(lambda one: (one.layout, one.model), self, (layout, self.model.with_electrodes(electrodes)))
 
     def touched_cells(
-        self, places, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
+        self, places: ArrayLike, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
     ) -> TouchedCells:
         """What touches at `places` (n, 2), metres, change, one at a time; `Bell` unless given, as in `touched_cells`.
 
@@ -168,7 +169,7 @@ class Skin(eqx.Module):
             raise
 
     def sheet_touches(
-        self, places, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
+        self, places: ArrayLike, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
     ) -> SheetTouches:
         """The same of a sheet, with derivatives in the places. Raises `ValueError` as `sheet_touches` does."""
         indentation = Bell() if indentation is None else indentation

@@ -1,8 +1,9 @@
 """Which hyperparameter for these data: what one rule chooses, or what all of them do."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
 
 from jeit.forward import ForwardModel
 from jeit.inverse.hyperparameter.choice import Choice
@@ -14,7 +15,7 @@ from jeit.inverse.prior.priors import AbstractPrior
 
 def choose_hyperparameter(
     model: ForwardModel,
-    conductivity,
+    conductivity: ArrayLike,
     *,
     rule: str | Rule = RULE,
     prior: AbstractPrior | None = None,
@@ -38,20 +39,27 @@ def choose_hyperparameter(
 
 def compare_rules(
     model: ForwardModel,
-    conductivity,
+    conductivity: ArrayLike,
     *,
     difference: Float[Array, " M"],
     prior: AbstractPrior | None = None,
     noise: Float[Array, " M"] | float = 1.0,
     mask: Bool[Array, " M"] | None = None,
     rules: Mapping[str, Rule] | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> dict[str, Choice]:
     """What every rule chooses for the same data, by name; the problem is decomposed once for all of them.
 
-    `rules`: those to compare, `jeit.inverse.RULES` unless given; other arguments as in `one_step`.
+    `rules`: those to compare, `jeit.inverse.RULES` unless given; `progress` is called with the name of each step and
+    rule as it begins; other arguments as in `one_step`.
     `jeit.plot.plot_choice` draws the result. Raises `ValueError` for arguments that do not fit.
     """
-    rules = RULES if rules is None else rules
+    rules, tell = RULES if rules is None else rules, progress or (lambda step: None)
+    tell("linearise")
     linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
     data = linear.whiten(difference)
-    return {name: choose(linear.spectrum, rule, data, model.mesh) for name, rule in rules.items()}
+    chosen = {}
+    for name, rule in rules.items():
+        tell(name)
+        chosen[name] = choose(linear.spectrum, rule, data, model.mesh)
+    return chosen

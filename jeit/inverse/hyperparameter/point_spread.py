@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 from scipy.special import ndtr
 
@@ -11,7 +12,12 @@ from jeit.mesh import Mesh, centroids, measures
 
 
 def best_resolution(
-    spectrum: Spectrum, data, mesh: Mesh | None, *, signal_to_noise: float = 1.0, num_targets: int = 30
+    spectrum: Spectrum,
+    data: ArrayLike | None,
+    mesh: Mesh | None,
+    *,
+    signal_to_noise: float = 1.0,
+    num_targets: int = 30,
 ) -> Choice:
     """λ whose point spread functions have the least blur radius, averaged over targets spread through the body.
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jeit.arguments import check_name
 from jeit.inverse.hyperparameter.choice import Choice
@@ -21,7 +22,7 @@ from jeit_solvers.engines import has_values
 Rule = Callable[[Spectrum, Float[Array, " M"] | None, Mesh | None], Choice]
 
 
-def generalised_cross_validation(spectrum: Spectrum, data, mesh: Mesh | None = None) -> Choice:
+def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None) -> Choice:
     """λ that predicts each channel best from the others: least M‖r‖²/(tr(I - H))². Golub, Heath and Wahba 1979.
 
     Criterion: that score, the mean squared error of prediction in units of the noise's variance. Raises `ValueError`
@@ -33,7 +34,7 @@ def generalised_cross_validation(spectrum: Spectrum, data, mesh: Mesh | None = N
     return Choice.among("gcv", candidates, int(np.argmin(score)), score, (residual, penalty))
 
 
-def discrepancy(spectrum: Spectrum, data, mesh: Mesh | None = None, *, noise: float = 1.0) -> Choice:
+def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None, *, noise: float = 1.0) -> Choice:
     """Largest λ whose residual is no more than the noise: ‖r‖² = r noise², r being the number of components.
 
     Criterion: ‖r‖/√r, the residual in standard deviations. `noise`: the standard deviation that the whitened data
@@ -58,7 +59,7 @@ def discrepancy(spectrum: Spectrum, data, mesh: Mesh | None = None, *, noise: fl
     )
 
 
-def l_curve(spectrum: Spectrum, data, mesh: Mesh | None = None) -> Choice:
+def l_curve(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None) -> Choice:
     """λ at the corner of greatest curvature of log ‖r‖ against log √(xᵀQx). Hansen, SIAM Review 34 (1992) 561-580.
 
     Criterion: that curvature, positive where the curve bends towards the origin. Raises `ValueError` without data.
@@ -70,7 +71,9 @@ def l_curve(spectrum: Spectrum, data, mesh: Mesh | None = None) -> Choice:
     return Choice.among("l-curve", candidates, int(np.argmax(bend)), bend, (residual, penalty))
 
 
-def noise_figure(spectrum: Spectrum, data=None, mesh: Mesh | None = None, *, target: float = 1.25) -> Choice:
+def noise_figure(
+    spectrum: Spectrum, data: ArrayLike | None = None, mesh: Mesh | None = None, *, target: float = 1.25
+) -> Choice:
     """λ at which the signal-to-noise ratio of the image is 1 / `target` times that of the data; looks at no data.
 
     Signals are drawn from the prior and the noise is white: the ratio of the data is trΛ / r, that of the image

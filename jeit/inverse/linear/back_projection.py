@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Array, Bool
+from numpy.typing import ArrayLike
 
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
@@ -10,7 +11,7 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 
 def back_projection(
     model: ForwardModel,
-    conductivity,
+    conductivity: ArrayLike,
     *,
     filtered: bool = False,
     hyperparameter: float = 0.05,

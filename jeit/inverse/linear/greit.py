@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jeit.forward import ForwardModel
@@ -27,7 +28,7 @@ _LEAST = 0.01
 
 def greit(
     model: ForwardModel,
-    conductivity,
+    conductivity: ArrayLike,
     *,
     radius: float | None = None,
     hyperparameter: float | str = "noise-figure",

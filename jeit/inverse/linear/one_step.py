@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from jeit.forward import ForwardModel
 from jeit.inverse.hyperparameter.choice import Choice
@@ -134,7 +135,7 @@ def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.nd
 @np.errstate(all="ignore")  # numbers that overflow are told of below
 def one_step(
     model: ForwardModel,
-    conductivity,
+    conductivity: ArrayLike,
     *,
     prior: AbstractPrior | None = None,
     hyperparameter: float | str | Rule | Choice = RULE,

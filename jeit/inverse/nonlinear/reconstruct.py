@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
 
 from jeit.forward import ForwardModel
 from jeit.forward.model import evaluate, voltages_of
@@ -74,7 +75,7 @@ class Reconstruction(eqx.Module):
 def reconstruct(
     model: ForwardModel,
     voltages: Float[Array, " M"],
-    background,
+    background: ArrayLike,
     *,
     prior: AbstractPrior | None = None,
     hyperparameter: float | str | Rule | None = None,

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from jeit.arguments import is_number, told
 from jeit.electrodes.precomputed import IntegratedElectrodes
@@ -97,7 +98,7 @@ class Imager(eqx.Module):
     def create(
         cls,
         model: ForwardModel,
-        background,
+        background: ArrayLike,
         *,
         reference: Float[Array, " M"] | None = None,
         solver: AbstractSolver | str | None = None,

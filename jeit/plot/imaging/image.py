@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 from jeit.electrodes import AbstractElectrodes
 from jeit.image import Inclusion, Raster
 from jeit.mesh import Mesh
-from jeit.plot.axes import INK, axes_or_new, bare, draw_scale_bar, extent_of
+from jeit.plot.axes import axes_or_new, bare, draw_scale_bar, extent_of
 from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.inclusions import draw_inclusions
-from jeit.plot.imaging.mesh import check_body, draw_outline
+from jeit.plot.imaging.mesh import check_body, draw_outline, draw_slice_outline
 
 
 def plot_image(
@@ -56,11 +56,7 @@ def plot_image(
             raise ValueError(f"height: there is no mesh at z = {height} m to cut through.")
         colours = scale.of(pixels[np.isfinite(pixels)], "S/m")
         drawn = ax.imshow(colours.factor * pixels, extent=extent, interpolation="nearest", **colours.keywords)
-        # A rim of nothing all round, for the slice's edge to be closed where it touches the picture's.
-        shown = np.pad(np.isfinite(pixels).astype(float), 1)
-        pixel = [(extent[1] - extent[0]) / pixels.shape[1], (extent[3] - extent[2]) / pixels.shape[0]]
-        wider = (extent[0] - pixel[0], extent[1] + pixel[0], extent[2] - pixel[1], extent[3] + pixel[1])
-        ax.contour(shown, [0.5], extent=wider, origin="upper", colors=INK, linewidths=0.9, zorder=2)
+        draw_slice_outline(pixels, extent, ax)
     else:
         points = np.asarray(mesh.points)
         extent = extent_of(points)

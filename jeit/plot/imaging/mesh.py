@@ -1,6 +1,7 @@
 """Meshes: their cells, their outline, their electrodes."""
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
@@ -45,3 +46,14 @@ def draw_outline(mesh: Mesh, ax: Axes) -> None:
     """The boundary of a 2-D mesh, holes included."""
     edges = np.asarray(mesh.points)[np.asarray(mesh.facets)]
     ax.add_collection(LineCollection(list(edges), colors=INK, linewidths=0.9, capstyle="round", zorder=2))
+
+
+def draw_slice_outline(
+    pixels: Float[np.ndarray, "rows columns"], extent: tuple[float, float, float, float], ax: Axes
+) -> None:
+    """The edge of a slice through a solid, sampled on `pixels`, NaN outside it; `extent` in metres."""
+    # A rim of nothing all round, for the edge to be closed where it touches the picture's.
+    shown = np.pad(np.isfinite(pixels).astype(float), 1)
+    width, height = (extent[1] - extent[0]) / pixels.shape[1], (extent[3] - extent[2]) / pixels.shape[0]
+    wider = (extent[0] - width, extent[1] + width, extent[2] - height, extent[3] + height)
+    ax.contour(shown, [0.5], extent=wider, origin="upper", colors=INK, linewidths=0.9, zorder=2)

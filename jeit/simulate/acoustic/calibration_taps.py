@@ -1,5 +1,6 @@
 """Taps at known places of a simulated skin, as a calibration needs them: many at once."""
 
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -7,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from jeit.simulate.acoustic.bursts import ONSET, VIBRATOR, Burst, check_burst
 from jeit.simulate.acoustic.checks import check_not_negative
@@ -38,18 +40,20 @@ class CalibrationTaps(eqx.Module):
 def calibration_taps(
     skin: SoundingSkin,
     key: Array,
-    positions,
+    positions: ArrayLike,
     *,
     repeats: int = 3,
     burst: Burst = VIBRATOR,
     strength_spread: float = 0.3,
     duration: float = 0.15,
     noise: bool = True,
+    progress: Callable[[str], None] | None = None,
 ) -> CalibrationTaps:
     """`repeats` taps at each of `positions` (P, 2), metres: T = P · repeats recordings, those of one place together.
 
     Strengths are log-normal about that of `burst` with standard deviation `strength_spread` in the logarithm, as a
-    hand's or a vibrator's are: whoever calibrates does not know them. Otherwise as `tap`, which says what is raised.
+    hand's or a vibrator's are: whoever calibrates does not know them. `progress` is called with how far it is.
+    Otherwise as `tap`, which says what is raised.
     """
     check_skin_and_key(skin, key)
     places = skin.layer.check_inside("positions", positions)
@@ -74,6 +78,8 @@ def calibration_taps(
         samples[part] = _still(
             skin, keys[part], places[part], strengths[part], envelope, level, size, filled_bins(skin, size)
         )
+        if progress is not None:
+            progress(f"{part[-1] + 1} of {len(places)} places")
     return CalibrationTaps(
         samples.reshape(-1, *samples.shape[2:]), skin.rate, np.repeat(places, repeats, axis=0), strengths.ravel()
     )

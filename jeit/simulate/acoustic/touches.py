@@ -8,6 +8,7 @@ from collections.abc import Callable
 import jax
 import numpy as np
 from jaxtyping import Array
+from numpy.typing import ArrayLike
 
 from jeit.simulate.acoustic.bursts import FIRM, LIGHT, ONSET, VIBRATOR, Burst, check_burst
 from jeit.simulate.acoustic.checks import check_positive
@@ -22,7 +23,7 @@ NOMINAL_SPEED = 0.1
 def tap(
     skin: SoundingSkin,
     key: Array,
-    position,
+    position: ArrayLike,
     *,
     burst: Burst = VIBRATOR,
     repeats: int = 1,
@@ -49,7 +50,7 @@ def tap(
 def pat(
     skin: SoundingSkin,
     key: Array,
-    position,
+    position: ArrayLike,
     *,
     burst: Burst = FIRM,
     taps: int = 3,
@@ -66,7 +67,7 @@ def pat(
 def tickle(
     skin: SoundingSkin,
     key: Array,
-    position,
+    position: ArrayLike,
     *,
     burst: Burst = LIGHT,
     radius: float = 0.01,
@@ -105,7 +106,7 @@ def tickle(
 def stroke(
     skin: SoundingSkin,
     key: Array,
-    path,
+    path: ArrayLike,
     *,
     strength: float = 1.0,
     duration: float = 1.0,

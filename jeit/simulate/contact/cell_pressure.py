@@ -1,7 +1,7 @@
 """Pressure on the cells of a mesh, at a few samples of each, which a load is balanced on."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -55,16 +55,21 @@ class PressedCells(NamedTuple):
     pressure: Float[np.ndarray, "n c s"]
 
 
-def pressed_cells(samples: Samples, support: AbstractSupport, touches: Sequence[tuple[Press, ...]]) -> PressedCells:
+def pressed_cells(
+    samples: Samples,
+    support: AbstractSupport,
+    touches: Sequence[tuple[Press, ...]],
+    progress: Callable[[str], None] | None = None,
+) -> PressedCells:
     """Cells under touches, each of one press or several; what several press, the sum of their pressures does.
 
-    What of an indenter is over the edge of the skin carries nothing. Raises `ValueError` for presses off the skin, and
-    as the support does.
+    What of an indenter is over the edge of the skin carries nothing. `progress` is told of presses done. Raises
+    `ValueError` for presses off the skin, and as the support does.
     """
     presses = [press for touch in touches for press in touch]
     if not presses:
         return PressedCells(np.zeros((len(touches), 1), int), np.zeros((len(touches), 1, samples.points.shape[1])))
-    found = _of_each(samples, support, presses)
+    found = _of_each(samples, support, presses, progress)
     if all(len(touch) == 1 for touch in touches):
         return found
     rows, pressures, first = [], [], 0
@@ -80,7 +85,9 @@ def pressed_cells(samples: Samples, support: AbstractSupport, touches: Sequence[
     return _joined(rows, pressures)
 
 
-def _of_each(samples: Samples, support: AbstractSupport, presses: Sequence[Press]) -> PressedCells:
+def _of_each(
+    samples: Samples, support: AbstractSupport, presses: Sequence[Press], progress: Callable[[str], None] | None
+) -> PressedCells:
     position = np.array([press.position for press in presses])
     shapes = _shapes(presses)
     farthest = np.array([press.indenter.reach for press in presses])
@@ -100,6 +107,7 @@ def _of_each(samples: Samples, support: AbstractSupport, presses: Sequence[Press
         )
     rows: list = [None] * len(presses)
     pressures: list = [None] * len(presses)
+    done = 0
     for shape in np.unique(shapes):
         same = np.flatnonzero(shapes == shape)
         same = same[np.argsort(number[same], kind="stable")]
@@ -109,6 +117,9 @@ def _of_each(samples: Samples, support: AbstractSupport, presses: Sequence[Press
             for one, own, pressed in zip(some, cells, pressure, strict=True):
                 kept = pressed.any(axis=-1)
                 rows[one], pressures[one] = own[kept], pressed[kept]
+            done += len(some)
+            if progress is not None:
+                progress(f"pressure: {done} of {len(presses)}")
     return _joined(rows, pressures)
 
 

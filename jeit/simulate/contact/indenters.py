@@ -5,6 +5,7 @@ import abc
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
 from jeit.arguments import check_kind, check_metres, real_array
@@ -161,7 +162,7 @@ class DepthMap(AbstractIndenter):
     height: Float[np.ndarray, "rows columns"]
     pixel: float
 
-    def __init__(self, height, pixel: float):
+    def __init__(self, height: ArrayLike, pixel: float):
         """Raises `ValueError` for what is no image of at least 2 × 2 pixels, one that is infinite somewhere or NaN
         throughout, and pixels of no size."""
         height = real_array("height", height, "an image (rows, columns), in metres")

@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jeit.arguments import is_number, real_array
 from jeit.simulate.contact.indenters import AbstractIndenter, check_indenter
@@ -14,7 +15,7 @@ class Placed(AbstractIndenter):
     position: Float[np.ndarray, "2"]
     angle: float
 
-    def __init__(self, indenter: AbstractIndenter, position=(0.0, 0.0), angle: float = 0.0):
+    def __init__(self, indenter: AbstractIndenter, position: ArrayLike = (0.0, 0.0), angle: float = 0.0):
         """Raises `ValueError` for what is no indenter, place or angle."""
         check_indenter("indenter", indenter)
         self.indenter, self.position, self.angle = indenter, check_position(position), check_angle(angle)

@@ -3,6 +3,7 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, real_array
 from jeit.simulate.contact.indenters import AbstractIndenter, check_indenter
@@ -18,7 +19,7 @@ class Press(eqx.Module):
     position: Float[np.ndarray, "2"]
     angle: float
 
-    def __init__(self, indenter: AbstractIndenter, load: float, position=(0.0, 0.0), angle: float = 0.0):
+    def __init__(self, indenter: AbstractIndenter, load: float, position: ArrayLike = (0.0, 0.0), angle: float = 0.0):
         """Raises `ValueError` for what is no indenter, load, place or angle."""
         check_indenter("indenter", indenter)
         check_load(load)
@@ -35,7 +36,9 @@ class MovingPress(eqx.Module):
     position: Float[np.ndarray, "T 2"]
     angle: Float[np.ndarray, " T"]
 
-    def __init__(self, indenter: AbstractIndenter, load, position=(0.0, 0.0), angle=0.0):
+    def __init__(
+        self, indenter: AbstractIndenter, load: ArrayLike, position: ArrayLike = (0.0, 0.0), angle: ArrayLike = 0.0
+    ):
         """Raises `ValueError` for what is no indenter, negative loads, and what is not finite or not as long."""
         check_indenter("indenter", indenter)
         load = real_array("load", load, "newtons, one or one a frame (T,)")

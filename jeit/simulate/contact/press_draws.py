@@ -1,5 +1,7 @@
 """Presses drawn at random: what is pressed, how hard, where, and how many at once."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -27,7 +29,15 @@ class PressDraws(eqx.Module):
     margin: float
     at_once: int
 
-    def __init__(self, indenters, outline: Domain, load: tuple[float, float], *, margin: float = 0.0, at_once: int = 1):
+    def __init__(
+        self,
+        indenters: Sequence[AbstractIndenter],
+        outline: Domain,
+        load: tuple[float, float],
+        *,
+        margin: float = 0.0,
+        at_once: int = 1,
+    ):
         """Raises `ValueError` for no indenters, no outline, loads that are not positive and rising, and a margin that
         leaves no place."""
         check_kind("indenters", indenters, (list, tuple), "a list of them, such as [ball(0.015)]")

@@ -1,11 +1,13 @@
 """`PressedSkin`: a skin of some material, and what it reads while it is pressed."""
 
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from jeit.arguments import check_key, check_kind, is_number, real_array, told
 from jeit.design.skin.touched_cells import TouchedCells, padded
@@ -18,7 +20,7 @@ from jeit.mesh import Mesh, centroids, measures
 from jeit.simulate.contact.cell_pressure import Samples, pressed_cells
 from jeit.simulate.contact.drift import gains, walk, white_noise
 from jeit.simulate.contact.materials import Material
-from jeit.simulate.contact.press import motions_of, touches_of
+from jeit.simulate.contact.press import MovingPress, Press, motions_of, touches_of
 from jeit.simulate.contact.response import advance, held_pressure, unstrained
 from jeit_solvers.engines import as_array
 
@@ -41,7 +43,7 @@ class PressedSkin(eqx.Module):
     conductivity: Float[np.ndarray, "..."]
     gain: Float[np.ndarray, " M"]
 
-    def __init__(self, key: Array, model: ForwardModel, material: Material, *, conductivity=None):
+    def __init__(self, key: Array, model: ForwardModel, material: Material, *, conductivity: ArrayLike | None = None):
         """A skin whose gains are drawn from `key`. `conductivity` at rest, S/m (2-D: S): the material's unless given.
 
         Raises `ValueError` for what is no key, model, material or conductivity.
@@ -59,48 +61,75 @@ class PressedSkin(eqx.Module):
         """Voltages (M,) of the skin that nobody touches and nothing disturbs, as its channels read them."""
         return self.gain * self._at_rest
 
-    def frames(self, key: Array, presses, *, held: float = 1.0, elapsed: float = 0.0) -> Float[np.ndarray, "n M"]:
+    def frames(
+        self,
+        key: Array,
+        presses: Sequence[Press | Sequence[Press]],
+        *,
+        held: float = 1.0,
+        elapsed: float = 0.0,
+        progress: Callable[[str], None] | None = None,
+    ) -> Float[np.ndarray, "n M"]:
         """Voltages (n, M) of n touches of a skin that has had no load before: one press each, or a tuple of several at
         once.
 
         `held`: seconds that the load has been there. `elapsed`: seconds since the skin was as its model says, over
-        which it drifts, once for all these frames. Raises `ValueError` for presses off the skin or through it, and what
-        is no press or time.
+        which it drifts, once for all these frames. `progress` is called with how far it is. Raises `ValueError` for
+        presses off the skin or through it, and what is no press or time.
         """
         check_key(key)
         check_seconds("held", held)
         check_seconds("elapsed", elapsed)
-        exact = self.voltages_under(self.touched(presses, held=held))
+        exact = self.voltages_under(self.touched(presses, held=held, progress=progress), progress=progress)
         return self._read(key, exact, np.array([float(elapsed)]))
 
-    def touched(self, presses, *, held: float = 1.0) -> TouchedCells:
+    def touched(
+        self,
+        presses: Sequence[Press | Sequence[Press]],
+        *,
+        held: float = 1.0,
+        progress: Callable[[str], None] | None = None,
+    ) -> TouchedCells:
         """The cells whose conductivity n touches change, and by how much; as of `frames`, whose errors it raises."""
         touches = touches_of(presses)
-        pressed = pressed_cells(Samples.of(self.model.mesh), self.material.support, touches)
+        pressed = pressed_cells(Samples.of(self.model.mesh), self.material.support, touches, progress)
         change = self.material.change(held_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
         places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])
         return _touched(places, pressed.cells, change, self.model.mesh.num_cells)
 
-    def record(self, key: Array, motions, seconds: Float[np.ndarray, " T"]) -> Float[np.ndarray, "T M"]:
+    def record(
+        self,
+        key: Array,
+        motions: MovingPress | Sequence[MovingPress],
+        seconds: Float[np.ndarray, " T"],
+        *,
+        progress: Callable[[str], None] | None = None,
+    ) -> Float[np.ndarray, "T M"]:
         """Voltages (T, M) at times `seconds` (T,) of a skin under moving presses, a `MovingPress` or several at once,
         or `[]`: nothing touches it.
 
         The skin has had no load before the first frame, and drifts from time 0. Raises `ValueError` for times that are
-        negative or fall, motions of other lengths, and as `frames` does.
+        negative or fall, motions of other lengths, and as `frames` does. `progress` is called with how far it is.
         """
         check_key(key)
         seconds = _check_times(seconds)
-        exact = self.voltages_under(self.touched_in_time(motions, seconds))
+        exact = self.voltages_under(self.touched_in_time(motions, seconds, progress=progress), progress=progress)
         return self._read(key, exact, seconds)
 
-    def touched_in_time(self, motions, seconds: Float[np.ndarray, " T"]) -> TouchedCells:
+    def touched_in_time(
+        self,
+        motions: MovingPress | Sequence[MovingPress],
+        seconds: Float[np.ndarray, " T"],
+        *,
+        progress: Callable[[str], None] | None = None,
+    ) -> TouchedCells:
         """What is changed in each of T frames, also by loads that were there before; as of `record`, whose errors it
         raises."""
         seconds = _check_times(seconds)
         motions = motions_of(motions, len(seconds))
         found = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
         touches = [tuple(press for press in some if press is not None) for some in found]
-        pressed = pressed_cells(Samples.of(self.model.mesh), self.material.support, touches)
+        pressed = pressed_cells(Samples.of(self.model.mesh), self.material.support, touches, progress)
         there = [own.any(axis=-1) for own in pressed.pressure]
         cells = np.unique(pressed.cells[np.array(there)]) if motions else np.zeros(1, int)
         place = np.searchsorted(cells, pressed.cells)
@@ -115,8 +144,12 @@ class PressedSkin(eqx.Module):
         places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])
         return _touched(places, np.broadcast_to(cells, change.shape), change, self.model.mesh.num_cells)
 
-    def voltages_under(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
-        """Voltages (n, M) of the model under n touches, undisturbed. Raises as `touch_changes` does."""
+    def voltages_under(
+        self, touched: TouchedCells, *, progress: Callable[[str], None] | None = None
+    ) -> Float[np.ndarray, "n M"]:
+        """Voltages (n, M) of the model under n touches, undisturbed; `progress` is told of touches done. Raises as
+        `touch_changes` does."""
+        done = 0
         voltages = np.tile(self._at_rest, (len(touched.places), 1))
         places, cells, change = (np.asarray(one) for one in (touched.places, touched.cells, touched.change))
         for alike in _kinds(self.model.mesh, cells, change):
@@ -126,6 +159,9 @@ class PressedSkin(eqx.Module):
                 arrays = as_array(places[even]), as_array(cells[even, own]), as_array(change[even, own])
                 rows = TouchedCells(*arrays, num_cells=touched.num_cells)
                 voltages[some] += np.asarray(touch_changes(self.model, self.conductivity, rows))[: len(some)]
+                done += len(some)
+                if progress is not None:
+                    progress(f"voltages: {done} of {len(voltages)}")
         return voltages
 
     def _read(self, key: Array, exact: Float[np.ndarray, "n M"], seconds: Float[np.ndarray, " t"]):

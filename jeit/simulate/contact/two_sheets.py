@@ -13,6 +13,7 @@ to σ₁ + 2σ₂ (u = w on a disc in an unbounded sheet has the dipole σ₂/(�
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity, stiffness
@@ -48,7 +49,9 @@ class TwoSheets(eqx.Module):
         self.pattern = SparsityPattern.from_elements([np.hstack([lower, lower + number]), *nodes], size=2 * number)
         self.plan = analyse(self.pattern, np.tile(np.asarray(model.mesh.points), (2, 1)))
 
-    def voltages(self, conductivity, upper_conductivity, conductance) -> Float[np.ndarray, " M"]:
+    def voltages(
+        self, conductivity: ArrayLike, upper_conductivity: ArrayLike, conductance: ArrayLike
+    ) -> Float[np.ndarray, " M"]:
         """Voltages (M,) of the lower sheet's channels.
 
         `conductivity` of the lower sheet and `upper_conductivity`, S, one or one a cell; `conductance` between them per

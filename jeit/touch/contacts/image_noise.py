@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy import sparse
 
 from jeit.arguments import check_kind, counted, real_array
@@ -59,7 +60,7 @@ class ImageNoise(eqx.Module):
         return cls._of_factor(strayed / np.sqrt(len(frames) - 1))
 
     @classmethod
-    def of_channels(cls, reconstruction: LinearReconstruction, deviation) -> "ImageNoise":
+    def of_channels(cls, reconstruction: LinearReconstruction, deviation: ArrayLike) -> "ImageNoise":
         """From the standard deviation of each channel, (M,) or one number, volts; channels independent.
 
         A difference of two such frames strays √2 as far. Raises `ValueError` for those that are negative, not finite,

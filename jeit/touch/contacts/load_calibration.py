@@ -6,9 +6,12 @@ rises with the load F and saturates, as conductivity under pressure does, and is
 are. It is for one indenter, or those much alike: a wider contact under the same load has another peak.
 """
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from jeit.arguments import check_kind, check_metres, real_array, told
@@ -49,7 +52,9 @@ class LoadCalibration(eqx.Module):
     highest: float
 
     @classmethod
-    def fit(cls, contacts, loads, *, radius: float, centre=(0.0, 0.0)) -> "LoadCalibration":
+    def fit(
+        cls, contacts: Sequence[Contact], loads: ArrayLike, *, radius: float, centre: ArrayLike = (0.0, 0.0)
+    ) -> "LoadCalibration":
         """From `contacts` (n) under known `loads` (n,) newtons, eight at least, at several places, by least squares of
         the logarithm of their peaks; `radius` of the skin and its `centre`, metres.
 

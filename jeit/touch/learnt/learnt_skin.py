@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, check_name, counted
 from jeit.forward import ForwardModel
@@ -67,20 +68,21 @@ class LearntSkin:
         model: ForwardModel | None = None,
         num_channels: int | None = None,
         per_session: bool = False,
-        progress: Callable[[str], None] = lambda said: None,
+        progress: Callable[[str], None] | None = None,
     ) -> "LearntSkin":
         """Learn from recorded presses.
 
         `method`: "auto" takes what errs least on presses held out, in stretches of time; or one of `METHODS`, for what
         it can learn. `model` of the skin, if one is known, of some hundred nodes: its images of the changes, and the
         contacts in them, are learnt from too. `num_channels`: only so many, those that tell most, are used.
-        `per_session`: changes of each `group` are standardised by themselves, against drift. Raises `ValueError` for
-        another method, one that cannot learn what the presses say, presses that nothing can be learnt from, and a model
-        of another number of channels.
+        `per_session`: changes of each `group` are standardised by themselves, against drift. `progress` is called with
+        what is being tried. Raises `ValueError` for another method, one that cannot learn what the presses say, presses
+        that nothing can be learnt from, and a model of another number of channels.
         """
         _check_fit(presses, method, model, num_channels, per_session)
         with one_thread():
-            return cls._fit(presses, method, model, num_channels, per_session, progress)
+            tell = progress or (lambda said: None)
+            return cls._fit(presses, method, model, num_channels, per_session, tell)
 
     @classmethod
     def _fit(cls, presses: Presses, method, model, num_channels, per_session, progress) -> "LearntSkin":
@@ -128,7 +130,7 @@ class LearntSkin:
             standing=standing,
         )
 
-    def predict(self, frames, reference=None, group=None) -> Touches:
+    def predict(self, frames: ArrayLike, reference: ArrayLike | None = None, group: ArrayLike | None = None) -> Touches:
         """Touches of frames (n, M), with the `reference` (M,) or (n, M) if there was one in the presses learnt from,
         and the session of each (`group`) if sessions are standardised.
 

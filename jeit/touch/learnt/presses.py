@@ -1,12 +1,13 @@
 """Recorded presses: frames of a skin, and what touched it in each; checked, and read from NPZ files."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 
 from jeit.arguments import need, npz_arrays
 
@@ -49,15 +50,15 @@ class Presses:
     @classmethod
     def create(
         cls,
-        frames,
+        frames: ArrayLike,
         *,
-        reference=None,
-        positions=None,
-        force=None,
-        label=None,
-        touched=None,
-        group=None,
-        time=None,
+        reference: ArrayLike | None = None,
+        positions: ArrayLike | None = None,
+        force: ArrayLike | None = None,
+        label: ArrayLike | None = None,
+        touched: ArrayLike | None = None,
+        group: ArrayLike | None = None,
+        time: ArrayLike | None = None,
         name: str = "presses",
     ) -> "Presses":
         """Check what was recorded; shapes and units as of the fields, `reference` also (M,) for all.
@@ -86,7 +87,7 @@ class Presses:
         reference = None if reference is None else check_reference(reference, frames)
         return replace(cls(frames, reference, name=name), **given)
 
-    def rows(self, index) -> "Presses":
+    def rows(self, index: ArrayLike | slice) -> "Presses":
         """The presses with these numbers, or of a slice."""
         kept = {key: getattr(self, key) for key in ("frames", "reference", *_ROWS)}
         return replace(self, **{key: None if values is None else values[index] for key, values in kept.items()})
@@ -249,7 +250,7 @@ def _check_time(given) -> np.ndarray:
     return time.astype(float)
 
 
-def _one_dimensional(name: str, given: Sequence | np.ndarray) -> np.ndarray:
+def _one_dimensional(name: str, given: ArrayLike) -> np.ndarray:
     values = np.asarray(given)
     if values.ndim == 2 and 1 in values.shape:
         values = values.ravel()

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from jeit_solvers.optimise.status import Status
 
@@ -36,7 +37,13 @@ def _jaxopt() -> Any:
 
 
 def lbfgsb(
-    objective: Objective, start: Float[Array, " n"], lower, upper, *, max_steps: int, tolerance: float
+    objective: Objective,
+    start: Float[Array, " n"],
+    lower: ArrayLike,
+    upper: ArrayLike,
+    *,
+    max_steps: int,
+    tolerance: float,
 ) -> BoundedMinimum:
     """The least value between two bounds (n,) by L-BFGS-B, inside `jax.jit`; coordinates should be of one size."""
     solver = _jaxopt().LBFGSB(objective, maxiter=max_steps, tol=tolerance, history_size=20)
@@ -45,7 +52,13 @@ def lbfgsb(
 
 
 def projected_gradient(
-    objective: Objective, start: Float[Array, " n"], lower, upper, *, max_steps: int, tolerance: float
+    objective: Objective,
+    start: Float[Array, " n"],
+    lower: ArrayLike,
+    upper: ArrayLike,
+    *,
+    max_steps: int,
+    tolerance: float,
 ) -> BoundedMinimum:
     """The same by accelerated projected gradients: more steps, each of them cheaper."""
     jaxopt = _jaxopt()
@@ -59,8 +72,8 @@ def projected_gradient(
 def scipy_lbfgsb(
     value_and_gradient: Callable[[Array], tuple[Array, Array]],
     start: Float[Array, "*shape"],
-    lower,
-    upper,
+    lower: ArrayLike,
+    upper: ArrayLike,
     *,
     tolerance: float,
     max_steps: int = 500,

@@ -1,0 +1,84 @@
+"""What takes long says how far it is: `progress=` of the public functions, called with texts."""
+
+import inspect
+
+import jax
+import numpy as np
+import pytest
+
+from jeit import acoustic, design, imaging, inverse, report, simulate, touch
+from jeit.acoustic import Taps, calibrate_microphones
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.inverse import compare_rules
+from jeit.layout import ring
+from jeit.mesh import Disk
+from jeit.protocol import adjacent
+from jeit.simulate import (
+    MovingPress,
+    Press,
+    PressedSkin,
+    SoundingSkin,
+    ball,
+    calibration_taps,
+    material,
+    microphone_grid,
+)
+
+KEY = jax.random.key(0)
+LONG = [
+    acoustic.calibrate_microphones,
+    acoustic.locate_touches,
+    design.compare_layouts,
+    design.improve_layout,
+    design.run_study,
+    imaging.compare_on_data,
+    imaging.image_difference,
+    imaging.prepare_imager,
+    inverse.compare_rules,
+    report.write_film,
+    report.write_stream,
+    simulate.PressedSkin.frames,
+    simulate.PressedSkin.record,
+    simulate.calibration_taps,
+    simulate.simulate_presses,
+    touch.LearntSkin.fit,
+]
+
+
+@pytest.mark.parametrize("function", LONG, ids=lambda function: function.__qualname__)
+def test_progress_can_be_asked_for(function):
+    assert "progress" in inspect.signature(function).parameters
+
+
+@pytest.fixture(scope="module")
+def model():
+    return ForwardModel(Disk(0.05).mesh(num_points=300), BoundaryElectrodes(ring(0.05, 8), 0.008, 0.2), adjacent(8))
+
+
+def test_rules_are_named(model):
+    told, difference = [], 1e-3 * np.asarray(model.voltages(1.0)) * np.random.default_rng(0).normal(size=40)
+    found = compare_rules(model, 1.0, difference=difference, progress=told.append)
+    assert told == ["linearise", *found]
+
+
+def test_presses_are_counted(model):
+    skin, told = PressedSkin(KEY, model, material("velostat")), []
+    presses = [Press(ball(0.02), 1.0, (0.001 * k, 0.0)) for k in range(5)]
+    frames = skin.frames(KEY, presses, progress=told.append)
+    assert told[-1] == "voltages: 5 of 5"
+    assert "pressure: 5 of 5" in told
+    np.testing.assert_array_equal(frames, skin.frames(KEY, presses))
+    told.clear()
+    skin.record(KEY, MovingPress(ball(0.02), np.ones(3)), np.arange(3.0), progress=told.append)
+    assert told[-1] == "voltages: 3 of 3"
+
+
+def test_taps_and_their_calibration_tell_their_steps():
+    skin, told, steps = SoundingSkin(KEY), [], []
+    taps = calibration_taps(skin, KEY, microphone_grid(5), repeats=1, progress=told.append)
+    assert told[-1] == "25 of 25 places"
+    corners = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
+    given = Taps(skin.microphones, corners, taps.positions, samples=taps.samples, rate=taps.rate)
+    calibrate_microphones(given, progress=steps.append)
+    assert steps == ["measure intensities", "fit", "leave out"]
