@@ -4,28 +4,29 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jeit.arguments import check_name
 from jeit.forward import ForwardModel
 from jeit.forward.contact_sensitivity import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
+from jeit.inverse.linearisation import check_mask
 from jeit.inverse.nonlinear.checks import check_steps
+from jeit.inverse.traced_calibration import FARTHEST, traced_fit
 from jeit_solvers import Status
-from jeit_solvers.engines import as_array, on_host
+from jeit_solvers.engines import as_array, has_values, on_host
 
 _REASONS = {
     Status.STEP_LIMIT: "Stopped after {} steps.",
     Status.FAILED: "The fit became NaN.",
 }
-
+_TRACED = "It was fitted inside a transformation of JAX; the status says how that ended."
 
 # A relative misfit that measured tanks of known geometry do not reach: 1 % of KIT4's, 8 % of the Kuopio challenge's.
 _MUCH = 0.12
-# Logarithm of a contact impedance over the model's, beyond which it is all the same.
-_FARTHEST = 50.0
 # Volts that no frame has; nor one over them.
 _SMALLEST = 1e-30
 # Relative change of misfit, or of the parameters, that ends a fit.
@@ -38,18 +39,26 @@ class Calibration(eqx.Module):
     **Fields**: `model`, with its electrodes' contact impedance fitted; `conductivity`, the uniform background
     (S/m; 2-D: S); `voltages` (M,), what the model predicts; `misfit`, ‖predicted - measured‖ / ‖measured‖ over the
     channels used; `contact_deviation` (k,), standard deviations of the logarithms of the k contact impedances fitted,
-    from how well the model fits; `iterations`; `status`, how the fit ended, and `reason`, in a sentence, empty where
-    all is well.
+    from how well the model fits; `iterations`; `outcome`, the `Status.number` of how the fit ended, and `reason`, in a
+    sentence, empty where all is well.
     """
 
     model: ForwardModel
     conductivity: Float[Array, ""]
     voltages: Float[Array, " M"]
     misfit: Float[Array, ""]
-    contact_deviation: Float[np.ndarray, " k"]
-    iterations: int = eqx.field(static=True)
-    status: Status = eqx.field(static=True)
+    contact_deviation: Float[Array, " k"]
+    iterations: int | Int[Array, ""]
+    outcome: int | Int[Array, ""]
     reason: str = eqx.field(static=True, default="")
+
+    @property
+    def status(self) -> Status:
+        """How the fit ended: "converged", "step limit" or "failed".
+
+        Raises `ValueError` inside `jax.jit`, where that is not known yet, and for a batch.
+        """
+        return Status.of_number(self.outcome)
 
     @property
     def tells_contacts_apart(self) -> bool:
@@ -82,9 +91,13 @@ def calibrate(
     for all electrodes; "each", one per electrode; "fixed", the model's own. The parameters are logarithms, so both
     stay positive; the start is the model's impedance with the conductivity that scales the prediction best (voltages
     are proportional to 1/σ at fixed z·σ). Raises `ValueError` for a frame of another shape or without signal.
+
+    Goes through `jax.grad`, `jax.vmap` and `jax.jit` in the voltages and in all fields of the model. Derivatives are
+    those of the minimum, by the implicit function theorem with the full Hessian.
     """
     check_model(model)
-    measured = np.asarray(voltages)
+    check_mask(mask)
+    measured = np.asarray(voltages) if has_values(voltages) else jnp.asarray(voltages)
     if measured.dtype.kind == "c":
         raise ValueError("voltages are complex; calibrate on their real part or magnitude.")
     if measured.dtype.kind not in "biuf":
@@ -98,6 +111,9 @@ def calibrate(
         )
     check_name("contact", contact, ("common", "each", "fixed"))
     max_steps = check_steps("max_steps", max_steps)
+    if not has_values(model, measured):
+        kind = "fixed" if model.electrodes.is_point else contact
+        return Calibration(*traced_fit(model, jnp.where(used, measured, 0), used, kind, max_steps), _TRACED)
     measured = np.where(used, measured, 0)
     largest = np.abs(measured).max()
     if not np.isfinite(largest) or largest == 0:
@@ -143,8 +159,10 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     status = Status.CONVERGED if solution.status > 0 else Status.STEP_LIMIT
     status = status if np.isfinite(misfit) else Status.FAILED
     reason = "" if status == Status.CONVERGED else _REASONS[status].format(max_steps)
-    deviation = _deviations(solution)[1:]
-    return Calibration(fitted, as_array(conductivity), voltages, misfit, deviation, int(solution.njev), status, reason)
+    deviation: Any = _deviations(solution)[1:]
+    return Calibration(
+        fitted, as_array(conductivity), voltages, misfit, deviation, int(solution.njev), status.number, reason
+    )
 
 
 def _deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, " p"]:
@@ -176,7 +194,7 @@ class _Problem:
         if self.contact == "fixed":
             return self.given, np.exp(parameters[0])
         electrodes = self.given.electrodes
-        factor = np.exp(np.clip(parameters[1:] - parameters[0], -_FARTHEST, _FARTHEST))
+        factor = np.exp(np.clip(parameters[1:] - parameters[0], -FARTHEST, FARTHEST))
         impedance = np.asarray(electrodes.contact_impedance) * factor
         return self.given.with_electrodes(electrodes.with_contact_impedance(impedance)), np.exp(parameters[0])
 

@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jeit_solvers import symmetric_eigen
-from jeit_solvers.engines import either_engine, namespace
+from jeit_solvers.engines import either_engine, has_values, namespace
 
 
 class Spectrum(eqx.Module):
@@ -62,8 +62,9 @@ class Spectrum(eqx.Module):
         return largest * np.logspace(-6, 1, size)
 
     def curves(self, data: ArrayLike | None, candidates: Float[np.ndarray, " K"]) -> tuple[np.ndarray, np.ndarray]:
-        """Residual ‖v - JR_λv‖ and penalty √(xᵀQx), each (K,), of every candidate λ; empty ones without data."""
-        if data is None:
+        """Residual ‖v - JR_λv‖ and penalty √(xᵀQx), each (K,), of every candidate λ; empty ones without data, or where
+        they are traced."""
+        if data is None or not has_values(data):
             return np.zeros(0), np.zeros(0)
         eigenvalues = np.asarray(self.eigenvalues)
         components = np.asarray(self.basis).T @ np.asarray(data)

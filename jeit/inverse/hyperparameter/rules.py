@@ -6,12 +6,13 @@ residual is ‖r‖² = Σ f²c² and the penalty xᵀQx = Σ Λc²/(Λ + λ²)�
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy
 from jaxtyping import Array, Float
 
-from jeit.arguments import check_name
+from jeit.arguments import check_has_values, check_name
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.point_spread import best_resolution
 from jeit.inverse.spectrum import Spectrum as Spectrum
@@ -103,23 +104,33 @@ RULES: dict[str, Rule] = {
 """Rules by name: each takes a `Spectrum`, the whitened data and the mesh, and returns a `Choice`."""
 
 
-def choose(spectrum: Spectrum, hyperparameter: float | str | Rule | Choice, data, mesh: Mesh | None = None) -> Choice:
+def choose(spectrum: Any, hyperparameter: float | str | Rule | Choice, data, mesh: Mesh | None = None) -> Choice:
     """λ and how it came about, from a number, the name of a rule, a rule, or a choice made before.
 
-    Raises `ValueError` for the name of no rule, and for a number that is not positive and finite.
+    `spectrum`: a `Spectrum`, which only a rule looks at.
+    Raises `ValueError` for the name of no rule, for a rule where the problem is traced, and for a number that is not
+    positive and finite.
     """
     if isinstance(hyperparameter, Choice):
         return hyperparameter
     if isinstance(hyperparameter, str):
         check_name("hyperparameter", hyperparameter, RULES, ", or a number")
+        _check_problem(spectrum, hyperparameter)
         return RULES[hyperparameter](spectrum, data, mesh)
     if callable(hyperparameter):
+        _check_problem(spectrum, getattr(hyperparameter, "__name__", "given"))
         return hyperparameter(spectrum, data, mesh)
     if has_values(hyperparameter):
         value = np.asarray(hyperparameter)
         if value.shape != () or value.dtype.kind not in "iuf" or not (np.isfinite(value) and value > 0):
             raise ValueError(f"hyperparameter must be positive and finite; it is {hyperparameter}.")
     return Choice.given(hyperparameter)
+
+
+def _check_problem(problem, name: str) -> None:
+    """A rule looks at values, which a problem that is traced has not."""
+    instead = "give a number, such as the one that jeit.inverse.choose_hyperparameter finds outside"
+    check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", instead)
 
 
 def _filters(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
@@ -150,6 +161,8 @@ def _log_derivatives(terms, once, twice):
 def _needed(data, rule: str) -> Float[np.ndarray, " M"]:
     if data is None:
         raise ValueError(f"The rule '{rule}' looks at the data: give difference, the change of voltages to be imaged.")
+    instead = "give a number as hyperparameter, such as the one that the rule finds outside"
+    check_has_values("difference (voltages)", data, f"the rule '{rule}' looks at", instead)
     values = np.asarray(data)
     if not (np.isfinite(values).all() and values.any()):
         raise ValueError(f"The rule '{rule}' looks at the data, and they are all zero, NaN or infinite: give others.")

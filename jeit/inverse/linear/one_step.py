@@ -51,6 +51,11 @@ class LinearReconstruction:
     @classmethod
     def create(cls, model: ForwardModel, matrix, hyperparameter, rule: str, method: str, choice: Choice | None = None):
         """From a full reconstruction matrix (m, M)."""
+        if not has_values(model.protocol, matrix, hyperparameter):
+            # Which columns are proportional cannot be seen: every channel stays on its own.
+            every, nothing = jnp.arange(matrix.shape[1]), jnp.zeros(matrix.shape[1])
+            given = every, every, nothing, jnp.asarray(matrix).T, jnp.asarray(hyperparameter, float)
+            return cls(model.mesh, *given, matrix.shape[1], rule, method, choice)
         matrix = np.asarray(matrix)
         first, second, ratio = _combine(model, matrix)
         # Of two tied columns the mean, not either: their rounding errors are large where λ is small, and opposite.
@@ -149,6 +154,9 @@ def one_step(
     imaged.
     `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
     other). `mask`: True for the channels to use. Raises `ValueError` for arguments that do not fit.
+
+    Differentiable, with a number for λ, in all that has a gradient: `jax.grad`, `jax.vmap` and `jax.jit` go through it
+    and through the image. What only values decide, a rule for λ or a mask, has to be settled outside.
 
     Computed in data space: R = ΓJᵀ(JΓJᵀ + λ²W⁻¹)⁻¹ with Γ = Q⁻¹; see `jeit.inverse.prior.priors` for a Q with a null
     space. Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179.
