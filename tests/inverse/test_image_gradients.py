@@ -62,7 +62,7 @@ def placed(theta):
 
 
 def assert_gradient(function, theta, *, equal=1e-8, compiled=False):
-    """Reverse mode, compiled, against central differences of fourth order of what is answered at once, or `compiled`; and
+    """Reverse mode against central differences of fourth order of what is answered at once, or `compiled`; and
     the value, which is to be `equal`. Large steps bend and small ones are rounded: one of six has to agree to 1e-5."""
     theta = {name: np.asarray(value, float) for name, value in theta.items()}
     value, gradient = jax.jit(jax.value_and_grad(function))(theta)
