@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -77,7 +76,7 @@ def prepare_difference(
 
     Arguments as in `jeit.imaging.image_difference` and its settings; `clock` takes the time of each step. Raises
     `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`), that do not say where the electrodes
-    are, that are complex, or on which the calibration fails.
+    are, or on which the calibration fails.
     """
     clock = Clock(None) if clock is None else clock
     with clock("check"):
@@ -168,6 +167,15 @@ def default_contact(measurement: Measurement) -> str:
     return "each" if measurement.protocol.channels_on_driven_electrodes().any() else "fixed"
 
 
+def check_real(measurement: Measurement) -> None:
+    """Raise `ValueError` for complex voltages, where only `image_difference` takes them."""
+    if np.iscomplexobj(measurement.voltages):
+        raise ValueError(
+            f"'{measurement.name}' is complex; choose the part to image with [data] component in its description: "
+            "real, imaginary or magnitude."
+        )
+
+
 def body_of(measurement: Measurement, reference: Measurement) -> tuple[Domain, AbstractElectrodes]:
     """Outline and electrodes, from whichever of the two says them; raises `ValueError` where neither does."""
     domain = measurement.domain if measurement.domain is not None else reference.domain
@@ -177,10 +185,5 @@ def body_of(measurement: Measurement, reference: Measurement) -> tuple[Domain, A
         raise ValueError(
             f"'{measurement.name}' does not say what it was measured on: give a description with {missing} "
             "(a TOML file beside the data, or description=)."
-        )
-    if jnp.iscomplexobj(measurement.voltages):
-        raise ValueError(
-            f"'{measurement.name}' is complex; choose the part to image with [data] component in its description: "
-            "real, imaginary or magnitude."
         )
     return domain, electrodes

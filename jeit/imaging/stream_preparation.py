@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jeit.arguments import check_kind
 from jeit.data import Measurement
 from jeit.imaging.clock import Clock
-from jeit.imaging.preparation import body_of, calibrated_model, check_measurement, select_frames
+from jeit.imaging.preparation import body_of, calibrated_model, check_measurement, check_real, select_frames
 from jeit.imaging.settings import check_body, check_hyperparameter
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
@@ -67,6 +67,8 @@ def prepare_imager(
     _, base = select_frames(measured, reference)
     if not base.protocol.same_patterns(measured.protocol):
         raise ValueError(f"'{measured.name}' was measured with another protocol than the reference '{base.name}'.")
+    check_real(measured)
+    check_real(base)
     domain, electrodes = body_of(measured, base)
     clock = Clock(progress)
     calibration, _ = calibrated_model(

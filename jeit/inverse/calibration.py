@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from jeit.arguments import check_name
 from jeit.forward import ForwardModel
@@ -37,15 +37,15 @@ class Calibration(eqx.Module):
     """A forward model fitted to a reference frame.
 
     **Fields**: `model`, with its electrodes' contact impedance fitted; `conductivity`, the uniform background
-    (S/m; 2-D: S); `voltages` (M,), what the model predicts; `misfit`, ‖predicted - measured‖ / ‖measured‖ over the
-    channels used; `contact_deviation` (k,), standard deviations of the logarithms of the k contact impedances fitted,
-    from how well the model fits; `iterations`; `outcome`, the `Status.number` of how the fit ended, and `reason`, in a
-    sentence, empty where all is well.
+    (S/m; 2-D: S), complex if the voltages are; `voltages` (M,), what the model predicts; `misfit`, ‖predicted -
+    measured‖ / ‖measured‖ over the channels used; `contact_deviation` (k,), standard deviations of the logarithms of
+    the k contact impedances fitted, from how well the model fits; `iterations`; `outcome`, the `Status.number` of how
+    the fit ended, and `reason`, in a sentence, empty where all is well.
     """
 
     model: ForwardModel
-    conductivity: Float[Array, ""]
-    voltages: Float[Array, " M"]
+    conductivity: Inexact[Array, ""]
+    voltages: Inexact[Array, " M"]
     misfit: Float[Array, ""]
     contact_deviation: Float[Array, " k"]
     iterations: int | Int[Array, ""]
@@ -79,7 +79,7 @@ class Calibration(eqx.Module):
 
 def calibrate(
     model: ForwardModel,
-    voltages: Float[Array, " M"],
+    voltages: Inexact[Array, " M"],
     *,
     mask: Bool[Array, " M"] | None = None,
     contact: str = "common",
@@ -90,7 +90,8 @@ def calibrate(
     `voltages` (M,) volts of the empty tank. `mask`: True for the channels to use. `contact`: "common", one impedance
     for all electrodes; "each", one per electrode; "fixed", the model's own. The parameters are logarithms, so both
     stay positive; the start is the model's impedance with the conductivity that scales the prediction best (voltages
-    are proportional to 1/σ at fixed z·σ). Raises `ValueError` for a frame of another shape or without signal.
+    are proportional to 1/σ at fixed z·σ). To complex voltages a complex background σ + iωε is fitted, its logarithm's
+    two parts; contact impedances stay real. Raises `ValueError` for a frame of another shape or without signal.
 
     Goes through `jax.grad`, `jax.vmap` and `jax.jit` in the voltages and in all fields of the model. Derivatives are
     those of the minimum, by the implicit function theorem with the full Hessian.
@@ -98,11 +99,10 @@ def calibrate(
     check_model(model)
     check_mask(mask)
     measured = np.asarray(voltages) if has_values(voltages) else jnp.asarray(voltages)
-    if measured.dtype.kind == "c":
-        raise ValueError("voltages are complex; calibrate on their real part or magnitude.")
-    if measured.dtype.kind not in "biuf":
-        raise ValueError(f"voltages are {measured.dtype}; give real numbers, in volts.")
-    measured = measured.astype(float)
+    kind = complex if measured.dtype.kind == "c" else float
+    if measured.dtype.kind not in "biufc":
+        raise ValueError(f"voltages are {measured.dtype}; give numbers, in volts.")
+    measured = measured.astype(kind)
     shape = (model.protocol.num_measurements,)
     used = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)
     if measured.shape != shape or used.shape != shape:
@@ -112,6 +112,10 @@ def calibrate(
     check_name("contact", contact, ("common", "each", "fixed"))
     max_steps = check_steps("max_steps", max_steps)
     if not has_values(model, measured):
+        if kind is complex:
+            raise ValueError(
+                "voltages are complex and traced; inside a transformation of JAX only real ones are fitted."
+            )
         kind = "fixed" if model.electrodes.is_point else contact
         return Calibration(*traced_fit(model, jnp.where(used, measured, 0), used, kind, max_steps), _TRACED)
     measured = np.where(used, measured, 0)
@@ -130,20 +134,26 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     size = np.linalg.norm(measured)
     # Start at the model's own contact impedance for a conductivity of one, scaled to fit.
     unit = np.where(used, model.voltages(1.0), 0)
-    if not unit @ measured > 0:
+    if not (unit @ measured).real > 0:
         raise ValueError(
             "voltages: they have the opposite sign of the model's. Is the polarity of drive or measurement turned "
             "round, or the order of the channels another than the protocol's?"
         )
-    problem = _Problem(model, contact)
+    is_complex = np.iscomplexobj(measured)
+    problem = _Problem(model, contact, is_complex)
     conductivity = np.log(unit @ unit / (unit @ measured))
-    initial = np.full(problem.num_parameters, conductivity)
+    initial = np.full(problem.num_parameters, conductivity.real)
+    if is_complex:
+        initial[1] = conductivity.imag
+
+    def parts(values):
+        return np.concatenate([values.real, values.imag]) if is_complex else values
 
     def residual(parameters):
-        return np.where(used, problem.voltages(parameters) - measured, 0) / size
+        return parts(np.where(used, problem.voltages(parameters) - measured, 0) / size)
 
     def jacobian(parameters):
-        return np.where(used[:, None], problem.jacobian(parameters), 0) / size
+        return parts(np.where(used[:, None], problem.jacobian(parameters), 0) / size)
 
     ends: dict[str, Any] = {
         "ftol": _TOLERANCE,
@@ -159,7 +169,7 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     status = Status.CONVERGED if solution.status > 0 else Status.STEP_LIMIT
     status = status if np.isfinite(misfit) else Status.FAILED
     reason = "" if status == Status.CONVERGED else _REASONS[status].format(max_steps)
-    deviation: Any = _deviations(solution)[1:]
+    deviation: Any = _deviations(solution)[problem.first_contact :]
     return Calibration(
         fitted, as_array(conductivity), voltages, misfit, deviation, int(solution.njev), status.number, reason
     )
@@ -175,28 +185,37 @@ def _deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, 
 class _Problem:
     """Voltages as a function of log σ and of log z·σ over the model's z: one for all electrodes, or for each.
 
-    Voltages at fixed z·σ are proportional to 1/σ, so that these are nearly independent of each other.
+    Voltages at fixed z·σ are proportional to 1/σ, so that these are nearly independent of each other. Of a complex
+    admittivity γ, log |γ| stands in place of log σ, and its phase is the second parameter.
     """
 
-    def __init__(self, model: ForwardModel, contact: str):
-        self.given, self.contact = model, contact
+    def __init__(self, model: ForwardModel, contact: str, is_complex: bool):
+        self.given, self.contact, self.is_complex = model, contact, is_complex
         self.select = partial(select_channels, on_host(model.protocol))
         self.sensitivity = None if model.electrodes.is_point else ContactSensitivity(model.mesh, model.electrodes)
         self.known: tuple[bytes, Any] | None = None
 
     @property
     def num_parameters(self) -> int:
-        """One for the conductivity, and those of the contacts."""
-        return 1 + {"fixed": 0, "common": 1, "each": self.given.electrodes.num_electrodes}[self.contact]
+        """One for the conductivity, or two, and those of the contacts."""
+        return (
+            self.first_contact + {"fixed": 0, "common": 1, "each": self.given.electrodes.num_electrodes}[self.contact]
+        )
 
-    def model(self, parameters) -> tuple[ForwardModel, float]:
+    @property
+    def first_contact(self) -> int:
+        """Which parameter is the first contact impedance."""
+        return 2 if self.is_complex else 1
+
+    def model(self, parameters) -> tuple[ForwardModel, float | complex]:
         """The model and conductivity that the parameters stand for."""
+        conductivity = np.exp(parameters[0] + 1j * parameters[1]) if self.is_complex else np.exp(parameters[0])
         if self.contact == "fixed":
-            return self.given, np.exp(parameters[0])
+            return self.given, conductivity
         electrodes = self.given.electrodes
-        factor = np.exp(np.clip(parameters[1:] - parameters[0], -FARTHEST, FARTHEST))
+        factor = np.exp(np.clip(parameters[self.first_contact :] - parameters[0], -FARTHEST, FARTHEST))
         impedance = np.asarray(electrodes.contact_impedance) * factor
-        return self.given.with_electrodes(electrodes.with_contact_impedance(impedance)), np.exp(parameters[0])
+        return self.given.with_electrodes(electrodes.with_contact_impedance(impedance)), conductivity
 
     def voltages(self, parameters):
         """(M,) volts."""
@@ -207,15 +226,18 @@ class _Problem:
         model, fields, impedance = self._fields(parameters)
         by_conductivity = -self.select(impedance)[:, None]
         if self.sensitivity is None:
-            return by_conductivity
+            return self._with_phase(by_conductivity, by_conductivity)
         energies = self.sensitivity(fields, impedance, model.electrodes.contact_impedance)
         by_contact = np.stack([self.select(energy) for energy in energies], axis=1)
-        if self.contact == "each":
-            return np.concatenate([by_conductivity, by_contact], axis=1)
-        common = by_contact.sum(axis=1, keepdims=True)
-        if self.contact == "common":
-            return np.concatenate([by_conductivity, common], axis=1)
-        return by_conductivity + common  # z·σ goes with σ
+        at_fixed_contact = by_conductivity + by_contact.sum(axis=1, keepdims=True)  # z·σ goes with σ
+        if self.contact == "fixed":
+            return self._with_phase(at_fixed_contact, at_fixed_contact)
+        columns = by_contact if self.contact == "each" else by_contact.sum(axis=1, keepdims=True)
+        return np.concatenate([self._with_phase(by_conductivity, at_fixed_contact), columns], axis=1)
+
+    def _with_phase(self, by_size, by_logarithm):
+        """The column of log |γ|, and of a complex γ that of its phase, at fixed contact impedance."""
+        return np.concatenate([by_size, 1j * by_logarithm], axis=1) if self.is_complex else by_size
 
     def _fields(self, parameters):
         key = parameters.tobytes()

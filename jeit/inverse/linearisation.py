@@ -56,8 +56,6 @@ class Linearisation(eqx.Module):
                 f"prior: {type(prior).__name__} is not quadratic, so there is no linear image with it, nor a rule for "
                 "its weight; take Noser(), Gaussian(length), Laplace() or Tikhonov(), or reconstruct with this one."
             )
-        if jnp.iscomplexobj(conductivity):
-            raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
         if np.shape(conductivity) not in ((), (model.mesh.num_cells,)):
             raise ValueError("conductivity: give one number, or one value per cell: the image has a value per cell.")
         channels, root_weight = used_channels(model, noise, mask)
@@ -65,12 +63,12 @@ class Linearisation(eqx.Module):
         if has_values(jacobian, root_weight, prior):
             whitened = root_weight[:, None] * host.asarray(jacobian)[channels]
             directions = _directions(model.protocol, channels, root_weight)
-            product = prior.covariance_product(model.mesh, directions.T @ whitened) @ directions.T
+            product = prior.covariance_product(model.mesh, (directions.T @ whitened).conj()) @ directions.T
             spectrum = Spectrum.create(whitened, product, prior.null_space(model.mesh))
         else:
             directions = _traced_directions(model.protocol, channels, root_weight)
             reduced = directions.T @ (root_weight[:, None] * jacobian[channels])
-            product = prior.covariance_product(model.mesh, reduced)
+            product = prior.covariance_product(model.mesh, reduced.conj())
             spectrum = DirectProblem(directions, reduced, product, prior.null_space(model.mesh))
         return cls(spectrum, prior, channels, root_weight, model.protocol.num_measurements)
 
@@ -79,9 +77,9 @@ class Linearisation(eqx.Module):
 
         Raises `ValueError` for another number of channels, and for NaN in channels in use, where they can be seen.
         """
-        if np.shape(difference) != (self.num_channels,) or np.iscomplexobj(difference):
+        if np.shape(difference) != (self.num_channels,):
             raise ValueError(
-                f"difference has shape {np.shape(difference)}; give {self.num_channels} real voltages, one frame."
+                f"difference has shape {np.shape(difference)}; give {self.num_channels} voltages, one frame."
             )
         if not has_values(difference, self.root_weight):
             return self.root_weight * jnp.asarray(difference)[self.channels]
@@ -94,9 +92,9 @@ class Linearisation(eqx.Module):
         """The reconstruction matrix: change of conductivity per volt, zero for channels not in use."""
         if not has_values(self.spectrum, self.root_weight, hyperparameter):
             used = jnp.asarray(self.spectrum.reconstruction(hyperparameter)) * self.root_weight
-            return jnp.zeros((used.shape[0], self.num_channels)).at[:, self.channels].set(used)
+            return jnp.zeros((used.shape[0], self.num_channels), used.dtype).at[:, self.channels].set(used)
         whitened = np.asarray(self.spectrum.reconstruction(hyperparameter))
-        matrix: Any = np.zeros((whitened.shape[0], self.num_channels))
+        matrix: Any = np.zeros((whitened.shape[0], self.num_channels), whitened.dtype)
         matrix[:, self.channels] = whitened * self.root_weight
         return matrix
 

@@ -120,6 +120,11 @@ def kept(values: Any) -> Any:
     return values if namespace(values) is np else jax.lax.optimization_barrier(values)
 
 
+def adjoint(matrix: Any) -> Any:
+    """The conjugate transpose of a matrix (m, n); of a real one the transpose, a view."""
+    return matrix.conj().T if np.iscomplexobj(matrix) else matrix.T
+
+
 def while_loop(condition: Callable[[Any], Any], body: Callable[[Any], Any], state: Any) -> Any:
     """The state after so many turns of `body` as `condition` asks for; `jax.lax.while_loop` of JAX's arrays."""
     if namespace(state) is jnp:

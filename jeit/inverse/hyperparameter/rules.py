@@ -17,7 +17,7 @@ from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.point_spread import best_resolution
 from jeit.inverse.spectrum import Spectrum as Spectrum
 from jeit.mesh import Mesh
-from jeit_solvers.engines import has_values
+from jeit_solvers.engines import adjoint, has_values
 
 Rule = Callable[[Spectrum, Float[Array, " M"] | None, Mesh | None], Choice]
 
@@ -38,20 +38,21 @@ def discrepancy(spectrum: Spectrum, data, mesh: Mesh | None = None, *, noise: fl
     """Largest λ whose residual is no more than the noise: ‖r‖² = r noise², r being the number of components.
 
     Criterion: ‖r‖/√r, the residual in standard deviations. `noise`: the standard deviation that the whitened data
-    really have, 1 where the channels' noise was given as it is. Morozov, Soviet Math. Dokl. 7 (1966) 414-417. Raises
-    `ValueError` without data.
+    really have (each part of complex data), 1 where the channels' noise was given as it is. Morozov, Soviet Math. Dokl.
+    7 (1966) 414-417. Raises `ValueError` without data.
     """
     candidates, data = spectrum.candidates(), _needed(data, "discrepancy")
-    components = np.asarray(spectrum.basis).T @ data
+    components = abs(adjoint(np.asarray(spectrum.basis)) @ data)
+    freedom = len(components) * (2 if np.iscomplexobj(data) else 1)
     residual, penalty = spectrum.curves(data, candidates)
-    criterion = residual / np.sqrt(len(components))
+    criterion = residual / np.sqrt(freedom)
     inside = np.flatnonzero(criterion <= noise)
     index = inside[-1] if inside.size else 0
     between = None
     if inside.size and index + 1 < len(candidates):
 
         def excess(log_value) -> float:
-            return float(np.sqrt(np.mean((_filters(spectrum, np.exp(log_value)) * components) ** 2)) - noise)
+            return float(np.sqrt(((_filters(spectrum, np.exp(log_value)) * components) ** 2).sum() / freedom) - noise)
 
         between = np.exp(scipy.optimize.root_scalar(excess, bracket=np.log(candidates[index : index + 2])).root)
     return Choice.among(
@@ -80,7 +81,7 @@ def noise_figure(spectrum: Spectrum, data=None, mesh: Mesh | None = None, *, tar
     """
     candidates = spectrum.candidates()
     eigenvalues = np.asarray(spectrum.eigenvalues)
-    gain = np.sum(np.asarray(spectrum.modes()) ** 2, axis=0)
+    gain = np.sum(abs(np.asarray(spectrum.modes())) ** 2, axis=0)
     passed = gain / (eigenvalues + candidates[:, None] ** 2) ** 2
     image = passed @ eigenvalues / passed.sum(axis=1)
     figure = np.sqrt(eigenvalues.mean() / image)
@@ -141,7 +142,7 @@ def _filters(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
 def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
     """Of the L-curve in its parameter t = log λ, from df/dt = 2f(1 - f) for the filter f."""
     left, eigenvalues = _filters(spectrum, candidates), np.asarray(spectrum.eigenvalues)
-    squared = (np.asarray(spectrum.basis).T @ data) ** 2
+    squared = abs(adjoint(np.asarray(spectrum.basis)) @ data) ** 2
     image = squared * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2  # its sum is the penalty
     rest = squared * left**2  # its sum is ‖r‖²
     # d/dt of rest is 4 rest (1 - f), of image -4 image f.

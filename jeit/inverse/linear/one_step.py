@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from jeit.forward import ForwardModel
 from jeit.inverse.hyperparameter.choice import Choice
@@ -41,7 +41,7 @@ class LinearReconstruction:
     first: Int[Array, " K"]
     second: Int[Array, " K"]
     ratio: Float[Array, " K"]
-    weights: Float[Array, "K m"]
+    weights: Inexact[Array, "K m"]
     hyperparameter: Float[Array, ""]
     num_measurements: int
     rule: str
@@ -75,13 +75,13 @@ class LinearReconstruction:
         )
 
     @property
-    def matrix(self) -> Float[Array, "m M"]:
+    def matrix(self) -> Inexact[Array, "m M"]:
         """The full reconstruction matrix (m, M), zero in the columns of masked channels."""
-        full = jnp.zeros((self.num_measurements, self.weights.shape[1]))
+        full = jnp.zeros((self.num_measurements, self.weights.shape[1]), self.weights.dtype)
         full = full.at[self.second].add(self.ratio[:, None] * self.weights)
         return full.at[self.first].add(self.weights).T
 
-    def image(self, difference: Float[Array, "*frames M"]) -> Float[Array, "*frames m"]:
+    def image(self, difference: Inexact[Array, "*frames M"]) -> Inexact[Array, "*frames m"]:
         """Change of conductivity in every cell, for one difference of frames (M,) in volts or many (F, M).
 
         Raises `ValueError` for another number of channels.
@@ -124,7 +124,7 @@ def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.nd
     pairs, _ = model.protocol.reciprocal_pairs()
     pairs = np.asarray(pairs).reshape(-1, 2)
     first, second = pairs[(size[pairs] > 0).all(axis=1)].T
-    ratio = np.einsum("ij,ij->j", matrix[:, first], matrix[:, second]) / size[first] ** 2
+    ratio = np.einsum("ij,ij->j", matrix[:, first].conj(), matrix[:, second]).real / size[first] ** 2
     tied = np.abs(matrix[:, second] - ratio * matrix[:, first]).max(axis=0) < 1e-9 * np.abs(matrix).max()
     first, second, ratio = first[tied], second[tied], ratio[tied]
     alone[first] = alone[second] = False
@@ -143,7 +143,7 @@ def one_step(
     *,
     prior: AbstractPrior | None = None,
     hyperparameter: float | str | Rule | Choice = RULE,
-    difference: Float[Array, " M"] | None = None,
+    difference: Inexact[Array, " M"] | None = None,
     noise: Float[Array, " M"] | float = 1.0,
     mask: Bool[Array, " M"] | None = None,
 ) -> LinearReconstruction:
@@ -154,6 +154,10 @@ def one_step(
     imaged.
     `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
     other). `mask`: True for the channels to use. Raises `ValueError` for arguments that do not fit.
+
+    A complex `conductivity` is an admittivity σ + iωε, S/m (2-D: S); its image is complex, and so are the voltages that
+    it takes. Both parts have the same prior, and `noise` is that of each part. Complex voltages about a real background
+    are imaged part by part.
 
     Differentiable, with a number for λ, in all that has a gradient: `jax.grad`, `jax.vmap` and `jax.jit` go through it
     and through the image. What only values decide, a rule for λ or a mask, has to be settled outside.

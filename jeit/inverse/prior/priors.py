@@ -39,7 +39,8 @@ class AbstractPrior(eqx.Module):
     """Base of all priors on an image of one value per cell.
 
     A new quadratic one is a class with `covariance_product`, `precision` and `basis`; one whose energy is not xᵀQx
-    answers `penalty` itself, and raises `ValueError` where it is asked for what it has not.
+    answers `penalty` itself, and raises `ValueError` where it is asked for what it has not. Both parts of a complex
+    image have the same prior; a complex Jacobian is given conjugated.
     """
 
     @property
@@ -125,7 +126,7 @@ class Noser(AbstractPrior):
 
     def covariance_product(self, mesh, jacobian):
         """Jᵀ, its rows divided by the diagonal of Q."""
-        return jacobian.T / (jacobian**2).sum(axis=0)[:, None] ** self.exponent
+        return jacobian.T / (abs(jacobian) ** 2).sum(axis=0)[:, None] ** self.exponent
 
     def precision(self, mesh, jacobian):
         """The diagonal matrix Q."""
@@ -134,11 +135,11 @@ class Noser(AbstractPrior):
     def entries(self, mesh, jacobian):
         """The diagonal, which follows the Jacobian into a derivative."""
         cells = host.arange(mesh.num_cells)
-        return cells, cells, (jacobian**2).sum(axis=0) ** self.exponent
+        return cells, cells, (abs(jacobian) ** 2).sum(axis=0) ** self.exponent
 
     def basis(self, mesh, jacobian):
         """Every cell on its own."""
-        return DiagonalBasis((jacobian**2).sum(axis=0) ** (-self.exponent / 2))
+        return DiagonalBasis((abs(jacobian) ** 2).sum(axis=0) ** (-self.exponent / 2))
 
 
 class Laplace(AbstractPrior):
@@ -154,7 +155,10 @@ class Laplace(AbstractPrior):
         pattern, plan = on_host(cell_factorisation(mesh, [pairs, np.zeros((1, 1), int)]))
         link = host.broadcast_to(np.array([[2.0, -2.0], [-2.0, 2.0]]), (len(pairs), 2, 2))
         factor = factorise(plan, pattern.assemble(link, np.full((1, 1, 1), 2.0)))
-        return solve(plan, factor, on_host(jacobian).T)
+        columns = on_host(jacobian).T
+        if not np.iscomplexobj(columns):
+            return solve(plan, factor, columns)
+        return solve(plan, factor, columns.real) + 1j * solve(plan, factor, columns.imag)
 
     def precision(self, mesh, jacobian):
         """The Laplacian matrix Q."""
