@@ -53,7 +53,7 @@ def image_frequencies(
 
 
 def frequency_weight(second: Measurement, first: Measurement) -> float | complex:
-    """α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ over the channels usable at both frequencies, one frame each; complex of complex voltages.
+    """α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ over the channels usable at both frequencies, one frame each; complex of complex ones.
 
     Raises `ValueError` for other channels, and where α is not finite or turns the voltages round.
     """

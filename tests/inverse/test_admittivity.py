@@ -126,7 +126,7 @@ def test_image_is_the_minimum_over_both_parts(prior):
     both = np.block([[jacobian.real, -jacobian.imag], [jacobian.imag, jacobian.real]])
     data = np.concatenate([difference.real, difference.imag]) / np.tile(noise, 2)
     if isinstance(prior, Gaussian):
-        covariance: Any = prior.covariance_product(model.mesh, np.eye(model.mesh.num_cells))
+        covariance: Any = prior.covariance_product(model.mesh, jnp.eye(model.mesh.num_cells))
         spread = np.kron(np.eye(2), covariance) @ both.T
         expected = spread @ np.linalg.solve(both @ spread + weight**2 * np.eye(len(both)), data)
     else:
@@ -188,7 +188,8 @@ def test_two_frequencies_of_one_body(fine):
     voltages = [one * (1 + 5e-4 * random.normal(size=one.size)) for one in voltages]
     found = image_frequencies(measured(voltages[1], "2"), measured(voltages[0], "1"), ImagingSettings(num_points=900))
     assert abs(found.weight - 1 / 1.2) < 0.05
-    change, centre = np.asarray(found.image.change), np.asarray(centroids(found.image.mesh))
+    change: Any = np.asarray(found.image.change)
+    centre = np.asarray(centroids(found.image.mesh))
     assert np.linalg.norm(centre[np.argmax(change.real)] - [0.05, 0]) < 0.1 * RADIUS
     assert np.linalg.norm(centre[np.argmax(change.imag)] - [0.05, 0]) < 0.1 * RADIUS
     near = np.hypot(*(centre - alike[:2]).T) < alike[2]
