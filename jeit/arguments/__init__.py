@@ -12,9 +12,11 @@ from jeit.arguments.kinds import check_kind, is_number, told
 from jeit.arguments.lengths import IN_MILLIMETRES, check_metres
 from jeit.arguments.names import check_name, did_you_mean
 from jeit.arguments.npz_file import need, npz_arrays
+from jeit.arguments.traced import check_has_values
 
 __all__ = [
     "IN_MILLIMETRES",
+    "check_has_values",
     "check_key",
     "check_kind",
     "check_metres",

@@ -7,6 +7,7 @@ inclusions; `stream_preparation` makes ready for frame after frame.
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.imaging.compared_rules import ComparedRules, RuleOutcome, compare_on_data
 from jeit.imaging.difference import ImagedDifference, image_difference
+from jeit.imaging.frequencies import ImagedFrequencies, frequency_weight, image_frequencies
 from jeit.imaging.method import METHODS
 from jeit.imaging.preparation import (
     PreparedDifference,
@@ -25,6 +26,7 @@ __all__ = [
     "METHODS",
     "ComparedRules",
     "ImagedDifference",
+    "ImagedFrequencies",
     "ImagingSettings",
     "PreparedDifference",
     "RuleOutcome",
@@ -32,7 +34,9 @@ __all__ = [
     "calibrated_model",
     "compare_on_data",
     "frames_of",
+    "frequency_weight",
     "image_difference",
+    "image_frequencies",
     "imaging_mesh",
     "prepare_difference",
     "prepare_imager",

@@ -32,6 +32,8 @@ def image_automatically(prepared: PreparedDifference, prior: NamedPrior) -> Chos
     """The one-step image, unless it is unsound; then Gauss-Newton's, unless that fails. Each with its default λ."""
     linear, newton = METHODS["one-step"], METHODS["gauss-newton"]
     imaged = linear.image(prepared, prior, linear.hyperparameter)
+    if np.iscomplexobj(prepared.difference):
+        return Chosen("one-step", "images of complex voltages are linear.", imaged)
     fault = unsound(prepared, imaged[1])
     if not fault:
         return Chosen("one-step", "the linear image is sound: changes are small, and it explains the voltages.", imaged)

@@ -15,7 +15,7 @@ from jeit.data import Measurement
 from jeit.image import Inclusion, find_inclusions
 from jeit.imaging.clock import Clock
 from jeit.imaging.method import prior_for, rule_for
-from jeit.imaging.preparation import PreparedDifference, prepare_difference
+from jeit.imaging.preparation import PreparedDifference, check_real, prepare_difference
 from jeit.imaging.settings import ImagingSettings, as_settings
 from jeit.inverse import RULES
 from jeit.inverse.hyperparameter.choice import Choice
@@ -89,6 +89,7 @@ def compare_on_data(
         as_is=settings.as_is,
         clock=clock,
     )
+    check_real(prepared.measurement)
     mesh = prepared.mesh
     with clock("linearise"):
         linear = Linearisation.create(

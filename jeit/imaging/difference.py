@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Float, Inexact, UInt8
 
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
@@ -38,11 +38,12 @@ class ImagedDifference:
     - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
     - `reconstruction`: the reconstruction matrix, or what the iteration found; with the hyperparameter used and the
       rule that chose it.
-    - `change`: change of conductivity in every cell (m,), S/m (2-D: S); against `calibration.conductivity`.
+    - `change`: change of conductivity in every cell (m,), S/m (2-D: S); against `calibration.conductivity`. Of complex
+      voltages the change of admittivity σ + iωε, complex like the background.
     - `raster`: `change` on a grid, NaN outside the mesh; `extent` (x_min, x_max, y_min, y_max) in metres.
     - `inclusions`: regions of changed conductivity, strongest first; iterative images are looked at on the scale of the
-      logarithm, which weighs both signs alike, and for what stands out of the noise. Of an image that was
-      segmented, those of the `labels`.
+      logarithm, which weighs both signs alike, and for what stands out of the noise; complex ones in the real part. Of
+      an image that was segmented, those of the `labels`.
     - `labels`: 0 background, 1 resistive, 2 conductive for every pixel of the raster, if asked for.
     - `timings`: seconds of each step.
     """
@@ -53,8 +54,8 @@ class ImagedDifference:
     settings: ImagingSettings
     calibration: Calibration
     reconstruction: LinearReconstruction | Reconstruction
-    change: Float[Array, " m"]
-    raster: Float[Array, "rows columns"]
+    change: Inexact[Array, " m"]
+    raster: Inexact[Array, "rows columns"]
     extent: tuple[float, float, float, float]
     inclusions: tuple[Inclusion, ...]
     wiring: Wiring
@@ -65,7 +66,7 @@ class ImagedDifference:
     @property
     def lowest(self) -> float:
         """Least change relative to the background; below -1 the linear image claims a negative conductivity."""
-        return float(np.asarray(self.change).min()) / float(self.calibration.conductivity)
+        return float(np.real(self.change).min()) / float(np.real(self.calibration.conductivity))
 
     @property
     def mesh(self) -> Mesh:
@@ -79,6 +80,11 @@ class ImagedDifference:
         rule, asked = self.reconstruction.rule, self.settings.hyperparameter
         own = asked is None or asked == METHODS[self.settings.method].hyperparameter
         return "default" if rule == "given" and own else rule
+
+    @property
+    def is_complex(self) -> bool:
+        """Whether the image is one of admittivity, of complex voltages."""
+        return np.iscomplexobj(self.change)
 
     @property
     def iterative(self) -> bool:
@@ -106,8 +112,8 @@ def image_difference(
     `reference`: the undisturbed body (the mean of its frames is used); None if `measurement` carries its own, a
     frame named "reference". `frame`: which frame to image, by number from 0 or by name; the first unless given.
     `progress` is called with the name of each step as it begins. Raises `ValueError` for data that cannot be
-    imaged (see `jeit.data.check_imageable`), that do not say where the electrodes are, or that are complex, and for
-    things of another kind, such as a path that is not read yet.
+    imaged (see `jeit.data.check_imageable`) or that do not say where the electrodes are, and for things of another
+    kind, such as a path that is not read yet.
     """
     settings = as_settings(settings)
     clock = Clock(progress)
@@ -130,7 +136,7 @@ def image_difference(
             method = METHODS[settings.method]
             reconstruction, change = method.image(prepared, settings.prior, settings.hyperparameter)
         largest = float(np.abs(change).max())
-        if not largest > 1e-9 * float(calibration.conductivity):
+        if not largest > 1e-9 * abs(complex(calibration.conductivity)):
             raise ValueError(
                 f"'{prepared.measurement.name}': the image is empty, no change reaches a billionth of the background. "
                 f"The hyperparameter {float(reconstruction.hyperparameter):.3g} leaves nothing of the data: give "
@@ -146,14 +152,14 @@ def image_difference(
             calibration=calibration,
             reconstruction=reconstruction,
             change=change,
-            raster=grid.sample(change),
+            raster=_sampled(grid, change),
             extent=grid.extent,
             inclusions=(),
             wiring=prepared.wiring,
             why=why,
             timings=clock.seconds,
         )
-        departure, labels = found.departure, None
+        departure, labels = as_array(np.real(found.departure)), None
         if settings.segment:
             pixels = np.asarray(grid.sample(departure))
             labels = segment(pixels)
@@ -168,6 +174,14 @@ def image_difference(
         if found.iterative:
             inclusions = [_with_change(one, calibration.conductivity) for one in inclusions]
     return replace(found, inclusions=tuple(inclusions), labels=labels)
+
+
+def _sampled(grid: Raster, change) -> Inexact[Array, "rows columns"]:
+    """An image on a raster; of a complex one both parts."""
+    if not np.iscomplexobj(change):
+        return grid.sample(change)
+    parts = [np.asarray(grid.sample(as_array(part))) for part in (np.real(change), np.imag(change))]
+    return as_array(parts[0] + 1j * parts[1])
 
 
 def _with_change(inclusion: Inclusion, background) -> Inclusion:

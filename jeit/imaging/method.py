@@ -4,7 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Inexact
 
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse import RULES, TotalVariation, back_projection, one_step, reconstruct
@@ -20,8 +21,8 @@ from jeit.mesh import Body
 from jeit_solvers import Status
 from jeit_solvers.engines import host
 
-Imaged = tuple[LinearReconstruction | Reconstruction, Float[Array, " m"]]
-"""A reconstruction, and the change of conductivity per cell that it finds, S/m (2-D: S)."""
+Imaged = tuple[LinearReconstruction | Reconstruction, Inexact[Array, " m"]]
+"""A reconstruction, and the change of conductivity per cell that it finds, S/m (2-D: S); complex of complex ones."""
 NamedPrior = str | AbstractPrior
 """A prior, or the name of one."""
 NamedWeight = float | str | None
@@ -90,7 +91,8 @@ def _back_projection(
     prepared: PreparedDifference, prior: NamedPrior, hyperparameter: NamedWeight, *, filtered: bool
 ) -> Imaged:
     given = {"hyperparameter": hyperparameter} if isinstance(hyperparameter, (int, float)) else {}
-    conductivity = prepared.calibration.conductivity
+    # Bands lie between the equipotential lines of the real background; complex voltages are imaged part by part.
+    conductivity = np.real(prepared.calibration.conductivity)
     found = back_projection(prepared.model, conductivity, filtered=filtered, mask=prepared.mask, **given)
     return found, found.image(prepared.difference)
 
@@ -109,6 +111,11 @@ def _iterated(
     that asked for. Raises `ValueError` if the solver fails.
     """
     model, background = prepared.model, prepared.calibration.conductivity
+    if np.iscomplexobj(prepared.difference):
+        raise ValueError(
+            f"'{prepared.measurement.name}' is complex, and iterative methods are for real voltages: take one-step, or "
+            "choose a part with [data] component in its description."
+        )
     found = reconstruct(
         model,
         host.add(model.voltages(background), prepared.difference),

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -74,7 +73,7 @@ class PreparedDifference:
         Where no noise can be found, a tenth of the difference, at most 1 % of what channels read, is taken for it.
         """
         shape, used = np.asarray(self.relative_noise), np.asarray(self.mask)
-        size = np.sqrt(np.mean((np.asarray(self.difference)[used] / shape[used]) ** 2))
+        size = np.sqrt(np.mean(np.abs(np.asarray(self.difference)[used] / shape[used]) ** 2))
         noise = min(1.0, 0.1 * size) if self.noise is None else self.noise
         return as_array(shape * np.hypot(noise, max(float(self.calibration.misfit), _LEAST_MISFIT) * size))
 
@@ -93,8 +92,7 @@ def prepare_difference(
 
     Arguments as in `jeit.imaging.image_difference` and its settings; `clock` takes the time of each step. Raises
     `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`), that do not say where the electrodes
-    are, that are complex, whose wiring is not as described (see `jeit.imaging.wiring`) unless `as_is`, or on which the
-    calibration fails.
+    are, whose wiring is not as described (see `jeit.imaging.wiring`) unless `as_is`, or on which the calibration fails.
     """
     clock = Clock(None) if clock is None else clock
     with clock("check"):
@@ -191,6 +189,15 @@ def default_contact(measurement: Measurement) -> str:
     return "each" if measurement.protocol.channels_on_driven_electrodes().any() else "fixed"
 
 
+def check_real(measurement: Measurement) -> None:
+    """Raise `ValueError` for complex voltages, where only `image_difference` takes them."""
+    if np.iscomplexobj(measurement.voltages):
+        raise ValueError(
+            f"'{measurement.name}' is complex; choose the part to image with [data] component in its description: "
+            "real, imaginary or magnitude."
+        )
+
+
 def body_of(measurement: Measurement, reference: Measurement) -> tuple[Body, AbstractElectrodes]:
     """Body and electrodes, from whichever of the two says them; raises `ValueError` where neither does."""
     domain = measurement.domain if measurement.domain is not None else reference.domain
@@ -200,10 +207,5 @@ def body_of(measurement: Measurement, reference: Measurement) -> tuple[Body, Abs
         raise ValueError(
             f"'{measurement.name}' does not say what it was measured on: give a description with {missing} "
             "(a TOML file beside the data, or description=)."
-        )
-    if jnp.iscomplexobj(measurement.voltages):
-        raise ValueError(
-            f"'{measurement.name}' is complex; choose the part to image with [data] component in its description: "
-            "real, imaginary or magnitude."
         )
     return domain, electrodes

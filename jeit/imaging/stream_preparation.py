@@ -14,6 +14,7 @@ from jeit.imaging.preparation import (
     body_of,
     calibrated_model,
     check_measurement,
+    check_real,
     check_wiring,
     imaging_mesh,
     select_frames,
@@ -77,6 +78,8 @@ def prepare_imager(
     _, base = select_frames(measured, reference)
     if not base.protocol.same_patterns(measured.protocol):
         raise ValueError(f"'{measured.name}' was measured with another protocol than the reference '{base.name}'.")
+    check_real(measured)
+    check_real(base)
     domain, electrodes = body_of(measured, base)
     clock = Clock(progress)
     with clock("mesh"):

@@ -4,28 +4,29 @@ from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from jeit.arguments import check_name
 from jeit.forward import ForwardModel
 from jeit.forward.contact_sensitivity import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
+from jeit.inverse.linearisation import check_mask
 from jeit.inverse.nonlinear.checks import check_steps
+from jeit.inverse.traced_calibration import FARTHEST, traced_fit
 from jeit_solvers import Status
-from jeit_solvers.engines import as_array, on_host
+from jeit_solvers.engines import as_array, has_values, on_host
 
 _REASONS = {
     Status.STEP_LIMIT: "Stopped after {} steps.",
     Status.FAILED: "The fit became NaN.",
 }
-
+_TRACED = "It was fitted inside a transformation of JAX; the status says how that ended."
 
 # A relative misfit that measured tanks of known geometry do not reach: 1 % of KIT4's, 8 % of the Kuopio challenge's.
 _MUCH = 0.12
-# Logarithm of a contact impedance over the model's, beyond which it is all the same.
-_FARTHEST = 50.0
 # Volts that no frame has; nor one over them.
 _SMALLEST = 1e-30
 # Relative change of misfit, or of the parameters, that ends a fit.
@@ -36,20 +37,28 @@ class Calibration(eqx.Module):
     """A forward model fitted to a reference frame.
 
     **Fields**: `model`, with its electrodes' contact impedance fitted; `conductivity`, the uniform background
-    (S/m; 2-D: S); `voltages` (M,), what the model predicts; `misfit`, ‖predicted - measured‖ / ‖measured‖ over the
-    channels used; `contact_deviation` (k,), standard deviations of the logarithms of the k contact impedances fitted,
-    from how well the model fits; `iterations`; `status`, how the fit ended, and `reason`, in a sentence, empty where
-    all is well.
+    (S/m; 2-D: S), complex if the voltages are; `voltages` (M,), what the model predicts; `misfit`, ‖predicted -
+    measured‖ / ‖measured‖ over the channels used; `contact_deviation` (k,), standard deviations of the logarithms of
+    the k contact impedances fitted, from how well the model fits; `iterations`; `outcome`, the `Status.number` of how
+    the fit ended, and `reason`, in a sentence, empty where all is well.
     """
 
     model: ForwardModel
-    conductivity: Float[Array, ""]
-    voltages: Float[Array, " M"]
+    conductivity: Inexact[Array, ""]
+    voltages: Inexact[Array, " M"]
     misfit: Float[Array, ""]
-    contact_deviation: Float[np.ndarray, " k"]
-    iterations: int = eqx.field(static=True)
-    status: Status = eqx.field(static=True)
+    contact_deviation: Float[Array, " k"]
+    iterations: int | Int[Array, ""]
+    outcome: int | Int[Array, ""]
     reason: str = eqx.field(static=True, default="")
+
+    @property
+    def status(self) -> Status:
+        """How the fit ended: "converged", "step limit" or "failed".
+
+        Raises `ValueError` inside `jax.jit`, where that is not known yet, and for a batch.
+        """
+        return Status.of_number(self.outcome)
 
     @property
     def tells_contacts_apart(self) -> bool:
@@ -70,7 +79,7 @@ class Calibration(eqx.Module):
 
 def calibrate(
     model: ForwardModel,
-    voltages: Float[Array, " M"],
+    voltages: Inexact[Array, " M"],
     *,
     mask: Bool[Array, " M"] | None = None,
     contact: str = "common",
@@ -81,15 +90,19 @@ def calibrate(
     `voltages` (M,) volts of the empty tank. `mask`: True for the channels to use. `contact`: "common", one impedance
     for all electrodes; "each", one per electrode; "fixed", the model's own. The parameters are logarithms, so both
     stay positive; the start is the model's impedance with the conductivity that scales the prediction best (voltages
-    are proportional to 1/σ at fixed z·σ). Raises `ValueError` for a frame of another shape or without signal.
+    are proportional to 1/σ at fixed z·σ). To complex voltages a complex background σ + iωε is fitted, its logarithm's
+    two parts; contact impedances stay real. Raises `ValueError` for a frame of another shape or without signal.
+
+    Goes through `jax.grad`, `jax.vmap` and `jax.jit` in the voltages and in all fields of the model. Derivatives are
+    those of the minimum, by the implicit function theorem with the full Hessian.
     """
     check_model(model)
-    measured = np.asarray(voltages)
-    if measured.dtype.kind == "c":
-        raise ValueError("voltages are complex; calibrate on their real part or magnitude.")
-    if measured.dtype.kind not in "biuf":
-        raise ValueError(f"voltages are {measured.dtype}; give real numbers, in volts.")
-    measured = measured.astype(float)
+    check_mask(mask)
+    measured = np.asarray(voltages) if has_values(voltages) else jnp.asarray(voltages)
+    kind = complex if measured.dtype.kind == "c" else float
+    if measured.dtype.kind not in "biufc":
+        raise ValueError(f"voltages are {measured.dtype}; give numbers, in volts.")
+    measured = measured.astype(kind)
     shape = (model.protocol.num_measurements,)
     used = np.ones(shape, bool) if mask is None else np.asarray(mask, bool)
     if measured.shape != shape or used.shape != shape:
@@ -98,6 +111,13 @@ def calibrate(
         )
     check_name("contact", contact, ("common", "each", "fixed"))
     max_steps = check_steps("max_steps", max_steps)
+    if not has_values(model, measured):
+        if kind is complex:
+            raise ValueError(
+                "voltages are complex and traced; inside a transformation of JAX only real ones are fitted."
+            )
+        kind = "fixed" if model.electrodes.is_point else contact
+        return Calibration(*traced_fit(model, jnp.where(used, measured, 0), used, kind, max_steps), _TRACED)
     measured = np.where(used, measured, 0)
     largest = np.abs(measured).max()
     if not np.isfinite(largest) or largest == 0:
@@ -114,20 +134,26 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     size = np.linalg.norm(measured)
     # Start at the model's own contact impedance for a conductivity of one, scaled to fit.
     unit = np.where(used, model.voltages(1.0), 0)
-    if not unit @ measured > 0:
+    if not (unit @ measured).real > 0:
         raise ValueError(
             "voltages: they have the opposite sign of the model's. Is the polarity of drive or measurement turned "
             "round, or the order of the channels another than the protocol's?"
         )
-    problem = _Problem(model, contact)
+    is_complex = np.iscomplexobj(measured)
+    problem = _Problem(model, contact, is_complex)
     conductivity = np.log(unit @ unit / (unit @ measured))
-    initial = np.full(problem.num_parameters, conductivity)
+    initial = np.full(problem.num_parameters, conductivity.real)
+    if is_complex:
+        initial[1] = conductivity.imag
+
+    def parts(values):
+        return np.concatenate([values.real, values.imag]) if is_complex else values
 
     def residual(parameters):
-        return np.where(used, problem.voltages(parameters) - measured, 0) / size
+        return parts(np.where(used, problem.voltages(parameters) - measured, 0) / size)
 
     def jacobian(parameters):
-        return np.where(used[:, None], problem.jacobian(parameters), 0) / size
+        return parts(np.where(used[:, None], problem.jacobian(parameters), 0) / size)
 
     ends: dict[str, Any] = {
         "ftol": _TOLERANCE,
@@ -143,8 +169,10 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     status = Status.CONVERGED if solution.status > 0 else Status.STEP_LIMIT
     status = status if np.isfinite(misfit) else Status.FAILED
     reason = "" if status == Status.CONVERGED else _REASONS[status].format(max_steps)
-    deviation = _deviations(solution)[1:]
-    return Calibration(fitted, as_array(conductivity), voltages, misfit, deviation, int(solution.njev), status, reason)
+    deviation: Any = _deviations(solution)[problem.first_contact :]
+    return Calibration(
+        fitted, as_array(conductivity), voltages, misfit, deviation, int(solution.njev), status.number, reason
+    )
 
 
 def _deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, " p"]:
@@ -157,28 +185,37 @@ def _deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, 
 class _Problem:
     """Voltages as a function of log σ and of log z·σ over the model's z: one for all electrodes, or for each.
 
-    Voltages at fixed z·σ are proportional to 1/σ, so that these are nearly independent of each other.
+    Voltages at fixed z·σ are proportional to 1/σ, so that these are nearly independent of each other. Of a complex
+    admittivity γ, log |γ| stands in place of log σ, and its phase is the second parameter.
     """
 
-    def __init__(self, model: ForwardModel, contact: str):
-        self.given, self.contact = model, contact
+    def __init__(self, model: ForwardModel, contact: str, is_complex: bool):
+        self.given, self.contact, self.is_complex = model, contact, is_complex
         self.select = partial(select_channels, on_host(model.protocol))
         self.sensitivity = None if model.electrodes.is_point else ContactSensitivity(model.mesh, model.electrodes)
         self.known: tuple[bytes, Any] | None = None
 
     @property
     def num_parameters(self) -> int:
-        """One for the conductivity, and those of the contacts."""
-        return 1 + {"fixed": 0, "common": 1, "each": self.given.electrodes.num_electrodes}[self.contact]
+        """One for the conductivity, or two, and those of the contacts."""
+        return (
+            self.first_contact + {"fixed": 0, "common": 1, "each": self.given.electrodes.num_electrodes}[self.contact]
+        )
 
-    def model(self, parameters) -> tuple[ForwardModel, float]:
+    @property
+    def first_contact(self) -> int:
+        """Which parameter is the first contact impedance."""
+        return 2 if self.is_complex else 1
+
+    def model(self, parameters) -> tuple[ForwardModel, float | complex]:
         """The model and conductivity that the parameters stand for."""
+        conductivity = np.exp(parameters[0] + 1j * parameters[1]) if self.is_complex else np.exp(parameters[0])
         if self.contact == "fixed":
-            return self.given, np.exp(parameters[0])
+            return self.given, conductivity
         electrodes = self.given.electrodes
-        factor = np.exp(np.clip(parameters[1:] - parameters[0], -_FARTHEST, _FARTHEST))
+        factor = np.exp(np.clip(parameters[self.first_contact :] - parameters[0], -FARTHEST, FARTHEST))
         impedance = np.asarray(electrodes.contact_impedance) * factor
-        return self.given.with_electrodes(electrodes.with_contact_impedance(impedance)), np.exp(parameters[0])
+        return self.given.with_electrodes(electrodes.with_contact_impedance(impedance)), conductivity
 
     def voltages(self, parameters):
         """(M,) volts."""
@@ -189,15 +226,18 @@ class _Problem:
         model, fields, impedance = self._fields(parameters)
         by_conductivity = -self.select(impedance)[:, None]
         if self.sensitivity is None:
-            return by_conductivity
+            return self._with_phase(by_conductivity, by_conductivity)
         energies = self.sensitivity(fields, impedance, model.electrodes.contact_impedance)
         by_contact = np.stack([self.select(energy) for energy in energies], axis=1)
-        if self.contact == "each":
-            return np.concatenate([by_conductivity, by_contact], axis=1)
-        common = by_contact.sum(axis=1, keepdims=True)
-        if self.contact == "common":
-            return np.concatenate([by_conductivity, common], axis=1)
-        return by_conductivity + common  # z·σ goes with σ
+        at_fixed_contact = by_conductivity + by_contact.sum(axis=1, keepdims=True)  # z·σ goes with σ
+        if self.contact == "fixed":
+            return self._with_phase(at_fixed_contact, at_fixed_contact)
+        columns = by_contact if self.contact == "each" else by_contact.sum(axis=1, keepdims=True)
+        return np.concatenate([self._with_phase(by_conductivity, at_fixed_contact), columns], axis=1)
+
+    def _with_phase(self, by_size, by_logarithm):
+        """The column of log |γ|, and of a complex γ that of its phase, at fixed contact impedance."""
+        return np.concatenate([by_size, 1j * by_logarithm], axis=1) if self.is_complex else by_size
 
     def _fields(self, parameters):
         key = parameters.tobytes()

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from jeit.protocol import Protocol
 from jeit_solvers import lower_cholesky, symmetric_inverse
-from jeit_solvers.engines import as_array, either_engine, namespace
+from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 
 _RANK = 1e-9
 
@@ -50,7 +50,11 @@ class IndependentChannels(eqx.Module):
 
     @classmethod
     def create(cls, protocol: Protocol) -> "IndependentChannels":
-        """By a pivoted QR factorisation of the channels as linear forms of Z."""
+        """By a pivoted QR factorisation of the channels as linear forms of Z; every channel, where the protocol is
+        traced and the forms have no values."""
+        if not has_values(protocol):
+            number = protocol.num_measurements
+            return cls(as_array(np.arange(number)), as_array(np.eye(number)))
         drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
         forms = drive[:, :, None] * measurement[:, None, :]
         rows, columns = np.triu_indices(protocol.num_electrodes)

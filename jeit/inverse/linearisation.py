@@ -1,19 +1,23 @@
 """The linearised problem of difference imaging: checked, whitened and decomposed, ready for any hyperparameter."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
+from jeit.inverse.direct_problem import DirectProblem
 from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.defaults import PRIOR
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.spectrum import Spectrum
 from jeit.protocol import Protocol
-from jeit_solvers.engines import as_array, host
+from jeit_solvers.engines import as_array, has_values, host, namespace
 
 # Singular values so small, beside the largest, are rounding.
 _NOTHING = 1e-12
@@ -22,14 +26,15 @@ _NOTHING = 1e-12
 class Linearisation(eqx.Module):
     """v = J x at a background conductivity, divided by the noise, for the channels in use.
 
-    **Fields**: `spectrum` of the problem; `prior`; `channels` (K,) in use; `root_weight` (K,), 1 / their standard
-    deviation; `num_channels` M of the protocol.
+    **Fields**: `spectrum` of the problem, or where anything of it is traced, by a derivative, `jax.jit` or `jax.vmap`,
+    the `DirectProblem`, which has no rules for λ; `prior`; `channels` (K,) in use; `root_weight` (K,), 1 / their
+    standard deviation; `num_channels` M of the protocol.
     """
 
-    spectrum: Spectrum
+    spectrum: Spectrum | DirectProblem
     prior: AbstractPrior
     channels: Int[np.ndarray, " K"]
-    root_weight: Float[np.ndarray, " K"]
+    root_weight: Float[Array, " K"]
     num_channels: int = eqx.field(static=True)
 
     @classmethod
@@ -51,54 +56,72 @@ class Linearisation(eqx.Module):
                 f"prior: {type(prior).__name__} is not quadratic, so there is no linear image with it, nor a rule for "
                 "its weight; take Noser(), Gaussian(length), Laplace() or Tikhonov(), or reconstruct with this one."
             )
-        if jnp.iscomplexobj(conductivity):
-            raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
         if np.shape(conductivity) not in ((), (model.mesh.num_cells,)):
             raise ValueError("conductivity: give one number, or one value per cell: the image has a value per cell.")
         channels, root_weight = used_channels(model, noise, mask)
-        whitened = root_weight[:, None] * host.asarray(model.jacobian(conductivity))[channels]
-        directions = _directions(model.protocol, channels, root_weight)
-        product = prior.covariance_product(model.mesh, directions.T @ whitened) @ directions.T
-        spectrum = Spectrum.create(whitened, product, prior.null_space(model.mesh))
+        jacobian = model.jacobian(conductivity)
+        if has_values(jacobian, root_weight, prior):
+            whitened = root_weight[:, None] * host.asarray(jacobian)[channels]
+            directions = _directions(model.protocol, channels, root_weight)
+            product = prior.covariance_product(model.mesh, (directions.T @ whitened).conj()) @ directions.T
+            spectrum = Spectrum.create(whitened, product, prior.null_space(model.mesh))
+        else:
+            directions = _traced_directions(model.protocol, channels, root_weight)
+            reduced = directions.T @ (root_weight[:, None] * jacobian[channels])
+            product = prior.covariance_product(model.mesh, reduced.conj())
+            spectrum = DirectProblem(directions, reduced, product, prior.null_space(model.mesh))
         return cls(spectrum, prior, channels, root_weight, model.protocol.num_measurements)
 
     def whiten(self, difference: ArrayLike) -> Float[Array, " K"]:
         """A change of voltages (M,) in standard deviations, channels in use only.
 
-        Raises `ValueError` for another number of channels, and for NaN in channels in use.
+        Raises `ValueError` for another number of channels, and for NaN in channels in use, where they can be seen.
         """
-        if np.shape(difference) != (self.num_channels,) or np.iscomplexobj(difference):
+        if np.shape(difference) != (self.num_channels,):
             raise ValueError(
-                f"difference has shape {np.shape(difference)}; give {self.num_channels} real voltages, one frame."
+                f"difference has shape {np.shape(difference)}; give {self.num_channels} voltages, one frame."
             )
+        if not has_values(difference, self.root_weight):
+            return self.root_weight * jnp.asarray(difference)[self.channels]
         data = self.root_weight * np.asarray(difference)[self.channels]
         if not np.isfinite(data).all():
             raise ValueError("difference has NaN or infinite voltages in channels in use; mask them.")
         return as_array(data)
 
-    def matrix(self, hyperparameter) -> Float[np.ndarray, "m M"]:
+    def matrix(self, hyperparameter) -> Float[Array, "m M"]:
         """The reconstruction matrix: change of conductivity per volt, zero for channels not in use."""
+        if not has_values(self.spectrum, self.root_weight, hyperparameter):
+            used = jnp.asarray(self.spectrum.reconstruction(hyperparameter)) * self.root_weight
+            return jnp.zeros((used.shape[0], self.num_channels), used.dtype).at[:, self.channels].set(used)
         whitened = np.asarray(self.spectrum.reconstruction(hyperparameter))
-        matrix = np.zeros((whitened.shape[0], self.num_channels))
+        matrix: Any = np.zeros((whitened.shape[0], self.num_channels), whitened.dtype)
         matrix[:, self.channels] = whitened * self.root_weight
         return matrix
 
 
-def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (K,) of the channels in use, and 1 / their noise (K,), 1 / volts; raises `ValueError`."""
+def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[Array, " K"]]:
+    """Indices (K,) of the channels in use, and 1 / their noise (K,), 1 / volts, traced where the noise is; raises
+    `ValueError`."""
+    check_mask(mask)
     num_channels = model.protocol.num_measurements
     used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
     if used.shape != (num_channels,) or not used.any():
         raise ValueError(f"mask must be ({num_channels},) booleans with at least one True: one for each channel.")
-    deviation = np.asarray(noise, float)
+    deviation = np.asarray(noise, float) if has_values(noise) else jnp.asarray(noise, float)
     if deviation.shape not in ((), (num_channels,)):
         raise ValueError(
             f"noise has shape {deviation.shape}; give one number, or one for each channel: ({num_channels},)."
         )
-    deviation = np.broadcast_to(deviation, (num_channels,))[used]
-    if not (np.isfinite(deviation) & (deviation > 0)).all():
+    deviation = namespace(deviation).broadcast_to(deviation, (num_channels,))[used]
+    if has_values(deviation) and not (np.isfinite(deviation) & (deviation > 0)).all():
         raise ValueError("noise must be positive and finite for every channel in use.")
     return np.flatnonzero(used), 1 / deviation
+
+
+def check_mask(mask) -> None:
+    """Raise `ValueError` for a mask that is traced: how many channels there are has to be known."""
+    instead = "give it as an array of NumPy, outside; to weigh channels by what is traced, give noise"
+    check_has_values("mask", mask, "which channels are used depends on", instead)
 
 
 def _directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarray, "K r"]:
@@ -108,9 +131,21 @@ def _directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarray, 
     Drive d and measurement m, which sum to zero, see Σ_ab d_a m_b G_ab = Σ_a<b (d_a m_b + d_b m_a)(G_ab - (G_aa +
     G_bb)/2) of a symmetric G, be it the transfer impedance or its derivative.
     """
+    directions, size, _ = np.linalg.svd(root_weight[:, None] * _seen(protocol, channels), full_matrices=False)
+    return directions[:, size > _NOTHING * size[0]]
+
+
+def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array, "K r"]:
+    """The same, differentiable in the weights; as many as channels where the protocol has no values."""
+    if not has_values(protocol):
+        return jnp.eye(len(channels))
+    directions, size, _ = np.linalg.svd(_seen(protocol, channels), full_matrices=False)
+    return jnp.linalg.qr(root_weight[:, None] * directions[:, size > _NOTHING * size[0]])[0]
+
+
+def _seen(protocol: Protocol, channels) -> Float[np.ndarray, "K e"]:
+    """What channels see of every pair of electrodes."""
     drive = np.asarray(protocol.drive)[np.asarray(protocol.drive_index)[channels]]
     measurement = np.asarray(protocol.measurement)[np.asarray(protocol.measurement_index)[channels]]
     first, second = np.triu_indices(protocol.num_electrodes, 1)
-    seen = drive[:, first] * measurement[:, second] + drive[:, second] * measurement[:, first]
-    directions, size, _ = np.linalg.svd(root_weight[:, None] * seen, full_matrices=False)
-    return directions[:, size > _NOTHING * size[0]]
+    return drive[:, first] * measurement[:, second] + drive[:, second] * measurement[:, first]

@@ -1,6 +1,7 @@
 """The linear problem in the space of the data, decomposed once, from which images for any hyperparameter are cheap.
 
-With whitened Jacobian J (M, m), prior covariance Γ and null space N, the reconstruction is
+For complex admittivities J and data are complex, ᵀ stands for the conjugate transpose, and the image is the minimum of
+the same sum of squares. With whitened Jacobian J (M, m), prior covariance Γ and null space N, the reconstruction is
 
     R_λ = ΓJᵀP_λ + N(BᵀK⁻¹B)⁻¹BᵀK⁻¹,   K = JΓJᵀ + λ²I,   B = JN,   P_λ = Q(QᵀKQ)⁻¹Qᵀ,
 
@@ -16,7 +17,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jeit_solvers import symmetric_eigen
-from jeit_solvers.engines import either_engine, namespace
+from jeit_solvers.engines import adjoint, either_engine, has_values, namespace
 
 
 class Spectrum(eqx.Module):
@@ -62,11 +63,12 @@ class Spectrum(eqx.Module):
         return largest * np.logspace(-6, 1, size)
 
     def curves(self, data: ArrayLike | None, candidates: Float[np.ndarray, " K"]) -> tuple[np.ndarray, np.ndarray]:
-        """Residual ‖v - JR_λv‖ and penalty √(xᵀQx), each (K,), of every candidate λ; empty ones without data."""
-        if data is None:
+        """Residual ‖v - JR_λv‖ and penalty √(xᵀQx), each (K,), of every candidate λ; empty ones without data, or where
+        they are traced."""
+        if data is None or not has_values(data):
             return np.zeros(0), np.zeros(0)
         eigenvalues = np.asarray(self.eigenvalues)
-        components = np.asarray(self.basis).T @ np.asarray(data)
+        components = abs(adjoint(np.asarray(self.basis)) @ np.asarray(data))
         damped = (components / (eigenvalues + candidates[:, None] ** 2)) ** 2
         return candidates**2 * np.sqrt(damped.sum(axis=1)), np.sqrt(damped @ eigenvalues)
 
@@ -76,18 +78,18 @@ def _decompose(jacobian, product, null_space):
     xp = namespace(jacobian, product, null_space)
     outer, seen = jacobian @ product, jacobian @ null_space
     if null_space.shape[1] == 0:
-        eigenvalues, vectors = symmetric_eigen((outer + outer.T) / 2)
+        eigenvalues, vectors = symmetric_eigen((outer + adjoint(outer)) / 2)
         return vectors, xp.maximum(eigenvalues, 0), seen, outer
     complement = xp.linalg.qr(seen, mode="complete")[0][:, null_space.shape[1] :]
-    projected = complement.T @ outer @ complement
-    eigenvalues, vectors = symmetric_eigen((projected + projected.T) / 2)
+    projected = adjoint(complement) @ outer @ complement
+    eigenvalues, vectors = symmetric_eigen((projected + adjoint(projected)) / 2)
     return complement @ vectors, xp.maximum(eigenvalues, 0), seen, outer
 
 
 @either_engine
 def _reconstruction(spectrum: Spectrum, hyperparameter):
     basis = spectrum.basis
-    inverse = (basis / (spectrum.eigenvalues + hyperparameter**2)) @ basis.T
+    inverse = (basis / (spectrum.eigenvalues + hyperparameter**2)) @ adjoint(basis)
     matrix = spectrum.product @ inverse
     if spectrum.null_space.shape[1] == 0:
         return matrix
@@ -99,7 +101,7 @@ def _reconstruction(spectrum: Spectrum, hyperparameter):
 
 @either_engine
 def _image(spectrum: Spectrum, data, hyperparameter):
-    inner = spectrum.basis @ ((spectrum.basis.T @ data) / (spectrum.eigenvalues + hyperparameter**2))
+    inner = spectrum.basis @ ((adjoint(spectrum.basis) @ data) / (spectrum.eigenvalues + hyperparameter**2))
     image = spectrum.product @ inner
     if spectrum.null_space.shape[1] == 0:
         return image

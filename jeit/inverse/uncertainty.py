@@ -15,11 +15,12 @@ import numpy as np
 import scipy.special
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from jeit.arguments import check_key, check_kind
+from jeit.arguments import check_has_values, check_key, check_kind
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.mesh import measures
 from jeit_solvers import Status
+from jeit_solvers.engines import has_values, on_host
 
 
 class Posterior(eqx.Module):
@@ -51,13 +52,14 @@ class Posterior(eqx.Module):
         link = self.inversion.link
         return link.conductivity(estimate - reach * deviation), link.conductivity(estimate + reach * deviation)
 
-    def region(self, cells) -> tuple[float, float]:
+    def region(self, cells) -> tuple[float | Float[Array, ""], float | Float[Array, ""]]:
         """Mean conductivity of some cells, weighted by area, and its standard deviation, S/m (2-D: S).
 
-        `cells`: booleans (m,) or indices. Raises `ValueError` for none, or cells that are not there.
+        `cells`: booleans (m,) or indices. Raises `ValueError` for none, or cells that are not there, or traced.
         """
-        measure = np.asarray(measures(self.inversion.model.mesh))
+        measure = on_host(measures(self.inversion.model.mesh))
         chosen = np.zeros(measure.size, bool)
+        check_has_values("cells", cells, "the region is made of", "choose them outside")
         indices = np.asarray(cells)
         if (indices.dtype == bool and indices.shape != chosen.shape) or indices.dtype.kind not in "iub":
             raise ValueError(f"cells must be booleans ({measure.size},), or indices of cells.")
@@ -66,9 +68,9 @@ class Posterior(eqx.Module):
         chosen[indices] = True
         if not chosen.any():
             raise ValueError("cells: none is chosen; give at least one.")
-        weight = jnp.asarray(np.where(chosen, measure, 0) / measure[chosen].sum())
-        mean, variance = _weighted(self, weight)
-        return float(mean), float(jnp.sqrt(variance))
+        weight = jnp.where(chosen, measure, 0) / measure[chosen].sum()
+        mean, deviation = _weighted(self, weight)
+        return (float(mean), float(deviation)) if has_values(mean) else (mean, deviation)
 
     def unknowns(self) -> dict[str, Float[Array, " k"]]:
         """Standard deviations of what was estimated along with the conductivity, in the units of
@@ -105,7 +107,7 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
             "posterior: only for smooth priors (Tikhonov, Noser, Laplace, Gaussian) and unbounded solvers; total "
             "variation and bounds have no Gaussian posterior."
         )
-    if reconstruction.status == Status.FAILED:
+    if has_values(reconstruction.outcome) and Status.FAILED.number in np.ravel(reconstruction.outcome):
         raise ValueError(f"posterior: the reconstruction failed. {reconstruction.reason}")
     return _posterior(reconstruction.inversion, reconstruction.coefficients)
 
@@ -136,7 +138,7 @@ def _estimate(posterior: Posterior):
 def _weighted(posterior: Posterior, weight):
     mean, gradient = jax.value_and_grad(lambda c: weight @ posterior.inversion.conductivity(c))(posterior.coefficients)
     variance = gradient @ gradient - jnp.sum((posterior.root @ (posterior.jacobian @ gradient)) ** 2)
-    return mean, variance
+    return mean, jnp.sqrt(variance)
 
 
 @eqx.filter_jit

@@ -14,6 +14,7 @@ from jeit.plot.colour_scale import ColourScale
 from jeit.plot.design.sensitivity_map import plot_sensitivity_histograms, plot_sensitivity_map
 from jeit.plot.design.taxels import plot_taxel_areas, plot_taxels
 from jeit.plot.design.travel import plot_travel
+from jeit.plot.imaging.admittivity import plot_admittivity
 from jeit.plot.imaging.figures_of_merit import plot_figures_of_merit
 from jeit.plot.imaging.frames import plot_frames
 from jeit.plot.imaging.hyperparameter import plot_choice
@@ -29,6 +30,7 @@ _tell_old_names(__name__)
 __all__ = [
     "ColourScale",
     "Marks",
+    "plot_admittivity",
     "plot_answers",
     "plot_choice",
     "plot_confusion",

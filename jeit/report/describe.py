@@ -45,13 +45,16 @@ def version_of(package: str) -> str | None:
 
 
 def plain(value: Any) -> Any:
-    """Arrays as lists, and None for numbers that JSON does not know (NaN, infinity)."""
+    """Arrays as lists, complex numbers by their parts, and None for numbers that JSON does not know (NaN,
+    infinity)."""
     if isinstance(value, dict):
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(entry) for entry in value]
     if hasattr(value, "tolist"):
         return plain(np.asarray(value).tolist())
+    if isinstance(value, complex):
+        return {"real": plain(value.real), "imaginary": plain(value.imag)}
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -46,13 +46,20 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
 
 
 def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = None):
-    """The picture of a result, as a matplotlib `Figure` that needs no display."""
+    """The picture of a result, as a matplotlib `Figure` that needs no display; both parts of one of admittivity."""
     from matplotlib.figure import Figure
 
     from jeit.plot.colour_scale import CHANGE, ColourScale
+    from jeit.plot.imaging.admittivity import plot_admittivity
     from jeit.plot.imaging.image import plot_image
     from jeit.plot.imaging.labels import draw_labels
 
+    if result.is_complex:
+        figure = Figure(figsize=(11.5, 5.2), layout="constrained")
+        figure.suptitle(result.measurement.name)
+        electrodes = result.calibration.model.electrodes
+        plot_admittivity(result.mesh, np.asarray(result.change), electrodes, figure=figure)
+        return figure
     figure, height = Figure(figsize=(6.4, 5.6), layout="constrained"), picture_height(result)
     # Iterative images reach from a hundredth to a hundred times the background: on the logarithm's scale both show.
     ax = plot_image(
@@ -161,7 +168,7 @@ def _calibration(result: ImagedDifference) -> dict[str, Any]:
     calibration = result.calibration
     electrodes = calibration.model.electrodes
     return {
-        "conductivity": float(calibration.conductivity),
+        "conductivity": np.asarray(calibration.conductivity).item(),
         "conductivity_unit": _unit(result),
         "contact": result.settings.contact,
         "contact_impedance": None if electrodes.is_point else electrodes.contact_impedance,
@@ -184,7 +191,7 @@ def _inclusion(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]
         "area_unit": "m²" if len(inclusion.centroid) == 2 else "m³",
         "peak": inclusion.peak,
         "peak_unit": _unit(result),
-        "peak_relative_to_background": inclusion.peak / float(result.calibration.conductivity),
+        "peak_relative_to_background": inclusion.peak / float(np.real(result.calibration.conductivity)),
     }
 
 

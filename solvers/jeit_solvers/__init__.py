@@ -4,7 +4,8 @@
   or conjugate gradients, for `SparseSymmetric` operators and behind `lineax.linear_solve`; and the functions beneath,
   for when every microsecond counts: `analyse`, `factorise`, `solve`;
 - `dense`: small systems that batch;
-- `optimise`: descent along quadratic models, many small problems at once, problems between bounds, and `Status`;
+- `optimise`: descent along quadratic models, many small problems at once, problems between bounds, derivatives of a
+  minimum, and `Status`;
 - `kmeans`; `over_cores` and `in_turn`, which share work out.
 """
 
@@ -15,6 +16,7 @@ from jeit_solvers.dense.cholesky import lower_cholesky, symmetric_eigen, symmetr
 from jeit_solvers.dense.ridge import QuadraticModel, ridge_model, ridge_step, solve_definite
 from jeit_solvers.optimise.bounded import BoundedMinimum, lbfgsb, projected_gradient, scipy_lbfgsb
 from jeit_solvers.optimise.descent import Descent
+from jeit_solvers.optimise.implicit import as_minimum
 from jeit_solvers.optimise.small_problems import (
     Minimum,
     definite_small,
@@ -25,7 +27,7 @@ from jeit_solvers.optimise.small_problems import (
     solve_small,
     symmetric_small,
 )
-from jeit_solvers.optimise.status import Status, ended
+from jeit_solvers.optimise.status import Status, ended, ended_number
 from jeit_solvers.sparse.choose import choose_solver
 from jeit_solvers.sparse.conjugate_gradient import ConjugateGradient
 from jeit_solvers.sparse.multifrontal import Factor, factorise, half_solve, quadratic_form, solve
@@ -51,9 +53,11 @@ __all__ = [
     "Status",
     "Strips",
     "analyse",
+    "as_minimum",
     "choose_solver",
     "definite_small",
     "ended",
+    "ended_number",
     "factorise",
     "gradient_small",
     "half_solve",

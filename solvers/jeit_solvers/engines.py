@@ -37,13 +37,23 @@ def has_values(*trees: Any) -> bool:
 
 
 def on_host(tree: Any) -> Any:
-    """The pytree with NumPy's arrays in place of JAX's; on a CPU they share their memory."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf, tree)
+    """The pytree with NumPy's arrays in place of JAX's, but for those that are traced; on a CPU they share their
+    memory."""
+    return jax.tree.map(_on_host, tree)
+
+
+def _on_host(leaf: Any) -> Any:
+    return np.asarray(leaf) if isinstance(leaf, jax.Array) and not isinstance(leaf, Tracer) else leaf
 
 
 def on_device(tree: Any) -> Any:
-    """The pytree with JAX's arrays in place of NumPy's."""
-    return jax.tree.map(lambda leaf: jax.device_put(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf, tree)
+    """The pytree with JAX's arrays in place of NumPy's; they keep their values where something else is traced."""
+    with jax.ensure_compile_time_eval():
+        return jax.tree.map(_on_device, tree)
+
+
+def _on_device(leaf: Any) -> Any:
+    return jax.device_put(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
 
 def as_array(values: Any, dtype: Any = None) -> Array:
@@ -52,7 +62,8 @@ def as_array(values: Any, dtype: Any = None) -> Array:
     `jax.numpy.asarray` may share the memory, and compiles a program for every shape.
     """
     if has_values(values):
-        return jax.device_put(np.array(values, dtype and jax.dtypes.canonicalize_dtype(dtype)))
+        with jax.ensure_compile_time_eval():  # what has values keeps them where something else is traced
+            return jax.device_put(np.array(values, dtype and jax.dtypes.canonicalize_dtype(dtype)))
     return jnp.asarray(values, dtype)
 
 
@@ -101,12 +112,17 @@ class Recent:
 
 def undifferentiated(values: Any) -> Any:
     """The same pytree of arrays, which no derivative goes through."""
-    return values if namespace(values) is np else jax.lax.stop_gradient(values)
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, values)
 
 
 def kept(values: Any) -> Any:
     """The same pytree of arrays, worked out once: XLA may else work them out anew wherever they are used."""
     return values if namespace(values) is np else jax.lax.optimization_barrier(values)
+
+
+def adjoint(matrix: Any) -> Any:
+    """The conjugate transpose of a matrix (m, n); of a real one the transpose, a view."""
+    return matrix.conj().T if np.iscomplexobj(matrix) else matrix.T
 
 
 def while_loop(condition: Callable[[Any], Any], body: Callable[[Any], Any], state: Any) -> Any:

@@ -91,10 +91,9 @@ def test_contact_sensitivity_against_differences(model):
         (lambda v: {"voltages": v, "max_steps": 0}, "max_steps must be a whole number"),
         (lambda v: {"voltages": 1e150 * v}, "are they in volts"),
         (lambda v: {"voltages": 1e-150 * v}, "are they in volts"),
-        (lambda v: {"voltages": v.astype(str)}, "give real numbers"),
-        (lambda v: {"voltages": v + 1j}, "complex"),
+        (lambda v: {"voltages": v.astype(str)}, "give numbers, in volts"),
     ],
-    ids=["half a step", "no step", "huge", "tiny", "text", "complex"],
+    ids=["half a step", "no step", "huge", "tiny", "text"],
 )
 def test_bad_arguments(model, change, message):
     with pytest.raises(ValueError, match=message):

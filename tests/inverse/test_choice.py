@@ -244,8 +244,7 @@ BAD = {
     "a number is no rule": (lambda m, d: choose_hyperparameter(m, 1.0, rule=0.1), "needs no"),  # pyright: ignore[reportArgumentType]
     "data of zeros": (lambda m, d: choose_hyperparameter(m, 1.0, rule="gcv", difference=0 * d), "all zero"),
     "data of NaN": (lambda m, d: compare_rules(m, 1.0, difference=np.nan * d), "mask them"),
-    "data of another length": (lambda m, d: compare_rules(m, 1.0, difference=d[1:]), "give 40 real voltages"),
-    "complex data": (lambda m, d: compare_rules(m, 1.0, difference=1j * d), "40 real voltages"),
+    "data of another length": (lambda m, d: compare_rules(m, 1.0, difference=d[1:]), "give 40 voltages"),
     "noise of another length": (lambda m, d: compare_rules(m, 1.0, difference=d, noise=d[1:]), "one for each channel"),
     "noise below zero": (lambda m, d: compare_rules(m, 1.0, difference=d, noise=-1.0), "noise must be positive"),
     "mask of nothing": (lambda m, d: compare_rules(m, 1.0, difference=d, mask=d > 1), "at least one True"),

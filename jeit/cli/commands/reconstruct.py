@@ -107,6 +107,8 @@ def reconstruct(
 
 def show(console, result: "ImagedDifference") -> None:
     """Print what was found."""
+    import numpy as np
+
     from jeit.arguments import counted, percent
     from jeit.cli.console import inclusion_table, pairs, scaled
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
@@ -117,8 +119,11 @@ def show(console, result: "ImagedDifference") -> None:
     noise = result.quality.difference_noise
     hyperparameter = float(reconstruction.hyperparameter)
     chosen = "none" if result.chosen_by == "none" else f"{hyperparameter:.3g} ({result.chosen_by})"
+    background = np.asarray(calibration.conductivity).item()
+    size = scaled(background.real, unit)
+    size += f" and {scaled(background.imag, unit)} of susceptivity" if isinstance(background, complex) else ""
     rows = [
-        ("background", f"{scaled(float(calibration.conductivity), unit)}, misfit {percent(float(calibration.misfit))}"),
+        ("background", f"{size}, misfit {percent(float(calibration.misfit))}"),
         ("difference", f"{percent(result.quality.difference)} of the reference"),
         ("noise in it", "not known" if noise is None else f"{percent(noise.relative)}, from {noise.method}"),
         ("method", f"{result.settings.method}, hyperparameter {chosen}"),
@@ -132,7 +137,7 @@ def show(console, result: "ImagedDifference") -> None:
         rows.append(("hyperparameter", reconstruction.choice.note))
     if isinstance(reconstruction, Reconstruction):
         misfit = f"misfit {float(reconstruction.misfit):.2g} standard deviations"
-        iterations = counted(reconstruction.iterations, "iteration")
+        iterations = counted(int(reconstruction.iterations), "iteration")
         rows.append(("iteration", f"{reconstruction.status}, {iterations}, {misfit}"))
         if reconstruction.status != Status.CONVERGED:
             rows.append(("", reconstruction.reason))

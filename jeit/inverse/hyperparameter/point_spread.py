@@ -9,6 +9,7 @@ from scipy.special import ndtr
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import Mesh, centroids, measures
+from jeit_solvers.engines import adjoint
 
 
 def best_resolution(
@@ -63,15 +64,15 @@ def blur_radius(
     signals = np.asarray(spectrum.jacobian)[:, targets]
     size = np.linalg.norm(signals, axis=0)
     strength = signal_to_noise * np.sqrt(len(signals)) / np.maximum(size, np.finfo(float).tiny)
-    components = np.asarray(spectrum.basis).T @ signals
+    components = adjoint(np.asarray(spectrum.basis)) @ signals
     # What the null space sees is imaged whatever λ.
     free = np.asarray(spectrum.null_space) @ np.linalg.pinv(np.asarray(spectrum.seen))
-    fixed, fixed_variance = free @ signals, np.sum(free**2, axis=1)
+    fixed, fixed_variance = free @ signals, np.sum(abs(free) ** 2, axis=1)
     damping = 1 / (eigenvalues + np.asarray(candidates)[:, None] ** 2)
-    variance = damping**2 @ (modes**2).T + fixed_variance
+    variance = damping**2 @ (abs(modes) ** 2).T + fixed_variance
     covered = np.empty((len(candidates), len(targets)))
     for k in range(len(candidates)):
-        image = modes @ (damping[k][:, None] * components) + fixed
+        image = np.real(modes @ (damping[k][:, None] * components) + fixed)
         above = image - image[targets, np.arange(len(targets))] / 2
         covered[k] = area @ ndtr(strength * above / np.sqrt(variance[k])[:, None])
     return (covered / area.sum()) ** (1 / mesh.dimension)

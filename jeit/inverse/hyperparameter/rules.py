@@ -6,18 +6,19 @@ residual is ‖r‖² = Σ f²c² and the penalty xᵀQx = Σ Λc²/(Λ + λ²)�
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_name
+from jeit.arguments import check_has_values, check_name
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.point_spread import best_resolution
 from jeit.inverse.spectrum import Spectrum as Spectrum
 from jeit.mesh import Mesh
-from jeit_solvers.engines import has_values
+from jeit_solvers.engines import adjoint, has_values
 
 Rule = Callable[[Spectrum, Float[Array, " M"] | None, Mesh | None], Choice]
 
@@ -38,20 +39,21 @@ def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = 
     """Largest λ whose residual is no more than the noise: ‖r‖² = r noise², r being the number of components.
 
     Criterion: ‖r‖/√r, the residual in standard deviations. `noise`: the standard deviation that the whitened data
-    really have, 1 where the channels' noise was given as it is. Morozov, Soviet Math. Dokl. 7 (1966) 414-417. Raises
-    `ValueError` without data.
+    really have (each part of complex data), 1 where the channels' noise was given as it is. Morozov, Soviet Math. Dokl.
+    7 (1966) 414-417. Raises `ValueError` without data.
     """
     candidates, data = spectrum.candidates(), _needed(data, "discrepancy")
-    components = np.asarray(spectrum.basis).T @ data
+    components = abs(adjoint(np.asarray(spectrum.basis)) @ data)
+    freedom = len(components) * (2 if np.iscomplexobj(data) else 1)
     residual, penalty = spectrum.curves(data, candidates)
-    criterion = residual / np.sqrt(len(components))
+    criterion = residual / np.sqrt(freedom)
     inside = np.flatnonzero(criterion <= noise)
     index = inside[-1] if inside.size else 0
     between = None
     if inside.size and index + 1 < len(candidates):
 
         def excess(log_value) -> float:
-            return float(np.sqrt(np.mean((_filters(spectrum, np.exp(log_value)) * components) ** 2)) - noise)
+            return float(np.sqrt(((_filters(spectrum, np.exp(log_value)) * components) ** 2).sum() / freedom) - noise)
 
         between = np.exp(scipy.optimize.root_scalar(excess, bracket=np.log(candidates[index : index + 2])).root)
     return Choice.among(
@@ -82,7 +84,7 @@ def noise_figure(
     """
     candidates = spectrum.candidates()
     eigenvalues = np.asarray(spectrum.eigenvalues)
-    gain = np.sum(np.asarray(spectrum.modes()) ** 2, axis=0)
+    gain = np.sum(abs(np.asarray(spectrum.modes())) ** 2, axis=0)
     passed = gain / (eigenvalues + candidates[:, None] ** 2) ** 2
     image = passed @ eigenvalues / passed.sum(axis=1)
     figure = np.sqrt(eigenvalues.mean() / image)
@@ -106,23 +108,33 @@ RULES: dict[str, Rule] = {
 """Rules by name: each takes a `Spectrum`, the whitened data and the mesh, and returns a `Choice`."""
 
 
-def choose(spectrum: Spectrum, hyperparameter: float | str | Rule | Choice, data, mesh: Mesh | None = None) -> Choice:
+def choose(spectrum: Any, hyperparameter: float | str | Rule | Choice, data, mesh: Mesh | None = None) -> Choice:
     """λ and how it came about, from a number, the name of a rule, a rule, or a choice made before.
 
-    Raises `ValueError` for the name of no rule, and for a number that is not positive and finite.
+    `spectrum`: a `Spectrum`, which only a rule looks at.
+    Raises `ValueError` for the name of no rule, for a rule where the problem is traced, and for a number that is not
+    positive and finite.
     """
     if isinstance(hyperparameter, Choice):
         return hyperparameter
     if isinstance(hyperparameter, str):
         check_name("hyperparameter", hyperparameter, RULES, ", or a number")
+        _check_problem(spectrum, hyperparameter)
         return RULES[hyperparameter](spectrum, data, mesh)
     if callable(hyperparameter):
+        _check_problem(spectrum, getattr(hyperparameter, "__name__", "given"))
         return hyperparameter(spectrum, data, mesh)
     if has_values(hyperparameter):
         value = np.asarray(hyperparameter)
         if value.shape != () or value.dtype.kind not in "iuf" or not (np.isfinite(value) and value > 0):
             raise ValueError(f"hyperparameter must be positive and finite; it is {hyperparameter}.")
     return Choice.given(hyperparameter)
+
+
+def _check_problem(problem, name: str) -> None:
+    """A rule looks at values, which a problem that is traced has not."""
+    instead = "give a number, such as the one that jeit.inverse.choose_hyperparameter finds outside"
+    check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", instead)
 
 
 def _filters(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
@@ -133,7 +145,7 @@ def _filters(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
 def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
     """Of the L-curve in its parameter t = log λ, from df/dt = 2f(1 - f) for the filter f."""
     left, eigenvalues = _filters(spectrum, candidates), np.asarray(spectrum.eigenvalues)
-    squared = (np.asarray(spectrum.basis).T @ data) ** 2
+    squared = abs(adjoint(np.asarray(spectrum.basis)) @ data) ** 2
     image = squared * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2  # its sum is the penalty
     rest = squared * left**2  # its sum is ‖r‖²
     # d/dt of rest is 4 rest (1 - f), of image -4 image f.
@@ -153,6 +165,8 @@ def _log_derivatives(terms, once, twice):
 def _needed(data, rule: str) -> Float[np.ndarray, " M"]:
     if data is None:
         raise ValueError(f"The rule '{rule}' looks at the data: give difference, the change of voltages to be imaged.")
+    instead = "give a number as hyperparameter, such as the one that the rule finds outside"
+    check_has_values("difference (voltages)", data, f"the rule '{rule}' looks at", instead)
     values = np.asarray(data)
     if not (np.isfinite(values).all() and values.any()):
         raise ValueError(f"The rule '{rule}' looks at the data, and they are all zero, NaN or infinite: give others.")

@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 from numpy.typing import ArrayLike
 
+from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit.inverse.linear.one_step import LinearReconstruction
@@ -30,6 +31,10 @@ def back_projection(
     defined. `conductivity`: the background, S/m (2-D: S).
     """
     check_model(model)
+    instead = (
+        "work it out once outside: its image() is what JAX transforms; or take one_step, which can be differentiated"
+    )
+    check_has_values("model or conductivity", (model, conductivity), "its bands are drawn from", instead)
     protocol = model.protocol
     used = np.ones(protocol.num_measurements, bool) if mask is None else np.asarray(mask, bool)
     if used.shape != (protocol.num_measurements,) or not used.any():

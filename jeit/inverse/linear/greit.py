@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
+from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit.inverse.hyperparameter.greit_noise_figure import greit_noise_figure
@@ -56,6 +57,10 @@ def greit(
     Raises `ValueError` for solids, for arguments that do not fit, and for a noise figure that no λ reaches.
     """
     check_model(model)
+    instead = (
+        "work it out once outside: its image() is what JAX transforms; or take one_step, which can be differentiated"
+    )
+    check_has_values("model, conductivity or noise", (model, conductivity, noise), "GREIT is trained on", instead)
     mesh = model.mesh
     if mesh.dimension != 2:
         raise ValueError("GREIT is for plane bodies, and this mesh is 3-D; use one_step, which takes either.")

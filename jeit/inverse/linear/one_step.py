@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Inexact, Int
 from numpy.typing import ArrayLike
 
 from jeit.forward import ForwardModel
@@ -42,7 +42,7 @@ class LinearReconstruction:
     first: Int[Array, " K"]
     second: Int[Array, " K"]
     ratio: Float[Array, " K"]
-    weights: Float[Array, "K m"]
+    weights: Inexact[Array, "K m"]
     hyperparameter: Float[Array, ""]
     num_measurements: int
     rule: str
@@ -52,6 +52,11 @@ class LinearReconstruction:
     @classmethod
     def create(cls, model: ForwardModel, matrix, hyperparameter, rule: str, method: str, choice: Choice | None = None):
         """From a full reconstruction matrix (m, M)."""
+        if not has_values(model.protocol, matrix, hyperparameter):
+            # Which columns are proportional cannot be seen: every channel stays on its own.
+            every, nothing = jnp.arange(matrix.shape[1]), jnp.zeros(matrix.shape[1])
+            given = every, every, nothing, jnp.asarray(matrix).T, jnp.asarray(hyperparameter, float)
+            return cls(model.mesh, *given, matrix.shape[1], rule, method, choice)
         matrix = np.asarray(matrix)
         first, second, ratio = _combine(model, matrix)
         # Of two tied columns the mean, not either: their rounding errors are large where λ is small, and opposite.
@@ -71,13 +76,13 @@ class LinearReconstruction:
         )
 
     @property
-    def matrix(self) -> Float[Array, "m M"]:
+    def matrix(self) -> Inexact[Array, "m M"]:
         """The full reconstruction matrix (m, M), zero in the columns of masked channels."""
-        full = jnp.zeros((self.num_measurements, self.weights.shape[1]))
+        full = jnp.zeros((self.num_measurements, self.weights.shape[1]), self.weights.dtype)
         full = full.at[self.second].add(self.ratio[:, None] * self.weights)
         return full.at[self.first].add(self.weights).T
 
-    def image(self, difference: Float[Array, "*frames M"]) -> Float[Array, "*frames m"]:
+    def image(self, difference: Inexact[Array, "*frames M"]) -> Inexact[Array, "*frames m"]:
         """Change of conductivity in every cell, for one difference of frames (M,) in volts or many (F, M).
 
         Raises `ValueError` for another number of channels.
@@ -120,7 +125,7 @@ def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.nd
     pairs, _ = model.protocol.reciprocal_pairs()
     pairs = np.asarray(pairs).reshape(-1, 2)
     first, second = pairs[(size[pairs] > 0).all(axis=1)].T
-    ratio = np.einsum("ij,ij->j", matrix[:, first], matrix[:, second]) / size[first] ** 2
+    ratio = np.einsum("ij,ij->j", matrix[:, first].conj(), matrix[:, second]).real / size[first] ** 2
     tied = np.abs(matrix[:, second] - ratio * matrix[:, first]).max(axis=0) < 1e-9 * np.abs(matrix).max()
     first, second, ratio = first[tied], second[tied], ratio[tied]
     alone[first] = alone[second] = False
@@ -139,7 +144,7 @@ def one_step(
     *,
     prior: AbstractPrior | None = None,
     hyperparameter: float | str | Rule | Choice = RULE,
-    difference: Float[Array, " M"] | None = None,
+    difference: Inexact[Array, " M"] | None = None,
     noise: Float[Array, " M"] | float = 1.0,
     mask: Bool[Array, " M"] | None = None,
 ) -> LinearReconstruction:
@@ -150,6 +155,13 @@ def one_step(
     imaged.
     `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
     other). `mask`: True for the channels to use. Raises `ValueError` for arguments that do not fit.
+
+    A complex `conductivity` is an admittivity σ + iωε, S/m (2-D: S); its image is complex, and so are the voltages that
+    it takes. Both parts have the same prior, and `noise` is that of each part. Complex voltages about a real background
+    are imaged part by part.
+
+    Differentiable, with a number for λ, in all that has a gradient: `jax.grad`, `jax.vmap` and `jax.jit` go through it
+    and through the image. What only values decide, a rule for λ or a mask, has to be settled outside.
 
     Computed in data space: R = ΓJᵀ(JΓJᵀ + λ²W⁻¹)⁻¹ with Γ = Q⁻¹; see `jeit.inverse.prior.priors` for a Q with a null
     space. Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179.

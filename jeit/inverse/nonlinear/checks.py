@@ -1,18 +1,24 @@
 """What is asked of the arguments of reconstructions, before anything is compiled: errors that say what to give."""
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit.inverse.channel_weights import relative_noise
-from jeit_solvers.engines import host
+from jeit.inverse.linearisation import check_mask
+from jeit_solvers.engines import has_values, host, namespace
 
 
 def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
-    """Voltages as an array with zeros for what is left out, and which channels are used; raises `ValueError`."""
+    """Voltages as an array with zeros for what is left out, and which channels are used; raises `ValueError`.
+
+    Values of tracers are not looked at.
+    """
     check_model(model)
-    voltages = host.array(voltages)
+    check_mask(mask)
+    voltages = _array(voltages)
     if voltages.dtype.kind == "c":
         raise ValueError("voltages are complex; reconstruct from their real part or magnitude.")
     if voltages.dtype.kind not in "biuf":
@@ -27,6 +33,8 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
         )
     if not used.any():
         raise ValueError("mask: every channel is left out, so there is nothing to reconstruct from.")
+    if not has_values(measured):
+        return jnp.where(used, measured, 0), used
     values = np.asarray(measured)[used]
     if not np.isfinite(values).all():
         raise ValueError(
@@ -39,28 +47,32 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
 
 def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
     """The background per cell; raises `ValueError` for what is not one real number or one for each cell."""
-    background = host.array(background)
+    background = _array(background)
     if background.dtype.kind not in "biuf" or background.shape not in ((), (model.mesh.num_cells,)):
         raise ValueError(
             f"background must be one real conductivity, or one for each of the {model.mesh.num_cells} cells; it is "
             f"{background.dtype} of shape {background.shape}."
         )
-    return host.broadcast_to(background.astype(float), (model.mesh.num_cells,))
+    return namespace(background).broadcast_to(background.astype(float), (model.mesh.num_cells,))
 
 
 def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[Array, " M"]:
     """Standard deviation of every channel, volts (1 where left out); raises `ValueError`."""
-    given = np.zeros(()) if noise is None else np.asarray(noise)
+    given = np.zeros(()) if noise is None else _array(noise)
     if given.shape not in ((), measured.shape) or given.dtype.kind not in "iuf":
         raise ValueError(
             f"noise is {given.dtype} of shape {given.shape}; give one real number, or one for each channel."
         )
-    deviation = (
-        relative_noise(measured, host.asarray(used)) if noise is None else np.broadcast_to(given, measured.shape)
-    )
-    if not (np.isfinite(deviation)[used] & (np.asarray(deviation)[used] > 0)).all():
+    xp = namespace(given, measured)
+    deviation = relative_noise(measured, xp.asarray(used)) if noise is None else xp.broadcast_to(given, measured.shape)
+    if has_values(deviation) and not (np.isfinite(deviation)[used] & (np.asarray(deviation)[used] > 0)).all():
         raise ValueError("noise must be positive and finite for every channel in use.")
-    return host.where(used, deviation, 1)
+    return xp.where(used, deviation, 1)
+
+
+def _array(values):
+    """A copy in NumPy of what has values."""
+    return host.array(values) if has_values(values) else jnp.asarray(values)
 
 
 def check_steps(name: str, steps) -> int:

@@ -55,7 +55,7 @@ class Linear(AbstractLink):
 
     def ends(self, lower, upper, reference):
         """The bounds themselves, and no less than a millionth of the background."""
-        return max(lower, _LEAST * float(reference.mean())), upper
+        return namespace(lower, reference).maximum(lower, _LEAST * reference.mean()), upper
 
 
 class Log(AbstractLink):
@@ -77,7 +77,7 @@ class Log(AbstractLink):
     def ends(self, lower, upper, reference):
         """Their logarithms: zero is no bound at all."""
         with np.errstate(divide="ignore"):
-            return float(np.log(lower)), float(np.log(upper))
+            return namespace(lower).log(lower), namespace(upper).log(upper)
 
 
 class Bounded(AbstractLink):
@@ -119,7 +119,7 @@ def _logistic(estimate):
 
 
 def _check_inside(conductivity, lower, upper) -> None:
-    if not has_values(conductivity):
+    if not has_values(conductivity, lower, upper):
         return
     values = np.asarray(conductivity)
     if not ((values > lower) & (values < upper)).all():

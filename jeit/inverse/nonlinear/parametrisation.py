@@ -13,6 +13,7 @@ from jeit.inverse.nonlinear.links import AbstractLink, Log
 from jeit.inverse.nonlinear.unknowns import AbstractUnknown
 from jeit.inverse.prior.bases import Regions
 from jeit.mesh import Mesh
+from jeit_solvers.engines import has_values
 
 
 def _tuple(unknowns) -> tuple[AbstractUnknown, ...]:
@@ -55,7 +56,7 @@ class Parametrisation(eqx.Module):
 
     def __check_init__(self):
         check_kind("link", self.link, AbstractLink, "one of those in jeit.inverse.nonlinear, such as Log()")
-        values = np.asarray((0.0, np.inf) if self.bounds is None else self.bounds)
+        values = np.asarray((0.0, np.inf) if self.bounds is None or not has_values(self.bounds) else self.bounds)
         if values.shape != (2,) or values.dtype.kind not in "iuf" or not 0 <= values[0] < values[1]:
             raise ValueError(f"bounds: give two numbers, 0 ≤ lower < upper, S/m (2-D: S); they are {self.bounds!r}.")
         names = [type(one).__name__ for one in self.unknowns]
@@ -83,8 +84,10 @@ class Parametrisation(eqx.Module):
         """
         lower, upper = (0.0, np.inf) if self.bounds is None else self.bounds
         reference = self.link.estimate(background)
-        ends = self.link.ends(float(lower), float(upper), reference)
-        if not ((reference >= ends[0]) & (reference <= ends[1])).all():
+        if has_values(self.bounds):
+            lower, upper = float(lower), float(upper)
+        ends = self.link.ends(lower, upper, reference)
+        if has_values(reference, ends) and not ((reference >= ends[0]) & (reference <= ends[1])).all():
             raise ValueError(f"background must lie between the bounds, {lower:g} and {upper:g}.")
         free = jnp.full(sum(one.size for one in self.unknowns), jnp.inf)
         return jnp.concatenate([ends[0] - reference, -free]), jnp.concatenate([ends[1] - reference, free])

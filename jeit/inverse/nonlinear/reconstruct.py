@@ -4,9 +4,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
 from jeit.forward.model import evaluate, voltages_of
 from jeit.inverse.channels import Data, IndependentChannels
@@ -22,7 +23,7 @@ from jeit.inverse.prior.defaults import PRIOR
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.spectrum import Spectrum
 from jeit_solvers import Status
-from jeit_solvers.engines import as_array, either_engine, namespace, on_device, on_host
+from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_device, on_host
 
 
 class Reconstruction(eqx.Module):
@@ -31,9 +32,9 @@ class Reconstruction(eqx.Module):
     **Fields**: `conductivity` (m,), S/m (2-D: S); `voltages` (M,), what the model predicts for it; `misfit`, root mean
     square of predicted - measured over the channels used, in standard deviations (1: as good as the noise lets it be);
     `costs`, the objective at every accepted iterate, the start first (only at start and end where a solver keeps no
-    record); `iterations`; `status`, how the solver ended ("converged", "step limit", "stalled" or "failed"), and
-    `reason`, in a sentence; `choice` of the hyperparameter λ; `inversion` and `coefficients`, the problem solved and
-    its solution, for warm starts and uncertainty; `model`, with the unknowns estimated along with the image put in.
+    record); `iterations`; `outcome`, the `Status.number` of how the solver ended, and `reason`, in a sentence; `choice`
+    of the hyperparameter λ; `inversion` and `coefficients`, the problem solved and its solution, for warm starts and
+    uncertainty; `model`, with the unknowns estimated along with the image put in.
     """
 
     conductivity: Float[Array, " m"]
@@ -44,9 +45,22 @@ class Reconstruction(eqx.Module):
     inversion: Inversion
     model: ForwardModel
     choice: Choice
-    iterations: int = eqx.field(static=True)
-    status: Status = eqx.field(static=True)
+    iterations: int | Int[Array, ""]
+    outcome: int | Int[Array, ""]
     reason: str = eqx.field(static=True)
+
+    @property
+    def status(self) -> Status:
+        """How the solver ended: "converged", "step limit", "stalled" or "failed".
+
+        Raises `ValueError` inside `jax.jit`, where that is not known yet, and for a batch: see `converged`.
+        """
+        return Status.of_number(self.outcome)
+
+    @property
+    def converged(self) -> Bool[Array, ""]:
+        """Whether the solver converged; inside `jax.jit` and of a batch, too."""
+        return jnp.asarray(self.outcome) == Status.CONVERGED.number
 
     @property
     def hyperparameter(self) -> Float[Array, ""]:
@@ -101,6 +115,12 @@ def reconstruct(
 
     Raises `ValueError` for arguments that do not fit; a solver that fails says so in the result's `status`.
 
+    With a number for λ it goes through `jax.grad`, `jax.jacfwd`, `jax.vmap` and `jax.jit`, in everything that has a
+    gradient: voltages, background, noise, λ, the prior's settings, and all fields of the model. Derivatives are those
+    of the minimum, by the implicit function theorem with the full Hessian, however few steps were taken; where bounds
+    are active, of the minimum with the same bounds active, so on one side only where a bound is just reached. See
+    docs/differentiable-images.md.
+
     Tarantola, Inverse Problem Theory (SIAM 2005), ch. 3; Nocedal and Wright, Numerical Optimization (2006), ch. 10.
     """
     measured, used = check_frame(model, voltages, mask)
@@ -113,39 +133,62 @@ def reconstruct(
     solver = _solver_for(solver, prior, parametrisation)
     box = parametrisation.box(background) if solver.keeps_bounds else None
     kept = np.flatnonzero(used)
-    observed = model.with_protocol(model.protocol.subset(kept))
+    _check_protocol(model, used)
+    observed = model if used.all() else model.with_protocol(model.protocol.subset(kept))
     channels = IndependentChannels.create(observed.protocol)
-    small = observed.with_protocol(observed.protocol.subset(np.asarray(channels.index)))
-    if model.at_once and not (parametrisation.unknowns or solver.keeps_bounds or solver.needs_squares):
+    small = observed
+    if has_values(observed.protocol):
+        small = observed.with_protocol(observed.protocol.subset(np.asarray(channels.index)))
+    if (
+        has_values(small)
+        and model.at_once
+        and not (parametrisation.unknowns or solver.keeps_bounds or solver.needs_squares)
+    ):
         small, channels = on_host((small, channels))  # and so is all that is made of them
     data = channels.weigh(deviation[kept]).combine(measured[kept])
     inversion, choice = pose(
         small, data, background, prior, hyperparameter, parametrisation, per_cell=solver.keeps_bounds
     )
     if parametrisation.informative and inversion.penalty.is_standard_normal:
+        instead = "leave it out, and take all shapes"
+        check_has_values("informative: the problem", inversion, "the shapes that data tell of are found from", instead)
         inversion = informed(inversion, parametrisation.informative)
     first = as_array(np.zeros(inversion.num_coefficients)) if start is None else _continued(start, inversion, choice)
-    coefficients, iterations, costs, status, reason = solver.minimise(inversion, first, box)
+    found = solver.minimise(inversion, first, box)
+    coefficients, status, reason = found.coefficients, found.status, found.reason
     fitted, conductivity = inversion.applied(model, coefficients), _conductivity(inversion, coefficients)
     predicted = evaluate(fitted, voltages_of, conductivity)
-    excess = ((np.asarray(predicted) - np.asarray(measured)) / np.asarray(deviation))[kept]
-    if not (np.isfinite(conductivity).all() and np.isfinite(excess).all()):
-        status, reason = Status.FAILED, "Conductivity or voltages are NaN; give better data, more noise or a greater λ."
-    elif status != Status.CONVERGED:
-        reason += _mismatch(model, measured[kept], background, kept)
+    xp = jnp if not has_values(predicted, measured, deviation) else np
+    excess = ((xp.asarray(predicted) - xp.asarray(measured)) / xp.asarray(deviation))[kept]
+    if xp is jnp or not isinstance(status, Status):
+        broken = ~(jnp.isfinite(conductivity).all() & jnp.isfinite(excess).all())
+        number = status.number if isinstance(status, Status) else status
+        outcome = jnp.where(broken, Status.FAILED.number, number)
+    elif not (np.isfinite(conductivity).all() and np.isfinite(excess).all()):
+        outcome = Status.FAILED.number
+        reason = "Conductivity or voltages are NaN; give better data, more noise or a greater λ."
+    else:
+        outcome = status.number
+        reason += "" if status == Status.CONVERGED else _mismatch(model, measured[kept], background, kept)
     return Reconstruction(
         conductivity=conductivity,
         voltages=predicted,
-        misfit=as_array(np.sqrt(np.mean(excess**2))),
-        costs=costs + inversion.data.rest / 2,
+        misfit=as_array(xp.sqrt(xp.mean(excess**2))),
+        costs=found.costs + inversion.data.rest / 2,
         coefficients=coefficients,
         inversion=on_device(inversion),
         model=fitted,
         choice=choice,
-        iterations=iterations,
-        status=status,
+        iterations=found.iterations,
+        outcome=outcome,
         reason=reason,
     )
+
+
+def _check_protocol(model: ForwardModel, used) -> None:
+    if not used.all():
+        instead = "close over the model, and put into it what varies, such as model.with_electrodes(electrodes)"
+        check_has_values("model: its protocol", model.protocol, "to leave out the channels of a mask takes", instead)
 
 
 def _solver_for(solver, prior: AbstractPrior, parametrisation: Parametrisation) -> AbstractSolver:
@@ -183,29 +226,25 @@ def pose(
     mesh, link = model.mesh, parametrisation.link
     reference, regions = link.estimate(background), parametrisation.regions_of(mesh)
     asked = prior.default_hyperparameter if hyperparameter is None else hyperparameter
+    is_rule = isinstance(asked, str) or callable(asked)
     if prior.is_quadratic:
-        predicted, jacobian = on_host(model.voltages_and_jacobian(background))
-        known, slope = on_host((data, link.slope(reference)))
+        predicted, jacobian, known, slope = on_host(
+            (*model.voltages_and_jacobian(background), data, link.slope(reference))
+        )
         seen = known.whiten(known.weight[:, None] * jacobian * slope)
-        spectrum = Spectrum.create(seen, prior.covariance_product(mesh, seen), prior.null_space(mesh))
-        difference = known.whiten(known.weight * (known.voltages - predicted))
+        spectrum = difference = None
+        if is_rule:
+            spectrum = Spectrum.create(seen, prior.covariance_product(mesh, seen), prior.null_space(mesh))
+            difference = known.whiten(known.weight * (known.voltages - predicted))
         choice = choose(spectrum, asked, difference, mesh)
+    elif is_rule:
+        raise ValueError(f"hyperparameter: total variation takes a number, not the rule {asked!r}.")
     else:
-        seen, choice = None, _number(asked)
-    basis, penalty = prior.penalty(
-        mesh, reference, float(choice.hyperparameter), jacobian=seen, regions=regions, per_cell=per_cell
-    )
+        seen, choice = None, choose(None, asked, None)
+    weight = float(choice.hyperparameter) if has_values(choice.hyperparameter) else choice.hyperparameter
+    basis, penalty = prior.penalty(mesh, reference, weight, jacobian=seen, regions=regions, per_cell=per_cell)
     inversion = Inversion(model, data, link, reference, basis, penalty, parametrisation.unknowns)
     return inversion if namespace(model) is np else on_device(inversion), choice
-
-
-def _number(hyperparameter) -> Choice:
-    """The choice of a number, for priors that the rules cannot weigh."""
-    if isinstance(hyperparameter, str) or callable(hyperparameter):
-        raise ValueError(f"hyperparameter: total variation takes a number, not the rule {hyperparameter!r}.")
-    if not (np.isfinite(hyperparameter) and hyperparameter > 0):
-        raise ValueError(f"hyperparameter must be positive and finite; it is {hyperparameter}.")
-    return Choice.given(hyperparameter)
 
 
 def _continued(start, inversion: Inversion, choice: Choice) -> Float[Array, " n"]:

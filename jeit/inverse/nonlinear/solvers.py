@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jeit.arguments import check_kind, check_name, counted
 from jeit.inverse.nonlinear.checks import check_steps, check_tolerance
+from jeit.inverse.nonlinear.implicit import as_solution
 from jeit.inverse.nonlinear.problem import Inversion
-from jeit_solvers import BoundedMinimum, Descent, Status, ended, lbfgsb, projected_gradient
-from jeit_solvers.engines import as_array, on_host
+from jeit_solvers import BoundedMinimum, Descent, Status, ended, ended_number, lbfgsb, projected_gradient
+from jeit_solvers.engines import as_array, has_values, on_host, undifferentiated
 
 _Value = TypeVar("_Value")
 
@@ -28,14 +29,19 @@ _REASONS = {
     Status.STALLED: "No shorter step lowered the objective; the model is at odds with the data.",
 }
 
+_TRACED = "It was solved inside a transformation of JAX; the status says how that ended."
+
 
 class Solved(NamedTuple):
-    """Where a solver ended: coefficients (n,), iterations, the objective at the accepted iterates, how and why."""
+    """Where a solver ended: coefficients (n,), iterations, the objective at the accepted iterates, how and why.
+
+    Of a problem that is traced, `costs` are those of start and end, and `status` is the number of one.
+    """
 
     coefficients: Float[Array, " n"]
-    iterations: int
+    iterations: int | Int[Array, ""]
     costs: Float[Array, " steps"]
-    status: Status
+    status: Status | Int[Array, ""]
     reason: str
 
 
@@ -193,6 +199,11 @@ class LeastSquares(AbstractSolver):
 
     def minimise(self, inversion, start, box):
         """Of the residuals of data and prior together."""
+        if not has_values(inversion, start):
+            problem, first = undifferentiated((inversion, start))
+            solution = _least_squares(problem, first, self.solver, self.max_steps, {})
+            number = ended_number(solution.result)
+            return _traced(inversion, start, solution.value, solution.stats["num_steps"], number)
         solution = _least_squares(inversion, start, self.solver, self.max_steps, {})
         costs = jnp.stack([_cost(inversion, start), _cost(inversion, solution.value)])
         status, iterations = ended(solution.result), int(solution.stats["num_steps"])
@@ -296,6 +307,11 @@ def _descend(descent: Descent, inversion: Inversion, start) -> Solved:
         point, state = descent.at_once(expand, start, problem, descent.history)
         point = as_array(point)
         status = Status.CONVERGED if state.converged else Status.STALLED if state.stuck else Status.STEP_LIMIT
+    elif not has_values(inversion, start):
+        problem, first = undifferentiated((inversion, start))
+        solution = _least_squares(problem, first, descent, descent.history, {"expand": expand})
+        iterations = jnp.maximum(solution.state.num_accepted - 1, 0)
+        return _traced(inversion, start, solution.value, iterations, ended_number(solution.result))
     else:
         solution = _least_squares(inversion, start, descent, descent.history, {"expand": expand})
         point, state, status = solution.value, solution.state, ended(solution.result)
@@ -305,9 +321,21 @@ def _descend(descent: Descent, inversion: Inversion, start) -> Solved:
     return Solved(point, iterations, as_array(np.asarray(state.history)[:accepted]), status, reason)
 
 
+def _traced(inversion: Inversion, start, found, iterations, status, box=None) -> Solved:
+    """Where a solver ended that saw no values: `found` gets the derivatives of the minimum."""
+    found = as_solution(found, inversion, box)
+    costs = jnp.stack([_cost(inversion, start), _cost(inversion, found)])
+    return Solved(found, iterations, costs, status, _TRACED)
+
+
 def _between(minimise, inversion: Inversion, start, box, max_steps: int, tolerance: float) -> Solved:
     start = jnp.clip(start, *box)
     lower, upper = box
+    if not has_values(inversion, start, box):
+        problem, first, *ends = undifferentiated((inversion, start, lower, upper))
+        found = minimise_between(problem, first, ends[0], ends[1], minimise, int(max_steps), float(tolerance))
+        status = jnp.where(found.converged, Status.CONVERGED.number, Status.STEP_LIMIT.number)
+        return _traced(inversion, start, found.x, found.steps, status, box)
     found = minimise_between(inversion, start, lower, upper, minimise, int(max_steps), float(tolerance))
     costs = jnp.stack([_cost(inversion, start), _cost(inversion, found.x)])
     if found.converged:

@@ -5,7 +5,6 @@ narrow one (a covariance of low rank) keeps what the prior holds possible and le
 """
 
 import abc
-from collections.abc import Callable
 
 import equinox as eqx
 import numpy as np
@@ -185,25 +184,3 @@ class RegionBasis(AbstractBasis):
     def pooled(self, regions):
         """Not done twice. Raises `ValueError`."""
         raise ValueError("This basis has regions already.")
-
-
-def pivoted_cholesky(
-    diagonal: np.ndarray, column: Callable[[int], np.ndarray], *, tolerance: float, max_rank: int
-) -> np.ndarray:
-    """S (m, n) with Γ ≈ S Sᵀ, for a covariance Γ given by its diagonal (m,) and a function that returns a column.
-
-    One column after the other, where the diagonal of Γ - S Sᵀ is largest, until its sum is below `tolerance` times
-    that of Γ. Harbrecht, Peters and Schneider, Appl. Numer. Math. 62 (2012) 428-440.
-    """
-    left = np.array(diagonal, float)
-    enough = tolerance * left.sum()
-    shapes = np.zeros((min(max_rank, left.size), left.size))
-    for rank in range(shapes.shape[0]):
-        if left.sum() <= enough:
-            return shapes[:rank].T
-        pivot = int(np.argmax(left))
-        row = column(pivot) - shapes[:rank, pivot] @ shapes[:rank]
-        shapes[rank] = row / np.sqrt(left[pivot])
-        left = np.maximum(left - shapes[rank] ** 2, 0)
-        left[pivot] = 0
-    return shapes.T

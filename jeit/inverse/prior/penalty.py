@@ -3,12 +3,17 @@
 import abc
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.inverse.channels import Data
 from jeit_solvers import QuadraticModel, ridge_model
 from jeit_solvers.engines import namespace
+
+# Added to a precision with a null space, relative to its largest entry, where an inverse need not be exact.
+_LITTLE = 1e-6
 
 
 class AbstractPenalty(eqx.Module):
@@ -34,6 +39,11 @@ class AbstractPenalty(eqx.Module):
         """Diagonal of the penalty's quadratic form at c: what scales a gradient method."""
 
     @abc.abstractmethod
+    def inverse_hessian(self, coefficients: Float[Array, " n"], free, columns: Float[Array, "n k"]) -> Array:
+        """About the inverse of the penalty's Hessian at c, of the coefficients that are `free` (n,), times columns that
+        are zero for the others: what makes derivatives of a minimum cheap, and need not be exact."""
+
+    @abc.abstractmethod
     def model(self, residual, jacobian, coefficients, data: Data) -> QuadraticModel:
         """The whole cost at c and its `step`, for `jeit_solvers.Descent`."""
 
@@ -54,6 +64,10 @@ class Ridge(AbstractPenalty):
         """Ones."""
         return namespace(coefficients).ones_like(coefficients)
 
+    def inverse_hessian(self, coefficients, free, columns):
+        """The columns themselves."""
+        return columns
+
     def model(self, residual, jacobian, coefficients, data):
         """Gauss-Newton's, in the space of data or of coefficients."""
         return ridge_model(residual, jacobian, coefficients, data.covariance, data.precision)
@@ -66,17 +80,13 @@ class QuadraticForm(AbstractPenalty):
     column: Int[Array, " k"]
     value: Float[Array, " k"]
     size: int = eqx.field(static=True)
+    is_diagonal: bool = eqx.field(static=True)
 
     @classmethod
-    def create(cls, precision, hyperparameter) -> "QuadraticForm":
-        """λ² times a SciPy sparse matrix."""
-        entries = precision.tocoo()
-        return cls(
-            entries.row,
-            entries.col,
-            float(hyperparameter) ** 2 * entries.data,
-            precision.shape[0],
-        )
+    def create(cls, row, column, value, hyperparameter, size: int) -> "QuadraticForm":
+        """λ² times a matrix of these entries."""
+        is_diagonal = len(row) == size and np.array_equal(row, column)
+        return cls(row, column, hyperparameter**2 * value, size, bool(is_diagonal))
 
     def cost(self, coefficients):
         """½ cᵀQc."""
@@ -87,6 +97,19 @@ class QuadraticForm(AbstractPenalty):
         """Of Q."""
         own = jnp.zeros(self.size).at[self.row].add(jnp.where(self.row == self.column, self.value, 0))
         return jnp.concatenate([own, jnp.ones(coefficients.size - self.size)])
+
+    def inverse_hessian(self, coefficients, free, columns):
+        """(Q + a little)⁻¹, dense unless Q is diagonal."""
+        image, rest = columns[: self.size], columns[self.size :]
+        if self.is_diagonal:
+            return jnp.concatenate([image / self.value[:, None], rest])
+        mine = free[: self.size]
+        entry = jnp.where(mine[self.row] & mine[self.column], self.value, 0)
+        dense = jnp.zeros((self.size, self.size)).at[self.row, self.column].add(entry)
+        scale = jnp.max(jnp.abs(self.value))
+        dense = dense + jnp.diag(jnp.where(mine, _LITTLE * scale, scale))
+        solved = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(dense), image)
+        return jnp.concatenate([jnp.where(mine[:, None], solved, 0), rest])
 
     def model(self, residual, jacobian, coefficients, data):
         """Not for descent along quadratic models: the bounded solvers take gradients. Raises `ValueError`."""

@@ -6,24 +6,31 @@ any generalised inverse and the null space is estimated from the data without pe
 """
 
 import abc
+from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 from jaxtyping import Array, Float
 from scipy.spatial.distance import cdist
 
+from jeit.arguments import check_has_values
 from jeit.inverse.hyperparameter.defaults import RULE
-from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, Regions, pivoted_cholesky
+from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, Regions
+from jeit.inverse.prior.low_rank import pivoted_cholesky, traced_pivoted_cholesky
 from jeit.inverse.prior.penalty import AbstractPenalty, QuadraticForm, Ridge
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geometry import interior_facets
-from jeit_solvers import SparsityPattern, analyse, factorise, solve
+from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, solve
 from jeit_solvers.engines import has_values, host, on_host
 
 # Rows of a dense covariance at a time.
 _BLOCK = 512
+# Of a Gaussian prior's variance, the share that its shapes may leave out, and their greatest number.
+_LEFT_OUT, _MOST_SHAPES = 1e-3, 2000
 # Precision given to the constant image where it would have none, relative to a step between neighbouring cells.
 _FREEDOM = 1e-6
 
@@ -32,7 +39,8 @@ class AbstractPrior(eqx.Module):
     """Base of all priors on an image of one value per cell.
 
     A new quadratic one is a class with `covariance_product`, `precision` and `basis`; one whose energy is not xᵀQx
-    answers `penalty` itself, and raises `ValueError` where it is asked for what it has not.
+    answers `penalty` itself, and raises `ValueError` where it is asked for what it has not. Both parts of a complex
+    image have the same prior; a complex Jacobian is given conjugated.
     """
 
     @property
@@ -66,8 +74,8 @@ class AbstractPrior(eqx.Module):
             return basis if regions is None else basis.pooled(regions), Ridge()
         if regions is not None:
             raise ValueError("regions: bounded solvers take every cell; use link=Bounded(lower, upper) instead.")
-        precision = self.precision(mesh, jacobian)
-        return DiagonalBasis(host.ones(mesh.num_cells)), QuadraticForm.create(precision, hyperparameter)
+        form = QuadraticForm.create(*self.entries(mesh, jacobian), hyperparameter, mesh.num_cells)
+        return DiagonalBasis(host.ones(mesh.num_cells)), form
 
     @abc.abstractmethod
     def covariance_product(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> Float[Array, "m M"]:
@@ -76,6 +84,11 @@ class AbstractPrior(eqx.Module):
     @abc.abstractmethod
     def precision(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> scipy.sparse.sparray:
         """Q (m, m), sparse."""
+
+    def entries(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> tuple[Any, Any, Any]:
+        """The entries of Q that are not zero: their rows, columns and values, (k,) each."""
+        found = scipy.sparse.coo_array(self.precision(mesh, jacobian))
+        return found.row, found.col, found.data
 
     @abc.abstractmethod
     def basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
@@ -113,15 +126,20 @@ class Noser(AbstractPrior):
 
     def covariance_product(self, mesh, jacobian):
         """Jᵀ, its rows divided by the diagonal of Q."""
-        return jacobian.T / (jacobian**2).sum(axis=0)[:, None] ** self.exponent
+        return jacobian.T / (abs(jacobian) ** 2).sum(axis=0)[:, None] ** self.exponent
 
     def precision(self, mesh, jacobian):
         """The diagonal matrix Q."""
-        return scipy.sparse.diags_array(np.sum(np.asarray(jacobian) ** 2, axis=0) ** self.exponent).tocsr()
+        return scipy.sparse.diags_array(np.asarray(self.entries(mesh, jacobian)[2])).tocsr()
+
+    def entries(self, mesh, jacobian):
+        """The diagonal, which follows the Jacobian into a derivative."""
+        cells = host.arange(mesh.num_cells)
+        return cells, cells, (abs(jacobian) ** 2).sum(axis=0) ** self.exponent
 
     def basis(self, mesh, jacobian):
         """Every cell on its own."""
-        return DiagonalBasis((jacobian**2).sum(axis=0) ** (-self.exponent / 2))
+        return DiagonalBasis((abs(jacobian) ** 2).sum(axis=0) ** (-self.exponent / 2))
 
 
 class Laplace(AbstractPrior):
@@ -132,15 +150,19 @@ class Laplace(AbstractPrior):
 
     def covariance_product(self, mesh, jacobian):
         """Γ Jᵀ with the generalised inverse that grounds cell 0."""
+        check_cells(mesh)
         pairs, _ = interior_facets(mesh)
-        pattern = on_host(SparsityPattern.from_elements([pairs, np.zeros((1, 1), int)], size=mesh.num_cells))
+        pattern, plan = on_host(cell_factorisation(mesh, [pairs, np.zeros((1, 1), int)]))
         link = host.broadcast_to(np.array([[2.0, -2.0], [-2.0, 2.0]]), (len(pairs), 2, 2))
-        plan = on_host(analyse(pattern, coordinates=np.asarray(centroids(mesh))))
         factor = factorise(plan, pattern.assemble(link, np.full((1, 1, 1), 2.0)))
-        return solve(plan, factor, host.asarray(jacobian).T)
+        columns = on_host(jacobian).T
+        if not np.iscomplexobj(columns):
+            return solve(plan, factor, columns)
+        return solve(plan, factor, columns.real) + 1j * solve(plan, factor, columns.imag)
 
     def precision(self, mesh, jacobian):
         """The Laplacian matrix Q."""
+        check_cells(mesh)
         pairs, _ = interior_facets(mesh)
         size = mesh.num_cells
         links = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(size, size))
@@ -174,18 +196,29 @@ class Gaussian(AbstractPrior):
 
     def covariance_product(self, mesh, jacobian):
         """Γ Jᵀ, a block of rows at a time: Γ is dense and is not kept."""
-        scaled = np.asarray(centroids(mesh)) / (np.sqrt(2) * self.length)
+        scaled = centroids(mesh) / (np.sqrt(2) * self.length)
+        if not has_values(scaled, jacobian):
+            return _traced_product(jnp.asarray(scaled), jnp.asarray(jacobian))
+        scaled = np.asarray(scaled)
         rows = np.split(scaled, np.arange(_BLOCK, len(scaled), _BLOCK))
         return host.concatenate([np.exp(-cdist(row, scaled, "sqeuclidean")) @ np.asarray(jacobian).T for row in rows])
 
     def basis(self, mesh, jacobian):
-        """The shapes that hold all but a thousandth of the variance: fewer than cells where `length` spans many."""
-        centres = np.asarray(centroids(mesh))
+        """The shapes that hold all but a thousandth of the variance: fewer than cells where `length` spans many.
+
+        Where the length or the mesh's points are traced, as many as cells, the others zero: the image is the same.
+        """
+        centres = centroids(mesh)
+        if not has_values(centres, self.length):
+            scaled = jnp.asarray(centres) / (np.sqrt(2) * self.length)
+            return DenseBasis(traced_pivoted_cholesky(scaled, tolerance=_LEFT_OUT, max_rank=_MOST_SHAPES))
+        centres = np.asarray(centres)
 
         def column(cell):
             return np.exp(-np.sum((centres - centres[cell]) ** 2, axis=1) / (2 * self.length**2))
 
-        return DenseBasis(host.asarray(pivoted_cholesky(np.ones(len(centres)), column, tolerance=1e-3, max_rank=2000)))
+        ones = np.ones(len(centres))
+        return DenseBasis(host.asarray(pivoted_cholesky(ones, column, tolerance=_LEFT_OUT, max_rank=_MOST_SHAPES)))
 
     def precision(self, mesh, jacobian):
         """Not to be had: the inverse of a Gaussian covariance is dense and ill-conditioned. Raises `ValueError`."""
@@ -193,3 +226,31 @@ class Gaussian(AbstractPrior):
             "prior: Gaussian has no usable precision matrix, which bounds need; take Noser, Tikhonov, Laplace or "
             "TotalVariation, or link=Bounded(lower, upper) in place of bounds."
         )
+
+
+@jax.jit
+def _traced_product(scaled, jacobian):
+    """Γ Jᵀ from cell centres over √2 length, in blocks of rows that a derivative works out anew."""
+
+    @jax.checkpoint
+    def rows(block):
+        return jnp.exp(-((block[:, None] - scaled) ** 2).sum(axis=-1)) @ jacobian.T
+
+    missing = -len(scaled) % _BLOCK
+    blocks = jnp.pad(scaled, ((0, missing), (0, 0))).reshape(-1, _BLOCK, scaled.shape[1])
+    return jax.lax.map(rows, blocks).reshape(-1, len(jacobian))[: len(scaled)]
+
+
+def check_cells(mesh: Mesh) -> None:
+    """Raise `ValueError` for a mesh whose cells are traced: which are neighbours has to be known."""
+    instead = "close over the mesh, and put into it what varies: eqx.tree_at(lambda m: m.points, mesh, points)"
+    check_has_values("mesh: its cells", mesh.cells, "the prior's neighbours are found from", instead)
+
+
+def cell_factorisation(mesh: Mesh, groups) -> tuple[SparsityPattern, FactorisationPlan]:
+    """Of matrices between cells that are made of entries between `groups` of them: where these go, and how to
+    factorise. Works where the mesh's points are traced, too."""
+    centres = centroids(mesh)
+    with jax.ensure_compile_time_eval():
+        pattern = SparsityPattern.from_elements(groups, size=mesh.num_cells)
+        return pattern, analyse(pattern, coordinates=np.asarray(centres) if has_values(centres) else None)

@@ -16,11 +16,11 @@ from jaxtyping import Array, Float, Int
 from jeit.inverse.hyperparameter.defaults import EDGE_PRICE
 from jeit.inverse.prior.bases import DiagonalBasis
 from jeit.inverse.prior.penalty import AbstractPenalty
-from jeit.inverse.prior.priors import AbstractPrior
-from jeit.mesh import centroids, measures
+from jeit.inverse.prior.priors import AbstractPrior, cell_factorisation, check_cells
+from jeit.mesh import measures
 from jeit.mesh.geometry import interior_facets
-from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, solve, solve_definite
-from jeit_solvers.engines import host, namespace, sum_into
+from jeit_solvers import FactorisationPlan, SparsityPattern, factorise, solve, solve_definite
+from jeit_solvers.engines import has_values, host, namespace, on_host, sum_into
 
 # Pull to the background, relative to the price of an edge: what fixes an image that the data do not.
 _LEVEL = 1e-3
@@ -37,7 +37,7 @@ class TotalVariation(AbstractPrior):
     smoothing: float = 0.01
 
     def __check_init__(self):
-        if not (np.isfinite(self.smoothing) and self.smoothing > 0):
+        if has_values(self.smoothing) and not (np.isfinite(self.smoothing) and self.smoothing > 0):
             raise ValueError(f"smoothing must be positive, on the link's scale; it is {self.smoothing}.")
 
     @property
@@ -67,24 +67,27 @@ class TotalVariation(AbstractPrior):
         unit of jump. Raises `ValueError` for `regions`."""
         if regions is not None:
             raise ValueError("regions: total variation finds its own; leave them out, or take another prior.")
+        check_cells(mesh)
         pairs, nodes = interior_facets(mesh)
-        corners = np.asarray(mesh.points)[nodes]
-        size = np.ptp(np.asarray(mesh.points), axis=0).max()
+        points = on_host(mesh.points)
+        xp = namespace(points, hyperparameter, self.smoothing)
+        corners = points[nodes]
+        size = (points.max(axis=0) - points.min(axis=0)).max()
         if mesh.dimension == 2:
-            length = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
+            length = xp.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
         else:
-            cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            length = np.linalg.norm(cross, axis=1) / 2
-        pattern = SparsityPattern.from_elements([pairs, np.arange(mesh.num_cells)[:, None]], size=mesh.num_cells)
-        area = np.asarray(measures(mesh))
+            cross = xp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            length = xp.linalg.norm(cross, axis=1) / 2
+        pattern, plan = cell_factorisation(mesh, [pairs, np.arange(mesh.num_cells)[:, None]])
+        area = on_host(measures(mesh))
         penalty = TotalVariationPenalty(
             pairs=host.asarray(pairs),
-            weight=float(hyperparameter) * length / size ** (mesh.dimension - 1),
-            level=float(hyperparameter) * _LEVEL * area / area.sum(),
-            smoothing=host.asarray(self.smoothing),
+            weight=hyperparameter * length / size ** (mesh.dimension - 1),
+            level=hyperparameter * _LEVEL * area / area.sum(),
+            smoothing=xp.asarray(self.smoothing),
             reference=reference,
             pattern=pattern,
-            plan=analyse(pattern, coordinates=np.asarray(centroids(mesh))),
+            plan=plan,
         )
         return DiagonalBasis(host.ones(mesh.num_cells)), penalty
 
@@ -124,6 +127,19 @@ class TotalVariationPenalty(AbstractPenalty):
         stiffness = self.weight / self._height(image)
         own = self.level.at[self.pairs[:, 0]].add(stiffness).at[self.pairs[:, 1]].add(stiffness)
         return jnp.concatenate([own, jnp.ones_like(rest)])
+
+    def inverse_hessian(self, coefficients, free, columns):
+        """Of the energy's own Hessian, with β² / (d² + β²) of the touching form's weights: zero across high edges."""
+        image, _ = self._parts(coefficients)
+        mine = free[: self.level.shape[0]]
+        bend = self.weight * self.smoothing**2 / self._height(image) ** 3
+        both = mine[self.pairs[:, 0]], mine[self.pairs[:, 1]]
+        own, across = [jnp.where(one, bend, 0) for one in both], jnp.where(both[0] & both[1], -bend, 0)
+        link = jnp.stack([jnp.stack([own[0], across], axis=-1), jnp.stack([across, own[1]], axis=-1)], axis=-2)
+        level = jnp.where(mine, self.level, 1)
+        factor = factorise(self.plan, self.pattern.assemble(link, level[:, None, None]))
+        image_columns, other = columns[: len(mine)], columns[len(mine) :]
+        return jnp.concatenate([solve(self.plan, factor, image_columns), other])
 
     def model(self, residual, jacobian, coefficients, data):
         """Gauss-Newton for the data, lagged diffusivity for the energy, in data space.
