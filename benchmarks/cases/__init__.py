@@ -20,6 +20,7 @@ NAMES = (
     "first_call",
     "contacts",
     "localisation_error",
+    "untuned_arrays",
     "ktc2023",
     "real_skins",
     "discriminants",
