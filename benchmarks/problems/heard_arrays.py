@@ -11,6 +11,7 @@ noise, taps that are not quite where they are said to be, dead microphones.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -31,11 +32,13 @@ class Ranges:
     aspect: tuple[float, float] = (0.4, 1.0)
     microphones: tuple[int, int] = (6, 36)
     depth: tuple[float, float] = (0.001, 0.012)
-    # Of intensity: at which length it falls by e, at 200 Hz; how often there is none; by which power of the distance.
+    # Of intensity: at which length it falls by e, at 200 Hz; how often it does not; by which power of the distance it
+    # spreads; how often near by as in a body and far off as in a sheet instead.
     attenuation: tuple[float, float] = (0.02, 0.3)
     lossless: float = 0.15
     frequency_exponent: tuple[float, float] = (0.0, 1.5)
     spreading: tuple[float, float] = (0.5, 3.0)
+    guided: float = 0.3
     speed: tuple[float, float] = (8.0, 80.0)
     reflection: tuple[float, float] = (-0.8, 0.8)
     slope: tuple[float, float] = (0.0, 2.0)
@@ -140,14 +143,20 @@ def draw_array(ranges: Ranges, seed: int, *, touches: int = 40) -> HeardArray:
     return HeardArray(layer.microphones, corners, places, heard, where, joined, sampled, layer.law)
 
 
-def steep_array(length: float, seed: int = 0, **changed) -> HeardArray:
+def steep_array(length: float, seed: int = 0, **changed: Any) -> HeardArray:
     """25 microphones under 200 × 200 mm in which intensity falls as exp(−r / `length`) beside its spreading, with edges
     that reflect: what a / (r² + b) alone does not follow."""
     steep = {"side": (0.2, 0.2), "aspect": (1.0, 1.0), "microphones": (25, 25), "attenuation": (length, length)}
-    plain = {"lossless": 0.0, "frequency_exponent": (0.0, 0.0), "spreading": (2.0, 2.0), "depth": (0.008, 0.008)}
+    plain = {
+        "lossless": 0.0,
+        "frequency_exponent": (0.0, 0.0),
+        "spreading": (2.0, 2.0),
+        "guided": 0.0,
+        "depth": (0.008, 0.008),
+    }
     quiet = {"signal_to_noise": (35.0, 35.0), "uneven": (0.02, 0.02), "misplaced": (0.0, 0.0), "dead": 0.0}
     reflecting = {"reflection": (0.4, 0.6), "leak": (0.0, 0.0), "tap_side": (9, 9), "gain_db": (2.0, 2.0)}
-    return draw_array(replace(DEVELOPMENT, **steep, **plain, **quiet, **reflecting, **changed), seed)
+    return draw_array(replace(DEVELOPMENT, **(steep | plain | quiet | reflecting | changed)), seed)
 
 
 @dataclass(frozen=True)
@@ -182,7 +191,7 @@ class _Layer:
         length = np.inf if rng.random() < ranges.lossless else np.exp(rng.uniform(*np.log(ranges.attenuation)))
         exponent = rng.uniform(*ranges.frequency_exponent)
         loss = 0.5 / length * (np.maximum(frequencies, 1.0) / _NOMINAL) ** exponent
-        power = rng.uniform(*ranges.spreading) if rng.random() < 0.7 else np.nan
+        power = rng.uniform(*ranges.spreading) if rng.random() < 1 - ranges.guided else np.nan
         leak = np.eye(count) + np.diag(np.full(count - 1, rng.uniform(*ranges.leak)), 1)
         depth = rng.uniform(*ranges.depth) * np.exp(0.1 * rng.normal(size=count))
         gain = 10 ** (rng.uniform(*ranges.gain_db) * rng.normal(size=count) / 20)

@@ -4,6 +4,7 @@ The places that were tapped are dealt to a few parts; where the taps of each par
 taps of the others. Taps at one place stay together, or the model would have seen them.
 """
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -19,9 +20,9 @@ from jeit.acoustic.surface import AbstractSurface
 from jeit_solvers.engines import as_array, host, on_device
 
 _PARTS = 4
-# Taps that must have been located for their errors to widen anything; χ² of two degrees that 80 % stay under.
-_FEWEST, _MOST_OF_THEM = 10, 0.8
-_CHI_SQUARE = -2 * np.log(1 - _MOST_OF_THEM)
+# Taps that must have been located for their errors to widen anything; χ² of two degrees that 90 % stay under.
+_FEWEST, _MOST_OF_THEM = 10, 0.9
+_CHI_SQUARE = -2 * math.log(1 - _MOST_OF_THEM)
 
 
 class LeftOutTaps(NamedTuple):
@@ -41,7 +42,7 @@ class LeftOutTaps(NamedTuple):
 
     @property
     def widening(self) -> float:
-        """What covariances must be multiplied by for ellipses to hold the taps, but for the fifth that is farthest off;
+        """What covariances must be multiplied by for ellipses to hold the taps, but for the tenth that is farthest off;
         1 at least, for what errors of models look like from here may look worse from elsewhere."""
         known = self.square[np.isfinite(self.square)]
         if known.size < _FEWEST:
@@ -67,7 +68,7 @@ def locate_left_out(
     values, use = [], np.zeros((number, *fit.usable.shape), bool)
     for k in range(number):
         kept = replace(fit, outlier=fit.outlier | (part == k))
-        heard = kept.use.any(axis=1)
+        heard = np.asarray(kept.use.any(axis=1))
         values.append(fit_within(kept.problem(), fit.values, fit.strength, heard, fit.bounds)[0])
         use[k] = fit.usable & heard[:, None] & (part == k) & ~fit.outlier
     every = np.concatenate(values, axis=1), np.tile(microphones, (number, 1))
@@ -78,7 +79,7 @@ def locate_left_out(
     found = Localiser.create(array, compiled=False)(power.T, use.T)
     offset, covariance = np.asarray(found.position) - places, np.asarray(found.covariance)
     # On a curved surface a covariance is flat.
-    known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(offset).all(axis=1)
+    known = np.asarray(np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(offset).all(axis=1))
     inverse = np.linalg.pinv(np.where(known[:, None, None], covariance, 0.0), hermitian=True, rcond=1e-9)
     square = np.where(known, np.einsum("ni,nij,nj->n", np.nan_to_num(offset), inverse, offset), np.nan)
     guess = float(np.median(np.linalg.norm(places - places.mean(axis=0), axis=1)))

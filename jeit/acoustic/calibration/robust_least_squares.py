@@ -169,8 +169,8 @@ def _refine(fit: TapFit, rounds: int, *, scattered: bool = False) -> TapFit:
     """All microphones together, and what their residuals say, until nothing changes; by how much they scatter is found
     along, if that is asked for."""
     for _ in range(rounds):
-        before = fit.values
-        values, strength, held = fit_within(fit.problem(), before, fit.strength, fit.usable.any(axis=1), fit.bounds)
+        before, heard = fit.values, np.asarray(fit.usable.any(axis=1))
+        values, strength, held = fit_within(fit.problem(), before, fit.strength, heard, fit.bounds)
         fit = replace(fit, values=values, strength=strength, held=held)
         strength = fit_strengths(fit.problem(with_outliers=True), fit.values, fit.strength)
         fit = _reweighed(replace(fit, strength=strength))
