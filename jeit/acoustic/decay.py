@@ -212,5 +212,5 @@ def find_decay(name: str | type[AbstractDecay]) -> type[AbstractDecay]:
     where there is none of that name."""
     if isinstance(name, type) and issubclass(name, AbstractDecay):
         return name
-    check_name("decay", name, DECAYS, ", or a class like theirs")
+    check_name("decay", name, DECAYS, ", a class like theirs, or 'auto'")
     return DECAYS[str(name)]

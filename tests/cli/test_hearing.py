@@ -83,8 +83,13 @@ def test_a_large_error_of_the_models_is_noted(folder, tmp_path, capsys):
         assert main(["calibrate-microphones", str(path), "--output", str(tmp_path / f"{name}.json")]) == 0
         told[name] = " ".join(capsys.readouterr().out.split())
     assert "the models miss" not in told["exact"]
+    assert re.search(
+        r"decay model inverse-square: locates taps left out of the fit to 0\.0 mm, median \(", told["exact"]
+    )
     assert "the models miss what was heard by" in told["off"]
-    assert "try another --decay." in told["off"]
+    assert "in another way here than in any decay model." in told["off"]
+    assert main(["calibrate-microphones", str(path), "-o", str(tmp_path / "one.json"), "--decay", "exponential"]) == 0
+    assert "try another --decay, or auto." in " ".join(capsys.readouterr().out.split())
     exact, off = (float(re.search(r"located to ± ([\d.]+) mm", one)[1]) for one in told.values())
     assert exact < 0.2
     assert off > 2

@@ -34,6 +34,7 @@ class Calibration(eqx.Module):
     - `intensity`: band and window with which the taps' samples were read; None where intensities were given.
     - `name`: of the taps.
     - `strengths`: of the weakest and the strongest tap; None where not known.
+    - `widening`: by which `locate` multiplies covariances, so that ellipses hold taps that were left out of the fit.
 
     The data fix parameters and strengths but for a factor. It is chosen so that the geometric mean of f_i(0) over the
     usable microphones is 1: a source's strength is the intensity that a typical microphone right under it would read.
@@ -46,6 +47,7 @@ class Calibration(eqx.Module):
     intensity: IntensitySettings | None
     name: str = eqx.field(static=True)
     strengths: tuple[float, float] | None = None
+    widening: float = 1.0
 
     @property
     def num_microphones(self) -> int:
@@ -122,6 +124,7 @@ class Calibration(eqx.Module):
             if settings is None
             else {key: float(getattr(settings, key)) for key in ("low", "high", "window", "hop")},
             "strengths": None if self.strengths is None else [float(value) for value in self.strengths],
+            "widening": float(self.widening),
             "microphones": microphones,
         }
 
@@ -169,6 +172,7 @@ class Calibration(eqx.Module):
             None if settings is None else IntensitySettings(**settings),
             str(content["name"]),
             None if strengths is None else _strengths(strengths),
+            _widening(content.get("widening", 1.0)),  # files of older jeits have none
         )
 
 
@@ -209,6 +213,12 @@ def _strengths(value) -> tuple[float, float]:
     if not 0 < low <= high:
         raise ValueError(f"strengths are {low:g} and {high:g}; they must be positive, the weaker first.")
     return low, high
+
+
+def _widening(value) -> float:
+    if not _real(value, "widening") >= 1:
+        raise ValueError(f"widening is {value!r}; it must be 1 or more.")
+    return float(value)
 
 
 def _flag(value, what: str) -> bool:

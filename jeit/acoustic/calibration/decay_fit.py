@@ -2,7 +2,9 @@
 
 Microphones are the first axis, taps the last. Each microphone alone, the taps' strengths given, is a problem of K
 unknowns; all of them together with the strengths one of K M + T, in which the strengths are eliminated (a Schur
-complement): what is left is no larger than the array. All of it is NumPy's, for a calibration is made once.
+complement): what is left is no larger than the array. Microphones of an array are of one kind, mostly: all parameters
+but the first scatter about what the array has in common, by a `spread` that costs; what is common is eliminated too, as
+the mean that costs least. All of it is NumPy's, for a calibration is made once.
 """
 
 from typing import Any, NamedTuple
@@ -11,24 +13,30 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.acoustic.decay import AbstractDecay
-from jeit_solvers import Descent, minimise_small, scipy_lbfgsb, solve_definite
+from jeit_solvers import Descent, minimise_small, solve_definite
 from jeit_solvers.engines import host, slopes
 
 _MOST_STEPS = 100
-# A factor of e to this power is the most that a parameter or a strength changes by in a step.
+# A factor of e to this power is the most that a strength changes by in a step.
 _LONGEST_STEP = 3.0
+# Rounds in which parameters are put to their bounds and taken back.
+_MOST_HELD = 6
 # In units of the weights, which are inverse variances: what is left once the data are met to rounding.
 _SOLVER = Descent(rtol=1e-10, atol=1e-20, damping=1e-2, history=1)
 
 
 class DecayProblem(NamedTuple):
-    """Levels y (M, T) at squared distances r² (m²), with weights (0: not used), and the floors N (M,)."""
+    """Levels y (M, T) at squared distances r² (m²), with weights (0: not used), and the floors N (M,).
+
+    `spread` (K,): by how much the logarithms of a parameter scatter over the microphones; infinite: by any amount.
+    """
 
     level: Float[np.ndarray, "M T"]
     squared_distance: Float[np.ndarray, "M T"]
     weight: Float[np.ndarray, "M T"]
     floor: Float[np.ndarray, " M"]
     decay: type[AbstractDecay]
+    spread: Float[np.ndarray, " K"]
 
     def log_response(self, logarithms: Any) -> Float[np.ndarray, "M T"]:
         """log f of models of these logarithms, (K, M)."""
@@ -80,22 +88,6 @@ def fit_strengths(
     return _minimise(expand, start[None], taps, (np.full(1, -np.inf), np.full(1, np.inf)))[0]
 
 
-def fit_each(
-    problem: DecayProblem, start: Float[np.ndarray, "K M"], strength: Float[np.ndarray, " T"], bounds
-) -> Float[np.ndarray, "K M"]:
-    """Every microphone's parameters between `bounds` on their logarithms, two of (K,), the strengths given."""
-
-    def expand(values, microphones):
-        (level, squared, weight), floor = (array.T for array in microphones[:3]), microphones[3]
-        some = DecayProblem(level, squared, weight, floor, problem.decay)
-        off, _, jacobian = some.expand(values, strength)
-        gradient = -np.einsum("kmt,mt->km", jacobian, weight * off)
-        return 0.5 * np.sum(weight * off**2, axis=1), gradient, np.einsum("kmt,lmt->klm", weight * jacobian, jacobian)
-
-    arrays = problem.level.T, problem.squared_distance.T, problem.weight.T, problem.floor
-    return _minimise(expand, start, arrays, bounds)
-
-
 def _minimise(expand, start, data, bounds) -> np.ndarray:
     lower, upper = (bound[:, None] for bound in bounds)
     longest = np.full_like(lower, _LONGEST_STEP)
@@ -121,6 +113,7 @@ def fit_together(
             change, shift = _step(system, damping)
             slope = np.sum(system.gradient * change) + system.tap_gradient @ shift
             inner = np.einsum("km,lm,mkl->", change, change, system.matrix)
+            inner += np.einsum("km,kmn,kn->", change, system.ties, change)
             across = 2 * np.einsum("km,kmt,t->", change, system.coupling, shift, optimize=True)
             return (
                 np.concatenate([change.ravel(), shift]),
@@ -133,22 +126,29 @@ def fit_together(
     return unpack(_SOLVER.at_once(expand, np.concatenate([start.ravel(), strength]), None, _MOST_STEPS)[0])
 
 
-def fit_between(
-    problem: DecayProblem, start: Float[np.ndarray, "K M"], strength: Float[np.ndarray, " T"], microphone: int, bounds
-) -> tuple[Float[np.ndarray, " K"], float]:
-    """The parameters of one microphone, (K,), between bounds on their logarithms, and their cost, by L-BFGS-B."""
-    # Still with its axis of length one.
-    level, squared, weight, floor = (array[[microphone]] for array in problem[:4])
-    mine = DecayProblem(level, squared, weight, floor, problem.decay)
-
-    first = host.clip(start[:, microphone], *bounds)
-
-    def cost_and_slope(values):
-        off, _, jacobian = mine.expand(np.asarray(values)[:, None], strength)
-        return 0.5 * np.sum(weight * off**2), -np.einsum("kmt,mt->k", jacobian, weight * off)
-
-    found, cost, _ = scipy_lbfgsb(cost_and_slope, first, *bounds, tolerance=1e-12)
-    return found, cost
+def fit_within(
+    problem: DecayProblem,
+    start: Float[np.ndarray, "K M"],
+    strength: Float[np.ndarray, " T"],
+    heard: Bool[np.ndarray, " M"],
+    bounds: tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]],
+) -> tuple[Float[np.ndarray, "K M"], Float[np.ndarray, " T"], Bool[np.ndarray, "K M"]]:
+    """The same, between `bounds` on the logarithms, of the microphones that `heard` something; and which parameters are
+    held at a bound. One comes back from there where the cost falls inwards."""
+    lower, upper = (bound[:, None] for bound in bounds)
+    held = ((start <= lower) | (start >= upper)) & heard
+    values = start
+    for _ in range(_MOST_HELD):
+        slope = _normal_equations(problem, values, strength, heard & np.ones_like(held))[1].gradient
+        inwards = np.where(values <= lower, slope < 0, slope > 0)
+        held &= ~inwards
+        found, strength = fit_together(problem, values, strength, ~held & heard)
+        values = np.clip(np.where(np.isfinite(found), found, values), lower, upper)
+        beyond = (values != found) & ~held & heard
+        held |= beyond
+        if not beyond.any():
+            break
+    return values, strength, held
 
 
 def log_covariance(
@@ -170,9 +170,11 @@ def log_covariance(
 
 
 class _System(NamedTuple):
-    """Normal equations: microphones' blocks (M, K, K), coupling (K, M, T) to the strengths, their diagonal (T,)."""
+    """Normal equations: microphones' blocks (M, K, K), coupling (K, M, T) to the strengths, their diagonal (T,); ties
+    (K, M, M) between microphones."""
 
     matrix: np.ndarray
+    ties: np.ndarray
     coupling: np.ndarray
     tap_matrix: np.ndarray
     gradient: np.ndarray
@@ -183,17 +185,26 @@ class _System(NamedTuple):
 def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[np.ndarray, _System]:
     off, share, jacobian = problem.expand(values, strengths)
     weight = problem.weight
+    ties = _ties(problem)
+    pulled = np.einsum("kmn,kn->km", ties, values)
     jacobian = np.where(free[:, :, None], jacobian, 0.0)
     weighted = weight * jacobian
     system = _System(
         matrix=np.einsum("kmt,lmt->mkl", weighted, jacobian),
+        ties=ties * (free[:, :, None] & free[:, None]),
         coupling=weighted * share,
         tap_matrix=np.sum(weight * share**2, axis=0),
-        gradient=-np.sum(weighted * off, axis=-1),
+        gradient=np.where(free, pulled, 0.0) - np.sum(weighted * off, axis=-1),
         tap_gradient=-np.sum(weight * share * off, axis=0),
         free=free,
     )
-    return 0.5 * np.sum(weight * off**2), system
+    return 0.5 * np.sum(weight * off**2) + 0.5 * np.sum(values * pulled), system
+
+
+def _ties(problem: DecayProblem) -> Float[np.ndarray, "K M M"]:
+    """The matrices of Σ_m (v_m − v̄)² / spread², v̄ the mean over microphones that heard something."""
+    heard = (problem.weight > 0).any(axis=1).astype(float)
+    return (np.diag(heard) - np.outer(heard, heard) / max(heard.sum(), 1.0)) / problem.spread[:, None, None] ** 2
 
 
 def _step(system: _System, damping):
@@ -221,5 +232,7 @@ def _schur(system: _System, damping):
     blocks = system.matrix * (1 + damping * np.eye(number))
     index, full = np.arange(count), np.zeros((number, count, number, count))
     full[:, index, :, index] = blocks
+    parameter = np.arange(number)
+    full[parameter, :, parameter] += system.ties
     coupling = system.coupling.reshape(size, -1)
     return full.reshape(size, size) - (coupling / _tap_diagonal(system, damping)) @ coupling.T

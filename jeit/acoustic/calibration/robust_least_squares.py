@@ -1,25 +1,18 @@
 """Iteratively reweighted least squares: decay models of all microphones, strengths of all taps, the noise of both.
 
-First each microphone alone, the strengths given, and the strengths, the models given, in turn. Then all together, what
-the residuals say of the noise, and new weights, until nothing changes. Every step takes a `TapFit` and returns another.
+First as if all microphones' responses had the same shape, which nearly any taps determine; then each with its own, as
+far as its taps say and as shapes of the array scatter. Between, what the residuals say of the noise, and new weights,
+until nothing changes. Every step takes a `TapFit` and returns another.
 """
 
 from dataclasses import replace
-from operator import itemgetter
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 
-from jeit.acoustic.calibration.decay_fit import (
-    DecayProblem,
-    fit_between,
-    fit_each,
-    fit_strengths,
-    fit_together,
-    log_covariance,
-)
+from jeit.acoustic.calibration.decay_fit import DecayProblem, fit_strengths, fit_within, log_covariance
 from jeit.acoustic.calibration.tap_noise import additive_deviations, relative_errors
 from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise, below_nothing
@@ -30,13 +23,10 @@ _ALTERNATIONS, _REWEIGHTINGS = 6, 12
 _TAIL = 5.0
 # A tap whose mean square residual is so many times the median tap's is left out.
 _OUTLIER = 12.0
-# A shape known no better than to this relative error is not determined by its taps.
+# By how much logarithms of shapes scatter over an array: as if all were alike; at first; at least and at most.
+_ALIKE, _FIRST, _LEAST, _MOST = 0.03, 0.5, 0.1, 1.0
+# A shape that a microphone's own taps tell no better than to this relative error is that of the others.
 _LOOSE = 0.5
-# Microphones whose shapes are determined, from which on the others can share theirs.
-_ENOUGH = 3
-
-# What holds a microphone's parameters: nothing; a bound on them; or, all but the first, the median of the others.
-FREE, BELOW, ABOVE, SHARED = range(4)
 
 
 class TapFit(eqx.Module):
@@ -44,10 +34,10 @@ class TapFit(eqx.Module):
 
     - `squared`: squared distances (M, T), m²; `power`: (M, T) above the floor, NaN where there is none to use.
     - `noise`; `known_noise`: whether its floor was measured.
-    - `values`: logarithms of the decay model's parameters, (K, M), held by `held` (M,); `strength`: (T,) logarithms.
+    - `values`: logarithms of the decay model's parameters, (K, M), those `held` (K, M) at their `bounds`, two of (K,);
+      `spread`: (K,) by how much each scatters over the array. `strength`: (T,) logarithms.
     - `weight`: (M, T) inverse variances of levels, less for what is far off.
     - `outlier`: (T,) taps left out; `dropped`: (M,) microphones left out.
-    - `start`: (K, M) first guess; `bounds`: least and greatest of each parameter, two of (K,).
     """
 
     kind: type[AbstractDecay] = eqx.field(static=True)
@@ -56,12 +46,12 @@ class TapFit(eqx.Module):
     noise: IntensityNoise
     known_noise: bool
     values: Float[np.ndarray, "K M"]
-    held: Int[np.ndarray, " M"]
+    held: Bool[np.ndarray, "K M"]
+    spread: Float[np.ndarray, " K"]
     strength: Float[np.ndarray, " T"]
     weight: Float[np.ndarray, "M T"]
     outlier: Bool[np.ndarray, " T"]
     dropped: Bool[np.ndarray, " M"]
-    start: Float[np.ndarray, "K M"]
     bounds: tuple[np.ndarray, np.ndarray]
 
     @property
@@ -83,9 +73,18 @@ class TapFit(eqx.Module):
     @property
     def free(self) -> Bool[np.ndarray, "K M"]:
         """Parameters that data determine."""
-        free = np.tile((self.held == FREE) & self.usable.any(axis=1), (len(self.kind.parameters), 1))
-        free[0] |= (self.held == SHARED) & self.usable.any(axis=1)
-        return free
+        return ~self.held & self.usable.any(axis=1)
+
+    @property
+    def shared(self) -> Bool[np.ndarray, " M"]:
+        """Microphones whose own taps do not say how their response falls off: it is that of the others.
+
+        Where no tap was near a microphone, b may be anything from nothing up: the least value would have it draw all
+        places to itself.
+        """
+        alone = np.where(np.arange(len(self.spread)) == 1, np.inf, self.spread)
+        own = standard_errors(replace(self, spread=alone))[1]
+        return self.usable.any(axis=1) & ~self.held[1] & ~(own < _LOOSE)
 
     @property
     def level(self) -> Float[np.ndarray, "M T"]:
@@ -95,7 +94,8 @@ class TapFit(eqx.Module):
     def problem(self, *, with_outliers: bool = False) -> DecayProblem:
         """The least-squares problem with the weights as they are."""
         weight = np.where(self.usable if with_outliers else self.use, self.weight, 0.0)
-        return DecayProblem(self.level, self.squared, weight, np.asarray(self.noise.floor), self.kind)
+        floor = np.asarray(self.noise.floor)
+        return DecayProblem(self.level, self.squared, weight, floor, self.kind, self.spread)
 
     def expected(self) -> Float[np.ndarray, "M T"]:
         """Levels that the models say."""
@@ -110,32 +110,31 @@ def fit_taps(
     noise: IntensityNoise,
     known_noise: bool,
 ) -> TapFit:
-    """Alternate between microphones and strengths, then fit until nothing changes, shapes shared where need be."""
+    """Fit all microphones as if they were alike, then each as its own taps say."""
     extent = float(np.sqrt(squared.max()))
     spacing = float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
     lower, upper = (np.array(bound) for bound in kind.bounds(extent))
-    start = kind.start(spacing if spacing > 0 else extent / 4, len(microphones)).logarithms()
-    start, noise = np.asarray(start), on_host(noise)
-    count, taps = squared.shape
+    start = np.asarray(kind.start(spacing if spacing > 0 else extent / 4, len(microphones)).logarithms())
+    taps = squared.shape[1]
     fit = TapFit(
         kind,
         squared,
         power,
-        noise,
+        on_host(noise),
         known_noise,
-        values=start,
-        held=np.full(count, FREE),
+        values=np.clip(start, lower[:, None], upper[:, None]),
+        held=np.zeros(start.shape, bool),
+        spread=_spread(np.full(len(start) - 1, _ALIKE)),
         strength=np.zeros(taps),
         weight=np.zeros(squared.shape),
         outlier=np.zeros(taps, bool),
-        dropped=np.zeros(count, bool),
-        start=start,
+        dropped=np.zeros(len(microphones), bool),
         bounds=(lower, upper),
     )
     # The loudest microphone alone says how strong a tap was.
     seen = np.where(fit.use, power, -np.inf)
     loudest = seen.argmax(axis=0), np.arange(taps)
-    response = fit.problem().log_response(start)
+    response = fit.problem().log_response(fit.values)
     strength = np.log(np.clip(seen[loudest], 1e-300, 1e300)) - response[loudest]
     fit = replace(
         fit,
@@ -143,16 +142,13 @@ def fit_taps(
         # At first the model is good to 20 % at best.
         weight=1 / np.maximum(_level_variance(fit, np.nan_to_num(np.maximum(power, 0.0))), 0.04),
     )
-    for _ in range(_ALTERNATIONS):
-        values = fit_each(fit.problem(), fit.values, fit.strength, fit.bounds)
-        strength = fit_strengths(fit.problem(with_outliers=True), values, fit.strength)
-        fit = _reweighed(replace(fit, values=values, strength=strength))
-    return _share_shapes(_refine(fit))
+    fit = _refine(fit, _ALTERNATIONS)
+    return _refine(replace(fit, spread=_spread(np.full(len(start) - 1, _FIRST))), _REWEIGHTINGS, scattered=True)
 
 
 def refit_without(fit: TapFit, bad: Bool[np.ndarray, " M"]) -> TapFit:
     """Once more, without the microphones that were found to be of no use."""
-    return _refine(replace(fit, dropped=fit.dropped | bad))
+    return _refine(replace(fit, dropped=fit.dropped | bad), _REWEIGHTINGS, scattered=True)
 
 
 def standard_errors(fit: TapFit) -> Float[np.ndarray, "K M"]:
@@ -169,64 +165,38 @@ def standard_errors(fit: TapFit) -> Float[np.ndarray, "K M"]:
     return np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(free.shape)
 
 
-def _refine(fit: TapFit) -> TapFit:
-    """All microphones together, and what their residuals say, until nothing changes."""
-    for _ in range(_REWEIGHTINGS):
-        before, free = fit.values, fit.free
-        values, strength = fit_together(fit.problem(), before, fit.strength, free)
-        fit = _keep_between(replace(fit, values=values, strength=strength))
+def _refine(fit: TapFit, rounds: int, *, scattered: bool = False) -> TapFit:
+    """All microphones together, and what their residuals say, until nothing changes; by how much they scatter is found
+    along, if that is asked for."""
+    for _ in range(rounds):
+        before, heard = fit.values, np.asarray(fit.usable.any(axis=1))
+        values, strength, held = fit_within(fit.problem(), before, fit.strength, heard, fit.bounds)
+        fit = replace(fit, values=values, strength=strength, held=held)
         strength = fit_strengths(fit.problem(with_outliers=True), fit.values, fit.strength)
         fit = _reweighed(replace(fit, strength=strength))
-        if np.abs(fit.values - before)[free].max(initial=0.0) < 1e-9:
+        if scattered:
+            fit = replace(fit, spread=_scatter(fit))
+        if np.abs(fit.values - before)[fit.free].max(initial=0.0) < 1e-9:
             break
     return fit
 
 
-def _share_shapes(fit: TapFit) -> TapFit:
-    """Give the median shape to microphones whose taps do not determine theirs: they are of one kind, mostly.
-
-    Where no tap was near a microphone, b may be anything from nothing up: the least value would have it draw all
-    places to itself.
-    """
-    errors = standard_errors(fit)[1:].max(axis=0)
-    determined = (fit.held == FREE) & (errors < _LOOSE)
-    if determined.sum() < _ENOUGH:
-        return fit
-    shape = np.median(fit.values[1:, determined], axis=1)
-    loose = (fit.held == FREE) & (errors >= _LOOSE)
-    values = np.array(fit.values)
-    pinned = [np.concatenate([limit[:1], shape]) for limit in fit.bounds]
-    # A microphone at its bound has drawn the strengths of its taps along: the others say what they were.
-    bound = fit.held == BELOW
-    # So many deviations squared is the bound from the median, if one is a factor of e.
-    unlikely = float(np.sum((shape - fit.bounds[0][1:]) ** 2))
-    strength = fit_strengths(replace(fit, dropped=fit.dropped | bound).problem(), fit.values, fit.strength)
-    problem = fit.problem()
-    for k in np.flatnonzero(loose | bound):
-        own, shared = (fit_between(problem, fit.values, strength, int(k), limits) for limits in (fit.bounds, pinned))
-        if loose[k] or 2 * (shared[1] - own[1]) < unlikely:
-            loose[k], values[:, k] = True, shared[0]
-    if not loose.any():
-        return fit
-    return _refine(replace(fit, values=values, held=np.where(loose, SHARED, fit.held)))
+def _spread(shapes) -> Float[np.ndarray, " K"]:
+    """Gains may differ by any amount."""
+    return np.concatenate([[np.inf], shapes])
 
 
-def _keep_between(fit: TapFit) -> TapFit:
-    """Fit microphones that left the bounds again between them, also from the first guess, and hold them there until
-    they have come back inside."""
-    lower, upper = fit.bounds
-    values, held = np.array(fit.values), fit.held.copy()
-    beyond = ((values <= lower[:, None]) | (values >= upper[:, None]) | ~np.isfinite(values)).any(axis=0)
-    problem = fit.problem()
-    for k in np.flatnonzero(fit.use.any(axis=1) & (held != SHARED) & (beyond | (held != FREE))):
-        starts = (np.nan_to_num(values), fit.start)
-        found = (fit_between(problem, first, fit.strength, int(k), fit.bounds) for first in starts)
-        values[:, k] = min(found, key=itemgetter(1))[0]
-        if (values[1:, k] >= upper[1:] - 1e-6).any():
-            held[k] = ABOVE
-        else:
-            held[k] = FREE if (values[:, k] > lower + 1e-6).all() else BELOW
-    return replace(fit, values=values, held=held)
+def _scatter(fit: TapFit) -> Float[np.ndarray, " K"]:
+    """The spread of shapes that what is found of each, and how well, makes likeliest (expectation maximisation)."""
+    known = fit.usable.any(axis=1)
+    if known.sum() < 2:
+        return fit.spread
+    shapes, errors = fit.values[1:, known], np.nan_to_num(standard_errors(fit)[1:, known])
+    # One that is off by far says nothing of the others.
+    off = np.abs(shapes - np.median(shapes, axis=1, keepdims=True))
+    near = np.minimum(off, 3 * fit.spread[1:, None])
+    square = (near**2 + errors**2).sum(axis=1) / (known.sum() - 1)
+    return _spread(np.clip(np.sqrt(square), _LEAST, _MOST))
 
 
 def _reweighed(fit: TapFit) -> TapFit:

@@ -12,6 +12,8 @@ from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise
 _BEYOND = 4.0
 # Taps that the median of all microphones counts for in the noise of each.
 _DRAWN = 20.0
+# Taps that say nothing of additive noise.
+_FEW = 8
 
 
 def relative_errors(
@@ -53,22 +55,31 @@ def additive_deviations(
 ) -> Float[np.ndarray, " M"]:
     """s of each microphone, where only intensities are known: what it reads of nothing.
 
-    The likeliest pair of relative and additive deviation, on a grid; 0 unless that is clearly better than none.
+    The likeliest pair of relative and additive deviation, on a grid and a finer one about the best; 0 unless that is
+    clearly better than none. No microphone is believed to be more than twice as quiet as the median one: few taps say
+    little of noise, and one that is taken to be silent takes noise for a touch.
     """
     deviation = np.zeros(len(received))
-    shares = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 50)])
+    coarse = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
     scatter = np.geomspace(LEAST_RELATIVE, 1.0, 30)
     for k in range(len(received)):
-        if use[k].sum() < 8:
+        if use[k].sum() < _FEW:
             continue
         read, signal = power[k, use[k]], received[k, use[k]]
         top = np.abs(read).max()
         if top == 0:
             continue
-        trial = (scatter[:, None, None] * signal) ** 2 + (top * shares[:, None]) ** 2 + 1e-30 * top**2
-        ratio = np.minimum(inflation * (read - signal) ** 2 / trial, _BEYOND**2)
-        score = np.sum(ratio + np.log(trial), axis=-1).min(axis=0)
-        best = int(score.argmin())
-        if score[best] < score[0] - 6:
-            deviation[k] = top * shares[best]
-    return deviation
+
+        def score(shares, read=read, signal=signal, top=top):
+            trial = (scatter[:, None, None] * signal) ** 2 + (top * shares[:, None]) ** 2 + 1e-30 * top**2
+            ratio = np.minimum(inflation * (read - signal) ** 2 / trial, _BEYOND**2)
+            return np.sum(ratio + np.log(trial), axis=-1).min(axis=0)
+
+        scores = score(coarse)
+        best = int(scores.argmin())
+        if scores[best] < scores[0] - 6:
+            near = coarse[best] * np.geomspace(0.5, 2.0, 9)
+            deviation[k] = top * near[score(near).argmin()]
+    judged = use.sum(axis=1) >= _FEW
+    typical = float(np.median(deviation[judged])) if judged.any() else 0.0
+    return np.where(judged, np.maximum(deviation, 0.5 * typical), deviation)

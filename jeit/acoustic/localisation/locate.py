@@ -90,6 +90,7 @@ def locate(
         excess = np.zeros(frames)
         excess[solve] = np.asarray(judge.excess)[:number]
         status[(status == LocationStatus.MISFIT) & (excess > _OUTSIDE)] = LocationStatus.OUTSIDE
+        result["covariance"] *= calibration.widening
         _bound(status, result, float(longer_side(on_host(microphone_array.surface))))
         notes += _notes(status, heard, use, microphone_array)
     return Locations(

@@ -40,8 +40,12 @@ def calibrate_microphones(
         ),
     ],
     decay: Annotated[
-        str, typer.Option(help="inverse-square, a/(r²+b); exponential; or attenuated, the product of both.")
-    ] = "inverse-square",
+        str,
+        typer.Option(
+            help="inverse-square, a/(r²+b); exponential; attenuated, the product of both; or auto, that of them which "
+            "best locates taps left out of the fit."
+        ),
+    ] = "auto",
     low: BandLow = None,
     high: BandHigh = None,
     window: Window = None,
@@ -53,6 +57,7 @@ def calibrate_microphones(
 
     from jeit.acoustic import calibrate_microphones as calibrate
     from jeit.acoustic import read_taps
+    from jeit.acoustic.calibration.calibrate import AUTO
     from jeit.acoustic.decay import find_decay
     from jeit.cli.console import Steps
     from jeit.report import write_calibration
@@ -61,7 +66,7 @@ def calibrate_microphones(
     settings = intensity_settings(low, high, window, hop)
     console = Console(highlight=False)
     with naming_options(_OPTIONS):
-        kind = find_decay(decay)
+        kind = decay if decay == AUTO else find_decay(decay)
         files = calibration_files(output)
         make_folder(output.parent, tuple(file.name for file in files))
         with Steps(console, quiet=quiet) as step:
@@ -85,7 +90,7 @@ def _show(console, fit: "CalibrationFit", taps: "Taps") -> None:
     rows = [
         ("microphones", f"{int(usable.sum())} of {len(usable)} usable"),
         ("taps", f"{len(fit.outlier)}, {int(fit.outlier.sum())} left out as outliers"),
-        ("decay model", calibration.microphone_array.decay.name),
+        ("decay model", f"{calibration.microphone_array.decay.name}: {fit.evidence}"),
         ("error of the model", f"{100 * fit.error:.1f} % of an intensity, median"),
         ("so a touch is located", f"to ± {1e3 * _location_error(fit, taps):.1f} mm by one window, median, at best"),
         *([("note", in_options(fit.note, {"decay": "--decay"}))] if fit.note else []),

@@ -1,0 +1,104 @@
+"""The defaults of hearing on arrays that nobody tuned them for: 200 drawn at random, beside each decay model and a fit
+as one writes it plainly.
+
+How sound falls off, echoes of the edges, gains, noise, how many microphones there are and where, how well and where it
+is tapped: all drawn by a generator that knows none of jeit's decay models (`benchmarks/problems/heard_arrays.py`).
+Choices were made on arrays of other seeds and other ranges, `DEVELOPMENT` there. Then arrays on which sound falls off
+ever faster than a / (r² + b).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.harness.case import Asked, Case, Options, Result, Table, judged
+from benchmarks.harness.timing import say
+from benchmarks.problems.heard_arrays import REPORTED, draw_array, steep_array
+from benchmarks.problems.located_arrays import Located, located_by_each, plainly_located
+from jeit.acoustic.calibration.calibrate import AUTO
+from jeit.acoustic.decay import DECAYS
+
+# Of the first array; how many there are.
+SEED, ARRAYS = 70_000, 200
+# Which arrays a plain fit locates, metres; how much worse than the best fixed model's the median may be.
+WITHIN, WORSE = 0.01, 0.1
+LENGTHS = (0.035, 0.05, 0.065, 0.08)
+PLAIN = "plain fit"
+NAMES = (PLAIN, *DECAYS, AUTO)
+
+
+def told(array) -> dict[str, Located]:
+    """What each way makes of an array."""
+    return {PLAIN: plainly_located(array)} | located_by_each(array)
+
+
+def medians(found: list[dict[str, Located]], name: str) -> np.ndarray:
+    """Of the touches of each array, metres; infinite where it is refused."""
+    return np.array([one[name].median for one in found])
+
+
+def arrays_table(found: list[dict[str, Located]]) -> Table:
+    """A row for each way: what is refused, how far off, and what ellipses hold of what is found."""
+    header = ["decay model", "refused", "of those the plain fit locates", "median, mm", "9 of 10 arrays, mm", "best"]
+    header += ["in the 68 % ellipse", "in the 95 % ellipse", "silence taken for touch"]
+    least = np.min([medians(found, name) for name in DECAYS], axis=0)
+    plain = medians(found, PLAIN) < WITHIN
+    rows = []
+    for name in NAMES:
+        mine = medians(found, name)
+        refused = np.array([bool(one[name].said) for one in found])
+        row = [name, str(refused.sum()), str((refused & plain).sum())]
+        row += [f"{1e3 * np.quantile(mine, part, method='inverted_cdf'):.1f}" for part in (0.5, 0.9)]
+        row += [f"{100 * np.mean(mine <= least):.0f} %"]
+        if name == PLAIN:
+            rows.append([*row, "", "", ""])
+            continue
+        held = [100 * np.nanmean([one[name].held(which) for one in found]) for which in (0, 1)]
+        quiet = 100 * np.mean([one[name].silence for one in found])
+        rows.append([*row, *(f"{share:.0f} %" for share in held), f"{quiet:.2g} %"])
+    return Table(header, rows, f"{len(found)} arrays", "Median: of the medians of 40 touches of each array.")
+
+
+def steep_table(lengths) -> Table:
+    """Medians on 25 microphones under 200 × 200 mm, two arrays of each length."""
+    rows = []
+    for length in lengths:
+        found = [told(steep_array(length, seed)) for seed in (0, 1)]
+        chosen = ", ".join(dict.fromkeys(one[AUTO].decay for one in found))
+        figures = [f"{1e3 * np.mean(medians(found, name)):.1f}" for name in NAMES]
+        rows.append([f"{1e3 * length:.0f} mm", *figures, chosen])
+        say(" | ".join(rows[-1]))
+    return Table(["attenuation length", *(f"{name}, mm" for name in NAMES), "auto takes"], rows)
+
+
+def run(options: Options) -> Result:
+    """Both tables, and what is asked."""
+    number, lengths = (4, LENGTHS[1:2]) if options.quick else (ARRAYS, LENGTHS)
+    found = []
+    for k in range(number):
+        found.append(told(draw_array(REPORTED, SEED + k)))
+        if (k + 1) % 20 == 0:
+            say(f"{k + 1} arrays, median {1e3 * np.median(medians(found, AUTO)):.1f} mm")
+    return Result([arrays_table(found), steep_table(lengths)], asked(found))
+
+
+def asked(found: list[dict[str, Located]]) -> list[Asked]:
+    """None refused that the plain fit locates; the median beside that of the best fixed model."""
+    lost = sum(bool(one[AUTO].said) and one[PLAIN].median < WITHIN for one in found)
+    mine = np.median(medians(found, AUTO))
+    fixed = {name: float(np.median(medians(found, name))) for name in DECAYS}
+    best = min(fixed, key=lambda name: fixed[name])
+    beside = f"{1e3 * mine:.2f} mm; {best} {1e3 * fixed[best]:.2f} mm"
+    return [
+        judged("auto refuses no array that a plain fit locates within 10 mm", f"{lost} refused", lost == 0),
+        judged("auto's median ≤ 1.1 × the best fixed model's", beside, bool(mine <= (1 + WORSE) * fixed[best])),
+    ]
+
+
+CASE = Case(
+    "untuned_arrays",
+    "touches located by sound with the defaults, on 200 arrays drawn at random",
+    run,
+    20,
+    timed=False,
+)

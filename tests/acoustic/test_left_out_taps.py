@@ -1,0 +1,102 @@
+"""Left-out taps: what they say of decay models, and of how wide covariances must be."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from microphone_arrays import MICROPHONES, OUTLINE, listen, models
+
+from jeit.acoustic import Calibration, Intensities, Taps, calibrate_microphones, locate
+from jeit.acoustic.calibration.calibrate import calibrate_each, choose
+from jeit.acoustic.calibration.left_out import LeftOutTaps, _deal
+from jeit.acoustic.decay import DECAYS
+from jeit.layout import grid
+
+ARRAY, PLACES = MICROPHONES[9], grid(0.18, 0.18, 7, 7)
+SQUARED = ((PLACES[:, None] - ARRAY) ** 2).sum(axis=-1)
+LAWS = {
+    "inverse-square": 1e-3 / (SQUARED + 1e-3),
+    "exponential": np.exp(-np.sqrt(SQUARED) / 0.03),
+    "attenuated": np.exp(-np.sqrt(SQUARED) / 0.05) / (SQUARED + 1e-4),
+}
+
+
+def taps(power, error=0.05, seed=0):
+    return Taps(
+        ARRAY, OUTLINE, PLACES, power=power * np.exp(error * np.random.default_rng(seed).normal(size=power.shape))
+    )
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_auto_takes_the_law_that_taps_were_made_by(law):
+    fit = calibrate_microphones(taps(LAWS[law]))
+    assert fit.calibration.microphone_array.decay.name == law
+    assert fit.left_out[0][1] < 2e-3
+    assert {name for name, _ in fit.left_out} == set(DECAYS)
+
+
+def test_what_auto_takes_is_what_that_law_alone_gives():
+    auto, alone = (calibrate_microphones(taps(LAWS["exponential"]), decay=decay) for decay in ("auto", "exponential"))
+    assert eqx.tree_equal(auto.calibration, alone.calibration)
+    assert alone.left_out == auto.left_out[:1]
+
+
+def test_the_simpler_of_two_that_do_as_well():
+    fits, _ = calibrate_each(taps(LAWS["inverse-square"]))
+    off = {"inverse-square": 1.04e-3, "exponential": 5e-3, "attenuated": 1e-3}
+    told = {name: eqx.tree_at(lambda f: f.left_out, fit, ((name, off[name]),)) for name, fit in fits.items()}
+    assert choose(told, {}).calibration.microphone_array.decay.name == "inverse-square"
+    told["inverse-square"] = eqx.tree_at(lambda f: f.left_out, fits["inverse-square"], (("inverse-square", 1.06e-3),))
+    assert choose(told, {}).calibration.microphone_array.decay.name == "attenuated"
+
+
+def test_taps_in_another_order_are_refused_by_every_law():
+    """Each with its reason; and by auto, with the first."""
+    power = np.random.default_rng(1).permutation(LAWS["inverse-square"])
+    fits, refused = calibrate_each(taps(power, 0.2))
+    assert fits == {}
+    assert set(refused) == set(DECAYS)
+    with pytest.raises(ValueError, match="in the order of the taps"):
+        calibrate_microphones(taps(power, 0.2))
+
+
+def test_taps_at_one_place_are_left_out_together():
+    part = _deal(PLACES.repeat(3, axis=0)).reshape(-1, 3)
+    assert (part == part[:, :1]).all()
+    assert np.bincount(part[:, 0]).tolist() == [13, 12, 12, 12]
+
+
+def test_the_widening_is_what_holds_nine_in_ten():
+    square = 3.0 * np.random.default_rng(2).chisquare(2, 4000)
+    taken = LeftOutTaps(np.ones(4000), square, 1.0)
+    assert taken.widening == pytest.approx(3.0, rel=0.06)
+    assert LeftOutTaps(np.ones(4000), square / 9, 1.0).widening == 1
+    assert LeftOutTaps(np.ones(9), square[:9], 1.0).widening == 1
+    assert LeftOutTaps(np.full(9, np.nan), np.full(9, np.nan), 1.0).median == np.inf
+
+
+def test_places_are_as_wide_as_the_calibration_says(tmp_path):
+    """By `widening`, which its file keeps; files without one are of calibrations that widened nothing."""
+    a, b = models(9)
+    calibration = calibrate_microphones(taps(listen(ARRAY, a, b, PLACES)), decay="inverse-square").calibration
+    plain, wide = (eqx.tree_at(lambda c: c.widening, calibration, value) for value in (1.0, 2.5))
+    touch = Intensities(np.arange(2.0), listen(ARRAY, a, b, [[0.01, 0.02], [-0.03, 0.0]]))
+    one, other = locate(touch, plain), locate(touch, wide)
+    np.testing.assert_allclose(other.covariance, 2.5 * one.covariance, rtol=1e-12)
+    np.testing.assert_array_equal(other.position, one.position)
+    wide.save(tmp_path / "wide.json")
+    assert Calibration.load(tmp_path / "wide.json").widening == 2.5
+    text = (tmp_path / "wide.json").read_text("utf-8")
+    (tmp_path / "older.json").write_text(text.replace(' "widening": 2.5,\n', ""), "utf-8")
+    assert Calibration.load(tmp_path / "older.json").widening == 1
+    (tmp_path / "narrow.json").write_text(text.replace('"widening": 2.5', '"widening": 0.5'), "utf-8")
+    with pytest.raises(ValueError, match=r"widening is 0\.5; it must be 1 or more"):
+        Calibration.load(tmp_path / "narrow.json")
+
+
+def test_a_microphone_is_not_believed_to_be_silent():
+    """Of eight that scatter about nothing alike, one by chance hardly: it is half as noisy as the others at least."""
+    rng = np.random.default_rng(4)
+    power = LAWS["exponential"] + 0.02 * rng.normal(size=SQUARED.shape)
+    power[:, 4] = LAWS["exponential"][:, 4]
+    deviation = np.asarray(calibrate_microphones(taps(power, 0.05)).calibration.microphone_array.noise.deviation)
+    assert deviation.min() > 0.4 * np.median(deviation) > 0.004
