@@ -93,6 +93,9 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
     a round and even one, is not found.
     """
     count, orders = model.protocol.num_electrodes, channel_orders(model.protocol)
+    plain = Wiring(tuple(range(count)))
+    if not np.any(np.asarray(measurement.filled())[0]):
+        return replace(plain, misfit=1.0, described=0.0)  # nothing is known of the wiring of a frame without signal
     misfit_of = _comparison(model, measurement, orders)
 
     def least(tried: Iterable[Wiring], so_far: Wiring) -> Wiring:
@@ -108,7 +111,6 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
                 break
         return best
 
-    plain = Wiring(tuple(range(count)))
     best = misfit_of(plain)
     described = 1.0 if best.reversed_signs else best.misfit
     if described < MOST_MISFIT:
@@ -195,8 +197,8 @@ def _exchanged(places: tuple[int, ...], first: int, second: int) -> tuple[int, .
 def _told_places(places: tuple[int, ...], cycles: list[list[int]]) -> str:
     """Which electrodes stand where, in words."""
     if cycles and places in _turns(len(places)):
-        way = "the other way round, " if (places[1] - places[0]) % len(places) != 1 else ""
-        return f"the electrodes look counted {way}electrode 1 standing where {places[0] + 1} should"
+        way = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"
+        return f"the electrodes look counted {way}, electrode 1 standing where {places[0] + 1} should"
     pairs = [f"{first + 1} and {second + 1}" for first, second in (one for one in cycles if len(one) == 2)]
     found = [f"electrodes {', '.join(pairs)} look exchanged"] if pairs else []
     found += [

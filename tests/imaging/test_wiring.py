@@ -99,7 +99,8 @@ def test_electrodes_counted_from_another_one_are_found_where_the_body_shows_it()
     for places in (shifted, mirrored):
         wiring = find_wiring(model, measured(model, domain, places))
         assert wiring.places == places
-        assert "electrode 1 standing where 4 should" in wiring.told
+        way = "from another one" if places == shifted else "the other way round"
+        assert f"look counted {way}, electrode 1 standing where 4 should" in wiring.told
     # A round, even tank looks alike from all electrodes.
     assert find_wiring(MODEL, measured(places=shifted)).as_described
 
@@ -126,6 +127,13 @@ def test_an_image_is_refused_with_what_was_found_and_made_as_it_is_if_asked():
         report_image(image_difference(measured(conductivity=np.where(near, 0.04, 0.02)), measured()))["wiring"]["fault"]
         is None
     )
+
+
+def test_a_frame_without_signal_is_left_to_others():
+    nothing = Measurement(np.zeros(208), np.ones(208, bool), MODEL.protocol, electrodes=ELECTRODES, domain=DISK)
+    assert find_wiring(MODEL, nothing).fault == ""
+    with pytest.raises(ValueError, match="inf times those of the reference"):
+        prepare_difference(measured(), nothing, num_points=300)
 
 
 def measured_tanks(data_folder):
