@@ -1,7 +1,8 @@
 """From two frames to a picture in one call, `image_difference`, and what every rule for λ would choose on the way.
 
-`settings` says how to image, `preparation` checks, meshes and calibrates, `method` images, `difference` looks for
-inclusions; `stream_preparation` makes ready for frame after frame.
+`settings` says how to image, `preparation` checks, meshes and calibrates, `wiring` finds what is not wired as described,
+`method` images, `automatic` decides how, `difference` looks for inclusions; `stream_preparation` makes ready for frame
+after frame.
 """
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
