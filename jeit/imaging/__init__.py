@@ -1,6 +1,6 @@
 """From two frames to a picture in one call, `image_difference`, and what every rule for λ would choose on the way.
 
-`settings` says how to image, `preparation` checks, meshes and calibrates, `wiring` finds what is not wired as described,
+`settings` says how to image, `preparation` checks, meshes and calibrates, `wiring` finds what is not wired as told,
 `method` images, `automatic` decides how, `difference` looks for inclusions; `stream_preparation` makes ready for frame
 after frame.
 """
