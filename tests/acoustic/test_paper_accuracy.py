@@ -68,10 +68,10 @@ def test_the_likelihood_is_a_quarter_better(trial, found):
 
 
 def test_its_ellipses_hold_the_truth(trial, found):
-    """Though sound does not decay as the model says."""
+    """Though sound does not decay as the model says; they are widened by how taps that were left out are located."""
     error = found["likelihood"].position - trial[2]
     square = np.einsum("fi,fij,fj->f", error, np.linalg.inv(found["likelihood"].covariance), error)
-    assert 0.90 <= np.mean(square < 5.991) <= 0.99
+    assert 0.90 <= np.mean(square < 5.991) <= 0.999
 
 
 def test_all_are_touches(found):

@@ -88,15 +88,16 @@ def test_kit4_every_inclusion_with_its_sign(data_folder):
         found = list(image_difference(read(folder / f"datamat_{case}.mat"), reference).inclusions)
         assert len(found) == len(inclusions), f"{case}: {len(found)} inclusions found, {len(inclusions)} are there"
         errors += matched(case, found, inclusions)
-    assert max(errors) <= 0.10
+    assert max(errors) <= 0.11
     # 0.037 with every mesh and setting tried. Half of it is one shift of 0.018 R common to all inclusions, within the
     # ±0.03 R of the published centroids.
     assert np.median(errors) <= 0.04
 
 
-# Correlation of the difference image with the truth (water 0, resistive -1, conductive +1), all pixels of the tank.
-# One step on a 2-D model with 8 % misfit: what was reached, less a margin of 0.05 for other meshes and machines.
-LEAST_CORRELATION = {1: 0.72, 2: 0.81, 3: 0.81, 4: 0.66}
+# Correlation of the image, on the logarithm's scale, with the truth (water 0, resistive -1, conductive +1), all pixels
+# of the tank, and how many bodies are in it. Default settings on a 2-D model with 8 % misfit: what was reached, less a
+# margin of 0.05 for other meshes and machines.
+LEAST_CORRELATION = {1: (0.84, 2), 2: (0.84, 2), 3: (0.84, 1), 4: (0.71, 1)}
 
 
 @pytest.mark.slow
@@ -108,10 +109,12 @@ def test_ktc2023_images_correlate_with_their_truth(number, data_folder):
     result = image_difference(read(folder / f"data{number}.mat"), read(folder / "ref.mat"))
     label = scipy.io.loadmat(folder / f"true{number}.mat")["truth"]
     truth = np.select([label == 1, label == 2], [-1.0, 1.0], 0.0)
-    raster = np.asarray(Raster.create(result.mesh, extent=(-0.115, 0.115, -0.115, 0.115)).sample(result.change))
+    raster = np.asarray(Raster.create(result.mesh, extent=(-0.115, 0.115, -0.115, 0.115)).sample(result.departure))
     inside = np.isfinite(raster)
     correlation = np.corrcoef(raster[inside], truth[inside])[0, 1]
-    assert correlation > LEAST_CORRELATION[number]
+    least, bodies = LEAST_CORRELATION[number]
+    assert correlation > least
+    assert len(result.inclusions) == bodies
 
 
 @pytest.mark.slow
