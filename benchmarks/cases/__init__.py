@@ -21,6 +21,7 @@ NAMES = (
     "contacts",
     "localisation_error",
     "mixed_tanks",
+    "cut_tanks",
     "untuned_arrays",
     "ktc2023",
     "real_skins",

@@ -1,7 +1,8 @@
 """The Kuopio Tomography Challenge 2023 on its four training targets.
 
 Difficulty level l leaves out electrodes 1 to 2(l - 1), as injectors and as meters; the seven levels are made from the
-complete data by masking. One setting for all: total variation, jeit's defaults.
+complete data by masking frame and reference. `jeit reconstruct --segment`, its defaults, which were set on simulated
+tanks (`problems/cut_tanks.py`), beside total variation.
 """
 
 from __future__ import annotations
@@ -10,44 +11,43 @@ import os
 import time
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.io
 
 from benchmarks.harness.case import NOT_MEASURED, Asked, Case, Headline, Options, Result, Table, judged
 from benchmarks.harness.machine import ROOT
 from benchmarks.harness.timing import say
+from benchmarks.problems.cut_tanks import without
 from jeit.data import read
-from jeit.image import Raster, segment
 from jeit.image.score import challenge_score
-from jeit.imaging.preparation import prepare_difference
-from jeit.inverse import TotalVariation, reconstruct
-from jeit.inverse.nonlinear import GaussNewton
+from jeit.imaging import ImagingSettings, image_difference
 
 LEVELS, TARGETS = range(1, 8), range(1, 5)
-# The mean score at level 1.
-SCORE = 0.85
+METHOD, OTHER = "auto", "total-variation"
+# Mean scores: of all levels, and of those from the fourth on.
+ALL, HARD = 0.8, 0.7
 
 
 def run(options: Options) -> Result:
     """All levels of all targets; one of each in a quick run. Without the challenge's data, nothing."""
-    asked = f"mean score at level 1: ≥ {SCORE}"
+    asked = f"mean score of all levels ≥ {ALL}", f"mean score of levels 4 to 7 ≥ {HARD}"
     folder = _folder(options.data)
     if folder is None:
         note = "the challenge's training data (ref.mat, data1.mat … true4.mat) are not there: give --data FOLDER"
-        return Result([Table(["level", "mean"], [])], [Asked(asked, "–", NOT_MEASURED)], [note])
-    levels, targets, nodes = (LEVELS[:1], TARGETS[:1], 400) if options.quick else (LEVELS, TARGETS, 1600)
-    table = scores(folder, nodes, levels, targets, say)
+        return Result([Table(["level", "mean"], [])], [Asked(one, "–", NOT_MEASURED) for one in asked], [note])
+    levels, targets, nodes = (LEVELS[:1], TARGETS[:1], 400) if options.quick else (LEVELS, TARGETS, 2000)
+    table, other = (scores(folder, method, nodes, levels, targets, say) for method in (METHOD, OTHER))
     rows = [
-        [str(level), *(f"{value:.3f}" for value in row), f"**{row.mean():.3f}**"]
-        for level, row in zip(levels, table, strict=True)
+        [str(level), *(f"{value:.3f}" for value in row), f"**{row.mean():.3f}**", f"{beside.mean():.3f}"]
+        for level, row, beside in zip(levels, table, other, strict=True)
     ]
-    rows.append(["all", *len(targets) * [""], f"**{table.mean():.3f}**"])
-    header = ["level", *(f"target {target}" for target in targets), "mean"]
-    first = float(table[0].mean())
-    job = f"Kuopio Tomography Challenge 2023, {len(targets)} training targets, score of level 1"
-    headline = Headline(job, f"{first:.3f}", accuracy=f"{table.mean():.3f} over all {len(levels)} levels")
-    return Result([Table(header, rows)], [judged(asked, f"{first:.3f}", first >= SCORE)], headline=headline)
+    rows.append(["all", *len(targets) * [""], f"**{table.mean():.3f}**", f"{other.mean():.3f}"])
+    header = ["level", *(f"target {target}" for target in targets), "mean", OTHER.replace("-", " ")]
+    every, hard = float(table.mean()), float(table[3:].mean()) if len(levels) > 3 else float("nan")
+    job = f"Kuopio Tomography Challenge 2023, {len(targets)} training targets, mean score of all {len(levels)} levels"
+    headline = Headline(job, f"{every:.3f}", accuracy=f"{hard:.3f} over levels 4 to 7")
+    verdicts = [judged(asked[0], f"{every:.3f}", every >= ALL), judged(asked[1], f"{hard:.3f}", hard >= HARD)]
+    return Result([Table(header, rows)], verdicts, headline=headline)
 
 
 def _folder(data: Path | None) -> Path | None:
@@ -56,36 +56,24 @@ def _folder(data: Path | None) -> Path | None:
     return next((path for path in (named, named / "ktc2023") if (path / "ref.mat").is_file()), None)
 
 
-def scores(folder: Path, num_points: int = 1600, levels=LEVELS, targets=TARGETS, report=print) -> np.ndarray:
+def scores(
+    folder: Path, method: str, num_points: int = 2000, levels=LEVELS, targets=TARGETS, report=print
+) -> np.ndarray:
     """Scores (levels, targets)."""
     reference = read(folder / "ref.mat")
     table = np.zeros((len(levels), len(targets)))
-    prepared = prepare_difference(read(folder / "data1.mat"), reference, contact="common", num_points=num_points)
-    model, background = prepared.model, prepared.calibration.conductivity
-    raster = Raster.create(model.mesh, extent=(-0.115, 0.115, -0.115, 0.115))
-    empty = model.voltages(background)
+    settings = ImagingSettings(method=method, segment=True, num_points=num_points)
     for row, level in enumerate(levels):
         gone = list(range(2 * (level - 1)))
         for column, target in enumerate(targets):
             frame = read(folder / f"data{target}.mat")
-            mask = np.array(frame.mask[0] & reference.mask[0])
-            if gone:
-                mask &= np.asarray(frame.protocol.mask_without(gone))
-            difference = jnp.where(mask, frame.filled()[0] - reference.filled()[0], 0)
             start = time.perf_counter()
-            found = reconstruct(
-                model, empty + difference, background,
-                prior=TotalVariation(), noise=prepared.relative_noise, mask=mask, solver=GaussNewton(max_steps=100),
-            )  # fmt: skip
-            image = raster.sample(jnp.log(found.conductivity / background))
+            found = image_difference(without(frame, gone), without(reference, gone), settings)
             seconds = time.perf_counter() - start
-            labels = segment(np.asarray(image))
+            assert found.labels is not None
             truth = scipy.io.loadmat(folder / f"true{target}.mat")["truth"]
-            table[row, column] = challenge_score(labels, truth)
-            report(
-                f"level {level}, target {target}: {table[row, column]:.3f}  ({found.status}, {found.iterations} "
-                f"steps, {seconds:.1f} s)"
-            )
+            table[row, column] = challenge_score(found.labels, truth)
+            report(f"{method}, level {level}, target {target}: {table[row, column]:.3f}  ({seconds:.1f} s)")
     return table
 
 

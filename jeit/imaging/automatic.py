@@ -1,4 +1,4 @@
-"""Linear or not: the one-step image where it is sound, Gauss-Newton's where it is not, and why."""
+"""Linear or not: one step where that is sound, Gauss-Newton and shapes of strong bodies where it is not; and why."""
 
 from typing import NamedTuple
 
@@ -6,9 +6,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import percent
-from jeit.imaging.method import METHODS, Imaged, NamedPrior
+from jeit.imaging.method import METHODS, Imaged, NamedPrior, shapes_in
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
+from jeit.inverse.shapes import ShapeReconstruction
 
 # Change relative to the background beyond which voltages are far from linear in it.
 _STRONG = 0.3
@@ -21,28 +22,50 @@ _STEP = 1e-4
 
 
 class Chosen(NamedTuple):
-    """**Fields**: `method` chosen, `why`, in a sentence, and what it `imaged`."""
+    """**Fields**: `method` chosen; `why`, in a sentence; what it `imaged`; `shapes` of the bodies in it, if those
+    explain the voltages."""
 
     method: str
     why: str
     imaged: Imaged
+    shapes: ShapeReconstruction | None = None
 
 
-def image_automatically(prepared: PreparedDifference, prior: NamedPrior) -> Chosen:
-    """The one-step image, unless it is unsound; then Gauss-Newton's, unless that fails. Each with its default λ."""
+def image_automatically(prepared: PreparedDifference, prior: NamedPrior, segmented: bool = False) -> Chosen:
+    """The one-step image, unless it is unsound; then Gauss-Newton's with its bodies as shapes, unless that fails.
+
+    Each with its default λ. To be `segmented`, and no shapes: the image by total variation.
+    """
     linear, newton = METHODS["one-step"], METHODS["gauss-newton"]
     imaged = linear.image(prepared, prior, linear.hyperparameter)
     if np.iscomplexobj(prepared.difference):
         return Chosen("one-step", "images of complex voltages are linear.", imaged)
     fault = unsound(prepared, imaged[1])
-    if not fault:
-        return Chosen("one-step", "the linear image is sound: changes are small, and it explains the voltages.", imaged)
-    try:
-        better = newton.image(prepared, prior, newton.hyperparameter)
-    except ValueError as error:
-        return Chosen("one-step", f"{fault}; but Gauss-Newton found no image. {error}", imaged)
-    assert isinstance(better[0], Reconstruction)
-    return Chosen("gauss-newton", f"{fault}: solved for conductivity itself.", better)
+    if fault:
+        try:
+            better = newton.image(prepared, prior, newton.hyperparameter)
+        except ValueError as error:
+            return Chosen("one-step", f"{fault}; but Gauss-Newton found no image. {error}", imaged)
+        assert isinstance(better[0], Reconstruction)
+        shapes = _shapes(prepared, better[0])
+        if shapes is not None or not segmented:
+            outlined = "" if shapes is None else ", and its bodies' outlines fitted"
+            return Chosen("gauss-newton", f"{fault}: solved for conductivity itself{outlined}.", better, shapes)
+    if segmented:
+        pieces = METHODS["total-variation"]
+        why = f"{fault or 'bodies are weak'}: cut up an image of few pieces."
+        return Chosen("total-variation", why, pieces.image(prepared, prior, pieces.hyperparameter))
+    return Chosen("one-step", "the linear image is sound: changes are small, and it explains the voltages.", imaged)
+
+
+def _shapes(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReconstruction | None:
+    """The bodies of a smooth image as shapes, if there are any and they explain the voltages within their noise, or as
+    well as the image does."""
+    if prepared.mesh.dimension != 2:
+        return None
+    found = shapes_in(prepared, smooth)
+    explains = float(found.misfit) <= max(1.0, float(smooth.misfit))
+    return found if found.stars and explains else None
 
 
 def unsound(prepared: PreparedDifference, change: Float[Array, " m"]) -> str:

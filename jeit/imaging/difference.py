@@ -4,7 +4,7 @@ This is what `jeit reconstruct` runs, as one function. Its steps are the public 
 `jeit.imaging.preparation`, `jeit.inverse` and `jeit.image`; take them from there for anything out of the ordinary.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Inexact, UInt8
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
 from jeit.image import Inclusion, Raster, find_inclusions, labelled_inclusions, segment
+from jeit.image.score import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
 from jeit.imaging.clock import Clock
 from jeit.imaging.method import METHODS
@@ -23,6 +24,7 @@ from jeit.inverse.calibration import Calibration
 from jeit.inverse.image_noise import image_noise
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
+from jeit.inverse.shapes import ShapeReconstruction, Star
 from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array
 
@@ -36,14 +38,18 @@ class ImagedDifference:
     - `settings`: how it was imaged, with what was decided on the way filled in; `why` the method, if that was decided.
     - `wiring`: how electrodes and channels seem to be connected.
     - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
-    - `reconstruction`: the reconstruction matrix, or what the iteration found; with the hyperparameter used and the
-      rule that chose it.
+    - `reconstruction`: the reconstruction matrix, or what the iteration found, or the shapes; with the hyperparameter
+      used and the rule that chose it.
     - `change`: change of conductivity in every cell (m,), S/m (2-D: S); against `calibration.conductivity`. Of complex
       voltages the change of admittivity σ + iωε, complex like the background.
     - `raster`: `change` on a grid, NaN outside the mesh; `extent` (x_min, x_max, y_min, y_max) in metres.
     - `inclusions`: regions of changed conductivity, strongest first; iterative images are looked at on the scale of the
-      logarithm, which weighs both signs alike, and for what stands out of the noise; complex ones in the real part. Of
-      an image that was segmented, those of the `labels`.
+      logarithm, which weighs both signs alike, and for what stands out of the noise; complex ones in the real part.
+      Where there are `shapes`, those; of an image that was segmented without, those of the `labels`.
+    - `unlike_electrodes`: electrodes, counted from 0, of which the model misses far more than of the others, and how
+      many times as much; channels that read them count less.
+    - `shapes`: strong bodies with their outlines, and what each explains; None where none were fitted, or they do not
+      explain the voltages.
     - `labels`: 0 background, 1 resistive, 2 conductive for every pixel of the raster, if asked for.
     - `timings`: seconds of each step.
     """
@@ -53,13 +59,15 @@ class ImagedDifference:
     quality: FrameQuality
     settings: ImagingSettings
     calibration: Calibration
-    reconstruction: LinearReconstruction | Reconstruction
+    reconstruction: LinearReconstruction | Reconstruction | ShapeReconstruction
     change: Inexact[Array, " m"]
     raster: Inexact[Array, "rows columns"]
     extent: tuple[float, float, float, float]
     inclusions: tuple[Inclusion, ...]
     wiring: Wiring
     why: str = ""
+    unlike_electrodes: dict[int, float] = field(default_factory=dict)
+    shapes: ShapeReconstruction | None = None
     labels: UInt8[np.ndarray, "rows columns"] | None = None
     timings: dict[str, float] = field(default_factory=dict)
 
@@ -89,7 +97,7 @@ class ImagedDifference:
     @property
     def iterative(self) -> bool:
         """Whether the image solves for conductivity itself."""
-        return isinstance(self.reconstruction, Reconstruction)
+        return isinstance(self.reconstruction, Reconstruction | ShapeReconstruction)
 
     @property
     def departure(self) -> Float[Array, " m"]:
@@ -128,13 +136,16 @@ def image_difference(
     )
     calibration, mesh = prepared.calibration, prepared.mesh
     with clock("image"):
-        why = ""
+        why, shapes = "", None
         if settings.method == AUTO:
-            chosen, why, (reconstruction, change) = image_automatically(prepared, settings.prior)
+            chosen, why, (reconstruction, change), shapes = image_automatically(
+                prepared, settings.prior, settings.segment
+            )
             settings = replace(settings, method=chosen)
         else:
             method = METHODS[settings.method]
             reconstruction, change = method.image(prepared, settings.prior, settings.hyperparameter)
+            shapes = reconstruction if isinstance(reconstruction, ShapeReconstruction) else None
         largest = float(np.abs(change).max())
         if not largest > 1e-9 * abs(complex(calibration.conductivity)):
             raise ValueError(
@@ -157,23 +168,45 @@ def image_difference(
             inclusions=(),
             wiring=prepared.wiring,
             why=why,
+            unlike_electrodes=prepared.unlike_electrodes,
+            shapes=shapes,
             timings=clock.seconds,
         )
-        departure, labels = as_array(np.real(found.departure)), None
-        if settings.segment:
-            pixels = np.asarray(grid.sample(departure))
-            labels = segment(pixels)
-            inclusions = labelled_inclusions(labels, pixels, grid)
-        else:
-            noise = None
-            if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
-                noise = as_array(image_noise(reconstruction))
-            inclusions = find_inclusions(
-                mesh, departure, level=settings.level, least_peak=settings.least_peak, noise=noise
-            )
-        if found.iterative:
-            inclusions = [_with_change(one, calibration.conductivity) for one in inclusions]
+        inclusions, labels = _inclusions(found, grid)
     return replace(found, inclusions=tuple(inclusions), labels=labels)
+
+
+def _inclusions(
+    found: ImagedDifference, grid: Raster
+) -> tuple[list[Inclusion], UInt8[np.ndarray, "rows columns"] | None]:
+    """What an image shows as inclusions, with changes of conductivity for peaks; and labels, if they are asked for."""
+    settings, reconstruction, background = found.settings, found.reconstruction, found.calibration.conductivity
+    if found.shapes is not None:
+        stars = found.shapes.stars
+        labels = _labels(stars, grid) if settings.segment else None
+        listed = [Inclusion(one.sign, tuple(one.centroid.tolist()), one.area, one.sign * one.contrast) for one in stars]
+        return [_with_change(one, background) for one in listed], labels
+    departure, labels, noise = as_array(np.real(found.departure)), None, None
+    if settings.segment:
+        pixels = np.asarray(grid.sample(departure))
+        labels = segment(pixels)
+        inclusions = labelled_inclusions(labels, pixels, grid)
+    else:
+        if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
+            noise = as_array(image_noise(reconstruction))
+        inclusions = find_inclusions(
+            found.mesh, departure, level=settings.level, least_peak=settings.least_peak, noise=noise
+        )
+    return [_with_change(one, background) for one in inclusions] if found.iterative else inclusions, labels
+
+
+def _labels(stars: Sequence[Star], grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
+    """Which pixels lie in a star of either sign, of the strongest where two meet."""
+    centres, inside = grid.pixel_centres(), np.asarray(grid.cell) >= 0
+    labels = np.zeros(inside.shape, np.uint8)
+    for one in reversed(stars):
+        labels[inside & one.holds(centres)] = CONDUCTIVE if one.sign > 0 else RESISTIVE
+    return labels
 
 
 def _sampled(grid: Raster, change) -> Inexact[Array, "rows columns"]:

@@ -1,5 +1,6 @@
 """What comes before any image of measured data: two frames checked, a mesh, and a model calibrated on the reference."""
 
+import functools
 from dataclasses import dataclass
 
 import jax
@@ -15,11 +16,14 @@ from jeit.imaging.clock import Clock
 from jeit.imaging.wiring import Wiring, find_wiring
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
+from jeit.inverse.channel_weights import electrode_misfits
 from jeit.mesh import Body, Mesh
 from jeit_solvers.engines import as_array
 
 # Of a difference, what no model is taken to explain better than.
 _LEAST_MISFIT = 0.03
+# How many times as much the model misses of an electrode that is not like the others; of sound tanks at most 2.6.
+_UNLIKE = 3.0
 
 
 @dataclass(frozen=True)
@@ -57,8 +61,24 @@ class PreparedDifference:
 
     @property
     def relative_noise(self) -> Float[Array, " M"]:
-        """How far channels are trusted relative to each other: `relative_noise` of the reference, volts."""
-        return relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
+        """How far channels are trusted relative to each other: `relative_noise` of the reference, volts; as many times
+        that as the model misses more of an unlike electrode that a channel reads."""
+        trusted = relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
+        reads = np.asarray(self.model.protocol.channel_measurement) != 0
+        return as_array(trusted * np.max(np.where(reads, self._doubt, 1), axis=1))
+
+    @property
+    def unlike_electrodes(self) -> dict[int, float]:
+        """Electrodes, counted from 0, of whose channels the model misses far more of the reference than of the others',
+        and how many times as much: of an uneven gain, loose, or out of place. Channels that read them count less."""
+        return {int(one): float(self._doubt[one]) for one in np.flatnonzero(self._doubt > 1)}
+
+    @functools.cached_property
+    def _doubt(self) -> Float[np.ndarray, " L"]:
+        base = np.asarray(self.reference.voltages)[0]
+        residual = np.asarray(self.calibration.voltages) - base
+        misfits = electrode_misfits(self.model.protocol, residual, relative_noise(base, self.mask), self.mask)
+        return np.where(misfits > _UNLIKE, misfits, 1)
 
     @property
     def noise(self) -> float | None:

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jeit.protocol import Protocol
 from jeit_solvers.engines import either_engine, namespace
 
 
@@ -21,6 +22,24 @@ def relative_noise(
     used = xp.isfinite(size) if mask is None else xp.asarray(mask) & xp.isfinite(size)
     typical = xp.nanmedian(xp.where(used, size, xp.nan))
     return xp.where(used, relative * xp.sqrt(xp.where(used, size, 0) ** 2 + (floor * typical) ** 2), 1.0)
+
+
+def electrode_misfits(
+    protocol: Protocol, residual: Float[Array, " M"], noise: Float[Array, " M"], mask: Bool[Array, " M"]
+) -> Float[np.ndarray, " L"]:
+    """How much of the channels that read an electrode a model misses, (L,), over the median of all electrodes.
+
+    `residual` (M,): predicted less measured, volts; `noise` (M,) volts, see `relative_noise`; `mask`: True for usable
+    channels. 1 for electrodes that none of those reads. An electrode far above 1 has a gain, an offset or a place of
+    its own.
+    """
+    used = np.asarray(mask)
+    reads = (np.asarray(protocol.channel_measurement) != 0) & used[:, None]
+    square = np.where(used, np.abs(np.asarray(residual) / np.asarray(noise)) ** 2, 0) @ reads
+    count = reads.sum(axis=0)
+    missed = np.sqrt(square / np.maximum(count, 1))
+    typical = np.median(missed[count > 0])
+    return np.where((count > 0) & (typical > 0), missed / max(typical, 1e-300), 1.0)
 
 
 def repeated_noise(frames, mask=None, *, prior_frames: float = 4.0) -> Float[np.ndarray, " M"]:

@@ -11,7 +11,7 @@ from jeit.image import Inclusion
 from jeit.imaging.difference import ImagedDifference
 from jeit.imaging.method import METHODS
 from jeit.imaging.settings import ImagingSettings
-from jeit.inverse.linear.one_step import LinearReconstruction
+from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.protocol import Protocol
 from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain, version_of
 from jeit.report.folder import results_folder
@@ -52,7 +52,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     from jeit.plot.colour_scale import CHANGE, ColourScale
     from jeit.plot.imaging.admittivity import plot_admittivity
     from jeit.plot.imaging.image import plot_image
-    from jeit.plot.imaging.labels import draw_labels
+    from jeit.plot.imaging.labels import draw_labels, draw_outlines
 
     if result.is_complex:
         figure = Figure(figsize=(11.5, 5.2), layout="constrained")
@@ -66,7 +66,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         result.mesh,
         np.asarray(result.departure) / (math.log(10) if result.iterative else 1),
         result.calibration.model.electrodes,
-        inclusions=result.inclusions if result.labels is None else (),
+        inclusions=result.inclusions if result.labels is None and result.shapes is None else (),
         title=result.measurement.name + ("" if height is None else f", slice at z = {1e3 * height:.1f} mm"),
         height=height,
         scale=ColourScale(quantity="log₁₀ of conductivity over background", unit="") if result.iterative else CHANGE,
@@ -77,6 +77,8 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         ax.plot(*truth, color="#157f3b", label="pressed here", **ring)
     if result.labels is not None:
         draw_labels(result.labels, result.extent, ax=ax)
+    elif result.shapes is not None:
+        draw_outlines(result.shapes.stars, ax=ax)
     elif result.inclusions:
         found = "found: sign and area" if height is None else "found: sign, and a ball of its volume"
         ax.plot([], [], color="black", linewidth=1, linestyle=(0, (4, 3)), label=found)
@@ -118,6 +120,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "relative_to_difference": noise.relative,
             "method": noise.method,
         },
+        "unlike_electrodes": result.unlike_electrodes,
         "wiring": {"fault": result.wiring.fault or None, "misfit": result.wiring.described},
         "quality": {
             "relative_difference": quality.difference,
@@ -139,6 +142,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "note": (reconstruction.choice.note or None) if reconstruction.choice is not None else None,
         },
         "inclusions": [_inclusion(result, one) for one in result.inclusions],
+        "shapes": _shapes(result),
         "inclusion_settings": {"level": settings.level, "least_peak": settings.least_peak}
         if result.labels is None
         else {"found_in": "labels"},
@@ -195,6 +199,28 @@ def _inclusion(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]
     }
 
 
+def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
+    """Strong bodies with their outlines, and what was taken for a ghost; None where none were fitted."""
+    if result.shapes is None:
+        return None
+    kept, left = (
+        [
+            {"sign": one.sign, "centroid": one.centroid, "area": one.area, "outline": one.outline, "rise": one.rise}
+            for one in stars
+        ]
+        for stars in (result.shapes.stars, result.shapes.doubtful)
+    )
+    return {
+        "bodies": kept,
+        "left_out": left,
+        "length_unit": "m",
+        "rise": "how many times the objective rises if the body is left out",
+        "misfit": float(result.shapes.misfit),
+        "misfit_unit": "standard deviations",
+        "drift_of_background": result.shapes.drift,
+    }
+
+
 def _prior(settings: ImagingSettings) -> str | None:
     """The prior's name, or that of the method's own; None where there is none."""
     method = METHODS[settings.method]
@@ -206,7 +232,7 @@ def _prior(settings: ImagingSettings) -> str | None:
 def _iteration(result: ImagedDifference) -> dict[str, Any]:
     """How the iteration went; nothing for linear images."""
     found = result.reconstruction
-    if isinstance(found, LinearReconstruction):
+    if not isinstance(found, Reconstruction):
         return {}
     return {
         "status": str(found.status),

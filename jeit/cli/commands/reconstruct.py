@@ -35,7 +35,8 @@ def reconstruct(
         str | None,
         typer.Option(
             help="auto (default): one-step, or gauss-newton where that is unsound; one-step, back-projection, "
-            "filtered-back-projection; gauss-newton, levenberg-marquardt, total-variation (default with --segment)."
+            "filtered-back-projection; gauss-newton, levenberg-marquardt, total-variation; shapes, outlines of strong "
+            "bodies."
         ),
     ] = None,
     prior: Annotated[
@@ -73,8 +74,6 @@ def reconstruct(
     from jeit.imaging import METHODS, ImagingSettings, image_difference
     from jeit.report import write_image
 
-    if segment and method is None:
-        method = "total-variation"
     given = {
         "segment": segment,
         "method": method,
@@ -147,8 +146,15 @@ def show(console, result: "ImagedDifference") -> None:
             "or shown where none are; leave out --method, or take gauss-newton"
         )
         rows.append(("linear image", fall))
+    if result.shapes is not None:
+        left = f"; {counted(len(result.shapes.doubtful), 'ghost')} left out" if result.shapes.doubtful else ""
+        drift = f"the background has drifted by {percent(result.shapes.drift)}"
+        rows.append(("bodies", f"{counted(len(result.shapes.stars), 'outline')} fitted{left}; {drift}"))
     if result.why:
         rows.append(("chosen, for", result.why))
+    if unlike := result.unlike_electrodes:
+        numbers = ", ".join(f"{one + 1} ({times:.1f} times)" for one, times in unlike.items())
+        rows.append(("note", f"more misfit than at other electrodes at {numbers}: what reads them counts less"))
     if result.wiring.fault:
         rows.append(("wiring", result.wiring.fault))
     rows += [("note", note) for note in dict.fromkeys((*result.measurement.notes, *result.reference.notes))]

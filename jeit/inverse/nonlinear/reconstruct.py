@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
 from jeit.forward.model import evaluate, voltages_of
-from jeit.inverse.channels import Data, IndependentChannels
+from jeit.inverse.channels import Data
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
 from jeit.inverse.nonlinear.informed import informed
+from jeit.inverse.nonlinear.observed import independent_data
 from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametrisation
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.solvers import LBFGSB, SOLVERS, AbstractSolver, GaussNewton, as_solver
@@ -132,20 +133,9 @@ def reconstruct(
     deviation = check_noise(noise, measured, used)
     solver = _solver_for(solver, prior, parametrisation)
     box = parametrisation.box(background) if solver.keeps_bounds else None
-    kept = np.flatnonzero(used)
     _check_protocol(model, used)
-    observed = model if used.all() else model.with_protocol(model.protocol.subset(kept))
-    channels = IndependentChannels.create(observed.protocol)
-    small = observed
-    if has_values(observed.protocol):
-        small = observed.with_protocol(observed.protocol.subset(np.asarray(channels.index)))
-    if (
-        has_values(small)
-        and model.at_once
-        and not (parametrisation.unknowns or solver.keeps_bounds or solver.needs_squares)
-    ):
-        small, channels = on_host((small, channels))  # and so is all that is made of them
-    data = channels.weigh(deviation[kept]).combine(measured[kept])
+    plain = not (parametrisation.unknowns or solver.keeps_bounds or solver.needs_squares)
+    small, data = independent_data(model, measured, used, deviation, at_once=plain)
     inversion, choice = pose(
         small, data, background, prior, hyperparameter, parametrisation, per_cell=solver.keeps_bounds
     )
@@ -159,6 +149,7 @@ def reconstruct(
     fitted, conductivity = inversion.applied(model, coefficients), _conductivity(inversion, coefficients)
     predicted = evaluate(fitted, voltages_of, conductivity)
     xp = jnp if not has_values(predicted, measured, deviation) else np
+    kept = np.flatnonzero(used)
     excess = ((xp.asarray(predicted) - xp.asarray(measured)) / xp.asarray(deviation))[kept]
     if xp is jnp or not isinstance(status, Status):
         broken = ~(jnp.isfinite(conductivity).all() & jnp.isfinite(excess).all())

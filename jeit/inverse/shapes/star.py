@@ -1,0 +1,241 @@
+"""Star shapes: an outline r(θ) round a centre, a strong contrast inside, and the bath that may have drifted.
+
+    log r(θ) = log r₀ + Σ aₙ cos nθ + bₙ sin nθ,  n = 2 … N;   log σ/σ₀ = drift + Σ_bodies ± contrast · (share inside)
+
+Everything is estimated in units of its prior's standard deviation, so that the penalty is ½‖c‖².
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Complex, Float
+
+from jeit.arguments import is_number, told
+from jeit.mesh import Mesh, measures
+
+# Corners' weights of the six points at which a cell is asked whether it lies in a body.
+_SAMPLES = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2.5, 2.5, 1], [2.5, 1, 2.5], [1, 2.5, 2.5]]) / 6
+# Over how much of a cell's size an outline is blurred: enough to be differentiable.
+_BLUR = 0.2
+_OUTLINE = 128
+
+
+@dataclass(frozen=True)
+class StarPrior:
+    """What bodies are expected to be; standard deviations, lengths in units of the longer side of the whole body.
+
+    - `modes`: N, the finest waves of an outline; 1 makes disks.
+    - `place`: of the centre about where the search starts. `radius` with the spread of its logarithm.
+    - `roughness`: of the logarithm of r in the second mode; the others have 2/n of it.
+    - `contrast` of log σ and its spread. What is ten times as conductive or resistive as the bath is hardly told from
+      what is more so: strong bodies are best held strong.
+    - `drift`: of the logarithm of the bath's conductivity between the two frames.
+    - `apart`: over the share of the whole body by which two stars overlap, its standard deviation. Without it two of
+      opposite sign may lie on each other and cancel.
+
+    Raises `ValueError` for what is not positive.
+    """
+
+    modes: int = 4
+    place: float = 0.15
+    radius: float = 0.12
+    radius_spread: float = 0.5
+    roughness: float = 0.25
+    contrast: float = 3.5
+    contrast_spread: float = 0.5
+    drift: float = 0.1
+    apart: float = 1e3
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if not (is_number(value) and value > 0):
+                raise ValueError(f"{name} must be a positive number; it is {told(value)}.")
+        if self.modes != int(self.modes):
+            raise ValueError(f"modes must be a whole number from 1; it is {told(self.modes)}.")
+
+    @property
+    def size(self) -> int:
+        """Coefficients of a body: centre, log radius, contrast, and two of every mode from the second."""
+        return 4 + 2 * (self.modes - 1)
+
+    def deviation(self, span: float) -> Float[np.ndarray, " q"]:
+        """Standard deviations of a body's values, for a whole body of this longer side, metres."""
+        mode = self.roughness * 2 / np.arange(2, self.modes + 1)
+        first = [self.place * span, self.place * span, self.radius_spread, self.contrast_spread]
+        return np.concatenate([first, np.repeat(mode, 2)])
+
+
+class Star(eqx.Module):
+    """A body that was found.
+
+    **Fields**: `sign`, +1 conductive or -1 resistive; `centre` (2,), of the star, metres; `outline` (k, 2), metres,
+    counter-clockwise; `contrast` of log σ, positive; `rise`, how many times the objective is, at its least, without
+    this body: what tells a body from a ghost.
+    """
+
+    sign: int
+    centre: Float[np.ndarray, "2"]
+    outline: Float[np.ndarray, "k 2"]
+    contrast: float
+    rise: float
+
+    @property
+    def area(self) -> float:
+        """m²."""
+        return abs(self._moments()[0])
+
+    @property
+    def centroid(self) -> Float[np.ndarray, "2"]:
+        """Of the area, (2,) metres."""
+        area, first = self._moments()
+        return first / area
+
+    def holds(self, points: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "*n"]:
+        """Which of points, metres, lie inside."""
+        corner, offset = self._from_centre(self.outline), self._from_centre(points)
+        angle = np.unwrap(np.angle(corner))
+        turn = angle[0] + (np.angle(offset) - angle[0]) % (2 * np.pi)
+        reach = np.interp(turn, np.append(angle, angle[0] + 2 * np.pi), np.abs(np.append(corner, corner[0])))
+        return np.abs(offset) < reach
+
+    def _from_centre(self, points) -> Complex[np.ndarray, "*n"]:
+        return (points[..., 0] - self.centre[0]) + 1j * (points[..., 1] - self.centre[1])
+
+    def _moments(self):
+        x, y = self.outline.T
+        cross = x * np.roll(y, -1) - np.roll(x, -1) * y
+        return cross.sum() / 2, (self.outline + np.roll(self.outline, -1, axis=0)).T @ cross / 6
+
+
+class StarImage(NamedTuple):
+    """**Fields**: `image` (m,), log σ/σ₀; its derivative `slope` (m, n); `overlap` of every two stars, in units of the
+    whole area, and its derivative `overlap_slope`."""
+
+    image: Float[np.ndarray, " m"]
+    slope: Float[np.ndarray, "m n"]
+    overlap: Float[np.ndarray, " p"]
+    overlap_slope: Float[np.ndarray, "p n"]
+
+
+@dataclass(frozen=True)
+class Stars:
+    """Some stars on a mesh: from coefficients to conductivity. Coefficients: the drift, then star by star.
+
+    **Fields**: `points` (m, s), where cells are sampled, x + iy in metres; `width` (m,) of the blur, metres; `span`,
+    the longer side of the whole body; `start` (k,), x + iy, and `sign` (k,) of every star.
+    """
+
+    prior: StarPrior
+    points: Complex[np.ndarray, "m s"]
+    width: Float[np.ndarray, " m"]
+    weight: Float[np.ndarray, " m"]
+    span: float
+    start: Complex[np.ndarray, " k"]
+    sign: Float[np.ndarray, " k"]
+
+    @classmethod
+    def create(cls, mesh: Mesh, prior: StarPrior, start, sign) -> Stars:
+        """`start` (k, 2), metres."""
+        corners = np.asarray(mesh.points)[np.asarray(mesh.cells)] @ np.array([1, 1j])
+        span = float(np.ptp(np.asarray(mesh.points), axis=0).max())
+        width = _BLUR * np.sqrt(np.asarray(measures(mesh)))
+        start = np.reshape(start, (-1, 2)) @ np.array([1, 1j])
+        area = np.asarray(measures(mesh))
+        return cls(prior, corners @ _SAMPLES.T, width, area / area.sum(), span, start, np.asarray(sign, float))
+
+    def rows(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "k q"]:
+        """Coefficients of every star."""
+        return coefficients[1:].reshape(len(self.sign), self.prior.size)
+
+    def of_radii(self, radii) -> Float[np.ndarray, " n"]:
+        """Coefficients of disks, metres, at the start."""
+        rows = np.zeros((len(self.sign), self.prior.size))
+        relative = np.log(np.asarray(radii, float) / (self.prior.radius * self.span)) / self.prior.radius_spread
+        rows[:, 2] = np.clip(relative, -2, 2)
+        return np.append(0, rows)
+
+    def without(self, k: int, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
+        """The others, and their coefficients."""
+        others = replace(self, start=np.delete(self.start, k), sign=np.delete(self.sign, k))
+        return others, np.append(coefficients[0], np.delete(self.rows(coefficients), k, axis=0))
+
+    def with_modes(self, modes: int, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
+        """The same stars with more modes, or fewer."""
+        new = replace(self, prior=replace(self.prior, modes=modes))
+        rows = np.zeros((len(self.sign), new.prior.size))
+        kept = min(new.prior.size, self.prior.size)
+        rows[:, :kept] = self.rows(coefficients)[:, :kept]
+        return new, np.append(coefficients[0], rows)
+
+    def image(self, coefficients) -> StarImage:
+        """log σ/σ₀ per cell, how far the stars overlap, and the derivatives of both."""
+        drift = np.full((len(self.width), 1), self.prior.drift)
+        parts = [self._one(*each) for each in zip(self.start, self.rows(coefficients), strict=True)]
+        image, share = coefficients[0] * drift[:, 0], []
+        columns = [drift]
+        for sign, (amount, inside, slope) in zip(self.sign, parts, strict=True):
+            image = image + sign * amount * inside
+            share.append(inside)
+            columns.append(sign * amount * slope)
+            columns[-1][:, 3] = sign * inside * self.prior.contrast_spread
+        overlap, rows = [], []
+        size = self.prior.size
+        for j in range(len(parts)):
+            for k in range(j):
+                row = np.zeros(len(coefficients))
+                for one, other in ((j, k), (k, j)):
+                    row[1 + one * size : 1 + (one + 1) * size] = (self.weight * parts[other][1]) @ parts[one][2]
+                overlap.append(parts[j][1] @ (self.weight * parts[k][1]))
+                rows.append(row)
+        overlap, rows = np.array(overlap), np.reshape(rows, (-1, len(coefficients)))
+        return StarImage(image, np.concatenate(columns, axis=1), overlap, rows)
+
+    def star(self, k: int, coefficients, rise: float = np.nan) -> Star:
+        """Star k."""
+        centre, log_radius, contrast, waves = self._values(self.start[k], self.rows(coefficients)[k])
+        direction = np.exp(2j * np.pi * np.arange(_OUTLINE) / _OUTLINE)
+        outline = centre + direction * np.exp(log_radius + self._wave(waves, direction)[0])
+        pair = np.stack([outline.real, outline.imag], axis=1)
+        return Star(int(self.sign[k]), np.array([centre.real, centre.imag]), pair, float(contrast), float(rise))
+
+    def _values(self, start, row):
+        """Centre, log r₀, contrast and aₙ - i bₙ."""
+        prior, values = self.prior, self.prior.deviation(self.span) * row
+        log_radius = np.log(prior.radius * self.span) + values[2]
+        return (
+            start + values[0] + 1j * values[1],
+            log_radius,
+            prior.contrast + values[3],
+            values[4::2] - 1j * values[5::2],
+        )
+
+    def _wave(self, waves, direction):
+        """Σ aₙ cos nθ + bₙ sin nθ and its slope, for directions exp iθ; and the powers exp inθ, n = 2 … N."""
+        number = np.arange(2, self.prior.modes + 1)
+        powers = direction ** number.reshape(-1, *np.ones(direction.ndim, int))
+        sums = np.tensordot(np.stack([waves, 1j * number * waves]), powers, 1)
+        return sums[0].real, sums[1].real, powers
+
+    def _one(self, start, row):
+        """A star's contrast, its share of every cell, and the derivative of that (m, q)."""
+        centre, log_radius, contrast, waves = self._values(start, row)
+        offset = self.points - centre
+        distance = np.maximum(np.abs(offset), 1e-9 * self.span)
+        direction = offset / distance
+        wave, slope, powers = self._wave(waves, direction)
+        radius = np.exp(np.minimum(log_radius + wave, np.log(10 * self.span)))
+        width = self.width[:, None]
+        inside = 0.5 * (1 + np.tanh(0.5 * (radius - distance) / width))
+        edge = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(r - distance)
+        # As the centre moves by dz, the distance falls by Re(dz/u), and θ by Im(dz/u) / distance; u is the direction.
+        towards = (edge * (1 - 1j * radius * slope / distance) * direction).sum(axis=1)
+        along = edge * radius
+        modes = np.einsum("ms,nms->mn", along, powers)
+        share = inside.mean(axis=1)
+        columns = [towards.real, towards.imag, along.sum(axis=1), np.zeros_like(share)]
+        columns += [part for mode in modes.T for part in (mode.real, mode.imag)]
+        return contrast, share, np.stack(columns, axis=1) * self.prior.deviation(self.span)
