@@ -52,7 +52,7 @@ def test_iterative_images(method, tank, run, tmp_path):
 def test_segmentation(tank, run, tmp_path):
     status, told, error = run(
         "reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv",
-        "--output", tmp_path / "out", "--segment", *FEW,
+        "--output", tmp_path / "out", "--segment", "--method", "total-variation", *FEW,
     )  # fmt: skip
     assert (status, error) == (0, "")
     assert "hyperparameter 300 (default)" in told

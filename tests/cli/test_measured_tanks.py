@@ -88,7 +88,7 @@ def test_kit4_every_inclusion_with_its_sign(data_folder):
         found = list(image_difference(read(folder / f"datamat_{case}.mat"), reference).inclusions)
         assert len(found) == len(inclusions), f"{case}: {len(found)} inclusions found, {len(inclusions)} are there"
         errors += matched(case, found, inclusions)
-    assert max(errors) <= 0.11
+    assert max(errors) <= 0.10
     # 0.037 with every mesh and setting tried. Half of it is one shift of 0.018 R common to all inclusions, within the
     # ±0.03 R of the published centroids.
     assert np.median(errors) <= 0.04

@@ -60,6 +60,51 @@ def test_a_strong_change_is_solved_for(factor, why):
     assert np.linalg.norm(np.array(result.inclusions[0].centroid) - [0.02, 0.01]) < 0.04 * RADIUS
 
 
+def test_strong_bodies_are_outlined():
+    result = image(20.0)
+    assert result.shapes is not None
+    (star,) = result.shapes.stars
+    np.testing.assert_allclose(star.area, np.pi * RADIUS**2 / 9, rtol=0.15)
+    assert result.inclusions[0].area == star.area
+    reported = report_image(result)["shapes"]
+    assert len(reported["bodies"]) == 1
+    assert np.shape(reported["bodies"][0]["outline"]) == star.outline.shape
+    labels = image(20.0, segment=True).labels
+    share = (labels == 2).sum() / (labels.size * np.pi / 4)
+    np.testing.assert_allclose(share, star.area / (np.pi * RADIUS**2), rtol=0.02)
+
+
+def test_weak_bodies_are_cut_out_of_an_image_of_few_pieces():
+    result = image(1.05, segment=True)
+    assert (result.settings.method, result.shapes) == ("total-variation", None)
+    assert "bodies are weak" in result.why
+    assert set(np.unique(result.labels)) == {0, 2}
+
+
+def test_shapes_may_be_asked_for():
+    result = image(20.0, method="shapes")
+    assert (result.settings.method, result.chosen_by) == ("shapes", "none")
+    assert [one.sign for one in result.inclusions] == [1]
+    report = report_image(result)
+    assert report["reconstruction"]["prior"] == "star shapes"
+    assert report["hyperparameter"]["value"] is None
+
+
+def test_shapes_that_do_not_explain_the_voltages_are_not_shown():
+    """Conductivity that rises evenly across the tank is no body."""
+
+    def sloped(amount, seed):
+        rising = 0.02 * np.exp(amount * CENTRES[:, 0] / RADIUS)
+        voltages = np.asarray(TRUTH.voltages(rising))
+        voltages = voltages * (1 + 1e-4 * np.random.default_rng(seed).normal(size=voltages.shape))
+        one = frame()
+        return Measurement(voltages, one.mask, one.protocol, electrodes=one.electrodes, domain=one.domain)
+
+    result = image_difference(sloped(1.2, 1), sloped(0.0, 0), ImagingSettings(**FEW))
+    assert result.settings.method == "gauss-newton"
+    assert result.shapes is None
+
+
 def test_a_hyperparameter_or_a_method_asked_for_is_taken():
     assert ImagingSettings(hyperparameter="gcv").method == "one-step"
     assert ImagingSettings(method="gauss-newton", hyperparameter=3.0).method == "gauss-newton"

@@ -72,7 +72,8 @@ def reconstruct_shapes(
     - `start`: sign, centre (x, y) and radius, metres, of every body that may be there, such as of all the inclusions
       of an image; too many do no harm, none that is missing is added.
     - `noise`, `mask`: as in `jeit.inverse.reconstruct`. `prior`: `StarPrior()` unless given.
-    - `least_rise`: bodies whose loss raises the objective less than so many times are taken for ghosts.
+    - `least_rise`: bodies whose loss raises the objective less than so many times are taken for ghosts; and those that
+      raise it by less than they have coefficients (Akaike).
 
     All are fitted together, as disks first. Then one after the other is left out and the rest fitted again, and that
     which is missed least goes, for as long as it is missed so little. What errors of the model and electrodes gone
@@ -146,7 +147,7 @@ def _without_ghosts(problem: ShapeProblem, stars: Stars, coefficients, cost: flo
             tried.append((*problem.fit(others, remaining, _STEPS_WITHOUT, 2 * _ROUGHLY), others))
         rises = [value / cost for _, value, _ in tried]
         least = int(np.argmin(rises))
-        if rises[least] >= least_rise:
+        if tried[least][1] >= max(least_rise * cost, cost + stars.prior.size):
             break
         doubtful.append(stars.star(least, coefficients, rises[least]))
         remaining, _, stars = tried[least]

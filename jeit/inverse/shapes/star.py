@@ -1,7 +1,9 @@
 """Star shapes: an outline r(θ) round a centre, a strong contrast inside, and the bath that may have drifted.
 
-    log r(θ) = log r₀ + Σ aₙ cos nθ + bₙ sin nθ,  n = 2 … N;   log σ/σ₀ = drift + Σ_bodies ± contrast · (share inside)
+    log r(θ) = log r₀ + Σ aₙ cos nθ + bₙ sin nθ,  n = 2 … N,
+    log σ/σ₀ = drift + Σ_bodies ± 2 artanh(s tanh(contrast / 2)),
 
+with s the share of a cell that a body covers: Maxwell Garnett's mixture, log σ/σ₀ = ± contrast where it covers all.
 Everything is estimated in units of its prior's standard deviation, so that the penalty is ½‖c‖².
 """
 
@@ -45,7 +47,7 @@ class StarPrior:
     radius: float = 0.12
     radius_spread: float = 0.5
     roughness: float = 0.25
-    contrast: float = 3.5
+    contrast: float = 4.5
     contrast_spread: float = 0.5
     drift: float = 0.1
     apart: float = 1e3
@@ -175,13 +177,14 @@ class Stars:
         """log σ/σ₀ per cell, how far the stars overlap, and the derivatives of both."""
         drift = np.full((len(self.width), 1), self.prior.drift)
         parts = [self._one(*each) for each in zip(self.start, self.rows(coefficients), strict=True)]
-        image, share = coefficients[0] * drift[:, 0], []
-        columns = [drift]
-        for sign, (amount, inside, slope) in zip(self.sign, parts, strict=True):
-            image = image + sign * amount * inside
-            share.append(inside)
-            columns.append(sign * amount * slope)
-            columns[-1][:, 3] = sign * inside * self.prior.contrast_spread
+        image, columns = coefficients[0] * drift[:, 0], [drift]
+        for sign, (contrast, share, slope) in zip(self.sign, parts, strict=True):
+            # What a cell of which a share is covered does to the field is so much of what all of it would do.
+            strength = np.tanh(contrast / 2)
+            image = image + 2 * sign * np.arctanh(share * strength)
+            steep = sign / (1 - (share * strength) ** 2)
+            columns.append((2 * strength * steep)[:, None] * slope)
+            columns[-1][:, 3] = steep * share * (1 - strength**2) * self.prior.contrast_spread
         overlap, rows = [], []
         size = self.prior.size
         for j in range(len(parts)):

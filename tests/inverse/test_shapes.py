@@ -1,0 +1,140 @@
+"""Bodies as star shapes: derivatives, geometry, and what is found in tanks solved on another mesh."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.inverse.shapes import Star, StarPrior, reconstruct_shapes
+from jeit.inverse.shapes.star import Stars
+from jeit.layout import ring
+from jeit.mesh import Disk, centroids
+from jeit.protocol import adjacent
+
+RADIUS, BATH = 0.1, 0.02
+ELECTRODES = BoundaryElectrodes(ring(RADIUS, 16), 0.015, 0.01)
+SQUARE, DISK = np.array([0.04, 0.02]), np.array([-0.035, -0.03])
+STARTS = [(1, (0.03, 0.03), 0.02), (-1, (-0.03, -0.02), 0.02), (1, (0.02, -0.06), 0.015), (-1, (-0.05, 0.05), 0.02)]
+
+
+@pytest.fixture(scope="module")
+def model():
+    return ForwardModel(Disk(RADIUS).mesh(num_points=2000), ELECTRODES, adjacent(16, current=1e-3))
+
+
+@pytest.fixture(scope="module")
+def frame():
+    """A square of metal and a disk of plastic in a bath grown 5 % more conductive, on a fine mesh; 0.1 % noise."""
+    fine = ForwardModel(Disk(RADIUS).mesh(num_points=6000), ELECTRODES, adjacent(16, current=1e-3))
+    place = np.asarray(centroids(fine.mesh))
+    square = np.abs(place - SQUARE).max(axis=1) < 0.018
+    disk = np.linalg.norm(place - DISK, axis=1) < 0.025
+    clean = np.asarray(fine.voltages(1.05 * BATH * np.where(square, 100.0, np.where(disk, 0.01, 1.0))))
+    return clean * (1 + 1e-3 * np.random.default_rng(0).normal(size=clean.shape))
+
+
+@pytest.fixture(scope="module")
+def found(model, frame):
+    return reconstruct_shapes(model, frame, BATH, start=STARTS, noise=0.03 * np.abs(frame))
+
+
+def test_derivatives_are_those_of_finite_differences(model):
+    stars = Stars.create(model.mesh, StarPrior(), [[0.01, 0.02], [-0.01, 0.0]], [1, -1])
+    rng = np.random.default_rng(0)
+    point = stars.of_radii([0.03, 0.02]) + 0.2 * rng.normal(size=1 + 2 * stars.prior.size)
+    along = rng.normal(size=point.shape)
+    here, step = stars.image(point), 1e-6
+    ahead, behind = stars.image(point + step * along), stars.image(point - step * along)
+    assert here.overlap[0] > 1e-3
+    np.testing.assert_allclose(here.slope @ along, (ahead.image - behind.image) / (2 * step), rtol=1e-6, atol=1e-6)
+    difference = (ahead.overlap - behind.overlap) / (2 * step)
+    np.testing.assert_allclose(here.overlap_slope @ along, difference, rtol=1e-6)
+
+
+def test_a_star_knows_its_area_its_middle_and_what_it_holds(model):
+    stars = Stars.create(model.mesh, StarPrior(), [[0.03, 0.01]], [-1])
+    round_one = stars.star(0, stars.of_radii([0.02]))
+    assert round_one.sign == -1
+    np.testing.assert_allclose(round_one.area, np.pi * 0.02**2, rtol=1e-3)
+    np.testing.assert_allclose(round_one.centroid, [0.03, 0.01], atol=1e-6)
+    rough = stars.star(0, stars.of_radii([0.02]) + np.random.default_rng(1).normal(size=1 + stars.prior.size))
+    axis = np.linspace(-0.15, 0.15, 601)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1)
+    inside = rough.holds(grid)
+    np.testing.assert_allclose(inside.sum() * (axis[1] - axis[0]) ** 2, rough.area, rtol=0.02)
+    np.testing.assert_allclose(grid[inside].mean(axis=0), rough.centroid, atol=5e-4)
+
+
+def test_bodies_are_found_and_ghosts_left_out(found):
+    assert [one.sign for one in sorted(found.stars, key=lambda one: one.sign)] == [-1, 1]
+    plastic, metal = sorted(found.stars, key=lambda one: one.sign)
+    assert np.linalg.norm(metal.centroid - SQUARE) < 0.02 * RADIUS
+    assert np.linalg.norm(plastic.centroid - DISK) < 0.02 * RADIUS
+    np.testing.assert_allclose(metal.area, 0.036**2, rtol=0.05)
+    np.testing.assert_allclose(plastic.area, np.pi * 0.025**2, rtol=0.1)
+    assert len(found.doubtful) == 2
+    assert max(one.rise for one in found.doubtful) < 2 < 100 < min(one.rise for one in found.stars)
+    np.testing.assert_allclose(found.drift, 0.05, atol=0.01)
+    assert float(found.misfit) < 1
+
+
+def test_conductivity_is_that_of_the_stars(found, model):
+    relative = np.asarray(found.conductivity) / BATH
+    metal = next(one for one in found.stars if one.sign > 0)
+    inside = metal.holds(np.asarray(centroids(model.mesh)))
+    assert np.median(relative[inside]) > 10
+    np.testing.assert_allclose(np.median(relative[~inside]), 1 + found.drift, rtol=1e-6)
+    np.testing.assert_allclose(model.voltages(found.conductivity), found.voltages, rtol=1e-9)
+
+
+def test_bodies_found_do_not_lie_on_each_other(model, frame):
+    twice = [*STARTS[:2], (-1, (0.04, 0.02), 0.02), (1, (0.045, 0.015), 0.02)]
+    result = reconstruct_shapes(model, frame, BATH, start=twice, noise=0.03 * np.abs(frame), least_rise=1.0)
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(-RADIUS, RADIUS, 200)]), axis=-1)
+    covered = np.sum([one.holds(grid) for one in result.stars], axis=0)
+    assert (covered > 1).mean() < 2e-3
+
+
+def test_nothing_to_start_from_is_a_bath_that_drifted(model):
+    result = reconstruct_shapes(model, model.voltages(1.1 * BATH), BATH, start=[])
+    assert result.stars == result.doubtful == ()
+    np.testing.assert_allclose(result.drift, 0.1, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"start": [(2, (0, 0), 0.01)]}, r"signs are \+1 or -1"),
+        ({"start": [(1, (0, 0), -0.01)]}, "radii positive"),
+        ({"start": [(1, (np.nan, 0), 0.01)]}, "centres finite"),
+        ({"start": [(1, 0.01)]}, "start: give"),
+        ({"start": 3}, "start: give"),
+        ({"prior": "smooth"}, "a StarPrior"),
+        ({"least_rise": 0.5}, "least_rise"),
+        ({"noise": -1.0}, "noise"),
+        ({"background": -1.0}, "positive"),
+    ],
+)
+def test_bad_arguments_are_refused(model, frame, given, message):
+    arguments = {"background": BATH, "start": STARTS, **given}
+    with pytest.raises(ValueError, match=message):
+        reconstruct_shapes(model, frame, arguments.pop("background"), **arguments)
+
+
+@pytest.mark.parametrize("wrong", [{"modes": 0}, {"modes": 2.5}, {"roughness": -1}, {"contrast": "strong"}])
+def test_bad_priors_are_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        StarPrior(**wrong)
+
+
+def test_traced_data_are_refused(model, frame):
+    with pytest.raises(ValueError, match="reconstruct_shapes"):
+        jax.grad(lambda v: reconstruct_shapes(model, v, BATH, start=STARTS).misfit)(jnp.asarray(frame))
+
+
+def test_stars_are_plain_values():
+    star = Star(1, np.zeros(2), np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]]), 3.5, 2.0)
+    np.testing.assert_allclose(star.area, 2.0)
+    assert star.holds(np.array([[0.0, 0.0], [0.9, 0.0], [2.0, 0.0]])).tolist() == [True, True, False]
