@@ -143,8 +143,10 @@ def test_kit4_gauss_newton_converges_on_every_file(data_folder):
 
 @pytest.mark.slow
 def test_ktc2023_segmentation(data_folder):
-    """Level 1 of the challenge's training targets; the asked mean of 0.85."""
+    """The challenge's training targets with all electrodes, and with 12 of 32 gone; 0.95 and 0.88 on the default mesh.
+    Asked is a mean of 0.8 over all levels, and of 0.7 from the fourth on."""
     from benchmarks.cases.ktc2023 import scores
 
-    table = scores(data_folder / "ktc2023", levels=(1,), report=lambda line: None)
-    assert table.mean() >= 0.85
+    whole, hardest = scores(data_folder / "ktc2023", "auto", levels=(1, 7), report=lambda line: None).mean(axis=1)
+    assert whole >= 0.92
+    assert hardest >= 0.82
