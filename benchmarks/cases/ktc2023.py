@@ -44,7 +44,7 @@ def run(options: Options) -> Result:
     rows.append(["all", *len(targets) * [""], f"**{table.mean():.3f}**", f"{other.mean():.3f}"])
     header = ["level", *(f"target {target}" for target in targets), "mean", OTHER.replace("-", " ")]
     every, hard = float(table.mean()), float(table[3:].mean()) if len(levels) > 3 else float("nan")
-    job = f"Kuopio Tomography Challenge 2023, {len(targets)} training targets, mean score of all {len(levels)} levels"
+    job = f"Kuopio Tomography Challenge 2023, {len(targets)} targets, score of all {len(levels)} levels"
     headline = Headline(job, f"{every:.3f}", accuracy=f"{hard:.3f} over levels 4 to 7")
     verdicts = [judged(asked[0], f"{every:.3f}", every >= ALL), judged(asked[1], f"{hard:.3f}", hard >= HARD)]
     return Result([Table(header, rows)], verdicts, headline=headline)
