@@ -14,9 +14,9 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 from matplotlib.path import Path
-from scipy.spatial import Delaunay
 
 from benchmarks.opponents.scipy_baseline import ScipyBaseline
+from benchmarks.problems.disk_meshes import meshed_disk
 from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes
 from jeit.layout import ring
@@ -186,14 +186,4 @@ def _mesh(outlines, rng) -> tuple[np.ndarray, np.ndarray]:
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rings = [circle, 0.9925 * circle[::2], 0.98 * circle[1::4], 0.96 * circle[2::8]]
     fixed = np.concatenate(rings + [_beside(outline, 0.005) for outline in outlines])
-    steps = np.arange(-1, 1, _SPACING)
-    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    grid = grid + rng.uniform(-0.25, 0.25, grid.shape) * _SPACING
-    grid = grid[np.hypot(*grid.T) < 0.94]
-    far = np.min(np.linalg.norm(grid[:, None] - fixed, axis=2), axis=1) > 0.6 * _SPACING
-    points = np.concatenate([fixed, grid[far]])
-    cells = Delaunay(points).simplices
-    first, second, third = (points[cells[:, k]] for k in range(3))
-    area = np.linalg.det(np.stack([second - first, third - first], axis=1))
-    cells[area < 0] = cells[area < 0][:, ::-1]
-    return points, cells[np.abs(area) > 1e-9]
+    return meshed_disk(fixed, _SPACING, rng)
