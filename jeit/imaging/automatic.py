@@ -11,8 +11,9 @@ from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import ShapeReconstruction
 
-# Change relative to the background beyond which voltages are far from linear in it.
-_STRONG = 0.3
+# Change relative to the background, as linear images show it: less by half or more than it is where bodies are small
+# or data few, so that beyond this voltages are no longer linear in it.
+_STRONG = 0.1
 # What a linear image may miss of the voltages: over what it misses if they are taken to be linear in it, and in all.
 _WORSE, _MUCH = 1.1, 0.1
 # Share of the background that conductivity is kept above where a linear image claims less.
@@ -59,8 +60,8 @@ def image_automatically(prepared: PreparedDifference, prior: NamedPrior, segment
 
 
 def _shapes(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReconstruction | None:
-    """The bodies of a smooth image as shapes, if there are any and they explain the voltages within their noise, or as
-    well as the image does."""
+    """The bodies of a smooth image as shapes, if there are any and they explain the voltages within what sharp outlines
+    may miss, or as well as the image does."""
     if prepared.mesh.dimension != 2:
         return None
     found = shapes_in(prepared, smooth)

@@ -48,7 +48,7 @@ class ImagedDifference:
       Where there are `shapes`, those; of an image that was segmented without, those of the `labels`.
     - `unlike_electrodes`: electrodes, counted from 0, of which the model misses far more than of the others, and how
       many times as much; channels that read them count less.
-    - `shapes`: strong bodies with their outlines, and what each explains; None where none were fitted, or they do not
+    - `shapes`: bodies with their outlines, and what each explains; None where none were fitted, or they do not
       explain the voltages.
     - `labels`: 0 background, 1 resistive, 2 conductive for every pixel of the raster, if asked for.
     - `timings`: seconds of each step.

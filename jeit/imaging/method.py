@@ -30,8 +30,6 @@ NamedPrior = str | AbstractPrior
 NamedWeight = float | str | None
 """λ, or the name of the rule that chooses it; None for methods that have no use for one."""
 
-# Sharp edges miss more of the voltages than smooth ones, which bend to what a model gets wrong: times the noise.
-_SHARP = 3.0
 # What shapes start from: as many peaks of a smooth image as may be bodies, ghosts among them.
 _PEAK, _AREA, _MOST = 0.15, 0.002, 8
 
@@ -148,7 +146,7 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReco
         host.add(model.voltages(background), prepared.difference),
         background,
         start=[(one.sign, one.centroid, one.radius) for one in peaks[:_MOST]],
-        noise=as_array(_SHARP * np.asarray(prepared.modelled_noise)),
+        noise=prepared.sharp_noise,
         mask=prepared.mask,
     )
 

@@ -17,8 +17,9 @@ AUTO = "auto"
 class ImagingSettings:
     """How to image. The defaults here are jeit's defaults, for Python and command line alike.
 
-    - `method`: "auto", the one-step image where it is sound and Gauss-Newton's where it is not; or one of `METHODS`:
-      linear ones, and iterative ones that solve for conductivity itself.
+    - `method`: "auto", the one-step image where it is sound, where it is not Gauss-Newton's, its bodies outlined in two
+      dimensions (`jeit.inverse.shapes`); or one of `METHODS`: linear ones, iterative ones that solve for conductivity
+      itself, and "shapes", outlines alone.
     - `prior`: a name in `jeit.inverse.prior.defaults.PRIORS`, or a quadratic prior; used by one-step, Gauss-Newton and
       Levenberg-Marquardt imaging.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; a number for total variation and filtered
@@ -31,7 +32,8 @@ class ImagingSettings:
     - `raster_shape`: (rows, columns) of the raster.
     - `level`, `least_peak`: see `jeit.image.find_inclusions`.
     - `as_is`: image even where the wiring is found to be another than described, see `jeit.imaging.wiring`.
-    - `segment`: whether to cut the image up into background, resistive and conductive, see `jeit.image.segment`.
+    - `segment`: whether to cut the image up into background, resistive and conductive: by the outlines where there are
+      any, else by `jeit.image.segment`; with "auto", of an image by total variation.
 
     Raises `ValueError`, naming the setting, for what there is not or what does not go together.
     """

@@ -200,12 +200,20 @@ def _inclusion(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]
 
 
 def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
-    """Strong bodies with their outlines, and what was taken for a ghost; None where none were fitted."""
+    """Bodies with their outlines, and what was taken for a ghost; None where none were fitted."""
     if result.shapes is None:
         return None
     kept, left = (
         [
-            {"sign": one.sign, "centroid": one.centroid, "area": one.area, "outline": one.outline, "rise": one.rise}
+            {
+                "sign": one.sign,
+                "centroid": one.centroid,
+                "area": one.area,
+                "outline": one.outline,
+                "conductivity_over_background": math.exp(one.sign * one.contrast),
+                "conductivity_is": "told by the data" if one.weak else "assumed, as of what is strong",
+                "rise": one.rise,
+            }
             for one in stars
         ]
         for stars in (result.shapes.stars, result.shapes.doubtful)

@@ -41,13 +41,15 @@ def found(model, frame):
 
 
 def test_derivatives_are_those_of_finite_differences(model):
-    stars = Stars.create(model.mesh, StarPrior(), [[0.01, 0.02], [-0.01, 0.0]], [1, -1])
+    stars = Stars.create(model.mesh, StarPrior(), [[0.01, 0.02], [-0.01, 0.0], [0.01, -0.02]], [1, -1, 1])
     rng = np.random.default_rng(0)
-    point = stars.of_radii([0.03, 0.02]) + 0.2 * rng.normal(size=1 + 2 * stars.prior.size)
+    point = stars.of_radii([0.03, 0.02, 0.03]) + 0.2 * rng.normal(size=1 + 3 * stars.prior.size)
+    stars, point = stars.weakened([2], point)
     along = rng.normal(size=point.shape)
     here, step = stars.image(point), 1e-6
     ahead, behind = stars.image(point + step * along), stars.image(point - step * along)
-    assert here.overlap[0] > 1e-3
+    assert here.overlap.shape == (3,)
+    assert here.overlap.min() > 1e-3
     np.testing.assert_allclose(here.slope @ along, (ahead.image - behind.image) / (2 * step), rtol=1e-6, atol=1e-6)
     difference = (ahead.overlap - behind.overlap) / (2 * step)
     np.testing.assert_allclose(here.overlap_slope @ along, difference, rtol=1e-6)
@@ -78,6 +80,34 @@ def test_bodies_are_found_and_ghosts_left_out(found):
     assert max(one.rise for one in found.doubtful) < 2 < 100 < min(one.rise for one in found.stars)
     np.testing.assert_allclose(found.drift, 0.05, atol=0.01)
     assert float(found.misfit) < 1
+
+
+def test_neighbours_that_merge_are_told_apart(model):
+    """Two disks of plastic, from one start between them."""
+    places = np.array([[0.03, 0.03], [0.03, -0.02]])
+    result = reconstruct_shapes(model, _solved(places, 0.02, 1e-2), BATH, start=[(-1, (0.03, 0.0), 0.03)])
+    assert [one.sign for one in result.stars] == [-1, -1]
+    found = sorted((one.centroid for one in result.stars), key=lambda place: -place[1])
+    np.testing.assert_allclose(found, places, atol=0.02 * RADIUS)
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.5, 100.0])
+def test_weak_bodies_are_told_from_small_strong_ones(model, factor):
+    sign = 1 if factor > 1 else -1
+    voltages = _solved([[0.03, 0.03]], 0.03, factor)
+    noise = 0.01 * jnp.abs(voltages)
+    (body,) = reconstruct_shapes(model, voltages, BATH, start=[(sign, (0.03, 0.02), 0.02)], noise=noise).stars
+    assert body.weak == (factor < 10)
+    np.testing.assert_allclose(body.area, np.pi * 0.03**2, rtol=0.25)
+    if body.weak:
+        np.testing.assert_allclose(body.contrast, abs(np.log(factor)), rtol=0.3)
+
+
+def _solved(places, radius, factor):
+    """Voltages of disks on a fine mesh."""
+    fine = ForwardModel(Disk(RADIUS).mesh(num_points=6000), ELECTRODES, adjacent(16, current=1e-3))
+    distance = np.linalg.norm(np.asarray(centroids(fine.mesh))[:, None] - np.asarray(places), axis=2).min(axis=1)
+    return fine.voltages(jnp.asarray(BATH * np.where(distance < radius, factor, 1.0)))
 
 
 def test_conductivity_is_that_of_the_stars(found, model):
@@ -140,6 +170,6 @@ def test_traced_data_are_refused(model, frame):
 
 
 def test_stars_are_plain_values():
-    star = Star(1, np.zeros(2), np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]]), 3.5, 2.0)
+    star = Star(1, np.zeros(2), np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]]), 3.5, False, 2.0)
     np.testing.assert_allclose(star.area, 2.0)
     assert star.holds(np.array([[0.0, 0.0], [0.9, 0.0], [2.0, 0.0]])).tolist() == [True, True, False]

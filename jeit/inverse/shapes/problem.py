@@ -1,4 +1,4 @@
-"""Least squares for the coefficients of stars: ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², r = w (v(σ(c)) - ŷ)."""
+"""Least squares for coefficients of stars: ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², r = w (v(σ(c)) - ŷ)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ShapeProblem:
         image, slope, overlap, overlap_slope = stars.image(coefficients)
         conductivity = self.background * np.exp(image)
         voltages, jacobian = evaluate(self.model, voltages_and_jacobian_of, conductivity)
-        weight = self.data.weight
+        weight = np.asarray(self.data.weight)
         rows = weight[:, None] * (np.asarray(jacobian) @ (conductivity[:, None] * slope))
         residual = weight * (np.asarray(voltages) - self.data.voltages)
         # That stars keep apart is one more datum of unit variance for every two of them.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -19,8 +20,12 @@ from jeit_solvers.engines import as_array
 
 # How many times the objective must rise, at least, when a body is left out and the others fitted again.
 LEAST_RISE = 1.4
-_FIRST_STEPS, _STEPS, _STEPS_WITHOUT = 15, 40, 8
+# And when a body is taken for strong that is better taken for weak, which costs no coefficient.
+_LEAST_RISE_WEAK = 1.1
+_FIRST_STEPS, _STEPS, _STEPS_WITHOUT, _STEPS_TRIED = 15, 40, 8, 6
 _ROUGHLY = 1e-2
+# Directions, from its longer axis, along which a star is split in two; and how many changes are made at most.
+_ACROSS, _MOST_CHANGES = (0.0, np.pi / 2), 10
 
 
 class ShapeReconstruction(eqx.Module):
@@ -70,14 +75,15 @@ def reconstruct_shapes(
 
     - `background`: conductivity without them, one number or (m,), S/m (2-D: S); what it has drifted is estimated.
     - `start`: sign, centre (x, y) and radius, metres, of every body that may be there, such as of all the inclusions
-      of an image; too many do no harm, none that is missing is added.
+      of an image; too many do no harm, and two that are one there are told apart; where none is, none is added.
     - `noise`, `mask`: as in `jeit.inverse.reconstruct`. `prior`: `StarPrior()` unless given.
     - `least_rise`: bodies whose loss raises the objective less than so many times are taken for ghosts; and those that
       raise it by less than they have coefficients (Akaike).
 
-    All are fitted together, as disks first. Then one after the other is left out and the rest fitted again, and that
-    which is missed least goes, for as long as it is missed so little. What errors of the model and electrodes gone
-    missing make of themselves is missed little, for other bodies can take its place.
+    All are fitted together, as strong disks first. Then one after the other is left out and the rest fitted again, and
+    that which is missed least goes, for as long as it is missed so little. What errors of the model and electrodes gone
+    missing make of themselves is missed little, for other bodies can take its place. Of what is left, each is split in
+    two for as long as that explains as much more, or taken for weak where that explains any more.
 
     Raises `ValueError` for arguments that do not fit, and for solids.
 
@@ -99,8 +105,17 @@ def reconstruct_shapes(
     sign, centre, radius = _checked_start(start)
     small, data = independent_data(model, measured, used, deviation, at_once=True)
     problem = ShapeProblem(small, data, background)
-    stars, coefficients, cost = _fitted(problem, Stars.create(model.mesh, prior, centre, sign), radius)
-    stars, coefficients, rises, doubtful = _without_ghosts(problem, stars, coefficients, cost, least_rise)
+    stars = Stars.create(model.mesh, prior, centre, sign)
+    stars, coefficients = _grown(problem, stars, stars.of_radii(radius))
+    fitted = _Fit(problem, stars, *problem.fit(stars, coefficients, _STEPS))
+    fitted, rises, doubtful = _without_ghosts(fitted, least_rise)
+    for _ in range(_MOST_CHANGES):
+        changed = _with_one_change(fitted, least_rise)
+        if changed is None:
+            break
+        fitted, rises, ghosts = _without_ghosts(changed, least_rise)
+        doubtful += ghosts
+    stars, coefficients = fitted.stars, fitted.coefficients
     conductivity = background * np.exp(stars.image(coefficients).image)
     predicted = np.asarray(model.voltages(conductivity))
     excess = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
@@ -128,29 +143,62 @@ def _checked_start(start):
     return sign, centre, radius
 
 
-def _fitted(problem: ShapeProblem, stars: Stars, radius):
-    """Stars fitted to the data, as disks first; their coefficients, and the cost."""
-    disks, coefficients = stars.with_modes(1, stars.of_radii(radius))
-    coefficients, _ = problem.fit(disks, coefficients, _FIRST_STEPS, _ROUGHLY)
-    stars, coefficients = disks.with_modes(stars.prior.modes, coefficients)
-    return stars, *problem.fit(stars, coefficients, _STEPS)
+class _Fit(NamedTuple):
+    """Stars fitted to data; the least `cost`."""
+
+    problem: ShapeProblem
+    stars: Stars
+    coefficients: Float[np.ndarray, " n"]
+    cost: float
 
 
-def _without_ghosts(problem: ShapeProblem, stars: Stars, coefficients, cost: float, least_rise: float):
-    """Stars that data tell of, their coefficients and rises; and those left out."""
+def _grown(problem: ShapeProblem, stars: Stars, coefficients, steps: int = _FIRST_STEPS):
+    """Stars with all their modes, fitted to the data as disks; and their coefficients."""
+    disks, coefficients = stars.with_modes(1, coefficients)
+    coefficients, _ = problem.fit(disks, coefficients, steps, _ROUGHLY)
+    return disks.with_modes(stars.prior.modes, coefficients)
+
+
+def _is_told(worse: float, better: float, coefficients: int, least_rise: float) -> bool:
+    """Whether data tell of what has so many coefficients and lowers the objective from `worse` to `better`."""
+    return worse >= max(least_rise * better, better + coefficients)
+
+
+def _without_ghosts(fitted: _Fit, least_rise: float) -> tuple[_Fit, list[float], list[Star]]:
+    """Stars that data tell of, and their rises; and those left out."""
     doubtful: list[Star] = []
-    rises: list[float] = []
-    while len(stars.sign):
+    while True:
+        problem, stars, coefficients, cost = fitted
         tried = []
         for k in range(len(stars.sign)):
             others, remaining = stars.without(k, coefficients)
             tried.append((*problem.fit(others, remaining, _STEPS_WITHOUT, 2 * _ROUGHLY), others))
         rises = [value / cost for _, value, _ in tried]
+        if not rises or _is_told(min(rises) * cost, cost, stars.prior.size, least_rise):
+            return fitted, rises, doubtful
         least = int(np.argmin(rises))
-        if tried[least][1] >= max(least_rise * cost, cost + stars.prior.size):
-            break
         doubtful.append(stars.star(least, coefficients, rises[least]))
-        remaining, _, stars = tried[least]
-        coefficients, cost = problem.fit(stars, remaining, _STEPS)
-        rises = []
-    return stars, coefficients, rises, doubtful
+        remaining, _, others = tried[least]
+        fitted = _Fit(problem, others, *problem.fit(others, remaining, _STEPS))
+
+
+def _with_one_change(fitted: _Fit, least_rise: float) -> _Fit | None:
+    """Of the stars with one of them split in two, or one or all taken for weak, those that explain most; None if data
+    do not tell of the change."""
+    problem, stars, coefficients, cost = fitted
+    tried = []
+    for k in range(len(stars.sign)):
+        for across in _ACROSS:
+            two, start = _grown(problem, *stars.split(k, coefficients, across), _STEPS_TRIED)
+            tried.append((*problem.fit(two, start, 3, _ROUGHLY), two))
+    strong = np.flatnonzero(~stars.weak)
+    for some in [[k] for k in strong] + [strong] * (len(strong) > 1):
+        weak, start = stars.weakened(some, coefficients)
+        tried.append((*problem.fit(weak, start, _STEPS_TRIED, _ROUGHLY), weak))
+    if not tried:
+        return None
+    start, _, changed = min(tried, key=lambda one: one[1])
+    start, value = problem.fit(changed, start, _STEPS)
+    more = len(start) - len(coefficients)
+    told = _is_told(cost, value, more, least_rise if more else min(least_rise, _LEAST_RISE_WEAK))
+    return _Fit(problem, changed, start, value) if told else None

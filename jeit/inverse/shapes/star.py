@@ -1,4 +1,4 @@
-"""Star shapes: an outline r(θ) round a centre, a strong contrast inside, and the bath that may have drifted.
+"""Star shapes: an outline r(θ) round a centre, one contrast inside, and the bath that may have drifted.
 
     log r(θ) = log r₀ + Σ aₙ cos nθ + bₙ sin nθ,  n = 2 … N,
     log σ/σ₀ = drift + Σ_bodies ± 2 artanh(s tanh(contrast / 2)),
@@ -9,6 +9,7 @@ Everything is estimated in units of its prior's standard deviation, so that the 
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -35,6 +36,7 @@ class StarPrior:
     - `roughness`: of the logarithm of r in the second mode; the others have 2/n of it.
     - `contrast` of log σ and its spread. What is ten times as conductive or resistive as the bath is hardly told from
       what is more so: strong bodies are best held strong.
+    - `weak_contrast` and the spread of its logarithm: of bodies that data tell to be weak.
     - `drift`: of the logarithm of the bath's conductivity between the two frames.
     - `apart`: over the share of the whole body by which two stars overlap, its standard deviation. Without it two of
       opposite sign may lie on each other and cancel.
@@ -49,6 +51,8 @@ class StarPrior:
     roughness: float = 0.25
     contrast: float = 4.5
     contrast_spread: float = 0.5
+    weak_contrast: float = 0.7
+    weak_spread: float = 0.8
     drift: float = 0.1
     apart: float = 1e3
 
@@ -65,24 +69,33 @@ class StarPrior:
         return 4 + 2 * (self.modes - 1)
 
     def deviation(self, span: float) -> Float[np.ndarray, " q"]:
-        """Standard deviations of a body's values, for a whole body of this longer side, metres."""
+        """Standard deviations of a body's values, 1 of its contrast; `span` of the whole body, metres."""
         mode = self.roughness * 2 / np.arange(2, self.modes + 1)
-        first = [self.place * span, self.place * span, self.radius_spread, self.contrast_spread]
+        first = [self.place * span, self.place * span, self.radius_spread, 1.0]
         return np.concatenate([first, np.repeat(mode, 2)])
+
+    def contrast_of(self, coefficient: float, weak: bool) -> tuple[float, float]:
+        """Contrast of log σ of a body, and its derivative."""
+        if not weak:
+            return self.contrast + self.contrast_spread * coefficient, self.contrast_spread
+        contrast = self.weak_contrast * np.exp(self.weak_spread * coefficient)
+        return contrast, self.weak_spread * contrast
 
 
 class Star(eqx.Module):
     """A body that was found.
 
     **Fields**: `sign`, +1 conductive or -1 resistive; `centre` (2,), of the star, metres; `outline` (k, 2), metres,
-    counter-clockwise; `contrast` of log σ, positive; `rise`, how many times the objective is, at its least, without
-    this body: what tells a body from a ghost.
+    counter-clockwise; `contrast` of log σ, positive, told by the data where the body is `weak`, else the prior's, "at
+    least about so much"; `rise`, how many times the objective is, at its least, without this body: what tells a body
+    from a ghost.
     """
 
     sign: int
     centre: Float[np.ndarray, "2"]
     outline: Float[np.ndarray, "k 2"]
     contrast: float
+    weak: bool
     rise: float
 
     @property
@@ -123,12 +136,23 @@ class StarImage(NamedTuple):
     overlap_slope: Float[np.ndarray, "p n"]
 
 
+class _Values(NamedTuple):
+    """A star's: `waves` are aₙ - i bₙ; `contrast_slope`, by its coefficient."""
+
+    centre: complex
+    log_radius: float
+    contrast: float
+    contrast_slope: float
+    waves: Complex[np.ndarray, " w"]
+
+
 @dataclass(frozen=True)
 class Stars:
     """Some stars on a mesh: from coefficients to conductivity. Coefficients: the drift, then star by star.
 
-    **Fields**: `points` (m, s), where cells are sampled, x + iy in metres; `width` (m,) of the blur, metres; `span`,
-    the longer side of the whole body; `start` (k,), x + iy, and `sign` (k,) of every star.
+    **Fields**: `prior` of every star; `points` (m, s), where cells are sampled, x + iy in metres; `width` (m,) of the
+    blur, metres; `weight` (m,), every cell's share of the area; `span`, the longer side of the whole body; `start`
+    (k,), x + iy, and `sign` (k,) of every star; `weak` (k,), whether it is taken for weak, not strong.
     """
 
     prior: StarPrior
@@ -138,16 +162,18 @@ class Stars:
     span: float
     start: Complex[np.ndarray, " k"]
     sign: Float[np.ndarray, " k"]
+    weak: Bool[np.ndarray, " k"]
 
     @classmethod
     def create(cls, mesh: Mesh, prior: StarPrior, start, sign) -> Stars:
         """`start` (k, 2), metres."""
         corners = np.asarray(mesh.points)[np.asarray(mesh.cells)] @ np.array([1, 1j])
         span = float(np.ptp(np.asarray(mesh.points), axis=0).max())
-        width = _BLUR * np.sqrt(np.asarray(measures(mesh)))
-        start = np.reshape(start, (-1, 2)) @ np.array([1, 1j])
         area = np.asarray(measures(mesh))
-        return cls(prior, corners @ _SAMPLES.T, width, area / area.sum(), span, start, np.asarray(sign, float))
+        start = np.reshape(start, (-1, 2)) @ np.array([1, 1j])
+        width, weight = _BLUR * np.sqrt(area), area / area.sum()
+        sign, weak = np.asarray(sign, float), np.zeros(len(start), bool)
+        return cls(prior, corners @ _SAMPLES.T, width, weight, span, start, sign, weak)
 
     def rows(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "k q"]:
         """Coefficients of every star."""
@@ -162,8 +188,32 @@ class Stars:
 
     def without(self, k: int, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
         """The others, and their coefficients."""
-        others = replace(self, start=np.delete(self.start, k), sign=np.delete(self.sign, k))
+        start, sign, weak = (np.delete(one, k) for one in (self.start, self.sign, self.weak))
+        others = replace(self, start=start, sign=sign, weak=weak)
         return others, np.append(coefficients[0], np.delete(self.rows(coefficients), k, axis=0))
+
+    def split(self, k: int, coefficients, angle: float) -> tuple[Stars, Float[np.ndarray, " n"]]:
+        """Two disks in place of star k, last, of half its area each, that lie side by side at `angle`, radians, from
+        its longer axis."""
+        others, remaining = self.without(k, coefficients)
+        centre, log_radius, _, _, waves = self._values(k, self.rows(coefficients)[k])
+        angle = angle - (np.angle(waves[0]) / 2 if len(waves) else 0)
+        half = np.zeros(self.prior.size)
+        half[2:4] = self.rows(coefficients)[k, 2:4]
+        half[2] -= np.log(2) / 2 / self.prior.radius_spread
+        step = np.exp(log_radius + 1j * angle) / np.sqrt(2)
+        start = np.append(others.start, [centre + step, centre - step])
+        sign, weak = np.append(others.sign, [self.sign[k]] * 2), np.append(others.weak, [self.weak[k]] * 2)
+        return replace(self, start=start, sign=sign, weak=weak), np.concatenate([remaining, half, half])
+
+    def weakened(self, some, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
+        """The same with `some` stars taken for weak, and so much larger that they do as much to the field."""
+        rows, weak = self.rows(coefficients).copy(), self.weak.copy()
+        for k in some:
+            strength = np.tanh(self._values(k, rows[k]).contrast / 2) / np.tanh(self.prior.weak_contrast / 2)
+            rows[k, 2] += np.log(strength) / 2 / self.prior.radius_spread
+            rows[k, 3], weak[k] = 0, True
+        return replace(self, weak=weak), np.append(coefficients[0], rows)
 
     def with_modes(self, modes: int, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
         """The same stars with more modes, or fewer."""
@@ -176,43 +226,40 @@ class Stars:
     def image(self, coefficients) -> StarImage:
         """log σ/σ₀ per cell, how far the stars overlap, and the derivatives of both."""
         drift = np.full((len(self.width), 1), self.prior.drift)
-        parts = [self._one(*each) for each in zip(self.start, self.rows(coefficients), strict=True)]
+        parts = [self._one(k, row) for k, row in enumerate(self.rows(coefficients))]
         image, columns = coefficients[0] * drift[:, 0], [drift]
-        for sign, (contrast, share, slope) in zip(self.sign, parts, strict=True):
+        for sign, (values, share, slope) in zip(self.sign, parts, strict=True):
             # What a cell of which a share is covered does to the field is so much of what all of it would do.
-            strength = np.tanh(contrast / 2)
+            strength = np.tanh(values.contrast / 2)
             image = image + 2 * sign * np.arctanh(share * strength)
             steep = sign / (1 - (share * strength) ** 2)
             columns.append((2 * strength * steep)[:, None] * slope)
-            columns[-1][:, 3] = steep * share * (1 - strength**2) * self.prior.contrast_spread
-        overlap, rows = [], []
-        size = self.prior.size
-        for j in range(len(parts)):
-            for k in range(j):
-                row = np.zeros(len(coefficients))
-                for one, other in ((j, k), (k, j)):
-                    row[1 + one * size : 1 + (one + 1) * size] = (self.weight * parts[other][1]) @ parts[one][2]
-                overlap.append(parts[j][1] @ (self.weight * parts[k][1]))
-                rows.append(row)
-        overlap, rows = np.array(overlap), np.reshape(rows, (-1, len(coefficients)))
-        return StarImage(image, np.concatenate(columns, axis=1), overlap, rows)
+            columns[-1][:, 3] = steep * share * (1 - strength**2) * values.contrast_slope
+        shares, weighed = np.array([part[1] for part in parts]), [self.weight * part[1] for part in parts]
+        overlap, overlap_slope = [], []
+        for j, k in itertools.combinations(range(len(parts)), 2):
+            rows = np.zeros((len(parts), self.prior.size))
+            rows[j], rows[k] = weighed[k] @ parts[j][2], weighed[j] @ parts[k][2]
+            overlap.append(weighed[j] @ shares[k])
+            overlap_slope.append(np.append(0, rows))
+        slopes = np.reshape(overlap_slope, (-1, len(coefficients)))
+        return StarImage(image, np.concatenate(columns, axis=1), np.array(overlap), slopes)
 
     def star(self, k: int, coefficients, rise: float = np.nan) -> Star:
         """Star k."""
-        centre, log_radius, contrast, waves = self._values(self.start[k], self.rows(coefficients)[k])
+        centre, log_radius, contrast, _, waves = self._values(k, self.rows(coefficients)[k])
         direction = np.exp(2j * np.pi * np.arange(_OUTLINE) / _OUTLINE)
         outline = centre + direction * np.exp(log_radius + self._wave(waves, direction)[0])
         pair = np.stack([outline.real, outline.imag], axis=1)
-        return Star(int(self.sign[k]), np.array([centre.real, centre.imag]), pair, float(contrast), float(rise))
+        middle = np.array([centre.real, centre.imag])
+        return Star(int(self.sign[k]), middle, pair, float(contrast), bool(self.weak[k]), float(rise))
 
-    def _values(self, start, row):
-        """Centre, log r₀, contrast and aₙ - i bₙ."""
+    def _values(self, k: int, row) -> _Values:
         prior, values = self.prior, self.prior.deviation(self.span) * row
-        log_radius = np.log(prior.radius * self.span) + values[2]
-        return (
-            start + values[0] + 1j * values[1],
-            log_radius,
-            prior.contrast + values[3],
+        return _Values(
+            self.start[k] + values[0] + 1j * values[1],
+            np.log(prior.radius * self.span) + values[2],
+            *prior.contrast_of(row[3], self.weak[k]),
             values[4::2] - 1j * values[5::2],
         )
 
@@ -223,9 +270,10 @@ class Stars:
         sums = np.tensordot(np.stack([waves, 1j * number * waves]), powers, 1)
         return sums[0].real, sums[1].real, powers
 
-    def _one(self, start, row):
-        """A star's contrast, its share of every cell, and the derivative of that (m, q)."""
-        centre, log_radius, contrast, waves = self._values(start, row)
+    def _one(self, k: int, row):
+        """Star k's values, its share of every cell, and the derivative of that (m, q)."""
+        values = self._values(k, row)
+        centre, log_radius, waves = values.centre, values.log_radius, values.waves
         offset = self.points - centre
         distance = np.maximum(np.abs(offset), 1e-9 * self.span)
         direction = offset / distance
@@ -241,4 +289,4 @@ class Stars:
         share = inside.mean(axis=1)
         columns = [towards.real, towards.imag, along.sum(axis=1), np.zeros_like(share)]
         columns += [part for mode in modes.T for part in (mode.real, mode.imag)]
-        return contrast, share, np.stack(columns, axis=1) * self.prior.deviation(self.span)
+        return values, share, np.stack(columns, axis=1) * self.prior.deviation(self.span)
