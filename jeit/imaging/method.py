@@ -18,7 +18,7 @@ from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.nonlinear.solvers import AbstractSolver
 from jeit.inverse.prior.defaults import MEASURED, PRIORS
 from jeit.inverse.prior.priors import AbstractPrior
-from jeit.inverse.shapes import ShapeReconstruction, reconstruct_shapes
+from jeit.inverse.shapes import LEAST_RISE, ShapeReconstruction, reconstruct_shapes
 from jeit.mesh import Body
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array, host
@@ -137,7 +137,10 @@ def _iterated(
 
 
 def shapes_in(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReconstruction:
-    """The strong bodies that explain a difference, started from all that a smooth image of it shows."""
+    """The bodies that explain a difference, started from all that a smooth image of it shows.
+
+    How much a body has to be missed, beyond what the evidence asks, is for errors of the model, which no noise tells.
+    """
     model, background = prepared.model, prepared.calibration.conductivity
     departure = as_array(np.log(np.asarray(smooth.conductivity) / float(background)))
     peaks = find_inclusions(prepared.mesh, departure, level=0.5, least_peak=_PEAK, least_area=_AREA)
@@ -148,6 +151,7 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReco
         start=[(one.sign, one.centroid, one.radius) for one in peaks[:_MOST]],
         noise=prepared.sharp_noise,
         mask=prepared.mask,
+        least_rise=1 + (LEAST_RISE - 1) * prepared.modelled_share,
     )
 
 

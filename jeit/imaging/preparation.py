@@ -102,6 +102,12 @@ class PreparedDifference:
         what a model gets wrong, sharp ones do not."""
         return self._off_by(_SHARP)
 
+    @property
+    def modelled_share(self) -> float:
+        """How much of the variance of `sharp_noise` is the model's fault, from 0 to 1; 1 where no noise is known."""
+        sharp = np.asarray(self.sharp_noise)[0] / np.asarray(self.relative_noise)[0]
+        return 1 - (0 if self.noise is None else self.noise / float(sharp)) ** 2
+
     def _off_by(self, times: float) -> Float[Array, " M"]:
         shape, used = np.asarray(self.relative_noise), np.asarray(self.mask)
         size = np.sqrt(np.mean(np.abs(np.asarray(self.difference)[used] / shape[used]) ** 2))

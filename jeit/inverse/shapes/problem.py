@@ -1,9 +1,15 @@
-"""Least squares for coefficients of stars: ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², r = w (v(σ(c)) - ŷ)."""
+"""Least squares for the coefficients of stars: ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², r = w (v(σ(c)) - ŷ).
+
+How well some stars explain the data, number and kind open, is told by the evidence, the probability of the data
+whatever the coefficients. By Laplace's approximation at the least cost, -log evidence = cost + ½ log det H + const,
+with H = 1 + JᵀC⁻¹J the Hessian in units of the prior: every coefficient costs as much as it has to be told precisely.
+MacKay, Neural Computation 4 (1992) 415, section 2.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -16,6 +22,14 @@ from jeit.inverse.shapes.star import Stars
 from jeit_solvers import Descent, QuadraticModel, ridge_model
 
 
+class Fit(NamedTuple):
+    """Stars and their `coefficients` (n,) of least `cost`."""
+
+    stars: Stars
+    coefficients: Float[np.ndarray, " n"]
+    cost: float
+
+
 @dataclass(frozen=True)
 class ShapeProblem:
     """**Fields**: `model` of the independent channels; `data` with ŷ, w and G; `background` σ₀ (m,), S/m (2-D: S)."""
@@ -24,8 +38,8 @@ class ShapeProblem:
     data: Data
     background: Float[np.ndarray, " m"]
 
-    def quadratic_model(self, coefficients: Float[np.ndarray, " n"], stars: Stars) -> QuadraticModel:
-        """Cost and step, for `jeit_solvers.Descent`."""
+    def linearise(self, coefficients: Float[np.ndarray, " n"], stars: Stars):
+        """Residual (r + p,), Jacobian (r + p, n), covariance and precision (r + p, r + p)."""
         image, slope, overlap, overlap_slope = stars.image(coefficients)
         conductivity = self.background * np.exp(image)
         voltages, jacobian = evaluate(self.model, voltages_and_jacobian_of, conductivity)
@@ -34,17 +48,27 @@ class ShapeProblem:
         residual = weight * (np.asarray(voltages) - self.data.voltages)
         # That stars keep apart is one more datum of unit variance for every two of them.
         apart, more = stars.prior.apart, np.eye(len(overlap))
-        model: list[Any] = [
+        return (
             np.concatenate([residual, apart * overlap]),
             np.concatenate([rows, apart * overlap_slope]),
-            coefficients,
             scipy.linalg.block_diag(self.data.covariance, more),
             scipy.linalg.block_diag(self.data.precision, more),
-        ]
-        return ridge_model(*model)
+        )
 
-    def fit(self, stars: Stars, start: Float[np.ndarray, " n"], max_steps: int, rtol: float = 3e-3):
-        """Coefficients of least cost near `start`, and that cost; by Levenberg-Marquardt."""
+    def quadratic_model(self, coefficients: Float[np.ndarray, " n"], stars: Stars) -> QuadraticModel:
+        """Cost and step, for `jeit_solvers.Descent`."""
+        residual, jacobian, covariance, precision = self.linearise(coefficients, stars)
+        return ridge_model(residual, jacobian, coefficients, covariance, precision)  # pyright: ignore[reportArgumentType]
+
+    def fit(self, stars: Stars, start: Float[np.ndarray, " n"], max_steps: int, rtol: float = 3e-3) -> Fit:
+        """The least cost near `start`, by Levenberg-Marquardt."""
         descent = Descent(rtol=rtol, damping=1.0, history=max_steps + 1)
         coefficients, state = descent.at_once(self.quadratic_model, start, stars, max_steps)
-        return coefficients, float(state.cost)
+        return Fit(stars, coefficients, float(state.cost))
+
+    def surprise(self, fit: Fit) -> float:
+        """-log evidence of some stars, up to a constant, with the odds against weak ones."""
+        _, jacobian, _, precision = self.linearise(fit.coefficients, fit.stars)
+        hessian = np.eye(len(fit.coefficients)) + jacobian.T @ (np.asarray(precision) @ jacobian)
+        odds = fit.stars.weak.sum() * np.log(fit.stars.prior.odds_against_weak)
+        return fit.cost + 0.5 * float(np.linalg.slogdet(hessian)[1]) + float(odds)

@@ -14,18 +14,18 @@ from jeit.arguments import check_has_values, check_kind, is_number, told
 from jeit.forward import ForwardModel
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
 from jeit.inverse.nonlinear.observed import independent_data
-from jeit.inverse.shapes.problem import ShapeProblem
+from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
 from jeit_solvers.engines import as_array
 
 # How many times the objective must rise, at least, when a body is left out and the others fitted again.
 LEAST_RISE = 1.4
-# And when a body is taken for strong that is better taken for weak, which costs no coefficient.
-_LEAST_RISE_WEAK = 1.1
 _FIRST_STEPS, _STEPS, _STEPS_WITHOUT, _STEPS_TRIED = 15, 40, 8, 6
 _ROUGHLY = 1e-2
 # Directions, from its longer axis, along which a star is split in two; and how many changes are made at most.
 _ACROSS, _MOST_CHANGES = (0.0, np.pi / 2), 10
+# How much likelier (of the logarithm) more has to make the data than less, to be told.
+_MARGIN = 2.0
 
 
 class ShapeReconstruction(eqx.Module):
@@ -77,13 +77,14 @@ def reconstruct_shapes(
     - `start`: sign, centre (x, y) and radius, metres, of every body that may be there, such as of all the inclusions
       of an image; too many do no harm, and two that are one there are told apart; where none is, none is added.
     - `noise`, `mask`: as in `jeit.inverse.reconstruct`. `prior`: `StarPrior()` unless given.
-    - `least_rise`: bodies whose loss raises the objective less than so many times are taken for ghosts; and those that
-      raise it by less than they have coefficients (Akaike).
+    - `least_rise`: bodies whose loss raises the objective less than so many times are taken for ghosts; and those whose
+      evidence is not for them.
 
     All are fitted together, as strong disks first. Then one after the other is left out and the rest fitted again, and
     that which is missed least goes, for as long as it is missed so little. What errors of the model and electrodes gone
     missing make of themselves is missed little, for other bodies can take its place. Of what is left, each is split in
-    two for as long as that explains as much more, or taken for weak where that explains any more.
+    two, or taken for weak, where the evidence is for it (`ShapeProblem.surprise`): once splits first, once weak ones
+    first, and the better of the two is kept.
 
     Raises `ValueError` for arguments that do not fit, and for solids.
 
@@ -103,18 +104,18 @@ def reconstruct_shapes(
     if not (is_number(least_rise) and least_rise >= 1):
         raise ValueError(f"least_rise must be a number from 1; it is {told(least_rise)}.")
     sign, centre, radius = _checked_start(start)
+    if not (background > 0).all():
+        raise ValueError("background must be positive, S/m (2-D: S).")
     small, data = independent_data(model, measured, used, deviation, at_once=True)
     problem = ShapeProblem(small, data, background)
     stars = Stars.create(model.mesh, prior, centre, sign)
-    stars, coefficients = _grown(problem, stars, stars.of_radii(radius))
-    fitted = _Fit(problem, stars, *problem.fit(stars, coefficients, _STEPS))
-    fitted, rises, doubtful = _without_ghosts(fitted, least_rise)
-    for _ in range(_MOST_CHANGES):
-        changed = _with_one_change(fitted, least_rise)
-        if changed is None:
-            break
-        fitted, rises, ghosts = _without_ghosts(changed, least_rise)
-        doubtful += ghosts
+    fitted = problem.fit(*_grown(problem, stars, stars.of_radii(radius), _FIRST_STEPS), _STEPS)
+    found = _without_ghosts(problem, fitted, (), least_rise)
+    ways, weak = [found], _as_weak(problem, found.fit)
+    if weak is not None:
+        ways.append(_without_ghosts(problem, weak, found.doubtful, least_rise))
+    ways = [_searched(problem, one, least_rise) for one in ways]
+    fitted, rises, doubtful = min(ways, key=lambda one: problem.surprise(one.fit))
     stars, coefficients = fitted.stars, fitted.coefficients
     conductivity = background * np.exp(stars.image(coefficients).image)
     predicted = np.asarray(model.voltages(conductivity))
@@ -126,7 +127,7 @@ def reconstruct_shapes(
         voltages=as_array(predicted),
         misfit=as_array(np.sqrt(np.mean(excess**2))),
         drift=float(np.expm1(prior.drift * coefficients[0])),
-        doubtful=tuple(doubtful),
+        doubtful=doubtful,
     )
 
 
@@ -143,62 +144,73 @@ def _checked_start(start):
     return sign, centre, radius
 
 
-class _Fit(NamedTuple):
-    """Stars fitted to data; the least `cost`."""
-
-    problem: ShapeProblem
-    stars: Stars
-    coefficients: Float[np.ndarray, " n"]
-    cost: float
-
-
-def _grown(problem: ShapeProblem, stars: Stars, coefficients, steps: int = _FIRST_STEPS):
+def _grown(problem: ShapeProblem, stars: Stars, coefficients, steps: int):
     """Stars with all their modes, fitted to the data as disks; and their coefficients."""
-    disks, coefficients = stars.with_modes(1, coefficients)
-    coefficients, _ = problem.fit(disks, coefficients, steps, _ROUGHLY)
-    return disks.with_modes(stars.prior.modes, coefficients)
+    disks, _, _ = found = problem.fit(*stars.with_modes(1, coefficients), steps, _ROUGHLY)
+    return disks.with_modes(stars.prior.modes, found.coefficients)
 
 
-def _is_told(worse: float, better: float, coefficients: int, least_rise: float) -> bool:
-    """Whether data tell of what has so many coefficients and lowers the objective from `worse` to `better`."""
-    return worse >= max(least_rise * better, better + coefficients)
-
-
-def _without_ghosts(fitted: _Fit, least_rise: float) -> tuple[_Fit, list[float], list[Star]]:
+class _Found(NamedTuple):
     """Stars that data tell of, and their rises; and those left out."""
-    doubtful: list[Star] = []
+
+    fit: Fit
+    rises: list[float]
+    doubtful: tuple[Star, ...]
+
+
+def _without_ghosts(problem: ShapeProblem, fitted: Fit, doubtful: Sequence[Star], least_rise: float) -> _Found:
     while True:
-        problem, stars, coefficients, cost = fitted
-        tried = []
-        for k in range(len(stars.sign)):
-            others, remaining = stars.without(k, coefficients)
-            tried.append((*problem.fit(others, remaining, _STEPS_WITHOUT, 2 * _ROUGHLY), others))
-        rises = [value / cost for _, value, _ in tried]
-        if not rises or _is_told(min(rises) * cost, cost, stars.prior.size, least_rise):
-            return fitted, rises, doubtful
+        stars, coefficients, cost = fitted
+        others = [
+            problem.fit(*stars.without(k, coefficients), _STEPS_WITHOUT, 2 * _ROUGHLY) for k in range(len(stars.sign))
+        ]
+        rises = [one.cost / cost for one in others]
+        if not rises:
+            return _Found(fitted, rises, tuple(doubtful))
         least = int(np.argmin(rises))
-        doubtful.append(stars.star(least, coefficients, rises[least]))
-        remaining, _, others = tried[least]
-        fitted = _Fit(problem, others, *problem.fit(others, remaining, _STEPS))
+        if rises[least] >= least_rise and _is_told(problem, others[least], fitted):
+            return _Found(fitted, rises, tuple(doubtful))
+        doubtful = [*doubtful, stars.star(least, coefficients, rises[least])]
+        fitted = problem.fit(others[least].stars, others[least].coefficients, _STEPS)
 
 
-def _with_one_change(fitted: _Fit, least_rise: float) -> _Fit | None:
-    """Of the stars with one of them split in two, or one or all taken for weak, those that explain most; None if data
-    do not tell of the change."""
-    problem, stars, coefficients, cost = fitted
-    tried = []
-    for k in range(len(stars.sign)):
-        for across in _ACROSS:
-            two, start = _grown(problem, *stars.split(k, coefficients, across), _STEPS_TRIED)
-            tried.append((*problem.fit(two, start, 3, _ROUGHLY), two))
-    strong = np.flatnonzero(~stars.weak)
-    for some in [[k] for k in strong] + [strong] * (len(strong) > 1):
-        weak, start = stars.weakened(some, coefficients)
-        tried.append((*problem.fit(weak, start, _STEPS_TRIED, _ROUGHLY), weak))
-    if not tried:
-        return None
-    start, _, changed = min(tried, key=lambda one: one[1])
-    start, value = problem.fit(changed, start, _STEPS)
-    more = len(start) - len(coefficients)
-    told = _is_told(cost, value, more, least_rise if more else min(least_rise, _LEAST_RISE_WEAK))
-    return _Fit(problem, changed, start, value) if told else None
+def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
+    """The stars with one of them split in two; None if the data do not tell of it."""
+    stars, coefficients, cost = fitted
+    tried = [
+        _grown(problem, *stars.split(k, coefficients, across), _STEPS_TRIED)
+        for k in range(len(stars.sign))
+        for across in _ACROSS
+    ]
+    found = _best(problem, tried)
+    return found if found and cost >= least_rise * found.cost and _is_told(problem, fitted, found) else None
+
+
+def _as_weak(problem: ShapeProblem, fitted: Fit) -> Fit | None:
+    """The stars with one or all of the strong ones taken for weak; None if the data do not tell of it."""
+    strong = np.flatnonzero(~fitted.stars.weak)
+    some = [[k] for k in strong] + [strong] * (len(strong) > 1)
+    found = _best(problem, [fitted.stars.weakened(one, fitted.coefficients) for one in some])
+    return found if found and _is_told(problem, fitted, found) else None
+
+
+def _best(problem: ShapeProblem, starts: Sequence[tuple[Stars, Float[np.ndarray, " n"]]]) -> Fit | None:
+    """The least cost from several starts, by which a few steps are best."""
+    tried = [problem.fit(*one, _STEPS_TRIED, _ROUGHLY) for one in starts]
+    best = min(tried, key=lambda one: one.cost, default=None)
+    return best and problem.fit(best.stars, best.coefficients, _STEPS)
+
+
+def _is_told(problem: ShapeProblem, simple: Fit, other: Fit) -> bool:
+    """Whether the evidence is for the other."""
+    return problem.surprise(other) + _MARGIN <= problem.surprise(simple)
+
+
+def _searched(problem: ShapeProblem, found: _Found, least_rise: float) -> _Found:
+    """The stars that explain the data: split one after the other, and then taken for weak."""
+    for _ in range(_MOST_CHANGES):
+        changed = _in_two(problem, found.fit, least_rise) or _as_weak(problem, found.fit)
+        if changed is None:
+            break
+        found = _without_ghosts(problem, changed, found.doubtful, least_rise)
+    return found

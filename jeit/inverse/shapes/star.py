@@ -36,7 +36,8 @@ class StarPrior:
     - `roughness`: of the logarithm of r in the second mode; the others have 2/n of it.
     - `contrast` of log σ and its spread. What is ten times as conductive or resistive as the bath is hardly told from
       what is more so: strong bodies are best held strong.
-    - `weak_contrast` and the spread of its logarithm: of bodies that data tell to be weak.
+    - `weak_contrast` and the spread of its logarithm: of bodies that data tell to be weak. `odds_against_weak`: how
+      many times as likely strong ones are beforehand.
     - `drift`: of the logarithm of the bath's conductivity between the two frames.
     - `apart`: over the share of the whole body by which two stars overlap, its standard deviation. Without it two of
       opposite sign may lie on each other and cancel.
@@ -53,6 +54,7 @@ class StarPrior:
     contrast_spread: float = 0.5
     weak_contrast: float = 0.7
     weak_spread: float = 0.8
+    odds_against_weak: float = 20.0
     drift: float = 0.1
     apart: float = 1e3
 
@@ -266,7 +268,7 @@ class Stars:
     def _wave(self, waves, direction):
         """Σ aₙ cos nθ + bₙ sin nθ and its slope, for directions exp iθ; and the powers exp inθ, n = 2 … N."""
         number = np.arange(2, self.prior.modes + 1)
-        powers = direction ** number.reshape(-1, *np.ones(direction.ndim, int))
+        powers = np.cumprod(np.broadcast_to(direction, (self.prior.modes, *direction.shape)), axis=0)[1:]
         sums = np.tensordot(np.stack([waves, 1j * number * waves]), powers, 1)
         return sums[0].real, sums[1].real, powers
 
