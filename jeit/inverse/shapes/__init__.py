@@ -1,4 +1,4 @@
-"""Strong bodies as shapes with few parameters: what is told of a body where voltages tell too little for an image."""
+"""Bodies as shapes with few parameters: what is told of a body where voltages tell too little for an image."""
 
 from jeit.inverse.shapes.search import LEAST_RISE, ShapeReconstruction, reconstruct_shapes
 from jeit.inverse.shapes.star import Star, StarPrior

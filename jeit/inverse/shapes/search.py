@@ -1,4 +1,4 @@
-"""`reconstruct_shapes`: the strong bodies that explain a frame of voltages, as many as it tells of."""
+"""`reconstruct_shapes`: the bodies that explain a frame of voltages, as many as it tells of."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def reconstruct_shapes(
     prior: StarPrior | None = None,
     least_rise: float = LEAST_RISE,
 ) -> ShapeReconstruction:
-    """The strong bodies, as star shapes, that explain measured `voltages` (M,), in volts, of a sheet or tank.
+    """The bodies, as star shapes, that explain measured `voltages` (M,), in volts, of a sheet or tank.
 
     - `background`: conductivity without them, one number or (m,), S/m (2-D: S); what it has drifted is estimated.
     - `start`: sign, centre (x, y) and radius, metres, of every body that may be there, such as of all the inclusions
