@@ -11,9 +11,9 @@ from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import ShapeReconstruction
 
-# Change relative to the background, as linear images show it: less by half or more than it is where bodies are small
-# or data few, so that beyond this voltages are no longer linear in it.
-_STRONG = 0.1
+# Change relative to the background beyond which voltages are far from linear in it; and beyond which that must be
+# expected where noise is so large a share of the difference that images are damped to far less than there is.
+_STRONG, _STRONG_IN_NOISE, _NOISY = 0.3, 0.1, 0.3
 # What a linear image may miss of the voltages: over what it misses if they are taken to be linear in it, and in all.
 _WORSE, _MUCH = 1.1, 0.1
 # Share of the background that conductivity is kept above where a linear image claims less.
@@ -76,7 +76,8 @@ def unsound(prepared: PreparedDifference, change: Float[Array, " m"]) -> str:
     lowest, highest = float(relative.min()), float(relative.max())
     if lowest < -1:
         return f"the linear image falls to {percent(lowest)} of the background, below -100 %"
-    if max(-lowest, highest) > _STRONG:
+    noisy = (quality := prepared.quality.difference_noise) is not None and quality.relative > _NOISY
+    if max(-lowest, highest) > (_STRONG_IN_NOISE if noisy else _STRONG):
         strongest = lowest if -lowest > highest else highest
         return f"the linear image reaches {percent(strongest)} of the background, where voltages are no longer linear"
     linear, real = (_missed(prepared, background, relative, step) for step in (_STEP, 1.0))
