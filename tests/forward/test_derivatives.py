@@ -8,6 +8,7 @@ import pytest
 from kinds import MODELS, QUICK
 
 from jeit.electrodes import BoundaryElectrodes, CombinedElectrodes, FacePatches, PointElectrodes
+from jeit.forward.changes import Change, solved_fields
 from jeit.forward.transfer import electrode_fields
 
 SEED = 7
@@ -58,6 +59,17 @@ def test_jacobian_is_second_order_accurate(model, conductivity):
     ]
     order = np.log(rest[0] / rest[1]) / np.log(steps[0] / steps[1])
     assert abs(order - 2) < 0.05
+
+
+def test_changes_of_some_cells_need_no_whole_jacobian(model, conductivity):
+    rng = np.random.default_rng(SEED)
+    cells = np.flatnonzero(rng.random(model.mesh.num_cells) < 0.2)
+    changes = [Change(slice(None), np.asarray(conductivity)[:, None]), Change(cells, rng.normal(size=(len(cells), 3)))]
+    solved = solved_fields(model, np.asarray(conductivity))
+    voltages, jacobian = model.voltages_and_jacobian(conductivity)
+    np.testing.assert_allclose(solved.voltages, voltages, rtol=1e-9, atol=1e-12 * np.abs(voltages).max())
+    expected = np.concatenate([np.asarray(jacobian)[:, one.cells] @ one.slope for one in changes], axis=1)
+    assert _relative(solved.derivatives(changes), expected) < 1e-10
 
 
 def test_products_with_the_jacobian_are_adjoint(model, conductivity):

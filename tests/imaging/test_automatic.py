@@ -69,6 +69,7 @@ def test_strong_bodies_are_outlined():
     reported = report_image(result)["shapes"]
     assert len(reported["bodies"]) == 1
     assert np.shape(reported["bodies"][0]["outline"]) == star.outline.shape
+    assert reported["bodies"][0]["conductivity_is"].startswith("assumed")
     labels = image(20.0, segment=True).labels
     share = (labels == 2).sum() / (labels.size * np.pi / 4)
     np.testing.assert_allclose(share, star.area / (np.pi * RADIUS**2), rtol=0.02)
@@ -79,6 +80,26 @@ def test_weak_bodies_are_cut_out_of_an_image_of_few_pieces():
     assert (result.settings.method, result.shapes) == ("total-variation", None)
     assert "bodies are weak" in result.why
     assert set(np.unique(result.labels)) == {0, 2}
+
+
+def test_noise_damps_images_and_bodies_are_then_solved_for():
+    """A body that a sound image shows by a fifth: kept linear, unless noise is why it shows so little."""
+    sound, noisy = image(1.15), image_difference(frame(1.15, noise=1.5e-2, seed=2), frame(), ImagingSettings(**FEW))
+    shown = [float(np.abs(one.change).max() / one.calibration.conductivity) for one in (sound, noisy)]
+    assert all(0.1 < one < 0.3 for one in shown)
+    relative = [one.quality.difference_noise.relative for one in (sound, noisy)]
+    assert relative[0] < 0.3 < relative[1]
+    assert [one.settings.method for one in (sound, noisy)] == ["one-step", "gauss-newton"]
+
+
+def test_sharp_outlines_are_asked_less_of_where_the_model_is_at_fault():
+    exact = prepare_difference(frame(20.0, seed=1), frame(), num_points=700)
+    noisy = prepare_difference(frame(20.0, noise=0.1, seed=1), frame(), num_points=700)
+    for one in (exact, noisy):
+        model = np.sqrt(np.asarray(one.modelled_noise) ** 2 - (one.noise * np.asarray(one.relative_noise)) ** 2)
+        expected = np.hypot(one.noise * np.asarray(one.relative_noise), 3 * model)
+        np.testing.assert_allclose(one.sharp_noise, expected, rtol=1e-6)
+    assert noisy.modelled_share < 0.5 < 0.95 < exact.modelled_share < 1
 
 
 def test_shapes_may_be_asked_for():

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit.arguments import told
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit.inverse.channel_weights import relative_noise
@@ -46,13 +47,16 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
 
 
 def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
-    """The background per cell; raises `ValueError` for what is not one real number or one for each cell."""
+    """The background per cell; raises `ValueError` for what is not one positive number or one for each cell."""
     background = _array(background)
     if background.dtype.kind not in "biuf" or background.shape not in ((), (model.mesh.num_cells,)):
         raise ValueError(
             f"background must be one real conductivity, or one for each of the {model.mesh.num_cells} cells; it is "
             f"{background.dtype} of shape {background.shape}."
         )
+    values = np.asarray(background) if has_values(background) else np.ones(())
+    if (wrong := values[~((values > 0) & np.isfinite(values))]).size:
+        raise ValueError(f"background must be positive and finite, S/m (2-D: S), everywhere; {told(wrong[0])} is not.")
     return namespace(background).broadcast_to(background.astype(float), (model.mesh.num_cells,))
 
 

@@ -9,14 +9,14 @@ MacKay, Neural Computation 4 (1992) 415, section 2.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
 from jaxtyping import Float
 
 from jeit.forward import ForwardModel
-from jeit.forward.model import evaluate, voltages_and_jacobian_of
+from jeit.forward.changes import Change, solved_fields
 from jeit.inverse.channels import Data
 from jeit.inverse.shapes.star import Stars
 from jeit_solvers import Descent, QuadraticModel, ridge_model
@@ -38,27 +38,35 @@ class ShapeProblem:
     data: Data
     background: Float[np.ndarray, " m"]
 
-    def linearise(self, coefficients: Float[np.ndarray, " n"], stars: Stars):
-        """Residual (r + p,), Jacobian (r + p, n), covariance and precision (r + p, r + p)."""
-        image, slope, overlap, overlap_slope = stars.image(coefficients)
+    def linearise(self, coefficients: Float[np.ndarray, " n"], stars: Stars) -> tuple[Any, Any, Any, Any]:
+        """Residual (r + p,), a function that gives its Jacobian (r + p, n), covariance and precision (r + p, r + p)."""
+        image, slopes, overlap, overlap_slope = stars.image(coefficients)
         conductivity = self.background * np.exp(image)
-        voltages, jacobian = evaluate(self.model, voltages_and_jacobian_of, conductivity)
+        fields = solved_fields(self.model, conductivity)
         weight = np.asarray(self.data.weight)
-        rows = weight[:, None] * (np.asarray(jacobian) @ (conductivity[:, None] * slope))
-        residual = weight * (np.asarray(voltages) - self.data.voltages)
         # That stars keep apart is one more datum of unit variance for every two of them.
         apart, more = stars.prior.apart, np.eye(len(overlap))
+
+        def jacobian():
+            changes = [Change(cells, conductivity[cells, None] * slope) for cells, slope in slopes]
+            return np.concatenate([weight[:, None] * fields.derivatives(changes), apart * overlap_slope])
+
         return (
-            np.concatenate([residual, apart * overlap]),
-            np.concatenate([rows, apart * overlap_slope]),
+            np.concatenate([weight * (fields.voltages - self.data.voltages), apart * overlap]),
+            jacobian,
             scipy.linalg.block_diag(self.data.covariance, more),
             scipy.linalg.block_diag(self.data.precision, more),
         )
 
     def quadratic_model(self, coefficients: Float[np.ndarray, " n"], stars: Stars) -> QuadraticModel:
-        """Cost and step, for `jeit_solvers.Descent`."""
+        """Cost and step, for `jeit_solvers.Descent`; points that are refused need no Jacobian."""
         residual, jacobian, covariance, precision = self.linearise(coefficients, stars)
-        return ridge_model(residual, jacobian, coefficients, covariance, precision)  # pyright: ignore[reportArgumentType]
+        cost = 0.5 * (residual @ precision @ residual + coefficients @ coefficients)
+
+        def step(damping):
+            return ridge_model(residual, jacobian(), coefficients, covariance, precision)[1](damping)  # pyright: ignore
+
+        return cost, step
 
     def fit(self, stars: Stars, start: Float[np.ndarray, " n"], max_steps: int, rtol: float = 3e-3) -> Fit:
         """The least cost near `start`, by Levenberg-Marquardt."""
@@ -69,6 +77,7 @@ class ShapeProblem:
     def surprise(self, fit: Fit) -> float:
         """-log evidence of some stars, up to a constant, with the odds against weak ones."""
         _, jacobian, _, precision = self.linearise(fit.coefficients, fit.stars)
-        hessian = np.eye(len(fit.coefficients)) + jacobian.T @ (np.asarray(precision) @ jacobian)
+        rows = jacobian()
+        hessian = np.eye(len(fit.coefficients)) + rows.T @ (precision @ rows)
         odds = fit.stars.weak.sum() * np.log(fit.stars.prior.odds_against_weak)
         return fit.cost + 0.5 * float(np.linalg.slogdet(hessian)[1]) + float(odds)

@@ -22,6 +22,8 @@ from jeit_solvers.engines import as_array
 LEAST_RISE = 1.4
 _FIRST_STEPS, _STEPS, _STEPS_WITHOUT, _STEPS_TRIED = 15, 40, 8, 6
 _ROUGHLY = 1e-2
+# How many times the objective rises at least without a body that is one beyond doubt.
+_SURELY = 10.0
 # Directions, from its longer axis, along which a star is split in two; and how many changes are made at most.
 _ACROSS, _MOST_CHANGES = (0.0, np.pi / 2), 10
 # How much likelier (of the logarithm) more has to make the data than less, to be told.
@@ -104,17 +106,13 @@ def reconstruct_shapes(
     if not (is_number(least_rise) and least_rise >= 1):
         raise ValueError(f"least_rise must be a number from 1; it is {told(least_rise)}.")
     sign, centre, radius = _checked_start(start)
-    if not (background > 0).all():
-        raise ValueError("background must be positive, S/m (2-D: S).")
     small, data = independent_data(model, measured, used, deviation, at_once=True)
     problem = ShapeProblem(small, data, background)
     stars = Stars.create(model.mesh, prior, centre, sign)
     fitted = problem.fit(*_grown(problem, stars, stars.of_radii(radius), _FIRST_STEPS), _STEPS)
     found = _without_ghosts(problem, fitted, (), least_rise)
-    ways, weak = [found], _as_weak(problem, found.fit)
-    if weak is not None:
-        ways.append(_without_ghosts(problem, weak, found.doubtful, least_rise))
-    ways = [_searched(problem, one, least_rise) for one in ways]
+    changes = [_in_two(problem, found.fit, least_rise), _as_weak(problem, found.fit)]
+    ways = [_searched(problem, found, one, least_rise) for one in changes if one is not None] or [found]
     fitted, rises, doubtful = min(ways, key=lambda one: problem.surprise(one.fit))
     stars, coefficients = fitted.stars, fitted.coefficients
     conductivity = background * np.exp(stars.image(coefficients).image)
@@ -159,29 +157,28 @@ class _Found(NamedTuple):
 
 
 def _without_ghosts(problem: ShapeProblem, fitted: Fit, doubtful: Sequence[Star], least_rise: float) -> _Found:
+    """The stars that are missed when they are left out and the rest fitted again; the least missed goes first."""
+    doubtful, missed = list(doubtful), np.zeros(len(fitted.stars.sign))  # cost without each star, at least
     while True:
         stars, coefficients, cost = fitted
-        others = [
-            problem.fit(*stars.without(k, coefficients), _STEPS_WITHOUT, 2 * _ROUGHLY) for k in range(len(stars.sign))
-        ]
-        rises = [one.cost / cost for one in others]
-        if not rises:
-            return _Found(fitted, rises, tuple(doubtful))
-        least = int(np.argmin(rises))
-        if rises[least] >= least_rise and _is_told(problem, others[least], fitted):
-            return _Found(fitted, rises, tuple(doubtful))
-        doubtful = [*doubtful, stars.star(least, coefficients, rises[least])]
+        # With one ghost fewer in whose place others can step, what was missed is missed as much.
+        beyond_doubt = max(_SURELY * cost, problem.surprise(fitted) + _MARGIN)
+        unsure, others = np.flatnonzero(missed <= beyond_doubt).tolist(), {}
+        for k in unsure:
+            others[k] = problem.fit(*stars.without(k, coefficients), _STEPS_WITHOUT, 2 * _ROUGHLY)
+            missed[k] = others[k].cost
+        least = min(others, key=lambda k: missed[k], default=None)
+        if least is None or (missed[least] >= least_rise * cost and _is_told(problem, others[least], fitted)):
+            return _Found(fitted, list(missed / cost), tuple(doubtful))
+        doubtful.append(stars.star(least, coefficients, float(missed[least]) / cost))
+        missed = np.delete(missed, least)
         fitted = problem.fit(others[least].stars, others[least].coefficients, _STEPS)
 
 
 def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
     """The stars with one of them split in two; None if the data do not tell of it."""
     stars, coefficients, cost = fitted
-    tried = [
-        _grown(problem, *stars.split(k, coefficients, across), _STEPS_TRIED)
-        for k in range(len(stars.sign))
-        for across in _ACROSS
-    ]
+    tried = [stars.split(k, coefficients, across) for k in range(len(stars.sign)) for across in _ACROSS]
     found = _best(problem, tried)
     return found if found and cost >= least_rise * found.cost and _is_told(problem, fitted, found) else None
 
@@ -206,11 +203,12 @@ def _is_told(problem: ShapeProblem, simple: Fit, other: Fit) -> bool:
     return problem.surprise(other) + _MARGIN <= problem.surprise(simple)
 
 
-def _searched(problem: ShapeProblem, found: _Found, least_rise: float) -> _Found:
-    """The stars that explain the data: split one after the other, and then taken for weak."""
+def _searched(problem: ShapeProblem, found: _Found, changed: Fit, least_rise: float) -> _Found:
+    """The stars that explain the data once they are `changed`: split one after the other, and then taken for weak."""
     for _ in range(_MOST_CHANGES):
-        changed = _in_two(problem, found.fit, least_rise) or _as_weak(problem, found.fit)
-        if changed is None:
-            break
         found = _without_ghosts(problem, changed, found.doubtful, least_rise)
+        change = _in_two(problem, found.fit, least_rise) or _as_weak(problem, found.fit)
+        if change is None:
+            break
+        changed = change
     return found

@@ -10,8 +10,9 @@ Everything is estimated in units of its prior's standard deviation, so that the 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -24,6 +25,8 @@ from jeit.mesh import Mesh, measures
 _SAMPLES = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2.5, 2.5, 1], [2.5, 1, 2.5], [1, 2.5, 2.5]]) / 6
 # Over how much of a cell's size an outline is blurred: enough to be differentiable.
 _BLUR = 0.2
+# Beyond so many widths of the blur from an outline a cell's share is less than 1e-12.
+_REACH = 30
 _OUTLINE = 128
 
 
@@ -129,11 +132,12 @@ class Star(eqx.Module):
 
 
 class StarImage(NamedTuple):
-    """**Fields**: `image` (m,), log σ/σ₀; its derivative `slope` (m, n); `overlap` of every two stars, in units of the
-    whole area, and its derivative `overlap_slope`."""
+    """**Fields**: `image` (m,), log σ/σ₀; its derivatives `slopes`, by the drift in all cells, then by every star's
+    coefficients in the cells that it reaches; `overlap` of every two stars, in units of the whole area, and its
+    derivative `overlap_slope`."""
 
     image: Float[np.ndarray, " m"]
-    slope: Float[np.ndarray, "m n"]
+    slopes: Sequence[tuple[Any, Float[np.ndarray, "k q"]]]
     overlap: Float[np.ndarray, " p"]
     overlap_slope: Float[np.ndarray, "p n"]
 
@@ -227,25 +231,31 @@ class Stars:
 
     def image(self, coefficients) -> StarImage:
         """log σ/σ₀ per cell, how far the stars overlap, and the derivatives of both."""
-        drift = np.full((len(self.width), 1), self.prior.drift)
+        size = len(self.width)
         parts = [self._one(k, row) for k, row in enumerate(self.rows(coefficients))]
-        image, columns = coefficients[0] * drift[:, 0], [drift]
-        for sign, (values, share, slope) in zip(self.sign, parts, strict=True):
+        drift, everywhere = np.full((size, 1), self.prior.drift), slice(None)
+        image = coefficients[0] * drift[:, 0]
+        slopes: list[tuple[Any, Any]] = [(everywhere, drift)]
+        shares = np.zeros((len(parts), size))
+        for k, (values, cells, share, slope) in enumerate(parts):
             # What a cell of which a share is covered does to the field is so much of what all of it would do.
             strength = np.tanh(values.contrast / 2)
-            image = image + 2 * sign * np.arctanh(share * strength)
-            steep = sign / (1 - (share * strength) ** 2)
-            columns.append((2 * strength * steep)[:, None] * slope)
-            columns[-1][:, 3] = steep * share * (1 - strength**2) * values.contrast_slope
-        shares, weighed = np.array([part[1] for part in parts]), [self.weight * part[1] for part in parts]
+            image[cells] += 2 * self.sign[k] * np.arctanh(share * strength)
+            steep = self.sign[k] / (1 - (share * strength) ** 2)
+            change = (2 * strength * steep)[:, None] * slope
+            change[:, 3] = steep * share * (1 - strength**2) * values.contrast_slope
+            slopes.append((cells, change))
+            shares[k, cells] = share
         overlap, overlap_slope = [], []
+        weighed = self.weight * shares
         for j, k in itertools.combinations(range(len(parts)), 2):
             rows = np.zeros((len(parts), self.prior.size))
-            rows[j], rows[k] = weighed[k] @ parts[j][2], weighed[j] @ parts[k][2]
+            for one, other in ((j, k), (k, j)):
+                _, cells, _, slope = parts[one]
+                rows[one] = weighed[other, cells] @ slope
             overlap.append(weighed[j] @ shares[k])
             overlap_slope.append(np.append(0, rows))
-        slopes = np.reshape(overlap_slope, (-1, len(coefficients)))
-        return StarImage(image, np.concatenate(columns, axis=1), np.array(overlap), slopes)
+        return StarImage(image, slopes, np.array(overlap), np.reshape(overlap_slope, (-1, len(coefficients))))
 
     def star(self, k: int, coefficients, rise: float = np.nan) -> Star:
         """Star k."""
@@ -273,15 +283,17 @@ class Stars:
         return sums[0].real, sums[1].real, powers
 
     def _one(self, k: int, row):
-        """Star k's values, its share of every cell, and the derivative of that (m, q)."""
+        """Star k's values, the cells it reaches (c,), its share of each, and the derivative of that (c, q)."""
         values = self._values(k, row)
         centre, log_radius, waves = values.centre, values.log_radius, values.waves
-        offset = self.points - centre
+        # No outline lies farther out, and beyond so many widths of the blur no share is left.
+        farthest = np.exp(np.minimum(log_radius + np.abs(waves).sum(), np.log(10 * self.span)))
+        cells = np.flatnonzero(np.abs(self.points[:, 0] - centre) < farthest + _REACH * self.width)
+        offset, width = self.points[cells] - centre, self.width[cells, None]
         distance = np.maximum(np.abs(offset), 1e-9 * self.span)
         direction = offset / distance
         wave, slope, powers = self._wave(waves, direction)
         radius = np.exp(np.minimum(log_radius + wave, np.log(10 * self.span)))
-        width = self.width[:, None]
         inside = 0.5 * (1 + np.tanh(0.5 * (radius - distance) / width))
         edge = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(r - distance)
         # As the centre moves by dz, the distance falls by Re(dz/u), and θ by Im(dz/u) / distance; u is the direction.
@@ -291,4 +303,4 @@ class Stars:
         share = inside.mean(axis=1)
         columns = [towards.real, towards.imag, along.sum(axis=1), np.zeros_like(share)]
         columns += [part for mode in modes.T for part in (mode.real, mode.imag)]
-        return values, share, np.stack(columns, axis=1) * self.prior.deviation(self.span)
+        return values, cells, share, np.stack(columns, axis=1) * self.prior.deviation(self.span)
