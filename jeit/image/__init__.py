@@ -4,7 +4,7 @@ from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.image.inclusions import Inclusion, find_inclusions
 from jeit.image.merit import figures_of_merit
 from jeit.image.raster import Raster
-from jeit.image.segmentation import labelled_inclusions, segment
+from jeit.image.segmentation import segment
 
 _tell_old_names(__name__)
 
@@ -13,6 +13,5 @@ __all__ = [
     "Raster",
     "figures_of_merit",
     "find_inclusions",
-    "labelled_inclusions",
     "segment",
 ]

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jeit.image.watershed import basins, cell_neighbours
 from jeit.mesh import Mesh, centroids, measures
@@ -52,6 +52,31 @@ def find_inclusions(
     (m,) is given, the standard deviation of the image, peaks of less than `least_significance` times that. Strongest
     first. Raises `ValueError` for an image of another size or with NaN.
     """
+    regions = inclusion_regions(
+        mesh,
+        image,
+        level=level,
+        least_peak=least_peak,
+        least_prominence=least_prominence,
+        least_area=least_area,
+        noise=noise,
+        least_significance=least_significance,
+    )
+    return [inclusion for inclusion, _ in regions]
+
+
+def inclusion_regions(
+    mesh: Mesh,
+    image: Float[Array, " m"],
+    *,
+    level: float,
+    least_peak: float,
+    least_prominence: float = 0.1,
+    least_area: float = 0.004,
+    noise: Float[Array, " m"] | None = None,
+    least_significance: float = 5.5,
+) -> list[tuple[Inclusion, Bool[np.ndarray, " m"]]]:
+    """What `find_inclusions` finds, each with its cells."""
     values = np.asarray(image)
     if values.shape != (mesh.num_cells,):
         raise ValueError(f"image has shape {values.shape}; give one value for each of the {mesh.num_cells} cells.")
@@ -81,5 +106,5 @@ def find_inclusions(
                 continue
             weight = (measure * change)[region]
             centroid = tuple(float(value) for value in weight @ centre[region] / weight.sum())
-            found.append(Inclusion(sign, centroid, float(measure[region].sum()), float(sign * peak)))
-    return sorted(found, key=lambda inclusion: -abs(inclusion.peak))
+            found.append((Inclusion(sign, centroid, float(measure[region].sum()), float(sign * peak)), region))
+    return sorted(found, key=lambda one: -abs(one[0].peak))

@@ -1,11 +1,9 @@
-"""Segmentation: an image cut up into background, resistive and conductive regions, and what these are as inclusions."""
+"""Segmentation: an image cut up into background, resistive and conductive regions."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy import ndimage
 
-from jeit.image.inclusions import Inclusion
-from jeit.image.raster import Raster
 from jeit.image.score import CONDUCTIVE, RESISTIVE
 
 
@@ -47,25 +45,3 @@ def segment(
         size[0] = 0
         labels[size[islands] >= max(1, least_area * inside.sum())] = label
     return labels
-
-
-def labelled_inclusions(
-    labels: UInt8[np.ndarray, "rows columns"], image: Float[np.ndarray, "rows columns"], raster: Raster
-) -> list[Inclusion]:
-    """The islands of labels as inclusions, strongest first: so many, and so large, as the labels show.
-
-    `image`: what was segmented, on `raster`. Raises `ValueError` for labels or an image of another shape.
-    """
-    found = []
-    for name, values in (("labels", labels), ("image", image)):
-        if np.shape(values) != raster.cell.shape:
-            raise ValueError(f"{name} has shape {np.shape(values)}, and the raster {raster.cell.shape}; give its own.")
-    place = raster.pixel_centres()
-    for sign, label in ((1, CONDUCTIVE), (-1, RESISTIVE)):
-        islands, number = ndimage.label(np.asarray(labels) == label)  # pyright: ignore[reportGeneralTypeIssues]
-        for island in range(1, number + 1):
-            inside = islands == island
-            change = sign * np.asarray(image)[inside]
-            centre = tuple(float(one) for one in change @ place[inside] / change.sum())
-            found.append(Inclusion(sign, centre, float(raster.pixel_area * inside.sum()), float(sign * change.max())))
-    return sorted(found, key=lambda inclusion: -abs(inclusion.peak))

@@ -12,7 +12,8 @@ from jaxtyping import Array, Float, Inexact, UInt8
 
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
-from jeit.image import Inclusion, Raster, find_inclusions, labelled_inclusions, segment
+from jeit.image import Inclusion, Raster
+from jeit.image.inclusions import inclusion_regions
 from jeit.image.score import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
 from jeit.imaging.clock import Clock
@@ -27,6 +28,8 @@ from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import ShapeReconstruction, Star
 from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array
+
+_MIDDLE = 0.5
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class ImagedDifference:
     - `raster`: `change` on a grid, NaN outside the mesh; `extent` (x_min, x_max, y_min, y_max) in metres.
     - `inclusions`: regions of changed conductivity, strongest first; iterative images are looked at on the scale of the
       logarithm, which weighs both signs alike, and for what stands out of the noise; complex ones in the real part.
-      Where there are `shapes`, those; of an image that was segmented without, those of the `labels`.
+      Where there are `shapes`, those.
     - `unlike_electrodes`: electrodes, counted from 0, of which the model misses far more than of the others, and how
       many times as much; channels that read them count less.
     - `shapes`: bodies with their outlines, and what each explains; None where none were fitted, or they do not
@@ -88,6 +91,11 @@ class ImagedDifference:
         rule, asked = self.reconstruction.rule, self.settings.hyperparameter
         own = asked is None or asked == METHODS[self.settings.method].hyperparameter
         return "default" if rule == "given" and own else rule
+
+    @property
+    def level(self) -> float:
+        """Share of its peak at which an inclusion ends: at the middle of its blurred edge, if it is cut out."""
+        return _MIDDLE if self.settings.segment else self.settings.level
 
     @property
     def is_complex(self) -> bool:
@@ -186,18 +194,21 @@ def _inclusions(
         labels = _labels(stars, grid) if settings.segment else None
         listed = [Inclusion(one.sign, tuple(one.centroid.tolist()), one.area, one.sign * one.contrast) for one in stars]
         return [_with_change(one, background) for one in listed], labels
-    departure, labels, noise = as_array(np.real(found.departure)), None, None
-    if settings.segment:
-        pixels = np.asarray(grid.sample(departure))
-        labels = segment(pixels)
-        inclusions = labelled_inclusions(labels, pixels, grid)
-    else:
-        if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
-            noise = as_array(image_noise(reconstruction))
-        inclusions = find_inclusions(
-            found.mesh, departure, level=settings.level, least_peak=settings.least_peak, noise=noise
-        )
-    return [_with_change(one, background) for one in inclusions] if found.iterative else inclusions, labels
+    departure, noise = as_array(np.real(found.departure)), None
+    if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
+        noise = as_array(image_noise(reconstruction))
+    regions = inclusion_regions(found.mesh, departure, level=found.level, least_peak=settings.least_peak, noise=noise)
+    inclusions = [_with_change(one, background) if found.iterative else one for one, _ in regions]
+    return inclusions, _covered(regions, grid) if settings.segment else None
+
+
+def _covered(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
+    """Which pixels lie in a region of either sign."""
+    cell = np.asarray(grid.cell)
+    labels = np.zeros(cell.shape, np.uint8)
+    for one, region in regions:
+        labels[(cell >= 0) & region[cell]] = CONDUCTIVE if one.sign > 0 else RESISTIVE
+    return labels
 
 
 def _labels(stars: Sequence[Star], grid: Raster) -> UInt8[np.ndarray, "rows columns"]:

@@ -33,7 +33,7 @@ class ImagingSettings:
     - `level`, `least_peak`: see `jeit.image.find_inclusions`.
     - `as_is`: image even where the wiring is found to be another than described, see `jeit.imaging.wiring`.
     - `segment`: whether to cut the image up into background, resistive and conductive: by the outlines where there are
-      any, else by `jeit.image.segment`; with "auto", of an image by total variation.
+      any, else at half of every inclusion's own peak; with "auto", of an image by total variation.
 
     Raises `ValueError`, naming the setting, for what there is not or what does not go together.
     """

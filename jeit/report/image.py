@@ -143,9 +143,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         },
         "inclusions": [_inclusion(result, one) for one in result.inclusions],
         "shapes": _shapes(result),
-        "inclusion_settings": {"level": settings.level, "least_peak": settings.least_peak}
-        if result.labels is None
-        else {"found_in": "labels"},
+        "inclusion_settings": {"level": result.level, "least_peak": settings.least_peak},
         "timings": {**result.timings, "unit": "s"},
         "versions": {name: version_of(name) for name in _PACKAGES},
     }

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.image import Raster, labelled_inclusions, segment
+from jeit.image import segment
 
 Y, X = np.mgrid[-1:1:200j, -1:1:200j]
 INSIDE = X**2 + Y**2 < 1
@@ -38,23 +38,6 @@ def test_an_image_of_nothing_is_background():
 
 def test_outside_is_background():
     assert not segment(image_of((1.0, (0.9, 0, 0.4))))[~INSIDE].any()
-
-
-def test_islands_of_labels_are_inclusions():
-    """As many, where and as large as the labels show; strongest first."""
-    raster = Raster(np.zeros(X.shape, int), (-1.0, 1.0, -1.0, 1.0))
-    image = image_of((1.0, (0.5, 0, 0.2)), (0.99, (-0.5, 0.3, 0.15)), (-2.0, (-0.4, -0.4, 0.25)))[::-1]
-    labels = segment(image)
-    found = labelled_inclusions(labels, image, raster)
-    assert [one.sign for one in found] == [-1, 1, 1]
-    for one, place, radius in zip(found, [(-0.4, -0.4), (0.5, 0), (-0.5, 0.3)], (0.25, 0.2, 0.15), strict=True):
-        np.testing.assert_allclose(one.centroid, place, atol=0.01)
-        assert one.area == pytest.approx(np.pi * radius**2, rel=0.05)
-    assert sum(one.area for one in found) == pytest.approx((labels > 0).sum() * raster.pixel_area)
-    assert found[0].peak == pytest.approx(-2, rel=0.05)
-    assert labelled_inclusions(0 * labels, image, raster) == []
-    with pytest.raises(ValueError, match="labels has shape"):
-        labelled_inclusions(labels[1:], image, raster)
 
 
 @pytest.mark.parametrize(

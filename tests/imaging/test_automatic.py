@@ -82,6 +82,23 @@ def test_weak_bodies_are_cut_out_of_an_image_of_few_pieces():
     assert set(np.unique(result.labels)) == {0, 2}
 
 
+def test_every_inclusion_of_a_segmented_image_is_labelled():
+    """A body that shows a quarter as much as another of its sign is one nevertheless."""
+    near = [np.linalg.norm(CENTRES - place, axis=1) < 0.013 for place in ([0.028, 0], [-0.028, 0])]
+    voltages = np.asarray(TRUTH.voltages(0.02 * np.where(near[0], 1.2, np.where(near[1], 1.09, 1.0))))
+    one = frame()
+    pair = Measurement(voltages, one.mask, one.protocol, electrodes=one.electrodes, domain=one.domain)
+    plain, cut = (
+        image_difference(pair, frame(noise=0), ImagingSettings(**FEW, method="total-variation", segment=segment))
+        for segment in (False, True)
+    )
+    assert [one.sign for one in cut.inclusions] == [one.sign for one in plain.inclusions] == [1, 1]
+    assert cut.inclusions[1].peak < 0.5 * cut.inclusions[0].peak
+    pixel = np.prod([cut.extent[1] - cut.extent[0], cut.extent[3] - cut.extent[2]]) / cut.labels.size
+    labelled = [(part == 2).sum() * pixel for part in np.array_split(cut.labels, 2, axis=1)]
+    np.testing.assert_allclose(labelled, [one.area for one in cut.inclusions[::-1]], rtol=0.05)
+
+
 def test_noise_damps_images_and_bodies_are_then_solved_for():
     """A body that a sound image shows by a fifth: kept linear, unless noise is why it shows so little."""
     sound, noisy = image(1.15), image_difference(frame(1.15, noise=1.5e-2, seed=2), frame(), ImagingSettings(**FEW))

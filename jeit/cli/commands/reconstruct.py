@@ -56,7 +56,11 @@ def reconstruct(
     ] = None,
     contact: Contact = None,
     segment: Annotated[
-        bool, typer.Option("--segment", help="Add labels to image.npz: 0 background, 1 resistive, 2 conductive.")
+        bool,
+        typer.Option(
+            "--segment",
+            help="Cut inclusions out; add labels to image.npz: 0 background, 1 resistive, 2 conductive.",
+        ),
     ] = False,
     num_points: Nodes = None,
     frame: Frame = None,
