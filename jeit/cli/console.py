@@ -75,6 +75,7 @@ def scaled(value: float | None, unit: str) -> str:
     """A value with three digits and an SI prefix: 0.00132 S is "1.32 mS"."""
     if value is None:
         return "not known"
+    value = float(f"{value:.3g}")  # 999.6 µS is 1 mS
     for exponent, prefix in _PREFIXES:
         if abs(value) >= 10.0**exponent:
             return f"{value / 10.0**exponent:.3g} {prefix}{unit}"
@@ -83,7 +84,7 @@ def scaled(value: float | None, unit: str) -> str:
 
 def in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
     """A unit with the SI prefix that suits the largest of the values, and all of them in it, for a table's column."""
-    largest = max((abs(value) for value in values), default=0.0)
+    largest = float(f"{max((abs(value) for value in values), default=0.0):.3g}")
     exponent, prefix = next((pair for pair in _PREFIXES if largest >= 10.0 ** pair[0]), _PREFIXES[0])
     return f"{prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
 

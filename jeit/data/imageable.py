@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jeit.arguments import counted
+from jeit.arguments import counted, percent
 from jeit.data.measurement import Measurement
 from jeit.data.quality import (
     NoiseEstimate,
@@ -17,6 +17,8 @@ from jeit.inverse import relative_noise
 
 # A quarter of the signs wrong means that half of the voltages are noise (noise is wrong half the time).
 MOST_IMPOSSIBLE_SIGNS = 0.25
+# Noise has as many right signs as wrong ones: so many wrong ones are not noise.
+MOST_OPPOSITE_SIGNS = 0.75
 # Reciprocity error r of a difference means noise over signal of r / sqrt(2 - r²): here a half.
 MOST_DIFFERENCE_RECIPROCITY_ERROR = 0.63
 
@@ -103,8 +105,9 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
 
     - it, or the reference, has an impossible sign in more than a quarter of its voltages
       (`impossible_signs`): half of the voltages or more then lie below the instrument's noise or offset;
-    - the difference breaks reciprocity by more than 0.63, i.e. its noise is over half its signal, each channel trusted
-      as images trust it (`jeit.inverse.relative_noise`): driven electrodes read large voltages, mostly of contacts;
+    - it, or the reference, breaks reciprocity by more than 0.63, or the difference does, i.e. its noise is over half its
+      signal, each channel trusted as images trust it (`jeit.inverse.relative_noise`): driven electrodes read large
+      voltages, mostly of contacts;
     - it does not differ from the reference at all;
     - fewer channels than electrodes are usable.
 
@@ -115,7 +118,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
     """
     check_same_setup(measurement, reference)
     mean = reference.mean_frame()
-    reference_signs = impossible_signs(mean)
+    reference_signs, reference_error = impossible_signs(mean), reciprocity_error(mean)
     trusted = np.asarray(relative_noise(np.abs(np.asarray(mean.voltages)[0]), np.asarray(mean.mask)[0]))
     results = []
     for index in range(measurement.num_frames):
@@ -129,6 +132,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
         signs = [float(s[0]) for s in (impossible_signs(frame), reference_signs) if s is not None]
         usable = int(both.sum())
         error = reciprocity_error(change, trusted) if usable and size > 0 else None
+        own = {f"the reference '{reference.name}'": reference_error, "the frame": reciprocity_error(frame)}
         wrong = max(signs) if signs else None
         results.append(
             FrameQuality(
@@ -138,7 +142,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                 difference_reciprocity_error=error,
                 impossible_signs=wrong,
                 usable_channels=usable,
-                reason=_reason(measurement.protocol.num_electrodes, usable, relative, wrong, error),
+                reason=_reason(measurement.protocol.num_electrodes, usable, relative, wrong, error, own),
             )
         )
     return results
@@ -154,20 +158,38 @@ def check_imageable(measurement: Measurement, reference: Measurement) -> list[Fr
     return qualities
 
 
-def _reason(electrodes: int, usable: int, difference: float, signs: float | None, reciprocity: float | None) -> str:
+def _reason(
+    electrodes: int,
+    usable: int,
+    difference: float,
+    signs: float | None,
+    reciprocity: float | None,
+    own: dict[str, float | None],
+) -> str:
+    """Why a frame cannot be imaged; `own`: the reciprocity errors of both frames themselves."""
     if usable < electrodes:
         return f"only {counted(usable, 'channel')} usable in both it and its reference, for {electrodes} electrodes."
     if difference < 1e-12:
         return "it equals its reference, so there is no difference to image. Is it the same file?"
+    if signs is not None and signs > MOST_OPPOSITE_SIGNS:
+        return (
+            f"{percent(signs)} of the voltages have a sign that no passive body gives: reverse the polarity of it, or "
+            "of its reference."
+        )
     if signs is not None and signs > MOST_IMPOSSIBLE_SIGNS:
         return (
-            f"too noisy: {100 * signs:.0f} % of the voltages have a sign that no passive body gives, so that "
-            "more than half of them lie below the instrument's noise or offset. Measure with more current or "
-            "gain (or, if every sign is wrong, reverse the polarity)."
+            f"too noisy: {percent(signs)} of the voltages have a sign that no passive body gives, so that "
+            "more than half of them lie below the instrument's noise or offset. Measure with more current or gain."
         )
+    for name, error in own.items():
+        if error is not None and error > MOST_DIFFERENCE_RECIPROCITY_ERROR:
+            return (
+                f"{name} breaks reciprocity by {percent(error)} on its own: it is too noisy, or its channels are in "
+                "another order than described. See `jeit info`."
+            )
     if reciprocity is not None and reciprocity > MOST_DIFFERENCE_RECIPROCITY_ERROR:
         return (
-            f"too noisy: the difference from the reference breaks reciprocity by {100 * reciprocity:.0f} %, "
+            f"too noisy: the difference from the reference breaks reciprocity by {percent(reciprocity)}, "
             "so that its noise is more than half its signal. Average more frames, or use more current."
         )
     return ""

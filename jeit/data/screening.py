@@ -32,7 +32,8 @@ def screen(
 
     Masked are: what `mask` (True = usable) excludes; NaN and infinity; saturated voltages (at or beyond
     `saturation` volts, or, when that is not given, stuck at exactly the same extreme value); drives that read
-    nothing at all, because their current never flowed; and frames that are all zero.
+    nothing at all, because their current never flowed, and what reads an electrode of which that holds for all its
+    drives; and frames that are all zero.
 
     Raises `ValueError` when the shape does not fit the protocol, or nothing usable is left.
     """
@@ -62,7 +63,13 @@ def screen(
         )
     exclude(np.broadcast_to(dead[:, None], values.shape), f"all zero: {int(dead.sum())} of {len(dead)} frames.")
     exclude(_saturated(values, usable, saturation), "saturated (stuck at an end of the instrument's range).")
-    exclude(_without_current(values, usable, protocol), "their drive's current did not flow.")
+    dead, alive = _currents(values, usable, protocol)
+    exclude(dead[:, np.asarray(protocol.drive_index)], "their drive's current did not flow.")
+    driven, reads = (np.asarray(one) != 0 for one in (protocol.drive, protocol.channel_measurement))
+    unconnected = (dead @ driven) & ~(alive @ driven)
+    numbers = ", ".join(str(one + 1) for one in np.flatnonzero(unconnected.any(axis=0)))
+    said = f"they read electrode {numbers}, through which no drive's current flowed: is it connected?"
+    exclude(unconnected @ reads.T, said)
     if not usable.any():
         raise ValueError(f"{name}: no usable voltage is left. {' '.join(found)}")
     described = {"electrodes": electrodes, "domain": domain, "name": name, "source": source, "frame_names": frame_names}
@@ -109,13 +116,15 @@ def _saturated(values: np.ndarray, usable: np.ndarray, limit: float | None) -> B
     return result
 
 
-def _without_current(values: np.ndarray, usable: np.ndarray, protocol: Protocol) -> Bool[np.ndarray, "F M"]:
-    """Channels of drives whose voltages are a thousand times smaller than those of the usual drive."""
-    drive_index = np.asarray(protocol.drive_index)
-    size = np.where(usable, np.abs(values), 0)
-    largest = np.zeros((values.shape[0], protocol.num_drives))
-    np.maximum.at(largest.T, drive_index, size.T)
+def _currents(
+    values: np.ndarray, usable: np.ndarray, protocol: Protocol
+) -> tuple[Bool[np.ndarray, "F S"], Bool[np.ndarray, "F S"]]:
+    """Drives whose voltages are a thousand times smaller than those of the usual drive; and the others. Neither where
+    no voltage is usable."""
+    index = np.asarray(protocol.drive_index)
+    largest = np.full((values.shape[0], protocol.num_drives), -1.0)
+    np.maximum.at(largest.T, index, np.where(usable, np.abs(values), -1.0).T)
     if protocol.num_drives < 3:
-        return np.zeros(values.shape, dtype=bool)
-    usual = np.median(largest, axis=1, keepdims=True)
-    return (largest < 1e-3 * usual)[:, drive_index]
+        return np.zeros(largest.shape, dtype=bool), largest >= 0
+    least = 1e-3 * np.median(np.maximum(largest, 0), axis=1, keepdims=True)
+    return (largest >= 0) & (largest < least), largest >= least

@@ -27,9 +27,12 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import ShapeReconstruction, Star
 from jeit.mesh import Mesh
+from jeit_solvers import Status
 from jeit_solvers.engines import as_array
 
 _MIDDLE = 0.5
+# Standard deviations by which the voltages of an image may miss the data.
+_MISFIT = 3.0
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,25 @@ class ImagedDifference:
         rule, asked = self.reconstruction.rule, self.settings.hyperparameter
         own = asked is None or asked == METHODS[self.settings.method].hyperparameter
         return "default" if rule == "given" and own else rule
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What speaks against believing the image, in sentences: an iteration that did not converge, voltages that it
+        does not explain."""
+        if isinstance(self.reconstruction, LinearReconstruction):
+            return ()
+        found, said = self.reconstruction, []
+        if isinstance(found, Reconstruction) and found.status != Status.CONVERGED:
+            said.append(
+                f"the iteration did not converge ({found.status}): neither peaks nor places are to be trusted. "
+                "Take the default hyperparameter, or a larger one."
+            )
+        if (misfit := float(found.misfit)) > _MISFIT:
+            said.append(
+                f"its voltages miss the data by {misfit:.2g} standard deviations: bodies may be missing, or shown "
+                "where none are."
+            )
+        return tuple(said)
 
     @property
     def level(self) -> float:

@@ -34,25 +34,28 @@ def write_film(
     *,
     titles: Sequence[str] | None = None,
     rate: float | None = None,
+    limit: float | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> None:
     """Write the frames of a stream as a film, `path` ending in .gif or .mp4, all on one colour scale.
 
-    `changes` and `titles` as in `jeit.plot.plot_frames`: frames that were refused are shown as such. `rate`: frames of
-    the stream in a second; the film then takes as long as the stream, unless it had more than 25 frames a second; 10 a
-    second unless given. Of long streams 120 frames are taken, evenly chosen. `progress` is called with how far it is.
+    `changes` and `titles` as in `jeit.plot.plot_frames`: frames that were refused are shown as such. `limit`: the end
+    of the scale, S (3-D: S/m), that of all frames unless given. `rate`: frames of the stream in a second; the film then
+    takes as long as the stream, unless it had more than 25 frames a second; 10 a second unless given. Of long streams
+    120 frames are taken, evenly chosen. `progress` is called with how far it is.
     Raises `ValueError` for another ending, where ffmpeg lacks, and where every frame was refused.
     """
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
 
+    from jeit.plot.colour_scale import ColourScale
     from jeit.plot.imaging.frames import FramePicture, chosen_frames, fit_scale
 
     path, values = Path(path), np.asarray(changes)
     check_film(path.name)
     said = [f"frame {number}" for number in range(len(values))] if titles is None else list(titles)
     figure = Figure(figsize=(5.0, 4.4), layout="constrained")
-    fitted, chosen = fit_scale(values, mesh), chosen_frames(len(values), _MOST)
+    fitted, chosen = fit_scale(values, mesh, ColourScale(limit=limit)), chosen_frames(len(values), _MOST)
     picture = FramePicture(figure.subplots(), mesh, electrodes, fitted)
     fitted.draw_bar(picture.ax, picture.drawn)
     picture.show(values[chosen[0]], said[chosen[0]])

@@ -141,6 +141,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "chosen_by": result.chosen_by,
             "note": (reconstruction.choice.note or None) if reconstruction.choice is not None else None,
         },
+        "doubts": list(result.doubts),
         "inclusions": [_inclusion(result, one) for one in result.inclusions],
         "shapes": _shapes(result),
         "inclusion_settings": {"level": result.level, "least_peak": settings.least_peak},

@@ -4,10 +4,12 @@ from typing import Any
 
 import numpy as np
 
+from jeit.arguments import percent
 from jeit.data import Measurement, estimate_noise, impossible_signs, reciprocity_error
+from jeit.data.imageable import MOST_DIFFERENCE_RECIPROCITY_ERROR
 from jeit.forward import ForwardModel
 from jeit.imaging import imaging_mesh
-from jeit.imaging.wiring import find_wiring
+from jeit.imaging.wiring import MOST_MISFIT, find_wiring
 from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain
 
 # Of the mesh on which wirings are compared.
@@ -45,4 +47,14 @@ def _wiring(measurement: Measurement) -> str | None:
         return None
     _, reference = measurement.split_reference() if "reference" in measurement.frame_names else (None, measurement)
     model = ForwardModel(imaging_mesh(domain, electrodes, _NODES), electrodes, measurement.protocol)
-    return find_wiring(model, reference).told or "nothing speaks against the description"
+    found, broken = find_wiring(model, reference), reciprocity_error(reference)
+    if broken is not None and broken > MOST_DIFFERENCE_RECIPROCITY_ERROR and not found.told:
+        return (
+            f"reciprocity broken by {percent(broken)}, and nothing that was tried mends it: channels or drives in "
+            "another order than described, or nothing but noise"
+        )
+    if found.fault:
+        return found.fault
+    if found.described > MOST_MISFIT:
+        return f"nothing that was tried speaks against the description, but it misses {percent(found.described)}"
+    return "nothing speaks against the description"

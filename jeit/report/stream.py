@@ -10,12 +10,16 @@ from jaxtyping import Float
 
 from jeit.arguments import is_number, told
 from jeit.inverse.calibration import Calibration
+from jeit.inverse.streaming.frame_check import FrameStatus
 from jeit.inverse.streaming.stream import FrameImage
 from jeit.mesh import centroids
 from jeit.report.film import check_film, write_film
 from jeit.report.folder import results_folder
 
 _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
+_NOTHING = (FrameStatus.REFUSED, FrameStatus.UNCHANGED)
+# Share of the background at the end of a colour scale on which nothing is to be seen.
+_FAINT = 0.01
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,8 @@ def write_stream(
     sheet, and a film, into `folder`.
 
     `images`: those of `jeit.inverse.stream`, of an imager made with `calibration`, see `jeit.imaging.prepare_imager`.
-    The table has the place in metres and the height, S (3-D: S/m), of each image's strongest change. The NPZ holds
+    The table has the place in metres and the height, S (3-D: S/m), of each image's strongest change, of frames that are
+    unchanged none. The NPZ holds
     `conductivity` (frames, cells), NaN for frames that were refused, `background`, `points` and `cells`. `film`: the
     name of its file, ending in .gif or, where ffmpeg is installed, .mp4; None for none. `rate`: frames in a second, for
     times in place of numbers, and the pace of the film. Pictures show refused frames as such; where all are, there is
@@ -86,31 +91,38 @@ def write_stream(
         cells=np.asarray(mesh.cells),
     )
     if latency:
-        pictures = _Pictures(folder, film, rate, drawing or (lambda said: None))
+        # Where all is noise, it is not to fill the colours.
+        changed = len(kept) > sum(counts.get(status, 0) for status in _NOTHING)
+        limit = None if changed else _FAINT * background
+        pictures = _Pictures(folder, film, rate, limit, drawing or (lambda said: None))
         pictures.draw(np.stack(kept) - np.float32(background), calibration)
     return WrittenStream(len(kept), counts, np.array(latency), refusals[0] if refusals else "")
 
 
 @dataclass(frozen=True)
 class _Pictures:
-    """Which are drawn into a folder, and who is told."""
+    """Which are drawn into a folder, where their scale ends, and who is told."""
 
     folder: Path
     film: str | None
     rate: float | None
+    limit: float | None
     tell: Callable[[str], None]
 
     def draw(self, changes: Float[np.ndarray, "F m"], calibration: Calibration) -> None:
         """The contact sheet, and the film."""
-        from jeit.plot import plot_frames
+        from jeit.plot import ColourScale, plot_frames
 
         model, rate = calibration.model, self.rate
         titles = [f"frame {one}" if rate is None else f"{one / rate:.2f} s" for one in range(len(changes))]
         self.tell("contact sheet")
-        plot_frames(model.mesh, changes, model.electrodes, titles=titles).savefig(self.folder / "frames.png", dpi=120)
+        sheet = plot_frames(model.mesh, changes, model.electrodes, titles=titles, scale=ColourScale(limit=self.limit))
+        sheet.savefig(self.folder / "frames.png", dpi=120)
         if self.film is not None:
             path, told = self.folder / self.film, lambda far: self.tell(f"film: {far}")
-            write_film(path, model.mesh, changes, model.electrodes, titles=titles, rate=rate, progress=told)
+            write_film(
+                path, model.mesh, changes, model.electrodes, titles=titles, rate=rate, limit=self.limit, progress=told
+            )
 
 
 def _row(one: FrameImage, centre, background: float) -> list[object]:
@@ -121,6 +133,7 @@ def _row(one: FrameImage, centre, background: float) -> list[object]:
     change = one.conductivity - background
     peak = int(np.argmax(np.abs(change)))
     misfit = "" if np.isnan(one.misfit) else f"{one.misfit:.4g}"
-    place = [f"{value:.5f}" for value in centre[peak]]
     head = [one.number, one.status, int(one.usable.sum()), misfit, one.iterations, spent]
-    return [*head, *place, f"{change[peak]:.5g}", one.reason]
+    if one.status == FrameStatus.UNCHANGED:
+        return [*head, "", "", "", one.reason]
+    return [*head, *(f"{value:.5f}" for value in centre[peak]), f"{change[peak]:.5g}", one.reason]

@@ -8,6 +8,7 @@ from jeit import data, protocol
 from jeit.data.imageable import assess
 from jeit.data.quality import channel_reciprocity_error, expected_signs
 from jeit.inverse import relative_noise
+from jeit.report.measurement import report_measurement
 
 
 def test_missing_saturated_and_dead_channels_are_masked_and_noted(tank, setup):
@@ -26,6 +27,28 @@ def test_missing_saturated_and_dead_channels_are_masked_and_noted(tank, setup):
     # Masked channels have no say in the sums.
     assert data.reciprocity_error(measurement) < 5e-3
     np.testing.assert_array_equal(measurement.filled()[0, ~mask], 0)
+
+
+@pytest.mark.parametrize(("patterns", "named"), [(protocol.adjacent, "5"), (protocol.opposite, "5, 13")])
+def test_channels_that_read_an_electrode_without_current_are_masked_and_it_is_named(tank, patterns, named):
+    chosen = patterns(16)
+    voltages, drives, reads = tank(chosen), np.asarray(chosen.channel_drive)[:, 4], chosen.channel_measurement
+    voltages[drives != 0] *= 1e-6
+    floating = (np.asarray(reads)[:, 4] != 0) & (drives == 0)
+    voltages[floating] = np.random.default_rng(0).normal(size=floating.sum())
+    measurement = data.screen(np.stack([tank(chosen), voltages]), chosen)
+    mask, others = np.asarray(measurement.mask), [int(one) - 1 for one in named.split(", ")]
+    assert mask[0].all()
+    np.testing.assert_array_equal(mask[1], (drives == 0) & ~np.any(np.asarray(reads)[:, others] != 0, axis=1))
+    assert any(f"they read electrode {named}, through which" in note for note in measurement.notes)
+
+
+def test_channels_that_read_an_electrode_are_kept_where_one_of_its_drives_flows(tank):
+    chosen = protocol.adjacent(16)
+    voltages = tank(chosen)
+    dead = np.asarray(chosen.drive_index) == 12
+    voltages[dead] *= 1e-6
+    np.testing.assert_array_equal(np.asarray(data.screen(voltages, chosen).mask)[0], ~dead)
 
 
 def test_a_given_limit_masks_what_reaches_it(tank):
@@ -150,6 +173,20 @@ def test_too_few_channels_are_refused(tank, setup):
     reference = data.screen(tank(chosen), chosen, **setup(16))
     with pytest.raises(ValueError, match="only 9 channels"):
         data.check_imageable(data.screen(1.1 * tank(chosen), chosen, mask=np.arange(208) < 9), reference)
+
+
+def test_a_reference_whose_channels_are_in_another_order_is_named(tank, setup):
+    chosen = protocol.adjacent(16)
+    clean = tank(chosen)
+    rolled = np.roll(clean.reshape(16, 13), 3, axis=1).ravel()
+    good, bad = (
+        data.screen(one, chosen, **setup(16), name=name) for one, name in ((1.1 * clean, "it"), (rolled, "that"))
+    )
+    with pytest.raises(ValueError, match=r"the reference 'that' breaks reciprocity by .* another order than described"):
+        data.check_imageable(good, bad)
+    with pytest.raises(ValueError, match="the frame breaks reciprocity"):
+        data.check_imageable(bad, good)
+    assert "reciprocity broken by" in report_measurement(bad)["wiring"]
 
 
 def test_reversed_polarity_is_named(tank, setup):

@@ -150,6 +150,16 @@ def test_a_hyperparameter_or_a_method_asked_for_is_taken():
     assert (result.settings.method, result.why) == ("one-step", "")
 
 
+def test_what_speaks_against_an_image_is_said():
+    """A λ so small that noise is imaged, and one so large that little of the data is."""
+    assert image(20.0, method="gauss-newton").doubts == image(1.05).doubts == ()
+    unfinished = image(20.0, method="gauss-newton", hyperparameter=1e-4).doubts
+    assert "did not converge" in unfinished[0]
+    stiff = image(20.0, method="gauss-newton", hyperparameter=1e3)
+    assert "standard deviations: bodies may be missing" in stiff.doubts[-1]
+    assert report_image(stiff)["doubts"] == list(stiff.doubts)
+
+
 def test_one_step_is_kept_where_gauss_newton_finds_nothing(monkeypatch):
     def fails(*_):
         raise ValueError("it fails.")

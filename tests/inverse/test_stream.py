@@ -91,6 +91,20 @@ def test_a_reference_takes_the_model_error_out(model, frames, options):
     assert np.linalg.norm(darkest(model, image.conductivity) - PLACES[0]) < 0.03
 
 
+def test_frames_of_nothing_but_noise_are_said_to_be_unchanged(model, options):
+    """Noise alone, an undisturbed frame, and a press that is fainter than the noise of a channel."""
+    rest, rng = np.asarray(model.voltages(1.0)), np.random.default_rng(1)
+    pressed = np.asarray(model.voltages(jnp.where(near(model, PLACES[0]), 0.9, 1.0)))
+    noise = 0.7 * np.median(np.abs(pressed - rest)) * np.ones(208)
+    imager = Imager.create(model, 1.0, reference=rest, **{**options, "noise": noise})
+    frames = [rest + noise * rng.normal(size=208), rest, pressed + noise * rng.normal(size=208)]
+    quiet, equal, found = stream(imager, frames)
+    assert [one.status for one in (quiet, equal, found)] == ["unchanged", "unchanged", "imaged"]
+    assert "by chance" in quiet.reason
+    assert "equals an undisturbed frame" in equal.reason
+    assert quiet.imaged
+
+
 def test_total_variation_streams_too(model, frames, options):
     imager = Imager.create(
         model, 1.0, prior=TotalVariation(), noise=options["noise"], hyperparameter=30.0, solver=GaussNewton(max_steps=6)
@@ -294,7 +308,7 @@ def test_an_undisturbed_frame_is_at_its_minimum(kind, model, frames, options):
     rest = model.voltages(1.0)
     imager = Imager.create(model, 1.0, solver=kind(), **options)
     images = list(stream(imager, [rest, frames[0], rest, rest]))
-    assert [str(one.status) for one in images] == ["imaged"] * 4
+    assert [str(one.status) for one in images] == ["unchanged", "imaged", "unchanged", "unchanged"]
     for one in images[2:]:
         np.testing.assert_allclose(one.conductivity, 1.0, atol=1e-5)
 
@@ -307,7 +321,7 @@ def test_an_undisturbed_frame_may_be_reached_by_the_last_step(model, options):
         imager = Imager.create(model, 1.0, solver=GaussNewton(max_steps=steps), **options)
         image = list(stream(imager, [pressed, rest]))[1]
         close = np.abs(image.conductivity - 1).max() < 1e-5
-        assert (image.status == "imaged") == close
+        assert (image.status == "unchanged") == close
 
 
 @pytest.mark.parametrize("kind", [GaussNewton, LevenbergMarquardt])

@@ -142,14 +142,13 @@ def show(console, result: "ImagedDifference") -> None:
         misfit = f"misfit {float(reconstruction.misfit):.2g} standard deviations"
         iterations = counted(int(reconstruction.iterations), "iteration")
         rows.append(("iteration", f"{reconstruction.status}, {iterations}, {misfit}"))
-        if reconstruction.status != Status.CONVERGED:
-            rows.append(("", reconstruction.reason))
     elif result.lowest < -1:
         fall = (
             f"falls to {percent(result.lowest)} of the background, below -100 %: bodies may be out of place, missing, "
             "or shown where none are; leave out --method, or take gauss-newton"
         )
         rows.append(("linear image", fall))
+    rows += [("doubt", doubt) for doubt in result.doubts]
     if result.shapes is not None:
         left = f"; {counted(len(result.shapes.doubtful), 'ghost')} left out" if result.shapes.doubtful else ""
         drift = f"the background has drifted by {percent(result.shapes.drift)}"

@@ -106,7 +106,7 @@ class Star(eqx.Module):
     @property
     def area(self) -> float:
         """m²."""
-        return abs(self._moments()[0])
+        return float(abs(self._moments()[0]))
 
     @property
     def centroid(self) -> Float[np.ndarray, "2"]:

@@ -3,7 +3,7 @@
 from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jeit.arguments import counted
 from jeit_solvers import Status
@@ -13,6 +13,9 @@ _LARGEST_DIFFERENCE = 0.5
 # Beyond this, an electrode is taken for dead whose channels have changed by half or more, and hold most of the change.
 _SUSPICIOUS, _EXPLAINED, _LOST = 0.15, 0.5, 0.5
 _LEAST_CHANNELS = 0.5
+# Reciprocal channels of nothing but noise are alike by chance: so many standard deviations of that, of so many pairs
+# at least, tell of a change; and a change of less than this, relative to an undisturbed frame, is none.
+_CHANCE, _FEWEST_PAIRS, _EQUAL = 3.0, 10, 1e-12
 
 
 class FrameStatus(StrEnum):
@@ -21,6 +24,8 @@ class FrameStatus(StrEnum):
     IMAGED = "imaged"
     PARTIAL = "partial"
     """Imaged, with some channels left out."""
+    UNCHANGED = "unchanged"
+    """Imaged, though nothing but noise tells it from an undisturbed frame."""
     STEP_LIMIT = Status.STEP_LIMIT.value
     """Imaged, though the steps that a frame is given were too few for it to converge."""
     REFUSED = "refused"
@@ -30,19 +35,48 @@ class FrameStatus(StrEnum):
 class FrameCheck:
     """Looks at frames (M,) of a sensor that reads `expected` (M,) volts when undisturbed, in the channels of `mask`.
 
-    `touching` (L, M): which channels each electrode takes part in.
+    `touching` (L, M): which channels each electrode takes part in. `tied`: pairs (P, 2) of channels that reciprocity
+    ties, and the ratio (P,) of the second's voltage to the first's. `noise` (M,): volts, relative to each other.
     """
 
     def __init__(
-        self, mask: Bool[np.ndarray, " M"], expected: Float[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
+        self,
+        mask: Bool[np.ndarray, " M"],
+        expected: Float[np.ndarray, " M"],
+        touching: Bool[np.ndarray, "L M"],
+        tied: tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]],
+        noise: Float[np.ndarray, " M"],
     ):
         self.mask, self.expected, self.touching = mask, expected, touching
+        self.first, self.second = tied[0].T
+        self.ratio = tied[1]
+        self.trust = 1 / np.hypot(noise[self.first], noise[self.second] / self.ratio)
         self.size = np.linalg.norm(expected[mask])
         self.ordinary = (_SUSPICIOUS * self.size) ** 2
 
     @np.errstate(over="ignore")  # a square that overflows is not an ordinary one
     def __call__(self, frame):
         """Values, usable channels, status and reason of a frame as it came."""
+        values, usable, status, reason = self._looked_at(frame)
+        if status != FrameStatus.REFUSED and (noise := self._unchanged(values, usable)):
+            return values, usable, FrameStatus.UNCHANGED, f"{reason} {noise}".lstrip()
+        return values, usable, status, reason
+
+    def _unchanged(self, values, usable) -> str:
+        """A sentence, if all that a frame differs by is noise."""
+        change = np.where(usable, values - self.expected, 0)
+        if np.linalg.norm(change) <= _EQUAL * self.size:
+            return "It equals an undisturbed frame."
+        both = usable[self.first] & usable[self.second]
+        if np.count_nonzero(both) < _FEWEST_PAIRS:
+            return ""
+        one, other = (self.trust * change[self.first])[both], (self.trust * change[self.second] / self.ratio)[both]
+        alike = 2 * (one @ other) / (one @ one + other @ other)
+        if alike * np.sqrt(len(one)) > _CHANCE:
+            return ""
+        return "Nothing but noise: reciprocal channels change alike as by chance."
+
+    def _looked_at(self, frame):
         none = np.zeros_like(self.mask)
         if np.ma.isMaskedArray(frame):
             frame = np.ma.filled(frame.astype(float), np.nan)

@@ -80,8 +80,9 @@ class Imager(eqx.Module):
     **Fields**: `channels`, which of them are independent; `inversion`, the problem, whose data are exchanged for every
     frame's; `noise` (M,), volts; `mask` (M,), the channels used at all; `expected` (M,) volts, an undisturbed frame;
     `offset` (M,) volts, added to frames: what the model's voltages have and the sensor's have not; `touching` (L, M),
-    channels that drive or read each electrode; `solver`, with the most iterations that a frame is given; `persistence`,
-    the share of the last image that the next one is expected to keep, 0 without a memory.
+    channels that drive or read each electrode; `tied`, pairs (P, 2) of channels that reciprocity ties, and the ratio
+    (P,) of the second's voltage to the first's; `solver`, with the most iterations that a frame is given;
+    `persistence`, the share of the last image that the next one is expected to keep, 0 without a memory.
     """
 
     channels: IndependentChannels
@@ -91,6 +92,7 @@ class Imager(eqx.Module):
     expected: Float[Array, " M"]
     offset: Float[Array, " M"]
     touching: Bool[Array, "L M"]
+    tied: tuple[Int[Array, "P 2"], Float[Array, " P"]]
     solver: AbstractSolver
     persistence: float = eqx.field(static=True)
 
@@ -154,6 +156,7 @@ class Imager(eqx.Module):
             expected=jnp.where(used, frame, predicted),
             offset=jnp.where(used, predicted - frame, 0),
             touching=jnp.asarray([model.protocol.channels_touching(k) for k in range(model.protocol.num_electrodes)]),
+            tied=jax.tree.map(as_array, model.protocol.reciprocal_pairs()),
             solver=chosen,
             persistence=persistence,
         )

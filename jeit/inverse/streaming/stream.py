@@ -46,8 +46,9 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     compiled before the first frame is asked for. A frame is refused, and the stream goes on, when it has another number
     of channels or is not real, when fewer than half of the channels can be used, when all read zero (the current source
     has failed), or when it differs from an undisturbed frame by more than half of it. A dead electrode's channels are
-    left out, and named. Raises `ValueError` for what is no imager, for what are no frames, and for an array of frames
-    that is not (frames, channels).
+    left out, and named. A frame that nothing but noise tells from an undisturbed one is imaged, and said to be
+    "unchanged". Raises `ValueError` for what is no imager, for what are no frames, and for an array of frames that is
+    not (frames, channels).
     """
     check_kind("imager", imager, Imager, "an Imager, as of Imager.create or prepare_imager(reference)[0]")
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
@@ -70,7 +71,8 @@ class _Session:
         self.mask = np.asarray(imager.mask)
         self.unmasked = bool(self.mask.all())
         self.expected = np.asarray(imager.expected)
-        self.check = FrameCheck(self.mask, self.expected, np.asarray(imager.touching))
+        touching, tied, noise = jax.tree.map(np.asarray, (imager.touching, imager.tied, imager.noise))
+        self.check = FrameCheck(self.mask, self.expected, touching, tied, noise)
         self.coefficients = np.asarray(imager.start)
         self.last = self.expected
         self._weigh(self.mask)
@@ -94,7 +96,7 @@ class _Session:
                 number, None, FrameStatus.REFUSED, reason, usable, np.nan, iterations, time.perf_counter() - begin
             )
         self.last = filled
-        if not converged and status == FrameStatus.IMAGED:
+        if not converged and status in (FrameStatus.IMAGED, FrameStatus.UNCHANGED):
             status = FrameStatus.STEP_LIMIT
             done = counted_iterations(iterations, self.imager.steps - iterations)
             reason = f"Stopped after {done}: this frame needs more than a frame is given."

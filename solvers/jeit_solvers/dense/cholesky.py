@@ -54,12 +54,15 @@ def symmetric_eigen(matrix: Inexact[Array, "s s"]) -> tuple[Inexact[Array, " s"]
 
 
 def symmetric_inverse(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
-    """A^-1 of one matrix that `inverse_cholesky` takes."""
+    """A^-1 of one matrix that `inverse_cholesky` takes; NaN where it is singular or not finite."""
     if not isinstance(matrix, np.ndarray):
         return _symmetric_inverse(matrix)
     if not np.isfinite(matrix).all():
         return host.full_like(matrix, np.nan)
-    inverse = host.linalg.inv(matrix)
+    try:
+        inverse = host.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        return host.full_like(matrix, np.nan)
     return (inverse + inverse.T) / 2
 
 
