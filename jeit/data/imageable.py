@@ -105,7 +105,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
 
     - it, or the reference, has an impossible sign in more than a quarter of its voltages
       (`impossible_signs`): half of the voltages or more then lie below the instrument's noise or offset;
-    - it, or the reference, breaks reciprocity by more than 0.63, or the difference does, i.e. its noise is over half its
+    - it, or the reference, breaks reciprocity by more than 0.63, or the difference does: its noise is over half its
       signal, each channel trusted as images trust it (`jeit.inverse.relative_noise`): driven electrodes read large
       voltages, mostly of contacts;
     - it does not differ from the reference at all;

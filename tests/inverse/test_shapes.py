@@ -72,6 +72,22 @@ def test_a_star_knows_its_area_its_middle_and_what_it_holds(model):
     np.testing.assert_allclose(grid[inside].mean(axis=0), rough.centroid, atol=5e-4)
 
 
+@pytest.mark.parametrize("reach", [0.085, 0.105])
+def test_a_star_ends_where_the_body_does(model, reach):
+    """A disk over the edge of the tank, its middle inside or outside: the area of two circles' lens."""
+    stars = Stars.create(model.mesh, StarPrior(), [[reach, 0.0]], [1])
+    star, radius = stars.star(0, stars.of_radii([0.03])), 0.03
+    assert np.linalg.norm(star.outline, axis=1).max() < 1.001 * RADIUS
+    angle = [
+        np.arccos((reach**2 + one**2 - other**2) / (2 * reach * one))
+        for one, other in ((radius, RADIUS), (RADIUS, radius))
+    ]
+    lens = sum(one**2 * (a - np.sin(2 * a) / 2) for one, a in zip((radius, RADIUS), angle, strict=True))
+    np.testing.assert_allclose(star.area, lens, rtol=0.02)
+    assert star.holds(star.centroid)
+    assert not star.holds(np.array([1.01 * RADIUS, 0.0]))
+
+
 def test_bodies_are_found_and_ghosts_left_out(found):
     assert [one.sign for one in sorted(found.stars, key=lambda one: one.sign)] == [-1, 1]
     plastic, metal = sorted(found.stars, key=lambda one: one.sign)

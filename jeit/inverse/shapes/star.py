@@ -157,14 +157,16 @@ class Stars:
     """Some stars on a mesh: from coefficients to conductivity. Coefficients: the drift, then star by star.
 
     **Fields**: `prior` of every star; `points` (m, s), where cells are sampled, x + iy in metres; `width` (m,) of the
-    blur, metres; `weight` (m,), every cell's share of the area; `span`, the longer side of the whole body; `start`
-    (k,), x + iy, and `sign` (k,) of every star; `weak` (k,), whether it is taken for weak, not strong.
+    blur, metres; `weight` (m,), every cell's share of the area; `edges` (b, 2) of the whole body, from point to point;
+    `span`, the longer side of the whole body; `start` (k,), x + iy, and `sign` (k,) of every star; `weak` (k,), whether
+    it is taken for weak, not strong.
     """
 
     prior: StarPrior
     points: Complex[np.ndarray, "m s"]
     width: Float[np.ndarray, " m"]
     weight: Float[np.ndarray, " m"]
+    edges: Complex[np.ndarray, "b 2"]
     span: float
     start: Complex[np.ndarray, " k"]
     sign: Float[np.ndarray, " k"]
@@ -173,13 +175,14 @@ class Stars:
     @classmethod
     def create(cls, mesh: Mesh, prior: StarPrior, start, sign) -> Stars:
         """`start` (k, 2), metres."""
-        corners = np.asarray(mesh.points)[np.asarray(mesh.cells)] @ np.array([1, 1j])
+        points = np.asarray(mesh.points) @ np.array([1, 1j])
+        corners, edges = points[np.asarray(mesh.cells)], points[np.asarray(mesh.facets)]
         span = float(np.ptp(np.asarray(mesh.points), axis=0).max())
         area = np.asarray(measures(mesh))
         start = np.reshape(start, (-1, 2)) @ np.array([1, 1j])
         width, weight = _BLUR * np.sqrt(area), area / area.sum()
         sign, weak = np.asarray(sign, float), np.zeros(len(start), bool)
-        return cls(prior, corners @ _SAMPLES.T, width, weight, span, start, sign, weak)
+        return cls(prior, corners @ _SAMPLES.T, width, weight, edges, span, start, sign, weak)
 
     def rows(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "k q"]:
         """Coefficients of every star."""
@@ -258,10 +261,18 @@ class Stars:
         return StarImage(image, slopes, np.array(overlap), np.reshape(overlap_slope, (-1, len(coefficients))))
 
     def star(self, k: int, coefficients, rise: float = np.nan) -> Star:
-        """Star k."""
+        """Star k, as far as it lies in the body."""
         centre, log_radius, contrast, _, waves = self._values(k, self.rows(coefficients)[k])
         direction = np.exp(2j * np.pi * np.arange(_OUTLINE) / _OUTLINE)
-        outline = centre + direction * np.exp(log_radius + self._wave(waves, direction)[0])
+        reach = np.exp(log_radius + self._wave(waves, direction)[0])
+        to_edge, inside = _first_crossing(centre, direction, self.edges)
+        _, cells, share, _ = self._one(k, self.rows(coefficients)[k])
+        if not inside and (covered := share * self.weight[cells]).sum() > 0:
+            outline = centre + direction * reach
+            centre = covered @ self.points[cells].mean(axis=1) / covered.sum()
+            reach, _ = _first_crossing(centre, direction, np.stack([outline, np.roll(outline, -1)], axis=1))
+            to_edge, _ = _first_crossing(centre, direction, self.edges)
+        outline = centre + direction * np.minimum(reach, to_edge)
         pair = np.stack([outline.real, outline.imag], axis=1)
         middle = np.array([centre.real, centre.imag])
         return Star(int(self.sign[k]), middle, pair, float(contrast), bool(self.weak[k]), float(rise))
@@ -304,3 +315,18 @@ class Stars:
         columns = [towards.real, towards.imag, along.sum(axis=1), np.zeros_like(share)]
         columns += [part for mode in modes.T for part in (mode.real, mode.imag)]
         return values, cells, share, np.stack(columns, axis=1) * self.prior.deviation(self.span)
+
+
+def _first_crossing(centre: complex, direction, edges) -> tuple[Float[np.ndarray, " k"], bool]:
+    """How far from `centre` lines in some `direction` (k,) first cross `edges` (b, 2), infinity where they do not; and
+    whether the closed line that these are goes round it."""
+    start, along = edges[:, 0] - centre, edges[:, 1] - edges[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        across = _cross(direction[:, None], along)
+        distance, share = _cross(start, along) / across, _cross(start, direction[:, None]) / across
+    crossed = (distance > 0) & (share >= 0) & (share < 1)
+    return np.where(crossed, distance, np.inf).min(axis=1), bool((crossed.sum(axis=1) % 2).mean() > 0.5)
+
+
+def _cross(one, other):
+    return (np.conj(one) * other).imag
