@@ -32,7 +32,10 @@ AsIs = Annotated[
     typer.Option("--as-is", help="Go on though electrodes, channels or signs look wired otherwise than described."),
 ]
 Frame = Annotated[
-    str | None, typer.Option(help="Frame of DATA to image, by number from 0 or by name; the first unless given.")
+    str | None,
+    typer.Option(
+        help="Frame of DATA to image, by number from 0 (negative: from the end) or by name; the first unless given."
+    ),
 ]
 BandLow = Annotated[
     float | None, typer.Option(help="Lowest frequency of the band, hertz (default 50, or the calibration's).")

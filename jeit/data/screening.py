@@ -12,6 +12,9 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh
 from jeit.protocol import Protocol
 
+# Volts that no instrument reads on electrodes.
+_LARGEST = 1000.0
+
 
 def screen(
     voltages: ArrayLike,
@@ -70,6 +73,9 @@ def screen(
     numbers = ", ".join(str(one + 1) for one in np.flatnonzero(unconnected.any(axis=0)))
     said = f"they read electrode {numbers}, through which no drive's current flowed: is it connected?"
     exclude(unconnected @ reads.T, said)
+    largest = np.abs(values[usable]).max(initial=0)
+    if largest > _LARGEST:
+        found.append(f"the largest voltage is {largest:.3g} V: are voltages in volts, and currents in amperes?")
     if not usable.any():
         raise ValueError(f"{name}: no usable voltage is left. {' '.join(found)}")
     described = {"electrodes": electrodes, "domain": domain, "name": name, "source": source, "frame_names": frame_names}

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
+from jeit.arguments.arrays import real_array
 from jeit.mesh import Body, Mesh, Refine
 from jeit_solvers.engines import as_array, has_values, namespace
 
@@ -164,6 +165,10 @@ def replace_contact_impedance(
 
 def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) -> Float[Array, " L"]:
     """Broadcast a positive scalar or (L,) argument to (L,) floats; `ValueError` if it cannot be that."""
+    if has_values(values):
+        values = real_array(
+            name, values, f"one number for all electrodes or one for each of the {num_electrodes}, in {unit}"
+        )
     values = as_array(values, float)
     if values.ndim > 1 or (values.ndim == 1 and values.shape[0] != num_electrodes):
         raise ValueError(

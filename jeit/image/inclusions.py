@@ -76,7 +76,7 @@ def inclusion_regions(
     noise: Float[Array, " m"] | None = None,
     least_significance: float = 5.5,
 ) -> list[tuple[Inclusion, Bool[np.ndarray, " m"]]]:
-    """What `find_inclusions` finds, each with its cells."""
+    """What `find_inclusions` finds, each with its cells. Raises `ValueError` as that does."""
     values = np.asarray(image)
     if values.shape != (mesh.num_cells,):
         raise ValueError(f"image has shape {values.shape}; give one value for each of the {mesh.num_cells} cells.")

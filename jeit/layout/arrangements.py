@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
+from jeit.arguments import is_number, told
 from jeit.mesh import Domain
 
 
@@ -103,5 +104,5 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
 
 
 def _check_count(number: int, least: int) -> None:
-    if int(number) != number or number < least:
-        raise ValueError(f"Give a whole number of electrodes, at least {least}; got {number}.")
+    if not is_number(number) or int(number) != number or number < least:
+        raise ValueError(f"Give a whole number of electrodes, at least {least}; got {told(number)}.")

@@ -48,8 +48,8 @@ def warn_large(extent: float, name: str) -> None:
     """Warn if a length in metres looks like millimetres."""
     if extent > _LARGE:
         warnings.warn(
-            f"{name}: the domain is {extent:g} m across. If the lengths are millimetres, multiply them by 1e-3: "
-            "jeit computes in metres.",
+            f"{name}: {extent:g} m is large for what electrodes are put on. If the lengths are millimetres, multiply "
+            "them by 1e-3: jeit computes in metres.",
             UserWarning,
             stacklevel=4,
         )

@@ -42,7 +42,7 @@ def arcs(number=8, radius=0.1, width=0.01, contact_impedance=0.01):
 
 GEOMETRY = {
     "negative radius": (lambda: disk(-0.1), "radius: expected a positive length"),
-    "radius is text": (lambda: Disk("10 cm"), "expected one length in metres"),  # pyright: ignore[reportArgumentType]
+    "radius is text": (lambda: Disk("10 cm"), "expected a positive length in metres"),  # pyright: ignore[reportArgumentType]
     "flat rectangle": (lambda: Rectangle(0.1, 0.0), "height: expected a positive length"),
     "centre of three": (lambda: Disk(0.1, (0, 0, 0)), "two finite coordinates"),
     "too few vertices": (lambda: Polygon(SQUARE[:2]), "vertices: "),
@@ -348,7 +348,7 @@ COMMANDS = {
         lambda t: ["layout", "compare", "park-inner", "grid-3x3", "--width-mm", "90", "--output", t.folder],
         "does not say its skin is read with --width-mm and --height-mm",
     ),
-    "no file of a study": (lambda t: ["study", "status", "a.toml"], "STUDY.toml: there is no file"),
+    "no file of a study": (lambda t: ["study", "status", "a.toml"], "study: there is no file"),
     "noise below zero": (lambda t: ["demo", "--noise", "-1"], "zero or positive"),
     "info on nothing": (lambda t: ["info", "absent.csv"], "There is no file"),
     "info on a folder": (lambda t: ["info", t.folder], "is a folder"),

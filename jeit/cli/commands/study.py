@@ -87,7 +87,7 @@ def report(file: File, output: Output = None, page: Page = None) -> None:
 def _read(file: Path, output: Path | None) -> "tuple[Study, Path]":
     from jeit.design.study import read_study
 
-    with naming_options({"path": "STUDY.toml"}):
+    with naming_options({"path": "study"}):
         return read_study(file), output or file.with_suffix(".zarr")
 
 
@@ -109,9 +109,12 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
     from rich.progress import Progress as Bar
 
     from jeit.design.study import run_study
+    from jeit.design.study.store import require
     from jeit.report.study import write_study_report
 
     where = _page(file, store, page)
+    for package in ("zarr", "xarray"):
+        require(package)  # before a bar says that it has begun
     console = Console(highlight=False)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with ExitStack() as stack:

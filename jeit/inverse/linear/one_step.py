@@ -96,6 +96,8 @@ class LinearReconstruction:
         if not has_values(difference, self._parts):
             return jax.jit(_product)(self._parts, difference)
         voltages = np.asarray(difference)
+        if voltages.dtype.kind not in "iufc":
+            raise ValueError(f"difference is {voltages.dtype}; give numbers, in volts.")
         if not np.isfinite(voltages).all():
             raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
         return _handed_over(_product(self._parts, voltages))

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
+from jeit.arguments import told
 from jeit.mesh._checks import warn_large
 from jeit.mesh.body import Body
 from jeit.mesh.generate.refine import Refinement
@@ -106,11 +107,11 @@ def check_length(name: str, value: Any) -> Any:
     if not has_values(value):
         return value
     try:
-        number = float(value)
+        number = np.nan if isinstance(value, str) else float(value)
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected one length in metres, got {value!r}.") from None
     if not np.isfinite(number) or number <= 0:
-        raise ValueError(f"{name}: expected a positive length in metres, got {number:g}.")
+        raise ValueError(f"{name}: expected a positive length in metres, got {told(value)}.")
     warn_large(number, name)
     return number
 
