@@ -15,7 +15,7 @@ from benchmarks.problems.mixed_tanks import draw, matched
 from jeit import image_difference
 from jeit.imaging import ImagingSettings
 
-TANKS, FIRST = 200, 400_000
+TANKS, FIRST = 200, 500_000
 FAR, MEDIAN = 0.12, 0.045
 METHODS = ("auto", "one-step")
 HEADER = ["channels", "image", "tanks", "bodies", "median / R", "beyond 0.12 R", "missed", "spurious", "time of one"]
