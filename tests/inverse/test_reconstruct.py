@@ -170,7 +170,7 @@ def test_voltages_of_the_background_are_at_the_minimum(model, solver):
         ({"mask": np.zeros(208, bool)}, "every channel"),
         ({"mask": np.ones(208)}, "booleans"),
         ({"noise": 0.0}, "noise"),
-        ({"background": -1.0}, "between 0"),
+        ({"background": -1.0}, "background"),
         ({"background": 5.0, "parametrisation": Parametrisation(link=Bounded(0.5, 4.0))}, "between 0.5 and 4"),
         ({"background": np.ones(3)}, "cells"),
         ({"background": 1 + 0.1j}, "real conductivity"),
