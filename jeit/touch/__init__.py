@@ -1,7 +1,7 @@
 """From frames to meaning: where, how hard and how a skin is touched.
 
 Rooms: `contacts` (what an image shows, from frame to frame, in newtons), `learnt` (skins that learn from recorded
-presses, without a model).
+presses, without a model), `kohonen` (maps that order frames by themselves).
 """
 
 from jeit.touch.contacts import (
@@ -14,6 +14,7 @@ from jeit.touch.contacts import (
     find_contacts,
     track_contacts,
 )
+from jeit.touch.kohonen import PlacedMap, SelfOrganisingMap
 from jeit.touch.learnt.file import read_skin, write_skin
 from jeit.touch.learnt.learnt_skin import LearntSkin, Standing
 from jeit.touch.learnt.presses import Presses, read_frames, read_presses
@@ -26,8 +27,10 @@ __all__ = [
     "ImageNoise",
     "LearntSkin",
     "LoadCalibration",
+    "PlacedMap",
     "Presses",
     "RasterFinder",
+    "SelfOrganisingMap",
     "Standing",
     "Touches",
     "find_contacts",

@@ -1,22 +1,14 @@
-"""What learning needs besides jeit's own dependencies, and how much of the machine it takes."""
+"""How much of the machine learning takes."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from jeit_solvers import number_of_cores
-
-
-def need_learning() -> None:
-    """Raise `ImportError`, saying what to install, where a package of the extra "learn" is missing."""
-    missing = [name for name in ("sklearn", "skops", "optax") if find_spec(name) is None]
-    if missing:
-        raise ImportError(f"learnt skins need {' and '.join(missing)}; pip install 'jeit[learn]'.")
 
 
 def one_thread() -> AbstractContextManager:

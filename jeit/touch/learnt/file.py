@@ -6,9 +6,10 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from jeit.touch.kohonen.placed_map import PlacedMap
+from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 from jeit.touch.learnt.channels import Channels
 from jeit.touch.learnt.classifiers import LinearEnsemble, QuadraticDiscriminant
-from jeit.touch.learnt.extras import need_learning
 from jeit.touch.learnt.features import Features
 from jeit.touch.learnt.forest import Forest
 from jeit.touch.learnt.gaussian_process import GaussianProcess
@@ -23,6 +24,7 @@ from jeit.touch.learnt.network import Network
 from jeit.touch.learnt.numbers import LearntNumbers
 from jeit.touch.learnt.spread import Spread
 from jeit.touch.learnt.whitening import Whitened
+from jeit.touch.needed import need_learning
 
 _KIND, _VERSION = "a jeit learnt skin", 2
 _OURS = {
@@ -43,7 +45,9 @@ _OURS = {
         Nearest,
         Neighbourhood,
         Network,
+        PlacedMap,
         QuadraticDiscriminant,
+        SelfOrganisingMap,
         Spread,
         Standardised,
         Whitened,

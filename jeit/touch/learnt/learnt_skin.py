@@ -16,7 +16,7 @@ from jeit.touch.learnt.answers import METHODS, Standing, learn_answers, places_a
 from jeit.touch.learnt.changes import changes_of, mean_reference, reference_used, standardised
 from jeit.touch.learnt.channel_choice import choose_channels
 from jeit.touch.learnt.channels import Channels
-from jeit.touch.learnt.extras import need_learning, one_thread, over_threads
+from jeit.touch.learnt.extras import one_thread, over_threads
 from jeit.touch.learnt.imaged import Imaged, check_imaged
 from jeit.touch.learnt.keys import LearntKeys
 from jeit.touch.learnt.labels import LearntLabels
@@ -24,6 +24,7 @@ from jeit.touch.learnt.lag import lag_of, shifted
 from jeit.touch.learnt.numbers import LearntNumbers
 from jeit.touch.learnt.presses import NO_TOUCH, Presses, check_frames, check_reference
 from jeit.touch.learnt.touches import Touches
+from jeit.touch.needed import need_learning
 
 # A frame is unlike any learnt from beyond so many times the novelty of the farthest of them, or with fewer channels.
 _UNLIKE, _FEWEST = 2.0, 0.66

@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from jeit.touch.kohonen.placed_map import PlacedMap
+from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
+from jeit.touch.kohonen.training import Schedule
 from jeit.touch.learnt.forest import Forest
 from jeit.touch.learnt.gaussian_process import GaussianProcess
 from jeit.touch.learnt.nearest import Nearest
@@ -15,6 +18,8 @@ from jeit.touch.learnt.network import Network
 
 _ALPHAS = np.logspace(-2, 5, 15)
 _TREES = 100
+# Times that each of few presses is shown to a map, in each phase.
+_SHOWN = 50
 
 
 def ridge(features, targets) -> Any:
@@ -42,6 +47,15 @@ def forest(features, targets) -> Any:
     return Forest.of_averaged(found.estimators_)
 
 
+def som(features, targets) -> Any:
+    """Kohonen's map, whose neurons know the targets of the presses that each won, and what lies between them."""
+    import jax
+
+    shown = min(Schedule().ordering, _SHOWN * len(features))
+    learnt = SelfOrganisingMap.fit(features, jax.random.key(0), schedule=Schedule(shown, shown))
+    return PlacedMap.learn(learnt, features, targets)
+
+
 REGRESSORS: dict[str, Callable[..., Any]] = {
     "ridge": ridge,
     "neighbours": Nearest.of_numbers,
@@ -49,6 +63,7 @@ REGRESSORS: dict[str, Callable[..., Any]] = {
     "trees": trees,
     "forest": forest,
     "network": Network.train,
+    "som": som,
 }
 # Quick enough to be tried on every form of the features.
 QUICK = ("ridge", "neighbours")

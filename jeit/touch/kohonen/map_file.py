@@ -1,0 +1,46 @@
+"""Maps as files: arrays alone."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jeit.arguments import check_kind, need, npz_arrays
+from jeit.touch.kohonen.placed_map import PlacedMap
+from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
+
+
+def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
+    """Write a map, or one with places, to an NPZ file: `weights` and `scale`, and its places. Raises
+    `ValueError` for what is no map, and for a folder."""
+    check_kind("learnt", learnt, (SelfOrganisingMap, PlacedMap), "a map, as of SelfOrganisingMap.fit, or a PlacedMap")
+    if Path(path).is_dir():
+        raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / 'map.npz'}.")
+    placed = isinstance(learnt, PlacedMap)
+    plain = learnt.learnt if placed else learnt
+    more = {"places": learnt.places, "widening": learnt.widening, "missed": learnt.missed} if placed else {}
+    with Path(path).open("wb") as file:  # NumPy would add .npz to another name
+        np.savez_compressed(file, weights=plain.weights, scale=plain.scale, **more)
+
+
+def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
+    """The map of a file that `write_map` made. Raises `FileNotFoundError`, and `ValueError` for another file."""
+    if Path(path).is_dir():
+        raise ValueError(f"'{path}' is a folder; give an NPZ file.")
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"'{path}': there is no such file.")
+    try:
+        arrays = npz_arrays(Path(path), "weights", "scale", "places", "widening", "missed")
+        need(arrays, "weights", "scale")
+        learnt = SelfOrganisingMap(arrays["weights"], _number("scale", arrays))
+        if "places" not in arrays:
+            return learnt
+        return PlacedMap(learnt, arrays["places"], _number("widening", arrays), _number("missed", arrays))
+    except ValueError as error:
+        raise ValueError(f"'{path}' is no map: {error}") from None
+
+
+def _number(name: str, arrays: dict[str, np.ndarray]) -> float:
+    value = arrays.get(name, np.zeros(0))
+    if value.dtype.kind not in "fiu" or value.shape != ():
+        raise ValueError(f"{name} must be one number; it has shape {value.shape}.")
+    return float(value)

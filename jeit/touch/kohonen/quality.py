@@ -1,0 +1,46 @@
+"""How well a map keeps the order of its frames, in the field's measures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind
+from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
+from jeit.touch.needed import need_learning
+
+# Frames of which all pairs are compared, and neighbours of each.
+_COMPARED, _NEIGHBOURS = 2000, 12
+
+
+@dataclass(frozen=True)
+class MapQuality:
+    """`quantisation_error`, mean distance of frames from their winners, in their unit; `topographic_error`, share of
+    the frames whose two nearest neurons are no neighbours on the grid, of eight each (Kiviluoto 1996);
+    `trustworthiness`, 1 if all that is near on the map was near among the frames (Venna and Kaski 2001)."""
+
+    quantisation_error: float
+    topographic_error: float
+    trustworthiness: float
+
+
+def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
+    """Of a `learnt` map, by frames (n, M), those it was learnt from or others; trustworthiness by 2,000 of them at
+    most, evenly chosen, of whose neighbours 12 are looked at.
+
+    Raises `ValueError` for what is no map, fewer than 25 frames, another number of channels, and NaN.
+    """
+    need_learning()
+    from sklearn.manifold import trustworthiness
+
+    check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
+    frames = learnt.checked(frames)
+    if len(frames) <= 2 * _NEIGHBOURS:
+        raise ValueError(f"frames: {len(frames)} are too few to compare; give {2 * _NEIGHBOURS + 1} or more.")
+    near, distance = learnt.nearest(frames, 2)
+    row, column = np.unravel_index(near, learnt.shape)
+    apart = np.maximum(np.abs(row[:, 0] - row[:, 1]), np.abs(column[:, 0] - column[:, 1]))
+    some = np.unique(np.linspace(0, len(frames) - 1, _COMPARED).astype(int))
+    grid = np.stack([row[some, 0], column[some, 0]], axis=1).astype(float)
+    trusted = trustworthiness(frames[some], grid, n_neighbors=_NEIGHBOURS)
+    return MapQuality(float(distance[:, 0].mean()), float(np.mean(apart > 1)), float(trusted))

@@ -1,0 +1,151 @@
+"""Several touches at once, told by a map that has learnt of one at a time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind, is_number, real_array, told
+from jeit.touch.kohonen.placed_map import PlacedMap
+
+# Of the strongest touch, what is believed at the least; of the extent of the map's places, how far touches are apart.
+_LEAST, _APART = 0.08, 0.1
+# Variances by which the sum of squares that is left must fall for one more touch; touches looked for, at most.
+_EVIDENCE, _MOST = 25.0, 6
+
+
+@dataclass(frozen=True)
+class MapTouch:
+    """One of several: its `place` (d,) and the root mean square distance `spread` of its neurons from there, metres;
+    its `strength`, 1 for a touch like those that were learnt."""
+
+    place: Float[np.ndarray, " d"]
+    spread: float
+    strength: float
+
+
+def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "R C"]:
+    """How much of each neuron's touch is in a frame (M,): shares (R, C), zero or more, whose neurons' changes from the
+    `reference` (M,), the untouched skin's, sum nearest to the frame's; 0 for neurons without a place.
+
+    Changes of small touches add up, and touches push one way only: of shares that may not be negative, few are needed
+    (non-negative least squares; Lawson and Hanson 1974). Raises `ValueError` for what is no map with places, more than
+    one frame, other numbers of channels, and NaN.
+    """
+    sum_of = _Sum.of(placed, frame, reference)
+    shares = np.zeros(placed.learnt.shape)
+    shares[placed.placed] = sum_of.shares(np.ones(len(sum_of.places), bool))[0]
+    return shares
+
+
+def touches_told(
+    placed: PlacedMap,
+    frame: ArrayLike,
+    reference: ArrayLike,
+    *,
+    least: float = _LEAST,
+    apart: float | None = None,
+) -> list[MapTouch]:
+    """The touches in a frame (M,) of a skin whose untouched frame is `reference` (M,), the strongest first, six at
+    most.
+
+    Neurons with a share in the frame (`neuron_shares`) whose places are less than `apart` metres from each other, one
+    after another, may be of one touch; unless given a tenth of the extent of all places. Of these, touches are taken
+    one after another, as long as what they leave unexplained falls by five standard deviations of what the map leaves
+    of touches at any rate. Those of less than `least` of the strongest, or of a touch that was learnt, are left out.
+    Raises `ValueError` as `neuron_shares` does, and for a share or distance that cannot be.
+    """
+    if not (is_number(least) and 0 <= least < 1):
+        raise ValueError(f"least must be a share, from 0 to below 1; it is {told(least)}.")
+    if apart is not None and not (is_number(apart) and apart > 0):
+        raise ValueError(f"apart must be positive, in metres; it is {told(apart)}.")
+    sum_of = _Sum.of(placed, frame, reference)
+    if apart is None:
+        apart = _APART * float(np.ptp(sum_of.places, axis=0).max())
+    shares, left = sum_of.shares(np.ones(len(sum_of.places), bool))
+    own = np.count_nonzero(shares)
+    if not own:
+        return []
+    variance = max(left / max(len(sum_of.change) - own, 1), sum_of.variance)
+    chosen = _needed(sum_of, sum_of.groups(shares, apart), variance)
+    if not chosen:
+        return []
+    shares, _ = sum_of.shares(np.any(chosen, axis=0))
+    touches = [_touch(sum_of.places[group], shares[group]) for group in chosen if shares[group].any()]
+    touches.sort(key=lambda one: -one.strength)
+    return [one for one in touches if one.strength >= least * max(1.0, touches[0].strength)]
+
+
+@dataclass(frozen=True)
+class _Sum:
+    """A frame's `change` (M,) as a sum of those of neurons, `changes` (k, M), at `places` (k, d); all in a unit in
+    which these are about 1, as is the `variance` that touches leave of a channel."""
+
+    change: Float[np.ndarray, " M"]
+    changes: Float[np.ndarray, "k M"]
+    places: Float[np.ndarray, "k d"]
+    variance: float
+
+    @classmethod
+    def of(cls, placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> "_Sum":
+        check_kind("placed", placed, PlacedMap, "a map with places, as of PlacedMap.learn")
+        read, rest = (_one(placed, name, given) for name, given in (("frame", frame), ("reference", reference)))
+        changes = placed.learnt.weights[placed.placed] - rest
+        size = float(np.sqrt(np.mean(changes**2))) or 1.0
+        own = placed.places[placed.placed]
+        return cls((read - rest) / size, changes / size, own, (placed.missed / size) ** 2)
+
+    def shares(self, some: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
+        """Shares (k,) of the neurons, those alone that are asked for, and the sum of squares that they leave."""
+        from scipy.optimize import nnls
+
+        found = np.zeros(len(some))
+        found[some], distance = nnls(self.changes[some].T, self.change)
+        return found, float(distance) ** 2
+
+    def groups(self, shares: Float[np.ndarray, " k"], apart: float) -> list[Bool[np.ndarray, " k"]]:
+        """Neurons (k,) near those of each cluster of shares, of the clusters that change the frame most."""
+        from scipy.cluster.hierarchy import fcluster, linkage
+
+        own = np.flatnonzero(shares)
+        cluster = np.ones(1, int)
+        if len(own) > 1:
+            cluster = fcluster(linkage(self.places[own], "single"), apart, "distance")
+        members = [own[cluster == one] for one in np.unique(cluster)]
+        members.sort(key=lambda some: -np.linalg.norm(shares[some] @ self.changes[some]))
+        return [
+            np.linalg.norm(self.places[:, None] - self.places[some], axis=-1).min(axis=1) < apart / 2
+            for some in members[:_MOST]
+        ]
+
+
+def _needed(sum_of: _Sum, groups: list[np.ndarray], variance: float) -> list[Bool[np.ndarray, " k"]]:
+    """Groups of neurons that the frame cannot do without, the most telling first."""
+    chosen: list[np.ndarray] = []
+    left = float(sum_of.change @ sum_of.change)
+    rest = list(groups)
+    while rest:
+        after = [sum_of.shares(np.any([*chosen, one], axis=0))[1] for one in rest]
+        best = int(np.argmin(after))
+        if left - after[best] < _EVIDENCE * variance:
+            break
+        chosen.append(rest.pop(best))
+        left = after[best]
+    return chosen
+
+
+def _touch(places: Float[np.ndarray, "k d"], shares: Float[np.ndarray, " k"]) -> MapTouch:
+    middle = shares @ places / shares.sum()
+    spread = np.sqrt(shares @ np.sum((places - middle) ** 2, axis=1) / shares.sum())
+    return MapTouch(middle, float(spread), float(shares.sum()))
+
+
+def _one(placed: PlacedMap, name: str, given) -> Float[np.ndarray, " M"]:
+    values = real_array(name, given, "one frame (M,)")
+    if values.shape != placed.learnt.weights.shape[2:] or not np.isfinite(values).all():
+        raise ValueError(
+            f"{name} must be one finite frame of {placed.learnt.weights.shape[2]} channels; it has shape "
+            f"{values.shape}" + ("." if np.isfinite(values).all() else ", and NaN or infinite readings.")
+        )
+    return values

@@ -1,0 +1,92 @@
+"""The learning rule: MiniSom's, to rounding; phases, batches, and curves that settle."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from minisom import MiniSom
+
+from jeit.touch.kohonen import Schedule, SelfOrganisingMap, fit_maps, learning_curves, time_constant
+from jeit.touch.kohonen.training import train
+
+
+def minisoms(weights, frames, order, rates, radii):
+    """What MiniSom makes of the same frames in the same order, and the winners on the way."""
+    oracle = MiniSom(*weights.shape)
+    oracle._weights = weights.copy()
+    oracle._learning_rate_decay_function = lambda rate, step, steps: rates[step]
+    oracle._sigma_decay_function = lambda radius, step, steps: radii[step]
+    for step, number in enumerate(order):
+        oracle.update(frames[number], oracle.winner(frames[number]), step, len(order))
+    return oracle
+
+
+@pytest.mark.parametrize(("ordering", "tuning"), [(300, 0), (0, 300), (200, 300)])
+def test_weights_are_minisoms(ordering, tuning):
+    random = np.random.default_rng(1)
+    frames, weights = random.normal(5.0, 1.0, (80, 12)), random.normal(0, 0.1, (7, 5, 12))
+    schedule = Schedule(ordering, tuning, (0.4, 0.05))
+    order = random.integers(0, 80, schedule.steps)
+    rates, radii = schedule.rates(), schedule.radii((7, 5))
+    learnt, curve = train(jnp.asarray(weights), jnp.asarray(frames), order, rates, radii)
+    oracle = minisoms(weights, frames, order, rates, radii)
+    np.testing.assert_allclose(learnt, oracle._weights, rtol=0, atol=1e-12)
+    assert curve[-1] == pytest.approx(oracle._weights.mean(), abs=1e-12)
+
+
+def test_tuning_moves_the_winner_alone():
+    random = np.random.default_rng(2)
+    frames, weights = random.normal(size=(1, 6)), random.normal(size=(4, 4, 6))
+    learnt, _ = train(jnp.asarray(weights), jnp.asarray(frames), np.zeros(1, int), *_one_step())
+    moved = np.abs(np.asarray(learnt) - weights).max(axis=2) > 1e-9
+    nearest = np.linalg.norm(weights - frames[0], axis=2).argmin()
+    assert np.flatnonzero(moved).tolist() == [nearest]
+
+
+def _one_step():
+    schedule = Schedule(0, 1, (0.5, 0.5))
+    return schedule.rates(), schedule.radii((4, 4))
+
+
+def test_maps_at_once_are_those_one_by_one():
+    frames = np.random.default_rng(3).normal(size=(60, 5))
+    keys, schedules = [jax.random.key(0), jax.random.key(1)], [Schedule(100, 50), Schedule(50, 100, (0.1, 0.1))]
+    together = fit_maps(frames, keys, shape=(5, 4), schedules=schedules)
+    alone = [
+        SelfOrganisingMap.fit(frames, key, shape=(5, 4), schedule=schedule) for key in keys for schedule in schedules
+    ]
+    for one, other in zip(together, alone, strict=True):
+        np.testing.assert_allclose(one.weights, other.weights, rtol=0, atol=1e-12)
+        assert one.scale == pytest.approx(other.scale)
+    assert not np.allclose(alone[0].weights, alone[2].weights)
+
+
+def test_curves_settle_without_overshoot_the_slower_the_smaller_the_rate():
+    frames = np.random.default_rng(4).normal(2.0, 0.01, (200, 8))
+    curves = learning_curves(frames, jax.random.key(0), (0.01, 0.005, 0.001), steps=8000, shape=(8, 8))
+    constants = [time_constant(one) for one in curves]
+    assert constants == sorted(constants)
+    # Every neuron moves by a share of ε of between 1 and exp(−(7² + 7²) / 2·4²) of the way.
+    assert all(1 <= constant * rate <= 10 for constant, rate in zip(constants, (0.01, 0.005, 0.001), strict=True))
+    assert (curves.max(axis=1) < 2.0 + 0.005).all()
+    np.testing.assert_allclose(curves[:2, -1], 2.0, atol=0.01)
+
+
+BAD = {
+    "no frames shown": (lambda: Schedule(0, 0), "nothing would be learnt"),
+    "half a frame": (lambda: Schedule(10.5, 0), "ordering must be a whole number"),
+    "negative": (lambda: Schedule(10, -1), "tuning must be a whole number"),
+    "text": (lambda: Schedule("many", 0), "ordering must be a whole number"),
+    "rising rate": (lambda: Schedule(rate=(0.01, 0.1)), "rate must be"),
+    "rate above one": (lambda: Schedule(rate=(2.0, 0.1)), "rate must be"),
+    "one radius": (lambda: Schedule(radius=3.0), "radius must be"),
+    "no radius": (lambda: Schedule(radius=(3.0, 0.0)), "radius must be"),
+    "short curve": (lambda: time_constant(np.ones(5)), "ten steps or more"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input(name):
+    make, message = BAD[name]
+    with pytest.raises(ValueError, match=message):
+        make()
