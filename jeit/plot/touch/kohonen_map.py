@@ -1,0 +1,65 @@
+"""A self-organising map: its net of neurons, and what each of them says."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+
+from jeit.arguments import check_kind, real_array
+from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar, extent_of
+from jeit.touch.kohonen import MapTouch
+
+# Area of a neuron's mark, points², of a map of as many neurons as one of 32 by 32.
+_MARK, _NEURONS = 26.0, 1024
+
+
+def plot_map(
+    places: Float[np.ndarray, "R C 2"],
+    values: Float[np.ndarray, "R C"] | None = None,
+    *,
+    label: str = "Activity",
+    touches: Sequence[MapTouch] = (),
+    on_skin: bool = True,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the net of a map's neurons at `places` (R, C, 2), neighbours joined, those that are NaN left out.
+
+    `places`: in metres, as of `PlacedMap.places`; or anywhere (`on_skin=False`, without a scale bar), as of
+    `drawn_map`. `values` (R, C) of neurons, such as the activity of a frame, in colour, named `label`. `touches`: a
+    cross for each. Raises `ValueError` for arrays of other shapes, and a map none of whose neurons has a place.
+    """
+    places = real_array("places", places, "places (R, C, 2) of neurons")
+    if places.ndim != 3 or places.shape[2] != 2:
+        raise ValueError(f"places must be (R, C, 2); they have shape {places.shape}.")
+    there = np.isfinite(places).all(axis=2)
+    if not there.any():
+        raise ValueError("places: no neuron has one.")
+    if values is not None and np.shape(values) != places.shape[:2]:
+        raise ValueError(f"values must be one for each neuron, {places.shape[:2]}; they have shape {np.shape(values)}.")
+    check_kind("touches", touches, (list, tuple), "a list of touches, as of touches_told")
+    ax = axes_or_new(ax)
+    extent = extent_of(places[there])
+    bare(ax, extent, numbered=False)
+    lines = [
+        ends
+        for first, second in ((places[:-1], places[1:]), (places[:, :-1], places[:, 1:]))
+        for ends in np.stack([first, second], axis=-2).reshape(-1, 2, 2)
+        if np.isfinite(ends).all()
+    ]
+    ax.add_collection(LineCollection(lines, colors=INK if values is None else SOFT, linewidths=0.5, zorder=1))
+    if values is not None:
+        size = _MARK * min(4.0, _NEURONS / there.size)
+        drawn = ax.scatter(
+            *places[there].T, c=np.asarray(values)[there], s=size, cmap=SEQUENTIAL, linewidths=0, zorder=2
+        )
+        draw_colour_bar(ax, drawn, label)
+    for touch in touches:
+        ax.plot(*touch.place, marker="+", color="#d1495b", markersize=13, markeredgewidth=2.2, zorder=4)
+    if on_skin:
+        draw_scale_bar(ax, extent)
+    if title is not None:
+        ax.set_title(title)
+    return ax
