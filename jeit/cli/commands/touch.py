@@ -40,8 +40,8 @@ def fit(
     method: Annotated[
         str | None,
         typer.Option(
-            help="ridge, neighbours, gaussian-process, trees, forest, network, som, blend for places and forces; one of "
-            "the classifiers of labels; auto (default): what errs least on presses held out."
+            help="ridge, neighbours, gaussian-process, trees, forest, network, som, blend for places and forces; one "
+            "of the classifiers of labels; auto (default): what errs least on presses held out."
         ),
     ] = None,
     description: Annotated[
