@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.harness.case import Case, Options, Result, Table, judged
-from benchmarks.harness.tables import duration
 from benchmarks.harness.timing import say
 from benchmarks.problems.mixed_tanks import draw, matched
 from jeit import image_difference
@@ -18,13 +17,13 @@ from jeit.imaging import ImagingSettings
 TANKS, FIRST = 200, 500_000
 FAR, MEDIAN = 0.12, 0.045
 METHODS = ("auto", "one-step")
-HEADER = ["channels", "image", "tanks", "bodies", "median / R", "beyond 0.12 R", "missed", "spurious", "time of one"]
+HEADER = ["channels", "image", "tanks", "bodies", "median / R", "beyond 0.12 R", "missed", "spurious"]
 
 
 def run(options: Options) -> Result:
     """All tanks, by the kind of channels and together."""
     seeds = range(FIRST, FIRST + (3 if options.quick else TANKS))
-    rows: dict[tuple[str, str], list[tuple[np.ndarray, int, float]]] = {}
+    rows: dict[tuple[str, str], list[tuple[np.ndarray, int]]] = {}
     refused = []
     for seed in seeds:
         tank = draw(seed)
@@ -40,13 +39,13 @@ def run(options: Options) -> Result:
                 refused.append(f"tank {seed}, {channels}: {error}")
                 break
             distances, spurious = matched(tank, found.inclusions)
-            outcome = distances, spurious, sum(found.timings.values())
+            outcome = distances, spurious
             for name in (channels, "all"):
                 rows.setdefault((name, method), []).append(outcome)
             say(f"{seed} {channels} {method} {found.settings.method} {np.round(distances, 3)} {spurious} spurious")
     names = sorted({name for name, _ in rows}, key=lambda name: (name == "all", name))
     table = [_row(name, method, rows[name, method]) for name in names for method in METHODS]
-    distances, spurious, _ = _together(rows["all", "auto"])
+    distances, spurious = _together(rows["all", "auto"])
     asked = [
         judged(f"median ≤ {MEDIAN} R", f"{np.median(distances):.3f} R", bool(np.median(distances) <= MEDIAN)),
         judged(f"all ≤ {FAR} R", f"{np.mean(distances <= FAR):.1%}", bool((distances <= FAR).all())),
@@ -57,16 +56,16 @@ def run(options: Options) -> Result:
     return Result([Table(HEADER, table)], asked, notes)
 
 
-def _together(outcomes) -> tuple[np.ndarray, int, float]:
-    distances, spurious, seconds = zip(*outcomes, strict=True)
-    return np.concatenate(distances), sum(spurious), float(np.median(seconds))
+def _together(outcomes) -> tuple[np.ndarray, int]:
+    distances, spurious = zip(*outcomes, strict=True)
+    return np.concatenate(distances), sum(spurious)
 
 
 def _row(name: str, method: str, outcomes) -> list[str]:
-    distances, spurious, seconds = _together(outcomes)
+    distances, spurious = _together(outcomes)
     missed = np.isinf(distances)
     figures = [f"{np.median(distances):.3f}", str((distances[~missed] > FAR).sum()), str(missed.sum()), str(spurious)]
-    return [name, method, str(len(outcomes)), str(len(distances)), *figures, duration(seconds)]
+    return [name, method, str(len(outcomes)), str(len(distances)), *figures]
 
 
 CASE = Case("mixed_tanks", "strong bodies in simulated tanks that no default was set on", run, 5, timed=False)
