@@ -229,6 +229,15 @@ def test_metal_and_plastic_in_one_tank_are_all_found_and_nothing_else(seed):
     assert spurious == 0
 
 
+@pytest.mark.slow
+def test_neighbours_of_one_kind_are_told_apart():
+    """Two resistive neighbours merge in the image; split as disks, and then bent, they come apart."""
+    tank = draw(500082)
+    distances, spurious = matched(tank, image_difference(tank.frame, tank.reference).inclusions)
+    assert distances.max() < 0.05
+    assert spurious == 0
+
+
 def test_frames_of_mixed_tanks_are_those_of_a_model_on_a_fine_mesh():
     """The problem itself: SciPy's voltages of the empty tank are those of a model on a fine mesh."""
     tank = draw(0, noise=0.0)

@@ -178,7 +178,11 @@ def _without_ghosts(problem: ShapeProblem, fitted: Fit, doubtful: Sequence[Star]
 def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
     """The stars with one of them split in two; None if the data do not tell of it."""
     stars, coefficients, cost = fitted
-    tried = [stars.split(k, coefficients, across) for k in range(len(stars.sign)) for across in _ACROSS]
+    tried = [
+        _grown(problem, *stars.split(k, coefficients, across), _STEPS_TRIED)
+        for k in range(len(stars.sign))
+        for across in _ACROSS
+    ]
     found = _best(problem, tried)
     return found if found and cost >= least_rise * found.cost and _is_told(problem, fitted, found) else None
 
