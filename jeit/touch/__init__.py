@@ -1,7 +1,7 @@
 """From frames to meaning: where, how hard and how a skin is touched.
 
 Rooms: `contacts` (what an image shows, from frame to frame, in newtons), `learnt` (skins that learn from recorded
-presses, without a model).
+presses, without a model), `health` (cuts, electrodes that fail, repair).
 """
 
 from jeit.touch.contacts import (
@@ -14,6 +14,7 @@ from jeit.touch.contacts import (
     find_contacts,
     track_contacts,
 )
+from jeit.touch.health import HealthEvent, SkinHealth, watch
 from jeit.touch.learnt.file import read_skin, write_skin
 from jeit.touch.learnt.learnt_skin import LearntSkin, Standing
 from jeit.touch.learnt.presses import Presses, read_frames, read_presses
@@ -23,11 +24,13 @@ __all__ = [
     "CellFinder",
     "Contact",
     "ContactTracker",
+    "HealthEvent",
     "ImageNoise",
     "LearntSkin",
     "LoadCalibration",
     "Presses",
     "RasterFinder",
+    "SkinHealth",
     "Standing",
     "Touches",
     "find_contacts",
@@ -35,5 +38,6 @@ __all__ = [
     "read_presses",
     "read_skin",
     "track_contacts",
+    "watch",
     "write_skin",
 ]
