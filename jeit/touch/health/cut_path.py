@@ -17,9 +17,11 @@ from jeit.mesh import centroids, measures
 _WIDTH, _DIRECTIONS, _FOLLOWED, _STEPS = 0.6, 6, 2, 25
 # Of the skin's side, the length that is begun with; depths a, least, first and greatest.
 _LENGTH, _LEAST_DEPTH, _DEPTH, _MOST_DEPTH = 0.18, 0.1, 2.5, 9.0
+# Of a spot, the radius, of the skin's side, and the depth that are begun with.
+_SPOT, _SPOT_DEPTH = 0.05, 0.5
 # A bend has to take so much of the misfit that a straight line leaves.
 _BEND = 0.6
-# Of a change, what no model of it gets right.
+# Of a change, and of the root mean square of all, what no model of it gets right.
 _MODEL = 0.05
 
 
@@ -47,11 +49,11 @@ class LossFit:
         self.width = _WIDTH * 1.5 * np.sqrt(across)
         self.rest = np.asarray(model.voltages(conductivity))[channels]
         size = np.sqrt(np.mean(change**2))
-        self.weight = 1 / np.hypot(noise, _MODEL * np.hypot(change, 0.2 * size))
+        self.weight = 1 / np.hypot(noise, _MODEL * np.hypot(change, size))
         self.change = change
         self.energy = float(np.sum((self.weight * change) ** 2))
 
-    def line(self, start: np.ndarray) -> FittedLoss | None:
+    def line(self, start: np.ndarray) -> FittedLoss:
         """A straight cut near a place (x, y), or a bent one where that is far better."""
         half = 0.5 * _LENGTH * self.side
         angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
@@ -69,10 +71,7 @@ class LossFit:
 
     def spot(self, start: np.ndarray) -> FittedLoss:
         """A round one."""
-        best = min(
-            (self._fitted(np.array([*start, size * self.side, depth])) for size in (0.05,) for depth in (0.5,)),
-            key=lambda one: one[1],
-        )
+        best = self._fitted(np.array([*start, _SPOT * self.side, _SPOT_DEPTH]))
         return FittedLoss(best[0][None, :2], best[1], self._values(best[0])[0])
 
     def _fitted(self, start: np.ndarray) -> tuple[np.ndarray, float]:

@@ -19,17 +19,19 @@ _AGREES = 3.0
 _OFF = 10.0
 # A place to begin at is the middle of what stands above this share of an image's peak.
 _ABOVE = 0.5
-# A line is a cut if it leaves no more of the change than this, and less than a spot does, by this factor.
-_EXPLAINS, _BETTER = 0.5, 0.9
+# A line is a cut if it leaves no more of the change than this, and no more than so many times what a spot does: round
+# presses leave a hundredth of what a line does, of a cut both leave about a tenth.
+_EXPLAINS, _BETTER = 0.5, 1.1
 
 
 @dataclass(frozen=True)
 class ImagedSkin:
-    """**Fields**: `model`; `conductivity` (m,), S/m (2-D: S), as it is now, cuts and all; `gain` (M,), what channels
-    read of the model's volts; `noise` (M,), volts; `sign` of a touch."""
+    """**Fields**: `model`; `conductivity` (m,), S/m (2-D: S), as it is now, cuts and all, and when it was
+    `healthy`; `gain` (M,), what channels read of the model's volts; `noise` (M,), volts; `sign` of a touch."""
 
     model: ForwardModel
     conductivity: Float[np.ndarray, " m"]
+    healthy: Float[np.ndarray, " m"]
     gain: Float[np.ndarray, " M"]
     noise: Float[np.ndarray, " M"]
     sign: int
@@ -59,12 +61,25 @@ class ImagedSkin:
             )
         each = reference / np.where(predicted == 0, np.inf, predicted)
         gain = np.where(used & (each > ratio / _AGREES) & (each < ratio * _AGREES), each, ratio)
-        return cls(model, values, gain, noise, int(sign))
+        return cls(model, values, values, gain, noise, int(sign))
 
     def linear(self, usable: Bool[np.ndarray, " M"]) -> LinearReconstruction:
         """One-step images of the model's volts by the `usable` channels (M,), about the skin as it is now."""
         noise = np.where(np.isfinite(self.noise), self.noise / np.abs(self.gain), 1.0)
         return one_step(self.model, self.conductivity, noise=noise, mask=usable)
+
+    def images(self, changes: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, " M"]) -> Float[np.ndarray, "F m"]:
+        """Changes of conductivity (F, m), S/m (2-D: S), of changes (F, M), volts, NaN where there is no reading; NaN
+        for a frame without any."""
+        there = np.isfinite(changes) & usable
+        volts = np.where(there, changes / self.gain, 0.0)
+        found = np.full((len(changes), self.model.mesh.num_cells), np.nan)
+        patterns, kind = np.unique(there, axis=0, return_inverse=True)
+        for number, pattern in enumerate(patterns):
+            if pattern.any():
+                rows = kind.ravel() == number
+                found[rows] = np.asarray(self.linear(pattern).image(volts[rows]))
+        return found
 
     def loss(self, change: Float[np.ndarray, " M"], usable: Bool[np.ndarray, " M"]) -> FittedLoss | None:
         """The cut that explains a change (M,), volts, if one does, and better than a press would."""
@@ -80,10 +95,14 @@ class ImagedSkin:
         noise = self.noise[channels] / np.abs(self.gain[channels])
         fit = LossFit(self.model, self.conductivity, volts[channels], channels, noise)
         line, spot = fit.line(start), fit.spot(start)
-        if line is None or line.misfit > _EXPLAINS or line.misfit > _BETTER * spot.misfit:
+        if line.misfit > _EXPLAINS or line.misfit > _BETTER * spot.misfit:
             return None
         return line
 
     def with_loss(self, loss: FittedLoss) -> "ImagedSkin":
         """The skin with a cut."""
         return replace(self, conductivity=loss.conductivity)
+
+    def healed(self) -> "ImagedSkin":
+        """The skin without any."""
+        return replace(self, conductivity=self.healthy)

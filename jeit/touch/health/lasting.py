@@ -96,5 +96,5 @@ def _split(along: np.ndarray, half: int) -> int:
     total, sums = along.sum(), np.cumsum(along)[:-1]
     count = np.arange(1, number)
     between = sums**2 / count + (total - sums) ** 2 / (number - count)
-    allowed = slice(max(1, half // 2), number - 2)
-    return int(np.argmax(between[allowed])) + allowed.start + 1
+    allowed = slice(max(3, half // 2) - 1, number - 3)
+    return int(np.argmax(between[allowed])) + int(allowed.start) + 1

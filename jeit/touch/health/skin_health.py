@@ -208,10 +208,21 @@ class SkinHealth:
             events=(*mended, event),
             reference=np.where(there, fresh, self.reference),
             trusted=there,
+            skin=None if self.skin is None else self.skin.healed(),
             _window=(),
             _part=(),
             _pending=None,
         )
+
+    def images(self, frames: ArrayLike) -> Float[np.ndarray, "F m"]:
+        """Changes of conductivity (F, m), S/m (2-D: S), from the skin as it is now, cuts and all, by the channels that
+        are left; NaN for a frame without a reading. Raises `ValueError` without a model, and for other channels."""
+        if self.skin is None:
+            raise ValueError("images need a model: give it to SkinHealth.fit, with its conductivity.")
+        read = _frames("frames", frames)
+        if read.shape[1] != self.reference.size:
+            raise ValueError(f"frames have {read.shape[1]} channels, and this skin {self.reference.size}.")
+        return self.skin.images(read - self.reference, self.trusted)
 
     @property
     def held(self) -> HealthEvent | None:
