@@ -20,6 +20,7 @@ NAMES = (
     "first_call",
     "contacts",
     "localisation_error",
+    "skin_health",
     "mixed_tanks",
     "cut_tanks",
     "untuned_arrays",
