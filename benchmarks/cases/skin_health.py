@@ -56,7 +56,7 @@ def _touches(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Aske
 def _cuts(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]:
     rows, asked = [], []
     seconds = np.arange(0, RECORDING, 1 / RATE)
-    for depth, number, first in ((1.0, 3 if quick else 40, 10_000), (0.5, 1 if quick else 15, 20_000)):
+    for depth, number, first in ((1.0, 3 if quick else 20, 10_000), (0.5, 1 if quick else 5, 20_000)):
         told, named, after, error, beside = 0, 0, [], [], []
         for one in range(first, first + number):
             cut = skin.cut(one, depth)
@@ -93,7 +93,7 @@ def _cuts(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]
 def _faults(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]:
     rows, asked = [], []
     seconds = np.arange(0, RECORDING, 1 / RATE)
-    number = 2 if quick else 20
+    number = 2 if quick else 10
     for kind in ("dead", "torn", "loose"):
         told, named, after = 0, 0, []
         for one in range(30_000, 30_000 + number):

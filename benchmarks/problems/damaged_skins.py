@@ -158,7 +158,7 @@ class DamagedSkin:
     def off(self, health: SkinHealth, skin: PressedSkin, presses: list[Press], number: int) -> np.ndarray:
         """How far presses are placed off, metres, in images about a fresh reference; NaN where nothing is found."""
         rest = np.asarray(skin.model.voltages(skin.conductivity))
-        exact = rest + np.concatenate([np.zeros((10, 1, rest.size)), changes(skin, presses)[:, 2:]])[:, 0]
+        exact = rest + np.concatenate([np.zeros((10, 1, rest.size)), changes(skin, presses, (1.0,))])[:, 0]
         frames = skin.read(self.key(number), exact, np.array([20.0]))
         images = health.skin.images(frames[10:] - frames[:10].mean(axis=0), health.trusted)  # pyright: ignore
         finder = CellFinder(self.image_model.mesh, sign=health.skin.sign)  # pyright: ignore
@@ -171,10 +171,10 @@ class DamagedSkin:
         )
 
 
-def changes(skin: PressedSkin, presses: list[Press]) -> np.ndarray:
-    """Changes (n, 3, M) of voltages by presses at the shares of their load, each solved anew, volts."""
+def changes(skin: PressedSkin, presses: list[Press], shares: tuple[float, ...] = RISE) -> np.ndarray:
+    """Changes (n, s, M) of voltages by presses at s shares of their load, each solved anew, volts."""
     model, rest = skin.model, np.broadcast_to(skin.conductivity, skin.model.mesh.num_cells)
-    parts = [Press(one.indenter, share * one.load, one.position, one.angle) for one in presses for share in RISE]
+    parts = [Press(one.indenter, share * one.load, one.position, one.angle) for one in presses for share in shares]
     touched = skin.touched(parts, held=1.0)
     at_rest = np.asarray(model.voltages(rest))
     found = np.empty((len(parts), at_rest.size))
@@ -182,4 +182,4 @@ def changes(skin: PressedSkin, presses: list[Press]) -> np.ndarray:
         values = rest.copy()
         np.multiply.at(values, cells, 1 + change)
         found[number] = np.asarray(model.voltages(values)) - at_rest
-    return found.reshape(len(presses), len(RISE), -1)
+    return found.reshape(len(presses), len(shares), -1)

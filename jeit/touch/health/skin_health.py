@@ -173,7 +173,7 @@ class SkinHealth:
             return replace(self, _pending=None)
         denied = self._with_status(event, EventStatus.DENIED)
         back = np.where(np.isfinite(event.change), self.reference - event.change, self.reference)
-        return replace(denied, reference=back, trusted=denied._trusted_channels())
+        return replace(denied, reference=back, trusted=denied._trusted_channels(), skin=denied._skin_left())
 
     def repaired(self, frames: ArrayLike) -> "SkinHealth":
         """The user says that the skin is mended, and gives frames (n, M) of it, untouched: the new reference.
@@ -357,7 +357,7 @@ class SkinHealth:
                 event = self._event(change, finding, EventStatus.LASTING, len(events))
                 after = replace(self, events=(*events, event))
                 fresh = np.where(np.isfinite(change.vector), self.reference + change.vector, self.reference)
-                return replace(after, reference=fresh, trusted=after._trusted_channels())
+                return replace(after, reference=fresh, trusted=after._trusted_channels(), skin=after._skin_left())
         return None
 
     def _with(self, change: Change, found: list[Finding], status: EventStatus) -> "SkinHealth":
@@ -398,6 +398,11 @@ class SkinHealth:
             raise ValueError(f"event {event.number} is none of this skin's, which has {len(self.events)}.")
         events = [_changed(one, status) if one.number == event.number else one for one in self.events]
         return replace(self, events=tuple(events))
+
+    def _skin_left(self) -> ImagedSkin | None:
+        """The model as it was healthy, once no cut is left."""
+        cut = any(one.path is not None for one in self.open_events)
+        return self.skin if self.skin is None or cut else self.skin.healed()
 
     def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
         """Channels (M,) that no open event of electrodes or channels takes away."""

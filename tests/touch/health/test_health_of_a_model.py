@@ -4,11 +4,13 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk
+from jeit.plot import plot_health
 from jeit.protocol import adjacent
 from jeit.simulate import Disc, MovingPress, PressedSkin, material
 from jeit.simulate.damage import Cut, Mishap, record_mishaps
@@ -92,6 +94,26 @@ def test_images_do_without_what_is_not_read(after):
     images = after.images(frames)
     assert np.isfinite(images).all(axis=1).tolist() == [True, True, False]
     assert np.abs(images[:2]).max() < 1e-6 * SHEET
+
+
+def test_a_cut_that_the_user_denies_is_out_of_the_model(after):
+    assert np.ptp(after.skin.conductivity) > 0
+    denied = after.deny(after.open_events[0])
+    assert np.ptp(denied.skin.conductivity) == 0
+
+
+def test_a_picture_has_the_cut_and_its_length(after):
+    ax = plot_health(after, title="a skin", ax=Figure().subplots())
+    said = [text.get_text() for text in ax.texts]
+    assert any(f"cut, {1e3 * after.open_events[0].length:.0f} mm" in text for text in said)
+    assert any(text.endswith("0 mm") and text[0].isdigit() for text in said)  # the scale bar
+    lines = [np.column_stack(line.get_data()) for line in ax.lines]
+    assert any(line.shape == (2, 2) and np.allclose(line, after.open_events[0].path) for line in lines)
+    image = after.images(after.reference[None])[0]
+    mended = after.repaired(np.tile(after.reference, (5, 1)))
+    assert any("mended" in text.get_text() for text in plot_health(mended, image, ax=Figure().subplots()).texts)
+    with pytest.raises(ValueError, match="health must be"):
+        plot_health("skin")  # pyright: ignore[reportArgumentType]
 
 
 def test_after_repair_the_skin_is_healthy(after, skin):
