@@ -72,7 +72,9 @@ def _cuts(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]
             error += [apart(cut.along(1e-3), event.path) for event in cuts[:1]]
             away = far(skin, one, cut)
             if depth == 1 and events and away:
-                mended = known.repaired(glued.read(skin.key(one), np.tile(exact(glued), (10, 1)), np.array([80.0])))
+                mended = known.repaired(
+                    skin.skin.read(skin.key(one), np.tile(skin.at_rest(glued), (10, 1)), np.array([80.0]))
+                )
                 states = ((skin.health, whole), (known, torn), (mended, glued))
                 beside.append([skin.off(health, state, away, one) for health, state in states])
         median = [f"{np.median(after):.1f} s" if after else "–", f"{1e3 * np.median(error):.1f} mm" if error else "–"]
@@ -111,11 +113,6 @@ def _faults(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked
                 judged(f"{skin.name}: {kind} electrodes found and named", f"{named} of {number}", named == number)
             )
     return rows, asked
-
-
-def exact(skin) -> np.ndarray:
-    """Voltages (M,) of an untouched skin, undisturbed."""
-    return np.asarray(skin.model.voltages(skin.conductivity))
 
 
 def far(skin: DamagedSkin, number: int, cut) -> list:

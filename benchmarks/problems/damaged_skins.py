@@ -120,15 +120,20 @@ class DamagedSkin:
             for out, some in zip(change, parts, strict=True):
                 out[rows] += some[which % len(some), profile[: len(rows)]]
             start += lasts + random.uniform(*BETWEEN)
-        skins = [skin, skin if later is None else later[1]]
-        rest = [np.asarray(one.model.voltages(one.conductivity)) for one in skins]
+        # Voltages at rest are of the own mesh, and what damage changes is added: another mesh is no damage.
+        at_rest = self.at_rest(self.skin)
+        rest = [at_rest, at_rest if later is None else at_rest + self.at_rest(later[1]) - self.at_rest(skin)]
         found = [
-            one.read(self.key(number), at_rest + own + more, seconds)
-            for one, at_rest, own in zip(skins, rest, change, strict=True)
+            self.skin.read(self.key(number), one + own + more, seconds) for one, own in zip(rest, change, strict=True)
         ]
         if later is None:
             return found[0]
         return np.where((seconds >= later[0])[:, None], found[1], found[0])
+
+    @staticmethod
+    def at_rest(skin: PressedSkin) -> np.ndarray:
+        """Voltages (M,) of an untouched skin, undisturbed."""
+        return np.asarray(skin.model.voltages(skin.conductivity))
 
     def cut(self, number: int, depth: float = 1.0) -> Cut:
         span = (0.02 * self.scale, 0.06 * self.scale)
@@ -157,9 +162,9 @@ class DamagedSkin:
 
     def off(self, health: SkinHealth, skin: PressedSkin, presses: list[Press], number: int) -> np.ndarray:
         """How far presses are placed off, metres, in images about a fresh reference; NaN where nothing is found."""
-        rest = np.asarray(skin.model.voltages(skin.conductivity))
+        rest = self.at_rest(skin)
         exact = rest + np.concatenate([np.zeros((10, 1, rest.size)), changes(skin, presses, (1.0,))])[:, 0]
-        frames = skin.read(self.key(number), exact, np.array([20.0]))
+        frames = self.skin.read(self.key(number), exact, np.array([20.0]))
         images = health.skin.images(frames[10:] - frames[:10].mean(axis=0), health.trusted)  # pyright: ignore
         finder = CellFinder(self.image_model.mesh, sign=health.skin.sign)  # pyright: ignore
         found = [find_contacts(finder, image) for image in images]

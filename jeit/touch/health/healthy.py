@@ -15,6 +15,8 @@ _LEAST_ALWAYS, _MOST_ALWAYS = 12, 64
 _LONGEST, _LEAST_SHARE = 3.0, 1 / 40
 # Of what healthy windows did at most, and in deviations of normal ones: a change below is none. Few windows say less.
 _BEYOND, _LEAST_SIZE, _FEW = 2.0, 4.0, 4.0
+# A step is still there when so much of it is.
+_STILL = 0.4
 # The same from the healthy recording to another.
 _BEYOND_LEVEL = 3.0
 # A touch stands out so far from what quiet frames do; of the frames, the quietest are this share.
@@ -34,7 +36,8 @@ class Healthy:
 
     **Fields**: `reference` (M,), untouched, volts; `used` (M,): channels that read anything; `noise` (M,), volts, from
     frame to frame; `span` (2, M): least and greatest change in it; `stride`: frames averaged to a step; `window`: steps
-    of a window; `scale` (M,), volts: how far windows that follow each other are apart; `limit` of `size_of`; `level`
+    of a window; `scale` (M,), volts: how far windows that follow each other are apart; `limit` of
+    `size_of` a step that stays, and `sudden` of one that may be a touch; `level`
     (M,), volts, how far any two are apart, and its `level_limit`; `touches` (M, k): directions of touches, orthonormal
     in units of noise; `unlike`: the share of a change that no touch has outside of those; `period`, seconds a frame,
     or 1.
@@ -48,6 +51,7 @@ class Healthy:
     window: int
     scale: Float[np.ndarray, " M"]
     limit: float
+    sudden: float
     level: Float[np.ndarray, " M"]
     level_limit: float
     touches: Float[np.ndarray, "M k"]
@@ -82,13 +86,15 @@ class Healthy:
         stride = max(1, -(-window // _MOST))
         steps = averaged(frames, stride)
         window = max(_FEWEST, window // stride)
-        scale, limit = _step_limit(_contrasts(steps, window), _floor(noise, stride * window))
+        scale, limit, sudden = _step_limits(_triples(steps, window), window, _floor(noise, stride * window))
         level, level_limit = _level_limit(_levels(steps, window), scale)
         touches, unlike = _touches(frames, noise, stride * window)
         local = frames - centre
         span = np.stack([np.nanmin(local, axis=0, initial=0.0), np.nanmax(local, axis=0, initial=0.0)])
         fixed = np.where(used, np.nan_to_num(centre), 0.0)
-        return cls(fixed, used, noise, span, stride, window, scale, limit, level, level_limit, touches, unlike, period)
+        return cls(
+            fixed, used, noise, span, stride, window, scale, limit, sudden, level, level_limit, touches, unlike, period
+        )
 
     def outside(self, change: Float[np.ndarray, " M"]) -> float:
         """The share of a change that is in no direction that touches have, of its energy in units of noise."""
@@ -137,10 +143,10 @@ def _floor(noise: np.ndarray, frames: int) -> np.ndarray:
     return noise * np.sqrt(np.pi / max(frames, 2))
 
 
-def _contrasts(steps: np.ndarray, window: int) -> np.ndarray:
-    """Two windows (n, 2w, M) that follow each other, all over a recording."""
-    starts = range(0, max(1, len(steps) - 2 * window + 1), max(1, window // 4))
-    return np.array([steps[start : start + 2 * window] for start in starts])
+def _triples(steps: np.ndarray, window: int) -> np.ndarray:
+    """Three windows (n, 3w, M) that follow each other, all over a recording."""
+    starts = range(0, max(1, len(steps) - 3 * window + 1), max(1, window // 4))
+    return np.array([steps[start : start + 3 * window] for start in starts])
 
 
 def _levels(steps: np.ndarray, window: int) -> np.ndarray:
@@ -149,19 +155,34 @@ def _levels(steps: np.ndarray, window: int) -> np.ndarray:
     return np.array([median(steps[start : start + window]) for start in starts]) - median(steps)
 
 
-def _step_limit(pairs: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, float]:
-    """The scale (M,) of changes between windows, and how large a step may be in it that lasts.
+def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """The scale (M,) of changes between windows; how large a step may be in it that is still there a window later; and
+    one that need not be, such as a touch.
 
-    Steps are of each half in the scale of the other, which they had no part in; touches that come and go are none.
+    Steps are of each half in the scale of the other, which they had no part in.
     """
+    pairs = triples[:, : 2 * window]
     changes = np.nan_to_num(np.array([window_change(one) for one in pairs]))
-    half, sizes = len(changes) // 2, [0.0]
+    half, stayed, sizes = len(changes) // 2, [0.0], [0.0]
+    rest = median(np.concatenate(list(triples[:: max(1, len(triples) // _WINDOWS)])))
     for learnt, other in ((slice(None, half), slice(half, None)), (slice(half, None), slice(None, half))):
         scale = _scale(changes[learnt], floor)
-        steps = [lasting_step(one, scale, 0.0) for one in pairs[other]]
-        sizes += [step.size for step in steps if step is not None]
-        sizes.append(float(np.median(size_of(changes[other] / scale))) if len(changes[other]) else 0.0)
-    return _scale(changes, floor), max(_LEAST_SIZE, (_BEYOND + _FEW / max(len(changes), 1)) * max(sizes))
+        for triple, pair in zip(triples[other], pairs[other], strict=True):
+            step = lasting_step(pair, scale, 0.0)
+            if step is None:
+                continue
+            sizes.append(step.size)
+            direction = np.nan_to_num(step.change / scale**2)
+            now = median(triple[2 * window :])
+            if size_of((now - rest) / scale) < _STILL * step.size:  # back from a touch
+                continue
+            later = np.nan_to_num(now - median(pair[:window]))
+            if later @ direction > _STILL * (np.nan_to_num(step.change) @ direction):
+                stayed.append(step.size)
+        stayed.append(float(np.median(size_of(changes[other] / scale))) if len(changes[other]) else 0.0)
+    beyond = _BEYOND + _FEW / max(len(changes), 1)
+    lasting = max(_LEAST_SIZE, beyond * max(stayed))
+    return _scale(changes, floor), lasting, max(lasting, beyond * max(sizes))
 
 
 def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, float]:

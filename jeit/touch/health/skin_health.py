@@ -334,7 +334,7 @@ class SkinHealth:
             return undone
         after = frames[step.first :]
         found = findings(step.change, after, self.reference, self.healthy, self.touching, self.skin)
-        if found[0].sure:
+        if found[0].electrode is not None or (found[0].sure and change.size > self.healthy.sudden):
             return fresh._with(change, found, EventStatus.LASTING)
         if self._pending is not None:  # one thing is waited for at a time: that which began first
             return fresh
