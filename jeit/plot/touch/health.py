@@ -52,7 +52,7 @@ def plot_health(
             _draw_cut(ax, event.path, event.length, event.time, mended=event.status == EventStatus.MENDED)
     failed = [one.electrode for one in health.open_events if one.electrode is not None]
     if failed:
-        places = np.asarray(electrodes.position)[failed, :2]
+        places = np.asarray(electrodes.position)[failed, :2]  # pyright: ignore[reportAttributeAccessIssue]
         ax.plot(*places.T, "x", color=_CUT, markersize=11, markeredgewidth=2.4, zorder=6, path_effects=_HALO)
     return ax
 

@@ -47,7 +47,9 @@ class ElectrodeFault(eqx.Module):
     def changes(
         self, key: Array, model: ForwardModel, conductivity: ArrayLike, seconds: Float[np.ndarray, " T"]
     ) -> Float[np.ndarray, "T M"]:
-        """By how much voltages (T, M) of a skin at rest differ from those without the fault, at `seconds` (T,).
+        """By how much voltages (T, M) of a skin at rest differ from those without the fault, at `seconds` (T,), volts.
+
+        `conductivity` of the skin, S/m (2-D: S).
 
         Raises `ValueError` for what is no key or model, an electrode that it lacks, and times that are none.
         """

@@ -8,7 +8,7 @@ every step. A round spot is fitted too, which is what a press makes: the better 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jeit.forward import ForwardModel
 from jeit.mesh import centroids, measures
@@ -36,9 +36,18 @@ class FittedLoss:
 
 
 class LossFit:
-    """Least squares for a `change` (K,) of voltages of a model's `channels` (K,), volts, from `conductivity` (m,)."""
+    """Least squares for a `change` (K,) of voltages of a model's `channels` (K,), volts, from `conductivity` (m,), S/m
+    (2-D: S)."""
 
-    def __init__(self, model: ForwardModel, conductivity, change, channels, noise):
+    def __init__(
+        self,
+        model: ForwardModel,
+        conductivity: Float[np.ndarray, " m"],
+        change: Float[np.ndarray, " K"],
+        channels: Int[np.ndarray, " K"],
+        noise: Float[np.ndarray, " K"],
+    ):
+        """`conductivity` as it was, S/m (2-D: S); `noise` (K,), volts."""
         self.model, self.conductivity, self.channels = model, conductivity, channels
         self.centres = np.asarray(centroids(model.mesh))[:, :2]
         area = np.asarray(measures(model.mesh))
@@ -84,7 +93,7 @@ class LossFit:
         found = least_squares(
             self._residual,
             inside,
-            self._slope,
+            self._slope,  # pyright: ignore[reportArgumentType]
             bounds=(low, high),
             x_scale=scale,
             max_nfev=_STEPS,

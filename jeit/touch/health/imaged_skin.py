@@ -12,6 +12,7 @@ from jeit.inverse import one_step
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.mesh import centroids, measures
 from jeit.touch.health.cut_path import FittedLoss, LossFit
+from jeit_solvers.engines import as_array
 
 # Gains of channels are read off the reference where the model agrees with it within this factor.
 _AGREES = 3.0
@@ -66,7 +67,7 @@ class ImagedSkin:
     def linear(self, usable: Bool[np.ndarray, " M"]) -> LinearReconstruction:
         """One-step images of the model's volts by the `usable` channels (M,), about the skin as it is now."""
         noise = np.where(np.isfinite(self.noise), self.noise / np.abs(self.gain), 1.0)
-        return one_step(self.model, self.conductivity, noise=noise, mask=usable)
+        return one_step(self.model, self.conductivity, noise=as_array(noise), mask=as_array(usable))
 
     def images(self, changes: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, " M"]) -> Float[np.ndarray, "F m"]:
         """Changes of conductivity (F, m), S/m (2-D: S), of changes (F, M), volts, NaN where there is no reading; NaN
@@ -78,14 +79,14 @@ class ImagedSkin:
         for number, pattern in enumerate(patterns):
             if pattern.any():
                 rows = kind.ravel() == number
-                found[rows] = np.asarray(self.linear(pattern).image(volts[rows]))
+                found[rows] = np.asarray(self.linear(pattern).image(as_array(volts[rows])))
         return found
 
     def loss(self, change: Float[np.ndarray, " M"], usable: Bool[np.ndarray, " M"]) -> FittedLoss | None:
         """The cut that explains a change (M,), volts, if one does, and better than a press would."""
         there = usable & np.isfinite(change)
         volts = np.where(there, change / self.gain, 0.0)
-        image = np.asarray(self.linear(there).image(volts))
+        image = np.asarray(self.linear(there).image(as_array(volts)))
         lost = np.maximum(-image, 0.0)
         if not lost.max() > 0:
             return None
