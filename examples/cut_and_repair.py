@@ -75,7 +75,9 @@ def main() -> float:
     axes[3].set(xlabel="s", ylabel="mV", title="change of four channels; events dashed")
     figure.savefig("cut_and_repair.png")
 
-    found = Cut(before.events[0].path).along(1e-3)
+    path = before.events[0].path
+    assert path is not None
+    found = Cut(path).along(1e-3)
     apart = np.linalg.norm(cut.along(1e-3)[:, None] - found, axis=-1)
     return max(*errors, 0.5 * float(apart.min(axis=0).mean() + apart.min(axis=1).mean()))
 

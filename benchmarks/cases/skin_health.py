@@ -69,7 +69,7 @@ def _cuts(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]
             cuts = [event for event in events if event.kind == EventKind.CUT]
             named += bool(cuts)
             after += [event.told - BEGINS for event in events[:1]]
-            error += [apart(cut.along(1e-3), event.path) for event in cuts[:1]]
+            error += [apart(cut.along(1e-3), event.path) for event in cuts[:1] if event.path is not None]
             away = far(skin, one, cut)
             if depth == 1 and events and away:
                 mended = known.repaired(

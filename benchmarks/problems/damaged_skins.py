@@ -104,7 +104,9 @@ class DamagedSkin:
         options = {"model": self.image_model, "conductivity": self.sheet, "sign": sign, "patience": PATIENCE}
         return SkinHealth.fit(frames, seconds, **options)
 
-    def read(self, skin: PressedSkin, number: int, seconds: np.ndarray, touches, later=None, more=0.0) -> np.ndarray:
+    def read(
+        self, skin: PressedSkin, number: int, seconds: np.ndarray, touches, later=None, more: float | np.ndarray = 0.0
+    ) -> np.ndarray:
         """Frames (T, M) of touches one after the other, of `touches`; from the time of `later` on, a (time, skin,
         touches), of another skin; `more` (T, M), volts, is added."""
         random = np.random.default_rng([self.seed, number])
