@@ -22,6 +22,7 @@ NAMES = (
     "contacts",
     "kohonen",
     "localisation_error",
+    "skin_health",
     "mixed_tanks",
     "cut_tanks",
     "untuned_arrays",

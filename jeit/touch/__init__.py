@@ -1,7 +1,8 @@
 """From frames to meaning: where, how hard and how a skin is touched.
 
 Rooms: `contacts` (what an image shows, from frame to frame, in newtons), `learnt` (skins that learn from recorded
-presses, without a model), `kohonen` (maps that order frames by themselves).
+presses, without a model), `kohonen` (maps that order frames by themselves), `health` (cuts, electrodes that fail,
+repair).
 """
 
 from jeit.touch.contacts import (
@@ -14,6 +15,7 @@ from jeit.touch.contacts import (
     find_contacts,
     track_contacts,
 )
+from jeit.touch.health import HealthEvent, SkinHealth, watch
 from jeit.touch.kohonen import PlacedMap, SelfOrganisingMap
 from jeit.touch.learnt.file import read_skin, write_skin
 from jeit.touch.learnt.learnt_skin import LearntSkin, Standing
@@ -24,6 +26,7 @@ __all__ = [
     "CellFinder",
     "Contact",
     "ContactTracker",
+    "HealthEvent",
     "ImageNoise",
     "LearntSkin",
     "LoadCalibration",
@@ -31,6 +34,7 @@ __all__ = [
     "Presses",
     "RasterFinder",
     "SelfOrganisingMap",
+    "SkinHealth",
     "Standing",
     "Touches",
     "find_contacts",
@@ -38,5 +42,6 @@ __all__ = [
     "read_presses",
     "read_skin",
     "track_contacts",
+    "watch",
     "write_skin",
 ]

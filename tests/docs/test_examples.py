@@ -12,6 +12,7 @@ MOST = {
     "press_on_a_skin": 3e-3,
     "press_with_a_load": 1e-8,
     "contacts_from_images": 4e-3,
+    "cut_and_repair": 0.015,
     "design_a_skin": 0.6,
     "design_gradient": 1e-5,
     "every_method": 0.25,

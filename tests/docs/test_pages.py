@@ -73,6 +73,12 @@ def _design(names: dict, folder: Path, printed: list[str]) -> None:
     assert "least Θ 19.5 mV, A 0.056" in printed
 
 
+def _health(names: dict, folder: Path, printed: list[str]) -> None:
+    (event,) = names["health"].events
+    assert event.frame == 300
+    assert len(printed) == 1
+
+
 def _hearing(names: dict, folder: Path, printed: list[str]) -> None:
     assert len(names["path"].touches) == 3
     microphones = names["fit"].calibration.microphone_array.microphones
@@ -101,6 +107,7 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "README.md": _readme,
     "contacts.md": _contacts,
     "design.md": _design,
+    "health.md": _health,
     "hearing.md": _hearing,
     "pressing.md": _pressing,
     "reconstruction.md": _reconstruction,

@@ -81,7 +81,7 @@ class PressedSkin(eqx.Module):
         check_seconds("held", held)
         check_seconds("elapsed", elapsed)
         exact = self.voltages_under(self.touched(presses, held=held, progress=progress), progress=progress)
-        return self._read(key, exact, np.array([float(elapsed)]))
+        return self.read(key, exact, np.array([float(elapsed)]))
 
     def touched(
         self,
@@ -114,7 +114,7 @@ class PressedSkin(eqx.Module):
         check_key(key)
         seconds = _check_times(seconds)
         exact = self.voltages_under(self.touched_in_time(motions, seconds, progress=progress), progress=progress)
-        return self._read(key, exact, seconds)
+        return self.read(key, exact, seconds)
 
     def touched_in_time(
         self,
@@ -164,12 +164,15 @@ class PressedSkin(eqx.Module):
                     progress(f"voltages: {done} of {len(voltages)}")
         return voltages
 
-    def _read(self, key: Array, exact: Float[np.ndarray, "n M"], seconds: Float[np.ndarray, " t"]):
-        """What the channels read of exact voltages at `seconds` (n,), or (1,) for all: drift, gains and noise.
+    def read(
+        self, key: Array, exact: Float[np.ndarray, "n M"], seconds: Float[np.ndarray, " t"]
+    ) -> Float[np.ndarray, "n M"]:
+        """What the channels read of exact voltages at `seconds` (n,), or (1,) for all: drift, gains and noise, volts.
 
         A sheet of e^d σ with contacts e^c z has the voltages of one of σ with contacts e^(c + d) z, over e^d; what
-        contacts change is linear, that of the skin at rest.
+        contacts change is linear, that of the skin at rest. Raises `ValueError` for what is no key.
         """
+        check_key(key)
         for_conductivity, for_contacts, for_noise = jax.random.split(key, 3)
         own = self.material
         drift = walk(for_conductivity, seconds, own.conductivity_trend, own.conductivity_walk, 1)

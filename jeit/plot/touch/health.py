@@ -1,0 +1,75 @@
+"""A skin and what happened to it: cuts as lines, electrodes that fail as crosses, over an image or the bare skin."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patheffects import withStroke
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind
+from jeit.plot.axes import SERIES_COLOURS, axes_or_new, bare, draw_scale_bar, extent_of
+from jeit.plot.colour_scale import CHANGE, ColourScale
+from jeit.plot.imaging.electrodes import draw_electrodes
+from jeit.plot.imaging.image import plot_image
+from jeit.plot.imaging.mesh import draw_outline
+from jeit.touch.health import EventStatus, SkinHealth
+
+_HALO = [withStroke(linewidth=4, foreground="white")]
+_CUT, _MENDED = SERIES_COLOURS[1], SERIES_COLOURS[2]
+
+
+def plot_health(
+    health: SkinHealth,
+    image: ArrayLike | None = None,
+    *,
+    scale: ColourScale = CHANGE,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw a skin with its cuts, those that are mended dashed, how long they are and when they were made, and a cross
+    on every electrode that has failed; over an `image` (m,) of it, if one is given.
+
+    `scale` as in `plot_image`. Raises `ValueError` for a skin without a model, and as `plot_image` does.
+    """
+    check_kind("health", health, SkinHealth, "a SkinHealth, as of SkinHealth.fit(frames, model=model, …)")
+    if health.skin is None:
+        raise ValueError(
+            "health has no model: give it to SkinHealth.fit, and it knows where the skin's electrodes are."
+        )
+    mesh, electrodes = health.skin.model.mesh, health.skin.model.electrodes
+    if image is not None:
+        ax = plot_image(mesh, image, electrodes, scale=scale, title=title, ax=ax)
+    else:
+        ax = axes_or_new(ax)
+        extent = extent_of(np.asarray(mesh.points))
+        draw_outline(mesh, ax)
+        draw_electrodes(mesh, electrodes, ax=ax)
+        bare(ax, extent)
+        draw_scale_bar(ax, extent)
+        if title:
+            ax.set_title(title)
+    for event in health.events:
+        if event.path is not None and event.status != EventStatus.DENIED:
+            _draw_cut(ax, event.path, event.length, event.time, mended=event.status == EventStatus.MENDED)
+    failed = [one.electrode for one in health.open_events if one.electrode is not None]
+    if failed:
+        places = np.asarray(electrodes.position)[failed, :2]  # pyright: ignore[reportAttributeAccessIssue]
+        ax.plot(*places.T, "x", color=_CUT, markersize=11, markeredgewidth=2.4, zorder=6, path_effects=_HALO)
+    return ax
+
+
+def _draw_cut(ax: Axes, path: np.ndarray, length: float, time: float, *, mended: bool) -> None:
+    colour = _MENDED if mended else _CUT
+    style = (0, (2.5, 1.5)) if mended else "-"
+    ax.plot(*path.T, color=colour, linestyle=style, linewidth=2.4, zorder=5, path_effects=_HALO)
+    told = f"{'mended' if mended else 'cut'}, {1e3 * length:.0f} mm, at {time:.4g} s"
+    ax.annotate(
+        told,
+        path[path[:, 1].argmax()],
+        (0, 7),
+        textcoords="offset points",
+        ha="center",
+        color=colour,
+        fontsize=9,
+        zorder=7,
+        path_effects=_HALO,
+    )

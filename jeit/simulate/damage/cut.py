@@ -1,0 +1,151 @@
+"""`Cut`: a slit along a path, through the whole skin or a part of its depth, and what conducts there afterwards."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_key, check_kind, check_metres, is_number, real_array, told
+from jeit.forward.assembly import check_conductivity
+from jeit.mesh import Domain, Mesh, Refine, centroids, measures
+
+# Directions tried for a cut before another place is; and how far a bent one turns, radians.
+_TRIES, _LEAST_BEND, _MOST_BEND = 400, 0.35, 1.2
+
+
+class Cut(eqx.Module):
+    """A slit along `path` (k, 2), metres, to a `depth`, its share of the thickness, 1 for all of it; what is cut
+    conducts `residual` times as well as before."""
+
+    path: Float[np.ndarray, "k 2"]
+    depth: float
+    residual: float
+
+    def __init__(self, path: ArrayLike, depth: float = 1.0, residual: float = 1e-6):
+        """Raises `ValueError` for a path of fewer than two places, or of no length, and shares that are none."""
+        path = real_array("path", path, "places (k, 2), metres, two or more")
+        if path.ndim != 2 or path.shape[1] != 2 or len(path) < 2 or not np.isfinite(path).all():
+            raise ValueError(f"path must be finite places (k, 2), metres, two or more; it has shape {path.shape}.")
+        if not np.linalg.norm(np.diff(path, axis=0), axis=1).min() > 0:
+            raise ValueError("path: two places that follow each other are one; give a path that goes somewhere.")
+        if not (is_number(depth) and 0 < depth <= 1):
+            raise ValueError(f"depth must be a share of the thickness, above 0 and up to 1; it is {told(depth)}.")
+        if not (is_number(residual) and 0 < residual < 1):
+            raise ValueError(f"residual must be between 0 and 1; it is {told(residual)}.")
+        self.path, self.depth, self.residual = path, float(depth), float(residual)
+
+    @property
+    def length(self) -> float:
+        """Of the path, metres."""
+        return float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
+
+    def refine(self, cell_size: float = 1e-3) -> Refine:
+        """For a mesh that is fine along the cut: `Rectangle(…).mesh(num_points=n, refine=cut.refine())`.
+
+        `cell_size` in metres. Raises `ValueError` for one that is none.
+        """
+        check_metres("cell_size", cell_size)
+        return Refine(self.along(cell_size), cell_size=cell_size)
+
+    def along(self, step: float) -> Float[np.ndarray, "n 2"]:
+        """Places (n, 2) on the path, no more than `step` metres apart. Raises `ValueError` for a step that is none."""
+        check_metres("step", step)
+        pieces = [
+            np.linspace(start, end, max(2, int(np.ceil(np.linalg.norm(end - start) / step)) + 1))
+            for start, end in itertools.pairwise(self.path)
+        ]
+        return np.concatenate([piece[:-1] for piece in pieces] + [self.path[-1:]])
+
+    def cells(self, mesh: Mesh) -> Int[np.ndarray, " c"]:
+        """Numbers of the cells that the cut goes through, seen from above; in a layer, all those to its depth.
+
+        Raises `ValueError` for what is no mesh, and for a cut that misses it.
+        """
+        check_kind("mesh", mesh, Mesh, "a Mesh, that of the skin")
+        points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
+        there = np.zeros(len(cells), bool)
+        for start, end in itertools.pairwise(self.path):
+            for a, b in itertools.combinations(range(cells.shape[1]), 2):
+                there |= _cross(start, end, points[cells[:, a], :2], points[cells[:, b], :2])
+        if mesh.dimension == 3:
+            top = points[:, 2].max()
+            there &= np.asarray(centroids(mesh))[:, 2] > top - self.depth * (top - points[:, 2].min())
+        if not there.any():
+            raise ValueError("cut: it goes through no cell of the mesh; are both in metres, about one origin?")
+        return np.flatnonzero(there)
+
+    def conductivity(
+        self, mesh: Mesh, conductivity: ArrayLike, thickness: float | None = None
+    ) -> Float[np.ndarray, " m"]:
+        """Conductivity (m,) of the skin with the cut, S/m (2-D: S), from that without.
+
+        A layer's cells to the depth of the cut conduct next to nothing. A sheet of `thickness` metres that is cut to a
+        part of it resists across the cut as if it were longer by (4h/π) ln csc(πr/2h), with the depth r that is left of
+        the thickness h: the blockage of a diaphragm in a channel (Lamb, Hydrodynamics, 6th edition, §306). Raises
+        `ValueError` for a conductivity that is none, and for a part of a sheet's depth without its thickness.
+        """
+        values = np.asarray(check_conductivity(mesh, conductivity))
+        if values.ndim > 1 or np.iscomplexobj(values) or values.size not in (1, mesh.num_cells):
+            raise ValueError("conductivity must be real, one number or one for each cell.")
+        values = np.broadcast_to(values, mesh.num_cells).astype(float)
+        cells, left = self.cells(mesh), self.residual
+        if mesh.dimension == 2 and self.depth < 1:
+            if thickness is None:
+                raise ValueError("thickness: give that of the sheet, metres; what half a cut resists depends on it.")
+            check_metres("thickness", thickness)
+            width = float(np.asarray(measures(mesh))[cells].sum()) / self.length
+            longer = -4 * thickness / np.pi * np.log(np.sin(np.pi * (1 - self.depth) / 2))
+            left = max(left, width / (width + longer))
+        values[cells] *= left
+        return values
+
+
+def draw_cut(
+    key: Array,
+    outline: Domain,
+    *,
+    length: tuple[float, float] = (0.02, 0.06),
+    depth: float = 1.0,
+    bent: float = 0.5,
+    margin: float = 5e-3,
+) -> Cut:
+    """A cut somewhere in an `outline`, all of it `margin` metres from its edge: of uniform length between the two,
+    metres, in any direction, bent once with a chance of `bent`, by 20 to 70 degrees.
+
+    Raises `ValueError` for what is no key or outline, lengths that are none, and a skin that is too small for them.
+    """
+    check_key(key)
+    check_kind("outline", outline, Domain, "an outline, such as Disk(0.05)")
+    span = real_array("length", length, "the least and the greatest, metres")
+    if span.shape != (2,) or not 0 < span[0] <= span[1] < np.inf:
+        raise ValueError(f"length must be the least and the greatest, metres, such as (0.02, 0.06); it is {length!r}.")
+    if not (is_number(bent) and 0 <= bent <= 1):
+        raise ValueError(f"bent must be a chance, from 0 to 1; it is {told(bent)}.")
+    if not (is_number(margin) and margin >= 0):
+        raise ValueError(f"margin must be metres, zero or more; it is {told(margin)}.")
+    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    low_x, high_x, low_y, high_y = map(float, outline.extent)
+    whole, turned = random.uniform(*span), random.random() < bent
+    for _ in range(_TRIES):
+        start, angle = random.uniform((low_x, low_y), (high_x, high_y)), random.uniform(-np.pi, np.pi)
+        share, turn = random.uniform(0.3, 0.7), random.choice((-1, 1)) * random.uniform(_LEAST_BEND, _MOST_BEND)
+        steps = [(share, angle), (1 - share, angle + turn)] if turned else [(1.0, angle)]
+        moves = [part * whole * np.array([np.cos(one), np.sin(one)]) for part, one in steps]
+        cut = Cut(np.cumsum([start, *moves], axis=0), depth)
+        if (np.asarray(outline.signed_distance(cut.along(whole / 20))) > margin).all():
+            return cut
+    raise ValueError(f"length: no cut of {1e3 * whole:.3g} mm was found that lies within the skin; give less.")
+
+
+def _cross(start, end, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Whether lines from `first` to `second` (m, 2) cross that from `start` to `end`."""
+    along, edge = end - start, second - first
+    one, other = _turn(along, first - start), _turn(along, second - start)
+    return (one * other <= 0) & (_turn(edge, start - first) * _turn(edge, end - first) <= 0)
+
+
+def _turn(first, second) -> np.ndarray:
+    return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]

@@ -1,0 +1,55 @@
+"""Which electrodes are behind a change: those in whose channels nearly all of it is."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jeit.touch.health.event import EventKind
+
+# Of the energy of a change, relative to the reference, what no electrode accounts for; of an electrode's channels, how
+# many have changed, by what share of their reading; and of all electrodes, those that may fail at once.
+_LEFT, _OWN, _RELATIVE, _AT_ONCE = 0.1, 0.75, 0.12, 0.25
+# A wire reads nothing below this share of what it did; contacts that wander have so many times the noise.
+_NOTHING, _WANDERS = 0.2, 5.0
+# Beyond so many times its reading, a channel tells no more.
+_MOST = 10.0
+
+
+def faulty_electrodes(
+    change: Float[np.ndarray, " M"], reference: Float[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
+) -> list[int]:
+    """Numbers of the electrodes that account for a change from the reference, volts, by themselves; none if a change of
+    the skin is needed too. `touching` (L, M): which channels each takes part in."""
+    size = np.sqrt(np.mean(reference[np.isfinite(reference)] ** 2))
+    relative = np.abs(np.nan_to_num(change)) / np.maximum(np.abs(reference), 0.1 * size)
+    relative = np.minimum(relative, _MOST)
+    # A channel with a weak reading is no larger a change for that.
+    energy = np.minimum(np.abs(np.nan_to_num(change)) / size, relative) ** 2
+    total, left, found = energy.sum(), np.ones(len(energy), bool), []
+    while total > 0 and energy[left].sum() > _LEFT * total and len(found) < max(1, _AT_ONCE * len(touching)):
+        own = np.array([energy[left & one].sum() / max(1, (left & one).sum()) ** 0.5 for one in touching])
+        best = int(own.argmax())
+        mine = touching[best] & left
+        if not mine.any() or np.mean(relative[mine] > _RELATIVE) < _OWN:
+            return []
+        found.append(best)
+        left &= ~touching[best]
+    return found if total > 0 and energy[left].sum() <= _LEFT * total else []
+
+
+def kind_of_fault(
+    frames: Float[np.ndarray, "n M"],
+    reference: Float[np.ndarray, " M"],
+    noise: Float[np.ndarray, " M"],
+    own: Bool[np.ndarray, " M"],
+) -> EventKind:
+    """What has become of an electrode with channels `own` (M,) whose frames (n, M) are these now."""
+    now = frames[:, own]
+    middle = np.nanmedian(now, axis=0)
+    size = np.sqrt(np.mean(reference[own] ** 2))
+    constant = len(middle) > 1 and np.ptp(middle) <= 0.02 * np.abs(middle).max() and np.ptp(reference[own]) > 0.1 * size
+    if constant or np.median(np.abs(middle)) < _NOTHING * np.median(np.abs(reference[own])):
+        return EventKind.TORN
+    wander = np.nanstd(now, axis=0) / np.minimum(noise[own], size)
+    if np.median(wander) > _WANDERS and np.median(np.abs(middle)) < _MOST * np.median(np.abs(reference[own])):
+        return EventKind.LOOSE
+    return EventKind.DEAD

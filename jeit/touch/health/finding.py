@@ -1,0 +1,77 @@
+"""What a lasting change is: of an electrode, a cut, something unlike a touch, or what a touch may be too."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jeit.touch.health.cut_path import FittedLoss
+from jeit.touch.health.electrode_faults import faulty_electrodes, kind_of_fault
+from jeit.touch.health.event import EventKind
+from jeit.touch.health.healthy import Healthy
+from jeit.touch.health.imaged_skin import ImagedSkin
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change that lasts: `vector` (M,), volts; its `size` in the scale of healthy ones; `time` and `frame` that it
+    began at; and `told`, the time now."""
+
+    vector: Float[np.ndarray, " M"]
+    size: float
+    time: float
+    frame: int
+    told: float
+
+
+@dataclass(frozen=True)
+class Finding:
+    """**Fields**: `kind`; `reason`; whether it is `sure`, or a press may do the same; `electrode`; `loss`, of a cut;
+    `own` (M,), the channels that it is in, all if None."""
+
+    kind: EventKind
+    reason: str
+    sure: bool
+    electrode: int | None = None
+    loss: FittedLoss | None = None
+    own: Bool[np.ndarray, " M"] | None = None
+
+
+def findings(
+    change: np.ndarray,
+    frames: Float[np.ndarray, "n M"],
+    reference: np.ndarray,
+    healthy: Healthy,
+    touching: Bool[np.ndarray, "L M"] | None,
+    skin: ImagedSkin | None,
+) -> list[Finding]:
+    """What a `change` (M,) from `reference` (M,) is, after which `frames` (n, M) came."""
+    if touching is not None:
+        electrodes = faulty_electrodes(change, reference, touching & healthy.used)
+        if electrodes:
+            found = []
+            for one in electrodes:
+                own = touching[one] & healthy.used
+                kind = kind_of_fault(frames, reference, healthy.noise, own)
+                reason = f"Nearly all of the change is in the {int(own.sum())} channels of electrode {one}."
+                found.append(Finding(kind, reason, True, electrode=one, own=own))
+            return found
+    used = healthy.used & np.isfinite(change)
+    loss = None if skin is None else skin.loss(change, used)
+    outside = healthy.outside(change)
+    unlike = outside > healthy.unlike
+    said = (
+        f"{100 * outside:.0f} % of it is in no direction of touches; of those, {100 * healthy.unlike:.0f} % at most."
+        if unlike
+        else "A press that is held looks like it: only time, or the user, tells."
+    )
+    if loss is not None:
+        return [
+            Finding(EventKind.CUT, f"Conductivity is lost along a line. {said}", unlike or _opposite(skin), loss=loss)
+        ]
+    return [Finding(EventKind.CHANGED, said, unlike)]
+
+
+def _opposite(skin: ImagedSkin | None) -> bool:
+    """Whether a loss of conductivity is what no touch makes."""
+    return skin is not None and skin.sign > 0

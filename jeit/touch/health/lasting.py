@@ -1,0 +1,100 @@
+"""A step that lasts in frames with touches, noise and drift, told from all of these by medians of two windows.
+
+A touch is shorter than half a window, so that the median of the window hardly knows of it; drift is as far within a
+window as between two; what is left is a step. How far windows of healthy frames are apart, channel by channel, is the
+scale for all.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import ndtr
+
+# Of a step, how much lies between the quarters of a window right before and after it: of a slope, a quarter.
+_SHARP = 0.55
+# Of a step, what all thirds of the window after it are above, and of the window before it below.
+_STAYED, _NOT_YET = 0.5, 0.5
+# Below this share of the step a frame is as before it; so few may be, by touches that do the opposite.
+_BACK, _SOME = 0.3, 0.1
+# A single channel among many is heard in the mean of so high a power.
+_POWER = 4
+
+
+@dataclass(frozen=True)
+class Step:
+    """**Fields**: `change` (M,) from window to window; `size`, in the scale of healthy windows; `first`: its first step
+    among those of both windows."""
+
+    change: Float[np.ndarray, " M"]
+    size: float
+    first: int
+
+
+def window_change(frames: Float[np.ndarray, "2w M"]) -> Float[np.ndarray, " M"]:
+    """From the median of the first half to that of the second, 0 where a half has no reading."""
+    half = len(frames) // 2
+    return median(frames[half:]) - median(frames[:half])
+
+
+def median(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
+    """Of every channel, of what readings there are; NaN where there are none."""
+    if not np.isnan(frames).any():
+        return np.median(frames, axis=0)
+    some = ~np.isnan(frames).all(axis=0)
+    found = np.full(frames.shape[1], np.nan)
+    found[some] = np.nanmedian(frames[:, some], axis=0)
+    return found
+
+
+def size_of(scaled: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
+    """Of changes in the scale of healthy ones; channels without a reading are left out."""
+    powers = np.minimum(np.abs(scaled), 1e9) ** _POWER
+    there = np.isfinite(powers)
+    mean = np.sum(np.where(there, powers, 0.0), axis=-1) / np.maximum(there.sum(axis=-1), 1)
+    return mean ** (1 / _POWER)
+
+
+def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M"], limit: float) -> Step | None:
+    """The step between two windows of frames (2w, M), if there is one above the `limit`, it is sharp, and it lasts for
+    all of the second."""
+    change = window_change(frames)
+    size = float(size_of(change / scale))
+    if size <= limit:
+        return None
+    direction = np.nan_to_num(change / scale**2)
+    half = len(frames) // 2
+    before = np.where(np.isfinite(change), median(frames[:half]), 0.0)
+    readings = np.where(np.isfinite(frames), frames, before)
+    # 0 before the step, 1 after it.
+    along = (readings - before) @ direction / max(np.nan_to_num(change) @ direction, 1e-300)
+    first = _split(np.clip(along, -1.0, 2.0), half)
+    quarter = max(2, half // 4)
+    if first < half // 2 or first + quarter > len(along):
+        return None
+    sharp = np.median(along[first : first + quarter]) - np.median(along[max(0, first - quarter) : first])
+    thirds = [np.median(part) for part in np.array_split(along[first:], 3)]
+    earlier = [np.median(part) for part in np.array_split(along[:first], 3)]
+    if sharp < _SHARP or min(thirds) < _STAYED or max(earlier) > _NOT_YET or not told_apart(along, first):
+        return None
+    # The step need not be where the windows meet.
+    return Step(median(frames[first:]) - median(frames[:first]), size, first)
+
+
+def told_apart(along: Float[np.ndarray, " n"], first: int) -> bool:
+    """Whether frames are 0 before the `first` and 1 from it on, but for noise and a few: between two touches frames
+    come back."""
+    noise = 1.4826 * np.median(np.abs(np.diff(along))) / np.sqrt(2)
+    most = max(_SOME, 1.5 * float(ndtr((_BACK - 1) / max(noise, 1e-12))))
+    early = np.mean(along[:first] > 1 - _BACK) if first else 0.0
+    return bool(np.mean(along[first:] < _BACK) <= most and early <= most)
+
+
+def _split(along: np.ndarray, half: int) -> int:
+    """Where two constants fit best."""
+    number = len(along)
+    total, sums = along.sum(), np.cumsum(along)[:-1]
+    count = np.arange(1, number)
+    between = sums**2 / count + (total - sums) ** 2 / (number - count)
+    allowed = slice(max(3, half // 2) - 1, number - 3)
+    return int(np.argmax(between[allowed])) + int(allowed.start) + 1

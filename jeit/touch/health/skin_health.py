@@ -1,0 +1,452 @@
+"""`SkinHealth`: whether a skin is still what it was, followed from frame to frame."""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind, is_number, real_array, told
+from jeit.forward import ForwardModel
+from jeit.forward.model import check_model
+from jeit.protocol import Protocol
+from jeit.touch.health.event import EventKind, EventStatus, HealthEvent
+from jeit.touch.health.finding import Change, Finding, findings
+from jeit.touch.health.healthy import Healthy, averaged
+from jeit.touch.health.imaged_skin import ImagedSkin
+from jeit.touch.health.lasting import Step, lasting_step, median, size_of, told_apart
+
+# Seconds that no touch is held; windows that none is, where frames have no times.
+PATIENCE, _PATIENCE_WINDOWS = 30.0, 3
+# Of the patience, what a window takes.
+_WINDOW = 3.0
+# How far the reference follows the window, a quarter of a window later.
+_FOLLOWS = 0.1
+# A change is gone when so much of it is; of channels that have no reading, beyond which a frame is refused.
+_GONE, _REFUSED = 0.6, 0.5
+# Beyond so many spans of healthy changes, a channel reads nothing of the skin; of the channels, that may be so at once.
+_SPANS, _FEW = 3.0, 0.34
+
+
+class WatchStatus(StrEnum):
+    """What became of a frame. Each is equal to its word."""
+
+    WATCHED = "watched"
+    PARTIAL = "partial"
+    """Watched; some of its channels are not to be trusted."""
+    REFUSED = "refused"
+    """Not looked at: too few readings, or its time is not after the last."""
+
+
+@dataclass(frozen=True)
+class _Pending:
+    """A change that looks like a touch, until it has lasted."""
+
+    change: Change
+    finding: Finding
+
+
+@dataclass(frozen=True)
+class SkinHealth:
+    """A skin that is watched. `health.follow(time, frame)` gives what is known after the next frame; this one stays.
+
+    Every quarter of a window, the medians of two windows are compared: a step between them, larger than any among the
+    healthy frames, sharp and lasting, is a change of the skin. Unlike any healthy touch, it is told at once; a change
+    that touches make too may be a press that is held, and is told when it has lasted for `patience` seconds. Drift is
+    followed.
+
+    **Fields**: `healthy`, what was learnt; `reference` (M,), the skin as it is now, untouched, volts; `trusted` (M,),
+    channels that may be used; `events` so far; `patience`, seconds; `skin`, its model, or None; `touching` (L, M), the
+    channels of every electrode, or None; `time` of the last frame; `frames`, how many were given; `status` of the last
+    frame, its `usable` channels (M,), and the `reason` in a sentence.
+
+    Make it with `SkinHealth.fit`.
+    """
+
+    healthy: Healthy
+    reference: Float[np.ndarray, " M"]
+    trusted: Bool[np.ndarray, " M"]
+    patience: float
+    skin: ImagedSkin | None = None
+    touching: Bool[np.ndarray, "L M"] | None = None
+    events: tuple[HealthEvent, ...] = ()
+    time: float = -np.inf
+    frames: int = 0
+    status: WatchStatus = WatchStatus.WATCHED
+    usable: Bool[np.ndarray, " M"] | None = None
+    reason: str = ""
+    _window: tuple[tuple[float, int, np.ndarray], ...] = ()
+    _part: tuple[np.ndarray, ...] = ()
+    _steps: int = 0
+    _settled: bool = False
+    _pending: _Pending | None = None
+
+    @classmethod
+    def fit(
+        cls,
+        healthy: ArrayLike,
+        times: ArrayLike | None = None,
+        *,
+        patience: float | None = None,
+        protocol: Protocol | None = None,
+        model: ForwardModel | None = None,
+        conductivity: ArrayLike | None = None,
+        sign: int = 1,
+    ) -> "SkinHealth":
+        """From a recording of the healthy skin, (F, M) volts or differences of volts, with touches in it at best.
+
+        `times` (F,), seconds; without them, frames count. `patience`: seconds (frames) that no touch is held; 30 s, or
+        three windows, unless given. `protocol`: what the channels are, so that electrodes are named. `model` of the
+        skin, its `conductivity` S/m (2-D: S), and the `sign` of a touch, -1 where touched skin conducts worse: cuts are
+        then found on it. Raises `ValueError` for frames that are no recording of this skin, fewer than 20, times that
+        do not rise, and a patience that is none.
+        """
+        frames = _frames("healthy", healthy)
+        period = 1.0
+        if times is not None:
+            seconds = _times(times, len(frames))
+            if (np.diff(seconds) <= 0).any():
+                raise ValueError("times must rise from frame to frame, in seconds; some do not.")
+            period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+        if patience is not None and not (is_number(patience) and patience > 0):
+            raise ValueError(f"patience must be positive, in seconds; it is {told(patience)}.")
+        wanted = PATIENCE if times is not None and patience is None else patience
+        learnt = Healthy.learn(frames, period, None if wanted is None else float(wanted) / _WINDOW)
+        window = learnt.window * learnt.stride * learnt.period
+        wanted = max(_PATIENCE_WINDOWS * window if wanted is None else float(wanted), 2 * window)
+        skin = None
+        if model is not None:
+            check_model(model)
+            if conductivity is None:
+                raise ValueError("conductivity: give that of the model's healthy skin, S/m (2-D: S).")
+            skin = ImagedSkin.create(model, conductivity, learnt.reference, learnt.noise, sign)
+            protocol = model.protocol
+        touching = None
+        if protocol is not None:
+            check_kind("protocol", protocol, Protocol, "a Protocol, such as adjacent(16)")
+            if protocol.num_measurements != frames.shape[1]:
+                raise ValueError(
+                    f"healthy has {frames.shape[1]} channels, and the protocol {protocol.num_measurements}; give both "
+                    "of one skin."
+                )
+            touching = np.array([protocol.channels_touching(one) for one in range(protocol.num_electrodes)])
+        return cls(learnt, learnt.reference, learnt.used, wanted, skin, touching)
+
+    def follow(self, time: float, frame: ArrayLike) -> "SkinHealth":
+        """After a frame (M,) at `time`, seconds. NaN marks a channel without a reading.
+
+        A frame that is not later than the last, or of which fewer than half of the channels read anything, is refused,
+        as `status` and `reason` say. Raises `ValueError` for what is no time, and for another number of channels.
+        """
+        if not is_number(time):
+            raise ValueError(f"time must be seconds; it is {told(time)}.")
+        values = real_array("frame", frame, f"{self.reference.size} voltages")
+        if values.shape != self.reference.shape:
+            raise ValueError(
+                f"frame has shape {values.shape}; this skin has {self.reference.size} channels, as its healthy frames."
+            )
+        there = np.isfinite(values) & self.healthy.used
+        if not time > self.time:
+            reason = f"Its time is not later than that of the frame before, {self.time:g}."
+        elif there.sum() < _REFUSED * self.healthy.used.sum():
+            reason = f"Only {int(there.sum())} of {int(self.healthy.used.sum())} channels have a reading."
+        else:
+            return self._watched(float(time), values, there)
+        none = np.zeros_like(there)
+        return replace(self, frames=self.frames + 1, status=WatchStatus.REFUSED, reason=reason, usable=none)
+
+    def confirm(self, event: HealthEvent) -> "SkinHealth":
+        """The user says that it is so; also of what is only `held`. Raises `ValueError` for an event of another
+        skin."""
+        if self._pending is not None and self.held is not None and event.number == self.held.number:
+            return replace(self, _pending=None)._with(
+                self._pending.change, [self._pending.finding], EventStatus.CONFIRMED
+            )
+        return self._with_status(event, EventStatus.CONFIRMED)
+
+    def deny(self, event: HealthEvent) -> "SkinHealth":
+        """The user says that it is no damage: a press that is held. The reference is again what it was before. Raises
+        `ValueError` for an event of another skin."""
+        if self._pending is not None and self.held is not None and event.number == self.held.number:
+            return replace(self, _pending=None)
+        denied = self._with_status(event, EventStatus.DENIED)
+        back = np.where(np.isfinite(event.change), self.reference - event.change, self.reference)
+        return replace(denied, reference=back, trusted=denied._trusted_channels(), skin=denied._skin_left())
+
+    def repaired(self, frames: ArrayLike) -> "SkinHealth":
+        """The user says that the skin is mended, and gives frames (n, M) of it, untouched: the new reference.
+
+        All that was open is mended. Raises `ValueError` for frames that are no reference: of other channels, or without
+        a reading in half of them.
+        """
+        read = _frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
+        if read.shape[1] != self.reference.size:
+            raise ValueError(f"frames have {read.shape[1]} channels, and this skin {self.reference.size}.")
+        fresh = median(np.where(np.isfinite(read), read, np.nan))
+        there = np.isfinite(fresh) & self.healthy.used
+        if there.sum() < _REFUSED * self.healthy.used.sum():
+            raise ValueError("frames: fewer than half of the channels have a reading; that is no reference.")
+        mended = tuple(_changed(one, EventStatus.MENDED) if one.open else one for one in self.events)
+        change = np.where(there, fresh - self.reference, 0.0)
+        strength = float(size_of(change / self.healthy.scale)) / self.healthy.limit
+        event = HealthEvent(
+            number=len(self.events),
+            kind=EventKind.REPAIRED,
+            status=EventStatus.CONFIRMED,
+            time=self.time,
+            told=self.time,
+            frame=self.frames,
+            channels=np.abs(change) > self.healthy.limit * self.healthy.scale,
+            change=change,
+            strength=strength,
+            reason="As the user says.",
+        )
+        return replace(
+            self,
+            events=(*mended, event),
+            reference=np.where(there, fresh, self.reference),
+            trusted=there,
+            skin=None if self.skin is None else self.skin.healed(),
+            _window=(),
+            _part=(),
+            _pending=None,
+        )
+
+    def images(self, frames: ArrayLike) -> Float[np.ndarray, "F m"]:
+        """Changes of conductivity (F, m), S/m (2-D: S), from the skin as it is now, cuts and all, by the channels that
+        are left; NaN for a frame without a reading. Raises `ValueError` without a model, and for other channels."""
+        if self.skin is None:
+            raise ValueError("images need a model: give it to SkinHealth.fit, with its conductivity.")
+        read = _frames("frames", frames)
+        if read.shape[1] != self.reference.size:
+            raise ValueError(f"frames have {read.shape[1]} channels, and this skin {self.reference.size}.")
+        return self.skin.images(read - self.reference, self.trusted)
+
+    @property
+    def held(self) -> HealthEvent | None:
+        """What looks like a touch that is held, or a void: time or the user will tell."""
+        if self._pending is None:
+            return None
+        return self._event(self._pending.change, self._pending.finding, EventStatus.HELD, len(self.events))
+
+    @property
+    def open_events(self) -> list[HealthEvent]:
+        """Those that are still so."""
+        return [one for one in self.events if one.open]
+
+    def _watched(self, time: float, values: np.ndarray, there: np.ndarray) -> "SkinHealth":
+        healthy = self.healthy
+        low, high = healthy.span + self.reference
+        far = _SPANS * (high - low) + healthy.limit * np.where(healthy.used, healthy.noise, 0.0)
+        strange = there & ((values < low - far) | (values > high + far))
+        # Where many are, the skin has changed, not they.
+        strange &= strange.sum() <= _FEW * healthy.used.sum()
+        usable = there & self.trusted & ~strange
+        lost = int((healthy.used & ~usable).sum())
+        status, reason = WatchStatus.WATCHED, ""
+        if lost:
+            status, reason = WatchStatus.PARTIAL, f"{lost} of {int(healthy.used.sum())} channels are not to be trusted."
+        part = (*self._part, np.where(there, values, np.nan))
+        after = replace(
+            self, time=time, frames=self.frames + 1, status=status, reason=reason, usable=usable, _part=part
+        )
+        if len(part) < healthy.stride:
+            return after
+        (step,) = averaged(np.array(part), healthy.stride)
+        first = self.frames + 1 - healthy.stride
+        window = (*self._window, (time, first, step))[-2 * healthy.window :]
+        after = replace(after, _part=(), _window=window, _steps=self._steps + 1)
+        return after._examined() if after._steps % max(1, healthy.window // 4) == 0 else after
+
+    def _examined(self) -> "SkinHealth":
+        """After looking at the windows."""
+        healthy, number = self.healthy, len(self._window)
+        if number < healthy.window:
+            return self
+        frames = np.array([one for _, _, one in self._window])
+        latest = median(frames[-healthy.window :])
+        if not self._settled:
+            return self._begun(latest)
+        after = self._waited(latest)
+        if number == 2 * healthy.window:
+            # What is not trusted is known already.
+            step = lasting_step(frames, np.where(after.trusted, healthy.scale, np.inf), healthy.limit)
+            if step is not None:
+                return after._stepped(step, frames)
+        off = np.where(self.trusted & np.isfinite(latest), latest - self.reference, 0.0)
+        if after._pending is None and size_of(off / healthy.scale) < healthy.limit:
+            followed = self.reference + _FOLLOWS * (latest - self.reference)
+            after = replace(after, reference=np.where(np.isfinite(latest), followed, self.reference))
+        return after
+
+    def _begun(self, latest: np.ndarray) -> "SkinHealth":
+        """After the first window: whether the skin is still that of the healthy frames."""
+        healthy = self.healthy
+        change = np.where(np.isfinite(latest), latest - healthy.reference, 0.0)
+        # Conductivity that drifts as a whole scales every channel alike.
+        whole = np.where(healthy.used, healthy.reference / healthy.level, 0.0)
+        scaled = np.where(healthy.used, change / healthy.level, 0.0)
+        if whole @ whole > 0 and abs(scaled @ whole) < 0.1 * (whole @ whole):
+            scaled = scaled - whole * (scaled @ whole) / (whole @ whole)
+        size = float(size_of(scaled))
+        first = np.array([one for _, _, one in self._window]) - healthy.reference
+        along = np.nan_to_num(first / healthy.level**2) @ change / max((change / healthy.level**2) @ change, 1e-300)
+        begun = replace(self, _settled=True, reference=np.where(np.isfinite(latest), latest, self.reference))
+        if size <= healthy.level_limit or not told_apart(along, 0):
+            return begun
+        time, frame, _ = self._window[0]
+        change = Change(change, size / healthy.level_limit * healthy.limit, time, frame, self.time)
+        frames = np.array([one for _, _, one in self._window])
+        found = findings(change.vector, frames, healthy.reference, healthy, self.touching, self.skin)
+        return replace(begun, reference=healthy.reference)._with(change, found, EventStatus.LASTING)
+
+    def _waited(self, latest: np.ndarray) -> "SkinHealth":
+        """Whether what was held is gone, or has lasted."""
+        pending = self._pending
+        if pending is None:
+            return self
+        change, scale = np.nan_to_num(pending.change.vector), np.where(self.trusted, self.healthy.scale, np.inf)
+        left = np.where(np.isfinite(latest), latest - self.reference, 0.0)
+        share = (left / scale**2) @ change / max((change / scale**2) @ change, 1e-300)
+        if share < 1 - _GONE:
+            return replace(self, _pending=None)
+        if self.time - pending.change.time < self.patience:
+            return self
+        lasted = replace(pending.change, vector=np.where(self.trusted, left, 0.0), told=self.time)
+        reason = f"{pending.finding.reason} It has lasted for {self.time - pending.change.time:.3g} s or frames."
+        return replace(self, _pending=None)._with(
+            lasted, [replace(pending.finding, reason=reason)], EventStatus.LASTING
+        )
+
+    def _stepped(self, step: Step, frames: np.ndarray) -> "SkinHealth":
+        """After a step that lasts."""
+        time, frame, _ = self._window[step.first]
+        change = Change(step.change, step.size, time, frame, self.time)
+        fresh = replace(self, _window=self._window[step.first :])
+        off = np.where(np.isfinite(step.change), median(frames[step.first :]) - self.reference, 0.0)
+        scale = np.where(self.trusted, self.healthy.scale, np.inf)
+        if size_of(off / scale) <= self.healthy.limit:  # as it was before a touch
+            return fresh
+        undone = fresh._undone(change)
+        if undone is not None:
+            return undone
+        after = frames[step.first :]
+        found = findings(step.change, after, self.reference, self.healthy, self.touching, self.skin)
+        if found[0].electrode is not None or (found[0].sure and change.size > self.healthy.sudden):
+            return fresh._with(change, found, EventStatus.LASTING)
+        if self._pending is not None:  # one thing is waited for at a time: that which began first
+            return fresh
+        return replace(fresh, _pending=_Pending(change, found[0]))
+
+    def _undone(self, change: Change) -> "SkinHealth | None":
+        """After a step that takes an earlier change back."""
+        for one in self.open_events:
+            there = np.isfinite(one.change) & np.isfinite(change.vector) & self.trusted
+            before = (one.change[there] / self.healthy.scale[there]).clip(-1e9, 1e9)
+            now = (change.vector[there] / self.healthy.scale[there]).clip(-1e9, 1e9)
+            share = -(now @ before) / max(before @ before, 1e-300)
+            if share > _GONE and np.linalg.norm(now + before) < 0.6 * np.linalg.norm(before):
+                events = tuple(
+                    _changed(other, EventStatus.MENDED) if other.number == one.number else other
+                    for other in self.events
+                )
+                reason = f"Event {one.number} is gone: it was mended, or a press that has been lifted."
+                finding = Finding(EventKind.REPAIRED, reason, True)
+                event = self._event(change, finding, EventStatus.LASTING, len(events))
+                after = replace(self, events=(*events, event))
+                fresh = np.where(np.isfinite(change.vector), self.reference + change.vector, self.reference)
+                return replace(after, reference=fresh, trusted=after._trusted_channels(), skin=after._skin_left())
+        return None
+
+    def _with(self, change: Change, found: list[Finding], status: EventStatus) -> "SkinHealth":
+        """After events that are told; the reference contains them from now on."""
+        events = [self._event(change, one, status, len(self.events) + number) for number, one in enumerate(found)]
+        # Electrodes that fail say nothing of the skin, which may be touched.
+        own = np.logical_or.reduce([np.ones_like(self.trusted) if one.own is None else one.own for one in found])
+        fresh = np.where(own & np.isfinite(change.vector), self.reference + change.vector, self.reference)
+        skin = self.skin
+        for one in found:
+            if one.loss is not None and skin is not None:
+                skin = skin.with_loss(one.loss)
+        after = replace(self, events=(*self.events, *events), reference=fresh, skin=skin)
+        return replace(after, trusted=after._trusted_channels())
+
+    def _event(self, change: Change, found: Finding, status: EventStatus, number: int) -> HealthEvent:
+        own = np.ones(self.reference.size, bool) if found.own is None else found.own
+        large = np.abs(np.nan_to_num(change.vector)) > self.healthy.limit * self.healthy.scale
+        return HealthEvent(
+            number=number,
+            kind=found.kind,
+            status=status,
+            time=change.time,
+            told=change.told,
+            frame=change.frame,
+            channels=large & own,
+            change=np.where(own, change.vector, 0.0),
+            strength=change.size / self.healthy.limit,
+            electrode=found.electrode,
+            path=None if found.loss is None else found.loss.path,
+            reason=found.reason,
+        )
+
+    def _with_status(self, event: HealthEvent, status: EventStatus) -> "SkinHealth":
+        """After another status of an event. Raises `ValueError` for one that is not of this skin."""
+        check_kind("event", event, HealthEvent, "one of health.events, or health.held")
+        if not event.number < len(self.events):
+            raise ValueError(f"event {event.number} is none of this skin's, which has {len(self.events)}.")
+        events = [_changed(one, status) if one.number == event.number else one for one in self.events]
+        return replace(self, events=tuple(events))
+
+    def _skin_left(self) -> ImagedSkin | None:
+        """The model as it was healthy, once no cut is left."""
+        cut = any(one.path is not None for one in self.open_events)
+        return self.skin if self.skin is None or cut else self.skin.healed()
+
+    def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
+        """Channels (M,) that no open event of electrodes or channels takes away."""
+        trusted = self.healthy.used.copy()
+        for one in self.open_events:
+            if one.electrode is not None and self.touching is not None:
+                trusted &= ~self.touching[one.electrode]
+            elif one.kind == EventKind.CHANNELS:
+                trusted &= ~one.channels
+        return trusted
+
+
+def watch(
+    health: SkinHealth, frames: Float[ArrayLike, "F M"], times: Float[ArrayLike, " F"] | None = None
+) -> SkinHealth:
+    """What is known after a recording (F, M), the same as following it frame by frame; `times` (F,), seconds, or
+    frames counted on. Raises `ValueError` as `SkinHealth.follow` does, and for another number of times."""
+    check_kind("health", health, SkinHealth, "a SkinHealth, as of SkinHealth.fit(healthy)")
+    read = real_array("frames", frames, "(F, M) volts")
+    if read.ndim != 2:
+        raise ValueError(f"frames must be (F, M) volts; they have shape {read.shape}.")
+    if times is None:
+        first = health.time + 1 if np.isfinite(health.time) else 0.0
+        seconds = first + np.arange(len(read))
+    else:
+        seconds = _times(times, len(read))
+    for time, frame in zip(seconds, read, strict=True):
+        health = health.follow(float(time), frame)
+    return health
+
+
+def _changed(event: HealthEvent, status: EventStatus) -> HealthEvent:
+    return eqx.tree_at(lambda one: one.status, event, status)
+
+
+def _frames(name: str, given) -> Float[np.ndarray, "F M"]:
+    frames = real_array(name, given, "frames (F, M), volts")
+    if frames.ndim != 2 or not frames.size:
+        raise ValueError(f"{name} must be frames (F, M), volts, one row each; it has shape {frames.shape}.")
+    return frames
+
+
+def _times(given, number: int) -> Float[np.ndarray, " F"]:
+    seconds = real_array("times", given, "seconds (F,), one for each frame")
+    if seconds.shape != (number,) or not np.isfinite(seconds).all():
+        raise ValueError(f"times: give one for each of the {number} frames; they have shape {seconds.shape}.")
+    return seconds

@@ -1,0 +1,142 @@
+"""Cuts, faults of electrodes and repair: what they do to voltages, and what is refused."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.layout import ring
+from jeit.mesh import Disk, Rectangle
+from jeit.protocol import adjacent, two_terminal
+from jeit.simulate import Disc, MovingPress, PressedSkin, material
+from jeit.simulate.damage import FAULTS, Cut, ElectrodeFault, Mishap, draw_cut, mended, record_mishaps
+
+WIDTH, HEIGHT = 0.06, 0.03
+
+
+def strip(cut: Cut, num_points: int = 1500) -> ForwardModel:
+    """A strip with an electrode over each of its ends."""
+    mesh = Rectangle(WIDTH, HEIGHT, (0, 0)).mesh(num_points=num_points, refine=cut.refine(5e-4))
+    ends = BoundaryElectrodes(np.array([[-WIDTH / 2, 0], [WIDTH / 2, 0]]), 0.999 * HEIGHT, 1e-6)
+    return ForwardModel(mesh, ends, two_terminal(2, np.array([[0, 1]]), current=1.0))
+
+
+def disk_model(cut: Cut, num_points: int = 900) -> ForwardModel:
+    mesh = Disk(0.05).mesh(num_points=num_points, refine=cut.refine(1e-3))
+    return ForwardModel(mesh, BoundaryElectrodes(ring(0.05, 16), 0.008, 1e-3), adjacent(16, current=1e-3))
+
+
+def test_a_cut_right_through_lets_nothing_pass():
+    cut = Cut([(0.003, -HEIGHT), (0.003, HEIGHT)])
+    model = strip(cut)
+    before, after = (
+        float(model.voltages(values)[0])
+        for values in (jnp.ones(model.mesh.num_cells), cut.conductivity(model.mesh, 1.0))
+    )
+    assert before == pytest.approx(WIDTH / HEIGHT, rel=0.02)
+    # Next to nothing conducts, over a band of one or two cells' width.
+    assert after > 1e6 * 2.5e-4 / HEIGHT
+
+
+def test_a_slit_half_way_across_resists_as_the_formula_says():
+    """A strip seen from the side is a sheet cut to half its depth: longer by (4h/π) ln csc(π/4)."""
+    cut = Cut([(0.002, -HEIGHT), (0.002, 0.0)])
+    model = strip(cut, 4000)
+    before, after = (
+        float(model.voltages(values)[0])
+        for values in (jnp.ones(model.mesh.num_cells), cut.conductivity(model.mesh, 1.0))
+    )
+    assert (after - before) * HEIGHT == pytest.approx(
+        4 * HEIGHT / np.pi * np.log(np.sqrt(2)), rel=0.12
+    )  # a cell longer
+
+
+def test_half_a_depth_is_less_than_a_whole_and_more_than_none():
+    cut = draw_cut(jax.random.key(3), Disk(0.05), length=(0.03, 0.03), bent=1.0)
+    model = disk_model(cut)
+    change = []
+    rest = np.asarray(model.voltages(1e-2))
+    for depth in (0.2, 0.5, 0.8, 1.0):
+        values = Cut(cut.path, depth).conductivity(model.mesh, 1e-2, thickness=1e-3)
+        change.append(np.linalg.norm(np.asarray(model.voltages(values)) - rest))
+    assert np.all(np.diff(change) > 0)
+    assert cut.length == pytest.approx(0.03)
+    assert len(cut.path) == 3
+
+
+def test_cuts_lie_within_and_are_as_long_as_asked():
+    outline = Rectangle(0.2, 0.2, (0, 0))
+    for number in range(40):
+        cut = draw_cut(jax.random.key(number), outline, margin=0.004)
+        assert 0.02 <= cut.length <= 0.06
+        assert np.abs(cut.along(1e-3)).max() < 0.096
+    with pytest.raises(ValueError, match="no cut of"):
+        draw_cut(jax.random.key(0), Disk(0.01), length=(0.05, 0.06))
+
+
+@pytest.mark.parametrize("kind", FAULTS)
+def test_a_fault_is_in_the_channels_of_its_electrode(kind):
+    cut = Cut([(-0.01, 0.0), (0.01, 0.0)])
+    model = disk_model(cut, 600).with_protocol(two_terminal(16, current=1e-3))
+    change = ElectrodeFault(5, kind).changes(jax.random.key(0), model, 1e-2, np.arange(30) / 10)
+    rest = np.asarray(model.voltages(1e-2))
+    own = model.protocol.channels_touching(5)
+    assert np.abs(change[:, own] / rest[own]).mean(axis=0).min() > 0.2
+    assert np.abs(change[:, ~own] / rest[~own]).max() < 0.12  # it no longer shunts the sheet
+    if kind == "loose":
+        assert (change[:, own].std(axis=0) > 0.1 * np.abs(rest[own])).all()
+
+
+def test_a_torn_wire_may_read_a_rail():
+    model = disk_model(Cut([(-0.01, 0.0), (0.01, 0.0)]), 600)
+    rest = np.asarray(model.voltages(1e-2))
+    read = rest + ElectrodeFault(2, "torn", rail=4.0).changes(jax.random.key(0), model, 1e-2, np.arange(3.0))
+    own = model.protocol.channels_touching(2)
+    np.testing.assert_allclose(read[:, own], 4.0)
+    np.testing.assert_allclose(read[:, ~own], np.tile(rest[~own], (3, 1)))
+
+
+def test_a_recording_goes_on_through_its_mishaps():
+    cut = Cut([(-0.012, 0.01), (0.012, 0.016)])
+    model, film = disk_model(cut, 600), dataclasses.replace(material("velostat"), noise=0.0)
+    skin = PressedSkin(jax.random.key(0), model, film)
+    damaged = eqx.tree_at(lambda one: one.conductivity, skin, cut.conductivity(model.mesh, skin.conductivity))
+    values, glued = mended(model.mesh, skin.conductivity, cut, film, 1.05)
+    whole = eqx.tree_at(lambda one: (one.conductivity, one.material), skin, (values, glued))
+    seconds = np.arange(12) / 2
+    press = MovingPress(Disc(0.012), np.where((seconds > 1) & (seconds < 5), 2.0, 0.0), (0.0, -0.02))
+    mishaps = [Mishap(2.0, damaged), Mishap(4.0, whole)]
+    found = record_mishaps(jax.random.key(1), skin, press, seconds, mishaps)
+    plain = record_mishaps(jax.random.key(1), skin, press, seconds, [])
+    exact = skin.record(jax.random.key(1), press, seconds)
+    np.testing.assert_allclose(plain, exact, rtol=1e-6, atol=1e-9 * np.abs(exact).max())
+    np.testing.assert_array_equal(found[seconds < 2], plain[seconds < 2])
+    size = np.linalg.norm(found - plain, axis=1) / np.linalg.norm(plain, axis=1)
+    assert size[(seconds >= 2) & (seconds < 4)].min() > 0.02
+    assert 0 < size[seconds >= 4].max() < 0.01
+    assert glued.hysteresis > film.hysteresis
+
+
+@pytest.mark.parametrize(
+    ("ask", "said"),
+    [
+        (lambda: Cut([(0, 0)]), "path"),
+        (lambda: Cut([(0, 0), (0, 0)]), "path"),
+        (lambda: Cut([(0, 0), (np.nan, 1)]), "path"),
+        (lambda: Cut([(0, 0), (1, 1)], depth=0), "depth"),
+        (lambda: Cut([(0, 0), (1, 1)], residual=1), "residual"),
+        (lambda: Cut([(3, 3), (4, 4)]).cells(Disk(0.05).mesh(num_points=200)), "no cell"),
+        (lambda: Cut([(0, 0), (0.01, 0)], 0.5).conductivity(Disk(0.05).mesh(num_points=200), 1.0), "thickness"),
+        (lambda: ElectrodeFault(-1), "electrode"),
+        (lambda: ElectrodeFault(1, "lost"), "kind"),  # pyright: ignore[reportArgumentType]
+        (lambda: Mishap(-1.0), "time"),
+    ],
+)
+def test_what_cannot_be_is_refused(ask, said):
+    with pytest.raises(ValueError, match=said):
+        ask()
