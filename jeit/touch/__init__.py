@@ -1,8 +1,12 @@
 """From frames to meaning: where, how hard and how a skin is touched.
 
 Rooms: `contacts` (what an image shows, from frame to frame, in newtons), `learnt` (skins that learn from recorded
-presses, without a model).
+presses, without a model), `gestures` (touches of a stream, and what they mean).
+
+`LogitBoostClassifier` is imported when it is first used, and scikit-learn with it.
 """
+
+from typing import TYPE_CHECKING
 
 from jeit.touch.contacts import (
     CellFinder,
@@ -19,6 +23,23 @@ from jeit.touch.learnt.learnt_skin import LearntSkin, Standing
 from jeit.touch.learnt.presses import Presses, read_frames, read_presses
 from jeit.touch.learnt.touches import Touches
 
+if TYPE_CHECKING:
+    from jeit.touch.gestures.logit_boost import LogitBoostClassifier as LogitBoostClassifier
+
+
+def __getattr__(name: str):
+    if name == "LogitBoostClassifier":
+        from jeit.touch.learnt.extras import need_learning
+
+        need_learning()
+        from jeit.touch.gestures.logit_boost import LogitBoostClassifier
+
+        return LogitBoostClassifier
+    from jeit.arguments.moved import missing
+
+    raise missing(__name__, name)
+
+
 __all__ = [
     "CellFinder",
     "Contact",
@@ -26,6 +47,7 @@ __all__ = [
     "ImageNoise",
     "LearntSkin",
     "LoadCalibration",
+    "LogitBoostClassifier",
     "Presses",
     "RasterFinder",
     "Standing",
