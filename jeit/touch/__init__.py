@@ -18,6 +18,7 @@ from jeit.touch.contacts import (
     find_contacts,
     track_contacts,
 )
+from jeit.touch.gestures import GestureModel, TouchLevel, TouchStream, find_touches, touch_features
 from jeit.touch.learnt.file import read_skin, write_skin
 from jeit.touch.learnt.learnt_skin import LearntSkin, Standing
 from jeit.touch.learnt.presses import Presses, read_frames, read_presses
@@ -44,6 +45,7 @@ __all__ = [
     "CellFinder",
     "Contact",
     "ContactTracker",
+    "GestureModel",
     "ImageNoise",
     "LearntSkin",
     "LoadCalibration",
@@ -51,11 +53,15 @@ __all__ = [
     "Presses",
     "RasterFinder",
     "Standing",
+    "TouchLevel",
+    "TouchStream",
     "Touches",
     "find_contacts",
+    "find_touches",
     "read_frames",
     "read_presses",
     "read_skin",
+    "touch_features",
     "track_contacts",
     "write_skin",
 ]
