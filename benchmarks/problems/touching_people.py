@@ -19,11 +19,13 @@ from jeit.layout import perimeter
 from jeit.mesh import Rectangle
 from jeit.protocol import reference_electrode
 from jeit.simulate import PressedSkin, material
-from jeit.simulate.people import GestureSet, Person, simulate_gestures
+from jeit.simulate.people import MANNERS, GestureSet, Person, simulate_gestures
 from jeit.touch.gestures import StreamTouch, TouchLevel, find_touches
 
 SIDES, INSET, EYELET, CURRENT, CONTACT = (0.32, 0.2), 0.01, 0.007, 1.8e-3, 1e-3
 NODES, FINE_NODES = 1193, 2000
+# Changes with what the same set is simulated to.
+_VERSION = 1
 
 
 class Sheet:
@@ -57,7 +59,9 @@ class Sheet:
     def gestures(self, people: int, each: int, seed: int, *, store: Path | None = None) -> GestureSet:
         """`each` times each gesture by so many people, drawn from `seed`; read from the folder `store` where it was
         made before, and written there."""
-        name = f"{people}-{each}-{seed}-{self.skin.model.mesh.num_cells}"
+        # All that decides what is made, but for the code, which the version stands for.
+        decides = people, each, seed, self.skin.model.mesh.num_cells, self.skin.material, MANNERS, _VERSION
+        name = repr(decides)
         path = None if store is None else store / f"gestures-{hashlib.sha256(name.encode()).hexdigest()[:12]}.npz"
         if path is not None and path.exists():
             return GestureSet.read(path)

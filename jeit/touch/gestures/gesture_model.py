@@ -163,7 +163,8 @@ class GestureModel:
 
         def make(own: dict[str, Any]) -> "GestureModel":
             scales = {name: Scale(**own[name]) for name in ("scale", "known_scale")}
-            return cls(**own | scales | {"names": tuple(own["names"]), "notes": tuple(own["notes"])})
+            whole: Any = own | scales | {"names": tuple(own["names"]), "notes": tuple(own["notes"])}
+            return cls(**whole)
 
         return read_plain(Path(path), _KIND, _VERSION, "gesture model", make)
 
