@@ -29,6 +29,7 @@ NAMES = (
     "ktc2023",
     "real_skins",
     "discriminants",
+    "gestures",
     "design_figures",
 )
 

@@ -2,7 +2,7 @@
 touches on them.
 
 The physics of pressing is in `jeit.simulate.contact`; what a sounding skin is made of (its layer, microphones and
-readout), in `jeit.simulate.acoustic`.
+readout), in `jeit.simulate.acoustic`; how people touch, in `jeit.simulate.people`.
 """
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
@@ -35,6 +35,7 @@ from jeit.simulate.contact import (
     open_presses,
     simulate_presses,
 )
+from jeit.simulate.people import GestureSet, Person, simulate_gestures
 from jeit.simulate.round_skin import RoundSkin, simulate_press
 
 _tell_old_names(__name__)
@@ -45,10 +46,12 @@ __all__ = [
     "DepthMap",
     "Disc",
     "Foundation",
+    "GestureSet",
     "HalfSpace",
     "Joined",
     "Material",
     "MovingPress",
+    "Person",
     "Placed",
     "Press",
     "PressDraws",
@@ -67,6 +70,7 @@ __all__ = [
     "open_presses",
     "pat",
     "quiet",
+    "simulate_gestures",
     "simulate_press",
     "simulate_presses",
     "stroke",

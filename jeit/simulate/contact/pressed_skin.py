@@ -116,6 +116,33 @@ class PressedSkin(eqx.Module):
         exact = self.voltages_under(self.touched_in_time(motions, seconds, progress=progress), progress=progress)
         return self.read(key, exact, seconds)
 
+    def record_each(
+        self,
+        key: Array,
+        recordings: Sequence[tuple[MovingPress | Sequence[MovingPress], Float[np.ndarray, " T"]]],
+        *,
+        progress: Callable[[str], None] | None = None,
+    ) -> list[Float[np.ndarray, "T M"]]:
+        """Voltages (T, M) of each of several recordings, pairs of motions and times, as of `record`: of this skin each
+        time anew, worked on together, which is quicker by far where there are many.
+
+        Raises `ValueError` for what are no such pairs, and as `record` does.
+        """
+        check_key(key)
+        wanted = "a list of pairs of motions and seconds, one for each recording"
+        check_kind("recordings", recordings, (list, tuple), wanted)
+        for number, pair in enumerate(recordings):
+            if not (isinstance(pair, tuple) and len(pair) == 2):
+                raise ValueError(f"recordings[{number}]: give {wanted}; it is {told(pair)}.")
+        if not recordings:
+            return []
+        times = [_check_times(seconds) for _, seconds in recordings]
+        each = [self.touched_in_time(motions, own) for (motions, _), own in zip(recordings, times, strict=True)]
+        exact = self.voltages_under(_together(each), progress=progress)
+        parts = np.split(exact, np.cumsum([len(own) for own in times])[:-1])
+        keys = jax.random.split(key, len(times))
+        return [self.read(one, part, own) for one, part, own in zip(keys, parts, times, strict=True)]
+
     def touched_in_time(
         self,
         motions: MovingPress | Sequence[MovingPress],
@@ -208,6 +235,18 @@ def _touched(places, cells, change, number: int) -> TouchedCells:
     changes[there] = change[kept]
     rows, changes = (np.pad(array, ((0, 0), (0, wide))) for array in (rows, changes))
     return TouchedCells(as_array(places), as_array(rows), as_array(changes), number)
+
+
+def _together(each: Sequence[TouchedCells]) -> TouchedCells:
+    """Several of one skin as one, with zeros at the ends of their rows."""
+    wide = max(one.cells.shape[1] for one in each)
+
+    def joined(name: str) -> Array:
+        arrays = [np.asarray(getattr(one, name)) for one in each]
+        return as_array(np.concatenate([np.pad(one, ((0, 0), (0, wide - one.shape[1]))) for one in arrays]))
+
+    places = as_array(np.concatenate([np.asarray(one.places) for one in each]))
+    return TouchedCells(places, joined("cells"), joined("change"), each[0].num_cells)
 
 
 def _kinds(mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, "n c"]) -> list[np.ndarray]:

@@ -2,6 +2,7 @@
 
 import zipfile
 import zlib
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -69,13 +70,8 @@ _FAULTS = (
 
 def write_skin(skin: LearntSkin, path: str | Path) -> None:
     """Write a learnt skin to one file, without how well it was learnt. Raises `ValueError` for a folder."""
-    from skops.io import dump
-
-    need_learning()
-    if Path(path).is_dir():
-        raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / 'skin.skops'}.")
     own = {one.name: getattr(skin, one.name) for one in fields(skin) if one.name != "standing"}
-    dump({"kind": _KIND, "version": _VERSION, "skin": _plain(own)}, path)
+    write_plain(path, _KIND, _VERSION, own, "skin.skops")
 
 
 def read_skin(path: str | Path) -> LearntSkin:
@@ -84,28 +80,45 @@ def read_skin(path: str | Path) -> LearntSkin:
     Nothing in the file is executed: it holds numbers, and estimators of scikit-learn. Raises `FileNotFoundError`, and
     `ValueError` for files of another kind, and such as hold anything else.
     """
-    from skops.io import get_untrusted_types, load
-
-    need_learning()
     path = Path(path)
     if path.is_dir():
         path = path / "skin.skops"
     if not path.is_file():
         raise FileNotFoundError(f"'{path}': there is no such file; `jeit touch fit` makes one.")
+    return read_plain(path, _KIND, _VERSION, "learnt skin", lambda own: LearntSkin(**own))
+
+
+def write_plain(path: str | Path, kind: str, version: int, own: dict[str, Any], example: str) -> None:
+    """Write what an object holds, by name, to one file: arrays, estimators, and objects of this room's classifiers.
+    Raises `ValueError` for a folder; `example`: a file's name, that is told then."""
+    from skops.io import dump
+
+    need_learning()
+    if Path(path).is_dir():
+        raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / example}.")
+    dump({"kind": kind, "version": version, "skin": _plain(own)}, path)
+
+
+def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[dict[str, Any]], Any]) -> Any:
+    """Undo `write_plain`: what `make` makes of it. Nothing in the file is executed. Raises `ValueError`, which says
+    that it is no such thing as is `said`, for files of another kind, and such as hold anything else."""
+    from skops.io import get_untrusted_types, load
+
+    need_learning()
     try:
         strange = sorted(get_untrusted_types(file=path))
         if strange:
-            raise ValueError(f"it holds {', '.join(strange[:3])}, which no learnt skin does")
+            raise ValueError(f"it holds {', '.join(strange[:3])}, which no {said} does")
         content = load(path, trusted=[])
-        if not isinstance(content, dict) or content.get("kind") != _KIND:
+        if not isinstance(content, dict) or content.get("kind") != kind:
             raise ValueError("it is of another kind")
-        if content["version"] != _VERSION:
-            raise ValueError(f"it is of version {content['version']}, and this jeit reads {_VERSION}")
+        if content["version"] != version:
+            raise ValueError(f"it is of version {content['version']}, and this jeit reads {version}")
         own: Any = _whole(content["skin"])
-        return LearntSkin(**own)
+        return make(own)
     except _FAULTS as error:
-        said = " ".join(str(error).split())
-        raise ValueError(f"'{path}' is not a learnt skin that can be read ({said}); fit it again.") from None
+        told = " ".join(str(error).split())
+        raise ValueError(f"'{path}' is not a {said} that can be read ({told}); fit it again.") from None
 
 
 def _plain(value):

@@ -93,6 +93,18 @@ class Forest:
         return cls._joined(trees, np.zeros(len(classes)), classes)
 
     @classmethod
+    def of_stumps(cls, model: Any) -> "Forest":
+        """Of a `LogitBoostClassifier`: a tree for each stump, what each adds to all classes."""
+        rounds, number = model.feature_.shape
+        trees = []
+        for one, kind in np.ndindex(rounds, number):
+            own = np.eye(number)[kind] - 1 / number
+            said = np.outer([0.0, model.below_[one, kind], model.above_[one, kind]], own)
+            asked, at = np.array([model.feature_[one, kind], 0, 0]), np.array([model.threshold_[one, kind], 0.0, 0.0])
+            trees.append((asked, at, np.array([1, 1, 2]), np.array([2, 1, 2]), np.array([False, True, True]), said))
+        return cls._joined(trees, np.zeros(number), model.classes_)
+
+    @classmethod
     def _joined(cls, trees: list[tuple], start: np.ndarray, classes: np.ndarray) -> "Forest":
         most, depth = max(len(tree[0]) for tree in trees), 1
         feature, left, right = (np.zeros((len(trees), most), np.int32) for _ in range(3))

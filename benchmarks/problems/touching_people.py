@@ -1,0 +1,74 @@
+"""The sheet of Silvera Tawil et al. (2011), and people who touch it, simulated: sets of gestures, imaged and cut.
+
+320 × 200 mm, 16 electrodes 10 mm from the edge and one in the middle, eyelets of 7 mm, 1.8 mA through neighbours, 224
+potentials against the middle, 60 frames/s. Simulated with complete electrodes on a mesh of some 2,000 nodes, imaged by
+one NOSER step on one of 1,193. How people differ is in `jeit.simulate.people`, fixed before accuracies were looked at.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jeit import ForwardModel, one_step
+from jeit.electrodes import SheetDiscs
+from jeit.layout import perimeter
+from jeit.mesh import Rectangle
+from jeit.protocol import reference_electrode
+from jeit.simulate import PressedSkin, material
+from jeit.simulate.people import MANNERS, GestureSet, Person, simulate_gestures
+from jeit.touch.gestures import StreamTouch, TouchLevel, find_touches
+
+SIDES, INSET, EYELET, CURRENT, CONTACT = (0.32, 0.2), 0.01, 0.007, 1.8e-3, 1e-3
+NODES, FINE_NODES = 1193, 2000
+# Changes with what the same set is simulated to.
+_VERSION = 1
+
+
+class Sheet:
+    """The sheet: `skin`, as it is, with `fine` nodes, and what images it: `linear`, and `outline`."""
+
+    def __init__(self, fine: int = FINE_NODES, nodes: int = NODES):
+        self.outline = Rectangle(*SIDES)
+        inner = Rectangle(*(side - 2 * INSET for side in SIDES))
+        places = np.vstack([perimeter(inner, 16, start=inner.perimeter / 32), [[0.0, 0.0]]])
+        electrodes, protocol = SheetDiscs(places, EYELET / 2, CONTACT), reference_electrode(16, current=CURRENT)
+        own = material("conductive fabric")
+        self.skin = PressedSkin(
+            jax.random.key(0), ForwardModel(self.outline.mesh(num_points=fine), electrodes, protocol), own
+        )
+        model = ForwardModel(self.outline.mesh(num_points=nodes), electrodes, protocol)
+        self.linear = one_step(model, own.conductivity * own.thickness)
+
+    def level(self, made: GestureSet) -> TouchLevel:
+        """Of what the untouched sheet's images show."""
+        return TouchLevel.of_untouched(self.linear.mesh, np.asarray(self.linear.image(made.untouched - made.reference)))
+
+    def touches(self, made: GestureSet) -> list[StreamTouch | None]:
+        """Of each recording the touch that lasts longest; none where none was found."""
+        level, found = self.level(made), []
+        for number in range(len(made)):
+            seconds, changes = made.changes(number)
+            own = find_touches(level, seconds, np.asarray(self.linear.image(changes)))
+            found.append(max(own, key=lambda one: one.offset - one.onset, default=None))
+        return found
+
+    def gestures(self, people: int, each: int, seed: int, *, store: Path | None = None) -> GestureSet:
+        """`each` times each gesture by so many people, drawn from `seed`; read from the folder `store` where it was
+        made before, and written there."""
+        # All that decides what is made, but for the code, which the version stands for.
+        decides = people, each, seed, self.skin.model.mesh.num_cells, self.skin.material, MANNERS, _VERSION
+        name = repr(decides)
+        path = None if store is None else store / f"gestures-{hashlib.sha256(name.encode()).hexdigest()[:12]}.npz"
+        if path is not None and path.exists():
+            return GestureSet.read(path)
+        for_people, for_touches = jax.random.split(jax.random.key(seed))
+        drawn = [Person.draw(one) for one in jax.random.split(for_people, people)]
+        made = simulate_gestures(for_touches, self.skin, self.outline, drawn, each)
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            made.write(path)
+        return made

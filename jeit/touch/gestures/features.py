@@ -1,0 +1,127 @@
+"""What is measured of a touch: the seven features of Silvera Tawil et al. (2011), table II, and more of its course."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.arguments import check_kind
+from jeit.touch.gestures.change_course import ChangeCourse
+from jeit.touch.gestures.segmentation import StreamTouch
+
+# Names and units, "image" for that of the images of change: siemens (a sheet's) or S/m.
+FEATURES = {
+    "greatest change": "image",
+    "least change": "image",
+    "share above half": "1",
+    "mean in contact": "image",
+    "duration": "s",
+    "rate of change": "image/s",
+    "displacement": "m",
+}
+"""The seven features of a touch, by name, each with its unit; "image" stands for that of the images."""
+
+# Of a touch's course: places in it at which P is taken, from onset to end.
+_PLACES = 16
+_MORE = (
+    "area", "area spread", "path length", "farthest", "speed", "fastest", "straightness", "peaks", "rise", "decay",
+    "roughness", "pauses", "centre of gravity", "breadth",
+)  # fmt: skip
+COURSE_FEATURES = (*FEATURES, *_MORE, *(f"course {one + 1}" for one in range(_PLACES)))
+"""Names of what `course_features` gives: the seven, more of the same course, and P as it goes, from onset to end."""
+
+
+@dataclass(frozen=True)
+class TouchFeatures:
+    """Features of n touches: `values` (n, k), a column for each of `names`, in `units`."""
+
+    values: Float[np.ndarray, "n k"]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Number of touches."""
+        return len(self.values)
+
+
+def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
+    """The seven features of n touches, with x_e the change of element e, P(t) = max_e x_e, and t* when it is greatest.
+
+    Greatest P; least x_e, of all elements and frames of the touch; share of the elements with x_e ≥ P / 2 at t*; mean
+    x_e at t* over the elements above the level that a touch exceeds; duration, s, of the frames above it;
+    mean of |dP/dt|, 0 of one frame; distance of the last centroid from the first, m. Silvera Tawil et al. (2011),
+    table II and section IV-A. Raises `ValueError` for what is no list of touches.
+    """
+    courses = _courses(touches)
+    values = np.array([_seven(one) for one in courses]).reshape(len(courses), len(FEATURES))
+    return TouchFeatures(values, tuple(FEATURES), tuple(FEATURES.values()))
+
+
+def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
+    """The seven features of n touches and more of their courses, `COURSE_FEATURES`: mean and spread of the contact's
+    area; the path's length, its farthest distance from its beginning, mean and greatest speed, and displacement over
+    length; peaks of P a touch; how fast P rises to its greatest and falls from there; how rough it is; the share of
+    frames below half of it; when it is, and how long, on the whole; and P / max P at places evenly spread in time.
+
+    Raises `ValueError` for what is no list of touches.
+    """
+    courses = _courses(touches)
+    seven = touch_features(touches)
+    values = np.array([_more(one) for one in courses]).reshape(len(courses), len(_MORE) + _PLACES)
+    units = ("m²", "1", "m", "m", "m/s", "m/s", "1", "1", "s", "s", "1", "1", "1", "1", *["1"] * _PLACES)
+    return TouchFeatures(np.hstack([seven.values, values]), COURSE_FEATURES, (*seven.units, *units))
+
+
+def _courses(touches) -> list[ChangeCourse]:
+    check_kind("touches", touches, (list, tuple), "a list of touches, such as of find_touches")
+    for number, one in enumerate(touches):
+        check_kind(f"touches[{number}]", one, StreamTouch, "a StreamTouch, such as of find_touches")
+    return [one.course for one in touches]
+
+
+def _seven(course: ChangeCourse) -> list[float]:
+    at = int(course.peak.argmax())
+    passed = np.diff(course.seconds)
+    rate = np.mean(np.abs(np.diff(course.peak)) / passed) if passed.size else 0.0
+    return [
+        course.peak[at],
+        course.least.min(),
+        course.half_share[at],
+        course.mean[at],
+        course.seconds[-1] - course.seconds[0],
+        float(rate),
+        float(np.linalg.norm(course.centroid[-1] - course.centroid[0])),
+    ]
+
+
+def _more(course: ChangeCourse) -> list[float]:
+    there = np.isfinite(course.centroid[:, 0])  # at a bridged frame there is none
+    place, seconds = course.centroid[there], course.seconds[there]
+    steps = np.linalg.norm(np.diff(place, axis=0), axis=1)
+    length, moved = float(steps.sum()), float(np.linalg.norm(place[-1] - place[0]))
+    duration = max(course.seconds[-1] - course.seconds[0], 1e-9)
+    speeds = steps / np.diff(seconds) if steps.size else np.zeros(1)
+    share = course.peak / course.peak.max()
+    at = int(share.argmax())
+    when = (course.seconds - course.seconds[0]) / duration
+    weight = share / share.sum()
+    middle = float(weight @ when)
+    rises = np.diff(share)
+    turns = np.flatnonzero((rises[:-1] > 0) & (rises[1:] <= 0)) + 1
+    return [
+        float(course.area[there].mean()),
+        float(course.area[there].std() / course.area[there].mean()),
+        length,
+        float(np.linalg.norm(place - place[0], axis=1).max()),
+        length / duration,
+        float(np.quantile(speeds, 0.9)),
+        moved / max(length, 1e-9),
+        float(max(np.count_nonzero(share[turns] > 0.5), 1)),
+        float(course.seconds[at] - course.seconds[0]),
+        float(course.seconds[-1] - course.seconds[at]),
+        float(np.abs(rises).sum()),
+        float(np.mean(share < 0.5)),
+        middle,
+        float(np.sqrt(weight @ (when - middle) ** 2)),
+        *np.interp(np.linspace(0, 1, _PLACES), when, share),
+    ]

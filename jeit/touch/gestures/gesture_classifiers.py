@@ -1,0 +1,87 @@
+"""Classifiers of gestures by name, and how right each is of touches that are held out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jeit.touch.gestures.features import course_features, touch_features
+from jeit.touch.learnt.classifiers import CLASSIFIERS, log_odds
+from jeit.touch.learnt.extras import over_folds
+from jeit.touch.learnt.forest import Forest
+
+
+def logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest:
+    """LogitBoost as the paper has it, `LogitBoostClassifier()`, as a forest, which is quicker to ask."""
+    from jeit.touch.gestures.logit_boost import LogitBoostClassifier
+
+    return Forest.of_stumps(LogitBoostClassifier().fit(features, label))
+
+
+GESTURE_CLASSIFIERS: dict[str, Callable[..., Any]] = {"logit-boost": logit_boost, **CLASSIFIERS}
+"""Classifiers by name: the paper's, and the nine of skins that learn."""
+
+FORMS: dict[str, Callable[..., Any]] = {"seven": touch_features, "course": course_features}
+"""What a touch is described by: the paper's seven features, or its course."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Features on a common scale: sign(x) log(1 + |x| / size), less its `mean`, over its `deviation`, all (k,)."""
+
+    size: Float[np.ndarray, " k"]
+    mean: Float[np.ndarray, " k"]
+    deviation: Float[np.ndarray, " k"]
+
+    @classmethod
+    def of(cls, values: Float[np.ndarray, "n k"]) -> "Scale":
+        """Of features (n, k), `size` the median of |x|; what is constant stays zero."""
+        size = np.median(np.abs(values), axis=0)
+        size = np.where(size > 0, size, np.maximum(np.abs(values).max(axis=0), 1e-300))
+        logs = np.sign(values) * np.log1p(np.abs(values) / size)
+        deviation = logs.std(axis=0)
+        return cls(size, logs.mean(axis=0), np.where(deviation > 1e-12, deviation, 1.0))
+
+    def __call__(self, values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+        """Of these features."""
+        return (np.sign(values) * np.log1p(np.abs(values) / self.size) - self.mean) / self.deviation
+
+
+def held_out_odds(
+    method: str, values: Float[np.ndarray, "n k"], right: Int[np.ndarray, " n"], folds: Int[np.ndarray, " n"]
+) -> Float[np.ndarray, "n C"]:
+    """What a classifier that learns all other folds says of each class (n, C), as `log_odds`, of features (n, k) of
+    classes `right` (n,), 0 … C − 1; of a class that the other folds lack, next to nothing. Raises `ValueError` where
+    they have one class alone."""
+    odds = np.full((len(right), right.max() + 1), -1e3)
+
+    def tell(fold: int) -> None:
+        out = folds == fold
+        if len(np.unique(right[~out])) < 2:
+            raise ValueError("labels: but for one fold, or person, there is one gesture only; give touches of more.")
+        scale = Scale.of(values[~out])
+        model = GESTURE_CLASSIFIERS[method](scale(values[~out]), right[~out])
+        odds[np.ix_(out, model.classes_)] = log_odds(model, scale(values[out]))
+
+    over_folds(tell, int(folds.max()) + 1)
+    return odds
+
+
+def random_folds(right: np.ndarray, number: int, seed: int = 0) -> Int[np.ndarray, " n"]:
+    """The fold (n,) that each touch is held out in, drawn at random, of every class alike: fewer than `number` folds
+    where there are fewer touches."""
+    rng = np.random.default_rng(seed)
+    fold, first = np.empty(len(right), int), 0
+    for one in np.unique(right):
+        own = rng.permutation(np.flatnonzero(right == one))
+        fold[own] = (first + np.arange(len(own))) % number
+        first += len(own)
+    return np.unique(fold, return_inverse=True)[1]
+
+
+def person_folds(people: np.ndarray, most: int | None = None) -> Int[np.ndarray, " n"]:
+    """The fold (n,) of each touch: one for each person, or `most`, each of as many people."""
+    number = np.unique(people, return_inverse=True)[1].ravel()
+    return number if most is None else number % most

@@ -1,0 +1,198 @@
+"""`GestureModel`: which of the gestures that it learnt a touch is, how probable, and whether it is like any of them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind, check_name
+from jeit.touch.gestures.features import course_features
+from jeit.touch.gestures.gesture_classifiers import (
+    FORMS,
+    GESTURE_CLASSIFIERS,
+    Scale,
+    held_out_odds,
+    person_folds,
+    random_folds,
+)
+from jeit.touch.gestures.segmentation import StreamTouch
+from jeit.touch.learnt.answers import Standing
+from jeit.touch.learnt.classifiers import log_odds, probabilities, sharpness_of
+from jeit.touch.learnt.file import read_plain, write_plain
+from jeit.touch.needed import need_learning
+
+METHODS = ("auto", *GESTURE_CLASSIFIERS)
+# Folds that a method is chosen on, at most; and of touches that are like those learnt, the share that passes for such.
+_FOLDS, _LIKE = 10, 0.99
+_KIND, _VERSION = "a jeit gesture model", 1
+
+
+@dataclass(frozen=True)
+class Gestures:
+    """What was told of n touches: `gesture` (n,), the likeliest name, how probable it is, `probability` (n,), and
+    `probabilities` (n, C) of all C `names`; `unlike` (n,), whether a touch is unlike any that was learnt from, where
+    nothing that is said of it counts."""
+
+    gesture: np.ndarray
+    probability: Float[np.ndarray, " n"]
+    probabilities: Float[np.ndarray, "n C"]
+    names: tuple[str, ...]
+    unlike: Bool[np.ndarray, " n"]
+
+    def __len__(self) -> int:
+        """Number of touches."""
+        return len(self.gesture)
+
+
+@dataclass(frozen=True)
+class GestureModel:
+    """A classifier of touches.
+
+    **Fields**: `names` (C,) of the gestures; the `method` and the `form` of its features ("seven": the paper's,
+    "course": those and more of the course); their `scale`, the `model` of the classifier and the `sharpness` of its
+    probabilities; `known` (N, k), scaled course features of what was learnt from, their `known_scale`, and the distance
+    from the nearest of them beyond which a touch is unlike all, `farthest`. `standing`: what was said of touches held
+    out, and the errors of all that was tried, the best first, None of a model that was read; `notes` on it.
+    """
+
+    names: tuple[str, ...]
+    method: str
+    form: str
+    scale: Scale
+    model: Any
+    sharpness: float
+    known: Float[np.ndarray, "N k"]
+    known_scale: Scale
+    farthest: float
+    standing: Standing | None = None
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def fit(
+        cls,
+        touches: list[StreamTouch],
+        labels: ArrayLike,
+        *,
+        people: ArrayLike | None = None,
+        method: str = "auto",
+        form: str = "auto",
+        progress: Callable[[str], None] | None = None,
+    ) -> "GestureModel":
+        """Learn the `labels` (n,), names of gestures, of touches, by whom each was made, `people` (n,), names or
+        numbers.
+
+        `method`: one of `METHODS`; `form`: "seven", "course" or "auto". Of "auto" that is taken which is right most
+        often of touches by people held out, one after the other, or a tenth of them where there are more than ten;
+        without people, or of one person, of touches held out at random, which promises nothing of other people.
+        `progress` is called with what is tried. Raises `ValueError` for labels and people that are not as many,
+        gestures of fewer than two touches, fewer than two gestures, and names of methods and forms that there are not;
+        `ImportError` without the extra `learn`.
+        """
+        need_learning()
+        check_name("method", method, METHODS)
+        check_name("form", form, ("auto", *FORMS))
+        named, people_of = _checked(touches, labels, people)
+        names, right = np.unique(named, return_inverse=True)
+        notes = []
+        if people_of is not None and len(np.unique(people_of)) > 1:
+            folds = person_folds(people_of, _FOLDS)
+        else:
+            folds = random_folds(right, _FOLDS)
+            notes.append("one person, or nobody, was told of: chosen on touches held out at random, not on people.")
+        found = []
+        for shape in FORMS if form == "auto" else (form,):
+            values = FORMS[shape](touches).values
+            for name in GESTURE_CLASSIFIERS if method == "auto" else (method,):
+                if progress is not None:
+                    progress(f"{name} on {shape}")
+                odds = held_out_odds(name, values, right, folds)
+                found.append((float(np.mean(odds.argmax(axis=1) != right)), name, shape, odds))
+        found.sort(key=lambda one: one[0])
+        _, chosen, shape, odds = found[0]
+        values, courses = FORMS[shape](touches).values, course_features(touches).values
+        tried = [(f"{name} on {shape}", error) for error, name, shape, _ in found]
+        scale, known_scale = Scale.of(values), Scale.of(courses)
+        known = known_scale(courses)
+        return cls(
+            names=tuple(str(one) for one in names),
+            method=chosen,
+            form=shape,
+            scale=scale,
+            model=GESTURE_CLASSIFIERS[chosen](scale(values), right),
+            sharpness=sharpness_of(odds, right),
+            known=known,
+            known_scale=known_scale,
+            farthest=_farthest(known, folds),
+            standing=Standing(tried[0][0], tried, names[odds.argmax(axis=1)], named),
+            notes=tuple(notes),
+        )
+
+    def predict(self, touches: list[StreamTouch]) -> Gestures:
+        """What touches are; those that are cut off too, of which less is known than was learnt from. Raises
+        `ValueError` for what is no list of touches."""
+        values = FORMS[self.form](touches).values
+        if not len(values):
+            nothing = np.empty(0)
+            return Gestures(
+                nothing.astype(str), nothing, np.empty((0, len(self.names))), self.names, nothing.astype(bool)
+            )
+        odds = np.full((len(values), len(self.names)), -1e3)
+        odds[:, self.model.classes_] = log_odds(self.model, self.scale(values))
+        shares = probabilities(odds, self.sharpness)
+        distance = _nearest(self.known, self.known_scale(course_features(touches).values))
+        said = np.array(self.names)[shares.argmax(axis=1)]
+        return Gestures(said, shares.max(axis=1), shares, self.names, distance > self.farthest)
+
+    def write(self, path: str | Path) -> None:
+        """Write it to one file, without how it stood. Raises `ValueError` for a folder."""
+        own = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "standing"}
+        for name in ("scale", "known_scale"):
+            own[name] = {one.name: getattr(own[name], one.name) for one in fields(Scale)}
+        write_plain(path, _KIND, _VERSION, own, "gestures.skops")
+
+    @classmethod
+    def read(cls, path: str | Path) -> "GestureModel":
+        """Undo `write`; nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` for files of
+        another kind, and such as hold anything else than numbers and estimators of scikit-learn."""
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"'{path}': there is no such file; GestureModel.write makes one.")
+
+        def make(own: dict[str, Any]) -> "GestureModel":
+            scales = {name: Scale(**own[name]) for name in ("scale", "known_scale")}
+            whole: Any = own | scales | {"names": tuple(own["names"]), "notes": tuple(own["notes"])}
+            return cls(**whole)
+
+        return read_plain(Path(path), _KIND, _VERSION, "gesture model", make)
+
+
+def _checked(touches, labels, people) -> tuple[np.ndarray, np.ndarray | None]:
+    check_kind("touches", touches, (list, tuple), "a list of touches, such as of find_touches")
+    named = np.asarray(labels)
+    if named.shape != (len(touches),) or named.dtype.kind not in "UT":
+        raise ValueError(f"labels must be the names of {len(touches)} gestures; they are {named.dtype} {named.shape}.")
+    given = None if people is None else np.asarray(people)
+    if given is not None and given.shape != named.shape:
+        raise ValueError(f"people must be {len(touches)}, one for each touch; they have shape {given.shape}.")
+    names, count = np.unique(named, return_counts=True)
+    if len(names) < 2:
+        raise ValueError("labels: give touches of two gestures, or more.")
+    if count.min() < 2:
+        raise ValueError(f"labels: there is only one touch of '{names[count.argmin()]}'; give two of each, or more.")
+    return named.astype(str), given
+
+
+def _nearest(known: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " n"]:
+    """Distances of the nearest of what is known (N, k)."""
+    from scipy.spatial import KDTree
+
+    return np.asarray(KDTree(known).query(values)[0])
+
+
+def _farthest(known: Float[np.ndarray, "N k"], folds: Int[np.ndarray, " N"]) -> float:
+    """Of touches held out, the distance from the nearest of the others that all but a hundredth keep."""
+    apart = [_nearest(known[folds != one], known[folds == one]) for one in np.unique(folds)]
+    return float(np.quantile(np.concatenate(apart), _LIKE))

@@ -1,0 +1,154 @@
+"""Models of gestures: chosen on people held out, asked, kept in files; and what is no gesture."""
+
+import zipfile
+
+import numpy as np
+import pytest
+from made_touches import KINDS, touch, touches
+
+from jeit.touch.gestures import GestureModel, touch_features
+from jeit.touch.gestures.gesture_classifiers import (
+    GESTURE_CLASSIFIERS,
+    held_out_odds,
+    logit_boost,
+    person_folds,
+    random_folds,
+)
+from jeit.touch.gestures.logit_boost import LogitBoostClassifier
+
+
+@pytest.fixture(scope="module")
+def model():
+    made, labels, people = touches()
+    return GestureModel.fit(made, labels, people=people, method="quadratic-svm")
+
+
+def test_unseen_people_are_told_right(model):
+    made, labels, _ = touches(people=3, each=6, seed=7)
+    said = model.predict(made)
+    assert np.mean(said.gesture == labels) > 0.9
+    assert said.names == tuple(sorted(KINDS))
+    np.testing.assert_allclose(said.probabilities.sum(axis=1), 1)
+    np.testing.assert_array_equal(said.probability, said.probabilities.max(axis=1))
+    assert np.mean(said.unlike) < 0.1
+    assert len(model.predict([])) == 0
+
+
+def test_what_is_no_gesture_is_unlike_any(model):
+    """An electrode that dies throws the image for good: a change a thousand times as strong that does not end."""
+    rng = np.random.default_rng(3)
+    assert model.predict([touch("push", rng, scale=1000.0)]).unlike.tolist() == [True]
+    assert model.predict([touch("push", rng)]).unlike.tolist() == [False]
+
+
+def test_the_best_on_people_held_out_is_taken():
+    made, labels, people = touches(people=3, each=4)
+    model = GestureModel.fit(made, labels, people=people)
+    assert model.standing is not None
+    errors = [error for _, error in model.standing.tried]
+    assert len(errors) == 2 * len(GESTURE_CLASSIFIERS)
+    assert errors == sorted(errors)
+    assert model.standing.method == f"{model.method} on {model.form}" == model.standing.tried[0][0]
+    assert np.mean(model.standing.held_out != model.standing.right) == errors[0]
+    assert model.notes == ()
+
+
+def test_of_one_person_it_says_so():
+    made, labels, _ = touches(people=1, each=6)
+    (note,) = GestureModel.fit(made, labels, people=["a"] * len(made), method="nearest", form="seven").notes
+    assert "not on people" in note
+
+
+def test_a_class_that_somebody_never_made():
+    """Folds that lack it do not fail, and a class that never occurs is never told."""
+    made, labels, people = touches(people=3, each=4)
+    kept = (labels != "slap") | (people == 0)
+    some = [one for one, there in zip(made, kept, strict=True) if there]
+    for method in GESTURE_CLASSIFIERS:
+        model = GestureModel.fit(some, labels[kept], people=people[kept], method=method, form="seven")
+        assert "slap" in model.names
+        assert not (model.standing.held_out[people[kept] == 0] == "slap").any()
+
+
+def test_a_forest_of_stumps_is_logit_boost():
+    made, labels, _ = touches()
+    values = touch_features(made).values
+    forest, plain = logit_boost(values, labels), LogitBoostClassifier().fit(values, labels)
+    np.testing.assert_allclose(forest.decision_function(values), plain.decision_function(values), atol=1e-9)
+    assert forest.classes_.tolist() == plain.classes_.tolist()
+
+
+def test_folds():
+    right = np.repeat([0, 1, 2], [30, 31, 4])
+    fold = random_folds(right, 15)
+    assert np.bincount(fold).max() - np.bincount(fold).min() <= 1
+    assert all(
+        np.bincount(fold[right == one], minlength=15).max() <= len(right[right == one]) // 15 + 1 for one in range(3)
+    )
+    people = np.repeat(["a", "b", "c"], 4)
+    assert person_folds(people).tolist() == [*[0] * 4, *[1] * 4, *[2] * 4]
+    assert person_folds(people, 2).max() == 1
+
+
+def test_touches_held_out_are_not_learnt_from():
+    """Of labels that mean nothing a fair guess is right by chance; one that had seen them would always be."""
+    rng = np.random.default_rng(0)
+    values, right = rng.normal(size=(200, 3)), rng.integers(0, 2, 200)
+    odds = held_out_odds("nearest", values, right, random_folds(right, 10))
+    assert np.mean(odds.argmax(axis=1) == right) < 0.65
+
+
+@pytest.mark.parametrize("method", ["logit-boost", "linear-discriminant", "quadratic-svm"])
+def test_a_file_keeps_it(method, tmp_path):
+    made, labels, people = touches(people=2)
+    model = GestureModel.fit(made, labels, people=people, method=method)
+    model.write(tmp_path / "gestures.skops")
+    again = GestureModel.read(tmp_path / "gestures.skops")
+    asked = touches(seed=5)[0]
+    one, other = model.predict(asked), again.predict(asked)
+    assert again.standing is None
+    assert (again.names, again.method, again.form, again.notes) == (model.names, method, model.form, model.notes)
+    np.testing.assert_array_equal(one.probabilities, other.probabilities)
+    np.testing.assert_array_equal(one.unlike, other.unlike)
+
+
+def test_other_files_are_refused(model, tmp_path):
+    from skops.io import dump
+
+    path = tmp_path / "gestures.skops"
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        GestureModel.read(path)
+    path.write_text("no zip")
+    with pytest.raises(ValueError, match="not a gesture model"):
+        GestureModel.read(path)
+    dump({"kind": "another"}, path)
+    with pytest.raises(ValueError, match="another kind"):
+        GestureModel.read(path)
+    dump({"kind": "a jeit gesture model", "version": 1, "skin": np.random.default_rng}, path)
+    with pytest.raises(ValueError, match="which no gesture model does"):
+        GestureModel.read(path)
+    with pytest.raises(ValueError, match="is a folder"):
+        model.write(tmp_path)
+    model.write(path)
+    assert not [name for name in zipfile.ZipFile(path).namelist() if name.endswith((".pkl", ".pickle"))]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"labels": ["tap"]}, "names of 16 gestures"),
+        ({"labels": range(16)}, "names of 16 gestures"),
+        ({"labels": ["tap"] * 16}, "two gestures, or more"),
+        ({"labels": ["tap"] * 15 + ["pat"]}, "only one touch of 'pat'"),
+        ({"people": [1, 2]}, "people must be 16"),
+        ({"people": [0] * 8 + [1] * 8, "labels": ["tap"] * 8 + ["pat"] * 8}, "one gesture only"),
+        ({"method": "logitboost"}, "did you mean 'logit-boost'"),
+        ({"form": "eight"}, "form must be one of"),
+        ({"touches": "tap"}, "touches must be a list"),
+    ],
+)
+def test_what_cannot_be_learnt_is_said(change, said):
+    made, labels, _ = touches(people=2, each=2)
+    given = {"touches": made, "labels": labels, "method": "nearest"} | change
+    with pytest.raises(ValueError, match=said):
+        GestureModel.fit(**given)
