@@ -8,7 +8,11 @@ with r_n its place on the grid (Kohonen, Self-Organizing Maps, 2001, chapter 3).
 tuning phase, where ρ is next to nothing, the winner alone moves. ε falls throughout.
 
 Distances from w and from w − m to x and x − m are the same: all is done about the frames' mean m, whose differences
-are small, with |w|² kept up beside w. A frame then costs one product with the weights, and one pass to move them.
+are small. The winner of |w|² − 2 w·x needs squares and products alone, and these follow from those before the step:
+
+    w′·y = (1 − ε h) w·y + ε h x·y,    |w′|² = (1 − ε h)² |w|² + 2 ε h (1 − ε h) w·x + (ε h)² |x|²
+
+so that weights are multiplied with some frames at once, and moved once after them.
 """
 
 import equinox as eqx
@@ -19,6 +23,8 @@ from jaxtyping import Array, Float, Int
 
 from jeit.arguments import is_number, real_array, told
 
+# Frames after which weights are moved.
+_AT_ONCE = 16
 # A radius, grid steps, within which there is the winner alone: of its neighbours exp(−1/2ρ²) is no number.
 _ALONE = 0.01
 
@@ -77,25 +83,43 @@ def train(
     rows, columns, channels = weights.shape
     middle = frames.mean(axis=0)
     frames = frames - middle
-    levels = frames.mean(axis=1)
     row, column = jnp.arange(rows)[:, None], jnp.arange(columns)[None, :]
 
-    def show(state, now):
+    def share_of(winner, rate, radius):
+        best_row, best_column = jnp.divmod(winner, columns)
+        return rate * jnp.exp(-((row - best_row) ** 2 + (column - best_column) ** 2) / (2 * radius**2)).reshape(-1)
+
+    def show_some(state, now):
+        # In the end weights are `kept` w + Σ `moved` x.
         flat, squares, level = state
-        number, rate, radius = now
-        frame = frames[number]
-        inner = flat @ frame
-        best_row, best_column = jnp.divmod(jnp.argmin(squares - 2 * inner), columns)
-        near = jnp.exp(-((row - best_row) ** 2 + (column - best_column) ** 2) / (2 * radius**2)).reshape(-1)
-        share = rate * near
-        squares = (1 - share) ** 2 * squares + 2 * share * (1 - share) * inner + share**2 * (frame @ frame)
-        level += share * (levels[number] - level)
-        return (flat + share[:, None] * (frame - flat), squares, level), level.mean()
+        some, *how = now
+        shown = frames[some]
+        among, levels = shown @ shown.T, shown.mean(axis=1)
+
+        def show(state, now):
+            inner, kept, moved, squares, level = state
+            one, rate, radius = now
+            share = share_of(jnp.argmin(squares - 2 * inner[one]), rate, radius)
+            rest = 1 - share
+            squares = rest**2 * squares + 2 * share * rest * inner[one] + share**2 * among[one, one]
+            inner = rest * inner + share * among[one][:, None]
+            moved = (rest * moved).at[one].set(share)
+            level = rest * level + share * levels[one]
+            return (inner, rest * kept, moved, squares, level), level.mean()
+
+        before = shown @ flat.T, jnp.ones_like(squares), jnp.zeros((len(some), len(flat))), squares, level
+        (_, kept, moved, squares, level), curve = jax.lax.scan(show, before, (jnp.arange(len(some)), *how))
+        return (kept[:, None] * flat + moved.T @ shown, squares, level), curve
 
     flat = (weights - middle).reshape(-1, channels)
     state = flat, jnp.sum(flat**2, axis=1), flat.mean(axis=1)
-    (flat, _, _), curve = jax.lax.scan(show, state, (order, rates, radii))
-    return flat.reshape(weights.shape) + middle, curve + middle.mean()
+    more = -order.size % _AT_ONCE
+    order, rates = jnp.pad(order, (0, more)), jnp.pad(rates, (0, more))  # frames at a rate of 0 change nothing
+    radii = jnp.pad(radii, (0, more), constant_values=1.0)
+    (flat, _, _), curve = jax.lax.scan(
+        show_some, state, tuple(one.reshape(-1, _AT_ONCE) for one in (order, rates, radii))
+    )
+    return flat.reshape(weights.shape) + middle, curve.reshape(-1)[: curve.size - more] + middle.mean()
 
 
 def _check_falling(name: str, value, most: float, wanted: str) -> None:
