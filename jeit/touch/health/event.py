@@ -18,8 +18,6 @@ class EventKind(StrEnum):
     """An electrode's channels read next to nothing, or one constant; a dead electrode may look the same."""
     LOOSE = "loose electrode"
     """An electrode's contact is worse, and wanders."""
-    CHANNELS = "channels"
-    """Some channels read noise, a constant, or what the others deny; no electrode is behind all of them."""
     CHANGED = "changed"
     """The skin is not what it was; of what kind that is, frames alone do not tell, or no model bears out."""
     REPAIRED = "repaired"

@@ -405,13 +405,11 @@ class SkinHealth:
         return self.skin if self.skin is None or cut else self.skin.healed()
 
     def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
-        """Channels (M,) that no open event of electrodes or channels takes away."""
+        """Channels (M,) that no open event of an electrode takes away."""
         trusted = self.healthy.used.copy()
         for one in self.open_events:
             if one.electrode is not None and self.touching is not None:
                 trusted &= ~self.touching[one.electrode]
-            elif one.kind == EventKind.CHANNELS:
-                trusted &= ~one.channels
         return trusted
 
 
