@@ -2,13 +2,14 @@
 
 Rooms: `contacts` (what an image shows, from frame to frame, in newtons), `learnt` (skins that learn from recorded
 presses, without a model), `kohonen` (maps that order frames by themselves), `gestures` (touches of a stream, and what
-they mean), `health` (cuts, electrodes that fail, repair).
+they mean), `health` (cuts, electrodes that fail, repair), `attributes` (how finely a skin feels).
 
 `LogitBoostClassifier` is imported when it is first used, and scikit-learn with it.
 """
 
 from typing import TYPE_CHECKING
 
+from jeit.touch.attributes import TouchAttributes, touch_attributes
 from jeit.touch.contacts import (
     CellFinder,
     Contact,
@@ -60,6 +61,7 @@ __all__ = [
     "SelfOrganisingMap",
     "SkinHealth",
     "Standing",
+    "TouchAttributes",
     "TouchLevel",
     "TouchStream",
     "Touches",
@@ -68,6 +70,7 @@ __all__ = [
     "read_frames",
     "read_presses",
     "read_skin",
+    "touch_attributes",
     "touch_features",
     "track_contacts",
     "watch",

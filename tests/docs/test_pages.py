@@ -62,7 +62,8 @@ def _contacts(names: dict, folder: Path, printed: list[str]) -> None:
     assert np.linalg.norm(names["contact"].centroid - [0.01, 0.02]) < 2e-3
     assert 0.04 < names["path"].length < 0.06
     assert abs(names["force"].force - 2.0) < 0.4
-    assert len(printed) == 2
+    assert names["feels"].localisation.mean < 3e-3
+    assert len(printed) == 3
 
 
 def _design(names: dict, folder: Path, printed: list[str]) -> None:
