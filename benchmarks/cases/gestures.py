@@ -17,7 +17,8 @@ from benchmarks.harness.case import Asked, Case, Options, Result, Table, judged
 from benchmarks.harness.tables import duration
 from benchmarks.harness.timing import say, timed
 from benchmarks.problems.touching_people import Sheet
-from jeit.simulate.people import GESTURES, GestureSet
+from jeit.data import GestureSet
+from jeit.simulate.people import GESTURES
 from jeit.touch.gestures import GestureModel, StreamTouch, TouchStream
 from jeit.touch.gestures.gesture_classifiers import (
     FORMS,

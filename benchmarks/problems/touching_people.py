@@ -14,12 +14,13 @@ import jax
 import numpy as np
 
 from jeit import ForwardModel, one_step
+from jeit.data import GestureSet
 from jeit.electrodes import SheetDiscs
 from jeit.layout import perimeter
 from jeit.mesh import Rectangle
 from jeit.protocol import reference_electrode
 from jeit.simulate import PressedSkin, material
-from jeit.simulate.people import MANNERS, GestureSet, Person, simulate_gestures
+from jeit.simulate.people import MANNERS, Person, simulate_gestures
 from jeit.touch.gestures import StreamTouch, TouchLevel, find_touches
 
 SIDES, INSET, EYELET, CURRENT, CONTACT = (0.32, 0.2), 0.01, 0.007, 1.8e-3, 1e-3

@@ -7,6 +7,7 @@ whether a frame can be imaged against a reference.
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.data.description import load_description
 from jeit.data.export import write_table
+from jeit.data.gesture_set import GestureSet
 from jeit.data.imageable import check_imageable
 from jeit.data.measurement import Measurement
 from jeit.data.quality import estimate_noise, impossible_signs, reciprocity_error
@@ -16,6 +17,7 @@ from jeit.data.screening import screen
 _tell_old_names(__name__)
 
 __all__ = [
+    "GestureSet",
     "Measurement",
     "check_imageable",
     "estimate_noise",

@@ -35,7 +35,7 @@ from jeit.simulate.contact import (
     open_presses,
     simulate_presses,
 )
-from jeit.simulate.people import GestureSet, Person, simulate_gestures
+from jeit.simulate.people import Person, simulate_gestures
 from jeit.simulate.round_skin import RoundSkin, simulate_press
 
 _tell_old_names(__name__)
@@ -46,7 +46,6 @@ __all__ = [
     "DepthMap",
     "Disc",
     "Foundation",
-    "GestureSet",
     "HalfSpace",
     "Joined",
     "Material",

@@ -1,14 +1,13 @@
-"""Gestures of many people on a simulated skin, as it reads them, and as a file."""
+"""Gestures of many people on a simulated skin, as it reads them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 
-from jeit.arguments import check_key, check_kind, check_name, need, npz_arrays, told
+from jeit.arguments import check_key, check_kind, check_name, told
+from jeit.data import GestureSet
 from jeit.mesh import Domain
 from jeit.simulate.contact.pressed_skin import PressedSkin
 from jeit.simulate.people.manners import GESTURES
@@ -19,56 +18,6 @@ from jeit.simulate.people.person import Person
 _LATEST, _REFERENCE, _DRIFTS, _FRAMES = 60.0, 60, 40, 16
 # Recordings simulated at once.
 _AT_ONCE = 120
-_ARRAYS = ("gesture", "person", "start", "seconds", "voltages", "reference", "untouched")
-
-
-@dataclass(frozen=True)
-class GestureSet:
-    """n recordings of one gesture each, one after the other: frames F in all, M channels.
-
-    **Fields**: `gesture` (n,), names, and `person` (n,), a number for each; `start` (n + 1,), where each recording's
-    frames begin, and the last one's end; `seconds` (F,), of each recording from 0; `voltages` (F, M), single precision,
-    volts; `reference` (M,), volts, the mean of frames of the untouched skin up to a minute before; `untouched` (u, M),
-    frames of the untouched skin as long after.
-    """
-
-    gesture: np.ndarray
-    person: Int[np.ndarray, " n"]
-    start: Int[np.ndarray, " s"]
-    seconds: Float[np.ndarray, " F"]
-    voltages: Float[np.ndarray, "F M"]
-    reference: Float[np.ndarray, " M"]
-    untouched: Float[np.ndarray, "u M"]
-
-    def __post_init__(self):
-        """Raises `ValueError` for arrays that do not belong together."""
-        number, frames, channels = len(self.gesture), len(self.voltages), self.voltages.shape[-1]
-        shapes = (number,), (number + 1,), (frames,), (channels,)
-        if shapes != (self.person.shape, self.start.shape, self.seconds.shape, self.reference.shape) or (
-            self.untouched.shape[1:] != (channels,) or self.start[0] or self.start[-1] != frames
-        ):
-            raise ValueError("the arrays do not belong together: one gesture, person and start for each recording.")
-
-    def __len__(self) -> int:
-        """Number of recordings."""
-        return len(self.gesture)
-
-    def changes(self, number: int) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T M"]]:
-        """Times (T,), seconds, and changes (T, M) from the reference, volts, of one recording."""
-        own = slice(self.start[number], self.start[number + 1])
-        return self.seconds[own], self.voltages[own].astype(float) - self.reference
-
-    def write(self, path: str | Path) -> None:
-        """Write it to an NPZ file. Raises `OSError` where it cannot be written."""
-        np.savez_compressed(path, **{name: getattr(self, name) for name in _ARRAYS})
-
-    @classmethod
-    def read(cls, path: str | Path) -> "GestureSet":
-        """Undo `write`. Raises `OSError` where there is no file, `ValueError` for one of another kind; nothing in it is
-        executed."""
-        arrays = npz_arrays(Path(path), *_ARRAYS, otherwise="not a set of gestures")
-        need(arrays, *_ARRAYS)
-        return cls(**{name: arrays[name] for name in _ARRAYS})
 
 
 def simulate_gestures(
