@@ -7,8 +7,9 @@ _LEAST_PERCENT = 0.001
 
 
 def counted(number: int, noun: str) -> str:
-    """So many of a thing: "1 frame", "1,000 frames"."""
-    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+    """So many of a thing: "1 frame", "1,000 frames", "2 touches"."""
+    several = "es" if noun.endswith(("ch", "s", "x")) else "s"
+    return f"{number:,} {noun}{'' if number == 1 else several}"
 
 
 def percent(value: float | None) -> str:

@@ -24,7 +24,7 @@ from jeit.cli.options import naming_options
 from jeit.start import discarded_damaged
 
 # Commands that run one program again and again: a frame in a third of the time.
-_REPEATING = ("study", "stream", "layout optimise", "touch fit")
+_REPEATING = ("study", "stream", "layout optimise", "touch fit", "touch gestures", "touch watch")
 
 app = typer.Typer(
     name="jeit",

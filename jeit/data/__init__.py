@@ -7,6 +7,7 @@ whether a frame can be imaged against a reference.
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.data.description import load_description
 from jeit.data.export import write_table
+from jeit.data.frame_recording import FrameRecording, read_frame_recording
 from jeit.data.gesture_set import GestureSet
 from jeit.data.imageable import check_imageable
 from jeit.data.measurement import Measurement
@@ -17,6 +18,7 @@ from jeit.data.screening import screen
 _tell_old_names(__name__)
 
 __all__ = [
+    "FrameRecording",
     "GestureSet",
     "Measurement",
     "check_imageable",
@@ -24,6 +26,7 @@ __all__ = [
     "impossible_signs",
     "load_description",
     "read",
+    "read_frame_recording",
     "reciprocity_error",
     "screen",
     "write_table",

@@ -112,6 +112,13 @@ def measurement_from(
     )
 
 
+def numbers(path: Path, layout: TableLayout) -> np.ndarray:
+    """The numbers of a text or NPY file, as they lie in it. Raises `ValueError` for what is not numbers."""
+    if path.suffix.lower() == ".npy":
+        return _voltages(_from_numpy(path), layout, path)
+    return _from_text(path, layout)
+
+
 def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:
     """Frames (F, M), in file units, of a table laid out as described; `ValueError` for an odd half of complex pairs."""
     frames = table.T if table.ndim == 2 and layout.frames_in == "columns" else np.atleast_2d(table)

@@ -2,13 +2,14 @@
 
 `settings` says how to image, `preparation` checks, meshes and calibrates, `wiring` finds what is not wired as told,
 `method` images, `automatic` decides how, `difference` looks for inclusions; `stream_preparation` makes ready for frame
-after frame.
+after frame. And from a stream of a touched skin to what it means: `touch_images`, `gesture_learning`, `touch_watch`.
 """
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.imaging.compared_rules import ComparedRules, RuleOutcome, compare_on_data
 from jeit.imaging.difference import ImagedDifference, image_difference
 from jeit.imaging.frequencies import ImagedFrequencies, frequency_weight, image_frequencies
+from jeit.imaging.gesture_learning import LearntGestures, learn_gestures
 from jeit.imaging.method import METHODS
 from jeit.imaging.preparation import (
     PreparedDifference,
@@ -19,6 +20,8 @@ from jeit.imaging.preparation import (
 )
 from jeit.imaging.settings import CONTACTS, ImagingSettings
 from jeit.imaging.stream_preparation import StreamSettings, frames_of, prepare_imager
+from jeit.imaging.touch_images import TouchImages, untouched_frames
+from jeit.imaging.touch_watch import NamedTouch, TouchWatch, WatchedFrame
 
 _tell_old_names(__name__)
 
@@ -29,9 +32,14 @@ __all__ = [
     "ImagedDifference",
     "ImagedFrequencies",
     "ImagingSettings",
+    "LearntGestures",
+    "NamedTouch",
     "PreparedDifference",
     "RuleOutcome",
     "StreamSettings",
+    "TouchImages",
+    "TouchWatch",
+    "WatchedFrame",
     "calibrated_model",
     "compare_on_data",
     "frames_of",
@@ -39,7 +47,9 @@ __all__ = [
     "image_difference",
     "image_frequencies",
     "imaging_mesh",
+    "learn_gestures",
     "prepare_difference",
     "prepare_imager",
     "select_frames",
+    "untouched_frames",
 ]

@@ -51,10 +51,8 @@ class ImagingSettings:
 
     def __post_init__(self):
         check_name("method", self.method, (AUTO, *METHODS))
-        if not isinstance(self.prior, AbstractPrior):
-            otherwise = "" if isinstance(self.prior, str) else ", or an object such as Noser()"
-            check_name("prior", self.prior, PRIORS, otherwise)
-        elif not self.prior.is_quadratic:
+        check_prior(self.prior)
+        if isinstance(self.prior, AbstractPrior) and not self.prior.is_quadratic:
             raise ValueError("prior: total variation is a method of its own; give method='total-variation'.")
         if self.method == AUTO and self.hyperparameter is not None:
             object.__setattr__(self, "method", "one-step")
@@ -74,6 +72,12 @@ def as_settings(given: ImagingSettings | None) -> ImagingSettings:
     settings = ImagingSettings() if given is None else given
     check_kind("settings", settings, ImagingSettings, "ImagingSettings, such as ImagingSettings(method='gauss-newton')")
     return settings
+
+
+def check_prior(prior) -> None:
+    """Raises `ValueError` for what is neither a prior nor the name of one."""
+    if not isinstance(prior, AbstractPrior):
+        check_name("prior", prior, PRIORS, "" if isinstance(prior, str) else ", or an object such as Noser()")
 
 
 def check_body(contact: str | None, num_points: int) -> None:

@@ -10,6 +10,7 @@ from jeit.arguments import check_kind
 from jeit.data import Measurement
 from jeit.forward import ForwardModel
 from jeit.imaging.clock import Clock
+from jeit.imaging.method import NamedPrior, prior_for
 from jeit.imaging.preparation import (
     body_of,
     calibrated_model,
@@ -19,12 +20,13 @@ from jeit.imaging.preparation import (
     imaging_mesh,
     select_frames,
 )
-from jeit.imaging.settings import check_body, check_hyperparameter
+from jeit.imaging.settings import check_body, check_hyperparameter, check_prior
 from jeit.imaging.wiring import find_wiring
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import GaussNewton
 from jeit.inverse.nonlinear.solvers import AbstractSolver, as_solver
+from jeit.inverse.prior.defaults import MEASURED
 from jeit.inverse.streaming.imager import check_memory
 
 
@@ -35,16 +37,18 @@ class StreamSettings:
     - `solver`: `GaussNewton()`, `LevenbergMarquardt()`, or `OneStep()` for linear images; or the name of one
       ("gauss-newton", "levenberg-marquardt", "one-step"). `max_steps`: most iterations for a frame, where the solver
       has none of its own; as an `Imager` has it, 4, unless given.
+    - `prior`: a name in `jeit.inverse.prior.defaults.PRIORS`, or a quadratic prior.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; "noise-figure" unless given.
     - `memory`: frames over which an image changes, see `jeit.inverse.Imager`; 0 takes every frame alone.
     - `contact`, `num_points`, `as_is`: as in `jeit.imaging.ImagingSettings`.
 
-    Raises `ValueError` for a solver that does not image frames, a memory that is no number of them, and as
-    `jeit.imaging.ImagingSettings`.
+    Raises `ValueError` for a solver that does not image frames, a prior that there is not, a memory that is no number
+    of frames, and as `jeit.imaging.ImagingSettings`.
     """
 
     solver: AbstractSolver | str = field(default_factory=GaussNewton)
     max_steps: int | None = None
+    prior: NamedPrior = MEASURED
     hyperparameter: float | str | None = None
     memory: float = 0.0
     contact: str | None = None
@@ -53,6 +57,7 @@ class StreamSettings:
 
     def __post_init__(self):
         object.__setattr__(self, "solver", as_solver(self.solver, frames=True).for_frames(self.max_steps))
+        check_prior(self.prior)
         check_memory(self.memory)
         check_body(self.contact, self.num_points)
         if self.hyperparameter is not None:
@@ -94,6 +99,7 @@ def prepare_imager(
             reference=base.filled()[0],
             mask=base.mask[0],
             solver=settings.solver,
+            prior=prior_for(settings.prior, domain),
             hyperparameter=settings.hyperparameter,
             memory=settings.memory,
         )

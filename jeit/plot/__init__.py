@@ -1,5 +1,5 @@
 """Pictures, with matplotlib: meshes, images, electrodes, sensitivity, taxels, layouts, voltages, microphones, touches,
-contacts, self-organising maps, damage.
+contacts, self-organising maps, damage, gestures in time.
 
 Every function takes `ax`, makes a figure of its own where none is given, and returns the axes it drew on. Lengths are
 in metres in the arguments and in millimetres in the pictures.
@@ -24,7 +24,14 @@ from jeit.plot.touch.contact_stages import plot_contact_stages
 from jeit.plot.touch.contacts import plot_contacts
 from jeit.plot.touch.health import plot_health
 from jeit.plot.touch.kohonen_map import plot_map
-from jeit.plot.touch.learning import plot_confusion, plot_force_errors, plot_key_errors, plot_place_errors
+from jeit.plot.touch.learning import (
+    plot_confusion,
+    plot_force_errors,
+    plot_key_errors,
+    plot_place_errors,
+    plot_tried,
+)
+from jeit.plot.touch.timeline import plot_changes, plot_timeline, plot_touch_paths
 from jeit.plot.touch.touches import plot_answers, plot_places
 
 _tell_old_names(__name__)
@@ -34,6 +41,7 @@ __all__ = [
     "Marks",
     "plot_admittivity",
     "plot_answers",
+    "plot_changes",
     "plot_choice",
     "plot_confusion",
     "plot_contact_stages",
@@ -56,6 +64,9 @@ __all__ = [
     "plot_sensitivity_map",
     "plot_taxel_areas",
     "plot_taxels",
+    "plot_timeline",
+    "plot_touch_paths",
     "plot_track",
     "plot_travel",
+    "plot_tried",
 ]

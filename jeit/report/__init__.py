@@ -1,10 +1,11 @@
 """What is told of results, and all that is written to a folder: measurements, images, streams, compared rules,
-calibrations of microphones, tracks, layouts, studies, learnt skins."""
+calibrations of microphones, tracks, layouts, studies, learnt skins, gestures, watched skins."""
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.report.calibration import draw_calibration, write_calibration
 from jeit.report.compared_rules import draw_choice, report_choice, write_choice
 from jeit.report.film import write_film
+from jeit.report.gestures import report_gestures, write_gestures
 from jeit.report.image import draw_image, report_image, write_image
 from jeit.report.layout_comparison import draw_layout_comparison, report_layout_comparison, write_layout_comparison
 from jeit.report.layout_improvement import draw_improved_layout, report_improved_layout, write_improved_layout
@@ -12,6 +13,7 @@ from jeit.report.learnt_skin import report_learnt_skin, write_learnt_skin, write
 from jeit.report.measurement import report_measurement
 from jeit.report.stream import write_stream
 from jeit.report.study import write_study_report
+from jeit.report.touch_watch import draw_watch, report_watch, write_watch
 from jeit.report.track import draw_track, report_track, write_track
 
 _tell_old_names(__name__)
@@ -23,16 +25,20 @@ __all__ = [
     "draw_improved_layout",
     "draw_layout_comparison",
     "draw_track",
+    "draw_watch",
     "report_choice",
+    "report_gestures",
     "report_image",
     "report_improved_layout",
     "report_layout_comparison",
     "report_learnt_skin",
     "report_measurement",
     "report_track",
+    "report_watch",
     "write_calibration",
     "write_choice",
     "write_film",
+    "write_gestures",
     "write_image",
     "write_improved_layout",
     "write_layout_comparison",
@@ -41,4 +47,5 @@ __all__ = [
     "write_study_report",
     "write_touches",
     "write_track",
+    "write_watch",
 ]

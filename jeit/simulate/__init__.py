@@ -35,7 +35,7 @@ from jeit.simulate.contact import (
     open_presses,
     simulate_presses,
 )
-from jeit.simulate.people import Person, simulate_gestures
+from jeit.simulate.people import GestureStream, Person, simulate_gesture_stream, simulate_gestures
 from jeit.simulate.round_skin import RoundSkin, simulate_press
 
 _tell_old_names(__name__)
@@ -46,6 +46,7 @@ __all__ = [
     "DepthMap",
     "Disc",
     "Foundation",
+    "GestureStream",
     "HalfSpace",
     "Joined",
     "Material",
@@ -69,6 +70,7 @@ __all__ = [
     "open_presses",
     "pat",
     "quiet",
+    "simulate_gesture_stream",
     "simulate_gestures",
     "simulate_press",
     "simulate_presses",

@@ -1,16 +1,20 @@
-"""`jeit touch`: skins that learn from recorded presses, and what they then say of frames."""
+"""`jeit touch`: skins that learn from recorded presses, what they then say of frames, and gestures."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from jeit.cli.commands.touch_watch import gestures, watch
 from jeit.cli.options import Quiet, make_folder, naming_options
 
 touch = typer.Typer(
     name="touch",
-    help="Skins that learn, from recorded presses and without a model, where, how hard and by what they are touched.",
+    help="Skins that learn, from recorded presses and without a model, where, how hard and by what they are touched; "
+    "and gestures, named as they end.",
 )
+touch.command()(gestures)
+touch.command()(watch)
 
 
 # Of the mesh of images: contacts are told between its cells.

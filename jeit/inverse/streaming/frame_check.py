@@ -122,11 +122,15 @@ class FrameCheck:
     def _without_dead_electrode(self, difference, usable):
         """The usable channels less those of an electrode that explains most of a large difference, and a sentence."""
         total = np.linalg.norm(difference)
-        left = [np.linalg.norm(difference[usable & ~touching]) for touching in self.touching]
+        left = np.array([np.linalg.norm(difference[usable & ~touching]) for touching in self.touching])
+        # What all channels read, such as a common reference, cannot be left out.
+        left[(usable & ~self.touching).sum(axis=1) < _LEAST_CHANNELS * self.mask.sum()] = np.inf
         electrode = int(np.argmin(left))
+        if not np.isfinite(left[electrode]):
+            return usable, ""
         own, rest = usable & self.touching[electrode], usable & ~self.touching[electrode]
         lost = np.median(np.abs(difference[own]) / np.abs(self.expected[own])) > _LOST
         explained = left[electrode] <= min(_EXPLAINED * total, _LARGEST_DIFFERENCE * self.size)
-        if not (lost and explained) or rest.sum() < _LEAST_CHANNELS * self.mask.sum():
+        if not (lost and explained):
             return usable, ""
         return rest, f"Electrode {electrode + 1} seems to be dead; its channels are left out."

@@ -90,3 +90,21 @@ def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None
     ax.set_title(said if title is None else title)
     soften_axes(ax)
     return ax
+
+
+def plot_tried(label: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
+    """Draw how many of the presses held out each of the methods that were tried told rightly, per cent, the best on
+    top."""
+    ax = axes_or_new(ax)
+    names, right = [one for one, _ in label.tried], [100 * (1 - error) for _, error in label.tried]
+    colours = [SERIES_COLOURS[0] if one == label.method else "#c9d3de" for one in names]
+    ax.barh(range(len(names)), right, color=colours, height=0.7)
+    for row, value in enumerate(right):
+        ax.text(value, row, f" {value:.0f}", va="center", color=INK, fontsize=8)
+    ax.set_yticks(range(len(names)), names, fontsize=8)
+    ax.invert_yaxis()
+    ax.set_xlim(0, 105)
+    ax.set_xlabel("Right of what was held out (%)", color=INK)
+    ax.set_title("What was tried" if title is None else title)
+    soften_axes(ax)
+    return ax

@@ -30,6 +30,14 @@ _MORE = (
 COURSE_FEATURES = (*FEATURES, *_MORE, *(f"course {one + 1}" for one in range(_PLACES)))
 """Names of what `course_features` gives: the seven, more of the same course, and P as it goes, from onset to end."""
 
+SEQUENCE_PLACES = 32
+SEQUENCE_VALUES = ("change", "share", "mean", "area", "half", "speed", "distance", "along")
+"""What `sequence_features` takes at each of `SEQUENCE_PLACES` places in a touch, from onset to end."""
+SEQUENCE_FEATURES = (
+    *COURSE_FEATURES, *(f"{name} {one + 1}" for one in range(SEQUENCE_PLACES) for name in SEQUENCE_VALUES)
+)  # fmt: skip
+"""Names of what `sequence_features` gives."""
+
 
 @dataclass(frozen=True)
 class TouchFeatures:
@@ -70,6 +78,21 @@ def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Tou
     values = np.array([_more(one) for one in courses]).reshape(len(courses), len(_MORE) + _PLACES)
     units = ("m²", "1", "m", "m", "m/s", "m/s", "1", "1", "s", "s", "1", "1", "1", "1", *["1"] * _PLACES)
     return TouchFeatures(np.hstack([seven.values, values]), COURSE_FEATURES, (*seven.units, *units))
+
+
+def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
+    """`course_features` of n touches and their whole course, `SEQUENCE_FEATURES`: at places evenly spread in time P;
+    P / max P; mean change and area in contact; the share of elements above half of P; the centroid's speed, its
+    distance from where it began, and its place along the line that it mostly goes along, beginning forwards.
+
+    Raises `ValueError` for what is no list of touches.
+    """
+    courses = _courses(touches)
+    whole = course_features(touches)
+    wide = SEQUENCE_PLACES * len(SEQUENCE_VALUES)
+    values = np.array([_sequence(one).ravel() for one in courses]).reshape(len(courses), wide)
+    units = ("image", "1", "image", "m²", "1", "m/s", "m", "m") * SEQUENCE_PLACES
+    return TouchFeatures(np.hstack([whole.values, values]), SEQUENCE_FEATURES, (*whole.units, *units))
 
 
 def _courses(touches) -> list[ChangeCourse]:
@@ -125,3 +148,24 @@ def _more(course: ChangeCourse) -> list[float]:
         float(np.sqrt(weight @ (when - middle) ** 2)),
         *np.interp(np.linspace(0, 1, _PLACES), when, share),
     ]
+
+
+def _sequence(course: ChangeCourse) -> Float[np.ndarray, "T c"]:
+    """`SEQUENCE_VALUES` at `SEQUENCE_PLACES` places in time."""
+    seconds = course.seconds
+    when = np.linspace(seconds[0], seconds[-1], SEQUENCE_PLACES)
+    there = np.isfinite(course.centroid[:, 0])  # at a bridged frame there is none
+    place = np.stack([np.interp(when, seconds[there], one[there]) for one in course.centroid.T], axis=1)
+    steps = np.linalg.norm(np.diff(place, axis=0, prepend=place[:1]), axis=1)
+    speed = steps / max((seconds[-1] - seconds[0]) / (SEQUENCE_PLACES - 1), 1e-9)
+    middle = place - place.mean(axis=0)
+    along = middle @ np.linalg.svd(middle, full_matrices=False)[2][0]
+    along = along - along[0]
+    forwards = along[np.abs(along).argmax()]
+    change, mean, area, half = (
+        np.interp(when, seconds, one) for one in (course.peak, course.mean, course.area, course.half_share)
+    )
+    distance = np.linalg.norm(place - place[0], axis=1)
+    return np.stack(
+        [change, change / course.peak.max(), mean, area, half, speed, distance, np.sign(forwards) * along], axis=1
+    )

@@ -7,10 +7,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jeit.touch.gestures.features import course_features, touch_features
+from jeit.touch.gestures.features import (
+    COURSE_FEATURES,
+    SEQUENCE_VALUES,
+    course_features,
+    sequence_features,
+    touch_features,
+)
 from jeit.touch.learnt.classifiers import CLASSIFIERS, log_odds
 from jeit.touch.learnt.extras import over_folds
 from jeit.touch.learnt.forest import Forest
+from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 
 def logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest:
@@ -20,11 +27,29 @@ def logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest
     return Forest.of_stumps(LogitBoostClassifier().fit(features, label))
 
 
-GESTURE_CLASSIFIERS: dict[str, Callable[..., Any]] = {"logit-boost": logit_boost, **CLASSIFIERS}
-"""Classifiers by name: the paper's, and the nine of skins that learn."""
+def temporal_network(features: Float[np.ndarray, "n k"], label: np.ndarray) -> TemporalNetwork:
+    """A small network on the course, of features as `sequence_features` gives them."""
+    return TemporalNetwork.fit(features, label, whole=len(COURSE_FEATURES), values=len(SEQUENCE_VALUES))
 
-FORMS: dict[str, Callable[..., Any]] = {"seven": touch_features, "course": course_features}
-"""What a touch is described by: the paper's seven features, or its course."""
+
+GESTURE_CLASSIFIERS: dict[str, Callable[..., Any]] = {
+    "logit-boost": logit_boost,
+    **CLASSIFIERS,
+    "temporal-network": temporal_network,
+}
+"""Classifiers by name: the paper's, the nine of skins that learn, and a network on the course."""
+
+FORMS: dict[str, Callable[..., Any]] = {
+    "seven": touch_features,
+    "course": course_features,
+    "sequence": sequence_features,
+}
+"""What a touch is described by: the paper's seven features, those and more of its course, or all of the course."""
+
+
+def forms_of(method: str) -> tuple[str, ...]:
+    """The forms of features that a classifier takes, of those in `FORMS`."""
+    return ("sequence",) if method == "temporal-network" else ("seven", "course")
 
 
 @dataclass(frozen=True)

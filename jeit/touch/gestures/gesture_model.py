@@ -15,10 +15,12 @@ from jeit.touch.gestures.gesture_classifiers import (
     FORMS,
     GESTURE_CLASSIFIERS,
     Scale,
+    forms_of,
     held_out_odds,
     person_folds,
     random_folds,
 )
+from jeit.touch.gestures.reading import Reading
 from jeit.touch.gestures.segmentation import StreamTouch
 from jeit.touch.learnt.answers import Standing
 from jeit.touch.learnt.classifiers import log_odds, probabilities, sharpness_of
@@ -28,7 +30,9 @@ from jeit.touch.needed import need_learning
 METHODS = ("auto", *GESTURE_CLASSIFIERS)
 # Folds that a method is chosen on, at most; and of touches that are like those learnt, the share that passes for such.
 _FOLDS, _LIKE = 10, 0.99
-_KIND, _VERSION = "a jeit gesture model", 1
+GESTURE_FILE = "gestures.skops"
+"""What a model is called in the folder of `jeit touch gestures`."""
+_KIND, _VERSION = "a jeit gesture model", 2
 
 
 @dataclass(frozen=True)
@@ -53,10 +57,11 @@ class GestureModel:
     """A classifier of touches.
 
     **Fields**: `names` (C,) of the gestures; the `method` and the `form` of its features ("seven": the paper's,
-    "course": those and more of the course); their `scale`, the `model` of the classifier and the `sharpness` of its
-    probabilities; `known` (N, k), scaled course features of what was learnt from, their `known_scale`, and the distance
-    from the nearest of them beyond which a touch is unlike all, `farthest`. `standing`: what was said of touches held
-    out, and the errors of all that was tried, the best first, None of a model that was read; `notes` on it.
+    "course": those and more of the course, "sequence": all of it); their `scale`, the `model` of the classifier and the
+    `sharpness` of its probabilities; `known` (N, k), scaled course features of what was learnt from, their
+    `known_scale`, and the distance from the nearest of them beyond which a touch is unlike all, `farthest`. `reading`:
+    how the skin was read, None where nobody said. `standing`: what was said of touches held out, and the errors of all
+    that was tried, the best first, None of a model that was read; `notes` on it.
     """
 
     names: tuple[str, ...]
@@ -68,6 +73,7 @@ class GestureModel:
     known: Float[np.ndarray, "N k"]
     known_scale: Scale
     farthest: float
+    reading: Reading | None = None
     standing: Standing | None = None
     notes: tuple[str, ...] = ()
 
@@ -80,37 +86,43 @@ class GestureModel:
         people: ArrayLike | None = None,
         method: str = "auto",
         form: str = "auto",
+        reading: Reading | None = None,
+        notes: tuple[str, ...] = (),
         progress: Callable[[str], None] | None = None,
     ) -> "GestureModel":
         """Learn the `labels` (n,), names of gestures, of touches, by whom each was made, `people` (n,), names or
         numbers.
 
-        `method`: one of `METHODS`; `form`: "seven", "course" or "auto". Of "auto" that is taken which is right most
-        often of touches by people held out, one after the other, or a tenth of them where there are more than ten;
-        without people, or of one person, of touches held out at random, which promises nothing of other people.
-        `progress` is called with what is tried. Raises `ValueError` for labels and people that are not as many,
-        gestures of fewer than two touches, fewer than two gestures, and names of methods and forms that there are not;
-        `ImportError` without the extra `learn`.
+        `method`: one of `METHODS`; `form`: "seven", "course", "sequence" (the network's) or "auto". Of "auto" that is
+        taken which is right most often of touches by people held out, one after the other, or a tenth of them where
+        there are more than ten; without people, or of one person, of touches held out at random, which promises nothing
+        of other people. `reading`, and `notes` on the touches, are kept with it. `progress` is called with what is
+        tried. Raises `ValueError` for labels and people that are not as many, gestures of fewer than two touches, fewer
+        than two gestures, and names of methods and forms that there are not; `ImportError` without the extra `learn`.
         """
         need_learning()
         check_name("method", method, METHODS)
         check_name("form", form, ("auto", *FORMS))
         named, people_of = _checked(touches, labels, people)
         names, right = np.unique(named, return_inverse=True)
-        notes = []
+        told = list(notes)
         if people_of is not None and len(np.unique(people_of)) > 1:
             folds = person_folds(people_of, _FOLDS)
         else:
             folds = random_folds(right, _FOLDS)
-            notes.append("one person, or nobody, was told of: chosen on touches held out at random, not on people.")
+            told.append("one person, or nobody, was told of: chosen on touches held out at random, not on people.")
         found = []
-        for shape in FORMS if form == "auto" else (form,):
+        for shape in FORMS:
             values = FORMS[shape](touches).values
-            for name in GESTURE_CLASSIFIERS if method == "auto" else (method,):
+            for name in GESTURE_CLASSIFIERS:
+                if method not in ("auto", name) or form not in ("auto", shape) or shape not in forms_of(name):
+                    continue
                 if progress is not None:
                     progress(f"{name} on {shape}")
                 odds = held_out_odds(name, values, right, folds)
                 found.append((float(np.mean(odds.argmax(axis=1) != right)), name, shape, odds))
+        if not found:
+            raise ValueError(f"form: '{method}' takes {' or '.join(forms_of(method))}; '{form}' was asked for.")
         found.sort(key=lambda one: one[0])
         _, chosen, shape, odds = found[0]
         values, courses = FORMS[shape](touches).values, course_features(touches).values
@@ -127,8 +139,9 @@ class GestureModel:
             known=known,
             known_scale=known_scale,
             farthest=_farthest(known, folds),
+            reading=reading,
             standing=Standing(tried[0][0], tried, names[odds.argmax(axis=1)], named),
-            notes=tuple(notes),
+            notes=tuple(told),
         )
 
     def predict(self, touches: list[StreamTouch]) -> Gestures:
@@ -152,21 +165,25 @@ class GestureModel:
         own = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "standing"}
         for name in ("scale", "known_scale"):
             own[name] = {one.name: getattr(own[name], one.name) for one in fields(Scale)}
-        write_plain(path, _KIND, _VERSION, own, "gestures.skops")
+        own["reading"] = None if self.reading is None else vars(self.reading)
+        write_plain(path, _KIND, _VERSION, own, GESTURE_FILE)
 
     @classmethod
     def read(cls, path: str | Path) -> "GestureModel":
-        """Undo `write`; nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` for files of
-        another kind, and such as hold anything else than numbers and estimators of scikit-learn."""
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"'{path}': there is no such file; GestureModel.write makes one.")
+        """Undo `write`, or read the folder of `jeit touch gestures`; nothing in the file is executed. Raises
+        `FileNotFoundError`, and `ValueError` for files of another kind, and such as hold anything else than numbers and
+        estimators of scikit-learn."""
+        path = Path(path) / GESTURE_FILE if Path(path).is_dir() else Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"'{path}': there is no such file; `jeit touch gestures` makes one.")
 
         def make(own: dict[str, Any]) -> "GestureModel":
-            scales = {name: Scale(**own[name]) for name in ("scale", "known_scale")}
-            whole: Any = own | scales | {"names": tuple(own["names"]), "notes": tuple(own["notes"])}
+            parts: dict[str, Any] = {name: Scale(**own[name]) for name in ("scale", "known_scale")}
+            parts["reading"] = None if own["reading"] is None else Reading(**own["reading"])
+            whole: Any = own | parts | {"names": tuple(own["names"]), "notes": tuple(own["notes"])}
             return cls(**whole)
 
-        return read_plain(Path(path), _KIND, _VERSION, "gesture model", make)
+        return read_plain(path, _KIND, _VERSION, "gesture model", make)
 
 
 def _checked(touches, labels, people) -> tuple[np.ndarray, np.ndarray | None]:

@@ -24,6 +24,7 @@ from jeit.touch.learnt.neighbourhood import Neighbourhood
 from jeit.touch.learnt.network import Network
 from jeit.touch.learnt.numbers import LearntNumbers
 from jeit.touch.learnt.spread import Spread
+from jeit.touch.learnt.temporal_network import TemporalNetwork
 from jeit.touch.learnt.whitening import Whitened
 from jeit.touch.needed import need_learning
 
@@ -51,6 +52,7 @@ _OURS = {
         SelfOrganisingMap,
         Spread,
         Standardised,
+        TemporalNetwork,
         Whitened,
     )
 }

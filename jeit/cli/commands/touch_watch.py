@@ -1,0 +1,249 @@
+"""`jeit touch gestures` and `jeit touch watch`: gestures learnt from recordings, and named as they end."""
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jeit.cli.options import AsIs, Quiet, check_positive, make_folder, naming_options
+
+Skin = Annotated[
+    Path,
+    typer.Option(metavar="SKIN.toml", help="Geometry, electrodes and protocol of the skin.", show_default=False),
+]
+
+
+def gestures(
+    recordings: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RECORDINGS.npz",
+            help="n recordings, one after the other: voltages (F, M) and seconds (F,) of all frames; start (n + 1,), "
+            "where each begins among them; gesture (n,) text; person (n,), if more than one; reference (M,) and "
+            "untouched (u, M), frames of the untouched skin.",
+            show_default=False,
+        ),
+    ],
+    skin: Skin,
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="MODEL", help="Folder for the learnt gestures.", show_default=False),
+    ],
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help="logit-boost, linear-discriminant, temporal-network or another classifier; auto (default): what is "
+            "right most often of people held out."
+        ),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Learn gestures from recordings of them; says how often they are told right, of people who were held out.
+
+    Writes gestures.skops, report.json and gestures.png, what was taken for what, to the folder MODEL.
+    """
+    from rich.console import Console
+
+    from jeit.cli.console import Steps, pairs
+    from jeit.data import GestureSet, load_description
+    from jeit.imaging import learn_gestures
+    from jeit.report.gestures import GESTURE_FILES, write_gestures
+
+    make_folder(output, GESTURE_FILES)
+    console = Console(highlight=False)
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        with naming_options({"which": "--skin", "description": "--skin"}):
+            description = load_description(skin)
+        made = GestureSet.read(recordings)
+        step("learn")
+        learnt = learn_gestures(description, made, method=method or "auto", progress=step.tell)
+        step("write")
+        write_gestures(learnt, output, name=recordings.name)
+    if quiet:
+        return
+    model, standing = learnt.model, learnt.model.standing
+    people = len(set(made.person.tolist()))
+    rows = [("recordings", f"{len(made)}, of {people} {'people' if people > 1 else 'person'}")]
+    rows += [("gestures", ", ".join(model.names)), ("classifier", f"{model.method} on {model.form}")]
+    if standing is not None:
+        right = standing.held_out == standing.right
+        by = ", ".join(f"{one} {100 * right[standing.right == one].mean():.0f}" for one in model.names)
+        rows.append(("right, held out", f"{100 * right.mean():.1f} % ({by})"))
+    rows += [("note", note) for note in model.notes]
+    console.print()
+    console.print(pairs(f"Learnt from {recordings.name}", rows))
+    console.print(f"[dim]Written:[/dim] {output / 'gestures.skops'}, report.json, gestures.png", soft_wrap=True)
+
+
+def watch(
+    stream: Annotated[
+        str,
+        typer.Argument(
+            help="File of frames (.npz with frames and seconds, or a table), or - for standard input: a frame a line, "
+            "its voltages parted by spaces or commas (nan: no reading).",
+            show_default=False,
+        ),
+    ],
+    skin: Skin,
+    gestures: Annotated[
+        Path, typer.Option(metavar="MODEL", help="Folder of 'jeit touch gestures', or its file.", show_default=False)
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for events.csv and timeline.png.", show_default=False)
+    ],
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="File of frames of the untouched skin; else the stream's own, or how it begins."),
+    ] = None,
+    untouched: Annotated[
+        float, typer.Option(help="Seconds at the stream's beginning in which nobody touches the skin.")
+    ] = 1.0,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Frames in a second, where no times say; that of what was learnt unless given. Standard "
+            "input: the clock."
+        ),
+    ] = None,
+    patience: Annotated[
+        float, typer.Option(help="Seconds after which a touch is taken for how the skin is now.")
+    ] = 30.0,
+    quiet: Quiet = False,
+    as_is: AsIs = False,
+) -> None:
+    """Name touches as they end: when, where, which gesture, and how probable that is.
+
+    Writes events.csv and paths.csv line by line, and at the end report.json and timeline.png. Of standard input a line
+    is printed with the first frame after a touch; where that goes on within 100 ms it is named anew.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+    from rich.console import Console
+
+    from jeit.arguments import counted
+    from jeit.cli.console import Steps
+    from jeit.data import load_description, read_frame_recording
+    from jeit.imaging import TouchImages, TouchWatch
+    from jeit.imaging.touch_images import TOUCH_IMAGES
+    from jeit.report.touch_watch import WATCH_FILES, write_watch
+    from jeit.touch import GestureModel
+
+    check_positive({"--untouched": untouched, "--patience": patience} | ({} if rate is None else {"--rate": rate}))
+    make_folder(output, WATCH_FILES)
+    console = Console(highlight=False)
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        with naming_options({"description": "--skin"}):
+            description = load_description(skin)
+        model = GestureModel.read(gestures)
+        still = None if reference is None else read_frame_recording(reference, description).frames
+        usual = 60.0 if model.reading is None else model.reading.rate
+        if stream == "-":
+            live = _Standard(rate)
+            still = live.untouched(untouched) if still is None else still
+            frames, own = iter(live), live.rate_seen or usual
+        else:
+            frames, still, own = _recorded(Path(stream), description, still, untouched, rate or usual)
+        step("prepare")
+        images = TouchImages.prepare(description, still, replace(TOUCH_IMAGES, as_is=as_is), progress=step.tell)
+        watch = TouchWatch.create(images, model, still, rate=own, patience=patience)
+    for note in () if quiet else watch.notes:
+        console.print(f"  note: {note}", soft_wrap=True, markup=False)
+
+    def show(one) -> None:
+        # Live, a touch is named with the first frame that has none; of a file it is told once, as it was in the end.
+        told = one.ended if stream != "-" else () if one.named is None else (one.named,)
+        for touch in () if quiet else told:
+            console.print(_line(touch), markup=False)
+
+    written = write_watch(watch.follow(frames), watch, output, name=stream, progress=show)
+    if quiet:
+        return
+    said = ", ".join(f"{number} {status}" for status, number in sorted(written.counts.items()))
+    unlike = sum(one.unlike for one in written.touches)
+    console.print(f"\n{counted(len(written.seconds), 'frame')}: {said}")
+    console.print(f"{counted(len(written.touches), 'touch')}, {unlike} of them unlike any learnt from")
+    if written.latency.size:
+        middle, high = 1e3 * np.quantile(written.latency, (0.5, 0.99))
+        console.print(f"named within {middle:.1f} ms of the frame after (median), 99 % within {high:.1f} ms")
+    if written.first_reason:
+        console.print(f"first refusal: {written.first_reason}", soft_wrap=True, markup=False)
+    console.print(f"[dim]Written:[/dim] {output / 'events.csv'}, paths.csv, report.json, timeline.png", soft_wrap=True)
+
+
+def _recorded(path: Path, description, still, span: float, rate: float):
+    """Frames of a file with their seconds, those of the untouched skin, and the rate."""
+    import numpy as np
+
+    from jeit.data import read_frame_recording
+    from jeit.imaging import untouched_frames
+
+    recording = read_frame_recording(path, description)
+    seconds = recording.seconds
+    if seconds is None:
+        seconds = np.arange(len(recording.frames)) / rate
+    elif len(seconds) > 1 and np.median(np.diff(seconds)) > 0:
+        rate = 1 / float(np.median(np.diff(seconds)))
+    if still is None:
+        with naming_options({"untouched": "--untouched"}):
+            still = untouched_frames(recording, seconds, span)
+    return zip(seconds.tolist(), recording.frames, strict=True), still, rate
+
+
+class _Standard:
+    """Frames of standard input and their seconds: by the `rate`, or where there is none by the clock, from the first
+    frame on."""
+
+    def __init__(self, rate: float | None):
+        from jeit.imaging.stream_preparation import parse_frames
+
+        self.rate, self.lines = rate, parse_frames(sys.stdin)
+        self.begun, self.number, self.read = 0.0, 0, []
+
+    def __iter__(self) -> Iterator[tuple[float, object]]:
+        yield from self.read
+        for frame in self.lines:
+            yield self._second(), frame
+
+    @property
+    def rate_seen(self) -> float | None:
+        """Frames/s of what has been read; None where that does not tell."""
+        if self.rate is not None or len(self.read) < 2 or self.read[-1][0] <= 0:
+            return self.rate
+        return (len(self.read) - 1) / self.read[-1][0]
+
+    def untouched(self, span: float):
+        """The frames of the first `span` seconds, which will be told of again."""
+        import numpy as np
+
+        for frame in self.lines:
+            self.read.append((self._second(), frame))
+            if self.read[-1][0] >= span:
+                break
+        rows = [frame for _, frame in self.read if isinstance(frame, list)]
+        if not rows:
+            raise ValueError("standard input: there was no frame of numbers in it.")
+        widths = [len(one) for one in rows]
+        usual = max(set(widths), key=widths.count)
+        return np.array([one for one in rows if len(one) == usual])
+
+    def _second(self) -> float:
+        now = time.monotonic()
+        self.begun = now if self.number == 0 else self.begun
+        second = now - self.begun if self.rate is None else self.number / self.rate
+        self.number += 1
+        return second
+
+
+def _line(one) -> str:
+    course = one.touch.course
+    x, y = 1e3 * course.centroid[int(course.peak.argmax())]
+    name = "unlike any" if one.unlike else f"{one.gesture:<12}{100 * one.probability:3.0f} %"
+    return (
+        f"  {one.touch.onset:8.2f} s  {one.touch.offset - one.touch.onset:5.2f} s  {name:<18} ({x:+.0f}, {y:+.0f}) mm"
+    )

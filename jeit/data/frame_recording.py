@@ -1,0 +1,93 @@
+"""Frames of a skin as they were recorded, with the times they came at: an NPZ file, or any table that is described."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.arguments import npz_arrays
+from jeit.data import table
+from jeit.data.description import Description
+
+_FRAMES, _TIMES = ("voltages", "frames"), ("seconds", "time")
+
+
+@dataclass(frozen=True)
+class FrameRecording:
+    """**Fields**: `frames` (F, M), volts, NaN where there is no reading; `seconds` (F,), None where nothing says;
+    `reference` (M,) or (r, M) of the untouched skin, volts, None where there is none; `name`."""
+
+    frames: Float[np.ndarray, "F M"]
+    seconds: Float[np.ndarray, " F"] | None
+    reference: Float[np.ndarray, "r M"] | None
+    name: str
+
+
+def read_frame_recording(path: str | Path, description: Description) -> FrameRecording:
+    """Frames of a file: NPZ with `frames` or `voltages` (F, M), and if it has them `seconds` or `time` (F,) and
+    `reference` (M,) or (r, M) of the untouched skin; or a table (.csv, .txt, .dat, .npy), a frame a row unless `[data]`
+    of the description says otherwise, where a frame named "reference" is that.
+
+    Raises `FileNotFoundError`, and `ValueError` for what is no such file, other numbers of channels than the protocol
+    has, and times that fall, are not finite or not as many.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"'{path}': it is a folder; give a file of frames.")
+    if not path.is_file():
+        raise FileNotFoundError(f"'{path}': there is no such file.")
+    if not table.recognises(path):
+        raise ValueError(f"'{path}': give frames as {', '.join(table.SUFFIXES)}.")
+    protocol = description.protocol(path)
+    if protocol is None:
+        raise ValueError(f'{description.origin}: add a [protocol] section, with kind = "adjacent" or another.')
+    layout, scale, arrays = description.layout, description.layout.scale, {}
+    try:
+        if path.suffix.lower() == ".npz":
+            arrays = npz_arrays(path, *_FRAMES, *_TIMES, "reference", *layout.keys)
+            key = next((one for one in (*layout.keys, *_FRAMES) if one in arrays), None)
+            if key is None:
+                raise ValueError(f"there is no array 'frames'; the file holds {', '.join(arrays[''][:12])}.")
+            given = arrays[key]
+        else:
+            given = table.numbers(path, layout)
+        if np.asarray(given).dtype.kind not in "iufc":
+            raise ValueError(f"frames are {np.asarray(given).dtype}; give numbers, in volts.")
+        frames = table.frames_from(np.atleast_2d(given), layout, path.name)
+        if np.iscomplexobj(frames):
+            raise ValueError("frames are complex; choose a part with [data] component: real, imaginary or magnitude.")
+        frames = _checked("frames", frames * scale, protocol.num_measurements)
+        seconds = next((_times(arrays[one], one, len(frames)) for one in _TIMES if one in arrays), None)
+        reference = None
+        if "reference" in arrays:
+            reference = _checked("reference", np.atleast_2d(arrays["reference"]) * scale, protocol.num_measurements)
+        elif "reference" in layout.frame_names and len(layout.frame_names) == len(frames):
+            own = np.array(layout.frame_names) == "reference"
+            frames, reference = frames[~own], frames[own]
+    except ValueError as error:
+        raise ValueError(f"'{path}': {error}") from None
+    return FrameRecording(frames, seconds, reference, path.name)
+
+
+def _checked(name: str, given: np.ndarray, channels: int) -> Float[np.ndarray, "F M"]:
+    if given.dtype.kind not in "iuf" or given.ndim != 2 or given.shape[1] != channels:
+        raise ValueError(
+            f"{name} have shape {given.shape}; give one row for each frame, of the protocol's {channels} channels."
+        )
+    if not len(given):
+        raise ValueError(f"{name}: there is none.")
+    values = given.astype(float)
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _times(given: np.ndarray, name: str, number: int) -> Float[np.ndarray, " F"]:
+    if given.dtype.kind not in "iuf" or given.shape != (number,):
+        raise ValueError(f"{name} is {given.dtype} of shape {given.shape}; give seconds for each of {number} frames.")
+    seconds = given.astype(float)
+    if not np.isfinite(seconds).all():
+        raise ValueError(f"{name}: some are not finite.")
+    falls = np.flatnonzero(np.diff(seconds) < 0)
+    if falls.size:
+        raise ValueError(f"{name} fall after frame {falls[0]}, {seconds[falls[0]]:g} s: sort frames by time.")
+    return seconds

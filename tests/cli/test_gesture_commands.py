@@ -1,0 +1,155 @@
+"""`jeit touch gestures` and `jeit touch watch`: learnt from a file, named from files and from standard input."""
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+from gesture_skin import RATE, TOML, gestures_and_stream
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("gestures")
+    made, stream = gestures_and_stream()
+    made.write(folder / "gestures.npz")
+    (folder / "skin.toml").write_text(TOML, "utf-8")
+    np.savez(folder / "stream.npz", frames=stream.voltages, seconds=stream.seconds)
+    np.savetxt(folder / "stream.csv", stream.voltages, delimiter=",")
+    np.savetxt(folder / "rest.csv", stream.voltages[:60], delimiter=",")
+    (folder / "empty.csv").write_text("", "utf-8")
+    np.savez(folder / "none.npz", frames=np.zeros((0, 48)), seconds=np.zeros(0))
+    np.savez(folder / "fewer.npz", frames=stream.voltages[:, :40], seconds=stream.seconds)
+    np.savez(folder / "falling.npz", frames=stream.voltages, seconds=stream.seconds[::-1])
+    np.savez(folder / "short.npz", frames=stream.voltages, seconds=stream.seconds[:-1])
+    np.savez(folder / "broken.npz", frames=np.full_like(stream.voltages, np.nan), seconds=stream.seconds)
+    (folder / "bare.toml").write_text(TOML[TOML.index("[protocol]") :] + "number = 8\n", "utf-8")
+    (folder / "text.npz").write_text("text", "utf-8")
+    return folder, stream
+
+
+@pytest.fixture(scope="module")
+def model(files):
+    from jeit.cli import main
+
+    folder, _ = files
+    arguments = ("touch", "gestures", folder / "gestures.npz", "--skin", folder / "skin.toml", "-o", folder / "model")
+    assert main([*map(str, arguments), "--method", "linear-discriminant", "--quiet"]) == 0
+    return folder / "model"
+
+
+def events(folder):
+    return list(csv.DictReader((folder / "events.csv").read_text("utf-8").splitlines()))
+
+
+def test_gestures_are_learnt(files, run, tmp_path):
+    folder, _ = files
+    status, output, error = run(
+        *("touch", "gestures", folder / "gestures.npz", "--skin", folder / "skin.toml", "--output", tmp_path),
+        *("--method", "nearest"),
+    )
+    assert (status, error) == (0, "")
+    assert "36, of 2 people" in output
+    assert "right, held out" in output
+    report = json.loads((tmp_path / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
+    assert report["reading"]["num_channels"] == 48
+    assert {one["classifier"] for one in report["held_out"]["tried"]} == {"nearest on seven", "nearest on course"}
+    assert (tmp_path / "gestures.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_file_is_watched(files, model, run):
+    folder, stream = files
+    status, output, error = run(
+        *("touch", "watch", folder / "stream.npz", "--skin", folder / "skin.toml", "--gestures", model),
+        *("--output", folder / "out"),
+    )
+    assert (status, error) == (0, "")
+    assert "99 % within" in output
+    told = events(folder / "out")
+    onset = np.array([float(one["onset_s"]) for one in told])
+    assert all(np.abs(onset - start).min() < 0.2 for start in stream.onset)
+    assert len(told) < 2 * len(stream.onset)
+    for one in told:
+        assert one["gesture"] in ("tap", "pat", "push", "stroke", "scratch", "slap")
+        assert 0 < float(one["probability"]) <= 1
+        assert abs(float(one["x_m"])) <= 0.16
+        assert abs(float(one["y_m"])) <= 0.1
+    paths = list(csv.DictReader((folder / "out" / "paths.csv").read_text("utf-8").splitlines()))
+    assert {one["touch"] for one in paths} == {one["touch"] for one in told}
+    report = json.loads((folder / "out" / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
+    assert report["frames"] == len(stream.seconds)
+    assert report["touches"] == len(told)
+    assert (folder / "out" / "timeline.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_table_by_its_rate_tells_the_same(files, model, run, tmp_path):
+    folder, _ = files
+    status, _, error = run(
+        *("touch", "watch", folder / "stream.csv", "--skin", folder / "skin.toml", "--gestures", model),
+        *("--rate", RATE, "--reference", folder / "rest.csv", "--output", tmp_path, "--quiet"),
+    )
+    assert (status, error) == (0, "")
+    assert len(events(tmp_path)) == len(events(folder / "out"))
+
+
+def test_standard_input_is_watched(files, model, run, tmp_path, monkeypatch):
+    folder, stream = files
+    lines = "\n".join(" ".join(map(repr, map(float, row))) for row in stream.voltages[:420])
+    monkeypatch.setattr("sys.stdin", io.StringIO(lines + "\nno numbers\n"))
+    status, output, error = run(
+        *("touch", "watch", "-", "--skin", folder / "skin.toml", "--gestures", model, "--output", tmp_path),
+        *("--rate", RATE),
+    )
+    assert (status, error) == (0, "")
+    assert "1 refused" in output
+    assert len(events(tmp_path)) >= 2
+
+
+@pytest.mark.parametrize(
+    ("stream", "options", "said"),
+    [
+        ("empty.csv", {}, "holds no numbers"),
+        ("none.npz", {}, "frames: there is none"),
+        ("fewer.npz", {}, "of the protocol's 48 channels"),
+        ("falling.npz", {}, "seconds fall after frame 0"),
+        ("short.npz", {}, "give seconds for each of"),
+        ("broken.npz", {}, "--untouched: the first 1 s of 'broken.npz' have 0 frames with a reading"),
+        ("text.npz", {}, "not an NPZ file"),
+        ("missing.npz", {}, "there is no such file"),
+        ("skin.toml", {}, "give frames as .csv"),
+        ("stream.npz", {"--rate": "0"}, "--rate must be positive"),
+        ("stream.npz", {"--untouched": "0"}, "--untouched must be positive"),
+        ("stream.npz", {"--patience": "nan"}, "--patience must be positive"),
+        ("stream.npz", {"--skin": "bare.toml"}, "images of touches need [geometry], [electrodes] too"),
+        ("stream.npz", {"--skin": "nowhere.toml"}, "there is no such file"),
+        ("stream.npz", {"--gestures": "nowhere"}, "`jeit touch gestures` makes one"),
+        ("stream.npz", {"--gestures": "stream.npz"}, "is not a gesture model"),
+        ("stream.npz", {"--untouched": "0.01"}, "--untouched: the first 0.01 s"),
+    ],
+)
+def test_what_cannot_be_is_said(files, model, run, tmp_path, stream, options, said):
+    folder, _ = files
+    given = {"--skin": "skin.toml", "--gestures": "model", "--output": tmp_path / "out"} | options
+    words = [
+        word
+        for name, value in given.items()
+        for word in (name, folder / value if name in ("--skin", "--gestures") else value)
+    ]
+    status, _, error = run("touch", "watch", folder / stream, *words)
+    assert status == 1
+    assert said in error
+    assert len(error) < 400
+    assert not (tmp_path / "out" / "events.csv").exists()
+
+
+def test_recordings_that_are_none(files, run, tmp_path):
+    folder, _ = files
+    made = gestures_and_stream()[0]
+    skin = ("--skin", folder / "skin.toml", "--output", tmp_path / "out")
+    np.savez(tmp_path / "few.npz", **{**vars(made), "gesture": np.full(len(made), "tap")})
+    assert "two gestures, or more" in run("touch", "gestures", tmp_path / "few.npz", *skin)[2]
+    np.savez(tmp_path / "odd.npz", gesture=made.gesture)
+    assert "there is no array 'start'" in run("touch", "gestures", tmp_path / "odd.npz", *skin)[2]
+    status, _, error = run("touch", "gestures", folder / "gestures.npz", *skin, "--method", "oracle")
+    assert (status, "--method must be one of" in error) == (1, True)
