@@ -15,14 +15,17 @@ import numpy as np
 
 from benchmarks.harness.case import Asked, Case, Options, Result, Table, judged
 from benchmarks.harness.tables import duration
-from benchmarks.harness.timing import say, timed
+from benchmarks.harness.timing import say
 from benchmarks.problems.touching_people import Sheet
 from jeit.data import GestureSet
+from jeit.imaging import TouchImages, TouchWatch, WatchedFrame, learn_gestures
+from jeit.report.touch_watch import WrittenWatch, draw_watch
 from jeit.simulate.people import GESTURES
-from jeit.touch.gestures import GestureModel, StreamTouch, TouchStream
+from jeit.touch.gestures import GestureModel, StreamTouch
 from jeit.touch.gestures.gesture_classifiers import (
     FORMS,
     GESTURE_CLASSIFIERS,
+    forms_of,
     held_out_odds,
     person_folds,
     random_folds,
@@ -35,6 +38,7 @@ PAIRS = (("tap", "pat"), ("pat", "tap"), ("stroke", "scratch"), ("scratch", "str
 # Of those pairs, per cent.
 CONFUSED = {"one person": (14, 15, 7, 7), "many people": (15, 27, 37, 34)}
 THEIRS, HIS = "logit-boost", "seven"
+MINUTE = 60.0  # of the stream, drawn
 # Where sets are kept from one run to the next.
 STORE = Path(tempfile.gettempdir()) / "jeit-gestures"
 
@@ -77,7 +81,7 @@ def run(options: Options) -> Result:
         if quick
         else {"one person": (1, 120, 1), "many people": (35, 5, 2)}
     )
-    names = (THEIRS, "linear-discriminant") if quick else tuple(GESTURE_CLASSIFIERS)
+    names = (THEIRS, "linear-discriminant", "temporal-network") if quick else tuple(GESTURE_CLASSIFIERS)
     folds = 3 if quick else FOLDS
     experiments, sets = {}, {}
     for name, (people, each, seed) in sizes.items():
@@ -87,7 +91,7 @@ def run(options: Options) -> Result:
     one, many = experiments.values()
     found, rows = {}, []
     for form in FORMS:
-        for method in names:
+        for method in (one for one in names if form in forms_of(one)):
             accuracies = []
             for experiment in (one, many):
                 at_random = experiment.confusion(method, form, random_folds(experiment.right, folds))
@@ -98,7 +102,7 @@ def run(options: Options) -> Result:
             rows.append([method, form, *(f"{one:.0f} %" for one in (*accuracies, by_person.diagonal().mean()))])
             say(" | ".join(rows[-1]))
     best = max(
-        ((method, form) for method in names for form in FORMS),
+        ((method, form) for method in names for form in forms_of(method)),
         key=lambda own: found["by person", *own].diagonal().mean(),
     )
     each = [_gestures(name, found[name, THEIRS, HIS], PAPER[name]) for name in experiments]
@@ -110,7 +114,7 @@ def run(options: Options) -> Result:
         for name in experiments
         for (a, b), theirs in zip(PAIRS, CONFUSED[name], strict=True)
     ]
-    answer, end = _seconds(many, sheet, sets["many people"], *best)
+    live = _live(sheet, sets["many people"], best, options)
     tables = [
         Table(["experiment", "by", *GESTURES, "mean"], each, "Gestures", _caption(experiments, folds)),
         Table(
@@ -123,17 +127,14 @@ def run(options: Options) -> Result:
             ["classifier", "features", "one person, at random", "many, at random", "many, by person"],
             rows,
             "Classifiers",
-            "Mean of the gestures, per cent right; seven: the paper's features; course: those and more of its course.",
+            "Mean of the gestures, per cent right; seven: the paper's features; course: those and more of its course; "
+            "sequence: all of it.",
         ),
-        Table(
-            ["what", "a time"],
-            [["a frame followed: imaged, cut", duration(end)], ["a touch told", duration(answer)]],
-            "Times",
-        ),
+        live.table(),
     ]
     if options.output is not None:
         _draw(options.output, many, best)
-    return Result(tables, [] if quick else _asked(found, best, end + answer))
+    return Result(tables, [] if quick else _asked(found, best, live))
 
 
 def _gestures(name: str, confusion: np.ndarray, paper: tuple[int, ...] | None = None) -> list[str]:
@@ -152,18 +153,72 @@ def _caption(experiments: dict[str, Experiment], folds: int) -> str:
     return f"Per cent right, the paper's in brackets. {folds} folds at random, and each person held out. {said}."
 
 
-def _seconds(many: Experiment, sheet: Sheet, made: GestureSet, method: str, form: str) -> tuple[float, float]:
-    """Of telling one touch, and of following one frame."""
-    labels = np.array(GESTURES)[many.right]
-    model = GestureModel.fit(many.touches, labels, people=many.person, method=method, form=form)
-    longest = max(many.touches, key=lambda one: len(one.course))
-    answer = timed(lambda: model.predict([longest]), 20).median
-    _, changes = made.changes(0)
-    stream = TouchStream(sheet.level(made))
-    for frame in range(3):
-        stream = stream.follow(frame / 60, np.asarray(sheet.linear.image(changes[len(changes) // 3])))
-    follow = timed(lambda: stream.follow(1.0, np.asarray(sheet.linear.image(changes[0]))), 20).median
-    return answer, follow
+@dataclass
+class Live:
+    """What was told of a stream of `frames` with so many `touches`: of these `told`, and told `right`; touches that
+    there were none of, `false`; seconds, in 99 of 100 cases at most, from any frame to what was told of it,
+    `followed`, from the frame after a touch to its name, `named`, and from the touch's last frame, `after_end`; and in
+    the middle of the latter computing alone, `usual`."""
+
+    frames: int
+    touches: int
+    told: int
+    right: int
+    false: int
+    followed: float
+    named: float
+    after_end: float
+    usual: float
+
+    def table(self) -> Table:
+        """Of all of it."""
+        rows = [
+            ["touches in the stream, by people who were not learnt from", f"{self.touches}"],
+            ["of these told", f"{self.told}"],
+            ["told right", f"{self.right}"],
+            ["told where there was none", f"{self.false}"],
+            ["a frame followed: imaged, cut (99 % within)", duration(self.followed)],
+            ["a touch named, computing (median)", duration(self.usual)],
+            ["a touch named, computing (99 % within)", duration(self.named)],
+            ["a touch named after its last frame, the next frame waited for (99 % within)", duration(self.after_end)],
+        ]
+        return Table(["what", "measured"], rows, f"A live stream of {self.frames:,} frames at 60 Hz")
+
+
+def _live(sheet: Sheet, made: GestureSet, best: tuple[str, str], options: Options) -> Live:
+    """A stream by four people whom the model does not know, followed frame by frame."""
+    model = learn_gestures(sheet.description, made, method=best[0], form=best[1]).model
+    stream = sheet.stream(4, 5 if options.quick else 60, 3, store=None if options.quick else STORE)
+    still = stream.voltages[stream.seconds < 1.0]
+    watch = TouchWatch.create(TouchImages.prepare(sheet.description, still), model, still, rate=60.0)
+    watched = list(watch.follow(zip(stream.seconds.tolist(), stream.voltages, strict=True)))
+    touches = [touch for one in watched for touch in one.ended]
+    if options.output is not None:
+        _draw_timeline(options.output / "timeline.png", watch, watched)
+    onset = np.array([one.touch.onset for one in touches])
+    own = [np.flatnonzero(np.abs(onset - begin) < 0.25) for begin in stream.onset]
+    told = [(one[0], name) for one, name in zip(own, stream.gesture, strict=True) if one.size]
+    named = np.array([one.named.latency for one in watched if one.named is not None] or [np.nan])
+    waited = np.array([one.named.named - one.named.touch.offset for one in watched if one.named is not None] or [0.0])
+    return Live(
+        frames=len(stream.seconds),
+        touches=len(stream.onset),
+        told=len(told),
+        right=sum(touches[number].gesture == name for number, name in told),
+        false=len(touches) - len({number for number, _ in told}),
+        followed=float(np.quantile([one.latency for one in watched], 0.99)),
+        named=float(np.quantile(named, 0.99)),
+        after_end=float(np.quantile(waited + named, 0.99)),
+        usual=float(np.median(named)),
+    )
+
+
+def _draw_timeline(path: Path, watch: TouchWatch, watched: list[WatchedFrame]) -> None:
+    """The first minute of the stream."""
+    shown = [one for one in watched if one.second < MINUTE]
+    touches = tuple(touch for one in shown for touch in one.ended)
+    seconds, peaks = (np.array([getattr(one, name) for one in shown]) for name in ("second", "peak"))
+    draw_watch(WrittenWatch(touches, seconds, peaks, np.zeros(0), {}), watch).savefig(path, dpi=110)
 
 
 def _draw(output: Path, many: Experiment, best: tuple[str, str]) -> None:
@@ -176,7 +231,7 @@ def _draw(output: Path, many: Experiment, best: tuple[str, str]) -> None:
         plot_confusion(model.standing).figure.savefig(output / "gestures.png", dpi=150)
 
 
-def _asked(found: dict, best: tuple[str, str], latency: float) -> list[Asked]:
+def _asked(found: dict, best: tuple[str, str], live: Live) -> list[Asked]:
     """What the paper finds, as far as it can be compared."""
     one, many = (found[name, THEIRS, HIS] for name in PAPER)
     left_out = found["by person", *best].diagonal().mean()
@@ -201,7 +256,11 @@ def _asked(found: dict, best: tuple[str, str], latency: float) -> list[Asked]:
     return [
         *asked,
         Asked("of people who were not learnt from, by the best classifier", f"{left_out:.0f} % ({', '.join(best)})"),
-        judged("a touch is told within 50 ms of the frame that ends it", duration(latency), latency < 0.05),
+        judged(
+            "on a live stream of 10,000 frames at 60 Hz a touch is named within 50 ms of its end (99 %)",
+            f"{duration(live.after_end)} after its last frame, {duration(live.named)} of it computing",
+            live.after_end < 0.05,
+        ),
     ]
 
 
@@ -209,6 +268,7 @@ CASE = Case(
     "gestures",
     "six gestures told apart, by LogitBoost and others, beside the paper's",
     run,
-    12,
-    timed=False,
+    25,
+    page=("docs/gestures.md", "gestures"),
+    pictures=True,
 )

@@ -15,12 +15,13 @@ import numpy as np
 
 from jeit import ForwardModel, one_step
 from jeit.data import GestureSet
+from jeit.data.description import parse_description
 from jeit.electrodes import SheetDiscs
 from jeit.layout import perimeter
 from jeit.mesh import Rectangle
 from jeit.protocol import reference_electrode
 from jeit.simulate import PressedSkin, material
-from jeit.simulate.people import MANNERS, Person, simulate_gestures
+from jeit.simulate.people import MANNERS, GestureStream, Person, simulate_gesture_stream, simulate_gestures
 from jeit.touch.gestures import StreamTouch, TouchLevel, find_touches
 
 SIDES, INSET, EYELET, CURRENT, CONTACT = (0.32, 0.2), 0.01, 0.007, 1.8e-3, 1e-3
@@ -30,7 +31,7 @@ _VERSION = 1
 
 
 class Sheet:
-    """The sheet: `skin`, as it is, with `fine` nodes, and what images it: `linear`, and `outline`."""
+    """The sheet: `skin`, as it is, with `fine` nodes, and what images it: `linear`, and `outline`; `description`."""
 
     def __init__(self, fine: int = FINE_NODES, nodes: int = NODES):
         self.outline = Rectangle(*SIDES)
@@ -43,6 +44,19 @@ class Sheet:
         )
         model = ForwardModel(self.outline.mesh(num_points=nodes), electrodes, protocol)
         self.linear = one_step(model, own.conductivity * own.thickness)
+        self.description = parse_description(
+            {
+                "geometry": {"shape": "rectangle", "width": SIDES[0], "height": SIDES[1]},
+                "electrodes": {
+                    "kind": "disc",
+                    "radius": EYELET / 2,
+                    "contact_impedance": CONTACT,
+                    "positions": places.tolist(),
+                },
+                "protocol": {"kind": "reference_electrode", "current": CURRENT},
+            },
+            "sheet.toml",
+        )
 
     def level(self, made: GestureSet) -> TouchLevel:
         """Of what the untouched sheet's images show."""
@@ -60,10 +74,7 @@ class Sheet:
     def gestures(self, people: int, each: int, seed: int, *, store: Path | None = None) -> GestureSet:
         """`each` times each gesture by so many people, drawn from `seed`; read from the folder `store` where it was
         made before, and written there."""
-        # All that decides what is made, but for the code, which the version stands for.
-        decides = people, each, seed, self.skin.model.mesh.num_cells, self.skin.material, MANNERS, _VERSION
-        name = repr(decides)
-        path = None if store is None else store / f"gestures-{hashlib.sha256(name.encode()).hexdigest()[:12]}.npz"
+        path = self._path("gestures", store, people, each, seed)
         if path is not None and path.exists():
             return GestureSet.read(path)
         for_people, for_touches = jax.random.split(jax.random.key(seed))
@@ -73,3 +84,25 @@ class Sheet:
             path.parent.mkdir(parents=True, exist_ok=True)
             made.write(path)
         return made
+
+    def stream(self, people: int, number: int, seed: int, *, store: Path | None = None) -> GestureStream:
+        """`number` gestures one after another by so many people, drawn from `seed`; kept as `gestures` are."""
+        path = self._path("stream", store, people, number, seed)
+        if path is not None and path.exists():
+            with np.load(path, allow_pickle=False) as kept:
+                return GestureStream(**kept)
+        for_people, for_touches = jax.random.split(jax.random.key(seed))
+        drawn = [Person.draw(one) for one in jax.random.split(for_people, people)]
+        made = simulate_gesture_stream(for_touches, self.skin, self.outline, drawn, number)
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez_compressed(path, **vars(made))
+        return made
+
+    def _path(self, kind: str, store: Path | None, *sizes: int) -> Path | None:
+        """Where such a set is kept: its name holds all that decides what is made, but for the code, which the version
+        stands for."""
+        if store is None:
+            return None
+        decides = *sizes, self.skin.model.mesh.num_cells, self.skin.material, MANNERS, _VERSION
+        return store / f"{kind}-{hashlib.sha256(repr(decides).encode()).hexdigest()[:12]}.npz"

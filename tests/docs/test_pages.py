@@ -74,6 +74,11 @@ def _design(names: dict, folder: Path, printed: list[str]) -> None:
     assert "least Θ 19.5 mV, A 0.056" in printed
 
 
+def _gestures(names: dict, folder: Path, printed: list[str]) -> None:
+    assert len(printed) >= 4
+    assert all(line.endswith("%") for line in printed)
+
+
 def _health(names: dict, folder: Path, printed: list[str]) -> None:
     (event,) = names["health"].events
     assert event.frame == 300
@@ -108,6 +113,7 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "README.md": _readme,
     "contacts.md": _contacts,
     "design.md": _design,
+    "gestures.md": _gestures,
     "health.md": _health,
     "hearing.md": _hearing,
     "pressing.md": _pressing,
@@ -134,7 +140,14 @@ def test_a_page_runs(page, tmp_path, monkeypatch, capsys, request):
 
 
 # Pages whose files those after them use too, and then what a reader types first.
-TYPED = ["docs/data.md", "docs/hearing.md", "docs/learning.md", "docs/choosing-a-hyperparameter.md", "README.md"]
+TYPED = [
+    "docs/data.md",
+    "docs/hearing.md",
+    "docs/learning.md",
+    "docs/gestures.md",
+    "docs/choosing-a-hyperparameter.md",
+    "README.md",
+]
 LONG = ("jeit layout optimise", "jeit study run")  # minutes; each has tests of its own
 
 

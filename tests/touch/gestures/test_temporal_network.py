@@ -1,0 +1,96 @@
+"""The network on a touch's course: learns what features of the whole do not tell, and is the same in NumPy."""
+
+import numpy as np
+import pytest
+from made_touches import KINDS, touch, touches
+
+from jeit.touch.gestures import GestureModel, touch_features
+from jeit.touch.gestures.features import (
+    COURSE_FEATURES,
+    SEQUENCE_FEATURES,
+    SEQUENCE_PLACES,
+    SEQUENCE_VALUES,
+    course_features,
+    sequence_features,
+)
+from jeit.touch.gestures.gesture_classifiers import forms_of
+from jeit.touch.learnt.temporal_network import TemporalNetwork
+
+
+def test_the_sequence_is_the_course_place_by_place():
+    made = [touch(kind, np.random.default_rng(3)) for kind in KINDS]
+    found = sequence_features(made)
+    assert found.names == SEQUENCE_FEATURES
+    assert len(found.units) == found.values.shape[1] == len(found.names)
+    whole = len(COURSE_FEATURES)
+    np.testing.assert_array_equal(found.values[:, :whole], course_features(made).values)
+    places = found.values[:, whole:].reshape(len(made), SEQUENCE_PLACES, len(SEQUENCE_VALUES))
+    course = made[2].course  # a stroke, 0.1 m along
+    own = dict(zip(SEQUENCE_VALUES, places[2].T, strict=True))
+    assert own["change"][[0, -1]] == pytest.approx(course.peak[[0, -1]])
+    assert own["share"].max() <= 1
+    moved = np.linalg.norm(course.centroid[-1] - course.centroid[0])
+    assert own["distance"][-1] == pytest.approx(moved)
+    assert own["along"][-1] == pytest.approx(moved, rel=1e-3)
+    assert own["along"][0] == 0
+    duration = touch_features(made).values[2, 4]
+    assert own["speed"].mean() * duration == pytest.approx(moved, rel=0.2)
+
+
+def test_an_order_in_time_is_learnt():
+    """Classes whose values are the same ones, in rising or in falling order: no mean or greatest value parts them."""
+    rng = np.random.default_rng(0)
+    label = rng.integers(0, 2, 400)
+    course = np.sort(rng.normal(size=(400, 16, 2)), axis=1)
+    course[label == 1] = course[label == 1, ::-1]
+    features = np.hstack([rng.normal(size=(400, 3)), course.reshape(400, -1)])
+    network = TemporalNetwork.fit(features[:300], label[:300], whole=3, values=2)
+    said = network.predict_proba(features[300:])
+    np.testing.assert_allclose(said.sum(axis=1), 1)
+    assert np.mean(said.argmax(axis=1) == label[300:]) > 0.95
+    again = TemporalNetwork.fit(features[:300], label[:300], whole=3, values=2)
+    np.testing.assert_array_equal(network.last, again.last)
+
+
+def test_what_jax_trains_is_what_numpy_asks():
+    import jax
+    import jax.numpy as jnp
+
+    rng = np.random.default_rng(0)
+    features, label = rng.normal(size=(70, 3 + 8 * 2)), rng.integers(0, 3, 70)
+    network = TemporalNetwork.fit(features, label, whole=3, values=2)
+    first, second = network.first[0], network.second[0]
+    kernel = jnp.asarray(first.reshape(len(first), 5, 2).transpose(0, 2, 1))  # outputs, values, places
+    course = jnp.asarray(features[:, 3:].reshape(70, 8, 2).transpose(0, 2, 1))
+    hidden = jax.nn.relu(jax.lax.conv(course, kernel, (1,), "SAME") + network.first_bias[0][:, None])
+    kernel = jnp.asarray(second.reshape(len(second), 5, -1).transpose(0, 2, 1))
+    hidden = jax.nn.relu(jax.lax.conv(hidden, kernel, (1,), "SAME") + network.second_bias[0][:, None])
+    pooled = jnp.hstack([features[:, :3], hidden.mean(axis=2), hidden.max(axis=2)])
+    odds = jax.nn.relu(pooled @ network.dense[0].T + network.dense_bias[0]) @ network.last[0].T + network.last_bias[0]
+    alone = TemporalNetwork(
+        *(getattr(network, name)[:1] for name in ("first", "first_bias", "second", "second_bias")),
+        *(getattr(network, name)[:1] for name in ("dense", "dense_bias", "last", "last_bias")),
+        whole=3,
+        classes_=network.classes_,
+    )
+    np.testing.assert_allclose(alone.predict_proba(features), jax.nn.softmax(odds), atol=1e-12)
+
+
+def test_a_model_of_it_is_kept(tmp_path):
+    made, labels, people = touches(people=2)
+    model = GestureModel.fit(made, labels, people=people, method="temporal-network")
+    assert (model.method, model.form) == ("temporal-network", "sequence")
+    model.write(tmp_path / "gestures.skops")
+    asked = touches(people=3, seed=5)
+    said = GestureModel.read(tmp_path / "gestures.skops").predict(asked[0])
+    np.testing.assert_array_equal(said.probabilities, model.predict(asked[0]).probabilities)
+    assert np.mean(said.gesture == asked[1]) > 0.85
+
+
+def test_forms():
+    made, labels, _ = touches(people=2)
+    assert forms_of("temporal-network") == ("sequence",)
+    with pytest.raises(ValueError, match="form: 'temporal-network' takes sequence; 'seven' was asked for"):
+        GestureModel.fit(made, labels, method="temporal-network", form="seven")
+    with pytest.raises(ValueError, match="takes seven or course; 'sequence'"):
+        GestureModel.fit(made, labels, method="nearest", form="sequence")
