@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jeit.arguments import npz_arrays
 from jeit.data import table
-from jeit.data.description import Description
+from jeit.data.description import Description, TableLayout
 
 _FRAMES, _TIMES = ("voltages", "frames"), ("seconds", "time")
 
@@ -24,13 +24,14 @@ class FrameRecording:
     name: str
 
 
-def read_frame_recording(path: str | Path, description: Description) -> FrameRecording:
+def read_frame_recording(path: str | Path, description: Description | None = None) -> FrameRecording:
     """Frames of a file: NPZ with `frames` or `voltages` (F, M), and if it has them `seconds` or `time` (F,) and
     `reference` (M,) or (r, M) of the untouched skin; or a table (.csv, .txt, .dat, .npy), a frame a row unless `[data]`
     of the description says otherwise, where a frame named "reference" is that.
 
-    Raises `FileNotFoundError`, and `ValueError` for what is no such file, other numbers of channels than the protocol
-    has, and times that fall, are not finite or not as many.
+    Without a description, or a protocol in it, any number of channels will do, and units are the file's. Raises
+    `FileNotFoundError`, and `ValueError` for what is no such file, other numbers of channels than the protocol has, and
+    times that fall, are not finite or not as many.
     """
     path = Path(path)
     if path.is_dir():
@@ -39,29 +40,16 @@ def read_frame_recording(path: str | Path, description: Description) -> FrameRec
         raise FileNotFoundError(f"'{path}': there is no such file.")
     if not table.recognises(path):
         raise ValueError(f"'{path}': give frames as {', '.join(table.SUFFIXES)}.")
-    protocol = description.protocol(path)
-    if protocol is None:
-        raise ValueError(f'{description.origin}: add a [protocol] section, with kind = "adjacent" or another.')
-    layout, scale, arrays = description.layout, description.layout.scale, {}
+    layout = TableLayout() if description is None else description.layout
+    protocol = None if description is None else description.protocol(path)
+    channels = None if protocol is None else protocol.num_measurements
     try:
-        if path.suffix.lower() == ".npz":
-            arrays = npz_arrays(path, *_FRAMES, *_TIMES, "reference", *layout.keys)
-            key = next((one for one in (*layout.keys, *_FRAMES) if one in arrays), None)
-            if key is None:
-                raise ValueError(f"there is no array 'frames'; the file holds {', '.join(arrays[''][:12])}.")
-            given = arrays[key]
-        else:
-            given = table.numbers(path, layout)
-        if np.asarray(given).dtype.kind not in "iufc":
-            raise ValueError(f"frames are {np.asarray(given).dtype}; give numbers, in volts.")
-        frames = table.frames_from(np.atleast_2d(given), layout, path.name)
-        if np.iscomplexobj(frames):
-            raise ValueError("frames are complex; choose a part with [data] component: real, imaginary or magnitude.")
-        frames = _checked("frames", frames * scale, protocol.num_measurements)
+        arrays = npz_arrays(path, *_FRAMES, *_TIMES, "reference", *layout.keys) if path.suffix == ".npz" else {}
+        frames = _frames(_table(path, arrays, layout), layout, path.name, channels)
         seconds = next((_times(arrays[one], one, len(frames)) for one in _TIMES if one in arrays), None)
         reference = None
         if "reference" in arrays:
-            reference = _checked("reference", np.atleast_2d(arrays["reference"]) * scale, protocol.num_measurements)
+            reference = _checked("reference", np.atleast_2d(arrays["reference"]) * layout.scale, frames.shape[1])
         elif "reference" in layout.frame_names and len(layout.frame_names) == len(frames):
             own = np.array(layout.frame_names) == "reference"
             frames, reference = frames[~own], frames[own]
@@ -70,11 +58,29 @@ def read_frame_recording(path: str | Path, description: Description) -> FrameRec
     return FrameRecording(frames, seconds, reference, path.name)
 
 
+def _table(path: Path, arrays: dict[str, np.ndarray], layout: TableLayout) -> np.ndarray:
+    """The numbers of a file as they lie in it."""
+    if not arrays:
+        return np.atleast_2d(table.numbers(path, layout))
+    key = next((one for one in (*layout.keys, *_FRAMES) if one in arrays), None)
+    if key is None:
+        raise ValueError(f"there is no array 'frames'; the file holds {', '.join(arrays[''][:12])}.")
+    return np.atleast_2d(arrays[key])
+
+
+def _frames(given: np.ndarray, layout: TableLayout, name: str, channels: int | None) -> Float[np.ndarray, "F M"]:
+    """Of a table, in volts."""
+    if given.dtype.kind not in "iufc":
+        raise ValueError(f"frames are {given.dtype}; give numbers, in volts.")
+    frames = table.frames_from(given, layout, name)
+    if np.iscomplexobj(frames):
+        raise ValueError("frames are complex; choose a part with [data] component: real, imaginary or magnitude.")
+    return _checked("frames", frames * layout.scale, frames.shape[-1] if channels is None else channels)
+
+
 def _checked(name: str, given: np.ndarray, channels: int) -> Float[np.ndarray, "F M"]:
     if given.dtype.kind not in "iuf" or given.ndim != 2 or given.shape[1] != channels:
-        raise ValueError(
-            f"{name} have shape {given.shape}; give one row for each frame, of the protocol's {channels} channels."
-        )
+        raise ValueError(f"{name} have shape {given.shape}; give one row for each frame, of {channels} channels.")
     if not len(given):
         raise ValueError(f"{name}: there is none.")
     values = given.astype(float)

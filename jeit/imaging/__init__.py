@@ -2,7 +2,8 @@
 
 `settings` says how to image, `preparation` checks, meshes and calibrates, `wiring` finds what is not wired as told,
 `method` images, `automatic` decides how, `difference` looks for inclusions; `stream_preparation` makes ready for frame
-after frame. And from a stream of a touched skin to what it means: `touch_images`, `gesture_learning`, `touch_watch`.
+after frame. And from a stream of a touched skin to what it means: `touch_images`, `gesture_learning`, `touch_watch`;
+`health_learning`, what it is like while it is healthy.
 """
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
@@ -10,6 +11,7 @@ from jeit.imaging.compared_rules import ComparedRules, RuleOutcome, compare_on_d
 from jeit.imaging.difference import ImagedDifference, image_difference
 from jeit.imaging.frequencies import ImagedFrequencies, frequency_weight, image_frequencies
 from jeit.imaging.gesture_learning import LearntGestures, learn_gestures
+from jeit.imaging.health_learning import learn_health
 from jeit.imaging.method import METHODS
 from jeit.imaging.preparation import (
     PreparedDifference,
@@ -48,6 +50,7 @@ __all__ = [
     "image_frequencies",
     "imaging_mesh",
     "learn_gestures",
+    "learn_health",
     "prepare_difference",
     "prepare_imager",
     "select_frames",

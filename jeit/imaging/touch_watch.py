@@ -8,6 +8,7 @@ touches; what lasts longer than the `patience` is told as held, and is from then
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -115,7 +116,7 @@ class TouchWatch:
             notes.append(f"gestures were learnt at {learnt:.3g} frames/s, and frames come at {rate:.3g}.")
         return cls(images, level, model, max(_GAP, _FRAMES_APART / rate), patience, tuple(notes))
 
-    def follow(self, frames: Iterable[tuple[float, Float[np.ndarray, " M"]]]) -> Iterator[WatchedFrame]:
+    def follow(self, frames: Iterable[tuple[float, Any]]) -> Iterator[WatchedFrame]:
         """What becomes of frames, each its second and its voltages (M,), as they come.
 
         Frames that are refused, or come with the time of the one before, count as lost. A touch that is there at the

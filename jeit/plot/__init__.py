@@ -23,6 +23,7 @@ from jeit.plot.imaging.mesh import plot_mesh
 from jeit.plot.touch.contact_stages import plot_contact_stages
 from jeit.plot.touch.contacts import plot_contacts
 from jeit.plot.touch.health import plot_health
+from jeit.plot.touch.health_course import plot_health_course
 from jeit.plot.touch.kohonen_map import plot_map
 from jeit.plot.touch.learning import (
     plot_confusion,
@@ -51,6 +52,7 @@ __all__ = [
     "plot_force_errors",
     "plot_frames",
     "plot_health",
+    "plot_health_course",
     "plot_image",
     "plot_key_errors",
     "plot_loss_map",

@@ -11,6 +11,7 @@ from jeit.report.layout_comparison import draw_layout_comparison, report_layout_
 from jeit.report.layout_improvement import draw_improved_layout, report_improved_layout, write_improved_layout
 from jeit.report.learnt_skin import report_learnt_skin, write_learnt_skin, write_touches
 from jeit.report.measurement import report_measurement
+from jeit.report.skin_health import draw_health, report_health, write_health
 from jeit.report.stream import write_stream
 from jeit.report.study import write_study_report
 from jeit.report.touch_watch import draw_watch, report_watch, write_watch
@@ -21,6 +22,7 @@ _tell_old_names(__name__)
 __all__ = [
     "draw_calibration",
     "draw_choice",
+    "draw_health",
     "draw_image",
     "draw_improved_layout",
     "draw_layout_comparison",
@@ -28,6 +30,7 @@ __all__ = [
     "draw_watch",
     "report_choice",
     "report_gestures",
+    "report_health",
     "report_image",
     "report_improved_layout",
     "report_layout_comparison",
@@ -39,6 +42,7 @@ __all__ = [
     "write_choice",
     "write_film",
     "write_gestures",
+    "write_health",
     "write_image",
     "write_improved_layout",
     "write_layout_comparison",

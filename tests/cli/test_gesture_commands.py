@@ -111,7 +111,7 @@ def test_standard_input_is_watched(files, model, run, tmp_path, monkeypatch):
     [
         ("empty.csv", {}, "holds no numbers"),
         ("none.npz", {}, "frames: there is none"),
-        ("fewer.npz", {}, "of the protocol's 48 channels"),
+        ("fewer.npz", {}, "of 48 channels"),
         ("falling.npz", {}, "seconds fall after frame 0"),
         ("short.npz", {}, "give seconds for each of"),
         ("broken.npz", {}, "--untouched: the first 1 s of 'broken.npz' have 0 frames with a reading"),

@@ -5,16 +5,18 @@ from typing import Annotated
 
 import typer
 
+from jeit.cli.commands.touch_health import health
 from jeit.cli.commands.touch_watch import gestures, watch
 from jeit.cli.options import Quiet, make_folder, naming_options
 
 touch = typer.Typer(
     name="touch",
     help="Skins that learn, from recorded presses and without a model, where, how hard and by what they are touched; "
-    "and gestures, named as they end.",
+    "gestures, named as they end; and damage.",
 )
 touch.command()(gestures)
 touch.command()(watch)
+touch.command()(health)
 
 
 # Of the mesh of images: contacts are told between its cells.

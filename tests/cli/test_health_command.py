@@ -1,0 +1,144 @@
+"""`jeit touch health`: damage told of recordings, on frames alone and with a skin described."""
+
+import csv
+import json
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.layout import ring
+from jeit.mesh import Disk
+from jeit.protocol import adjacent
+from jeit.simulate import Disc, MovingPress, PressedSkin, material
+from jeit.simulate.damage import Cut, Mishap, record_mishaps
+
+TOML = """
+[geometry]
+shape = "disk"
+radius = 0.05
+[electrodes]
+kind = "boundary"
+layout = "ring"
+number = 16
+width = 0.008
+contact_impedance = 300.0
+[protocol]
+kind = "adjacent"
+current = 1e-3
+"""
+SECONDS = np.arange(0, 30, 0.2)
+
+
+def touched(rng, number, rest, noise=1e-3):
+    """Frames of a made-up skin with a touch of eight frames in every thirty."""
+    frames = rest + noise * rng.normal(size=(number, len(rest)))
+    for start in range(10, number - 20, 30):
+        frames[start : start + 8] += 0.1 * np.exp(-((np.arange(len(rest)) - rng.uniform(0, len(rest))) ** 2) / 20)
+    return frames
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder, rng = tmp_path_factory.mktemp("health"), np.random.default_rng(0)
+    rest = rng.uniform(0.5, 1.5, 40)
+    np.savetxt(folder / "healthy.csv", touched(rng, 800, rest), delimiter=",")
+    np.savetxt(folder / "again.csv", touched(rng, 600, rest), delimiter=",")
+    hurt = touched(rng, 600, rest)
+    hurt[300:] += 0.03 * rng.normal(size=40)
+    np.savetxt(folder / "hurt.csv", hurt, delimiter=",")
+    np.savez(folder / "timed.npz", frames=hurt, seconds=np.arange(600) / 10)
+    np.savetxt(folder / "fewer.csv", hurt[:, :30], delimiter=",")
+    np.savetxt(folder / "short.csv", hurt[:5], delimiter=",")
+    np.savetxt(folder / "constant.csv", np.ones((100, 40)), delimiter=",")
+    (folder / "empty.csv").write_text("", "utf-8")
+    return folder
+
+
+def events(folder):
+    return list(csv.DictReader((folder / "events.csv").read_text("utf-8").splitlines()))
+
+
+def test_frames_alone_are_enough(files, run, tmp_path):
+    status, output, error = run(
+        "touch", "health", files / "hurt.csv", "--healthy", files / "healthy.csv", "--output", tmp_path
+    )
+    assert (status, error) == (0, "")
+    assert "600 frames: 1 event" in output
+    (event,) = events(tmp_path)
+    assert abs(int(event["frame"]) - 300) < 8
+    assert (event["electrode"], event["path_m"]) == ("", "")
+    report = json.loads((tmp_path / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
+    assert report["units"]["time"] == "frames"
+    assert (tmp_path / "health.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_healthy_skin_has_no_events(files, run, tmp_path):
+    status, _, error = run(
+        *("touch", "health", files / "again.csv", "--healthy", files / "healthy.csv", "--output", tmp_path),
+        *("--rate", 10, "--quiet"),
+    )
+    assert (status, error) == (0, "")
+    assert events(tmp_path) == []
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory):
+    """A disk of film that is cut after twelve seconds, as files."""
+    folder, cut = tmp_path_factory.mktemp("cut"), Cut([(-0.005, 0.014), (0.02, 0.024)])
+    electrodes, film = BoundaryElectrodes(ring(0.05, 16), 0.008, 300.0), material("velostat")
+    mesh = Disk(0.05).mesh(num_points=900, refine=cut.refine(2e-3))
+    whole = PressedSkin(jax.random.key(0), ForwardModel(mesh, electrodes, adjacent(16)), film)
+    torn = eqx.tree_at(lambda one: one.conductivity, whole, cut.conductivity(mesh, whole.conductivity))
+
+    def recorded(key, mishaps):
+        place = 0.03 * np.array([np.cos(2.0 * (SECONDS // 4)), np.sin(2.0 * (SECONDS // 4))]).T
+        load = np.where((SECONDS % 4 > 1) & (SECONDS % 4 < 2), 2.0, 0.0)
+        return record_mishaps(jax.random.key(key), whole, MovingPress(Disc(0.012), load, place), SECONDS, mishaps)
+
+    np.savez(folder / "healthy.npz", frames=recorded(1, []), seconds=SECONDS)
+    np.savez(folder / "cut.npz", frames=recorded(2, [Mishap(12.0, torn)]), seconds=SECONDS)
+    (folder / "skin.toml").write_text(TOML, "utf-8")
+    return folder
+
+
+def test_a_cut_is_drawn_on_a_described_skin(cut, run, tmp_path):
+    status, output, error = run(
+        *("touch", "health", cut / "cut.npz", "--healthy", cut / "healthy.npz", "--skin", cut / "skin.toml"),
+        *("--patience", 9, "--output", tmp_path),
+    )
+    assert (status, error) == (0, "")
+    assert "mm long" in output
+    (event,) = events(tmp_path)
+    assert (event["kind"], event["status"]) == ("cut", "lasting")
+    assert abs(float(event["time"]) - 12.0) < 1.0
+    path = np.array([[float(one) for one in place.split()] for place in event["path_m"].split("; ")])
+    assert np.linalg.norm(path.mean(axis=0) - [0.0075, 0.019]) < 0.01
+    report = json.loads((tmp_path / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
+    assert report["with_a_model"]
+
+
+@pytest.mark.parametrize(
+    ("recording", "healthy", "options", "said"),
+    [
+        ("hurt.csv", "fewer.csv", (), "has 40 channels, and"),
+        ("hurt.csv", "short.csv", (), "5 frames are too few"),
+        ("hurt.csv", "constant.csv", (), "all are constant"),
+        ("empty.csv", "healthy.csv", (), "holds no numbers"),
+        ("nothing.csv", "healthy.csv", (), "there is no such file"),
+        ("timed.npz", "healthy.csv", (), "--rate: only one of the recordings says"),
+        ("hurt.csv", "healthy.csv", ("--rate", -1), "--rate must be positive"),
+        ("hurt.csv", "healthy.csv", ("--patience", 0), "--patience must be positive"),
+        ("hurt.csv", "healthy.csv", ("--skin", "nowhere.toml"), "there is no such file"),
+    ],
+)
+def test_what_cannot_be_is_said(files, run, tmp_path, recording, healthy, options, said):
+    status, _, error = run(
+        *("touch", "health", files / recording, "--healthy", files / healthy, "--output", tmp_path / "out", *options)
+    )
+    assert status == 1
+    assert said in error
+    assert not (tmp_path / "out" / "events.csv").exists()

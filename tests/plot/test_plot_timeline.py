@@ -1,0 +1,94 @@
+"""Touches in time and on the skin, judged by what was drawn: lanes, bars, gaps, colours; a skin's change in time."""
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from jeit.imaging import NamedTouch
+from jeit.mesh import Rectangle
+from jeit.plot import plot_changes, plot_health_course, plot_timeline, plot_touch_paths, plot_tried
+from jeit.touch import SkinHealth, Standing
+from jeit.touch.gestures import ChangeCourse, StreamTouch
+
+NAMES = ("pat", "tap")
+
+
+def named(number, gesture, onset, length, *, unlike=False, cut_off=False, probability=0.9):
+    seconds = onset + np.linspace(0, length, 5)
+    place = np.linspace((0.0, 0.0), (0.02, 0.01), 5)
+    place[2] = np.nan  # bridged
+    ones = np.ones(5)
+    course = ChangeCourse(seconds, ones, -ones, 0.1 * ones, ones, 1e-4 * ones, place)
+    shares = np.array([probability, 1 - probability])
+    touch = StreamTouch(course, 0, False, cut_off)
+    return NamedTouch(number, touch, gesture, probability, shares, unlike, onset + length, 1e-3)
+
+
+@pytest.fixture
+def ax():
+    return Figure().subplots()
+
+
+def test_touches_are_bars_in_their_lanes(ax):
+    touches = [
+        named(1, "pat", 1.0, 0.5),
+        named(2, "tap", 3.0, 0.25, cut_off=True),
+        named(3, "tap", 5.0, 1.0, unlike=True),
+    ]
+    plot_timeline(touches, NAMES, ax=ax)
+    assert [one.get_text() for one in ax.get_yticklabels()] == ["pat", "tap", "unlike any"]
+    assert [(one.get_x(), one.get_width(), round(one.get_y() + 0.36)) for one in ax.patches] == [
+        (1.0, 0.5, 0),
+        (3.0, 0.25, 1),
+        (5.0, 1.0, 2),
+    ]
+    assert {one.get_text() for one in ax.texts} == {"1", "2", "3"}
+    (end,) = ax.lines
+    assert end.get_xdata()[0] == 3.25  # cut off there
+
+
+def test_a_curve_is_thinned_with_its_extremes_and_gaps(ax):
+    seconds = np.arange(50_000) / 60
+    peaks = np.zeros(50_000)
+    peaks[31_415] = 2e-3
+    peaks[100:200] = np.nan
+    plot_changes(seconds, peaks, 1e-3, ax=ax)
+    line = ax.lines[0]
+    assert len(line.get_xdata()) <= 3000
+    assert np.nanmax(line.get_ydata()) == pytest.approx(2.0)
+    assert np.isnan(line.get_ydata()).any()
+    assert ax.get_ylabel() == "Greatest change (mS)"
+    with pytest.raises(ValueError, match="one of each for every frame"):
+        plot_changes(seconds, peaks[:-1], 1e-3, ax=ax)
+
+
+def test_paths_leave_out_what_has_no_place(ax):
+    plot_touch_paths(Rectangle(0.1, 0.05).mesh(num_points=60), [named(1, "pat", 0.0, 1.0)], NAMES, ax=ax)
+    path = next(one for one in ax.lines if len(one.get_xdata()) == 4)
+    assert path.get_xdata()[-1] == pytest.approx(0.02)
+
+
+def test_what_are_no_touches_is_said(ax):
+    for draw in (lambda: plot_timeline([1], NAMES, ax=ax), lambda: plot_timeline(None, NAMES, ax=ax)):
+        with pytest.raises(ValueError, match="touches"):
+            draw()
+
+
+def test_what_was_tried_stands_in_order(ax):
+    standing = Standing("b on seven", [("b on seven", 0.1), ("a on seven", 0.3)], np.array(["x"]), np.array(["x"]))
+    plot_tried(standing, ax=ax)
+    assert [round(one.get_width()) for one in ax.patches] == [90, 70]
+    assert ax.patches[0].get_facecolor() != ax.patches[1].get_facecolor()
+
+
+def test_a_skin_in_time(ax):
+    rng = np.random.default_rng(0)
+    health = SkinHealth.fit(1 + 1e-3 * rng.normal(size=(200, 6)))
+    frames = 1 + 1e-3 * rng.normal(size=(50, 6))
+    frames[20:] += 1.0
+    frames[5] = np.nan
+    plot_health_course(health, np.arange(50), frames, ax=ax)
+    size = ax.lines[0].get_ydata()
+    assert size[:5].max() < 1 < size[20:].min()
+    with pytest.raises(ValueError, match="frames have shape"):
+        plot_health_course(health, np.arange(49), frames, ax=ax)
