@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 _HIDDEN, _DENSE, _WIDE = 24, 32, 5
-_MEMBERS, _BATCH, _EPOCHS, _RATE, _DECAY = 4, 64, 60, 3e-3, 2e-2
+_MEMBERS, _BATCH, _EPOCHS, _RATE, _DECAY = 2, 64, 45, 3e-3, 2e-2
 # Of features' scale, added anew in every batch; how far from certain the labels are taken to be; the share of what is
 # pooled that each batch does without.
 _NOISE, _SMOOTHED, _DROPPED = 0.15, 0.05, 0.2
