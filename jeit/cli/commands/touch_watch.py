@@ -1,8 +1,6 @@
 """`jeit touch gestures` and `jeit touch watch`: gestures learnt from recordings, and named as they end."""
 
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -118,7 +116,8 @@ def watch(
     """Name touches as they end: when, where, which gesture, and how probable that is.
 
     Writes events.csv and paths.csv line by line, and at the end report.json and timeline.png. Of standard input a line
-    is printed with the first frame after a touch; where that goes on within 100 ms it is named anew.
+    is printed with the first frame after a touch; where that goes on within 100 ms it is named anew. Ctrl-C ends it,
+    and all is written.
     """
     from dataclasses import replace
 
@@ -127,8 +126,10 @@ def watch(
 
     from jeit.arguments import counted
     from jeit.cli.console import Steps
+    from jeit.cli.live_frames import LiveFrames
     from jeit.data import load_description, read_frame_recording
     from jeit.imaging import TouchImages, TouchWatch
+    from jeit.imaging.stream_preparation import parse_frames
     from jeit.imaging.touch_images import TOUCH_IMAGES
     from jeit.report.touch_watch import WATCH_FILES, write_watch
     from jeit.touch import GestureModel
@@ -143,10 +144,11 @@ def watch(
         model = GestureModel.read(gestures)
         still = None if reference is None else read_frame_recording(reference, description).frames
         usual = 60.0 if model.reading is None else model.reading.rate
+        live = None
         if stream == "-":
-            live = _Standard(rate)
+            live = LiveFrames(parse_frames(sys.stdin), rate, usual)
             still = live.untouched(untouched) if still is None else still
-            frames, own = iter(live), live.rate_seen or usual
+            frames, own = live, live.rate_seen
         else:
             frames, still, own = _recorded(Path(stream), description, still, untouched, rate or usual)
         step("prepare")
@@ -171,6 +173,8 @@ def watch(
     if written.latency.size:
         middle, high = 1e3 * np.quantile(written.latency, (0.5, 0.99))
         console.print(f"named within {middle:.1f} ms of the frame after (median), 99 % within {high:.1f} ms")
+    if live is not None and live.left_out:
+        console.print(f"{counted(live.left_out, 'frame')} left out that had come before they could be read")
     if written.first_reason:
         console.print(f"first refusal: {written.first_reason}", soft_wrap=True, markup=False)
     console.print(f"[dim]Written:[/dim] {output / 'events.csv'}, paths.csv, report.json, timeline.png", soft_wrap=True)
@@ -193,51 +197,6 @@ def _recorded(path: Path, description, still, span: float, rate: float):
         with naming_options({"untouched": "--untouched"}):
             still = untouched_frames(recording, seconds, span)
     return zip(seconds.tolist(), recording.frames, strict=True), still, rate
-
-
-class _Standard:
-    """Frames of standard input and their seconds: by the `rate`, or where there is none by the clock, from the first
-    frame on."""
-
-    def __init__(self, rate: float | None):
-        from jeit.imaging.stream_preparation import parse_frames
-
-        self.rate, self.lines = rate, parse_frames(sys.stdin)
-        self.begun, self.number, self.read = 0.0, 0, []
-
-    def __iter__(self) -> Iterator[tuple[float, object]]:
-        yield from self.read
-        for frame in self.lines:
-            yield self._second(), frame
-
-    @property
-    def rate_seen(self) -> float | None:
-        """Frames/s of what has been read; None where that does not tell."""
-        if self.rate is not None or len(self.read) < 2 or self.read[-1][0] <= 0:
-            return self.rate
-        return (len(self.read) - 1) / self.read[-1][0]
-
-    def untouched(self, span: float):
-        """The frames of the first `span` seconds, which will be told of again."""
-        import numpy as np
-
-        for frame in self.lines:
-            self.read.append((self._second(), frame))
-            if self.read[-1][0] >= span:
-                break
-        rows = [frame for _, frame in self.read if isinstance(frame, list)]
-        if not rows:
-            raise ValueError("standard input: there was no frame of numbers in it.")
-        widths = [len(one) for one in rows]
-        usual = max(set(widths), key=widths.count)
-        return np.array([one for one in rows if len(one) == usual])
-
-    def _second(self) -> float:
-        now = time.monotonic()
-        self.begun = now if self.number == 0 else self.begun
-        second = now - self.begun if self.rate is None else self.number / self.rate
-        self.number += 1
-        return second
 
 
 def _line(one) -> str:

@@ -1,0 +1,109 @@
+"""Frames of standard input, and the seconds they come at: by a rate, or by the clock."""
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+# Of the usual time between frames, how long is waited for one that comes as it is read, not before; so many in a row;
+# and seconds in which what came before is read, at most.
+_WAITED, _IN_A_ROW, _BEFORE = 0.4, 3, 5.0
+
+
+class LiveFrames:
+    """Pairs of a second and a frame, of `lines` as `parse_frames` gives them, that end with them or as Ctrl-C says.
+
+    By a `rate`, frames/s, all frames count. Without one the clock tells their seconds, which it cannot of frames that
+    came while nobody read: those are left out, `left_out` of them; and where all have come already, as of a file, the
+    `usual` rate is taken.
+    """
+
+    def __init__(self, lines: Iterator[object], rate: float | None, usual: float):
+        self.lines, self.rate, self.usual = lines, rate, usual
+        self.by_clock, self.left_out = rate is None, 0
+        self.read: list[tuple[float, object]] = []
+        self.begun, self.number = 0.0, 0
+        self.waiting, self.stopped = False, False
+
+    @property
+    def rate_seen(self) -> float:
+        """Frames/s of what has been read."""
+        if self.rate is not None:
+            return self.rate
+        seconds = [second for second, _ in self.read]
+        return (len(seconds) - 1) / seconds[-1] if len(seconds) > 1 and seconds[-1] > 0 else self.usual
+
+    def untouched(self, span: float) -> Float[np.ndarray, "u M"]:
+        """The frames of the first `span` seconds, which will come again. Raises `ValueError` where there is none."""
+        self._catch_up()
+        while not self.read or self.read[-1][0] < span:
+            frame = self._next()
+            if frame is None:
+                break
+            self.read.append((self._second(), frame))
+        rows = [frame for second, frame in self.read if isinstance(frame, list) and second <= span]
+        if not rows:
+            raise ValueError("standard input: there was no frame of numbers in it.")
+        widths = [len(one) for one in rows]
+        usual = max(set(widths), key=widths.count)
+        return np.array([one for one in rows if len(one) == usual])
+
+    def __iter__(self) -> Iterator[tuple[float, object]]:
+        on_main = threading.current_thread() is threading.main_thread()
+        earlier = signal.signal(signal.SIGINT, self._stop) if on_main else None
+        try:
+            self._catch_up()
+            yield from self.read
+            while not self.stopped and (frame := self._next()) is not None:
+                yield self._second(), frame
+        except KeyboardInterrupt:
+            return
+        finally:
+            if on_main:
+                signal.signal(signal.SIGINT, earlier)
+
+    def _catch_up(self) -> None:
+        """Leave out what came before it was read; if that is all there is, keep it, by a rate."""
+        if not self.by_clock:
+            return
+        before, in_a_row, start = [], 0, time.monotonic()
+        while time.monotonic() - start < _BEFORE:
+            asked = time.monotonic()
+            frame = self._next()
+            if frame is None:
+                self.rate = self.rate_seen
+                self.number = len(self.read)
+                self.by_clock = False
+                self.read += [(self._second(), one) for one in before]
+                return
+            in_a_row = in_a_row + 1 if time.monotonic() - asked > _WAITED / self.usual else 0
+            if in_a_row == _IN_A_ROW:
+                self.left_out += len(before)
+                self.read.append((self._second(), frame))
+                return
+            before.append(frame)
+        self.left_out += len(before)
+
+    def _second(self) -> float:
+        now = time.monotonic()
+        self.begun = now if self.number == 0 else self.begun
+        second = now - self.begun if self.by_clock else self.number / self.rate_seen
+        self.number += 1
+        return max(second, self.read[-1][0] if self.read else 0.0)
+
+    def _next(self) -> object | None:
+        """The next frame, waited for; None after the last."""
+        self.waiting = True
+        try:
+            return next(self.lines, None)
+        finally:
+            self.waiting = False
+
+    def _stop(self, *_) -> None:
+        """What is under way is finished; waiting ends at once."""
+        self.stopped = True
+        if self.waiting:
+            raise KeyboardInterrupt
