@@ -11,8 +11,9 @@ from jeit.touch.kohonen.training import train
 
 
 def minisoms(weights, frames, order, rates, radii):
-    """What MiniSom makes of the same frames in the same order, and the winners on the way."""
+    """What MiniSom makes of the same frames in the same order: with a radius next to nothing the winner moves alone."""
     oracle = MiniSom(*weights.shape)
+    radii = np.append(radii, np.full(len(order) - len(radii), 0.01))
     oracle._weights = weights.copy()
     oracle._learning_rate_decay_function = lambda rate, step, steps: rates[step]
     oracle._sigma_decay_function = lambda radius, step, steps: radii[step]
@@ -21,7 +22,7 @@ def minisoms(weights, frames, order, rates, radii):
     return oracle
 
 
-@pytest.mark.parametrize(("ordering", "tuning"), [(300, 0), (0, 300), (200, 300)])
+@pytest.mark.parametrize(("ordering", "tuning"), [(300, 0), (0, 300), (200, 300), (17, 1)])
 def test_weights_are_minisoms(ordering, tuning):
     random = np.random.default_rng(1)
     frames, weights = random.normal(5.0, 1.0, (80, 12)), random.normal(0, 0.1, (7, 5, 12))
