@@ -73,6 +73,22 @@ def test_curves_settle_without_overshoot_the_slower_the_smaller_the_rate():
     np.testing.assert_allclose(curves[:2, -1], 2.0, atol=0.01)
 
 
+def test_a_phase_may_end_anywhere_in_what_is_shown_at_once():
+    """Frames are shown some at once, and the last of them are filled up: of those nothing is seen."""
+    random = np.random.default_rng(5)
+    frames, weights = random.normal(size=(30, 6)), random.normal(size=(4, 3, 6))
+    schedule = Schedule(37, 101)
+    order, rates, radii = random.integers(0, 30, schedule.steps), schedule.rates(), schedule.radii((4, 3))
+    whole, curve = train(jnp.asarray(weights), jnp.asarray(frames), order, rates, radii)
+    first, begun = train(jnp.asarray(weights), jnp.asarray(frames), order[:50], rates[:50], radii)
+    then, ended = train(first, jnp.asarray(frames), order[50:], rates[50:], radii[:0])
+    np.testing.assert_allclose(then, whole, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.append(begun, ended), curve, rtol=0, atol=1e-12)
+    for steps in (37, 38, 110):
+        part, _ = train(jnp.asarray(weights), jnp.asarray(frames), order[:steps], rates[:steps], radii)
+        assert curve[steps - 1] == pytest.approx(float(part.mean()), abs=1e-12)
+
+
 BAD = {
     "no frames shown": (lambda: Schedule(0, 0), "nothing would be learnt"),
     "half a frame": (lambda: Schedule(10.5, 0), "ordering must be a whole number"),
