@@ -341,7 +341,7 @@ def _draw(folder: Path, curves, located, drawings, multi, pressed, sensed) -> No
     for ax, (name, frame) in zip(axes[2], pressed.items(), strict=True):
         plot_map(placed.places, neuron_shares(placed, frame, rest), label="Share", title=f"{name}, 3 N", ax=ax)
         for line in OUTLINES[name]:
-            ax.plot(*(line + MIDDLE).T, color=MARKED, linewidth=1)
+            ax.plot(*(line + MIDDLE).T, color=MARKED, linewidth=1.5, zorder=3)
     axes[1, 3].plot(1e3 * sensed[0], sensed[1].T, marker=".")
     axes[1, 3].set(yscale="log", xlabel="Place on a diameter (mm)", ylabel="Mean change (Ω)", title="Sensitivity")
     axes[1, 3].legend([f"{one:g} g" for one in GRAMS], frameon=False, ncols=2, loc="upper center")

@@ -129,9 +129,7 @@ class PlacedMap:
         if self.fitted is None:
             near, held = known.neurons.nearest(frames, min(_NEAREST, len(known.places)))[0], _HELD
         else:
-            count, held = min(_ON_GRID, len(known.places)), _HELD_ON_GRID
-            winners = known.neurons.nearest(frames, 1)[0][:, 0]
-            near = known.tree.query(known.grid[winners], count, p=np.inf)[1].reshape(-1, count)
+            near, held = known.around[known.neurons.winners(frames)[:, 1]], _HELD_ON_GRID
         shares, left = np.empty(near.shape), np.empty(frames.shape)
         for first in range(0, len(frames), _AT_ONCE):
             some = slice(first, first + _AT_ONCE)
@@ -144,18 +142,19 @@ class PlacedMap:
 
     @cached_property
     def _known(self) -> "_Known":
-        grid, places = np.argwhere(self.placed), self.places if self.fitted is None else self.fitted
         neurons = SelfOrganisingMap(self.learnt.weights[self.placed][None], self.learnt.scale)
-        return _Known(neurons, places[self.placed], grid, KDTree(grid))
+        places, grid = (self.places if self.fitted is None else self.fitted)[self.placed], np.argwhere(self.placed)
+        # Sorted by the longer way along the grid: the first is the neuron itself.
+        around = KDTree(grid).query(grid, min(_ON_GRID, len(grid)), p=np.inf)[1].reshape(len(grid), -1)
+        return _Known(neurons, places, around)
 
 
 class _Known(NamedTuple):
-    """The neurons that have a place, in one row; the places that tell; where they are on the grid, and who is near."""
+    """The neurons that have a place, in one row; the places that tell; the numbers of those about each on the grid."""
 
     neurons: SelfOrganisingMap
     places: Float[np.ndarray, "k d"]
-    grid: Int[np.ndarray, "k 2"]
-    tree: KDTree
+    around: Int[np.ndarray, "k q"]
 
 
 class _Told(NamedTuple):
@@ -172,8 +171,9 @@ def _combined(own: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"],
     middle = own.mean(axis=1, keepdims=True)
     apart = own - middle
     gram = apart @ np.swapaxes(apart, 1, 2)
-    held = held * np.trace(gram, axis1=1, axis2=2)[:, None, None] / count + 1e-300
-    change = (frames[:, None] - middle).transpose(0, 2, 1)
-    found = np.linalg.solve(gram + held * np.eye(count), apart @ change)
-    shares = found[..., 0] + (1 - found.sum(axis=1)) / count
-    return shares, (change - np.swapaxes(apart, 1, 2) @ found)[..., 0]
+    diagonal = np.einsum("nqq->nq", gram)  # a view
+    diagonal += held * diagonal.mean(axis=1, keepdims=True) + 1e-300
+    change = frames - middle[:, 0]
+    found = np.linalg.solve(gram, apart @ change[..., None])
+    left = change - (np.swapaxes(found, 1, 2) @ apart)[:, 0]
+    return found[..., 0] + (1 - found.sum(axis=1)) / count, left
