@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from benchmarks.harness.case import Case, Options, Result, Table, judged
 from benchmarks.harness.timing import say
-from benchmarks.problems.weighed_skins import DISC, GRAVITY, WeighedSkin
+from benchmarks.problems.weighed_skins import CURRENT, DISC, GRAVITY, WeighedSkin
 from jeit.image import find_inclusions
 from jeit.inverse import Laplace, one_step
 from jeit.simulate import Bar, Disc, Press, Prism, Ring
@@ -43,6 +43,25 @@ OBJECTS = {
     "cube": Bar(0.03, 0.03),
     "ruler": Bar(0.09, 0.02),
     "tube": Ring(0.06, 0.05),
+}
+MIDDLE, MARKED = np.array([0.0, 0.02]), "#d1495b"  # of the objects, m; what is true, in pictures
+
+
+def _rectangle(length: float, width: float) -> np.ndarray:
+    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * [length / 2, width / 2]
+
+
+def _circle(diameter: float) -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi, 60)
+    return diameter / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+# What of them touches.
+OUTLINES = {
+    "prism": [_rectangle(0.06, 0.0)],
+    "cube": [_rectangle(0.03, 0.03)],
+    "ruler": [_rectangle(0.09, 0.02)],
+    "tube": [_circle(0.06), _circle(0.05)],
 }
 
 
@@ -113,8 +132,9 @@ def run(options: Options) -> Result:
     worst = float(np.linalg.norm(told - right, axis=1).max())
     asked.append(judged("error ≤ 1.5 % of the diameter everywhere", f"{100 * worst / 0.2:.1f} %", worst <= 3e-3))
     say("sensitivity")
-    table, inner, outer = _sensitivity(disk, rest)
-    tables.append(table)
+    along, ohms = _sensitivity(disk, rest)
+    inner, outer = float(ohms[-1, [0, 8]].mean() / ohms[-1, 4]), float(ohms[-1, 9] / ohms[-1, 4])
+    tables.append(_ohms(along, ohms))
     asked.append(
         judged(
             "102.3 g at the boundary about 7 × as in the middle",
@@ -138,11 +158,19 @@ def run(options: Options) -> Result:
     tables.append(table)
     asked.append(judged("trustworthiness ≥ 0.95 on disk and square", f"{min(trust):.3f}", min(trust) >= 0.95))
     pressed = {
-        name: disk.skin.frames(jax.random.key(40), [Press(one, 3.0, (0.0, 0.02))])[0] for name, one in OBJECTS.items()
+        name: disk.skin.frames(jax.random.key(40), [Press(one, 3.0, tuple(MIDDLE))])[0] for name, one in OBJECTS.items()
     }
     tables.append(_shapes(placed, pressed, rest))
     if options.output is not None:
-        _draw(options.output, curves, (placed, images, fresh, right), drawings, (disk, placed, rest), pressed)
+        _draw(
+            options.output,
+            curves,
+            (placed, images, fresh, right),
+            drawings,
+            (disk, placed, rest),
+            pressed,
+            (along, ohms),
+        )
     return Result(tables, [] if quick else asked)
 
 
@@ -164,32 +192,22 @@ def _imaged(disk: WeighedSkin, fresh: np.ndarray, rest: np.ndarray, quick: bool)
     return np.array([one[0].centroid if one else (np.nan, np.nan) for one in found])
 
 
-def _sensitivity(disk: WeighedSkin, rest: np.ndarray) -> tuple[Table, float, float]:
-    """Mean change of transfer resistance against the place, of five weights; 80 and 90 mm out over the middle."""
+def _sensitivity(disk: WeighedSkin, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places (10,) along a diameter, metres, and the mean change (5, 10) of transfer resistance under five weights."""
     along = np.array([*np.linspace(-0.08, 0.08, 9), 0.09])
-    ohms = (
-        np.array(
-            [
-                np.abs(
-                    disk.skin.voltages_under(
-                        disk.skin.touched([Press(Disc(DISC), grams * GRAVITY, (x, 0.0)) for x in along])
-                    )
-                    * disk.skin.gain
-                    - rest
-                ).mean(axis=1)
-                for grams in GRAMS
-            ]
-        )
-        / 200e-6
-    )
+    touches = [[Press(Disc(DISC), grams * GRAVITY, (x, 0.0)) for x in along] for grams in GRAMS]
+    read = [disk.skin.voltages_under(disk.skin.touched(some)) * disk.skin.gain for some in touches]
+    return along, np.array([np.abs(one - rest).mean(axis=1) for one in read]) / CURRENT
+
+
+def _ohms(along: np.ndarray, ohms: np.ndarray) -> Table:
     rows = [[f"{grams:g} g", *(f"{one:.3g}" for one in row)] for grams, row in zip(GRAMS, ohms, strict=True)]
-    table = Table(
+    return Table(
         ["weight", *(f"{1e3 * x:.0f} mm" for x in along)],
         rows,
         "Mean change of 208 transfer resistances, Ω",
         "The paper: at its boundary, 102.3 g change resistance about seven times as much as in the middle.",
     )
-    return table, float(ohms[-1, [0, 8]].mean() / ohms[-1, 4]), float(ohms[-1, 9] / ohms[-1, 4])
 
 
 def _several(disk: WeighedSkin, placed: PlacedMap, rest: np.ndarray, trials: int) -> tuple[Table, dict[int, float]]:
@@ -274,7 +292,7 @@ def _shapes(placed: PlacedMap, pressed: dict[str, np.ndarray], rest: np.ndarray)
         middle = weight @ place / weight.sum()
         spread = np.linalg.eigvalsh((place - middle).T * weight @ (place - middle) / weight.sum())
         sides = 1e3 * np.sqrt(12 * np.maximum(spread, 0))
-        rows.append([name, f"{sides[1]:.0f} × {sides[0]:.0f} mm", f"{1e3 * np.hypot(*(middle - [0.0, 0.02])):.1f} mm"])
+        rows.append([name, f"{sides[1]:.0f} × {sides[0]:.0f} mm", f"{1e3 * np.hypot(*(middle - MIDDLE)):.1f} mm"])
         say(" | ".join(rows[-1]))
     return Table(
         ["object", "extent told", "off"],
@@ -284,7 +302,7 @@ def _shapes(placed: PlacedMap, pressed: dict[str, np.ndarray], rest: np.ndarray)
     )
 
 
-def _draw(folder: Path, curves, located, drawings, multi, pressed) -> None:
+def _draw(folder: Path, curves, located, drawings, multi, pressed, sensed) -> None:
     """One picture of everything that the paper draws."""
     import matplotlib.pyplot as plt
 
@@ -292,7 +310,7 @@ def _draw(folder: Path, curves, located, drawings, multi, pressed) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     placed, images, fresh, right = located
-    figure, axes = plt.subplots(4, 4, figsize=(19, 17), layout="constrained")
+    figure, axes = plt.subplots(4, 4, figsize=(17, 16), layout="constrained")
     for rate, curve in zip(RATES, curves, strict=True):
         axes[0, 0].plot(np.abs(curve), label=f"ε = {rate:g}")
     axes[0, 0].set(xlabel="Frames shown", ylabel="Mean weight (V)", title="Learning curves")
@@ -301,12 +319,13 @@ def _draw(folder: Path, curves, located, drawings, multi, pressed) -> None:
     top = 5.0
     for ax, (name, one) in zip(axes[0, 1:3], off.items(), strict=True):
         drawn = ax.scatter(*(1e3 * right.T), c=1e3 * np.linalg.norm(one, axis=1), s=9, vmin=0, vmax=top, cmap="viridis")
-        ax.set(title=f"Error of places, {name}", xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
+        ax.set(title=f"Places of 100 g, {name}", xlabel="x (mm)", ylabel="y (mm)", aspect="equal")
+        ax.set(xticks=range(-100, 101, 50), yticks=range(-100, 101, 50))
         figure.colorbar(drawn, ax=ax, label="Error (mm)", shrink=0.7)
     bins = np.linspace(0, 8, 41)
     for name, one in off.items():
         axes[0, 3].hist(1e3 * np.linalg.norm(one, axis=1), bins, density=True, histtype="step", label=name)
-    axes[0, 3].set(xlabel="Error (mm)", ylabel="Density (1/mm)", title="Density of the error")
+    axes[0, 3].set(xlabel="Error (mm)", ylabel="Density (1/mm)", title="Errors of places of 100 g")
     axes[0, 3].legend(frameon=False)
     disk, _, rest = multi
     where = np.array([[-0.05, 0.03], [0.05, 0.04], [0.0, -0.06]])
@@ -318,14 +337,20 @@ def _draw(folder: Path, curves, located, drawings, multi, pressed) -> None:
         activity = placed.learnt.activity(frame)[0]
         title = " + ".join(f"{one:g} g" for one in WEIGHTS[:number])
         plot_map(placed.places, activity, touches=touches_told(placed, frame, rest), title=title, ax=ax)
+        ax.plot(*where[:number].T, "o", markersize=17, markerfacecolor="none", color=MARKED)
     for ax, (name, frame) in zip(axes[2], pressed.items(), strict=True):
         plot_map(placed.places, neuron_shares(placed, frame, rest), label="Share", title=f"{name}, 3 N", ax=ax)
-    axes[1, 3].set_axis_off()
+        for line in OUTLINES[name]:
+            ax.plot(*(line + MIDDLE).T, color=MARKED, linewidth=1.5, zorder=3)
+    axes[1, 3].plot(1e3 * sensed[0], sensed[1].T, marker=".")
+    axes[1, 3].set(yscale="log", xlabel="Place on a diameter (mm)", ylabel="Mean change (Ω)", title="Sensitivity")
+    axes[1, 3].legend([f"{one:g} g" for one in GRAMS], frameon=False, ncols=2, loc="upper center")
+    axes[1, 3].set_ylim(top=60)
     for column, (name, own) in enumerate(drawings.items()):
         plot_map(own.places, title=f"{name}: neurons where they lie", ax=axes[3, 2 * column])
         drawn = drawn_map(own.learnt, jax.random.key(0))
         plot_map(drawn, title=f"{name}: by springs alone", on_skin=False, ax=axes[3, 2 * column + 1])
-    figure.savefig(folder / "kohonen.png", dpi=60)
+    figure.savefig(folder / "kohonen.png", dpi=72)
     plt.close(figure)
 
 

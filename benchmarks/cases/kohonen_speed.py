@@ -84,8 +84,9 @@ def run(options: Options) -> Result:
 
 
 def _minisom(start, frames, order, rates, radii) -> np.ndarray:
-    """What MiniSom's weights become."""
+    """What MiniSom's weights become; in the tuning phase a radius next to nothing leaves the winner alone."""
     theirs = MiniSom(*start.shape)
+    radii = np.append(radii, np.full(len(order) - len(radii), 0.01))
     theirs._weights = start.copy()
     theirs._learning_rate_decay_function = lambda rate, step, steps: rates[step]
     theirs._sigma_decay_function = lambda radius, step, steps: radii[step]

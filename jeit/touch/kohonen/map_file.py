@@ -8,6 +8,8 @@ from jeit.arguments import check_kind, need, npz_arrays
 from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
+_OF_PLACES = "places", "widening", "missed", "fitted"
+
 
 def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
     """Write a map, or one with places, to an NPZ file: `weights` and `scale`, and its places. Raises
@@ -17,7 +19,8 @@ def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / 'map.npz'}.")
     placed = isinstance(learnt, PlacedMap)
     plain = learnt.learnt if placed else learnt
-    more = {"places": learnt.places, "widening": learnt.widening, "missed": learnt.missed} if placed else {}
+    more = {name: getattr(learnt, name) for name in _OF_PLACES} if placed else {}
+    more = {name: value for name, value in more.items() if value is not None}
     with Path(path).open("wb") as file:  # NumPy would add .npz to another name
         np.savez_compressed(file, weights=plain.weights, scale=plain.scale, **more)
 
@@ -29,12 +32,13 @@ def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
     if not Path(path).is_file():
         raise FileNotFoundError(f"'{path}': there is no such file.")
     try:
-        arrays = npz_arrays(Path(path), "weights", "scale", "places", "widening", "missed")
+        arrays = npz_arrays(Path(path), "weights", "scale", *_OF_PLACES)
         need(arrays, "weights", "scale")
         learnt = SelfOrganisingMap(arrays["weights"], _number("scale", arrays))
         if "places" not in arrays:
             return learnt
-        return PlacedMap(learnt, arrays["places"], _number("widening", arrays), _number("missed", arrays))
+        numbers = _number("widening", arrays), _number("missed", arrays)
+        return PlacedMap(learnt, arrays["places"], *numbers, arrays.get("fitted"))
     except ValueError as error:
         raise ValueError(f"'{path}' is no map: {error}") from None
 

@@ -1,36 +1,51 @@
 """`PlacedMap`: what a self-organising map says of places, once some presses have told where its neurons lie."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import lsqr
+from scipy.spatial import KDTree
 
 from jeit.arguments import check_kind, real_array
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
-# Neurons that a frame is told by, and what holds their weights together, over the mean square of their differences.
+# Neurons that a frame is told by, those nearest to it, or 5 by 5 on the grid about the nearest; and what holds their
+# shares together, over the mean square of their differences.
 _NEAREST, _HELD = 9, 0.05
+_ON_GRID, _HELD_ON_GRID = 25, 0.005
+# Presses that say as much of a neuron's place as the mean of all that it won.
+_DOUBT = 0.3
 _FEWEST = 10
+# Frames that are told at once.
+_AT_ONCE = 512
 
 
 @dataclass(frozen=True)
 class PlacedMap:
     """A `learnt` map whose neurons have `places` (R, C, d), metres: the mean place of the presses that each won, NaN
     of those that won none; make it with `PlacedMap.learn`. `widening`: the root mean square distance of presses held
-    out from where they were told, over the spread told. `missed`: the root mean square of what neighbouring neurons
-    leave of a press's channel, in the unit of frames."""
+    out from where they were told, over the spread told. `missed`: the root mean square of what the neurons nearest to a
+    press leave of a channel, in the unit of frames. `fitted` (R, C, d), metres: places that tell presses best, where
+    neighbours on the grid tell a frame; None: it is told by the neurons nearest to it, and their places."""
 
     learnt: SelfOrganisingMap
     places: Float[np.ndarray, "R C d"]
     widening: float
     missed: float
+    fitted: Float[np.ndarray, "R C d"] | None = None
 
     @classmethod
     def learn(cls, learnt: SelfOrganisingMap, frames: ArrayLike, positions: ArrayLike) -> "PlacedMap":
         """Places of the neurons of a `learnt` map, from presses: frames (N, M) as it was learnt from, those or others,
         and their `positions` (N, d), metres.
+
+        Of few presses the neurons nearest to a frame say more; of many, neighbours on the grid, with places fitted by
+        least squares. That is taken which errs less on presses held out.
 
         Raises `ValueError` for what is no map, fewer than ten presses, and positions that are not finite, one for each
         frame, or all the same.
@@ -47,15 +62,38 @@ class PlacedMap:
             raise ValueError(f"positions: give those of {_FEWEST} presses or more, at different places.")
         winners = learnt.nearest(frames, 1)[0][:, 0]
         odd = np.arange(len(frames)) % 2 == 1
-        off = spread = missed = 0.0
-        for out in (odd, ~odd):
-            part = cls(learnt, _places(winners[~out], positions[~out], learnt.shape), 1.0, 0.0)
-            said, own, left = part._told(frames[out])
-            off += float(np.sum((said - positions[out]) ** 2))
-            spread += float(np.sum(own**2))
-            missed += float(np.sum(left**2))
-        known = _places(winners, positions, learnt.shape)
-        return cls(learnt, known, float(np.sqrt(off / max(spread, 1e-300))), float(np.sqrt(missed / frames.size)))
+        ways = []
+        for fit in (False, True):
+            off = spread = missed = 0.0
+            for out in (odd, ~odd):
+                part = cls._of(learnt, frames[~out], positions[~out], winners[~out], fit)
+                told = part._told(frames[out])
+                off += float(np.sum((told.places - positions[out]) ** 2))
+                spread += float(np.sum(told.spread**2))
+                missed += float(np.sum(told.left**2))
+            ways.append((off, fit, float(np.sqrt(off / max(spread, 1e-300))), float(np.sqrt(missed / frames.size))))
+        _, fit, widening, _ = min(ways)
+        whole = cls._of(learnt, frames, positions, winners, fit)
+        return replace(whole, widening=widening, missed=ways[0][3])
+
+    @classmethod
+    def _of(cls, learnt, frames, positions, winners, fit: bool) -> "PlacedMap":
+        """The map whose places these presses say, with these winners (N,); of deviations it knows nothing yet."""
+        number = learnt.shape[0] * learnt.shape[1]
+        count = np.bincount(winners, minlength=number)[:, None]
+        sums = np.stack([np.bincount(winners, one, minlength=number) for one in positions.T], axis=1)
+        means = np.where(count > 0, sums / np.maximum(count, 1), np.nan).reshape(*learnt.shape, -1)
+        placed = cls(learnt, means, 1.0, 0.0, means if fit else None)
+        if not fit:
+            return placed
+        near, shares, _ = placed._shares(frames)
+        row = np.repeat(np.arange(len(frames)), near.shape[1])
+        combined = csr_array((shares.ravel(), (row, near.ravel())), shape=(len(frames), np.count_nonzero(count)))
+        off = positions - combined @ means[placed.placed]
+        moved = [lsqr(combined, one, damp=np.sqrt(_DOUBT), atol=1e-9, btol=1e-9)[0] for one in off.T]
+        fitted = means.copy()
+        fitted[placed.placed] += np.stack(moved, axis=1)
+        return replace(placed, fitted=fitted)
 
     @property
     def placed(self) -> Bool[np.ndarray, "R C"]:
@@ -65,48 +103,77 @@ class PlacedMap:
     def locate(self, frames: ArrayLike) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
         """Places (n, d) of frames (n, M), or one (M,), and their standard deviations (n, d), metres.
 
-        The nearest neurons are combined so that their frames, in shares of sum 1, come nearest to the one read: their
-        places, in the same shares, are where it is (a map that is linear between neurons; the shares are those of
-        Roweis and Saul 2000), at most as far from their middle as any of them. Raises `ValueError` for frames of
-        another number of channels, and NaN.
+        The neurons nearest to it, or those about the nearest on the grid (`fitted`), are combined so that their frames,
+        in shares of sum 1, come nearest to the one read: their places, in the same shares, are where it is (a map that
+        is linear between neurons; the shares are those of Roweis and Saul 2000), at most as far from the middle of
+        these, or on the grid from the nearest, as any of them. Raises `ValueError` for frames of another number of
+        channels, and NaN.
         """
-        said, spread, _ = self._told(self.learnt.checked(frames))
-        return said, self.widening * spread
+        told = self._told(self.learnt.checked(frames))
+        return told.places, self.widening * told.spread
 
-    def _told(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Places (n, d), how far the neurons' own are spread about them (n, d), and what their frames leave (n, M)."""
-        map_of_placed, places = self._known
-        weights = map_of_placed.weights[0]
-        number = min(_NEAREST, len(weights))
-        near = map_of_placed.nearest(frames, number)[0]
-        own, there = weights[near], places[near]
-        middle, centre = own.mean(axis=1, keepdims=True), there.mean(axis=1, keepdims=True)
-        apart, round_centre = own - middle, there - centre
-        gram = apart @ np.swapaxes(apart, 1, 2)
-        held = _HELD * np.trace(gram, axis1=1, axis2=2)[:, None, None] / number + 1e-300
-        change = (frames[:, None] - middle).transpose(0, 2, 1)
-        shares = np.linalg.solve(gram + held * np.eye(number), apart @ change)
-        offset = np.sum(shares * round_centre, axis=1)
-        most = np.linalg.norm(round_centre, axis=2).max(axis=1)
+    def _told(self, frames: Float[np.ndarray, "n M"]) -> "_Told":
+        near, shares, left = self._shares(frames)
+        there = self._known.places[near]
+        own = there.mean(axis=1) if self.fitted is None else there[:, 0]
+        offset = np.einsum("nq,nqd->nd", shares, there) - own
+        most = np.linalg.norm(there - own[:, None], axis=2).max(axis=1)
         length = np.linalg.norm(offset, axis=1)
-        said = centre[:, 0] + offset * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
-        spread = np.sqrt(np.mean((there - said[:, None]) ** 2, axis=1))
-        return said, spread, (change - np.swapaxes(apart, 1, 2) @ shares)[..., 0]
+        said = own + offset * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
+        return _Told(said, np.sqrt(np.mean((there - said[:, None]) ** 2, axis=1)), left)
+
+    def _shares(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Numbers (n, q) among the neurons with places of those that tell frames, the shares (n, q) of these, and what
+        they leave (n, M)."""
+        known = self._known
+        if self.fitted is None:
+            near, held = known.neurons.nearest(frames, min(_NEAREST, len(known.places)))[0], _HELD
+        else:
+            near, held = known.around[known.neurons.winners(frames)[:, 1]], _HELD_ON_GRID
+        shares, left = np.empty(near.shape), np.empty(frames.shape)
+        for first in range(0, len(frames), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            shares[some], left[some] = _combined(known.neurons.weights[0][near[some]], frames[some], held)
+        return near, shares, left
 
     def predict(self, features: ArrayLike) -> Float[np.ndarray, "n d"]:
         """Places (n, d) alone, as of `locate`, for who asks as of scikit-learn's estimators."""
         return self.locate(features)[0]
 
     @cached_property
-    def _known(self) -> tuple[SelfOrganisingMap, Float[np.ndarray, "k d"]]:
-        """The neurons that have a place, in one row, and those."""
-        weights = self.learnt.weights[self.placed]
-        return SelfOrganisingMap(weights[None], self.learnt.scale), self.places[self.placed]
+    def _known(self) -> "_Known":
+        neurons = SelfOrganisingMap(self.learnt.weights[self.placed][None], self.learnt.scale)
+        places, grid = (self.places if self.fitted is None else self.fitted)[self.placed], np.argwhere(self.placed)
+        # Sorted by the longer way along the grid: the first is the neuron itself.
+        around = KDTree(grid).query(grid, min(_ON_GRID, len(grid)), p=np.inf)[1].reshape(len(grid), -1)
+        return _Known(neurons, places, around)
 
 
-def _places(winners: np.ndarray, positions: np.ndarray, shape: tuple[int, int]) -> Float[np.ndarray, "R C d"]:
-    number = shape[0] * shape[1]
-    count = np.bincount(winners, minlength=number)
-    sums = np.stack([np.bincount(winners, one, minlength=number) for one in positions.T], axis=1)
-    means = np.where(count[:, None] > 0, sums / np.maximum(count, 1)[:, None], np.nan)
-    return means.reshape(*shape, positions.shape[1])
+class _Known(NamedTuple):
+    """The neurons that have a place, in one row; the places that tell; the numbers of those about each on the grid."""
+
+    neurons: SelfOrganisingMap
+    places: Float[np.ndarray, "k d"]
+    around: Int[np.ndarray, "k q"]
+
+
+class _Told(NamedTuple):
+    """Places (n, d), how far those of the neurons are spread about them (n, d), what their frames leave (n, M)."""
+
+    places: Float[np.ndarray, "n d"]
+    spread: Float[np.ndarray, "n d"]
+    left: Float[np.ndarray, "n M"]
+
+
+def _combined(own: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"], held: float):
+    """Shares (n, q), of sum 1, in which neurons' own frames come nearest to those read, and what they leave (n, M)."""
+    count = own.shape[1]
+    middle = own.mean(axis=1, keepdims=True)
+    apart = own - middle
+    gram = apart @ np.swapaxes(apart, 1, 2)
+    diagonal = np.einsum("nqq->nq", gram)  # a view
+    diagonal += held * diagonal.mean(axis=1, keepdims=True) + 1e-300
+    change = frames - middle[:, 0]
+    found = np.linalg.solve(gram, apart @ change[..., None])
+    left = change - (np.swapaxes(found, 1, 2) @ apart)[:, 0]
+    return found[..., 0] + (1 - found.sum(axis=1)) / count, left

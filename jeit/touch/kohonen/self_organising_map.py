@@ -17,6 +17,8 @@ from jeit.touch.kohonen.training import Schedule, train
 _FEWEST = 3
 # Weights at the start, over the frames' root mean square.
 _SMALL = 1e-3
+# A radius, grid steps, within which there is the winner alone: of its neighbours exp(−1/2ρ²) is no number.
+_ALONE = 0.01
 # Frames of which the distances to all neurons are worked out at once.
 _AT_ONCE = 1024
 
@@ -151,7 +153,8 @@ def learn_weights(
     starts = np.stack([_started(frames, key, shape) for key, _ in pairs])
     orders = np.stack([_order(key, len(frames), schedule.steps) for key, schedule in pairs])
     rates = np.stack([schedule.rates() for _, schedule in pairs])
-    radii = np.stack([schedule.radii(shape) for _, schedule in pairs])
+    longest = max(schedule.ordering for schedule in schedules)
+    radii = np.stack([_filled(schedule.radii(shape), longest) for _, schedule in pairs])
     many = jax.vmap(train, in_axes=(0, None, 0, 0, 0)) if len(pairs) > 1 else _alone
     weights, curves = many(jnp.asarray(starts), jnp.asarray(frames), orders, rates, radii)
     return np.asarray(weights), np.asarray(curves)
@@ -172,6 +175,11 @@ def checked_frames(given, channels: int | None = None) -> Float[np.ndarray, "n M
             "or those channels."
         )
     return frames
+
+
+def _filled(radii: Float[np.ndarray, " O"], longest: int) -> Float[np.ndarray, " L"]:
+    """Radii of as many frames as the longest ordering phase of some schedules has: the tuning phase's are next to 0."""
+    return np.concatenate([radii, np.full(longest - len(radii), _ALONE)])
 
 
 def _alone(starts, frames, orders, rates, radii):

@@ -7,12 +7,12 @@ For each frame x the winner c is the neuron whose weights are nearest; every neu
 with r_n its place on the grid (Kohonen, Self-Organizing Maps, 2001, chapter 3). In the ordering phase ρ shrinks; in the
 tuning phase, where ρ is next to nothing, the winner alone moves. ε falls throughout.
 
-Distances from w and from w − m to x and x − m are the same: all is done about the frames' mean m, whose differences
-are small. The winner of |w|² − 2 w·x needs squares and products alone, and these follow from those before the step:
+All is done about the frames' mean, whose differences are small. A weight that moves to x by the share s = ε h comes
 
-    w′·y = (1 − ε h) w·y + ε h x·y,    |w′|² = (1 − ε h)² |w|² + 2 ε h (1 − ε h) w·x + (ε h)² |x|²
+    |w′ − y|² = (1 − s) |w − y|² + s |x − y|² − s (1 − s) |w − x|²
 
-so that weights are multiplied with some frames at once, and moved once after them.
+far from y, whichever that is (Stewart's theorem). So weights are multiplied with some frames at once, and moved once
+after them: in between, distances alone change, in the tuning phase those of the winner alone.
 """
 
 import equinox as eqx
@@ -23,10 +23,10 @@ from jaxtyping import Array, Float, Int
 
 from jeit.arguments import is_number, real_array, told
 
-# Frames after which weights are moved.
-_AT_ONCE = 16
-# A radius, grid steps, within which there is the winner alone: of its neighbours exp(−1/2ρ²) is no number.
-_ALONE = 0.01
+# Frames after which weights are moved, in either phase.
+_ORDERED, _TUNED = 16, 64
+# Of neurons that are there: an index that may lie outside costs a copy of all.
+_THERE = "promise_in_bounds"
 
 
 class Schedule(eqx.Module):
@@ -63,10 +63,10 @@ class Schedule(eqx.Module):
         """ε at every frame shown."""
         return np.geomspace(*self.rate, self.steps)
 
-    def radii(self, shape: tuple[int, int]) -> Float[np.ndarray, " T"]:
-        """ρ at every frame shown to a map of this `shape`, grid steps."""
+    def radii(self, shape: tuple[int, int]) -> Float[np.ndarray, " O"]:
+        """ρ at every frame of the ordering phase, shown to a map of this `shape`, grid steps."""
         first, last = (max(max(shape) / 2, 1.0), 1.0) if self.radius is None else self.radius
-        return np.concatenate([np.geomspace(first, last, self.ordering), np.full(self.tuning, _ALONE)])
+        return np.geomspace(first, last, self.ordering)
 
 
 @jax.jit
@@ -75,51 +75,100 @@ def train(
     frames: Float[Array, "N M"],
     order: Int[Array, " T"],
     rates: Float[Array, " T"],
-    radii: Float[Array, " T"],
+    radii: Float[Array, " O"],
 ) -> tuple[Float[Array, "R C M"], Float[Array, " T"]]:
-    """Weights (R, C, M) after those of the frames (N, M) were shown that `order` (T,) numbers, with these rates and
-    radii (T,), grid steps; and the mean of all weights after each (T,). Under `jax.vmap` too, over starts, orders and
-    rates."""
-    rows, columns, channels = weights.shape
-    middle = frames.mean(axis=0)
-    frames = frames - middle
-    row, column = jnp.arange(rows)[:, None], jnp.arange(columns)[None, :]
+    """Weights (R, C, M) after those of the frames (N, M) were shown that `order` (T,) numbers, with these rates (T,),
+    the first O in the ordering phase, with these radii (O,), grid steps, those after them in the tuning phase; and the
+    mean of all weights after each (T,). Under `jax.vmap` too, over starts, orders, rates and radii."""
+    shape, middle, ordering = weights.shape[:2], frames.mean(axis=0), len(radii)
 
-    def share_of(winner, rate, radius):
-        best_row, best_column = jnp.divmod(winner, columns)
-        return rate * jnp.exp(-((row - best_row) ** 2 + (column - best_column) ** 2) / (2 * radius**2)).reshape(-1)
+    def show_all(phase, flat, at_once, order, rates, *radii):
+        more = -len(order) % at_once
+        # Frames at a rate of 0 change nothing.
+        order_rates = [jnp.pad(one, (0, more)) for one in (order, rates)]
+        filled = *order_rates, *(jnp.pad(one, (0, more), "edge") for one in radii)
 
-    def show_some(state, now):
-        # In the end weights are `kept` w + Σ `moved` x.
-        flat, squares, level = state
-        some, *how = now
-        shown = frames[some]
-        among, levels = shown @ shown.T, shown.mean(axis=1)
+        def show_some(flat, now):
+            some, *how = now
+            return phase(shape, flat, frames[some] - middle, *how)
 
-        def show(state, now):
-            inner, kept, moved, squares, level = state
-            one, rate, radius = now
-            share = share_of(jnp.argmin(squares - 2 * inner[one]), rate, radius)
-            rest = 1 - share
-            squares = rest**2 * squares + 2 * share * rest * inner[one] + share**2 * among[one, one]
-            inner = rest * inner + share * among[one][:, None]
-            moved = (rest * moved).at[one].set(share)
-            level = rest * level + share * levels[one]
-            return (inner, rest * kept, moved, squares, level), level.mean()
+        flat, curve = jax.lax.scan(show_some, flat, tuple(one.reshape(-1, at_once) for one in filled))
+        return flat, curve.reshape(-1)[: len(order)]
 
-        before = shown @ flat.T, jnp.ones_like(squares), jnp.zeros((len(some), len(flat))), squares, level
-        (_, kept, moved, squares, level), curve = jax.lax.scan(show, before, (jnp.arange(len(some)), *how))
-        return (kept[:, None] * flat + moved.T @ shown, squares, level), curve
+    flat, curves = (weights - middle).reshape(-1, weights.shape[2]), []
+    if ordering:
+        flat, curve = show_all(_ordered, flat, _ORDERED, order[:ordering], rates[:ordering], radii)
+        curves.append(curve)
+    if len(order) > ordering:
+        flat, curve = show_all(_tuned, flat, _TUNED, order[ordering:], rates[ordering:])
+        curves.append(curve)
+    return flat.reshape(weights.shape) + middle, jnp.concatenate(curves) + middle.mean()
 
-    flat = (weights - middle).reshape(-1, channels)
-    state = flat, jnp.sum(flat**2, axis=1), flat.mean(axis=1)
-    more = -order.size % _AT_ONCE
-    order, rates = jnp.pad(order, (0, more)), jnp.pad(rates, (0, more))  # frames at a rate of 0 change nothing
-    radii = jnp.pad(radii, (0, more), constant_values=1.0)
-    (flat, _, _), curve = jax.lax.scan(
-        show_some, state, tuple(one.reshape(-1, _AT_ONCE) for one in (order, rates, radii))
-    )
-    return flat.reshape(weights.shape) + middle, curve.reshape(-1)[: curve.size - more] + middle.mean()
+
+def _ordered(shape, flat, shown, rates, radii):
+    """Weights (k, M) of a map of this shape after frames (n, M), and their means after each (n,): all neurons move."""
+    row, column = jnp.arange(shape[0])[:, None], jnp.arange(shape[1])
+
+    def show(state, now):
+        distances, level = state
+        one, rate, radius, to_others, mean = now
+        own = distances[one]
+        best_row, best_column = _winner(own, shape)
+        share = rate * jnp.exp(-((row - best_row) ** 2 + (column - best_column) ** 2) / (2 * radius**2)).reshape(-1)
+        distances = (1 - share) * distances + share * (to_others[:, None] - (1 - share) * own)
+        level = level + share * (mean - level)
+        return (distances, level), (share, level.mean())
+
+    start, apart = (_squared(shown, flat), flat.mean(axis=1)), _squared(shown, shown)
+    each = jnp.arange(len(shown)), rates, radii, apart, shown.mean(axis=1)
+    _, (shares, curve) = jax.lax.scan(show, start, each)
+    return _moved(flat, shares, shown), curve
+
+
+def _tuned(shape, flat, shown, rates):
+    """As `_ordered`: the winners alone move."""
+
+    def show(state, now):
+        distances, level, (winner, moved) = state
+        one, rate, to_others, mean = now
+        # Of the frame before: written before anything is read, which spares a copy of all distances.
+        distances = distances.at[:, winner].set(moved, mode=_THERE)
+        row, column = _winner(distances[one], shape)
+        winner = row * shape[1] + column
+        moved = distances.at[:, winner].get(mode=_THERE)
+        moved = (1 - rate) * moved + rate * (to_others - (1 - rate) * moved[one])
+        level = level.at[winner].add(rate * (mean - level[winner]), mode=_THERE)
+        return (distances, level, (winner, moved)), (winner, level.mean())
+
+    distances, apart = _squared(shown, flat), _squared(shown, shown)
+    start = distances, flat.mean(axis=1), (jnp.zeros((), int), distances[:, 0])
+    each = jnp.arange(len(shown)), rates, apart, shown.mean(axis=1)
+    _, (winners, curve) = jax.lax.scan(show, start, each)
+    shares = jnp.where(winners[:, None] == winners, rates[:, None], 0.0)
+    return flat.at[winners].set(_moved(flat[winners], shares, shown)), curve
+
+
+def _squared(shown, flat):
+    """Squared distances (n, k) of frames (n, M) from weights (k, M)."""
+    return jnp.sum(shown**2, axis=1)[:, None] + jnp.sum(flat**2, axis=1) - 2 * shown @ flat.T
+
+
+def _winner(distances, shape):
+    """Row and column of the least of distances (k,): of each column's least first, which are found many at once."""
+    grid = distances.reshape(shape)
+    column = jnp.argmin(grid.min(axis=0))
+    return jnp.argmin(grid[:, column]), column
+
+
+def _moved(weights, shares, shown):
+    """Weights (k, M) that were moved to frames (n, M), one after another, by `shares` (n, k) of the way."""
+
+    def left(after, share):
+        return after * (1 - share), after * share
+
+    # From the last to the first: what there is of a frame in the end is what those after it have left.
+    kept, moved = jax.lax.scan(left, jnp.ones(len(weights)), shares, reverse=True)
+    return kept[:, None] * weights + moved.T @ shown
 
 
 def _check_falling(name: str, value, most: float, wanted: str) -> None:

@@ -3,6 +3,7 @@
 import io
 import pickle
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,6 +23,21 @@ def test_places_lie_between_neurons(placed):
     assert np.quantile(off, 0.95) < 5e-3
     ratio = np.sqrt(np.mean(off**2) / np.mean(np.sum(spread**2, axis=1)))
     assert 0.5 < ratio < 2.0
+
+
+def test_many_presses_are_told_by_the_grid_about_the_winner(placed):
+    """Six presses for each neuron: told better than by the nearest, in the worst case too."""
+    assert placed.fitted is not None
+    places = drawn_places(5, 300)
+    ways = placed, replace(placed, fitted=None)
+    off, other = (np.linalg.norm(one.locate(frames_at(places))[0] - places, axis=1) for one in ways)
+    assert np.median(off) < 0.8 * np.median(other)
+    assert off.max() < other.max()
+
+
+def test_a_grid_without_order_tells_nothing(learnt, pressed, places):
+    shuffled = np.random.default_rng(0).permutation(learnt.weights.reshape(256, CHANNELS)).reshape(16, 16, CHANNELS)
+    assert PlacedMap.learn(SelfOrganisingMap(shuffled, learnt.scale), pressed, places).fitted is None
 
 
 def test_places_stay_on_the_skin_whatever_is_read(placed):
@@ -78,6 +94,9 @@ def test_files_hold_all(learnt, placed, tmp_path):
     np.testing.assert_array_equal(again.locate(frames)[0], placed.locate(frames)[0])
     np.testing.assert_array_equal(again.locate(frames)[1], placed.locate(frames)[1])
     np.testing.assert_array_equal(plain.activity(frames), learnt.activity(frames))
+    fitted = replace(placed, fitted=placed.places + 1e-3)
+    write_map(fitted, tmp_path / "fitted.npz")
+    np.testing.assert_array_equal(read_map(tmp_path / "fitted.npz").locate(frames)[0], fitted.locate(frames)[0])
 
 
 class _Payload:

@@ -11,8 +11,9 @@ from jeit.touch.kohonen.training import train
 
 
 def minisoms(weights, frames, order, rates, radii):
-    """What MiniSom makes of the same frames in the same order, and the winners on the way."""
+    """What MiniSom makes of the same frames in the same order: with a radius next to nothing the winner moves alone."""
     oracle = MiniSom(*weights.shape)
+    radii = np.append(radii, np.full(len(order) - len(radii), 0.01))
     oracle._weights = weights.copy()
     oracle._learning_rate_decay_function = lambda rate, step, steps: rates[step]
     oracle._sigma_decay_function = lambda radius, step, steps: radii[step]
@@ -21,7 +22,7 @@ def minisoms(weights, frames, order, rates, radii):
     return oracle
 
 
-@pytest.mark.parametrize(("ordering", "tuning"), [(300, 0), (0, 300), (200, 300)])
+@pytest.mark.parametrize(("ordering", "tuning"), [(300, 0), (0, 300), (200, 300), (17, 1)])
 def test_weights_are_minisoms(ordering, tuning):
     random = np.random.default_rng(1)
     frames, weights = random.normal(5.0, 1.0, (80, 12)), random.normal(0, 0.1, (7, 5, 12))
@@ -70,6 +71,22 @@ def test_curves_settle_without_overshoot_the_slower_the_smaller_the_rate():
     assert all(1 <= constant * rate <= 10 for constant, rate in zip(constants, (0.01, 0.005, 0.001), strict=True))
     assert (curves.max(axis=1) < 2.0 + 0.005).all()
     np.testing.assert_allclose(curves[:2, -1], 2.0, atol=0.01)
+
+
+def test_a_phase_may_end_anywhere_in_what_is_shown_at_once():
+    """Frames are shown some at once, and the last of them are filled up: of those nothing is seen."""
+    random = np.random.default_rng(5)
+    frames, weights = random.normal(size=(30, 6)), random.normal(size=(4, 3, 6))
+    schedule = Schedule(37, 101)
+    order, rates, radii = random.integers(0, 30, schedule.steps), schedule.rates(), schedule.radii((4, 3))
+    whole, curve = train(jnp.asarray(weights), jnp.asarray(frames), order, rates, radii)
+    first, begun = train(jnp.asarray(weights), jnp.asarray(frames), order[:50], rates[:50], radii)
+    then, ended = train(first, jnp.asarray(frames), order[50:], rates[50:], radii[:0])
+    np.testing.assert_allclose(then, whole, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.append(begun, ended), curve, rtol=0, atol=1e-12)
+    for steps in (37, 38, 110):
+        part, _ = train(jnp.asarray(weights), jnp.asarray(frames), order[:steps], rates[:steps], radii)
+        assert curve[steps - 1] == pytest.approx(float(part.mean()), abs=1e-12)
 
 
 BAD = {
