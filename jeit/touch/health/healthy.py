@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.touch.health.lasting import lasting_step, median, size_of, window_change
+from jeit.touch.health.unsteady import Steadiness
 
 # Steps of a window at most, more frames are averaged; at least; and windows that a healthy recording has at least.
 _MOST, _FEWEST, _WINDOWS = 48, 5, 8
@@ -14,7 +15,7 @@ _LEAST_ALWAYS, _MOST_ALWAYS = 12, 64
 # A window is so many times the longest touch, where no time is given, and no less than this share of the frames.
 _LONGEST, _LEAST_SHARE = 3.0, 1 / 40
 # Of what healthy windows did at most, and in deviations of normal ones: a change below is none. Few windows say less.
-_BEYOND, _LEAST_SIZE, _FEW = 2.0, 4.0, 4.0
+_BEYOND, _LEAST_SIZE, _FEW = 2.0, 4.0, 8.0
 # A step is still there when so much of it is.
 _STILL = 0.4
 # The same from the healthy recording to another.
@@ -39,8 +40,8 @@ class Healthy:
     of a window; `scale` (M,), volts: how far windows that follow each other are apart; `limit` of
     `size_of` a step that stays, and `sudden` of one that may be a touch; `level`
     (M,), volts, how far any two are apart, and its `level_limit`; `touches` (M, k): directions of touches, orthonormal
-    in units of noise; `unlike`: the share of a change that no touch has outside of those; `period`, seconds a frame,
-    or 1.
+    in units of noise; `unlike`: the share of a change that no touch has outside of those; `steadiness` of single
+    channels; `period`, seconds a frame, or 1.
     """
 
     reference: Float[np.ndarray, " M"]
@@ -56,6 +57,7 @@ class Healthy:
     level_limit: float
     touches: Float[np.ndarray, "M k"]
     unlike: float
+    steadiness: Steadiness
     period: float
 
     @classmethod
@@ -92,8 +94,23 @@ class Healthy:
         local = frames - centre
         span = np.stack([np.nanmin(local, axis=0, initial=0.0), np.nanmax(local, axis=0, initial=0.0)])
         fixed = np.where(used, np.nan_to_num(centre), 0.0)
+        steadiness = Steadiness.learn(steps, window, noise)
         return cls(
-            fixed, used, noise, span, stride, window, scale, limit, sudden, level, level_limit, touches, unlike, period
+            reference=fixed,
+            used=used,
+            noise=noise,
+            span=span,
+            stride=stride,
+            window=window,
+            scale=scale,
+            limit=limit,
+            sudden=sudden,
+            level=level,
+            level_limit=level_limit,
+            touches=touches,
+            unlike=unlike,
+            steadiness=steadiness,
+            period=period,
         )
 
     def outside(self, change: Float[np.ndarray, " M"]) -> float:

@@ -275,6 +275,7 @@ class SkinHealth:
             step = lasting_step(frames, np.where(after.trusted, healthy.scale, np.inf), healthy.limit)
             if step is not None:
                 return after._stepped(step, frames)
+            after = after._steadied(frames)
         off = np.where(self.trusted & np.isfinite(latest), latest - self.reference, 0.0)
         if after._pending is None and size_of(off / healthy.scale) < healthy.limit:
             followed = self.reference + _FOLLOWS * (latest - self.reference)
@@ -340,6 +341,28 @@ class SkinHealth:
             return fresh
         return replace(fresh, _pending=_Pending(change, found[0]))
 
+    def _steadied(self, frames: np.ndarray) -> "SkinHealth":
+        """After single channels that have got noisy, or are stuck."""
+        after, steadiness = self, self.healthy.steadiness
+        for kind, which in (
+            (EventKind.NOISY, steadiness.noisy(frames, self.trusted)),
+            (EventKind.STUCK, steadiness.stuck(frames, self.trusted)),
+        ):
+            for channel in np.flatnonzero(which):
+                own = np.arange(self.reference.size) == channel
+                time, frame, _ = self._window[0]
+                change = Change(np.zeros(own.size), self.healthy.limit, time, frame, self.time)
+                said = "is several times as noisy as it was, or jumps" if kind == EventKind.NOISY else "does not move"
+                event = after._event(
+                    change,
+                    Finding(kind, f"Channel {channel} {said}.", True, own=own),
+                    EventStatus.LASTING,
+                    len(after.events),
+                )
+                event = eqx.tree_at(lambda one: one.channels, event, own)
+                after = replace(after, events=(*after.events, event))
+        return after if after is self else replace(after, trusted=after._trusted_channels())
+
     def _undone(self, change: Change) -> "SkinHealth | None":
         """After a step that takes an earlier change back."""
         for one in self.open_events:
@@ -388,6 +411,8 @@ class SkinHealth:
             strength=change.size / self.healthy.limit,
             electrode=found.electrode,
             path=None if found.loss is None else found.loss.path,
+            deviation=0.0 if found.loss is None else found.loss.deviation,
+            through=None if found.loss is None else found.loss.through,
             reason=found.reason,
         )
 
@@ -405,11 +430,13 @@ class SkinHealth:
         return self.skin if self.skin is None or cut else self.skin.healed()
 
     def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
-        """Channels (M,) that no open event of an electrode takes away."""
+        """Channels (M,) that no open event of an electrode, or of themselves, takes away."""
         trusted = self.healthy.used.copy()
         for one in self.open_events:
             if one.electrode is not None and self.touching is not None:
                 trusted &= ~self.touching[one.electrode]
+            if one.kind in (EventKind.NOISY, EventKind.STUCK):
+                trusted &= ~one.channels
         return trusted
 
 
