@@ -1,10 +1,10 @@
-"""A cut's path from the change of voltages that it made: a line that resists what crosses it, fitted to the exact model.
+"""A cut's path from the change of voltages that it made: a line that resists what crosses it, fitted exactly.
 
 Across the path a sheet conducts as if it were longer there by some length, very long where it is cut through; along
-the path it conducts as before. This is spread over a band about as wide as two edges of a mesh that is made finer around
-where images show a loss. The places of the path's ends and its bend, and that length, are found by least squares,
-the voltages solved anew in every step. A round spot is fitted too, which is what a press makes: the better of the two
-says what it is.
+the path it conducts as before. This is spread over a band about as wide as two edges of a mesh that is made finer where
+images show a loss. The places of the path's ends and its bend, and that length, are found by least squares, the
+voltages solved anew in every step. A round spot is fitted too, which is what a press makes: the better of the two says
+what it is.
 """
 
 from dataclasses import dataclass
@@ -32,8 +32,9 @@ _SPOT, _MOST_SPOT, _REACH, _SPOT_DEPTHS, _MOST_DEPTH = 0.05, 0.1, 3.0, (0.5, -0.
 _ASIDE = 0.2
 # A bend, or a cut that does not go through, has to take so much of the misfit that without it is left.
 _BEND, _NOT_THROUGH = 0.7, 0.4
-# Two explanations are told apart if one leaves so many times more; an end is known to so many edges at worst.
-_TOLD_APART, _WIDEST = 4.0, 10.0
+# A cut that leaves less than this and goes through is one; else it is told from one that does not where that leaves so
+# many times more. An end is known to so many edges at worst.
+_CLEAR, _TOLD_APART, _WIDEST = 0.01, 4.0, 10.0
 # Of a change, and of the root mean square of all, what no model of it gets right; and of all of it, a common factor.
 _MODEL, _FACTOR = 0.05, 0.1
 # Of the skin's side, a step of a derivative.
@@ -115,14 +116,14 @@ class LossFit:
             ]
             tried.append(sorted(first, key=self._misfit)[:_FOLLOWED])
         through = min((self._fitted(one, fixed=True) for one in tried[0]), key=lambda one: one.misfit)
-        through = self._bent(through, fixed=True)
         partly = min((self._fitted(one) for one in tried[1]), key=lambda one: one.misfit)
-        partly = self._bent(partly)
+        through, partly = self._bent(through, fixed=True), self._bent(partly)
         is_through = not partly.misfit < _NOT_THROUGH * through.misfit
         best, other = (through, partly) if is_through else (partly, through)
         path = best.unknowns[:-2].reshape(-1, 2)
-        # A shallow long line and a deep short one may both explain it.
-        alike = not is_through and other.misfit < _TOLD_APART * best.misfit
+        # A shallow long line and a deep short one may both explain it, neither well.
+        clear = is_through and best.misfit < _CLEAR
+        alike = not clear and other.misfit < _TOLD_APART * best.misfit
         unsure = abs(_length(best) - _length(other)) if alike else 0.0
         deviation = float(np.hypot(self._deviation(best), unsure))
         return FittedLoss(path, best.misfit, self._own(best.unknowns), is_through, deviation)

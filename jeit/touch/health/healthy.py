@@ -27,6 +27,8 @@ _DIRECTIONS, _EXPLAINED = 40, 0.98
 # Of healthy touches, how many are as unlike the others; those count that have this share of a strong one's energy.
 _UNLIKE, _STRONG = 0.99, 0.2
 _LEAST_FRAMES = 20
+# Of steps from frame to frame, those that touches have no part in; the mean magnitude of as many of a normal number.
+_QUIETER, _OF_NORMAL = 0.8, 0.5586
 # Deviation of a normal number over its mean magnitude.
 _MEAN = float(np.sqrt(np.pi / 2))
 
@@ -132,10 +134,17 @@ def _noise(frames: np.ndarray) -> np.ndarray:
     """Of every channel from frame to frame; what moves only now and then has the deviation that this makes."""
     steps = np.diff(frames, axis=0)
     some = np.isfinite(steps).any(axis=0)
-    quiet, whole = np.zeros(frames.shape[1]), np.zeros(frames.shape[1])
-    quiet[some] = 1.4826 * np.nanmedian(np.abs(steps[:, some]), axis=0) / np.sqrt(2)
+    quiet, most, whole = np.zeros((3, frames.shape[1]))
+    sizes = np.sort(np.abs(steps[:, some]), axis=0)  # NaN last
+    there = np.isfinite(sizes).sum(axis=0)
+    quiet[some] = 1.4826 * np.nanmedian(sizes, axis=0) / np.sqrt(2)
     whole[some] = np.nanstd(steps[:, some], axis=0) / np.sqrt(2)
-    # Coarse steps of a converter have a median of zero.
+    # Coarse steps of a converter have a median of zero, or of one of them; their mean tells more.
+    small = np.maximum((_QUIETER * there).astype(int), 1)
+    most[some] = (
+        np.cumsum(np.nan_to_num(sizes), axis=0)[small - 1, np.arange(len(small))] / small / _OF_NORMAL / np.sqrt(2)
+    )
+    quiet = np.where((quiet > 0.05 * whole) & (quiet < 2 * most), quiet, most)
     return np.where(quiet > 0.05 * whole, quiet, whole)
 
 

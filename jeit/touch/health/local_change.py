@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import gradients
 from jeit.forward.model import evaluate, solved_system_of
-from jeit.forward.transfer import electrode_impedance
+from jeit.forward.transfer import centred, electrode_impedance
 from jeit.mesh import centroids, measures
 
 # Nodes of a region at most.
@@ -67,7 +67,9 @@ class LocalChange:
         for way in ways:
             part = way[cells] * self.measures[cells].reshape((-1,) + (1,) * (way.ndim - 1))
             turned = np.einsum("cab,bcl->acl", part, slope) if part.ndim == 3 else part[:, None] * slope
-            found.append(-np.tensordot(slope, turned, axes=([0, 1], [0, 1])))
+            # What a grounded node adds is taken out again, as in the impedance.
+            energy = np.tensordot(slope, turned, axes=([0, 1], [0, 1]))
+            found.append(-np.asarray(centred(energy)))  # pyright: ignore[reportArgumentType]
         return impedance, found
 
     def _solved(self, change: np.ndarray):
@@ -75,7 +77,7 @@ class LocalChange:
         size = np.abs(change).reshape(len(change), -1).max(axis=1)
         cells = np.flatnonzero(size > 0)
         if not len(cells):
-            return cells, electrode_impedance(self.model.electrodes, self.at_rest), np.zeros((0, len(self.at_rest)))
+            return cells, self._impedance(self.at_rest), np.zeros((0, len(self.at_rest)))
         nodes, corners = np.unique(self.corners[cells], return_inverse=True)
         corners = corners.reshape(len(cells), -1)
         slope = self.gradients[cells]
@@ -87,7 +89,10 @@ class LocalChange:
         before = self.solution[nodes]
         now = np.linalg.solve(np.eye(len(nodes)) + self.inverse[np.ix_(nodes, nodes)] @ stiffness, before)
         product = self.at_rest - before.T @ (stiffness @ now)
-        return cells, electrode_impedance(self.model.electrodes, product), now
+        return cells, self._impedance(product), now
+
+    def _impedance(self, product: np.ndarray) -> Float[np.ndarray, "L L"]:
+        return np.asarray(electrode_impedance(self.model.electrodes, product))  # pyright: ignore[reportArgumentType]
 
 
 def _inverse_between(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:

@@ -29,6 +29,8 @@ _GONE, _REFUSED = 0.6, 0.5
 # Beyond so many spans of healthy changes, a channel reads nothing of the skin; of the channels, that may be so at once.
 _SPANS, _FEW = 3.0, 0.34
 
+_OF_CHANNELS = (EventKind.NOISY, EventKind.STUCK)
+
 
 class WatchStatus(StrEnum):
     """What became of a frame. Each is equal to its word."""
@@ -343,22 +345,21 @@ class SkinHealth:
 
     def _steadied(self, frames: np.ndarray) -> "SkinHealth":
         """After single channels that have got noisy, or are stuck."""
-        after, steadiness = self, self.healthy.steadiness
+        after, steadiness, asked = self, self.healthy.steadiness, self.trusted.copy()
+        for one in self.events:
+            if one.kind in _OF_CHANNELS and one.status == EventStatus.DENIED:
+                asked &= ~one.channels
         for kind, which in (
-            (EventKind.NOISY, steadiness.noisy(frames, self.trusted)),
-            (EventKind.STUCK, steadiness.stuck(frames, self.trusted)),
+            (EventKind.NOISY, steadiness.noisy(frames, asked)),
+            (EventKind.STUCK, steadiness.stuck(frames, asked)),
         ):
             for channel in np.flatnonzero(which):
                 own = np.arange(self.reference.size) == channel
                 time, frame, _ = self._window[0]
                 change = Change(np.zeros(own.size), self.healthy.limit, time, frame, self.time)
                 said = "is several times as noisy as it was, or jumps" if kind == EventKind.NOISY else "does not move"
-                event = after._event(
-                    change,
-                    Finding(kind, f"Channel {channel} {said}.", True, own=own),
-                    EventStatus.LASTING,
-                    len(after.events),
-                )
+                finding = Finding(kind, f"Channel {channel} {said}.", True, own=own)
+                event = after._event(change, finding, EventStatus.LASTING, len(after.events))
                 event = eqx.tree_at(lambda one: one.channels, event, own)
                 after = replace(after, events=(*after.events, event))
         return after if after is self else replace(after, trusted=after._trusted_channels())
@@ -435,7 +436,7 @@ class SkinHealth:
         for one in self.open_events:
             if one.electrode is not None and self.touching is not None:
                 trusted &= ~self.touching[one.electrode]
-            if one.kind in (EventKind.NOISY, EventKind.STUCK):
+            if one.kind in _OF_CHANNELS:
                 trusted &= ~one.channels
         return trusted
 
