@@ -15,7 +15,7 @@ _LEAST_ALWAYS, _MOST_ALWAYS = 12, 64
 # A window is so many times the longest touch, where no time is given, and no less than this share of the frames.
 _LONGEST, _LEAST_SHARE = 3.0, 1 / 40
 # Of what healthy windows did at most, and in deviations of normal ones: a change below is none. Few windows say less.
-_BEYOND, _LEAST_SIZE, _FEW = 2.0, 4.0, 8.0
+_BEYOND, _LEAST_SIZE, _FEW = 2.0, 4.0, 20.0
 # A step is still there when so much of it is.
 _STILL = 0.4
 # The same from the healthy recording to another.
