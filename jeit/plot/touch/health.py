@@ -11,7 +11,7 @@ from jeit.plot.colour_scale import CHANGE, ColourScale
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import plot_image
 from jeit.plot.imaging.mesh import draw_outline
-from jeit.touch.health import EventStatus, SkinHealth
+from jeit.touch.health import EventStatus, HealthEvent, SkinHealth
 
 _HALO = [withStroke(linewidth=4, foreground="white")]
 _CUT, _MENDED = SERIES_COLOURS[1], SERIES_COLOURS[2]
@@ -25,8 +25,8 @@ def plot_health(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a skin with its cuts, those that are mended dashed, how long they are and when they were made, and a cross
-    on every electrode that has failed; over an `image` (m,) of it, if one is given.
+    """Draw a skin with its cuts, those that are mended dashed, how long they are and how well that is known, when they
+    were made, and a cross on every electrode that has failed; over an `image` (m,) of it, if one is given.
 
     `scale` as in `plot_image`. Raises `ValueError` for a skin without a model, and as `plot_image` does.
     """
@@ -49,7 +49,7 @@ def plot_health(
             ax.set_title(title)
     for event in health.events:
         if event.path is not None and event.status != EventStatus.DENIED:
-            _draw_cut(ax, event.path, event.length, event.time, mended=event.status == EventStatus.MENDED)
+            _draw_cut(ax, event)
     failed = [one.electrode for one in health.open_events if one.electrode is not None]
     if failed:
         places = np.asarray(electrodes.position)[failed, :2]  # pyright: ignore[reportAttributeAccessIssue]
@@ -57,17 +57,25 @@ def plot_health(
     return ax
 
 
-def _draw_cut(ax: Axes, path: np.ndarray, length: float, time: float, *, mended: bool) -> None:
+def _draw_cut(ax: Axes, event: HealthEvent) -> None:
+    mended, path = event.status == EventStatus.MENDED, np.asarray(event.path)
     colour = _MENDED if mended else _CUT
     style = (0, (2.5, 1.5)) if mended else "-"
     ax.plot(*path.T, color=colour, linestyle=style, linewidth=2.4, zorder=5, path_effects=_HALO)
-    told = f"{'mended' if mended else 'cut'}, {1e3 * length:.0f} mm, at {time:.4g} s"
+    # No finer than it is known.
+    known = f" ± {1e3 * event.deviation:.0f}" if 1e3 * event.deviation >= 0.5 else ""
+    said = f"{'mended' if mended else 'cut'}, {1e3 * event.length:.0f}{known} mm, at {event.time:.4g} s"
+    low, high = ax.get_xlim()
+    top = path[path[:, 1].argmax()]
+    # A label by the edge of the skin grows away from it.
+    share = (top[0] - low) / (high - low)
+    aligned = "left" if share < 0.25 else "right" if share > 0.75 else "center"
     ax.annotate(
-        told,
-        path[path[:, 1].argmax()],
+        said,
+        top,
         (0, 7),
         textcoords="offset points",
-        ha="center",
+        ha=aligned,
         color=colour,
         fontsize=9,
         zorder=7,

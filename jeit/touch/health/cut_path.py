@@ -1,8 +1,10 @@
-"""A cut's path from the change of voltages that it made: a line of lost conductivity, fitted to the exact model.
+"""A cut's path from the change of voltages that it made: a line that resists what crosses it, fitted exactly.
 
-Along a path, conductivity falls by exp(−a w(d)), w a Gaussian of the distance d to it about as wide as the mesh can
-hold; depth a, and the places of the path's ends and its bend, are found by least squares, the voltages solved anew in
-every step. A round spot is fitted too, which is what a press makes: the better of the two says what it is.
+Across the path a sheet conducts as if it were longer there by some length, very long where it is cut through; along
+the path it conducts as before. This is spread over a band about as wide as two edges of a mesh that is made finer where
+images show a loss. The places of the path's ends and its bend, and that length, are found by least squares, the
+voltages solved anew in every step. A round spot is fitted too, which is what a press makes: the better of the two says
+what it is.
 """
 
 from dataclasses import dataclass
@@ -11,33 +13,61 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jeit.forward import ForwardModel
-from jeit.mesh import centroids, measures
+from jeit.mesh import centroids
+from jeit.touch.health.finer_mesh import finer_model
+from jeit.touch.health.local_change import LocalChange
 
-# Of the edge of a mean cell, how wide a cut is; directions tried first, of which so many are followed; steps of each.
-_WIDTH, _DIRECTIONS, _FOLLOWED, _STEPS = 0.6, 6, 2, 25
-# Of the skin's side, the length that is begun with; depths a, least, first and greatest.
-_LENGTH, _LEAST_DEPTH, _DEPTH, _MOST_DEPTH = 0.18, 0.1, 2.5, 9.0
-# Of a spot, the radius, of the skin's side, and the depth that are begun with.
-_SPOT, _SPOT_DEPTH = 0.05, 0.5
-# A bend has to take so much of the misfit that a straight line leaves.
-_BEND = 0.6
-# Of a change, and of the root mean square of all, what no model of it gets right.
-_MODEL = 0.05
+# Directions and lengths, of the skin's side, tried first, and how many of these are followed, in steps of each.
+_DIRECTIONS, _LENGTHS, _FOLLOWED, _STEPS = 8, (0.08, 0.2), 2, 25
+# Of the skin's side, by how much longer it is across a cut that goes through, at most; and where a lesser cut begins.
+_THROUGH, _PART, _LEAST = 3.0, 0.02, 1e-4
+# Of the skin's side, how far around a place it is looked at, and the edges of the mesh there.
+_RADIUS, _EDGE = 0.22, 0.0125
+# Half the width of the band, in edges of the fine mesh; beyond a path's ends it is so many times as narrow.
+_BAND, _ENDS = 1.5, 2.0
+# Of a spot, the radius, of the skin's side, the greatest, and how many of them it reaches; depths that are begun with,
+# and the greatest.
+_SPOT, _MOST_SPOT, _REACH, _SPOT_DEPTHS, _MOST_DEPTH = 0.05, 0.1, 3.0, (0.5, -0.5), 6.0
+# Of a line's length, how far its middle is put aside to begin with for a bend.
+_ASIDE = 0.2
+# A bend, or a cut that does not go through, has to take so much of the misfit that without it is left.
+_BEND, _NOT_THROUGH = 0.7, 0.4
+# A cut that leaves less than this and goes through is one; else it is told from one that does not where that leaves so
+# many times more. An end is known to so many edges at worst.
+_CLEAR, _TOLD_APART, _WIDEST = 0.01, 4.0, 10.0
+# Of a change, and of the root mean square of all, what no model of it gets right; and of all of it, a common factor.
+_MODEL, _FACTOR = 0.05, 0.1
+# Of the skin's side, a step of a derivative.
+_STEP = 1e-5
 
 
 @dataclass(frozen=True)
 class FittedLoss:
     """Conductivity lost: along a `path` (k, 2), metres, or of a round spot at `path` (1, 2); `misfit`, the share of the
-    change's energy that it does not explain, and its `conductivity` (m,), S/m (2-D: S)."""
+    change's energy that it does not explain; its `conductivity` (m,), S/m (2-D: S); whether the cut goes `through`,
+    which is so where nothing else is needed; and the standard `deviation` of its length, metres."""
 
     path: Float[np.ndarray, "k 2"]
     misfit: float
     conductivity: Float[np.ndarray, " m"]
+    through: bool = False
+    deviation: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Found:
+    unknowns: np.ndarray
+    misfit: float
+
+
+def _length(found: _Found) -> float:
+    """Of its path, metres."""
+    return float(np.linalg.norm(np.diff(found.unknowns[:-2].reshape(-1, 2), axis=0), axis=1).sum())
 
 
 class LossFit:
     """Least squares for a `change` (K,) of voltages of a model's `channels` (K,), volts, from `conductivity` (m,), S/m
-    (2-D: S)."""
+    (2-D: S), in a skin that is looked at finely around a `centre` (2,), metres."""
 
     def __init__(
         self,
@@ -46,109 +76,206 @@ class LossFit:
         change: Float[np.ndarray, " K"],
         channels: Int[np.ndarray, " K"],
         noise: Float[np.ndarray, " K"],
+        centre: Float[np.ndarray, " 2"],
     ):
-        """`conductivity` as it was, S/m (2-D: S); `noise` (K,), volts."""
-        self.model, self.conductivity, self.channels = model, conductivity, channels
-        self.centres = np.asarray(centroids(model.mesh))[:, :2]
-        area = np.asarray(measures(model.mesh))
-        self.low, self.high = self.centres.min(axis=0), self.centres.max(axis=0)
+        """`conductivity` as it was, S/m (2-D: S); `noise` (K,) of the change, volts."""
+        own = np.asarray(centroids(model.mesh))[:, :2]
+        self.low, self.high = own.min(axis=0), own.max(axis=0)
         self.side = float((self.high - self.low).max())
-        flat = model.mesh.dimension == 2
-        across = float(np.mean(area)) if flat else float(np.prod(self.high - self.low)) / len(area) * 3
-        self.width = _WIDTH * 1.5 * np.sqrt(across)
-        self.rest = np.asarray(model.voltages(conductivity))[channels]
+        finer, parent, edge = finer_model(model, centre, _RADIUS * self.side, _EDGE * self.side)
+        self.region = LocalChange(finer, conductivity[parent], centre, _RADIUS * self.side)
+        self.low = np.maximum(self.low, centre - self.region.radius)
+        self.high = np.minimum(self.high, centre + self.region.radius)
+        self.edge, self.band, self.whole = edge, _BAND * edge, conductivity
+        self.parent, self.parts = parent[self.region.cells], np.bincount(parent, minlength=len(conductivity))
+        self.conductivity, self.centres = conductivity[self.parent], self.region.centres
+        self.dimension = model.mesh.dimension
+        protocol = model.protocol
+        self.driven = np.asarray(protocol.drive)[np.asarray(protocol.drive_index)[channels]]
+        self.measured = np.asarray(protocol.measurement)[np.asarray(protocol.measurement_index)[channels]]
+        self.rest = self._volts(self.region.impedance(np.zeros(len(self.conductivity))))
         size = np.sqrt(np.mean(change**2))
         self.weight = 1 / np.hypot(noise, _MODEL * np.hypot(change, size))
         self.change = change
-        self.energy = float(np.sum((self.weight * change) ** 2))
+        # A skin that conducts better or worse as a whole is not what is looked for.
+        whole = self.weight * self.rest
+        self.drift = whole / np.linalg.norm(whole)
+        self.energy = float(np.sum(self._weighted(change) ** 2))
 
-    def line(self, start: np.ndarray) -> FittedLoss:
-        """A straight cut near a place (x, y), or a bent one where that is far better."""
-        half = 0.5 * _LENGTH * self.side
+    def line(self, starts: list[np.ndarray]) -> FittedLoss:
+        """A straight cut near one of some places (x, y), or a bent one where that is far better."""
         angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
-        first = [
-            np.concatenate([start - half * way, start + half * way, [_DEPTH]])
-            for way in np.column_stack([np.cos(angles), np.sin(angles)])
-        ]
-        tried = sorted(first, key=lambda one: self._misfit(one))[:_FOLLOWED]
-        straight = min((self._fitted(one) for one in tried), key=lambda one: one[1])
-        ends = straight[0][:-1].reshape(-1, 2)
-        bent = self._fitted(np.concatenate([ends[0], ends.mean(axis=0), ends[-1], straight[0][-1:]]))
-        best = bent if bent[1] < _BEND * straight[1] else straight
-        path = best[0][:-1].reshape(-1, 2)
-        return FittedLoss(path, best[1], self._values(best[0])[0])
+        ways = np.column_stack([np.cos(angles), np.sin(angles)])
+        tried = []
+        for depth in (_THROUGH, _PART):
+            first = [
+                np.array([*(start - half * way), *(start + half * way), np.log(depth), 0.0])
+                for start in starts
+                for half in 0.5 * self.side * np.array(_LENGTHS)
+                for way in ways
+            ]
+            tried.append(sorted(first, key=self._misfit)[:_FOLLOWED])
+        through = min((self._fitted(one, fixed=True) for one in tried[0]), key=lambda one: one.misfit)
+        partly = min((self._fitted(one) for one in tried[1]), key=lambda one: one.misfit)
+        through, partly = self._bent(through, fixed=True), self._bent(partly)
+        is_through = not partly.misfit < _NOT_THROUGH * through.misfit
+        best, other = (through, partly) if is_through else (partly, through)
+        path = best.unknowns[:-2].reshape(-1, 2)
+        # A shallow long line and a deep short one may both explain it, neither well.
+        clear = is_through and best.misfit < _CLEAR
+        alike = not clear and other.misfit < _TOLD_APART * best.misfit
+        unsure = abs(_length(best) - _length(other)) if alike else 0.0
+        deviation = float(np.hypot(self._deviation(best), unsure))
+        return FittedLoss(path, best.misfit, self._own(best.unknowns), is_through, deviation)
 
     def spot(self, start: np.ndarray) -> FittedLoss:
-        """A round one."""
-        best = self._fitted(np.array([*start, _SPOT * self.side, _SPOT_DEPTH]))
-        return FittedLoss(best[0][None, :2], best[1], self._values(best[0])[0])
+        """A round one, or a round gain."""
+        begun = [np.array([*start, np.log(_SPOT), depth, 0.0]) for depth in _SPOT_DEPTHS]
+        best = min((self._fitted(one) for one in begun), key=lambda one: one.misfit)
+        return FittedLoss(best.unknowns[None, :2], best.misfit, self._own(best.unknowns))
 
-    def _fitted(self, start: np.ndarray) -> tuple[np.ndarray, float]:
+    def _bent(self, straight: _Found, *, fixed: bool = False) -> _Found:
+        ends = straight.unknowns[:-2].reshape(-1, 2)
+        middle, (x, y) = ends.mean(axis=0), ends[-1] - ends[0]
+        aside = _ASIDE * np.array([-y, x])
+        tried = [
+            np.array([*ends[0], *place, *ends[-1], *straight.unknowns[-2:]])
+            for place in (middle + aside, middle - aside)
+        ]
+        bent = min((self._fitted(one, fixed=fixed) for one in tried), key=lambda one: one.misfit)
+        return bent if bent.misfit < _BEND * straight.misfit else straight
+
+    def _fitted(self, start: np.ndarray, *, fixed: bool = False) -> _Found:
+        """From a `start`; with how long the cut is across, `fixed`."""
         from scipy.optimize import least_squares
 
-        low, high = self._bounds(len(start))
-        inside = np.clip(start, low + 1e-9, high - 1e-9)
-        scale = np.full(len(start), 0.05 * self.side)
-        scale[-1] = 1.0
-        found = least_squares(
-            self._residual,
-            inside,
-            self._slope,  # pyright: ignore[reportArgumentType]
-            bounds=(low, high),
-            x_scale=scale,
-            max_nfev=_STEPS,
-            ftol=1e-4,
-            xtol=1e-4,
-        )
-        return found.x, 2 * found.cost / self.energy
+        low, high, scale = self._bounds(len(start))
+        free = np.ones(len(start), bool)
+        free[-2] = not fixed
 
-    def _bounds(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        if number == 4:  # a spot
-            low = np.concatenate([self.low, [self.width], [-_MOST_DEPTH]])
-            return low, np.concatenate([self.high, [0.3 * self.side], [_MOST_DEPTH]])
-        places = (number - 1) // 2
-        low = np.concatenate([np.tile(self.low, places), [_LEAST_DEPTH]])
-        return low, np.concatenate([np.tile(self.high, places), [_MOST_DEPTH]])
+        def whole(some: np.ndarray) -> np.ndarray:
+            unknowns = start.copy()
+            unknowns[free] = some
+            return unknowns
+
+        inside = np.clip(start, low + 1e-9, high - 1e-9)
+        found = least_squares(
+            lambda some: self._residual(whole(some)),
+            inside[free],
+            lambda some: self._slope(whole(some))[:, free],  # pyright: ignore[reportArgumentType]
+            bounds=(low[free], high[free]),
+            x_scale=scale[free],
+            max_nfev=_STEPS,
+            ftol=1e-3,
+            xtol=1e-3,
+        )
+        return _Found(whole(found.x), 2 * found.cost / self.energy)
+
+    def _bounds(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Least and greatest unknowns, and of what size they are."""
+        if number == 5:  # a spot
+            low, high = (
+                [*self.low, np.log(self.band / self.side), -_MOST_DEPTH],
+                [*self.high, np.log(_MOST_SPOT), _MOST_DEPTH],
+            )
+            scale = [0.05 * self.side, 0.05 * self.side, 0.5, 0.5]
+        else:
+            places = (number - 2) // 2
+            low = [*np.tile(self.low, places), np.log(_LEAST)]
+            high = [*np.tile(self.high, places), np.log(_THROUGH) + 1e-6]
+            scale = [*np.full(2 * places, 0.05 * self.side), 1.0]
+        return np.array([*low, -0.5]), np.array([*high, 0.5]), np.array([*scale, _FACTOR])
+
+    def _deviation(self, found: _Found) -> float:
+        """Of a path's length, metres: by how much its ends may move, and half an edge of the mesh."""
+        least = found.misfit * self.energy
+        each = least / max(len(self.change) - len(found.unknowns), 1)
+        path = found.unknowns[:-2].reshape(-1, 2)
+        square = (0.5 * self.edge) ** 2
+        for end, next_one in ((0, 1), (-1, -2)):
+            way = path[end] - path[next_one]
+            way = self.edge * way / max(float(np.linalg.norm(way)), 1e-12)
+            rises = []
+            for sign in (1.0, -1.0):
+                moved = path.copy()
+                moved[end] += sign * way
+                rises.append(self._misfit(np.array([*moved.ravel(), *found.unknowns[-2:]])) - least)
+            square += self.edge**2 * min(each / max(max(rises), 1e-12 * self.energy), _WIDEST**2)
+        return float(np.sqrt(square))
+
+    def _weighted(self, volts: np.ndarray) -> np.ndarray:
+        scaled = (self.weight * volts.T).T
+        return scaled - np.multiply.outer(self.drift, self.drift @ scaled)
 
     def _misfit(self, unknowns: np.ndarray) -> float:
         return float(np.sum(self._residual(unknowns) ** 2))
 
+    def _volts(self, impedance: np.ndarray) -> np.ndarray:
+        """Of the channels (K,), from a transfer impedance (L, L)."""
+        return np.einsum("kl,kl->k", self.measured @ impedance, self.driven)
+
+    def _predicted(self, unknowns: np.ndarray) -> np.ndarray:
+        return self._volts(self.region.impedance(self._change(unknowns))) - self.rest
+
     def _residual(self, unknowns: np.ndarray) -> np.ndarray:
-        voltages = np.asarray(self.model.voltages(self._values(unknowns)[0]))[self.channels]
-        return self.weight * (voltages - self.rest - self.change)
+        left = (1 + unknowns[-1]) * self._predicted(unknowns) - self.change
+        return np.append(self._weighted(left), unknowns[-1] / _FACTOR)
 
     def _slope(self, unknowns: np.ndarray) -> np.ndarray:
-        values, slope = self._values(unknowns)
-        jacobian = np.asarray(self.model.jacobian(values))[self.channels]
-        return self.weight[:, None] * (jacobian @ slope)
+        """Derivatives (K + 1, q) of the residual."""
+        change = self._change(unknowns)
+        steps = np.full(len(unknowns) - 1, _STEP)
+        steps[: 2 if len(unknowns) == 5 else -1] *= self.side
+        ways = []
+        for number, step in enumerate(steps):
+            more = unknowns.copy()
+            more[number] += step
+            ways.append((self._change(more) - change) / step)
+        impedance, slopes = self.region.slopes(change, ways)
+        found = np.column_stack([*(self._volts(one) for one in slopes), self._volts(impedance) - self.rest])
+        found[:, :-1] *= 1 + unknowns[-1]
+        last = np.zeros(len(unknowns))
+        last[-1] = 1 / _FACTOR
+        return np.concatenate([self._weighted(found), last[None]])
 
-    def _values(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Conductivity (m,) and its derivatives (m, q) by the unknowns."""
-        depth = unknowns[-1]
-        if len(unknowns) == 4:
-            off = self.centres - unknowns[:2]
-            square, width = np.sum(off**2, axis=1), unknowns[2]
-            shape = np.exp(-square / (2 * width**2))
-            by = np.column_stack([shape[:, None] * off / width**2, shape * square / width**3])
-        else:
-            shape, by = self._near_path(unknowns[:-1].reshape(-1, 2))
-        values = self.conductivity * np.exp(-depth * shape)
-        return values, -values[:, None] * np.column_stack([depth * by, shape])
+    def _change(self, unknowns: np.ndarray) -> np.ndarray:
+        """Of the region's conductivity: of a spot (c,), along a path tensors (c, d, d)."""
+        if len(unknowns) == 5:
+            return self.conductivity * np.expm1(self._spot_log(unknowns))
+        left, across = self._across(unknowns)
+        change = np.zeros((len(left), self.dimension, self.dimension))
+        change[:, :2, :2] = (self.conductivity * (left - 1))[:, None, None] * across[:, :, None] * across[:, None, :]
+        return change
 
-    def _near_path(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """w(d) (m,) and its derivatives by the coordinates of the path's places."""
+    def _spot_log(self, unknowns: np.ndarray) -> np.ndarray:
+        """The logarithm (c,) of what share of conductivity is left in a spot."""
+        square = np.sum((self.centres - unknowns[:2]) ** 2, axis=1) / (np.exp(unknowns[2]) * self.side) ** 2
+        return -unknowns[3] * np.where(square < _REACH**2, np.exp(-square / 2), 0.0)
+
+    def _across(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What share of conductivity is left (m,) across the nearest part of a path, and the direction (m, 2) of it."""
+        path = unknowns[:-2].reshape(-1, 2)
         start, along = path[:-1], np.diff(path, axis=0)
+        lengths = np.maximum(np.linalg.norm(along, axis=1), 1e-9)
+        along = along / lengths[:, None]
+        normal = np.column_stack([-along[:, 1], along[:, 0]])
         off = self.centres[:, None] - start  # (m, s, 2)
-        share = np.sum(off * along, axis=-1) / np.maximum(np.sum(along**2, axis=-1), 1e-12)
-        share = np.clip(share, 0.0, 1.0)
-        away = off - share[..., None] * along
-        square = np.sum(away**2, axis=-1)
+        place = np.sum(off * along, axis=-1)
+        # The band ends where the path does.
+        pulled = np.minimum(self.band / _ENDS, 0.45 * lengths)
+        first, last = np.zeros(len(lengths)), lengths.copy()
+        first[0] += pulled[0]
+        last[-1] -= pulled[-1]
+        beyond = _ENDS * (place - np.clip(place, first, last))
+        square = np.sum(off * normal, axis=-1) ** 2 + beyond**2
         nearest = square.argmin(axis=1)
-        rows = np.arange(len(self.centres))
-        shape = np.exp(-square[rows, nearest] / (2 * self.width**2))
-        # The foot's own movement along the path changes the distance by nothing.
-        pull = shape[:, None] * away[rows, nearest] / self.width**2
-        by = np.zeros((len(rows), *path.shape))
-        by[rows, nearest] += (1 - share[rows, nearest])[:, None] * pull
-        by[rows, nearest + 1] += share[rows, nearest][:, None] * pull
-        return shape, by.reshape(len(rows), -1)
+        square = square[np.arange(len(square)), nearest] / self.band**2
+        # A bump of integral 1 across the path.
+        shape = np.where(square < 1, (1 - square) ** 2, 0.0) * 15 / (16 * self.band)
+        return 1 / (1 + np.exp(unknowns[-2]) * self.side * shape), normal[nearest]
+
+    def _own(self, unknowns: np.ndarray) -> np.ndarray:
+        """On the mesh that was given, one number for each cell."""
+        # Across a path conductivity is lost, along it none.
+        lost = self._spot_log(unknowns) if len(unknowns) == 5 else 0.5 * np.log(self._across(unknowns)[0])
+        return self.whole * np.exp(np.bincount(self.parent, lost, len(self.whole)) / self.parts)

@@ -10,6 +10,8 @@ from jeit.touch.health.event import EventKind
 _LEFT, _OWN, _RELATIVE, _AT_ONCE = 0.1, 0.75, 0.12, 0.25
 # A wire reads nothing below this share of what it did; contacts that wander have so many times the noise.
 _NOTHING, _WANDERS = 0.2, 5.0
+# Deviation of a normal number over the median magnitude of the difference of two.
+_DEVIATION = 1.0484
 # Beyond so many times its reading, a channel tells no more.
 _MOST = 10.0
 
@@ -49,7 +51,13 @@ def kind_of_fault(
     constant = len(middle) > 1 and np.ptp(middle) <= 0.02 * np.abs(middle).max() and np.ptp(reference[own]) > 0.1 * size
     if constant or np.median(np.abs(middle)) < _NOTHING * np.median(np.abs(reference[own])):
         return EventKind.TORN
-    wander = np.nanstd(now, axis=0) / np.minimum(noise[own], size)
+    # From frame to frame: what touches do is not meant.
+    steps = np.diff(now, axis=0)
+    some = np.isfinite(steps).any(axis=0)
+    wander = np.zeros(len(middle))
+    if some.any():
+        wander[some] = _DEVIATION * np.nanmedian(np.abs(steps[:, some]), axis=0)
+    wander /= np.minimum(noise[own], size)
     if np.median(wander) > _WANDERS and np.median(np.abs(middle)) < _MOST * np.median(np.abs(reference[own])):
         return EventKind.LOOSE
     return EventKind.DEAD

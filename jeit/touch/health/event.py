@@ -18,6 +18,10 @@ class EventKind(StrEnum):
     """An electrode's channels read next to nothing, or one constant; a dead electrode may look the same."""
     LOOSE = "loose electrode"
     """An electrode's contact is worse, and wanders."""
+    NOISY = "noisy channel"
+    """A single channel has several times its noise, or jumps about."""
+    STUCK = "stuck channel"
+    """A single channel does not move any more, while others do."""
     CHANGED = "changed"
     """The skin is not what it was; of what kind that is, frames alone do not tell, or no model bears out."""
     REPAIRED = "repaired"
@@ -43,7 +47,8 @@ class HealthEvent(eqx.Module):
     **Fields**: `number`, in order of telling; `kind`; `status`; `time`, when it began, and `told`, when it was noticed,
     both seconds (frames, where there are no times); `frame`, the number of the frame that it began at; `channels` (M,)
     that changed; `change` (M,), by what, volts; `strength`: how many times more than anything that healthy frames did;
-    `electrode`, its number from 0, or None; `path` (k, 2) of a cut, metres, or None, and its `length`, metres;
+    `electrode`, its number from 0, or None; `path` (k, 2) of a cut, metres, or None, its `length`, metres, and the
+    standard `deviation` of that, as the voltages tell it; `through`, whether all of the skin's depth is cut, or None;
     `reason`, a sentence.
     """
 
@@ -58,6 +63,8 @@ class HealthEvent(eqx.Module):
     strength: float
     electrode: int | None = None
     path: Float[np.ndarray, "k 2"] | None = None
+    deviation: float = 0.0
+    through: bool | None = None
     reason: str = ""
 
     @property

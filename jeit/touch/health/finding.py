@@ -11,6 +11,9 @@ from jeit.touch.health.event import EventKind
 from jeit.touch.health.healthy import Healthy
 from jeit.touch.health.imaged_skin import ImagedSkin
 
+# Of a change in the channels of an electrode, what a cut beside it leaves at most; a contact leaves more.
+_CUT_BESIDE = 0.1
+
 
 @dataclass(frozen=True)
 class Change:
@@ -46,18 +49,21 @@ def findings(
     skin: ImagedSkin | None,
 ) -> list[Finding]:
     """What a `change` (M,) from `reference` (M,) is, after which `frames` (n, M) came."""
-    if touching is not None:
-        electrodes = faulty_electrodes(change, reference, touching & healthy.used)
-        if electrodes:
-            found = []
-            for one in electrodes:
-                own = touching[one] & healthy.used
-                kind = kind_of_fault(frames, reference, healthy.noise, own)
-                reason = f"Nearly all of the change is in the {int(own.sum())} channels of electrode {one}."
-                found.append(Finding(kind, reason, True, electrode=one, own=own))
-            return found
     used = healthy.used & np.isfinite(change)
-    loss = None if skin is None else skin.loss(change, used)
+    electrodes = [] if touching is None else faulty_electrodes(change, reference, touching & healthy.used)
+    faults = []
+    for one in electrodes:
+        own = touching[one] & healthy.used  # pyright: ignore[reportOptionalSubscript]
+        kind = kind_of_fault(frames, reference, healthy.noise, own)
+        reason = f"Nearly all of the change is in the {int(own.sum())} channels of electrode {one}."
+        faults.append(Finding(kind, reason, True, electrode=one, own=own))
+    # A cut right beside an electrode is nearly all in its channels too; but does not wander, and more current does not
+    # reach it than did.
+    if faults and (skin is None or any(one.kind != EventKind.DEAD for one in faults)):
+        return faults
+    loss = None if skin is None else skin.loss(change, used, healthy.scale)
+    if faults and (loss is None or loss.misfit > _CUT_BESIDE):
+        return faults
     outside = healthy.outside(change)
     unlike = outside > healthy.unlike
     said = (
@@ -66,9 +72,9 @@ def findings(
         else "A press that is held looks like it: only time, or the user, tells."
     )
     if loss is not None:
-        return [
-            Finding(EventKind.CUT, f"Conductivity is lost along a line. {said}", unlike or _opposite(skin), loss=loss)
-        ]
+        across = "through the whole skin" if loss.through else "perhaps through a part of its depth"
+        said = f"Conductivity is lost along a line, {across}. {said}"
+        return [Finding(EventKind.CUT, said, unlike or _opposite(skin), loss=loss)]
     return [Finding(EventKind.CHANGED, said, unlike)]
 
 

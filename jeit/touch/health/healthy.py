@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.touch.health.lasting import lasting_step, median, size_of, window_change
+from jeit.touch.health.unsteady import Steadiness
 
 # Steps of a window at most, more frames are averaged; at least; and windows that a healthy recording has at least.
 _MOST, _FEWEST, _WINDOWS = 48, 5, 8
@@ -14,7 +15,7 @@ _LEAST_ALWAYS, _MOST_ALWAYS = 12, 64
 # A window is so many times the longest touch, where no time is given, and no less than this share of the frames.
 _LONGEST, _LEAST_SHARE = 3.0, 1 / 40
 # Of what healthy windows did at most, and in deviations of normal ones: a change below is none. Few windows say less.
-_BEYOND, _LEAST_SIZE, _FEW = 2.0, 4.0, 4.0
+_BEYOND, _LEAST_SIZE, _FEW = 2.0, 4.0, 20.0
 # A step is still there when so much of it is.
 _STILL = 0.4
 # The same from the healthy recording to another.
@@ -26,6 +27,8 @@ _DIRECTIONS, _EXPLAINED = 40, 0.98
 # Of healthy touches, how many are as unlike the others; those count that have this share of a strong one's energy.
 _UNLIKE, _STRONG = 0.99, 0.2
 _LEAST_FRAMES = 20
+# Of steps from frame to frame, those that touches have no part in; the mean magnitude of as many of a normal number.
+_QUIETER, _OF_NORMAL = 0.8, 0.5586
 # Deviation of a normal number over its mean magnitude.
 _MEAN = float(np.sqrt(np.pi / 2))
 
@@ -39,8 +42,8 @@ class Healthy:
     of a window; `scale` (M,), volts: how far windows that follow each other are apart; `limit` of
     `size_of` a step that stays, and `sudden` of one that may be a touch; `level`
     (M,), volts, how far any two are apart, and its `level_limit`; `touches` (M, k): directions of touches, orthonormal
-    in units of noise; `unlike`: the share of a change that no touch has outside of those; `period`, seconds a frame,
-    or 1.
+    in units of noise; `unlike`: the share of a change that no touch has outside of those; `steadiness` of single
+    channels; `period`, seconds a frame, or 1.
     """
 
     reference: Float[np.ndarray, " M"]
@@ -56,6 +59,7 @@ class Healthy:
     level_limit: float
     touches: Float[np.ndarray, "M k"]
     unlike: float
+    steadiness: Steadiness
     period: float
 
     @classmethod
@@ -92,8 +96,23 @@ class Healthy:
         local = frames - centre
         span = np.stack([np.nanmin(local, axis=0, initial=0.0), np.nanmax(local, axis=0, initial=0.0)])
         fixed = np.where(used, np.nan_to_num(centre), 0.0)
+        steadiness = Steadiness.learn(steps, window, noise)
         return cls(
-            fixed, used, noise, span, stride, window, scale, limit, sudden, level, level_limit, touches, unlike, period
+            reference=fixed,
+            used=used,
+            noise=noise,
+            span=span,
+            stride=stride,
+            window=window,
+            scale=scale,
+            limit=limit,
+            sudden=sudden,
+            level=level,
+            level_limit=level_limit,
+            touches=touches,
+            unlike=unlike,
+            steadiness=steadiness,
+            period=period,
         )
 
     def outside(self, change: Float[np.ndarray, " M"]) -> float:
@@ -115,10 +134,17 @@ def _noise(frames: np.ndarray) -> np.ndarray:
     """Of every channel from frame to frame; what moves only now and then has the deviation that this makes."""
     steps = np.diff(frames, axis=0)
     some = np.isfinite(steps).any(axis=0)
-    quiet, whole = np.zeros(frames.shape[1]), np.zeros(frames.shape[1])
-    quiet[some] = 1.4826 * np.nanmedian(np.abs(steps[:, some]), axis=0) / np.sqrt(2)
+    quiet, most, whole = np.zeros((3, frames.shape[1]))
+    sizes = np.sort(np.abs(steps[:, some]), axis=0)  # NaN last
+    there = np.isfinite(sizes).sum(axis=0)
+    quiet[some] = 1.4826 * np.nanmedian(sizes, axis=0) / np.sqrt(2)
     whole[some] = np.nanstd(steps[:, some], axis=0) / np.sqrt(2)
-    # Coarse steps of a converter have a median of zero.
+    # Coarse steps of a converter have a median of zero, or of one of them; their mean tells more.
+    small = np.maximum((_QUIETER * there).astype(int), 1)
+    most[some] = (
+        np.cumsum(np.nan_to_num(sizes), axis=0)[small - 1, np.arange(len(small))] / small / _OF_NORMAL / np.sqrt(2)
+    )
+    quiet = np.where((quiet > 0.05 * whole) & (quiet < 2 * most), quiet, most)
     return np.where(quiet > 0.05 * whole, quiet, whole)
 
 

@@ -20,9 +20,10 @@ _AGREES = 3.0
 _OFF = 10.0
 # A place to begin at is the middle of what stands above this share of an image's peak.
 _ABOVE = 0.5
-# A line is a cut if it leaves no more of the change than this, and no more than so many times what a spot does: round
-# presses leave a hundredth of what a line does, of a cut both leave about a tenth.
-_EXPLAINS, _BETTER = 0.5, 1.1
+# A line is a cut if it leaves no more of the change than this, and no more than this share of what a spot does.
+_EXPLAINS, _BETTER = 0.4, 0.6
+# Of the skin's side: a second place to begin at is so far from the first, or it is no second.
+_APART = 0.05
 
 
 @dataclass(frozen=True)
@@ -82,20 +83,28 @@ class ImagedSkin:
                 found[rows] = np.asarray(self.linear(pattern).image(as_array(volts[rows])))
         return found
 
-    def loss(self, change: Float[np.ndarray, " M"], usable: Bool[np.ndarray, " M"]) -> FittedLoss | None:
-        """The cut that explains a change (M,), volts, if one does, and better than a press would."""
+    def loss(
+        self, change: Float[np.ndarray, " M"], usable: Bool[np.ndarray, " M"], noise: Float[np.ndarray, " M"]
+    ) -> FittedLoss | None:
+        """The cut that explains a change (M,), volts, if one does, and better than a press would. `noise` (M,) of the
+        change, volts."""
         there = usable & np.isfinite(change)
         volts = np.where(there, change / self.gain, 0.0)
         image = np.asarray(self.linear(there).image(as_array(volts)))
         lost = np.maximum(-image, 0.0)
         if not lost.max() > 0:
             return None
+        centres = np.asarray(centroids(self.model.mesh))[:, :2]
         weight = np.asarray(measures(self.model.mesh)) * np.where(lost > _ABOVE * lost.max(), lost, 0.0)
-        start = weight @ np.asarray(centroids(self.model.mesh))[:, :2] / weight.sum()
+        start = weight @ centres / weight.sum()
         channels = np.flatnonzero(there)
-        noise = self.noise[channels] / np.abs(self.gain[channels])
-        fit = LossFit(self.model, self.conductivity, volts[channels], channels, noise)
-        line, spot = fit.line(start), fit.spot(start)
+        own = noise[channels] / np.abs(self.gain[channels])
+        fit = LossFit(self.model, self.conductivity, volts[channels], channels, own, start)
+        spot = fit.spot(start)
+        starts = [start]
+        if np.linalg.norm(spot.path[0] - start) > _APART * fit.side:
+            starts.append(spot.path[0])
+        line = fit.line(starts)
         if line.misfit > _EXPLAINS or line.misfit > _BETTER * spot.misfit:
             return None
         return line

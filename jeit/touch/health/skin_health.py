@@ -29,6 +29,8 @@ _GONE, _REFUSED = 0.6, 0.5
 # Beyond so many spans of healthy changes, a channel reads nothing of the skin; of the channels, that may be so at once.
 _SPANS, _FEW = 3.0, 0.34
 
+_OF_CHANNELS = (EventKind.NOISY, EventKind.STUCK)
+
 
 class WatchStatus(StrEnum):
     """What became of a frame. Each is equal to its word."""
@@ -275,6 +277,7 @@ class SkinHealth:
             step = lasting_step(frames, np.where(after.trusted, healthy.scale, np.inf), healthy.limit)
             if step is not None:
                 return after._stepped(step, frames)
+            after = after._steadied(frames)
         off = np.where(self.trusted & np.isfinite(latest), latest - self.reference, 0.0)
         if after._pending is None and size_of(off / healthy.scale) < healthy.limit:
             followed = self.reference + _FOLLOWS * (latest - self.reference)
@@ -340,6 +343,27 @@ class SkinHealth:
             return fresh
         return replace(fresh, _pending=_Pending(change, found[0]))
 
+    def _steadied(self, frames: np.ndarray) -> "SkinHealth":
+        """After single channels that have got noisy, or are stuck."""
+        after, steadiness, asked = self, self.healthy.steadiness, self.trusted.copy()
+        for one in self.events:
+            if one.kind in _OF_CHANNELS and one.status == EventStatus.DENIED:
+                asked &= ~one.channels
+        for kind, which in (
+            (EventKind.NOISY, steadiness.noisy(frames, asked)),
+            (EventKind.STUCK, steadiness.stuck(frames, asked)),
+        ):
+            for channel in np.flatnonzero(which):
+                own = np.arange(self.reference.size) == channel
+                time, frame, _ = self._window[0]
+                change = Change(np.zeros(own.size), self.healthy.limit, time, frame, self.time)
+                said = "is several times as noisy as it was, or jumps" if kind == EventKind.NOISY else "does not move"
+                finding = Finding(kind, f"Channel {channel} {said}.", True, own=own)
+                event = after._event(change, finding, EventStatus.LASTING, len(after.events))
+                event = eqx.tree_at(lambda one: one.channels, event, own)
+                after = replace(after, events=(*after.events, event))
+        return after if after is self else replace(after, trusted=after._trusted_channels())
+
     def _undone(self, change: Change) -> "SkinHealth | None":
         """After a step that takes an earlier change back."""
         for one in self.open_events:
@@ -388,6 +412,8 @@ class SkinHealth:
             strength=change.size / self.healthy.limit,
             electrode=found.electrode,
             path=None if found.loss is None else found.loss.path,
+            deviation=0.0 if found.loss is None else found.loss.deviation,
+            through=None if found.loss is None else found.loss.through,
             reason=found.reason,
         )
 
@@ -405,11 +431,13 @@ class SkinHealth:
         return self.skin if self.skin is None or cut else self.skin.healed()
 
     def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
-        """Channels (M,) that no open event of an electrode takes away."""
+        """Channels (M,) that no open event of an electrode, or of themselves, takes away."""
         trusted = self.healthy.used.copy()
         for one in self.open_events:
             if one.electrode is not None and self.touching is not None:
                 trusted &= ~self.touching[one.electrode]
+            if one.kind in _OF_CHANNELS:
+                trusted &= ~one.channels
         return trusted
 
 

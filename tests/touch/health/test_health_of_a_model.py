@@ -69,8 +69,10 @@ def test_a_cut_is_found_where_it_is(after):
     assert abs(event.time - DAMAGED) <= 0.5
     along, found = CUT.along(1e-3), Cut(event.path).along(1e-3)
     apart = np.linalg.norm(along[:, None] - found, axis=-1)
-    assert 0.5 * (apart.min(axis=0).mean() + apart.min(axis=1).mean()) < 6e-3
-    assert 0.4 < event.length / CUT.length < 1.8
+    assert 0.5 * (apart.min(axis=0).mean() + apart.min(axis=1).mean()) < 1.5e-3
+    assert event.through
+    assert abs(event.length - CUT.length) < max(0.15 * CUT.length, 2 * event.deviation)
+    assert 0 < event.deviation < 0.3 * CUT.length
 
 
 def test_touches_are_placed_beside_the_cut(after, damaged):
@@ -105,7 +107,8 @@ def test_a_cut_that_the_user_denies_is_out_of_the_model(after):
 def test_a_picture_has_the_cut_and_its_length(after):
     ax = plot_health(after, title="a skin", ax=Figure().subplots())
     said = [text.get_text() for text in ax.texts]
-    assert any(f"cut, {1e3 * after.open_events[0].length:.0f} mm" in text for text in said)
+    event = after.open_events[0]
+    assert any(f"cut, {1e3 * event.length:.0f} ± {1e3 * event.deviation:.0f} mm" in text for text in said)
     assert any(text.endswith("0 mm") and text[0].isdigit() for text in said)  # the scale bar
     lines = [np.column_stack(line.get_data()) for line in ax.lines]
     assert any(line.shape == (2, 2) and np.allclose(line, after.open_events[0].path) for line in lines)

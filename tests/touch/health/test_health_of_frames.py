@@ -133,6 +133,54 @@ def test_a_loose_electrode_is_named(health):
     assert [(one.electrode, one.kind) for one in watch(health, frames).events] == [(3, EventKind.LOOSE)]
 
 
+def spoilt(kind: str, channel: int = 9) -> np.ndarray:
+    frames, random = recording(60), np.random.default_rng(4)
+    if kind == "noisy":
+        frames[300:, channel] += 8e-3 * random.normal(size=300)
+    elif kind == "jumps":
+        frames[300:, channel] += 0.2 * random.integers(0, 2, 300)
+    else:
+        frames[300:, channel] = frames[300, channel]
+    return frames
+
+
+@pytest.mark.parametrize(("kind", "said"), [("noisy", "noisy"), ("jumps", "noisy"), ("stuck", "stuck")])
+def test_a_single_channel_that_goes_wrong_is_named_and_left_out(health, kind, said):
+    after = watch(health, spoilt(kind))
+    (event,) = [one for one in after.events if one.kind in (EventKind.NOISY, EventKind.STUCK)]
+    assert event.kind == f"{said} channel"
+    assert np.flatnonzero(event.channels).tolist() == [9]
+    assert f"Channel 9 {'is several' if said == 'noisy' else 'does not move'}" in event.reason
+    assert np.flatnonzero(~after.trusted).tolist() == [9]
+    assert event.told - 300 <= 2.5 * health.healthy.window * health.healthy.stride
+    denied = after.deny(event)
+    assert denied.trusted.all()
+    again = watch(denied, spoilt(kind)[400:], 1000 + np.arange(200.0))
+    assert [one.number for one in again.events if one.kind == event.kind] == [event.number]
+
+
+def test_counts_of_a_coarse_converter_are_healthy():
+    counts = 2e-3
+    health = SkinHealth.fit(np.round(recording(0) / counts))
+    told = [watch(health, np.round(recording(seed, 300) / counts)).events for seed in range(61, 76)]
+    assert sum(map(bool, told)) == 0
+    frames = recording(76)
+    frames[301:] += damage()
+    assert [abs(one.frame - 301) <= 2 for one in watch(health, np.round(frames / counts)).events] == [True]
+
+
+def test_rows_that_are_doubled_and_channels_that_are_constant():
+    healthy = np.repeat(recording(0, 300), 2, axis=0)
+    healthy[:, 3] = 1.0
+    health = SkinHealth.fit(healthy)
+    assert not health.healthy.used[3]
+    frames = recording(77)
+    frames[301:] += damage()
+    frames[:, 3] = 1.0
+    (event,) = watch(health, np.repeat(frames, 2, axis=0)).events
+    assert abs(event.frame - 602) <= 4
+
+
 def test_repair_is_told_and_the_reference_is_new(health):
     frames = recording(57, 900)
     frames[300:600] += damage()

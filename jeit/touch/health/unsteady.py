@@ -1,0 +1,93 @@
+"""Single channels that have got noisy, jump about, or are stuck, told from how they go from step to step.
+
+Two measures of every channel in a window: the mean of the smaller half of its steps' sizes, which touches
+hardly know of, and that of all, which hears jumps. Each is compared with what healthy windows did, in two windows that
+follow each other, and with the other channels now: where many do it at once, it is a touch, not they.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+# Of a window's steps, the smallest that are noise; those that have to have a reading.
+_SMALL, _READ = 0.5, 0.5
+# Beyond so many times the usual, and what healthy windows did at most, a channel is unsteady; few windows say less.
+_LEAST, _BEYOND, _FEW = 3.0, 2.0, 4.0
+# Of its steps, so many move a channel of which it tells something that none does.
+_MOVES = 0.6
+# Of the channels, those that may be so at once.
+_AT_ONCE = 0.1
+
+
+@dataclass(frozen=True)
+class Steadiness:
+    """**Fields**: `usual` (2, M), of the two measures, volts; `limits` (2,) of what is above it, in its unit; `still`
+    (M,), whether a channel that does not move at all is stuck."""
+
+    usual: Float[np.ndarray, "2 M"]
+    limits: Float[np.ndarray, " 2"]
+    still: Bool[np.ndarray, " M"]
+
+    @classmethod
+    def learn(cls, steps: Float[np.ndarray, "n M"], window: int, noise: Float[np.ndarray, " M"]) -> "Steadiness":
+        """From healthy steps and how many a window has; `noise` (M,), volts, infinite where nothing is read."""
+        starts = range(0, max(1, len(steps) - window + 1), max(1, window // 2))
+        found = np.array([_measures(steps[start : start + window]) for start in starts])  # (n, 2, M)
+        half, ratios = len(found) // 2, [np.zeros((1, *found.shape[1:]))]
+        for learnt, other in ((found[:half], found[half:]), (found[half:], found[:half])):
+            if len(learnt) and len(other):
+                ratios.append(_above_others(np.nan_to_num(other / _usual(learnt, noise))))
+        most = np.concatenate(ratios).max(axis=(0, 2))
+        limits = np.maximum(_LEAST, (_BEYOND + _FEW / max(len(found), 1)) * most)
+        # A coarse converter may stand still for a window.
+        moves = np.diff(steps, axis=0)
+        still = np.isfinite(noise) & (np.sum(np.abs(moves) > 0, axis=0) > _MOVES * np.isfinite(moves).sum(axis=0))
+        return cls(_usual(found, noise), limits, still)
+
+    def noisy(self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
+        """Which channels (M,) are noisy, or jump, in both of two windows, far more than any other."""
+        half, found = len(steps) // 2, []
+        for part in (steps[:half], steps[half:]):
+            over = np.where(trusted, np.nan_to_num(_measures(part) / self.usual), 0.0)
+            found.append((_above_others(over) > self.limits[:, None]).any(axis=0))
+        return self._few(found, trusted)
+
+    def stuck(self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
+        """Which channels (M,) do not move at all in both of two windows, while others do."""
+        half = len(steps) // 2
+        return self._few([(_measures(part)[1] == 0) & self.still for part in (steps[:half], steps[half:])], trusted)
+
+    @staticmethod
+    def _few(each: list[np.ndarray], trusted: np.ndarray) -> Bool[np.ndarray, " M"]:
+        found = each[0] & each[1] & trusted
+        # One that begins is told later; but so many at once are none.
+        at_once = max(1, _AT_ONCE * trusted.sum())
+        return (
+            found if 0 < found.sum() <= at_once and (each[1] & trusted).sum() <= 2 * at_once else np.zeros_like(found)
+        )
+
+
+def _above_others(over: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "... M"]:
+    """Times the usual, relative to the highest of the others where these are above it: all but a few."""
+    few = max(1, int(_AT_ONCE * over.shape[-1]))
+    if few >= over.shape[-1]:
+        return over
+    return over / np.maximum(np.sort(over, axis=-1)[..., -(few + 1), None], 1.0)
+
+
+def _measures(steps: Float[np.ndarray, "w M"]) -> Float[np.ndarray, "2 M"]:
+    """Of a window; NaN where too little is read."""
+    sizes = np.sort(np.abs(np.diff(steps, axis=0)), axis=0)  # NaN last
+    there = np.isfinite(sizes).sum(axis=0)
+    sizes, sums = np.nan_to_num(sizes), np.cumsum(np.nan_to_num(sizes), axis=0)
+    small = np.maximum((_SMALL * there).astype(int), 1)
+    channels = np.arange(sizes.shape[1])
+    found = np.stack([sums[small - 1, channels] / small, sums[-1] / np.maximum(there, 1)])
+    return np.where(there >= max(2, _READ * len(sizes)), found, np.nan)
+
+
+def _usual(found: Float[np.ndarray, "n 2 M"], noise: Float[np.ndarray, " M"]) -> Float[np.ndarray, "2 M"]:
+    """Of healthy windows, and no less than a small part of the noise, which a coarse converter hides."""
+    usual = np.nan_to_num(found).mean(axis=0)
+    return np.where(np.isfinite(noise), np.maximum(usual, 0.1 * np.where(np.isfinite(noise), noise, 1.0)), np.inf)

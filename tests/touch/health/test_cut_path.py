@@ -1,0 +1,108 @@
+"""Cuts fitted on a mesh made finer: that mesh, the update of one solve, its derivatives, and paths found in noise."""
+
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes, FacetElectrodes, NodeElectrodes
+from jeit.forward import ForwardModel
+from jeit.layout import ring
+from jeit.mesh import Disk, centroids, measures
+from jeit.protocol import adjacent
+from jeit.simulate.damage import Cut
+from jeit.touch.health.cut_path import LossFit
+from jeit.touch.health.finer_mesh import finer_mesh, finer_model
+from jeit.touch.health.local_change import LocalChange
+
+CENTRE, RADIUS = np.array([0.01, 0.012]), 0.02
+
+
+@pytest.fixture(scope="module")
+def model() -> ForwardModel:
+    mesh = Disk(0.05).mesh(num_points=300)
+    return ForwardModel(mesh, BoundaryElectrodes(ring(0.05, 16), 0.008, 0.003), adjacent(16))
+
+
+def test_a_mesh_is_made_finer_without_a_node_that_hangs(model):
+    finer, parent = finer_mesh(model.mesh, CENTRE, RADIUS, 1e-6)
+    size, centres = np.asarray(measures(finer)), np.asarray(centroids(finer))
+    assert size[np.linalg.norm(centres - CENTRE, axis=1) < RADIUS].max() <= 1e-6
+    np.testing.assert_allclose(np.bincount(parent, size), np.asarray(measures(model.mesh)), rtol=1e-9)
+    edges = np.sort(np.asarray(finer.cells)[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
+    number = np.unique(edges, axis=0, return_counts=True)[1]
+    assert set(number) == {1, 2}
+    # A node that hangs would leave edges with one cell inside the skin.
+    before = np.sort(np.asarray(model.mesh.cells)[:, [[0, 1], [1, 2], [2, 0]]], axis=-1).reshape(-1, 2)
+    outer = np.unique(before, axis=0, return_counts=True)[1] == 1
+    ends = np.asarray(model.mesh.points)[np.unique(before, axis=0)[outer]]
+    around = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum()
+    own = np.asarray(finer.points)[np.unique(edges, axis=0)[number == 1]]
+    assert np.linalg.norm(own[:, 0] - own[:, 1], axis=1).sum() == pytest.approx(around)
+
+
+def test_a_skin_whose_electrodes_are_of_its_mesh_keeps_it(model):
+    groups = [[8 * one, 8 * one + 1] for one in range(4)]
+    electrodes = FacetElectrodes(model.mesh, groups, 1e-3)
+    plates = ForwardModel(model.mesh, electrodes, adjacent(4))
+    finer, parent, edge = finer_model(plates, CENTRE, RADIUS, 1e-3)
+    assert finer is plates
+    assert len(parent) == model.mesh.num_cells
+    assert 0.004 < edge < 0.012
+
+
+@pytest.mark.parametrize("kind", ["complete", "point"])
+@pytest.mark.parametrize("tensor", [True, False])
+def test_the_update_is_the_exact_solve(model, kind, tensor):
+    if kind == "point":
+        nodes = np.unique(np.asarray(model.mesh.facets))[::3][:16]
+        model = ForwardModel(model.mesh, NodeElectrodes(nodes), adjacent(16))
+    random = np.random.default_rng(0)
+    base = random.uniform(1, 2, model.mesh.num_cells)
+    local = LocalChange(model, base, CENTRE, RADIUS)
+    change, way = (random.uniform(-0.4, 0.4, len(local.cells)) for _ in range(2))
+    change[::3] = 0.0
+    way[::3] = 0.0
+    across = np.array([[0.36, 0.48], [0.48, 0.64]]) if tensor else None
+
+    def whole(some):
+        if across is None:
+            return base + np.bincount(local.cells, some, len(base))
+        values = base[:, None, None] * np.eye(2)
+        values[local.cells] += some[:, None, None] * across
+        return values
+
+    def given(some):
+        return some if across is None else some[:, None, None] * across
+
+    exact = np.asarray(model.transfer_impedance(whole(change)))
+    impedance, (slope,) = local.slopes(given(change), [given(way)])
+    np.testing.assert_allclose(impedance, exact, atol=1e-9 * np.abs(exact).max())
+    np.testing.assert_allclose(local.impedance(given(change)), impedance)
+    step = 1e-5
+    ends = [np.asarray(model.transfer_impedance(whole(change + sign * step * way))) for sign in (1, -1)]
+    central = (ends[0] - ends[1]) / (2 * step)
+    np.testing.assert_allclose(slope, central, atol=1e-5 * np.abs(central).max())
+    untouched = local.impedance(given(0 * change))
+    np.testing.assert_allclose(untouched, model.transfer_impedance(base), atol=1e-9 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("depth", [1.0, 0.5])
+def test_a_path_is_found_in_a_change_that_another_mesh_made(depth):
+    sheet, thickness, cut = 2e-3, 4e-3, Cut([(0.0, 0.008), (0.016, 0.02)], depth)
+    electrodes = BoundaryElectrodes(ring(0.05, 16), 0.008, 3.0)
+    fine = ForwardModel(Disk(0.05).mesh(num_points=1500, refine=cut.refine(7e-4)), electrodes, adjacent(16))
+    coarse = ForwardModel(Disk(0.05).mesh(num_points=500), electrodes, adjacent(16))
+    rest = np.asarray(fine.voltages(sheet))
+    change = np.asarray(fine.voltages(cut.conductivity(fine.mesh, sheet, thickness))) - rest
+    noise = np.full(len(rest), 2e-3 * np.sqrt(np.mean(change**2)))
+    change += noise * np.random.default_rng(1).normal(size=len(rest)) + 1e-5 * rest
+    fit = LossFit(coarse, np.full(coarse.mesh.num_cells, sheet), change, np.arange(208), noise, np.array([0.01, 0.01]))
+    line, spot = fit.line([np.array([0.01, 0.01])]), fit.spot(np.array([0.01, 0.01]))
+    assert line.misfit < 0.25 * spot.misfit
+    found = Cut(line.path).along(1e-3)
+    apart = np.linalg.norm(cut.along(1e-3)[:, None] - found, axis=-1)
+    assert 0.5 * (apart.min(axis=0).mean() + apart.min(axis=1).mean()) < 4e-3
+    length = np.linalg.norm(np.diff(line.path, axis=0), axis=1).sum()
+    assert abs(length - cut.length) < max(0.25 * cut.length, 2 * line.deviation)
+    assert line.through or depth < 1
+    assert (line.conductivity <= sheet * (1 + 1e-12)).all()
+    assert line.conductivity.min() < 0.8 * sheet
