@@ -15,7 +15,7 @@ from jeit.touch.health import HealthEvent, SkinHealth
 HEALTH_FILES = ("events.csv", "report.json", "health.png")
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 _EVENTS = (
-    "event", "kind", "status", "time", "told", "frame", "electrode", "channels", "strength", "length_m", "path_m",
+    "event", "kind", "status", "time", "told", "frame", "electrode", "channels", "strength", "length_m", "length_deviation_m", "path_m",
     "reason",
 )  # fmt: skip
 
@@ -64,6 +64,8 @@ def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
                     "channels": np.flatnonzero(one.channels),
                     "strength": one.strength,
                     "length_m": None if one.path is None else one.length,
+                    "length_deviation_m": None if one.path is None else one.deviation,
+                    "through": one.through,
                     "path_m": one.path,
                     "reason": one.reason,
                 }
@@ -112,6 +114,7 @@ def _row(one: HealthEvent) -> list[object]:
         int(one.channels.sum()),
         f"{one.strength:.4g}",
         "" if one.path is None else f"{one.length:.5f}",
+        "" if one.path is None else f"{one.deviation:.5f}",
         path,
         one.reason,
     ]

@@ -99,7 +99,7 @@ def health(
     console.print(f"\n{counted(now.frames, 'frame')}: {counted(len(now.events), 'event')}")
     for one in now.events:
         where = "" if one.electrode is None else f" {one.electrode + 1}"
-        long = "" if one.path is None else f", {1e3 * one.length:.0f} mm long"
+        long = "" if one.path is None else f", {1e3 * one.length:.0f} ± {1e3 * one.deviation:.0f} mm long"
         at = f"{unit} {one.time:.0f}" if seconds is None else f"{one.time:.2f} s"
         console.print(f"  {at}: {one.kind}{where}{long}, {one.status}. {one.reason}", soft_wrap=True, markup=False)
     if (held := now.held) is not None:
