@@ -15,8 +15,8 @@ from jeit.touch.health import HealthEvent, SkinHealth
 HEALTH_FILES = ("events.csv", "report.json", "health.png")
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 _EVENTS = (
-    "event", "kind", "status", "time", "told", "frame", "electrode", "channels", "strength", "length_m", "length_deviation_m", "path_m",
-    "reason",
+    "event", "kind", "status", "time", "told", "frame", "electrode", "channels", "strength", "length_m",
+    "length_deviation_m", "path_m", "reason",
 )  # fmt: skip
 
 

@@ -145,6 +145,7 @@ TYPED = [
     "docs/hearing.md",
     "docs/learning.md",
     "docs/gestures.md",
+    "docs/health.md",
     "docs/choosing-a-hyperparameter.md",
     "README.md",
 ]
