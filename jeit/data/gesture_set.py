@@ -42,7 +42,9 @@ class GestureSet:
         for name in ("seconds", "voltages", "reference", "untouched"):
             if getattr(self, name).dtype.kind not in "fiu":
                 raise ValueError(f"{name} is {getattr(self, name).dtype}; give real numbers.")
-        number, frames, channels = len(self.gesture), len(self.voltages), self.voltages.shape[-1]
+        if self.gesture.ndim != 1 or self.voltages.ndim != 2:
+            raise ValueError("gesture must be (n,) and voltages (F, M), one row for each frame.")
+        number, (frames, channels) = len(self.gesture), self.voltages.shape
         shapes = (number,), (number + 1,), (frames,), (channels,)
         if shapes != (self.person.shape, self.start.shape, self.seconds.shape, self.reference.shape) or (
             self.untouched.shape[1:] != (channels,) or self.start[0] or self.start[-1] != frames
@@ -77,6 +79,6 @@ class GestureSet:
         of another kind; nothing in it is executed."""
         arrays = npz_arrays(Path(path), *_ARRAYS, otherwise="not a set of gestures")
         if "gesture" in arrays:
-            arrays.setdefault("person", np.zeros(len(np.atleast_1d(arrays["gesture"])), int))
+            arrays.setdefault("person", np.zeros(arrays["gesture"].shape, int))
         need(arrays, *_ARRAYS)
         return cls(**{name: arrays[name] for name in _ARRAYS})

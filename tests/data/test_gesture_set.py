@@ -49,6 +49,8 @@ def test_other_files_are_refused(tmp_path):
     ("change", "said"),
     [
         ({"start": np.array([0, 2, 4])}, "do not belong together"),
+        ({"voltages": np.ones(5)}, r"voltages \(F, M\)"),
+        ({"gesture": np.array("tap")}, r"gesture must be \(n,\)"),
         ({"start": np.array([0, 6, 5])}, "start falls"),
         ({"start": np.array([0.0, 2.0, 5.0])}, "start is float64; give whole numbers"),
         ({"gesture": np.array([1, 2])}, "gesture is int64; give text"),
