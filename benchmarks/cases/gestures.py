@@ -228,7 +228,9 @@ def _draw(output: Path, many: Experiment, best: tuple[str, str]) -> None:
     labels = np.array(GESTURES)[many.right]
     model = GestureModel.fit(many.touches, labels, people=many.person, method=best[0], form=best[1])
     if model.standing is not None:
-        plot_confusion(model.standing).figure.savefig(output / "gestures.png", dpi=150)
+        right = 100 * np.mean(model.standing.held_out == model.standing.right)
+        title = f"Gestures of people who were held out: {right:.0f} % right"
+        plot_confusion(model.standing, title=title).figure.savefig(output / "gestures.png", dpi=110)
 
 
 def _asked(found: dict, best: tuple[str, str], live: Live) -> list[Asked]:

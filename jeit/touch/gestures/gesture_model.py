@@ -24,12 +24,15 @@ from jeit.touch.gestures.reading import Reading
 from jeit.touch.gestures.segmentation import StreamTouch
 from jeit.touch.learnt.answers import Standing
 from jeit.touch.learnt.classifiers import log_odds, probabilities, sharpness_of
+from jeit.touch.learnt.extras import in_parts
 from jeit.touch.learnt.file import read_plain, write_plain
 from jeit.touch.needed import need_learning
 
 METHODS = ("auto", *GESTURE_CLASSIFIERS)
 # Folds that a method is chosen on, at most; and of touches that are like those learnt, the share that passes for such.
 _FOLDS, _LIKE = 10, 0.99
+# Touches whose distances from all that is known are worked out at once.
+_AT_ONCE = 1000
 GESTURE_FILE = "gestures.skops"
 """What a model is called in the folder of `jeit touch gestures`."""
 _KIND, _VERSION = "a jeit gesture model", 2
@@ -204,9 +207,9 @@ def _checked(touches, labels, people) -> tuple[np.ndarray, np.ndarray | None]:
 
 def _nearest(known: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " n"]:
     """Distances of the nearest of what is known (N, k)."""
-    from scipy.spatial import KDTree
+    from scipy.spatial.distance import cdist
 
-    return np.asarray(KDTree(known).query(values)[0])
+    return in_parts(lambda some: cdist(some, known).min(axis=1), values, _AT_ONCE)
 
 
 def _farthest(known: Float[np.ndarray, "N k"], folds: Int[np.ndarray, " N"]) -> float:
