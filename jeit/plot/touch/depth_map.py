@@ -51,18 +51,18 @@ def plot_depth_map(
 
 
 def plot_losses(courses: Mapping[str, Trained], *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the losses of trainings, by name, as of `jeit.touch.training.fit`, of the rows held out, and where each was
-    best. Raises `ValueError` for what are none."""
+    """Draw the losses of trainings, by name, as of `jeit.touch.training.fit`: of the rows held out, relative to the
+    first look, and where each was best. Raises `ValueError` for what are none."""
     check_kind("courses", courses, Mapping, "trainings by name, such as learnt.courses")
     ax = axes_or_new(ax)
     for (name, trained), colour in zip(courses.items(), SERIES_COLOURS * len(courses), strict=False):
         check_kind(f"courses[{name!r}]", trained, Trained, "a Trained, as of fit")
         own = trained.course
-        ax.plot(own.steps, own.validation, color=colour, linewidth=1.6, label=name)
-        ax.plot(own.steps[own.best], own.validation[own.best], marker="o", color=colour, markersize=5)
-    ax.set_yscale("log")
+        shares = np.array(own.validation) / own.validation[0]
+        ax.plot(own.steps, shares, color=colour, linewidth=1.6, label=name)
+        ax.plot(own.steps[own.best], shares[own.best], marker="o", color=colour, markersize=5)
     ax.set_xlabel("Batches", color=INK)
-    ax.set_ylabel("Loss of touches held out", color=INK)
+    ax.set_ylabel("Loss of touches held out, of that at first", color=INK)
     soften_axes(ax)
     draw_legend_above(ax)
     if title is not None:

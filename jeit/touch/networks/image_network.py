@@ -26,8 +26,8 @@ from jeit.touch.training import check_same, read_model, write_model
 DESIGNS = ("unrolled", "three-stages")
 _KIND, _VERSION = "a jeit image network", 1
 FILE = "network.jeit"
-# Frames that are imaged at once, at most; numbers of them are made even, for JAX compiles for each.
-_AT_ONCE = 1000
+# Frames that are imaged at once, at most: more leave the cache. JAX compiles for every number of them that is 2ⁿ.
+_AT_ONCE = 64
 
 
 @dataclass(frozen=True)

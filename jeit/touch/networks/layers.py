@@ -73,7 +73,9 @@ class Chain(eqx.Module):
 
 def doubled(image: Float[Array, "b r c i"]) -> Float[Array, "b s d i"]:
     """Every pixel as 2 × 2."""
-    return jnp.repeat(jnp.repeat(image, 2, axis=1), 2, axis=2)
+    number, rows, columns, channels = image.shape
+    wide = jnp.broadcast_to(image[:, :, None, :, None], (number, rows, 2, columns, 2, channels))
+    return wide.reshape(number, 2 * rows, 2 * columns, channels)
 
 
 def unfolded(image: Float[Array, "b r c 4"]) -> Float[Array, "b s d"]:

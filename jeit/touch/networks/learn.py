@@ -32,16 +32,27 @@ _BALL, _DEPTH, _PLACES = 0.015, 0.75, 15
 
 @dataclass(frozen=True)
 class Preset:
-    """How much is learnt: `number` of touches, `held_out` ones besides, and the `plan` of every training."""
+    """How much is learnt: `number` of touches, `held_out` ones besides, and the `plan` of every training; that of the
+    `three_stages`, where it is another."""
 
     number: int
     held_out: int
     plan: Plan
+    three_stages: Plan | None = None
+
+    def plan_of(self, design: str) -> Plan:
+        """Of one of the designs."""
+        return self.three_stages if design == "three-stages" and self.three_stages is not None else self.plan
 
 
 PRESETS = {
-    "quick": Preset(1000, 250, Plan(rate=2e-3, batch=32, epochs=8, patience=8, decay=0.75)),
-    "full": Preset(16_000, 1500, Plan(epochs=30, patience=6, decay=0.9)),
+    "quick": Preset(1000, 250, Plan(rate=2e-3, batch=32, epochs=6, patience=6, decay=0.7)),
+    "full": Preset(
+        12_000,
+        1500,
+        Plan(rate=2e-3, batch=64, epochs=14, patience=6, decay=0.82),
+        Plan(rate=1e-3, batch=128, epochs=14, patience=6, decay=0.85),
+    ),
 }
 
 
@@ -115,7 +126,7 @@ def learn_images(
         sets[name] = Examples(found["change"].to_numpy(), found["depth"].to_numpy())
     seconds["touches"] = time.monotonic() - start
     key = jax.random.key(seed)
-    runs = Runs(preset.plan, key, work, progress)
+    runs = Runs(preset.plan_of(design), key, work, progress)
     if design == "unrolled":
         sensed = Sensed.of(skin, SHAPE)
         start_network = Unrolled(sets["learnt"].change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))

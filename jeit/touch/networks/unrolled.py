@@ -61,23 +61,23 @@ class Refinement(eqx.Module):
 class Unrolled(eqx.Module):
     """Relative changes (b, M) to depth maps (b, rows, columns) over the skin's thickness.
 
-    **Fields**: `operator` (M, P), what pixels change; `imagers` (k, M, p), transposed matrices of linear images on
+    **Fields**: `operator` (M, P), what pixels change; `imagers` (M, p, k), transposed matrices of linear images on
     pixels twice as wide; `still` (rows / 2, columns / 2, s), of the skin alone; `scale`, of changes in the images; the
     `steps`. All but these are the skin's, and not trained.
     """
 
     operator: Float[Array, "M P"]
-    imagers: Float[Array, "k M p"]
+    imagers: Float[Array, "M p k"]
     still: Float[Array, "r c s"]
     steps: tuple[Refinement, ...]
     shape: tuple[int, int] = eqx.field(static=True)
 
-    def __init__(self, channels: int, shape: tuple[int, int], num_steps: int = 2, *, key: Array):
+    def __init__(self, channels: int, shape: tuple[int, int], num_steps: int = 1, *, key: Array):
         """Of so many channels, and maps of this shape; untrained, and of no skin yet."""
         rows, columns = shape[0] // 2, shape[1] // 2
         images = len(_TIMES) + 1
         self.operator = jnp.zeros((channels, shape[0] * shape[1]), jnp.float32)
-        self.imagers = jnp.zeros((images, channels, rows * columns), jnp.float32)
+        self.imagers = jnp.zeros((channels, rows * columns, images), jnp.float32)
         self.still = jnp.zeros((rows, columns, 2), jnp.float32)
         keys = jax.random.split(key, num_steps)
         self.steps = tuple(Refinement(images + 2 + (4 if number else 0), key=one) for number, one in enumerate(keys))
@@ -93,7 +93,7 @@ class Unrolled(eqx.Module):
         drift = _DRIFT**2 * sensed.contacts.T @ sensed.contacts
         white = noise**2 * np.eye(len(own))
         rests = [*(times**2 * white for times in _TIMES), white + drift]
-        imagers = np.stack([np.linalg.solve(own + rest, across) for rest in rests])
+        imagers = np.stack([np.linalg.solve(own + rest, across) for rest in rests], axis=-1)
         middles = places.reshape(self.shape[0] // 2, 2, self.shape[1] // 2, 2, 2).mean(axis=(1, 3))
         distance = np.linalg.norm(middles[..., None, :] - np.asarray(centres), axis=-1).min(axis=-1)
         felt = np.log(np.linalg.norm(operator, axis=0).reshape(distance.shape) + 1e-9)
@@ -118,7 +118,7 @@ class Unrolled(eqx.Module):
         found = []
         for step in self.steps:
             rest = changes - self.felt(found[-1]) if found else changes
-            images = jnp.einsum("bm,kmp->bpk", rest, self.imagers).reshape(number, rows, columns, -1)
+            images = (rest @ self.imagers.reshape(len(self.imagers), -1)).reshape(number, rows, columns, -1)
             parts = [images / _DEVIATION, still]
             if found:
                 maps = found[-1]
