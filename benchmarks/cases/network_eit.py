@@ -68,7 +68,8 @@ def run(options: Options) -> Result:
         rows.append([name, *(f"{1e3 * one[key]:.2f}" for one in (by_centroid, by_peak) for key in by_centroid)])
     header = ["by", "centroid: mean", "SD", "RMS", "peak: mean", "SD", "RMS"]
     tables = [Table(header, rows, "A ball of 15 mm, 7.5 mm deep, at 15 × 15 places, errors in millimetres", _SPREADS)]
-    tables.append(_wrong(ways, touches, right, clean, noise, places, quick))
+    wrong, drifted = _wrong(ways, touches, right, clean, noise, places, quick)
+    tables.append(wrong)
     pairs, together = _pairs(ways, judged_by, noise, places, 8 if quick else 60)
     tables.append(pairs)
     shapes, share = _shapes(ways, judged_by, noise, places, 5 if quick else 60, told, options.output)
@@ -82,6 +83,11 @@ def run(options: Options) -> Result:
         judged("mean ≤ 4.2 mm", f"{1e3 * ours:.2f} mm", ours <= ASKED_MEAN),
         judged("≤ 0.8 × the error of Tikhonov", f"{ours / rival:.2f} ×", ours <= ASKED_RATIO * rival),
         judged("better than the paper's design on the grid", f"{1e3 * paper:.2f} mm is the paper's", ours < paper),
+        judged(
+            "better than the paper's design where contacts drift by 10 %",
+            f"{1e3 * drifted['network, unrolled']:.2f} mm, the paper's {1e3 * drifted['network, three-stages']:.2f}",
+            drifted["network, unrolled"] < drifted["network, three-stages"],
+        ),
         judged(
             "better than the paper's design on unseen shapes",
             f"misses {share['network, unrolled']:.2f}, the paper's {share['network, three-stages']:.2f}",
@@ -168,8 +174,8 @@ def _nearest(told: Skin, places: np.ndarray) -> np.ndarray:
     return np.asarray(KDTree(np.asarray(centroids(told.model.mesh))).query(places.reshape(-1, 2))[1])
 
 
-def _wrong(ways, touches, right, clean, noise: float, places, quick: bool) -> Table:
-    """Mean errors against noise, against electrodes out of place, and against contacts."""
+def _wrong(ways, touches, right, clean, noise: float, places, quick: bool) -> tuple[Table, dict[str, float]]:
+    """Mean errors against noise, against electrodes out of place, and against contacts; those of the last, metres."""
     random = np.random.default_rng(4)
     cases = {f"noise × {times:g}": (clean, times * noise) for times in (0.0, 3.0, 10.0)}
     some = slice(None, None, 5)
@@ -183,18 +189,21 @@ def _wrong(ways, touches, right, clean, noise: float, places, quick: bool) -> Ta
     for name, wrong in kinds.items():
         own = problem.JudgedSkins(wrong, seed=79, skins=1 if quick else 3, cell=4.5e-3)
         cases[name] = own.changes(touches[some]), noise
-    rows = []
+    rows, means = [], []
     for name, (changes, deviation) in cases.items():
         frames = changes + deviation * random.normal(size=changes.shape)
         known = right if len(changes) == len(right) else right[some]
         means = [errors(centroids_of(way(frames), places), known)["mean"] for way in ways.values()]
         rows.append([name, *(f"{1e3 * one:.2f}" for one in means)])
         say(" | ".join(rows[-1]))
-    return Table(["", *ways], rows, "The same ball, mean errors in millimetres", "A fifth of the places but for noise.")
+    caption = "A fifth of the places but for noise; on a mesh of 4.5 mm, three skins in turn, but for noise."
+    table = Table(["", *ways], rows, "The same ball, mean errors in millimetres", caption)
+    return table, dict(zip(ways, means, strict=True))
 
 
 def _pairs(ways, judged_by, noise: float, places, number: int) -> tuple[Table, dict[str, float]]:
-    """How often two balls are two: a peak within 15 mm of each, and between them no more than 0.8 of the lower one."""
+    """How often two balls are two: a peak within 15 mm of each, and between them no more than 0.8 of the lower one,
+    which is more than half of the map's greatest depth."""
     touches, right = problem.pair_touches(number)
     changes = judged_by.changes(touches)
     frames = changes + noise * np.random.default_rng(6).normal(size=changes.shape)
@@ -206,7 +215,7 @@ def _pairs(ways, judged_by, noise: float, places, number: int) -> tuple[Table, d
             values = one.ravel()
             near = [values[np.linalg.norm(flat - place, axis=1) < 0.015].max() for place in pair]
             middle = values[np.linalg.norm(flat - pair.mean(axis=0), axis=1) < 0.004].max()
-            told += min(near) > 0.25 * values.max() and middle < 0.8 * min(near)
+            told += min(near) > 0.5 * values.max() and middle < 0.8 * min(near)
         found[name] = told / len(right)
     rows = [[name, f"{100 * share:.0f} %"] for name, share in found.items()]
     caption = "6 mm deep; the paper's virtual taxels are 41 mm wide."

@@ -50,13 +50,20 @@ class Sensed(NamedTuple):
         operator = np.zeros((rows * columns, len(rest)))
         for place, number in enumerate(pixel.reshape(points.shape[:2]).T):
             np.add.at(operator, number, each * share[:, place, None] / points.shape[1])
-        return cls(operator.T, _of_contacts(skin, rest, conductivity), shape)
+        return cls(rounded(operator.T), rounded(_of_contacts(skin, rest, conductivity)), shape)
 
     def halved(self) -> Float[np.ndarray, "M p"]:
         """The operator of pixels twice as wide and high."""
         rows, columns = self.shape
         parts = self.operator.reshape(len(self.operator), rows // 2, 2, columns // 2, 2)
         return parts.sum(axis=(2, 4)).reshape(len(parts), -1)
+
+
+def rounded(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Values to a millionth of their greatest, or less: what the order of sums decides is then gone, and the same key
+    gives the same training wherever NumPy's arrays lie in memory."""
+    unit = 2.0 ** (np.floor(np.log2(max(float(np.abs(values).max()), 1e-300))) - 20)
+    return np.round(values / unit) * unit
 
 
 def strength(depth):

@@ -54,4 +54,5 @@ def detection_noise(skin: Skin, limit: float = _LIMIT) -> float:
     depth = material("hydrogel").support.pressure(tip, limit).approach
     grid = touches_away_from_the_edge(skin.outline, 0.0075, _PLACES, _PLACES)
     change = relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places])
-    return float(np.median(np.abs(change).max(axis=1)) / _DEVIATIONS)
+    # To four digits, which no order of sums decides.
+    return float(f"{np.median(np.abs(change).max(axis=1)) / _DEVIATIONS:.4g}")

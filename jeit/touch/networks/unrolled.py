@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.touch.networks.layers import Convolution, doubled, unfolded
-from jeit.touch.networks.sensed import Sensed, depth_of, strength
+from jeit.touch.networks.sensed import Sensed, depth_of, rounded, strength
 
 _WIDE, _NARROW = 32, 16
 # The prior: deviation of a pixel's strength, and length of its correlation over the skin's longer side; how many times
@@ -98,7 +98,7 @@ class Unrolled(eqx.Module):
         distance = np.linalg.norm(middles[..., None, :] - np.asarray(centres), axis=-1).min(axis=-1)
         felt = np.log(np.linalg.norm(operator, axis=0).reshape(distance.shape) + 1e-9)
         still = np.stack([distance / distance.max(), (felt - felt.mean()) / felt.std()], axis=-1)
-        arrays = [jnp.asarray(one, jnp.float32) for one in (sensed.operator, imagers, still)]
+        arrays = [jnp.asarray(rounded(one), jnp.float32) for one in (sensed.operator, imagers, still)]
         return eqx.tree_at(lambda one: (one.operator, one.imagers, one.still), self, arrays)
 
     @property

@@ -1,6 +1,11 @@
 """Networks that image a skin: what they learn, that they go on, and their files."""
 
 import dataclasses
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -74,6 +79,39 @@ def test_what_is_done_is_not_done_again(small_skin, learnt):
     again = learn_images(small_skin, folder, preset=PRESET)
     assert again.seconds["training"] < found.seconds["training"]
     assert bits(again.network.network) == bits(found.network.network)
+
+
+SCRIPT = """
+import sys
+from jeit.design import Skin
+from jeit.layout import named_layout
+from jeit.mesh import Rectangle
+from jeit.touch.networks import learn_images
+from small_networks import PRESET
+
+skin = Skin.create(named_layout("grid-4x4", Rectangle(0.1, 0.1)), num_layers=0, cell_size=6e-3)
+learn_images(skin, sys.argv[1], preset=PRESET, progress=lambda said: print(said, flush=True))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("last_word", ["touches learnt: 200 of 200", "unrolled, epoch 3 "])
+def test_killed_at_any_moment(small_skin, learnt, tmp_path, last_word):
+    """By kill -9, amid touches or training; it ends as one that was never killed."""
+    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert process.stdout is not None
+    assert any(line.startswith(last_word) for line in process.stdout)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert not (tmp_path / "network.jeit").exists()
+    again = learn_images(small_skin, tmp_path, preset=PRESET)
+    assert bits(again.network.network) == bits(learnt[1].network.network)
 
 
 def test_a_network_comes_back(small_skin, learnt, tmp_path):
