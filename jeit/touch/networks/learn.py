@@ -51,7 +51,7 @@ PRESETS = {
         12_000,
         1500,
         Plan(rate=2e-3, batch=64, epochs=14, patience=6, decay=0.82),
-        Plan(rate=1e-3, batch=128, epochs=14, patience=6, decay=0.85),
+        Plan(rate=1e-3, batch=128, epochs=60, patience=8, decay=0.97),
     ),
 }
 
