@@ -21,6 +21,7 @@ NAMES = (
     "first_call",
     "contacts",
     "kohonen",
+    "network_eit",
     "localisation_error",
     "skin_health",
     "mixed_tanks",

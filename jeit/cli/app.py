@@ -15,6 +15,7 @@ from jeit.cli.commands.choose import choose
 from jeit.cli.commands.demo import demo
 from jeit.cli.commands.info import info
 from jeit.cli.commands.layout import layout
+from jeit.cli.commands.learn import learn
 from jeit.cli.commands.locate import locate
 from jeit.cli.commands.reconstruct import reconstruct
 from jeit.cli.commands.stream import stream
@@ -24,7 +25,7 @@ from jeit.cli.options import naming_options
 from jeit.start import discarded_damaged
 
 # Commands that run one program again and again: a frame in a third of the time.
-_REPEATING = ("study", "stream", "layout optimise", "touch fit", "touch gestures", "touch watch")
+_REPEATING = ("study", "stream", "layout optimise", "touch fit", "touch gestures", "touch watch", "learn")
 
 app = typer.Typer(
     name="jeit",
@@ -44,6 +45,7 @@ app.command()(locate)
 app.add_typer(layout)
 app.add_typer(study)
 app.add_typer(touch)
+app.add_typer(learn)
 
 
 @app.callback(invoke_without_command=True)

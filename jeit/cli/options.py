@@ -31,6 +31,10 @@ AsIs = Annotated[
     bool,
     typer.Option("--as-is", help="Go on though electrodes, channels or signs look wired otherwise than described."),
 ]
+Model = Annotated[
+    Path | None,
+    typer.Option("--model", help="Folder of 'jeit learn image', or its network.jeit; for --method network."),
+]
 Frame = Annotated[
     str | None,
     typer.Option(

@@ -1,5 +1,5 @@
 """Pictures, with matplotlib: meshes, images, electrodes, sensitivity, taxels, layouts, voltages, microphones, touches,
-contacts, self-organising maps, damage, gestures in time.
+contacts, self-organising maps, damage, gestures in time, depths.
 
 Every function takes `ax`, makes a figure of its own where none is given, and returns the axes it drew on. Lengths are
 in metres in the arguments and in millimetres in the pictures.
@@ -22,6 +22,7 @@ from jeit.plot.imaging.image import plot_image
 from jeit.plot.imaging.mesh import plot_mesh
 from jeit.plot.touch.contact_stages import plot_contact_stages
 from jeit.plot.touch.contacts import plot_contacts
+from jeit.plot.touch.depth_map import plot_depth_map, plot_losses
 from jeit.plot.touch.health import plot_health
 from jeit.plot.touch.health_course import plot_health_course
 from jeit.plot.touch.kohonen_map import plot_map
@@ -47,6 +48,7 @@ __all__ = [
     "plot_confusion",
     "plot_contact_stages",
     "plot_contacts",
+    "plot_depth_map",
     "plot_error_curve",
     "plot_figures_of_merit",
     "plot_force_errors",
@@ -56,6 +58,7 @@ __all__ = [
     "plot_image",
     "plot_key_errors",
     "plot_loss_map",
+    "plot_losses",
     "plot_map",
     "plot_mesh",
     "plot_pairs",

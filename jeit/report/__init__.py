@@ -1,5 +1,5 @@
 """What is told of results, and all that is written to a folder: measurements, images, streams, compared rules,
-calibrations of microphones, tracks, layouts, studies, learnt skins, gestures, watched skins."""
+calibrations of microphones, tracks, layouts, studies, learnt skins, gestures, watched skins, networks that image."""
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.report.calibration import draw_calibration, write_calibration
@@ -7,6 +7,7 @@ from jeit.report.compared_rules import draw_choice, report_choice, write_choice
 from jeit.report.film import write_film
 from jeit.report.gestures import report_gestures, write_gestures
 from jeit.report.image import draw_image, report_image, write_image
+from jeit.report.image_network import report_learnt_images, write_depths, write_learnt_images
 from jeit.report.layout_comparison import draw_layout_comparison, report_layout_comparison, write_layout_comparison
 from jeit.report.layout_improvement import draw_improved_layout, report_improved_layout, write_improved_layout
 from jeit.report.learnt_skin import report_learnt_skin, write_learnt_skin, write_touches
@@ -34,18 +35,21 @@ __all__ = [
     "report_image",
     "report_improved_layout",
     "report_layout_comparison",
+    "report_learnt_images",
     "report_learnt_skin",
     "report_measurement",
     "report_track",
     "report_watch",
     "write_calibration",
     "write_choice",
+    "write_depths",
     "write_film",
     "write_gestures",
     "write_health",
     "write_image",
     "write_improved_layout",
     "write_layout_comparison",
+    "write_learnt_images",
     "write_learnt_skin",
     "write_stream",
     "write_study_report",

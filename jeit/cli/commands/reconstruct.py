@@ -12,6 +12,7 @@ from jeit.cli.options import (
     Description,
     Format,
     Frame,
+    Model,
     Nodes,
     Quiet,
     Reference,
@@ -36,7 +37,7 @@ def reconstruct(
         typer.Option(
             help="auto (default): one-step, or gauss-newton where that is unsound; one-step, back-projection, "
             "filtered-back-projection; gauss-newton, levenberg-marquardt, total-variation; shapes, outlines of strong "
-            "bodies."
+            "bodies; network, maps of depth by one that learnt the skin (--model)."
         ),
     ] = None,
     prior: Annotated[
@@ -65,12 +66,37 @@ def reconstruct(
     num_points: Nodes = None,
     frame: Frame = None,
     as_is: AsIs = False,
+    model: Model = None,
     quiet: Quiet = False,
 ) -> None:
     """Image what changed between REFERENCE and DATA; writes image.png, image.npz and report.json.
 
+    With --method network, how deep a skin is indented: frames.csv, depth.npz, depth.png and report.json.
+
     In Python: `jeit.image_difference` and `jeit.report.write_image`; `jeit.reconstruct` makes absolute images.
     """
+    if method == "network" or model is not None:
+        from jeit.cli.networks import image_by_network
+
+        unused = {
+            "prior": prior,
+            "hyperparameter": hyperparameter,
+            "contact": contact,
+            "num-points": num_points,
+            "segment": segment or None,
+            "as-is": as_is or None,
+        }
+        which = None if frame is None else number_or_name(frame, int)
+        image_by_network(
+            model,
+            (data, reference, format, description),
+            output,
+            method=method,
+            frame=which,
+            unused=unused,
+            quiet=quiet,
+        )
+        return
     from rich.console import Console
 
     from jeit.cli.console import Steps

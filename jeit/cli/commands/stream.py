@@ -6,7 +6,17 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.options import AsIs, Contact, Description, Format, Quiet, make_folder, naming_options, number_or_name
+from jeit.cli.options import (
+    AsIs,
+    Contact,
+    Description,
+    Format,
+    Model,
+    Quiet,
+    make_folder,
+    naming_options,
+    number_or_name,
+)
 
 
 def stream(
@@ -28,7 +38,11 @@ def stream(
     format: Format = None,
     description: Description = None,
     method: Annotated[
-        str | None, typer.Option(help="gauss-newton (default), levenberg-marquardt, or one-step for linear images.")
+        str | None,
+        typer.Option(
+            help="gauss-newton (default), levenberg-marquardt, or one-step for linear images; network, maps of depth "
+            "by one that learnt the skin (--model)."
+        ),
     ] = None,
     hyperparameter: Annotated[
         str | None,
@@ -52,14 +66,31 @@ def stream(
         float | None,
         typer.Option(help="Frames in a second: times in place of numbers, and the film's pace (default 10)."),
     ] = None,
+    model: Model = None,
     quiet: Quiet = False,
 ) -> None:
     """Image every frame of DATA as it comes; bad frames are refused with the reason, and the stream goes on.
 
     Writes frames.csv line by line (x, y and peak of the strongest change, metres and S), and at the end images.npz with
     `conductivity` (frames, cells), NaN for frames that were refused, `points`, `cells` and `background`; frames.png,
-    some frames on one colour scale; and a film. If all were refused, the exit status is 1.
+    some frames on one colour scale; and a film. If all were refused, the exit status is 1. With --method network, how
+    deep a skin is indented: frames.csv, depth.npz, depth.png and report.json.
     """
+    if method == "network" or model is not None:
+        from jeit.cli.networks import image_by_network
+
+        unused = {
+            "hyperparameter": hyperparameter,
+            "steps": steps,
+            "memory": memory,
+            "contact": contact,
+            "num-points": num_points,
+            "rate": rate,
+            "as-is": as_is or None,
+        }
+        given = data if data == "-" else Path(data), reference, format, description
+        image_by_network(model, given, output, method=method, unused=unused, quiet=quiet, streamed=True)
+        return
     import numpy as np
     from rich.console import Console
 

@@ -118,7 +118,7 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
     console = Console(highlight=False)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with ExitStack() as stack:
-        client = None if scheduler is None else stack.enter_context(_client(scheduler))
+        client = None if scheduler is None else stack.enter_context(connected(scheduler))
         bar = stack.enter_context(Bar(*columns, TextColumn("{task.fields[left]}"), console=console, disable=quiet))
         task = bar.add_task("points", total=len(sweep.points), left="")
 
@@ -132,7 +132,8 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
         console.print(f"[dim]Written:[/dim] {store}, {where}", soft_wrap=True)
 
 
-def _client(scheduler: str):
+def connected(scheduler: str):
+    """A client of the dask scheduler at this address. Raises `ValueError` where none answers."""
     from jeit.design.study.store import require
 
     try:

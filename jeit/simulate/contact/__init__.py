@@ -6,7 +6,9 @@ Arrays are NumPy's: what touches what is no smooth function of anything.
 
 from jeit.simulate.contact.foundation import Foundation
 from jeit.simulate.contact.half_space import HalfSpace
+from jeit.simulate.contact.indent_sets import IndentSet
 from jeit.simulate.contact.indenters import Bar, DepthMap, Disc, Prism, Revolved, Ring, ball
+from jeit.simulate.contact.indents import Indent, IndentDraws, depth_maps, indented_cells, relative_changes
 from jeit.simulate.contact.joined import Joined, Placed
 from jeit.simulate.contact.materials import Material, material
 from jeit.simulate.contact.press import MovingPress, Press
@@ -21,6 +23,9 @@ __all__ = [
     "Disc",
     "Foundation",
     "HalfSpace",
+    "Indent",
+    "IndentDraws",
+    "IndentSet",
     "Joined",
     "Material",
     "MovingPress",
@@ -34,7 +39,10 @@ __all__ = [
     "Ring",
     "TwoSheets",
     "ball",
+    "depth_maps",
+    "indented_cells",
     "material",
     "open_presses",
+    "relative_changes",
     "simulate_presses",
 ]

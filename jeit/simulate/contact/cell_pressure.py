@@ -41,7 +41,7 @@ class Samples(NamedTuple):
         corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
         thickness = np.ptp(corners[..., 2]) if mesh.dimension == 3 else 1.0
         corners = corners[..., :2]
-        points = _lattice(corners, _LATTICE)
+        points = lattice(corners, _LATTICE)
         area = np.asarray(measures(mesh)) / thickness / points.shape[1]
         radius = np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=-1).max()
         return cls(points, area, float(radius), corners)
@@ -167,7 +167,7 @@ def _alike(samples: Samples, support: AbstractSupport, presses: Sequence[Press],
 def _between(samples: Samples, support: AbstractSupport, press: Press, cells, there):
     """Pressures (c, s) of a press on few samples: means of each of the `cells` (c,) over a finer lattice; all on the
     nearest sample where that is missed. Raises `ValueError` for one that touches no skin."""
-    points = _lattice(samples.corners[cells], _FINE_LATTICE)
+    points = lattice(samples.corners[cells], _FINE_LATTICE)
     fine, coarse = points.shape[1], samples.points.shape[1]
     local = _in_frame([press], points.reshape(1, -1, 2))
     area = np.repeat(samples.area[cells] * there * coarse / fine, fine)[None]
@@ -190,8 +190,8 @@ def _between(samples: Samples, support: AbstractSupport, press: Press, cells, th
     return pressure
 
 
-def _lattice(corners: Float[np.ndarray, "m k 2"], number: int) -> Float[np.ndarray, "m s 2"]:
-    """Places (m, s, 2) in cells of these corners, spread evenly."""
+def lattice(corners: Float[np.ndarray, "m k d"], number: int) -> Float[np.ndarray, "m s d"]:
+    """Places (m, s, d) in cells of these corners, spread evenly; more of them the greater `number` is."""
     size = corners.shape[1]
     steps = [each for each in itertools.product(range(number + 1), repeat=size) if sum(each) == number]
     return np.einsum("sk,mkd->msd", (np.array(steps) + 1 / size) / (number + 1), corners)

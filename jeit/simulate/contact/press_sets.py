@@ -17,6 +17,7 @@ from jeit.design.study.cluster import over_cluster
 from jeit.design.study.contents import Contents
 from jeit.design.study.progress import Progress, Teller
 from jeit.design.study.store import Store, require
+from jeit.simulate.contact.indent_sets import IndentSet
 from jeit.simulate.contact.press import Press
 from jeit.simulate.contact.press_draws import PressDraws
 from jeit.simulate.contact.pressed_skin import PressedSkin, check_seconds
@@ -128,9 +129,13 @@ class PressSet:
 
 
 def simulate_presses(
-    presses: PressSet, path: str | Path, *, client: Any = None, progress: Callable[[Progress], None] | None = None
+    presses: PressSet | IndentSet,
+    path: str | Path,
+    *,
+    client: Any = None,
+    progress: Callable[[Progress], None] | None = None,
 ):
-    """Simulate what is not finished of a set, and return it, as of `open_presses`.
+    """Simulate what is not finished of a set, of presses or indents, and return it, as of `open_presses`.
 
     Killed at any moment, it goes on from the last finished chunk when run again, to the same store. `path`, `client`
     and `progress` as in `jeit.design.run_study`. Raises `ValueError` for another set's store, and as
@@ -138,7 +143,7 @@ def simulate_presses(
     written.
     """
     require("xarray")
-    check_kind("presses", presses, PressSet, "a PressSet(skin, draws, number)")
+    check_kind("presses", presses, (PressSet, IndentSet), "a PressSet(skin, draws, number), or an IndentSet")
     store = Store(presses.contents(), path)
     done = set(store.sound())
     left = [number for number in range(len(presses.chunks)) if number not in done]
@@ -149,9 +154,10 @@ def simulate_presses(
     return open_presses(presses, path)
 
 
-def open_presses(presses: PressSet, path: str | Path):
-    """The set in a store as an `xarray.Dataset` with dimensions touch, channel and press, read when it is asked for;
-    `finished` (touch,) says which touches are. Raises as `jeit.design.study.store.Store` does."""
+def open_presses(presses: PressSet | IndentSet, path: str | Path):
+    """The set in a store as an `xarray.Dataset` with dimensions touch, channel and press (row and column of indents),
+    read when it is asked for; `finished` (touch,) says which touches are. Raises as `jeit.design.study.store.Store`
+    does."""
     require("xarray")
     store = Store(presses.contents(), path, create=False)
     finished = np.zeros(presses.number, bool)
@@ -160,12 +166,14 @@ def open_presses(presses: PressSet, path: str | Path):
     return store.open_dataset().assign_coords(finished=("touch", finished))
 
 
-def solve_presses(presses: PressSet, number: int) -> dict[str, np.ndarray]:
+def solve_presses(presses: PressSet | IndentSet, number: int) -> dict[str, np.ndarray]:
     """One chunk of a set, as `PressSet.solve`: a function, for workers of a cluster to be sent."""
     return presses.solve(number)
 
 
-def _solved(presses: PressSet, numbers: list[int], client: Any) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+def _solved(
+    presses: PressSet | IndentSet, numbers: list[int], client: Any
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     if client is None:
         return ((number, solve_presses(presses, number)) for number in numbers)
     return over_cluster(client, solve_presses, presses, numbers)

@@ -1,0 +1,173 @@
+"""`ImageNetwork`: voltages of a skin to maps of how deep it is indented, by a network that learnt it; and its file."""
+
+import functools
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind, check_name, is_number, real_array
+from jeit.design import Skin
+from jeit.protocol import Protocol
+from jeit.simulate.contact.indents import relative_to
+from jeit.touch.networks.three_stages import ThreeStages
+from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.training import check_same, read_model, write_model
+
+DESIGNS = ("unrolled", "three-stages")
+_KIND, _VERSION = "a jeit image network", 1
+FILE = "network.jeit"
+# Frames that are imaged at once, at most: more leave the cache. JAX compiles for every number of them that is 2ⁿ.
+_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class ImageNetwork:
+    """A network that images touches of one skin.
+
+    **Fields**: the `network` and its `design`; `thickness` of the skin, metres; the `shape` (rows, columns) of its maps
+    and their `extent` (x_min, x_max, y_min, y_max), metres, row 0 at the least y; the relative `noise` of a channel
+    that it was trained with; `made_for`, what it can be used for: skin, electrodes and protocol, as plain values.
+    """
+
+    network: ThreeStages | Unrolled
+    design: str
+    thickness: float
+    shape: tuple[int, int]
+    extent: tuple[float, float, float, float]
+    noise: float
+    made_for: dict[str, Any]
+
+    @classmethod
+    def of_skin(cls, network: ThreeStages | Unrolled, skin: Skin, noise: float, shape: tuple[int, int]):
+        """A network that was trained on this skin."""
+        design = "unrolled" if isinstance(network, Unrolled) else "three-stages"
+        low_x, high_x, low_y, high_y = map(float, skin.outline.extent)
+        extent = low_x, high_x, low_y, high_y
+        made_for = described(skin.model.protocol, skin.layout.centres, extent)
+        return cls(network, design, float(skin.thickness), shape, extent, float(noise), made_for)
+
+    def depth(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "*n rows columns"]:
+        """How deep the skin is indented, metres, of frames (M,) or (n, M), volts, and a `reference` (M,) of the skin
+        that nobody touches.
+
+        Raises `ValueError` for other numbers of channels, and for what is not finite: a network has no use for frames
+        with channels missing.
+        """
+        channels = self.made_for["channels"]
+        frames = real_array("voltages", voltages, f"frames ({channels},) or (n, {channels}), volts")
+        rest = real_array("reference", reference, f"a frame ({channels},), volts")
+        for name, given in (("voltages", frames), ("reference", rest)):
+            if given.shape[-1:] != (channels,) or given.ndim > (2 if name == "voltages" else 1):
+                raise ValueError(f"{name} has shape {given.shape}; this network takes {channels} channels.")
+            if not np.isfinite(given).all():
+                raise ValueError(f"{name} is not finite everywhere, and this network needs every channel.")
+        change = relative_to(rest, np.atleast_2d(frames))
+        maps = self.thickness * self.share(change)
+        return maps if frames.ndim == 2 else maps[0]
+
+    def share(self, change: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n rows columns"]:
+        """Depths over the thickness, of changes relative to a reference, as of `jeit.simulate.relative_changes`."""
+        number = len(change)
+        if not number:
+            return np.zeros((0, *self.shape), np.float32)
+        size = min(_AT_ONCE, 2 ** (number - 1).bit_length())
+        given = np.zeros((-(-number // size) * size, change.shape[1]), np.float32)
+        given[:number] = change
+        parts = [np.asarray(self._compiled(given[one : one + size])) for one in range(0, len(given), size)]
+        return np.concatenate(parts)[:number]
+
+    @functools.cached_property
+    def _compiled(self) -> Callable[..., Any]:
+        arrays, still = eqx.partition(self.network, eqx.is_array)
+        called = jax.jit(lambda arrays, change: eqx.combine(arrays, still)(change))
+        return lambda change: called(arrays, jnp.asarray(change))
+
+    def check_protocol(self, protocol: Protocol, name: str = "the data") -> None:
+        """Raise `ValueError`, with the difference, where frames of another protocol are to be imaged; currents may
+        differ."""
+        check_same(name, self.made_for, _channels_of(protocol))
+
+
+def described(protocol: Protocol, centres: ArrayLike, extent: tuple[float, ...]) -> dict[str, Any]:
+    """What a network is made for, as plain values that JSON takes: of a protocol, electrodes at `centres` (L, 2) and a
+    skin in a box, metres."""
+    places = np.round(1e3 * np.asarray(centres), 3).tolist()
+    skin = np.round(1e3 * np.asarray(extent), 3).tolist()
+    return {**_channels_of(protocol), "skin_mm": skin, "electrodes_mm": places}
+
+
+def write_network(network: ImageNetwork, path: str | Path) -> None:
+    """Write a network to one file, numbers with a head of JSON. Raises `ValueError` for what is none, and for a folder;
+    `OSError` where it cannot be written."""
+    check_kind("network", network, ImageNetwork, "an ImageNetwork, as of learn_images")
+    head = {
+        "design": network.design,
+        "steps": len(network.network.steps) if isinstance(network.network, Unrolled) else 0,
+        "thickness_m": network.thickness,
+        "shape": list(network.shape),
+        "extent_m": list(network.extent),
+        "noise": network.noise,
+        "made_for": network.made_for,
+        "versions": {name: version(name) for name in ("jeit", "jax", "equinox")},
+    }
+    write_model(path, _KIND, _VERSION, head, network.network)
+
+
+def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
+    """The network of a file that `write_network` made, or of the folder of `learn_images`; nothing in it is executed.
+
+    Raises `FileNotFoundError`, and `ValueError` for another file, and where it was trained for another `skin` than is
+    given, with the difference."""
+    path = Path(path)
+    path = path / FILE if path.is_dir() else path
+    head, network = read_model(path, _KIND, _VERSION, _untrained)
+    low_x, high_x, low_y, high_y = map(float, head["extent_m"])
+    found = ImageNetwork(
+        network,
+        head["design"],
+        float(head["thickness_m"]),
+        (int(head["shape"][0]), int(head["shape"][1])),
+        (low_x, high_x, low_y, high_y),
+        float(head["noise"]),
+        head["made_for"],
+    )
+    if skin is not None:
+        here = described(skin.model.protocol, skin.layout.centres, (*map(float, skin.outline.extent),))
+        check_same(path, found.made_for, here)
+    return found
+
+
+def _untrained(head: dict[str, Any]) -> ThreeStages | Unrolled:
+    check_name("design", head["design"], DESIGNS)
+    rows, columns = head["shape"]
+    channels, key = head["made_for"]["channels"], jax.random.key(0)
+    for number in (rows, columns, channels):
+        if not (isinstance(number, int) and 1 <= number <= 10_000):
+            raise ValueError(f"its head tells of {number!r} rows, columns or channels")
+    numbers = [head["thickness_m"], head["noise"], *head["extent_m"]]
+    if len(numbers) != 6 or not all(is_number(one) for one in numbers):
+        raise ValueError("its head tells of no thickness, noise and extent")
+    if head["design"] == "three-stages":
+        return ThreeStages(channels, (rows, columns), key=key)
+    return Unrolled(channels, (rows, columns), int(head["steps"]), key=key)
+
+
+def _channels_of(protocol: Protocol) -> dict[str, Any]:
+    """Of a protocol: how many channels and electrodes, and what is driven and read, whatever current is."""
+    drive, measured = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
+    patterns = np.round(np.concatenate([drive / np.abs(drive).max(), measured / np.abs(measured).max()]), 6) + 0.0
+    return {
+        "channels": protocol.num_measurements,
+        "electrodes": protocol.num_electrodes,
+        "patterns_sha256": hashlib.sha256(patterns.tobytes()).hexdigest()[:16],
+    }

@@ -1,0 +1,89 @@
+"""Layers of networks that image, for batches: dense ones, and convolutions of images (b, rows, columns, channels)."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+class Dense(eqx.Module):
+    """x W + b, of x (b, i)."""
+
+    weight: Float[Array, "i o"]
+    bias: Float[Array, " o"]
+
+    def __init__(self, inputs: int, outputs: int, *, key: Array):
+        """Weights of He et al. 2015, as of every layer here; no bias."""
+        self.weight = _start(key, (inputs, outputs), inputs)
+        self.bias = jnp.zeros(outputs, jnp.float32)
+
+    def __call__(self, values: Float[Array, "b i"]) -> Float[Array, "b o"]:
+        """Of a batch."""
+        return values @ self.weight + self.bias
+
+
+class Convolution(eqx.Module):
+    """3 × 3, padded with zeros, of every `stride`-th pixel."""
+
+    weight: Float[Array, "3 3 i o"]
+    bias: Float[Array, " o"]
+    stride: int = eqx.field(static=True)
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1, *, key: Array):
+        """Of images of so many channels."""
+        self.weight = _start(key, (3, 3, inputs, outputs), 9 * inputs)
+        self.bias = jnp.zeros(outputs, jnp.float32)
+        self.stride = stride
+
+    def __call__(self, image: Float[Array, "b r c i"]) -> Float[Array, "b p q o"]:
+        """Of a batch."""
+        layout = ("NHWC", "HWIO", "NHWC")
+        steps = (self.stride, self.stride)
+        return jax.lax.conv_general_dilated(image, self.weight, steps, "SAME", dimension_numbers=layout) + self.bias
+
+
+class Chain(eqx.Module):
+    """Layers one after the other, exponential linear units between them; dropout of a share before each but the first
+    where a key is given."""
+
+    layers: tuple[eqx.Module, ...]
+    dropout: float = eqx.field(static=True)
+
+    @classmethod
+    def dense(cls, widths: Sequence[int], *, key: Array, dropout: float = 0.0) -> "Chain":
+        """Dense layers from each of the `widths` to the next."""
+        keys = jax.random.split(key, len(widths) - 1)
+        return cls(tuple(Dense(i, o, key=one) for (i, o), one in zip(pairwise(widths), keys, strict=True)), dropout)
+
+    def __call__(self, values: Array, key: Array | None = None) -> Array:
+        """Of a batch; not of a last unit."""
+        for number, layer in enumerate(self.layers):
+            if number:
+                values = jax.nn.elu(values)
+                if key is not None and self.dropout:
+                    kept = jax.random.bernoulli(jax.random.fold_in(key, number), 1 - self.dropout, values.shape)
+                    values = jnp.where(kept, values / (1 - self.dropout), 0.0)
+            values = layer(values)  # pyright: ignore[reportCallIssue]
+        return values
+
+
+def doubled(image: Float[Array, "b r c i"]) -> Float[Array, "b s d i"]:
+    """Every pixel as 2 × 2."""
+    number, rows, columns, channels = image.shape
+    wide = jnp.broadcast_to(image[:, :, None, :, None], (number, rows, 2, columns, 2, channels))
+    return wide.reshape(number, 2 * rows, 2 * columns, channels)
+
+
+def unfolded(image: Float[Array, "b r c 4"]) -> Float[Array, "b s d"]:
+    """Four channels of each pixel as 2 × 2 of one."""
+    number, rows, columns, _ = image.shape
+    parts = image.reshape(number, rows, columns, 2, 2)
+    return jnp.moveaxis(parts, 3, 2).reshape(number, 2 * rows, 2 * columns)
+
+
+def _start(key: Array, shape: tuple[int, ...], inputs: int) -> Array:
+    return jax.random.normal(key, shape, jnp.float32) * np.float32(np.sqrt(2 / inputs))

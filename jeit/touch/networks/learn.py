@@ -1,0 +1,161 @@
+"""`learn_images`: from a skin's description to a network that images its touches; its data, trainings and standing."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jeit.arguments import check_kind, check_name
+from jeit.design import Skin, touches_away_from_the_edge
+from jeit.simulate import Indent, IndentSet, ball, relative_changes, simulate_presses
+from jeit.simulate.contact.indent_sets import image_places
+from jeit.touch.needed import need_learning
+from jeit.touch.networks.image_network import DESIGNS, FILE, ImageNetwork, write_network
+from jeit.touch.networks.places import centroids_of, errors
+from jeit.touch.networks.sensed import Sensed
+from jeit.touch.networks.touches import detection_noise, touch_draws
+from jeit.touch.networks.training import Examples, Runs, train_three_stages, train_unrolled
+from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.training import Plan, Trained
+
+SHAPE = (48, 48)
+# Touches of a chunk; seeds of those learnt from, held out, and of the standing, which nothing is chosen by.
+_CHUNK, _SEEDS = 250, (0, 1, 2)
+# Of the standing: a ball of so many metres, so deep in the skin's thickness, on a grid of so many places a side.
+_BALL, _DEPTH, _PLACES = 0.015, 0.75, 15
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How much is learnt: `number` of touches, `held_out` ones besides, and the `plan` of every training; that of the
+    `three_stages`, where it is another."""
+
+    number: int
+    held_out: int
+    plan: Plan
+    three_stages: Plan | None = None
+
+    def plan_of(self, design: str) -> Plan:
+        """Of one of the designs."""
+        return self.three_stages if design == "three-stages" and self.three_stages is not None else self.plan
+
+
+PRESETS = {
+    "quick": Preset(1000, 250, Plan(rate=2e-3, batch=32, epochs=6, patience=6, decay=0.7)),
+    "full": Preset(
+        12_000,
+        1500,
+        Plan(rate=2e-3, batch=64, epochs=14, patience=6, decay=0.82),
+        Plan(rate=1e-3, batch=128, epochs=60, patience=8, decay=0.97),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class ImageStanding:
+    """How well a network images touches that nothing was learnt from.
+
+    **Fields**: `explained`, the share of the squares of depths in the touches of a test set that its maps get right,
+    at most 1; `place`, errors of the middle of a single ball, metres, over a grid of places (mean, sd, rms);
+    `examples`, some maps, right and told, (k, rows, columns) over the thickness.
+    """
+
+    explained: float
+    place: dict[str, float]
+    right: Float[np.ndarray, "k rows columns"]
+    told: Float[np.ndarray, "k rows columns"]
+
+
+@dataclass(frozen=True)
+class LearntImages:
+    """A `network`, the `courses` of its trainings by name, its `standing`; `seconds` of each part of the work."""
+
+    network: ImageNetwork
+    courses: dict[str, Trained]
+    standing: ImageStanding
+    seconds: dict[str, float]
+
+
+def learn_images(
+    skin: Skin,
+    folder: str | Path,
+    *,
+    preset: str | Preset = "full",
+    design: str = "unrolled",
+    seed: int = 0,
+    client: Any = None,
+    progress: Callable[[str], None] | None = None,
+) -> LearntImages:
+    """Simulate touches of a skin, train a network on them, and write it to `folder`, as `network.jeit`.
+
+    Killed at any moment, the same call goes on where it was: touches are in chunks in stores in the folder `work`, and
+    trainings in checkpoints. `preset`: "quick", under two minutes, "full", or one of one's own; `design`: "unrolled", a
+    network that knows the skin's physics, or "three-stages", that of Park et al. 2022. `client`: of a dask cluster,
+    which then simulates. `progress` is called with how far it is. Raises `ValueError` for names that there are not and
+    a folder of another skin's work; `ImportError` without the extras `learn` and `cluster`.
+    """
+    need_learning()
+    check_kind("skin", skin, Skin, "a Skin, as of read_described_skin('skin.toml')")
+    check_name("design", design, DESIGNS)
+    if not isinstance(preset, Preset):
+        check_name("preset", preset, PRESETS)
+        preset = PRESETS[preset]
+    tell = (lambda _: None) if progress is None else progress
+    work = Path(folder) / "work"
+    work.mkdir(parents=True, exist_ok=True)
+    seconds, start = {}, time.monotonic()
+    tell("noise")
+    noise = detection_noise(skin)
+    sets = {}
+    for name, number, own in zip(
+        ("learnt", "held-out", "standing"), (preset.number, preset.held_out, preset.held_out), _SEEDS, strict=True
+    ):
+        indents = IndentSet(skin, touch_draws(skin), number, seed=3 * seed + own, shape=SHAPE, chunk=_CHUNK)
+        where = work / f"{name}.zarr"
+        found = simulate_presses(
+            indents,
+            where,
+            client=client,
+            progress=lambda now, name=name: tell(f"touches {name}: {now.points} of {now.all_points}"),
+        )
+        sets[name] = Examples(found["change"].to_numpy(), found["depth"].to_numpy())
+    seconds["touches"] = time.monotonic() - start
+    key = jax.random.key(seed)
+    runs = Runs(preset.plan_of(design), key, work, progress)
+    if design == "unrolled":
+        sensed = Sensed.of(skin, SHAPE)
+        start_network = Unrolled(sets["learnt"].change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
+        places = image_places(skin, SHAPE[1], SHAPE[0])
+        start_network = start_network.of_skin(sensed, places, skin.layout.centres, noise)
+        learnt = train_unrolled(start_network, sensed, sets["learnt"], sets["held-out"], noise, runs)
+    else:
+        learnt = train_three_stages(sets["learnt"], sets["held-out"], noise, runs)
+    seconds["training"] = time.monotonic() - start - seconds["touches"]
+    network = ImageNetwork.of_skin(learnt.network, skin, noise, SHAPE)
+    tell("standing")
+    standing = stand(network, skin, sets["standing"])
+    seconds["all"] = time.monotonic() - start
+    write_network(network, Path(folder) / FILE)
+    return LearntImages(network, learnt.courses, standing, seconds)
+
+
+def stand(network: ImageNetwork, skin: Skin, examples: Examples, seed: int = 0) -> ImageStanding:
+    """How well a network images touches, with the noise that it was trained with."""
+    random = np.random.default_rng(seed)
+
+    def told(change):
+        return network.share(change + network.noise * random.normal(size=change.shape))
+
+    maps = told(examples.change)
+    explained = 1 - float(np.mean((maps - examples.depth) ** 2) / np.mean(examples.depth**2))
+    grid = touches_away_from_the_edge(skin.outline, _BALL / 2, _PLACES, _PLACES)
+    tip, depth = ball(_BALL), min(_DEPTH * float(skin.thickness), _BALL / 2)
+    found = told(relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places]))
+    rows, columns = network.shape
+    place = errors(centroids_of(found, image_places(skin, columns, rows)), grid.places)
+    return ImageStanding(explained, place, examples.depth[:6], maps[:6])

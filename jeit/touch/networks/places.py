@@ -1,0 +1,29 @@
+"""Where a map of depth says that a skin is touched."""
+
+import numpy as np
+from jaxtyping import Float
+
+# Of a map's greatest depth: what is below is no part of a touch.
+_PART = 0.5
+
+
+def peaks(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
+    """Places (n, 2) of the deepest pixels, metres; `places` of the pixels."""
+    deepest = maps.reshape(len(maps), -1).argmax(axis=1)
+    return places.reshape(-1, 2)[deepest]
+
+
+def centroids_of(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
+    """Middles (n, 2) of what is deeper than half of the deepest, weighted by depth, metres."""
+    flat = maps.reshape(len(maps), -1)
+    most = flat.max(axis=1, keepdims=True)
+    weight = np.where(flat > _PART * most, np.maximum(flat, 0), 0)
+    # Of a map without any depth: the middle of the skin.
+    weight = np.where(most > 0, weight, 1.0)
+    return weight @ places.reshape(-1, 2) / weight.sum(axis=1, keepdims=True)
+
+
+def errors(found: Float[np.ndarray, "n 2"], right: Float[np.ndarray, "n 2"]) -> dict[str, float]:
+    """Mean, standard deviation and root mean square of how far off places are, metres."""
+    off = np.linalg.norm(found - right, axis=1)
+    return {"mean": float(off.mean()), "sd": float(off.std()), "rms": float(np.sqrt(np.mean(off**2)))}

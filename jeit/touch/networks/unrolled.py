@@ -1,0 +1,141 @@
+"""A network that knows the skin's physics: linear images of what its maps do not explain yet, refined by convolutions.
+
+Every step images the rest of the changes by matrices of the forward model (one Gauss-Newton step of a Gaussian prior,
+with the noise alone and with drifting contacts besides), and a small convolutional network, the same all over the skin,
+adds to the map. Trained with the misfit of the voltages that the model gives its maps.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jeit.touch.networks.layers import Convolution, doubled, unfolded
+from jeit.touch.networks.sensed import Sensed, depth_of, rounded, strength
+
+_WIDE, _NARROW = 32, 16
+# The prior: deviation of a pixel's strength, and length of its correlation over the skin's longer side; how many times
+# the noise is taken for each of the images without drift, the first of which is where maps start; and the drift of
+# logarithms of contacts with which one more is made.
+_DEVIATION, _LENGTH, _TIMES, _DRIFT = 0.15, 0.04, (8.0, 1.5), 0.05
+
+
+class Refinement(eqx.Module):
+    """Images (b, rows, columns, i) to changes of a map of twice as many rows and columns: a U of convolutions."""
+
+    inwards: tuple[Convolution, ...]
+    outwards: tuple[Convolution, ...]
+    last: Convolution
+
+    def __init__(self, channels: int, *, key: Array):
+        """Of images of so many channels."""
+        keys = jax.random.split(key, 9)
+        self.inwards = (
+            Convolution(channels, _NARROW, key=keys[0]),
+            Convolution(_NARROW, _WIDE, 2, key=keys[1]),
+            Convolution(_WIDE, _WIDE, key=keys[2]),
+            Convolution(_WIDE, _WIDE, 2, key=keys[3]),
+            Convolution(_WIDE, _WIDE, key=keys[4]),
+        )
+        self.outwards = (
+            Convolution(_WIDE, _WIDE, key=keys[5]),
+            Convolution(_WIDE, _NARROW, key=keys[6]),
+            Convolution(_NARROW, _NARROW, key=keys[7]),
+        )
+        last = Convolution(_NARROW, 4, key=keys[8])
+        # Nothing is added at first: what is untrained leaves linear images as they are.
+        self.last = eqx.tree_at(lambda one: one.weight, last, 0.01 * last.weight)
+
+    def __call__(self, images: Float[Array, "b r c i"]) -> Float[Array, "b s d"]:
+        """Of a batch."""
+        elu = jax.nn.elu
+        first = elu(self.inwards[0](images))
+        second = elu(self.inwards[2](elu(self.inwards[1](first))))
+        third = elu(self.inwards[4](elu(self.inwards[3](second))))
+        wide = elu(self.outwards[0](second + doubled(third)))
+        fine = elu(self.outwards[2](first + doubled(elu(self.outwards[1](wide)))))
+        return unfolded(self.last(fine))
+
+
+class Unrolled(eqx.Module):
+    """Relative changes (b, M) to depth maps (b, rows, columns) over the skin's thickness.
+
+    **Fields**: `operator` (M, P), what pixels change; `imagers` (M, p, k), transposed matrices of linear images on
+    pixels twice as wide; `still` (rows / 2, columns / 2, s), of the skin alone; `scale`, of changes in the images; the
+    `steps`. All but these are the skin's, and not trained.
+    """
+
+    operator: Float[Array, "M P"]
+    imagers: Float[Array, "M p k"]
+    still: Float[Array, "r c s"]
+    steps: tuple[Refinement, ...]
+    shape: tuple[int, int] = eqx.field(static=True)
+
+    def __init__(self, channels: int, shape: tuple[int, int], num_steps: int = 1, *, key: Array):
+        """Of so many channels, and maps of this shape; untrained, and of no skin yet."""
+        rows, columns = shape[0] // 2, shape[1] // 2
+        images = len(_TIMES) + 1
+        self.operator = jnp.zeros((channels, shape[0] * shape[1]), jnp.float32)
+        self.imagers = jnp.zeros((channels, rows * columns, images), jnp.float32)
+        self.still = jnp.zeros((rows, columns, 2), jnp.float32)
+        keys = jax.random.split(key, num_steps)
+        self.steps = tuple(Refinement(images + 2 + (4 if number else 0), key=one) for number, one in enumerate(keys))
+        self.shape = shape
+
+    def of_skin(self, sensed: Sensed, places: Float[np.ndarray, "r c 2"], centres, noise: float) -> "Unrolled":
+        """The same of a skin: what it senses, where its pixels and its electrodes' `centres` (L, 2) are, metres, and
+        the relative `noise` of its channels."""
+        operator = sensed.halved()
+        covariance = _covariance(places[::2, ::2].reshape(-1, 2))
+        across = operator @ covariance
+        own = across @ operator.T
+        drift = _DRIFT**2 * sensed.contacts.T @ sensed.contacts
+        white = noise**2 * np.eye(len(own))
+        rests = [*(times**2 * white for times in _TIMES), white + drift]
+        imagers = np.stack([np.linalg.solve(own + rest, across) for rest in rests], axis=-1)
+        middles = places.reshape(self.shape[0] // 2, 2, self.shape[1] // 2, 2, 2).mean(axis=(1, 3))
+        distance = np.linalg.norm(middles[..., None, :] - np.asarray(centres), axis=-1).min(axis=-1)
+        felt = np.log(np.linalg.norm(operator, axis=0).reshape(distance.shape) + 1e-9)
+        still = np.stack([distance / distance.max(), (felt - felt.mean()) / felt.std()], axis=-1)
+        arrays = [jnp.asarray(rounded(one), jnp.float32) for one in (sensed.operator, imagers, still)]
+        return eqx.tree_at(lambda one: (one.operator, one.imagers, one.still), self, arrays)
+
+    @property
+    def trained(self) -> "Unrolled":
+        """A tree of truth values: what is trained of it."""
+        nothing = jax.tree.map(lambda _: False, self)
+        return eqx.tree_at(lambda one: one.steps, nothing, jax.tree.map(eqx.is_inexact_array, self.steps))
+
+    def felt(self, maps: Float[Array, "b r c"]) -> Float[Array, "b M"]:
+        """Relative changes that the model gives maps."""
+        return strength(maps).reshape(len(maps), -1) @ self.operator.T
+
+    def each(self, changes: Float[Array, "b M"]) -> list[Float[Array, "b r c"]]:
+        """Maps after each of its steps."""
+        number, (rows, columns) = len(changes), (self.shape[0] // 2, self.shape[1] // 2)
+        still = jnp.broadcast_to(self.still, (number, *self.still.shape))
+        found = []
+        for step in self.steps:
+            rest = changes - self.felt(found[-1]) if found else changes
+            images = (rest @ self.imagers.reshape(len(self.imagers), -1)).reshape(number, rows, columns, -1)
+            parts = [images / _DEVIATION, still]
+            if found:
+                maps = found[-1]
+                folded = maps.reshape(number, rows, 2, columns, 2)
+                parts.append(jnp.moveaxis(folded, 2, 3).reshape(number, rows, columns, 4))
+            else:
+                maps = doubled(depth_of(images[..., :1]))[..., 0]
+            found.append(maps + step(jnp.concatenate(parts, axis=-1)))
+        return found
+
+    def __call__(self, changes: Float[Array, "b M"]) -> Float[Array, "b r c"]:
+        """After the last."""
+        return self.each(changes)[-1]
+
+
+def _covariance(places: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p p"]:
+    """Of strengths: Gaussian in the distance."""
+    length = _LENGTH * np.ptp(places, axis=0).max()
+    squared = ((places[:, None] - places) ** 2).sum(axis=-1)
+    return _DEVIATION**2 * np.exp(-squared / (2 * length**2))

@@ -1,0 +1,136 @@
+"""Bodies held at a depth: their maps, what they change, and sets of them that a killed run goes on with."""
+
+import jax
+import numpy as np
+import pytest
+
+from jeit.design import Skin
+from jeit.layout import named_layout
+from jeit.mesh import Rectangle, measures
+from jeit.simulate import (
+    Bar,
+    Disc,
+    Indent,
+    IndentDraws,
+    IndentSet,
+    ball,
+    depth_maps,
+    indented_cells,
+    open_presses,
+    relative_changes,
+    simulate_presses,
+)
+from jeit.simulate.contact.indent_sets import image_places
+
+
+def made(num_layers: int) -> Skin:
+    return Skin.create(named_layout("grid-3x3", Rectangle(0.06, 0.06)), num_layers=num_layers, cell_size=5e-3)
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    return made(0)
+
+
+def test_a_ball_leaves_a_cap(sheet):
+    """Of π d² (R − d / 3)."""
+    places = image_places(sheet, 240, 240)
+    (depth,) = depth_maps([[Indent(ball(0.02), 4e-3, (0.003, -0.004))]], places)
+    volume = depth.sum() * (0.06 / 240) ** 2
+    assert volume == pytest.approx(np.pi * 4e-3**2 * (0.01 - 4e-3 / 3), rel=1e-3)
+    assert np.linalg.norm(places.reshape(-1, 2)[depth.argmax()] - (0.003, -0.004)) < 0.3e-3
+
+
+def test_turned_and_several(sheet):
+    places = image_places(sheet, 120, 120)
+    bar = Bar(0.03, 0.006)
+    along, across = (depth_maps([[Indent(bar, 2e-3, angle=one)]], places)[0] for one in (0.0, np.pi / 2))
+    assert np.allclose(along, across.T)
+    both = depth_maps([[Indent(bar, 2e-3), Indent(bar, 3e-3, angle=np.pi / 2)]], places)[0]
+    assert np.allclose(both, np.maximum(along, 1.5 * across))
+
+
+@pytest.mark.parametrize("num_layers", [0, 4])
+def test_what_is_indented_conducts_no_more(num_layers):
+    """The share of a skin's volume that cells lose is that of the indented body."""
+    skin = made(num_layers)
+    depth = 4e-3
+    cells = indented_cells(skin, [[Indent(Disc(0.03), depth)]])
+    lost = -np.sum(np.asarray(cells.change) * np.asarray(measures(skin.model.mesh))[np.asarray(cells.cells)])
+    whole = float(skin.outline.area) * (float(skin.thickness) if num_layers else 1.0)
+    wanted = np.pi * 0.015**2 * depth / (0.06**2 * float(skin.thickness))
+    assert lost / whole == pytest.approx(wanted, rel=0.12 if num_layers else 0.03)
+
+
+def test_changes_are_those_of_the_model(sheet):
+    """Against the model solved anew."""
+    touch = [Indent(ball(0.02), 5e-3, (0.004, 0.002)), Indent(Disc(0.01), 2e-3, (-0.015, 0.0))]
+    cells = indented_cells(sheet, [touch])
+    conductivity = np.full(sheet.model.mesh.num_cells, float(sheet.model_conductivity))
+    conductivity[np.asarray(cells.cells[0])] *= 1 + np.asarray(cells.change[0])
+    rest, pressed = (np.asarray(sheet.model.voltages(one)) for one in (sheet.model_conductivity, conductivity))
+    assert np.allclose(relative_changes(sheet, [touch])[0], pressed / rest - 1, rtol=1e-6, atol=1e-9)
+
+
+def test_nothing_touched(sheet):
+    assert np.abs(relative_changes(sheet, [[], [Indent(Disc(0.01), 1e-3)]])[0]).max() == 0
+
+
+@pytest.fixture
+def draws(sheet):
+    return IndentDraws([ball(0.015), Disc(0.01)], sheet.outline, (1e-3, 6e-3), margin=5e-3, at_once=2)
+
+
+def test_draws(draws):
+    touches = draws.draw(jax.random.key(0), 400)
+    depths = np.array([one.depth for touch in touches for one in touch])
+    assert depths.min() >= 1e-3
+    assert depths.max() <= 6e-3
+    assert np.median(depths) == pytest.approx(np.sqrt(6) * 1e-3, rel=0.1)
+    assert {len(touch) for touch in touches} == {1, 2}
+
+
+def test_a_set_goes_on(sheet, draws, tmp_path):
+    """Stopped after its first chunk, it ends with the same arrays."""
+    indents = IndentSet(sheet, draws, 40, seed=3, shape=(12, 12), chunk=16)
+    whole = simulate_presses(indents, tmp_path / "whole.zarr")
+
+    def stop(now):
+        if now.chunks == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate_presses(indents, tmp_path / "killed.zarr", progress=stop)
+    assert open_presses(indents, tmp_path / "killed.zarr").finished.sum() == 16
+    told = []
+    again = simulate_presses(indents, tmp_path / "killed.zarr", progress=told.append)
+    assert told[0].chunks == 1
+    for name in ("change", "depth"):
+        assert np.array_equal(again[name].to_numpy(), whole[name].to_numpy())
+    depth = whole["depth"].to_numpy()
+    assert depth.shape == (40, 12, 12)
+    assert 0 <= depth.min() <= depth.max() <= 0.6
+    assert np.abs(whole["change"].to_numpy()).max(axis=1).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda skin, draws: Indent("ball", 1e-3), "indenter must be an indenter"),
+        (lambda skin, draws: Indent(Disc(0.01), 0.0), "depth must be a positive length"),
+        (lambda skin, draws: IndentDraws([Disc(0.01)], skin.outline, (1.0, 8.0)), "were millimetres given"),
+        (lambda skin, draws: indented_cells(skin, [[Indent(Disc(0.01), 0.02)]]), "indent it less"),
+        (lambda skin, draws: indented_cells("skin", []), "skin must be a Skin"),
+        (lambda skin, draws: IndentSet(skin, draws, 0), "number must be a whole number"),
+        (lambda skin, draws: IndentSet(skin, draws, 1, seed=-1), "seed must be a whole number"),
+        (lambda skin, draws: IndentSet(skin, "draws", 1), "draws must be IndentDraws"),
+        (
+            lambda skin, draws: IndentSet(skin, IndentDraws([Disc(0.01)], skin.outline, (1e-3, 0.02)), 1),
+            "draw less depth",
+        ),
+        (lambda skin, draws: simulate_presses("set", "here"), "presses must be a PressSet"),
+    ],
+)
+def test_what_cannot_be(sheet, draws, make, said):
+    with pytest.raises(ValueError, match=said):
+        make(sheet, draws)

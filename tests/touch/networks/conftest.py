@@ -1,0 +1,20 @@
+"""A small skin, and a network that learnt it."""
+
+import pytest
+from small_networks import PRESET
+
+from jeit.design import Skin
+from jeit.layout import named_layout
+from jeit.mesh import Rectangle
+from jeit.touch.networks import learn_images
+
+
+@pytest.fixture(scope="session")
+def small_skin():
+    return Skin.create(named_layout("grid-4x4", Rectangle(0.1, 0.1)), num_layers=0, cell_size=6e-3)
+
+
+@pytest.fixture(scope="session")
+def learnt(small_skin, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("learnt")
+    return folder, learn_images(small_skin, folder, preset=PRESET)

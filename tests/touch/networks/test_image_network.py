@@ -1,0 +1,166 @@
+"""Networks that image a skin: what they learn, that they go on, and their files."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from small_networks import PRESET, bits
+
+from jeit.design import Skin
+from jeit.design.skin.protocol import skin_protocol
+from jeit.layout import named_layout
+from jeit.mesh import Rectangle
+from jeit.protocol import adjacent
+from jeit.simulate import Disc, Indent, relative_changes
+from jeit.touch.networks import ImageNetwork, Preset, learn_images, read_network, write_network
+from jeit.touch.networks.learn import stand
+from jeit.touch.networks.three_stages import ThreeStages
+from jeit.touch.networks.training import Examples, Runs, shuffled, train_three_stages
+from jeit.touch.training import Plan
+
+
+def voltages(skin, touches):
+    rest = np.asarray(skin.model.voltages(skin.model_conductivity))
+    return rest * (1 + relative_changes(skin, touches)), rest
+
+
+def test_it_learns(learnt):
+    """Of two hundred touches, in three rounds, something; an untrained network explains nothing."""
+    _, found = learnt
+    assert found.standing.explained > 0.3
+    assert found.standing.place["mean"] < 0.02
+    losses = found.courses["unrolled"].course.validation
+    assert losses[-1] < losses[0]
+
+
+def test_an_untrained_network_explains_nothing(small_skin, learnt):
+    _, found = learnt
+    plain = found.network
+    fresh = ThreeStages(plain.made_for["channels"], plain.shape, key=jax.random.key(5))
+    examples = Examples(relative_changes(small_skin, [[Indent(Disc(0.02), 4e-3)]]), found.standing.right[:1])
+    assert stand(dataclasses.replace(plain, network=fresh), small_skin, examples).explained < 0.1
+
+
+def test_frames(small_skin, learnt):
+    _, found = learnt
+    given, rest = voltages(small_skin, [[Indent(Disc(0.02), 5e-3, (0.01, -0.02))], [Indent(Disc(0.02), 5e-3)]])
+    depth = found.network.depth(given, rest)
+    assert depth.shape == (2, 48, 48)
+    assert np.allclose(found.network.depth(given[1], rest), depth[1], atol=1e-6)
+    assert np.allclose(found.network.depth(3 * given, 3 * rest), depth, atol=1e-6)
+    assert found.network.depth(np.zeros((0, len(rest))), rest).shape == (0, 48, 48)
+    assert np.abs(found.network.depth(rest, rest)).max() < np.abs(depth).max()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda frame, rest: (frame[:-1], rest), "voltages has shape"),
+        (lambda frame, rest: (frame, rest[:-1]), "reference has shape"),
+        (lambda frame, rest: (np.where(rest > rest.mean(), np.nan, frame), rest), "voltages is not finite"),
+        (lambda frame, rest: (frame, np.stack([rest, rest])), "reference has shape"),
+    ],
+)
+def test_frames_of_another_kind(small_skin, learnt, change, said):
+    given, rest = voltages(small_skin, [[Indent(Disc(0.02), 5e-3)]])
+    with pytest.raises(ValueError, match=said):
+        learnt[1].network.depth(*change(given[0], rest))
+
+
+def test_what_is_done_is_not_done_again(small_skin, learnt):
+    folder, found = learnt
+    again = learn_images(small_skin, folder, preset=PRESET)
+    assert again.seconds["training"] < found.seconds["training"]
+    assert bits(again.network.network) == bits(found.network.network)
+
+
+SCRIPT = """
+import sys
+from jeit.design import Skin
+from jeit.layout import named_layout
+from jeit.mesh import Rectangle
+from jeit.touch.networks import learn_images
+from small_networks import PRESET
+
+skin = Skin.create(named_layout("grid-4x4", Rectangle(0.1, 0.1)), num_layers=0, cell_size=6e-3)
+learn_images(skin, sys.argv[1], preset=PRESET, progress=lambda said: print(said, flush=True))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("last_word", ["touches learnt: 200 of 200", "unrolled, epoch 3 "])
+def test_killed_at_any_moment(small_skin, learnt, tmp_path, last_word):
+    """By kill -9, amid touches or training; it ends as one that was never killed."""
+    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(tmp_path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": path},
+    )
+    assert process.stdout is not None
+    assert any(line.startswith(last_word) for line in process.stdout)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert not (tmp_path / "network.jeit").exists()
+    again = learn_images(small_skin, tmp_path, preset=PRESET)
+    assert bits(again.network.network) == bits(learnt[1].network.network)
+
+
+def test_a_network_comes_back(small_skin, learnt, tmp_path):
+    folder, found = learnt
+    again = read_network(folder, skin=small_skin)
+    assert eqx.tree_equal(again.network, found.network.network)
+    assert again.made_for == found.network.made_for
+    assert (again.design, again.extent, again.noise) == ("unrolled", found.network.extent, found.network.noise)
+    write_network(again, tmp_path / "copy.jeit")
+    assert (tmp_path / "copy.jeit").read_bytes() == (folder / "network.jeit").read_bytes()
+
+
+def test_another_skin_is_refused(small_skin, learnt):
+    folder, found = learnt
+    pairs = skin_protocol(small_skin.layout)
+    layout = named_layout("grid-4x4", Rectangle(0.12, 0.1))
+    other = Skin.create(layout, num_layers=0, cell_size=6e-3, protocol=pairs)
+    with pytest.raises(ValueError, match=r"its skin_mm is \[-50.0, 50.0"):
+        read_network(folder, skin=other)
+    with pytest.raises(ValueError, match="its channels is 94, and here it is 208"):
+        found.network.check_protocol(adjacent(16), "frames.csv")
+    found.network.check_protocol(small_skin.model.protocol)
+
+
+def test_the_paper_s_network(small_skin, learnt):
+    """Its three trainings; a network that is taught other touches' maps learns none of them."""
+    folder, found = learnt
+    import xarray
+
+    sets = [xarray.open_zarr(folder / "work" / f"{name}.zarr") for name in ("learnt", "held-out")]
+    training, held = (Examples(one["change"].to_numpy(), one["depth"].to_numpy()) for one in sets)
+    noise = found.network.noise
+    own = train_three_stages(training, held, noise, Runs(PRESET.plan, jax.random.key(1)))
+    assert set(own.courses) == {"voltages", "maps", "projection"}
+    assert eqx.tree_equal(own.network.decoder, own.courses["maps"].network.decoder)
+    assert eqx.tree_equal(own.network.encoder, own.courses["voltages"].network.encoder)
+    network = ImageNetwork.of_skin(own.network, small_skin, noise, (48, 48))
+    assert network.design == "three-stages"
+    lost = train_three_stages(shuffled(training), held, noise, Runs(PRESET.plan, jax.random.key(1)))
+    right, wrong = (one.courses["projection"].course for one in (own, lost))
+    assert min(right.validation) < min(wrong.validation)
+
+
+@pytest.mark.parametrize(("change", "said"), [({"preset": "fast"}, "preset must be"), ({"design": "u"}, "design must")])
+def test_no_such_thing(small_skin, tmp_path, change, said):
+    with pytest.raises(ValueError, match=said):
+        learn_images(small_skin, tmp_path, **change)
+
+
+def test_work_of_another_set_is_refused(small_skin, learnt):
+    with pytest.raises(ValueError, match="another"):
+        learn_images(small_skin, learnt[0], preset=Preset(201, 50, Plan()))

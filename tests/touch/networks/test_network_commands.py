@@ -1,0 +1,109 @@
+"""Measured frames imaged by a network, on the command line."""
+
+import io
+import json
+
+import numpy as np
+import pytest
+
+from jeit.cli import main
+from jeit.data import Measurement, screen
+from jeit.data.export import write_table
+from jeit.protocol import adjacent
+from jeit.simulate import Disc, Indent, relative_changes
+
+PLACES = ((0.01, -0.02), (-0.025, 0.01))
+
+
+@pytest.fixture(scope="module")
+def recorded(small_skin, tmp_path_factory):
+    """A folder with a file of the untouched skin, and one of two touches and a frame without one of its channels."""
+    folder = tmp_path_factory.mktemp("recorded")
+    model = small_skin.model
+    rest = np.asarray(model.voltages(small_skin.model_conductivity))
+    touched = rest * (1 + relative_changes(small_skin, [[Indent(Disc(0.02), 5e-3, one)] for one in PLACES]))
+    for name, frames in (("rest", rest[None]), ("touched", np.concatenate([touched, touched[:1]]))):
+        mask = np.ones(frames.shape, bool)
+        if name == "touched":
+            mask[2, 7] = False
+        known = {"electrodes": model.electrodes, "domain": small_skin.outline, "name": name}
+        write_table(Measurement(frames, mask, model.protocol, **known), folder / f"{name}.npz")
+    return folder
+
+
+@pytest.fixture
+def run(capsys):
+    def call(*arguments):
+        status = main([str(argument) for argument in arguments])
+        told = capsys.readouterr()
+        return status, told.out, told.err
+
+    return call
+
+
+def told(folder):
+    return np.genfromtxt(folder / "frames.csv", delimiter=",", skip_header=1)
+
+
+def test_reconstruct(learnt, recorded, run, tmp_path):
+    status, out, error = run(
+        "reconstruct", recorded / "touched.npz", "--reference", recorded / "rest.npz", "--frame", 1,
+        "--method", "network", "--model", learnt[0], "--output", tmp_path,
+    )  # fmt: skip
+    assert (status, error) == (0, "")
+    assert "1 frame imaged" in out
+    assert np.linalg.norm(told(tmp_path)[1:3] - PLACES[1]) < 0.015
+    with np.load(tmp_path / "depth.npz") as written:
+        assert written["depth"].shape == (1, 48, 48)
+    assert json.loads((tmp_path / "report.json").read_text())["design"] == "unrolled"
+    assert (tmp_path / "depth.png").stat().st_size > 5000
+
+
+def test_stream(learnt, recorded, run, tmp_path):
+    given = "--reference", recorded / "rest.npz", "--method", "network", "--model", learnt[0], "--output", tmp_path
+    status, out, error = run("stream", recorded / "touched.npz", *given)
+    assert (status, error) == (0, "")
+    assert "2 frames imaged" in out
+    assert "frame 2: refused. voltages is not finite" in " ".join(out.split())
+    lines = told(tmp_path)
+    assert (np.linalg.norm(lines[:2, 1:3] - PLACES, axis=1) < 0.015).all()
+    assert np.isnan(lines[2, 1:]).all()
+    assert json.loads((tmp_path / "report.json").read_text())["refused"] == [2]
+
+
+def test_stream_from_standard_input(learnt, recorded, run, tmp_path, monkeypatch):
+    with np.load(recorded / "touched.npz") as one:
+        text = " ".join(map(repr, one["voltages"][0].tolist())) + "\n1 2 3\n"
+    monkeypatch.setattr("sys.stdin", io.StringIO(text))
+    given = "--reference", recorded / "rest.npz", "--method", "network", "--model", learnt[0], "--output", tmp_path
+    status, out, _ = run("stream", "-", *given)
+    assert status == 0
+    assert "1 frame imaged" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--method", "network"), "--method network needs --model"),
+        (("--model", "MODEL"), "--model is for --method network"),
+        (("--method", "network", "--model", "MODEL", "--prior", "laplace"), "--prior has no use"),
+        (("--method", "network", "--model", "nowhere"), "there is no such file"),
+    ],
+)
+def test_what_does_not_go_together(learnt, recorded, run, tmp_path, options, said):
+    options = [learnt[0] if one == "MODEL" else one for one in options]
+    given = recorded / "touched.npz", "--reference", recorded / "rest.npz", "--output", tmp_path, *options
+    status, _, error = run("reconstruct", *given)
+    assert status == 1
+    assert said in error
+
+
+def test_another_protocol_is_refused(small_skin, learnt, recorded, run, tmp_path):
+    other = screen(
+        np.linspace(1, 2, 208)[None], adjacent(16), electrodes=small_skin.model.electrodes, domain=small_skin.outline
+    )
+    write_table(other, tmp_path / "other.npz")
+    given = "--method", "network", "--model", learnt[0], "--output", tmp_path
+    status, _, error = run("reconstruct", tmp_path / "other.npz", "--reference", tmp_path / "other.npz", *given)
+    assert status == 1
+    assert "its channels is 94, and here it is 208" in error

@@ -1,0 +1,72 @@
+"""What a skin's channels feel of a depth map, against exact voltages."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.design import Skin
+from jeit.layout import named_layout
+from jeit.mesh import Rectangle
+from jeit.simulate import Disc, Indent, depth_maps, relative_changes
+from jeit.simulate.contact.indent_sets import image_places
+from jeit.touch.networks.sensed import Sensed, depth_of, strength
+
+
+@pytest.fixture(scope="module")
+def sensed(small_skin):
+    return Sensed.of(small_skin)
+
+
+def felt(sensed, depth):
+    return np.asarray(strength(jnp.asarray(depth))).reshape(len(depth), -1) @ sensed.operator.T
+
+
+def missed(found, right):
+    return np.linalg.norm(found - right) / np.linalg.norm(right)
+
+
+@pytest.mark.parametrize(("depth", "most"), [(0.5e-3, 0.04), (4e-3, 0.12), (7e-3, 0.25)])
+def test_nearly_the_exact_changes(small_skin, sensed, depth, most):
+    """Of a disc of 24 mm; without the square root 7 mm are missed by half."""
+    touches = [[Indent(Disc(0.024), depth, place)] for place in [(0.0, 0.005), (0.02, -0.018), (-0.03, 0.01)]]
+    maps = depth_maps(touches, image_places(small_skin, 48, 48)) / float(small_skin.thickness)
+    exact = relative_changes(small_skin, touches)
+    assert missed(felt(sensed, maps), exact) < most
+    if depth == 7e-3:
+        assert missed(maps.reshape(3, -1) @ sensed.operator.T, exact) > 0.4
+
+
+def test_halved_pixels_feel_the_same(sensed):
+    """Of a map that is alike in each 2 × 2."""
+    coarse = np.random.default_rng(0).uniform(size=(24, 24))
+    fine = coarse.repeat(2, axis=0).repeat(2, axis=1)
+    assert np.allclose(sensed.halved() @ coarse.ravel(), sensed.operator @ fine.ravel(), rtol=1e-12)
+
+
+def test_contacts(small_skin, sensed):
+    """Against a skin of other contacts: 1 % more at electrode 5."""
+    impedance = np.full(16, 1e-4)
+    impedance[5] *= np.exp(0.01)
+    other = small_skin.with_layout(small_skin.layout, impedance)
+    rest, changed = (np.asarray(one.model.voltages(one.model_conductivity)) for one in (small_skin, other))
+    assert missed(0.01 * sensed.contacts[5], (changed - rest) / rest) < 0.01
+
+
+def test_strength():
+    """√ε apart at most from 2 sinh(s / 2) of e^−s = 1 − δ, and smooth beyond what it is clipped at."""
+    depth = np.linspace(0, 0.9, 10)
+    assert np.allclose(strength(jnp.asarray(depth)), 2 * np.sinh(-np.log1p(-depth) / 2), rtol=1e-12)
+    assert np.allclose(depth_of(strength(jnp.asarray(depth))), depth, rtol=1e-6)
+    slopes = jax.vmap(jax.grad(strength))(jnp.asarray([-0.1, 0.95, 1.2]))
+    assert np.isfinite(slopes).all()
+
+
+def test_a_layer_feels_less_of_the_same_indent():
+    """Its electrodes are below, and what is taken is above."""
+    layout = named_layout("grid-3x3", Rectangle(0.06, 0.06))
+    layer = Skin.create(layout, num_layers=4, cell_size=6e-3)
+    own = Sensed.of(layer, (24, 24))
+    touches = [[Indent(Disc(0.02), 2.5e-3, (0.002, 0.004))]]
+    maps = depth_maps(touches, image_places(layer, 24, 24)) / float(layer.thickness)
+    assert missed(felt(own, maps), relative_changes(layer, touches)) < 0.6
