@@ -2,7 +2,8 @@
 
 Rooms: `contacts` (what an image shows, from frame to frame, in newtons), `learnt` (skins that learn from recorded
 presses, without a model), `kohonen` (maps that order frames by themselves), `gestures` (touches of a stream, and what
-they mean), `health` (cuts, electrodes that fail, repair), `attributes` (how finely a skin feels).
+they mean), `health` (cuts, electrodes that fail, repair), `attributes` (how finely a skin feels), `training` (of
+networks, and their files).
 
 `LogitBoostClassifier` is imported when it is first used, and scikit-learn with it.
 """

@@ -1,0 +1,101 @@
+"""Rows to train on, in memory or chunk by chunk, and which of them make up each batch."""
+
+import hashlib
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from jeit.arguments import told
+
+
+class Rows(Protocol):
+    """Rows that are trained on: `sizes`, how many each chunk has, `chunk`, those of one, and a `fingerprint` that
+    changes with any of them. Sets larger than memory write a class of their own."""
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of rows of each chunk."""
+        ...
+
+    @property
+    def fingerprint(self) -> str:
+        """Of all that the rows hold, the same in another process."""
+        ...
+
+    def chunk(self, number: int) -> Any:
+        """Arrays (rows, …), in tuples, dictionaries or modules, alike in all chunks but for their number of rows."""
+        ...
+
+
+class ArrayRows:
+    """Rows in memory, one chunk: `arrays`, any tree of them, each (n, …)."""
+
+    def __init__(self, arrays: Any, name: str = "training"):
+        """Raises `ValueError`, about the argument `name`, for no arrays, and for numbers of rows that differ."""
+        lengths = {len(leaf) if np.ndim(leaf) else -1 for leaf in jax.tree.leaves(arrays)}
+        if len(lengths) != 1 or min(lengths) < 1:
+            raise ValueError(
+                f"{name} must be arrays of one and the same number of rows, 1 or more, such as (inputs, targets); it "
+                f"is {told(arrays)} of {sorted(lengths) or 'none'}."
+            )
+        self.arrays = arrays
+        self.sizes = (lengths.pop(),)
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the arrays."""
+        digest = hashlib.sha256()
+        for leaf in jax.tree.leaves(self.arrays):
+            values = np.ascontiguousarray(leaf)
+            digest.update(f"{values.dtype} {values.shape}".encode())
+            digest.update(values.data)
+        return digest.hexdigest()
+
+    def chunk(self, number: int) -> Any:
+        """All of them."""
+        return self.arrays
+
+
+class Leg(NamedTuple):
+    """Batches one after the other of one chunk: its number, which `rows` (b, batch) they take, and the number of the
+    first of them in the whole training."""
+
+    chunk: int
+    rows: Int[np.ndarray, "b batch"]
+    first: int
+
+
+class Order:
+    """Which rows each batch has: in every epoch all chunks in another order, and within each its rows in another; those
+    that fill no batch are left out, others each time. All of it follows from `seed`, so that a place in the data is one
+    number, that of the batch."""
+
+    def __init__(self, sizes: tuple[int, ...], batch: int, seed: list[int]):
+        self.batch, self.seed = min(batch, *sizes), seed
+        self.batches = [size // self.batch for size in sizes]
+        self.sizes = sizes
+
+    @property
+    def an_epoch(self) -> int:
+        """Number of batches."""
+        return sum(self.batches)
+
+    def legs(self, first: int, last: int, most: int) -> Iterator[Leg]:
+        """Batches `first` to `last`, that one left out, in legs of `most` at most, each within one chunk."""
+        while first < last:
+            epoch, place = divmod(first, self.an_epoch)
+            chunks = self._shuffled(len(self.sizes), epoch)
+            ends = np.cumsum([self.batches[one] for one in chunks])
+            which = int(np.searchsorted(ends, place, side="right"))
+            chunk = int(chunks[which])
+            within = place - (int(ends[which]) - self.batches[chunk])
+            number = min(most, last - first, int(ends[which]) - place)
+            rows = self._shuffled(self.sizes[chunk], epoch, 1 + chunk)[within * self.batch :][: number * self.batch]
+            yield Leg(chunk, rows.reshape(number, self.batch), first)
+            first += number
+
+    def _shuffled(self, number: int, *place: int) -> np.ndarray:
+        return np.random.default_rng([*self.seed, *place]).permutation(number)

@@ -1,0 +1,237 @@
+"""`fit`: a network trained by Adam until rows held out get no better, in a way that goes on where it was killed."""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jeit.arguments import check_key, check_kind, is_number, told
+from jeit.touch.needed import need_learning
+from jeit.touch.training.batches import ArrayRows, Order
+from jeit.touch.training.checkpoint import Checkpoint, Course, State
+
+# Batches of one compiled call, and rows held out that are asked for at once, at most.
+_LEG, _AT_ONCE = 256, 256
+
+
+class Objective(NamedTuple):
+    """What a network is to get better at; both are compiled.
+
+    **Fields**: `loss(network, batch, key)` gives the loss of a batch of rows, to be minimised, and the network, whose
+    leaves that are not trained it may have changed, such as running means; `held_out(network, batch)` the loss (b,) of
+    each row held out; `trained`, which leaves are trained: a function of a leaf, or a tree of truth values like the
+    network, as of `equinox.filter`.
+    """
+
+    loss: Callable[[Any, Any, Array], tuple[Float[Array, ""], Any]]
+    held_out: Callable[[Any, Any], Float[Array, " b"]]
+    trained: Any = eqx.is_inexact_array
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a network is trained: by Adam of this `rate`, which is multiplied by `decay` after every `decay_epochs`, in
+    batches of `batch` rows for `epochs` at most. Rows held out are looked at after every `look_every` batches, an epoch
+    unless given; the training stops at the `patience`-th look in a row that was no better than the best. A checkpoint
+    is written after so many `seconds`, between two compiled calls, of an epoch or some hundred batches at most."""
+
+    rate: float = 1e-3
+    batch: int = 128
+    epochs: int = 100
+    patience: int = 10
+    look_every: int | None = None
+    decay: float = 1.0
+    decay_epochs: int = 1
+    seconds: float = 10.0
+
+    def __post_init__(self):
+        """Raises `ValueError` for what is no rate and no number."""
+        for name in ("rate", "decay"):
+            given = getattr(self, name)
+            if not (is_number(given) and given > 0):
+                raise ValueError(f"{name} must be positive; it is {told(given)}.")
+        for name in ("batch", "epochs", "patience", "decay_epochs", "look_every"):
+            given = getattr(self, name)
+            if not (isinstance(given, int) and given >= 1) and not (name == "look_every" and given is None):
+                raise ValueError(f"{name} must be a whole number, 1 or more; it is {told(given)}.")
+        if not (is_number(self.seconds) and self.seconds >= 0):
+            raise ValueError(f"seconds must be zero or more; it is {told(self.seconds)}.")
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A trained `network`, that which rows held out were best with, and its `course`; `reason`, why it ended."""
+
+    network: Any
+    course: Course
+    reason: str
+
+
+def fit(
+    network: Any,
+    objective: Objective,
+    training: Any,
+    validation: Any,
+    plan: Plan | None = None,
+    *,
+    key: Array,
+    checkpoint: str | Path | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Trained:
+    """Train a `network`, any tree of arrays and functions, on rows.
+
+    `training` and `validation`: arrays (n, …), in any tree, such as (inputs, targets), or `training` may be `Rows` of
+    many chunks. The same `key` gives the same bits, on one machine. `checkpoint`: a file; killed at any moment, the
+    same call goes on from it, and ends with the bits of one that was never killed; it stays there, finished. `progress`
+    is called with how far it is, after every look at the rows held out. Raises `ValueError` for arguments that do not
+    fit, a checkpoint of another training, and losses that are not finite from the first look on; `ImportError` without
+    the extra `learn`.
+    """
+    need_learning()
+    check_key(key)
+    check_kind("objective", objective, Objective, "an Objective(loss, held_out)")
+    plan = Plan() if plan is None else plan
+    rows = training if _are_rows(training) else ArrayRows(training)
+    held = ArrayRows(validation, "validation")
+    seed = [int(word) for word in np.asarray(jax.random.key_data(key) if _is_new(key) else key).ravel()]
+    order = Order(rows.sizes, plan.batch, seed)
+    run = _Run(network, objective, plan, order, jax.random.wrap_key_data(jnp.asarray(seed, jnp.uint32)))
+    fingerprint = {
+        "plan": {**dataclasses.asdict(plan), "seconds": 0},
+        "key": seed,
+        "network": [
+            str(one) for one in jax.tree.leaves(eqx.filter_eval_shape(lambda: network)) if hasattr(one, "shape")
+        ],
+        "training": rows.fingerprint,
+        "validation": held.fingerprint,
+    }
+    kept = None if checkpoint is None else Checkpoint(checkpoint, fingerprint)
+    state = run.start() if kept is None else kept.read(run.start())
+    look_every = plan.look_every or order.an_epoch
+    last, saved, loaded = plan.epochs * order.an_epoch, time.monotonic(), (-1, None)
+    while (reason := _ended(state, plan, last)) is None:
+        upto = min(last, (state.step // look_every + 1) * look_every)
+        for leg in order.legs(state.step, upto, _LEG):
+            if loaded[0] != leg.chunk:
+                loaded = leg.chunk, jax.tree.map(jnp.asarray, rows.chunk(leg.chunk))
+            state = run.leg(state, loaded[1], leg.rows)
+            if state.step < upto and kept is not None and time.monotonic() - saved >= plan.seconds:
+                kept.write(state)
+                saved = time.monotonic()
+        state = run.look(state, held.arrays, upto - (upto - 1) // look_every * look_every)
+        if progress is not None:
+            progress(_said(state, plan, order.an_epoch))
+        if kept is not None and (time.monotonic() - saved >= plan.seconds or _ended(state, plan, last)):
+            kept.write(state)
+            saved = time.monotonic()
+    return Trained(run.whole(state.best), state.course, reason)
+
+
+class _Run:
+    """The compiled parts of a training, and how they change its state."""
+
+    def __init__(self, network, objective: Objective, plan: Plan, order: Order, key: Array):
+        import optax
+
+        steps = plan.decay_epochs * order.an_epoch
+        rate = plan.rate if plan.decay == 1 else optax.exponential_decay(plan.rate, steps, plan.decay, staircase=True)
+        adam = optax.adam(rate)
+        self.arrays, self.fixed = eqx.partition(network, eqx.is_array)
+        whole, trained = self.whole, objective.trained
+
+        def moved(arrays, state, batch, key):
+            moving, still = eqx.partition(whole(arrays), trained)
+
+            def loss(moving):
+                value, after = objective.loss(eqx.combine(moving, still), batch, key)
+                return value, eqx.filter(eqx.partition(after, trained)[1], eqx.is_array)
+
+            (value, still_after), slope = eqx.filter_value_and_grad(loss, has_aux=True)(moving)
+            updates, state = adam.update(slope, state, eqx.filter(moving, eqx.is_inexact_array))
+            moving = eqx.apply_updates(moving, updates)
+            return eqx.combine(eqx.filter(moving, eqx.is_array), still_after), state, value
+
+        def leg(arrays, state, total, data, rows, number, first):
+            def step(place, carried):
+                arrays, state, total = carried
+                batch = jax.tree.map(lambda one: one[rows[place]], data)
+                arrays, state, value = moved(arrays, state, batch, jax.random.fold_in(key, first + place))
+                return arrays, state, total + value.astype(total.dtype)
+
+            return jax.lax.fori_loop(0, number, step, (arrays, state, total))
+
+        def look(arrays, data):
+            number = len(jax.tree.leaves(data)[0])
+            index = jnp.minimum(jnp.arange(-(-number // _AT_ONCE) * _AT_ONCE), number - 1).reshape(-1, _AT_ONCE)
+            index = index[:, : min(number, _AT_ONCE)]
+            each = jax.lax.map(
+                lambda some: objective.held_out(whole(arrays), jax.tree.map(lambda one: one[some], data)), index
+            )
+            return each.ravel()[:number].mean()
+
+        self._leg, self._look = jax.jit(leg), jax.jit(look)
+        self.batch = order.batch
+        self.optimiser = adam.init(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
+
+    def whole(self, arrays) -> Any:
+        """The network of its arrays."""
+        return eqx.combine(arrays, self.fixed)
+
+    def start(self) -> State:
+        """Before the first batch."""
+        return State(0, Course([], [], []), self.arrays, self.optimiser, self.arrays, jnp.zeros(()))
+
+    def leg(self, state: State, data, rows: Int[np.ndarray, "b batch"]) -> State:
+        """After batches of these rows."""
+        padded = np.zeros((_LEG, self.batch), np.int32)
+        padded[: len(rows)] = rows
+        found = self._leg(state.moving, state.optimiser, state.total, data, padded, len(rows), state.step)
+        return State(state.step + len(rows), state.course, found[0], found[1], state.best, found[2])
+
+    def look(self, state: State, data, since: int) -> State:
+        """After a look at the rows held out, `since` batches after the last. Raises `ValueError` if neither that loss
+        nor any before was finite."""
+        held = float(self._look(state.moving, data))
+        own = state.course
+        course = Course([*own.steps, state.step], [*own.training, float(state.total) / since], [*own.validation, held])
+        if not np.isfinite(held) and not np.isfinite(own.validation).any():
+            raise ValueError(
+                f"the loss of the rows held out is {held} after {state.step} batches; are all rows finite, and is the "
+                "plan's rate too large?"
+            )
+        finite = [value if np.isfinite(value) else np.inf for value in course.validation]
+        course = course._replace(validation=finite)
+        best = state.moving if course.best == len(finite) - 1 else state.best
+        return State(state.step, course, state.moving, state.optimiser, best, jnp.zeros(()))
+
+
+def _ended(state: State, plan: Plan, last: int) -> str | None:
+    """Why a training is at its end; None while it is not."""
+    looks = len(state.course.validation)
+    if looks and looks - 1 - state.course.best >= plan.patience:
+        return f"no better at {plan.patience} looks in a row"
+    return f"{plan.epochs} epochs done" if state.step >= last else None
+
+
+def _said(state: State, plan: Plan, an_epoch: int) -> str:
+    own = state.course
+    return (
+        f"epoch {state.step / an_epoch:.3g} of {plan.epochs}: {own.training[-1]:.4g}, held out "
+        f"{own.validation[-1]:.4g} (best {own.validation[own.best]:.4g})"
+    )
+
+
+def _are_rows(given: Any) -> bool:
+    return all(hasattr(given, name) for name in ("sizes", "fingerprint", "chunk"))
+
+
+def _is_new(key: Array) -> bool:
+    return jnp.issubdtype(key.dtype, jax.dtypes.prng_key)

@@ -1,0 +1,165 @@
+"""Networks as files: a head of JSON, which says what they are, and their arrays; never a pickle."""
+
+import json
+import math
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jeit.arguments import told
+
+# Of the file: how it begins; bytes of the head, and of all arrays together, at most.
+_MAGIC, _LONGEST_HEAD, _LARGEST = b"jeit model\n", 2**20, 2**31
+
+
+def write_model(path: str | Path, kind: str, version: int, head: dict[str, Any], model: Any) -> None:
+    """Write the arrays of a `model`, any tree of them, to one file, whole or not at all.
+
+    `kind` and `version`: what it is, such as "a jeit network of images", which `read_model` asks for again; `head`:
+    all else that makes the model anew, and says what it is for, as JSON takes it. Raises `ValueError` for a folder, and
+    heads or models that are too large; `OSError` where it cannot be written.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"'{path}' is a folder; give a file, such as {path / 'network.jeit'}.")
+    text = json.dumps({"kind": kind, "version": version, **head}, allow_nan=True).encode()
+    if len(text) > _LONGEST_HEAD:
+        raise ValueError(f"head has {len(text)} bytes as JSON, more than {_LONGEST_HEAD}; put arrays into the model.")
+    arrays = [leaf for leaf in jax.tree.leaves(model) if eqx.is_array(leaf)]
+    if _size(arrays) > _LARGEST:
+        raise ValueError(f"model has {_size(arrays)} bytes of arrays, and a file {_LARGEST} at most.")
+    with written_whole(path) as file:
+        file.write(_MAGIC + text + b"\n")
+        for array in arrays:
+            np.lib.format.write_array(file, np.asarray(array), allow_pickle=False)
+
+
+def read_head(path: str | Path, kind: str, version: int) -> dict[str, Any]:
+    """The head of a file that `write_model` made; its arrays are not looked at. Raises `FileNotFoundError`, and
+    `ValueError` for files of another kind or version, and what is none of ours."""
+    with _opened(Path(path), kind) as file:
+        return _head(file, kind, version)
+
+
+def read_model(
+    path: str | Path, kind: str, version: int, make: Callable[[dict[str, Any]], Any]
+) -> tuple[dict[str, Any], Any]:
+    """The head and the model of a file that `write_model` made.
+
+    `make(head)`: a model of that architecture; it is asked for shapes alone, so that no head makes it take memory.
+    Nothing in the file is executed: every array has to have the shape and dtype that the architecture says before it is
+    read. Raises `FileNotFoundError`, and `ValueError` for files of another kind or version, cut short, too long, or of
+    arrays of another architecture.
+    """
+    with _opened(Path(path), kind) as file:
+        head = _head(file, kind, version)
+        try:
+            like = eqx.filter_eval_shape(make, head)
+        except (KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
+            raise ValueError(f"its head does not say what it is made of ({type(error).__name__}: {error})") from None
+        arrays = [leaf for leaf in jax.tree.leaves(like) if isinstance(leaf, jax.ShapeDtypeStruct)]
+        left = os.fstat(file.fileno()).st_size - file.tell()
+        if not _size(arrays) <= min(left, _LARGEST):
+            raise ValueError(f"it has {left} bytes of arrays, fewer than the {_size(arrays)} of what its head says")
+        model = jax.tree.map(lambda leaf: _read_array(file, leaf), like)
+        if file.read(1):
+            raise ValueError("it goes on after its last array")
+    return head, model
+
+
+def check_same(path: str | Path, made_for: dict[str, Any], here: dict[str, Any]) -> None:
+    """Raise `ValueError`, which names the first difference, where a model was made for something else than is here: of
+    dictionaries that JSON takes, such as of a skin and its protocol; numbers may differ by a millionth."""
+    for name in here:
+        if not _alike(made_for.get(name), here[name]):
+            raise ValueError(
+                f"'{path}' was trained for another skin or protocol: its {name} is {_said(made_for.get(name))}, and "
+                f"here it is {_said(here[name])}; train one for this."
+            )
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[BinaryIO]:
+    """A file that takes the place of `path` when all of it is on the disk: one killed before leaves what was there."""
+    other = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with other.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        other.replace(path)
+    finally:
+        other.unlink(missing_ok=True)
+
+
+@contextmanager
+def _opened(path: Path, kind: str) -> Iterator[BinaryIO]:
+    """A file to read, whose faults are told with its name."""
+    if path.is_dir():
+        raise ValueError(f"'{path}' is a folder; give a file, {kind}.")
+    if not path.is_file():
+        raise FileNotFoundError(f"'{path}': there is no such file.")
+    try:
+        with path.open("rb") as file:
+            yield file
+    except (ValueError, EOFError) as error:
+        said = " ".join(str(error).split()).rstrip(".")
+        raise ValueError(f"'{path}' is not {kind} that can be read: {said}.") from None
+
+
+def _head(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
+    if file.read(len(_MAGIC)) != _MAGIC:
+        raise ValueError("it is a file of another kind")
+    line = file.readline(_LONGEST_HEAD + 1)
+    if not line.endswith(b"\n"):
+        raise ValueError("its head is cut short, or too long")
+    try:
+        head = json.loads(line)
+    except (ValueError, RecursionError):
+        raise ValueError("its head is no JSON") from None
+    if not isinstance(head, dict) or head.get("kind") != kind:
+        other = head.get("kind") if isinstance(head, dict) else head
+        raise ValueError(f"it is {told(other)}")
+    if head.get("version") != version:
+        raise ValueError(f"it is of version {told(head.get('version'))}, and this jeit reads {version}")
+    return head
+
+
+def _size(arrays) -> int:
+    return sum(math.prod(one.shape) * np.dtype(one.dtype).itemsize for one in arrays)
+
+
+def _read_array(file: BinaryIO, leaf: Any) -> Any:
+    """What stands in the place of one array; all that is no array is of the architecture."""
+    if not isinstance(leaf, jax.ShapeDtypeStruct):
+        return leaf
+    version = np.lib.format.read_magic(file)
+    if version != (1, 0):
+        raise ValueError(f"an array of it is in format {version}")
+    shape, columns_first, dtype = np.lib.format.read_array_header_1_0(file)
+    if (shape, dtype, columns_first) != (leaf.shape, leaf.dtype, columns_first and len(leaf.shape) > 1):
+        raise ValueError(f"an array of it is {dtype} of shape {shape}, and its head says {leaf.dtype} of {leaf.shape}")
+    data = file.read(_size([leaf]))
+    if len(data) != _size([leaf]):
+        raise ValueError("it is cut short")
+    values = np.frombuffer(data, dtype).reshape(shape, order="F" if columns_first else "C")
+    return jax.numpy.asarray(values)
+
+
+def _alike(one: Any, other: Any) -> bool:
+    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
+        return len(one) == len(other) and all(map(_alike, one, other))
+    if isinstance(one, int | float) and isinstance(other, int | float):
+        return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-12)
+    return one == other
+
+
+def _said(value: Any) -> str:
+    text = "not told" if value is None else str(value)
+    return text if len(text) <= 60 else f"{text[:59]}…"

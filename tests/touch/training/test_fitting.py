@@ -1,0 +1,255 @@
+"""Networks trained from arrays: they learn, stop early, and go on where they were killed, to the same bits."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.touch.training import ArrayRows, Objective, Plan, fit
+from jeit.touch.training.batches import Order
+
+
+def loss(network, batch, key):
+    inputs, targets = batch
+    noisy = inputs + 0.01 * jax.random.normal(key, inputs.shape, inputs.dtype)
+    return jnp.mean((jax.vmap(network)(noisy) - targets) ** 2), network
+
+
+def held_out(network, batch):
+    inputs, targets = batch
+    return jnp.mean((jax.vmap(network)(inputs) - targets) ** 2, axis=1)
+
+
+def rows(number: int, seed: int = 0):
+    inputs = np.random.default_rng(seed).uniform(-1, 1, (number, 2)).astype(np.float32)
+    return inputs, np.stack([inputs[:, 0] * inputs[:, 1]], axis=1)
+
+
+def network(seed: int = 0):
+    return eqx.nn.MLP(2, 1, 16, 2, jnp.tanh, dtype=jnp.float32, key=jax.random.key(seed))
+
+
+OBJECTIVE = Objective(loss, held_out)
+PLAN = Plan(rate=1e-2, batch=32, epochs=30, seconds=0.0)
+KEY = jax.random.key(3)
+
+
+def bits(tree):
+    return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(eqx.filter(tree, eqx.is_array))]
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return fit(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY)
+
+
+def test_it_learns(trained):
+    """x y has a variance of 1/9; a straight line explains nothing of it."""
+    assert trained.course.validation[trained.course.best] < 0.02 / 9
+    assert float(held_out(trained.network, rows(300, 2)).mean()) < 0.03 / 9
+    assert float(held_out(network(), rows(300, 2)).mean()) > 1 / 9
+
+
+def test_the_best_network_is_kept(trained):
+    found = float(held_out(trained.network, rows(100, 1)).mean())
+    assert found == pytest.approx(min(trained.course.validation), rel=1e-5)
+
+
+def test_a_key_decides_all(trained):
+    again = fit(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY)
+    other = fit(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=jax.random.key(4))
+    assert bits(again.network) == bits(trained.network)
+    assert bits(other.network) != bits(trained.network)
+
+
+def test_it_stops_early():
+    """Targets of noise: what is learnt of them makes others worse."""
+    inputs, _ = rows(64)
+    noise = np.random.default_rng(1).normal(size=(64, 1)).astype(np.float32)
+    other = np.random.default_rng(2).normal(size=(64, 1)).astype(np.float32)
+    plan = Plan(rate=3e-2, batch=16, epochs=500, patience=5)
+    found = fit(network(), OBJECTIVE, (inputs, noise), (inputs, other), plan, key=KEY)
+    assert found.reason == "no better at 5 looks in a row"
+    assert len(found.course.steps) == found.course.best + 6 < 500
+
+
+class Stopped(Exception):
+    pass
+
+
+@pytest.mark.parametrize("look_every", [None, 4])
+def test_what_was_stopped_goes_on_to_the_same_bits(tmp_path, look_every):
+    plan = Plan(rate=1e-2, batch=32, epochs=6, look_every=look_every, seconds=0.0, decay=0.5, decay_epochs=2)
+    given = network(), OBJECTIVE, rows(500), rows(100, 1), plan
+    whole = fit(*given, key=KEY)
+    told = []
+
+    def stop(said):
+        told.append(said)
+        if len(told) % 3 == 0:
+            raise Stopped
+
+    for _ in range(20):
+        try:
+            found = fit(*given, key=KEY, checkpoint=tmp_path / "state", progress=stop)
+            break
+        except Stopped:
+            continue
+    assert len(told) > 5
+    assert found.course == whole.course
+    assert bits(found.network) == bits(whole.network)
+    assert bits(fit(*given, key=KEY, checkpoint=tmp_path / "state").network) == bits(whole.network)
+
+
+def test_killed_at_any_moment(tmp_path):
+    """By kill -9, after its first looks; its successor ends as one that was never killed."""
+    script = tmp_path / "train.py"
+    script.write_text(
+        "import sys\nimport numpy as np\nimport jax, equinox as eqx\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "from test_fitting import KEY, OBJECTIVE, PLAN, fit, network, rows\n"
+        "def tell(said):\n    print(said, flush=True)\n"
+        "found = fit(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY, checkpoint=sys.argv[1], "
+        "progress=tell)\n"
+        "leaves = jax.tree.leaves(eqx.filter(found.network, eqx.is_array))\n"
+        "np.savez(sys.argv[2], *map(np.asarray, leaves))\n",
+        "utf-8",
+    )
+
+    def start(name: str):
+        command = [sys.executable, str(script), str(tmp_path / name), str(tmp_path / f"{name}.npz")]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=dict(os.environ))
+
+    process = start("killed")
+    assert process.stdout is not None
+    for _ in range(4):
+        process.stdout.readline()
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    second, never = start("killed"), start("never")
+    said, whole = second.communicate()[0].splitlines(), never.communicate()[0].splitlines()
+    assert (second.returncode, never.returncode) == (0, 0)
+    assert len(said) < len(whole)
+    with np.load(tmp_path / "killed.npz") as one, np.load(tmp_path / "never.npz") as other:
+        assert [one[name].tobytes() for name in one.files] == [other[name].tobytes() for name in other.files]
+
+
+def test_a_checkpoint_of_another_training_is_refused(tmp_path):
+    given = network(), OBJECTIVE, rows(100), rows(50, 1)
+    fit(*given, Plan(epochs=2), key=KEY, checkpoint=tmp_path / "state")
+    with pytest.raises(ValueError, match="of another training \\(plan was"):
+        fit(*given, Plan(epochs=3), key=KEY, checkpoint=tmp_path / "state")
+    with pytest.raises(ValueError, match="training was"):
+        fit(*given[:2], rows(101), given[3], Plan(epochs=2), key=KEY, checkpoint=tmp_path / "state")
+    with pytest.raises(ValueError, match="key was"):
+        fit(*given, Plan(epochs=2), key=jax.random.key(0), checkpoint=tmp_path / "state")
+
+
+class Chunks:
+    """The same rows in three chunks."""
+
+    def __init__(self, arrays, sizes):
+        self.arrays, self.sizes = arrays, sizes
+        self.fingerprint = ArrayRows(arrays).fingerprint
+        self.loaded = []
+
+    def chunk(self, number):
+        self.loaded.append(number)
+        first = sum(self.sizes[:number])
+        return tuple(one[first : first + self.sizes[number]] for one in self.arrays)
+
+
+def test_chunks(tmp_path):
+    """A set larger than memory is learnt as well, chunk by chunk, and goes on amid an epoch."""
+    chunks = Chunks(rows(500), (200, 200, 100))
+    found = fit(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY)
+    assert found.course.validation[found.course.best] < 0.02 / 9
+    assert len(chunks.loaded) <= 3 * PLAN.epochs
+    given = network(), OBJECTIVE, Chunks(rows(500), (200, 200, 100)), rows(100, 1), PLAN
+    given[2].chunk = lambda number, whole=given[2].chunk: whole(number) if len(given[2].loaded) < 7 else stop()
+
+    def stop():
+        raise Stopped
+
+    with pytest.raises(Stopped):
+        fit(*given, key=KEY, checkpoint=tmp_path / "state")
+    again = fit(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY, checkpoint=tmp_path / "state")
+    assert bits(again.network) == bits(found.network)
+
+
+def test_every_epoch_takes_each_row_once_at_most():
+    order = Order((70, 50), 16, [1, 2])
+    legs = list(order.legs(0, 2 * order.an_epoch, 3))
+    for epoch in range(2):
+        own = [leg for leg in legs if leg.first // order.an_epoch == epoch]
+        assert sum(len(leg.rows) for leg in own) == order.an_epoch == 7
+        for chunk, size in enumerate((70, 50)):
+            taken = np.concatenate([leg.rows.ravel() for leg in own if leg.chunk == chunk])
+            assert len(set(taken.tolist())) == len(taken) == size // 16 * 16
+    again = list(order.legs(5, 2 * order.an_epoch, 3))
+    assert np.array_equal(np.concatenate([leg.rows for leg in again]), np.concatenate([leg.rows for leg in legs])[5:])
+
+
+class Counting(eqx.Module):
+    """A line, an offset that is not trained, and how many batches it has seen."""
+
+    slope: jax.Array
+    offset: jax.Array
+    seen: jax.Array
+
+
+def test_leaves_that_are_not_trained():
+    """They stay, but for what the loss changes of them."""
+
+    def line(own, batch, key):
+        inputs, targets = batch
+        value = jnp.mean((own.slope * inputs[:, :1] + own.offset - targets) ** 2)
+        return value, eqx.tree_at(lambda one: one.seen, own, own.seen + 1.0)
+
+    def each(own, batch):
+        return (own.slope * batch[0][:, 0] + own.offset - batch[1][:, 0]) ** 2
+
+    inputs = np.linspace(-1, 1, 128)[:, None]
+    start = Counting(*(jnp.asarray(value) for value in (0.0, 0.5, 0.0)))
+    wanted = Counting(True, False, False)  # pyright: ignore[reportArgumentType]
+    plan = Plan(rate=0.05, batch=32, epochs=100, patience=100)
+    given = inputs, 2 * inputs + 0.5
+    found = fit(start, Objective(line, each, wanted), given, given, plan, key=KEY)
+    assert float(found.network.slope) == pytest.approx(2, abs=1e-2)
+    assert float(found.network.offset) == 0.5
+    assert float(found.network.seen) == found.course.steps[found.course.best]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"training": (np.zeros((3, 2)), np.zeros((4, 1)))}, "training must be arrays of one and the same number"),
+        ({"validation": ()}, "validation must be arrays"),
+        ({"key": 3}, "key must be one random key"),
+        ({"objective": loss}, "objective must be an Objective"),
+    ],
+)
+def test_what_does_not_fit(change, said):
+    given = {"objective": OBJECTIVE, "training": rows(10), "validation": rows(10), "key": KEY, **change}
+    with pytest.raises(ValueError, match=said):
+        fit(network(), given.pop("objective"), given.pop("training"), given.pop("validation"), **given)
+
+
+@pytest.mark.parametrize("change", [{"rate": 0.0}, {"batch": 0}, {"epochs": 1.5}, {"look_every": 0}, {"seconds": -1}])
+def test_no_plan(change):
+    with pytest.raises(ValueError, match=f"{next(iter(change))} must be"):
+        Plan(**change)
+
+
+def test_losses_that_are_not_finite():
+    inputs, targets = rows(100)
+    with pytest.raises(ValueError, match="are all rows finite"):
+        fit(network(), OBJECTIVE, (inputs, np.full_like(targets, np.nan)), rows(50), Plan(epochs=1), key=KEY)

@@ -1,0 +1,126 @@
+"""Networks as files: the same numbers come back, and nothing else is read."""
+
+import io
+import json
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+from jeit.touch.training import check_same, read_head, read_model, write_model
+
+KIND = "a jeit test network"
+
+
+def make(head):
+    return eqx.nn.MLP(head["inputs"], 2, head["width"], 1, key=jax.random.key(0), dtype=np.float32)
+
+
+HEAD = {"inputs": 3, "width": 5}
+
+
+@pytest.fixture
+def written(tmp_path):
+    network = make(HEAD)
+    network = jax.tree.map(lambda leaf: leaf + 1 if eqx.is_array(leaf) else leaf, network)
+    write_model(tmp_path / "network.jeit", KIND, 1, HEAD, network)
+    return tmp_path / "network.jeit", network
+
+
+def test_it_comes_back(written):
+    path, network = written
+    head, again = read_model(path, KIND, 1, make)
+    assert head["inputs"] == read_head(path, KIND, 1)["inputs"] == 3
+    assert eqx.tree_equal(network, again)
+    assert again(np.ones(3, np.float32)).shape == (2,)
+
+
+def parts(path):
+    content = path.read_bytes()
+    first, head, rest = content.split(b"\n", 2)
+    return first, json.loads(head), rest
+
+
+def put(path, first, head, rest):
+    path.write_bytes(b"\n".join([first, json.dumps(head).encode(), rest]))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda first, head, rest: (b"something", head, rest), "of another kind"),
+        (lambda first, head, rest: (first, {**head, "kind": "a map"}, rest), "it is 'a map'"),
+        (lambda first, head, rest: (first, [1], rest), "it is a list"),
+        (lambda first, head, rest: (first, {**head, "version": 2}, rest), "version 2, and this jeit reads 1"),
+        (lambda first, head, rest: (first, {**head, "width": 10**9}, rest), "fewer than the"),
+        (lambda first, head, rest: (first, {**head, "width": 4}, rest), "its head says"),
+        (lambda first, head, rest: (first, {**head, "width": "many"}, rest), "does not say what it is made of"),
+        (lambda first, head, rest: (first, {"kind": KIND, "version": 1}, rest), "does not say what it is made of"),
+        (lambda first, head, rest: (first, head, rest[:40]), "fewer than the"),
+        (lambda first, head, rest: (first, head, rest[:-3]), "cut short"),
+        (lambda first, head, rest: (first, head, rest + b"more"), "goes on after"),
+        (lambda first, head, rest: (first, head, b"x" * len(rest)), "magic string"),
+    ],
+)
+def test_files_of_another_kind(written, change, said):
+    path, _ = written
+    put(path, *change(*parts(path)))
+    with pytest.raises(ValueError, match=said) as error:
+        read_model(path, KIND, 1, make)
+    assert str(path) in str(error.value)
+
+
+class Bomb:
+    def __reduce__(self):
+        return (pytest.fail, ("something was executed",))
+
+
+def test_nothing_is_executed(written):
+    """An array of objects, which NumPy would unpickle if it was allowed to."""
+    path, _ = written
+    first, head, rest = parts(path)
+    file = io.BytesIO()
+    np.save(file, np.array([Bomb()], dtype=object), allow_pickle=True)
+    put(path, first, head, file.getvalue() + rest)
+    with pytest.raises(ValueError, match="object of shape"):
+        read_model(path, KIND, 1, make)
+
+
+def test_arrays_of_another_kind(written):
+    path, _ = written
+    first, head, rest = parts(path)
+    file = io.BytesIO()
+    np.save(file, np.zeros((5, 3)))
+    put(path, first, head, file.getvalue() + rest)
+    with pytest.raises(ValueError, match=r"float64 of shape \(5, 3\), and its head says float32"):
+        read_model(path, KIND, 1, make)
+
+
+def test_no_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match="there is no such file"):
+        read_model(tmp_path / "network.jeit", KIND, 1, make)
+    with pytest.raises(ValueError, match="is a folder"):
+        read_model(tmp_path, KIND, 1, make)
+    with pytest.raises(ValueError, match="is a folder"):
+        write_model(tmp_path, KIND, 1, HEAD, make(HEAD))
+    with pytest.raises(ValueError, match="put arrays into the model"):
+        write_model(tmp_path / "large", KIND, 1, {"text": "x" * 2**21}, make(HEAD))
+
+
+def test_one_that_cannot_be_written_leaves_what_was_there(written):
+    path, network = written
+    before = path.read_bytes()
+    with pytest.raises(TypeError):
+        write_model(path, KIND, 1, {"key": object()}, network)
+    assert path.read_bytes() == before
+    assert [one.name for one in path.parent.iterdir()] == ["network.jeit"]
+
+
+def test_another_skin_is_refused():
+    made_for = {"num_channels": 94, "outline": [0.2, 0.2]}
+    check_same("model", made_for, {"outline": (0.2, 0.2 + 1e-9), "num_channels": 94})
+    with pytest.raises(ValueError, match="its num_channels is 94, and here it is 208"):
+        check_same("model", made_for, {"num_channels": 208})
+    with pytest.raises(ValueError, match="its protocol is not told, and here it is adjacent"):
+        check_same("model", made_for, {"protocol": "adjacent"})
