@@ -18,8 +18,8 @@ from jeit.touch.needed import need_learning
 from jeit.touch.training.batches import ArrayRows, Order
 from jeit.touch.training.checkpoint import Checkpoint, Course, State
 
-# Batches of one compiled call, and rows held out that are asked for at once, at most.
-_LEG, _AT_ONCE = 256, 256
+# Batches between two chances to write a checkpoint, and rows held out that are asked for at once, at most.
+_LEG, _AT_ONCE = 32, 256
 
 
 class Objective(NamedTuple):
@@ -41,7 +41,7 @@ class Plan:
     """How a network is trained: by Adam of this `rate`, which is multiplied by `decay` after every `decay_epochs`, in
     batches of `batch` rows for `epochs` at most. Rows held out are looked at after every `look_every` batches, an epoch
     unless given; the training stops at the `patience`-th look in a row that was no better than the best. A checkpoint
-    is written after so many `seconds`, between two compiled calls, of an epoch or some hundred batches at most."""
+    is written after so many `seconds`, some dozen batches later at most."""
 
     rate: float = 1e-3
     batch: int = 128
@@ -101,6 +101,7 @@ def fit(
     plan = Plan() if plan is None else plan
     rows = training if _are_rows(training) else ArrayRows(training)
     held = ArrayRows(validation, "validation")
+    looked_at = jax.tree.map(jnp.asarray, held.arrays)
     seed = [int(word) for word in np.asarray(jax.random.key_data(key) if _is_new(key) else key).ravel()]
     order = Order(rows.sizes, plan.batch, seed)
     run = _Run(network, objective, plan, order, jax.random.wrap_key_data(jnp.asarray(seed, jnp.uint32)))
@@ -126,7 +127,7 @@ def fit(
             if state.step < upto and kept is not None and time.monotonic() - saved >= plan.seconds:
                 kept.write(state)
                 saved = time.monotonic()
-        state = run.look(state, held.arrays, upto - (upto - 1) // look_every * look_every)
+        state = run.look(state, looked_at, upto - (upto - 1) // look_every * look_every)
         if progress is not None:
             progress(_said(state, plan, order.an_epoch))
         if kept is not None and (time.monotonic() - saved >= plan.seconds or _ended(state, plan, last)):
@@ -159,26 +160,16 @@ class _Run:
             moving = eqx.apply_updates(moving, updates)
             return eqx.combine(eqx.filter(moving, eqx.is_array), still_after), state, value
 
-        def leg(arrays, state, total, data, rows, number, first):
-            def step(place, carried):
-                arrays, state, total = carried
-                batch = jax.tree.map(lambda one: one[rows[place]], data)
-                arrays, state, value = moved(arrays, state, batch, jax.random.fold_in(key, first + place))
-                return arrays, state, total + value.astype(total.dtype)
+        # A step a call: XLA's convolutions take a hundred times as long within loops that it compiles, on processors.
+        def step(arrays, state, total, data, rows, number):
+            batch = jax.tree.map(lambda one: one[rows], data)
+            arrays, state, value = moved(arrays, state, batch, jax.random.fold_in(key, number))
+            return arrays, state, total + value.astype(total.dtype)
 
-            return jax.lax.fori_loop(0, number, step, (arrays, state, total))
+        def look(arrays, data, rows):
+            return objective.held_out(whole(arrays), jax.tree.map(lambda one: one[rows], data))
 
-        def look(arrays, data):
-            number = len(jax.tree.leaves(data)[0])
-            index = jnp.minimum(jnp.arange(-(-number // _AT_ONCE) * _AT_ONCE), number - 1).reshape(-1, _AT_ONCE)
-            index = index[:, : min(number, _AT_ONCE)]
-            each = jax.lax.map(
-                lambda some: objective.held_out(whole(arrays), jax.tree.map(lambda one: one[some], data)), index
-            )
-            return each.ravel()[:number].mean()
-
-        self._leg, self._look = jax.jit(leg), jax.jit(look)
-        self.batch = order.batch
+        self._step, self._look = jax.jit(step), jax.jit(look)
         self.optimiser = adam.init(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
 
     def whole(self, arrays) -> Any:
@@ -191,15 +182,19 @@ class _Run:
 
     def leg(self, state: State, data, rows: Int[np.ndarray, "b batch"]) -> State:
         """After batches of these rows."""
-        padded = np.zeros((_LEG, self.batch), np.int32)
-        padded[: len(rows)] = rows
-        found = self._leg(state.moving, state.optimiser, state.total, data, padded, len(rows), state.step)
-        return State(state.step + len(rows), state.course, found[0], found[1], state.best, found[2])
+        arrays, optimiser, total = state.moving, state.optimiser, state.total
+        for place, batch in enumerate(rows):
+            arrays, optimiser, total = self._step(arrays, optimiser, total, data, batch, state.step + place)
+        return State(state.step + len(rows), state.course, arrays, optimiser, state.best, total)
 
     def look(self, state: State, data, since: int) -> State:
         """After a look at the rows held out, `since` batches after the last. Raises `ValueError` if neither that loss
         nor any before was finite."""
-        held = float(self._look(state.moving, data))
+        number = len(jax.tree.leaves(data)[0])
+        size = min(number, _AT_ONCE)
+        index = np.minimum(np.arange(-(-number // size) * size), number - 1).reshape(-1, size)
+        each = [np.asarray(self._look(state.moving, data, rows)) for rows in index]
+        held = float(np.concatenate(each)[:number].mean())
         own = state.course
         course = Course([*own.steps, state.step], [*own.training, float(state.total) / since], [*own.validation, held])
         if not np.isfinite(held) and not np.isfinite(own.validation).any():
