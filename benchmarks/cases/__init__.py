@@ -30,6 +30,7 @@ NAMES = (
     "real_skins",
     "discriminants",
     "gestures",
+    "modality",
     "design_figures",
 )
 

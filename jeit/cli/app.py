@@ -15,6 +15,7 @@ from jeit.cli.commands.choose import choose
 from jeit.cli.commands.demo import demo
 from jeit.cli.commands.info import info
 from jeit.cli.commands.layout import layout
+from jeit.cli.commands.listen import listen
 from jeit.cli.commands.locate import locate
 from jeit.cli.commands.reconstruct import reconstruct
 from jeit.cli.commands.stream import stream
@@ -24,7 +25,7 @@ from jeit.cli.options import naming_options
 from jeit.start import discarded_damaged
 
 # Commands that run one program again and again: a frame in a third of the time.
-_REPEATING = ("study", "stream", "layout optimise", "touch fit")
+_REPEATING = ("study", "stream", "layout optimise", "touch fit", "listen fit")
 
 app = typer.Typer(
     name="jeit",
@@ -41,6 +42,7 @@ app.command()(choose)
 app.command()(info)
 app.command()(calibrate_microphones)
 app.command()(locate)
+app.add_typer(listen)
 app.add_typer(layout)
 app.add_typer(study)
 app.add_typer(touch)

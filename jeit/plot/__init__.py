@@ -23,6 +23,7 @@ from jeit.plot.imaging.mesh import plot_mesh
 from jeit.plot.touch.contact_stages import plot_contact_stages
 from jeit.plot.touch.contacts import plot_contacts
 from jeit.plot.touch.health import plot_health
+from jeit.plot.touch.heard import plot_heard
 from jeit.plot.touch.kohonen_map import plot_map
 from jeit.plot.touch.learning import plot_confusion, plot_force_errors, plot_key_errors, plot_place_errors
 from jeit.plot.touch.touches import plot_answers, plot_places
@@ -43,6 +44,7 @@ __all__ = [
     "plot_force_errors",
     "plot_frames",
     "plot_health",
+    "plot_heard",
     "plot_image",
     "plot_key_errors",
     "plot_loss_map",

@@ -9,6 +9,7 @@ from jeit.report.image import draw_image, report_image, write_image
 from jeit.report.layout_comparison import draw_layout_comparison, report_layout_comparison, write_layout_comparison
 from jeit.report.layout_improvement import draw_improved_layout, report_improved_layout, write_improved_layout
 from jeit.report.learnt_skin import report_learnt_skin, write_learnt_skin, write_touches
+from jeit.report.listener import draw_heard, report_heard, report_listener, write_heard, write_listener
 from jeit.report.measurement import report_measurement
 from jeit.report.stream import write_stream
 from jeit.report.study import write_study_report
@@ -19,24 +20,29 @@ _tell_old_names(__name__)
 __all__ = [
     "draw_calibration",
     "draw_choice",
+    "draw_heard",
     "draw_image",
     "draw_improved_layout",
     "draw_layout_comparison",
     "draw_track",
     "report_choice",
+    "report_heard",
     "report_image",
     "report_improved_layout",
     "report_layout_comparison",
     "report_learnt_skin",
+    "report_listener",
     "report_measurement",
     "report_track",
     "write_calibration",
     "write_choice",
     "write_film",
+    "write_heard",
     "write_image",
     "write_improved_layout",
     "write_layout_comparison",
     "write_learnt_skin",
+    "write_listener",
     "write_stream",
     "write_study_report",
     "write_touches",
