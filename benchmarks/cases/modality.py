@@ -44,7 +44,7 @@ class Experiment:
 
     def learnt(self, method: str, name: str, images: SoundImages, right: np.ndarray, groups: np.ndarray):
         """What learns these windows; `name` tells its training from others."""
-        kept = None if self.folder is None else self.folder / f"{name}.training"
+        kept = None if self.folder is None else self.folder / f"{name}-{self.batches}.training"
         return LEARNERS[method].learn(
             Lesson(images, right, groups, len(MODALITIES), jax.random.key(0), self.batches, kept)
         )
@@ -104,12 +104,13 @@ def run(options: Options) -> Result:
         (STORE / "trainings").mkdir(exist_ok=True)
     noisier = [(louder, 25) for louder in LOUDER]
     splits, persons, rows = {}, {}, []
-    for method in METHODS[::-1]:
-        persons[method] = experiment.by_person(method, noisier)
-        splits[method] = (experiment.as_the_paper(method), experiment.by_recording(method), _right(persons[method][0]))
-        rows.append([method, *(f"{100 * one:.1f} %" for one in splits[method])])
-        say(" | ".join(rows[-1]))
     nothing = experiment.untrained(), experiment.by_recording("network", shuffled=True)
+    for method in METHODS[::-1]:
+        leaky, fair = experiment.as_the_paper(method), experiment.by_recording(method)
+        say(f"{method}: {100 * leaky:.1f} % of the paper's split, {100 * fair:.1f} % by recording")
+        persons[method] = experiment.by_person(method, noisier)
+        splits[method] = (leaky, fair, _right(persons[method][0]))
+        rows.append([method, *(f"{100 * one:.1f} %" for one in splits[method])])
     rows += [[name, "", f"{100 * one:.1f} %", ""] for name, one in zip(("untrained", "shuffled"), nothing, strict=True)]
     best = max(METHODS, key=lambda method: splits[method][2])
     noise = [[method, *(f"{100 * _right(one):.1f} %" for one in persons[method])] for method in METHODS]

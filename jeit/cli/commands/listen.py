@@ -116,7 +116,9 @@ def fit(
     method: Annotated[
         str, typer.Option(help="network, trees or linear; auto: what is right most often of clips held out.")
     ] = "auto",
-    batches: Annotated[int | None, typer.Option(help="Batches of a network's training, at most (default 600).")] = None,
+    batches: Annotated[
+        int | None, typer.Option(help="Batches a network is trained for, at most (default 1500).")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of the random numbers that networks are drawn and trained by.")] = 0,
     quiet: Quiet = False,
 ) -> None:
@@ -145,7 +147,6 @@ def fit(
         step("read")
         labelled = read_clips(clips, progress=step.tell)
         step("learn")
-        under_way.mkdir(exist_ok=True)
         with naming_options({"method": "--method", "labels": "FOLDER-BY-CLASS"}):
             listener = Listener.fit(
                 labelled,
@@ -157,7 +158,7 @@ def fit(
             )
         step("write")
         write_listener(listener, output)
-        shutil.rmtree(under_way)
+        shutil.rmtree(under_way, ignore_errors=True)
     if quiet:
         return
     channels = "mixed to one channel" if listener.channels == 1 else f"{listener.channels} channels"

@@ -22,8 +22,10 @@ from jeit.touch.listening.window_features import sound_features
 
 # Rounds of boosting, leaves of a tree, and presses in a leaf at least, of sets that are large enough.
 _ROUNDS, _LEAVES, _IN_A_LEAF = 100, 15, 10
-# Batches of a training at most, unless more are asked for.
-BATCHES = 600
+BATCHES = 1500
+"""Batches of a training at most, unless told otherwise."""
+# Times through the windows of a small set, at most, and batches that are done all the same.
+_THROUGH, _FEWEST = 40, 100
 # Of the groups of each class one in so many is held out to stop the network's training.
 _STOPPING = 6
 
@@ -57,7 +59,11 @@ class NetworkListener:
         held = stopping_rows(lesson.right, lesson.groups)
         levels = Levels.of(lesson.images[~held])
         shown = levels(lesson.images)
-        plan = plan_of(int((~held).sum()), batches=lesson.batches)
+        if lesson.checkpoint is not None:
+            lesson.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        number = int((~held).sum())
+        enough = max(_FEWEST, _THROUGH * number // 64)
+        plan = plan_of(number, batches=min(lesson.batches, enough))
         trained = train_network(
             shown[~held],
             lesson.right[~held],

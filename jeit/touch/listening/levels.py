@@ -34,10 +34,16 @@ class Levels:
         return cls(np.array(loudest), np.array(mean), np.array(deviation))
 
     def __call__(self, images: SoundImages) -> Float[np.ndarray, "W rows 41"]:
-        """Feature images (W, M + 64, 41), single precision: the M rows of intensity, then 64 of the spectrogram."""
+        """Feature images (W, M + 64, 41), single precision: the M rows of intensity, then 64 of the spectrogram.
+
+        The microphone that is loudest in the window comes first, then the next: the paper does not say in which order
+        they stand, and so a touch looks the same wherever it is.
+        """
+        order = np.argsort(-images.intensity.sum(axis=2), axis=1, kind="stable")
+        intensity = np.take_along_axis(images.intensity, order[..., None], axis=1)
         parts = [
             (_decibels(power, self.loudest[part] - _RANGE) - self.mean[part]) / self.deviation[part]
-            for part, power in enumerate((images.intensity, images.spectrum))
+            for part, power in enumerate((intensity, images.spectrum))
         ]
         return np.concatenate(parts, axis=1).astype(np.float32)
 

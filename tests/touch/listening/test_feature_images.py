@@ -23,7 +23,13 @@ def test_at_10_khz_bands_are_the_papers_bins():
     images = sound_images(heard)
     assert images.intensity.shape == (len(images), 25, 41)
     assert images.spectrum.shape == (len(images), 64, 41)
-    assert Levels.of(images)(images).shape == (len(images), 89, 41)
+    shown = Levels.of(images)(images)
+    assert shown.shape == (len(images), 89, 41)
+    # The loudest microphone's row is the first, and the others follow.
+    loud = Levels.of(images)
+    rows = 10 ** ((shown[:, :25] * loud.deviation[0] + loud.mean[0]) / 10)
+    assert (np.diff(rows.mean(axis=2), axis=1) < 1e-4).all()
+    np.testing.assert_allclose(np.sort(rows.mean(axis=2)), np.sort(images.intensity.mean(axis=2)), rtol=1e-3)
     taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(128) / 128)
     frame = heard.samples[images.strongest[0], 240:368]
     power = np.abs(np.fft.rfft((frame - frame.mean()) * taper)) ** 2 * 2 / (128 * (taper**2).sum())

@@ -6,6 +6,7 @@ import pytest
 
 from jeit.acoustic import Recording
 from jeit.simulate import SoundingPerson, SoundingSkin, microphone_grid, sound_clips
+from jeit.simulate.acoustic.microphones import MicrophoneModel
 from jeit.simulate.acoustic.people import MODALITIES
 from jeit.touch.listening import Levels, Listener, ModalityNetwork, SoundImages, sound_images
 from jeit.touch.listening.learners import LEARNERS, Lesson, NetworkListener
@@ -48,26 +49,29 @@ def test_a_network_is_kept_with_its_levels(tmp_path):
 
 @pytest.mark.slow
 def test_a_small_training_tells_people_it_never_met():
-    """The small preset: four people learnt from, a fifth asked. A network that is not trained, or that learnt shuffled
-    labels, is right of some 20 %; the bar is half way up."""
-    skin = SoundingSkin(jax.random.key(0), microphone_grid(3))
+    """The small preset: four people are learnt from, a fifth is asked, on a skin that hears well. One in five is right
+    by chance; a network that is not trained, or that learnt shuffled labels, comes nowhere near the bar."""
+    skin = SoundingSkin(jax.random.key(0), microphone_grid(3), microphone_model=MicrophoneModel(snr_db=12.0))
     people = [SoundingPerson.draw(key) for key in jax.random.split(KEY, 5)]
     parts, right, person = [], [], []
-    for clip in sound_clips(KEY, skin, people, 2, duration=1.6):
+    for clip in sound_clips(KEY, skin, people, 3, duration=1.6):
         parts.append(sound_images(Recording(clip.samples, skin.rate))[::2])
         right += [MODALITIES.index(clip.modality)] * len(parts[-1])
         person += [clip.person] * len(parts[-1])
     images, right, person = SoundImages.joined(parts), np.array(right), np.array(person)
     out = person == 4
 
-    def share(learner, labels) -> float:
-        lesson = Lesson(images[~out], labels[~out], person[~out], 5, KEY, batches=120)
-        return float(np.mean(learner.learn(lesson).log_odds(images[out]).argmax(axis=1) == right[out]))
+    def share(method: str, labels) -> float:
+        lesson = Lesson(images[~out], labels[~out], person[~out], 5, KEY, batches=200)
+        return float(np.mean(LEARNERS[method].learn(lesson).log_odds(images[out]).argmax(axis=1) == right[out]))
 
     shuffled = np.random.default_rng(0).permutation(right)
     untrained = NetworkListener.of(ModalityNetwork.draw(KEY, 73, 41, 5), Levels.of(images)).log_odds(images)
-    assert np.mean(untrained.argmax(axis=1) == right) < 0.4
-    assert share(LEARNERS["trees"], shuffled) < 0.4
-    for method in ("network", "trees", "linear"):
-        found = share(LEARNERS[method], right)
-        assert found > 0.6, (method, found)
+    found = {
+        "untrained": float(np.mean(untrained.argmax(axis=1) == right)),
+        "shuffled": share("network", shuffled),
+        **{method: share(method, right) for method in LEARNERS},
+    }
+    assert max(found["untrained"], found["shuffled"]) < 0.4, found
+    assert found["network"] > 0.55, found
+    assert min(found["trees"], found["linear"]) > 0.8, found
