@@ -38,6 +38,8 @@ def folder(tmp_path_factory):
                 samples = np.round(np.iinfo(kind).max * samples)
             wavfile.write(folder / "clips" / name / f"{number}.wav", RATE, samples.astype(kind))
     (folder / "clips" / "low" / "notes.wav").write_text("text that is named as sound is", "utf-8")
+    wavfile.write(folder / "clips" / "low" / "nan.wav", RATE, np.full(9000, np.nan, np.float32))
+    wavfile.write(folder / "clips" / "low" / "slow.wav", 800, np.ones(9000, np.float32))
     (folder / "clips" / "low" / ".DS_Store").write_text("hidden", "utf-8")
     command = ["listen", "fit", str(folder / "clips"), "--output", str(folder / "model"), "--method", "trees"]
     assert main(command) == 0
@@ -52,7 +54,8 @@ def test_a_model_is_made_and_its_report_says_how_good(folder):
     assert report["held_out"]["clips"] == 10
     assert report["held_out"]["right"] > 0.8
     assert report["held_out"]["tried"] == [{"method": "trees", "right": report["held_out"]["right"]}]
-    assert "1 file not read: notes.wav" in report["notes"][0]
+    assert report["notes"][0].startswith("3 files not read: nan.wav: none of its samples is a number; notes.wav:")
+    assert "slow.wav: 800 samples a second are too few" in report["notes"][0]
     assert (folder / "model" / "learning.png").stat().st_size > 10_000
 
 

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jeit.acoustic import Recording, read_recording
+from jeit.acoustic import Intensities, Recording, read_recording
 from jeit.arguments import check_kind, counted
+from jeit.touch.listening.feature_images import LOWEST
 
 # Files that were not read, told by name at most.
 _TOLD = 3
@@ -120,10 +121,9 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
         before = len(read)
         for path in files:
             try:
-                if not isinstance(read_recording(path), Recording):
-                    raise ValueError(f"{path.name}: it holds intensities, not samples.")
+                _check_clip(read_recording(path), path.name)
             except (ValueError, OSError) as error:
-                failed.append(str(error))
+                failed.append(str(error).rstrip("."))
                 continue
             within = path.relative_to(one).parts[:-1]
             read.append(path)
@@ -139,6 +139,16 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
         more = f"; and {len(failed) - _TOLD} more" if len(failed) > _TOLD else ""
         notes.append(f"{counted(len(failed), 'file')} not read: {'; '.join(failed[:_TOLD])}{more}")
     return LabelledClips.of(_Files(read), labels, groups, notes=notes, name=folder.name or str(folder))
+
+
+def _check_clip(clip: Recording | Intensities, name: str) -> None:
+    """Raise `ValueError` for what cannot be learnt from."""
+    if not isinstance(clip, Recording):
+        raise ValueError(f"{name}: it holds intensities, not samples.")
+    if not np.isfinite(clip.samples).any():
+        raise ValueError(f"{name}: none of its samples is a number.")
+    if clip.rate < 2 * LOWEST:
+        raise ValueError(f"{name}: {clip.rate:g} samples a second are too few; give {2 * LOWEST:g} or more.")
 
 
 def mixed(recording: Recording) -> Recording:
