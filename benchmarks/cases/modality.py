@@ -27,7 +27,7 @@ from jeit.touch.listening.modality_network import COPIES
 
 # Where sets and trainings are kept from one run to the next.
 STORE = Path(tempfile.gettempdir()) / "jeit-modality"
-PEOPLE, CLIPS, SEED, BATCHES = 10, 4, 1, 400
+PEOPLE, CLIPS, SEED, BATCHES = 10, 4, 1, 1000
 # Decibels by which the copies of the paper's split differ from each window.
 _COPIED = 2.0
 PAPER = 98.7
