@@ -31,6 +31,7 @@ NAMES = (
     "real_skins",
     "discriminants",
     "gestures",
+    "modality",
     "design_figures",
 )
 

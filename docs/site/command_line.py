@@ -17,7 +17,9 @@ _VALUES = {"Path": "PATH", "str": "TEXT", "int": "INTEGER", "float": "NUMBER"}
 def commands(app: Any, path: str = "jeit") -> Iterator[tuple[str, Callable]]:
     """What is typed to call each command of a Typer application, and the function behind it."""
     for one in app.registered_commands:
-        yield f"{path} {one.name or one.callback.__name__.replace('_', '-')}", one.callback
+        name = one.name or one.callback.__name__.replace("_", "-")
+        # What is hidden is called by the name of its group and its arguments.
+        yield path if one.hidden else f"{path} {name}", one.callback
     for one in app.registered_groups:
         yield from commands(one.typer_instance, f"{path} {one.name or one.typer_instance.info.name}")
 

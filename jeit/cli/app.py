@@ -16,6 +16,7 @@ from jeit.cli.commands.demo import demo
 from jeit.cli.commands.info import info
 from jeit.cli.commands.layout import layout
 from jeit.cli.commands.learn import learn
+from jeit.cli.commands.listen import listen
 from jeit.cli.commands.locate import locate
 from jeit.cli.commands.reconstruct import reconstruct
 from jeit.cli.commands.stream import stream
@@ -25,7 +26,16 @@ from jeit.cli.options import naming_options
 from jeit.start import discarded_damaged
 
 # Commands that run one program again and again: a frame in a third of the time.
-_REPEATING = ("study", "stream", "layout optimise", "touch fit", "touch gestures", "touch watch", "learn")
+_REPEATING = (
+    "study",
+    "stream",
+    "layout optimise",
+    "touch fit",
+    "touch gestures",
+    "touch watch",
+    "learn",
+    "listen fit",
+)
 
 app = typer.Typer(
     name="jeit",
@@ -42,6 +52,7 @@ app.command()(choose)
 app.command()(info)
 app.command()(calibrate_microphones)
 app.command()(locate)
+app.add_typer(listen)
 app.add_typer(layout)
 app.add_typer(study)
 app.add_typer(touch)

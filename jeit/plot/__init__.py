@@ -25,6 +25,7 @@ from jeit.plot.touch.contacts import plot_contacts
 from jeit.plot.touch.depth_map import plot_depth_map, plot_losses
 from jeit.plot.touch.health import plot_health
 from jeit.plot.touch.health_course import plot_health_course
+from jeit.plot.touch.heard import plot_heard
 from jeit.plot.touch.kohonen_map import plot_map
 from jeit.plot.touch.learning import (
     plot_confusion,
@@ -55,6 +56,7 @@ __all__ = [
     "plot_frames",
     "plot_health",
     "plot_health_course",
+    "plot_heard",
     "plot_image",
     "plot_key_errors",
     "plot_loss_map",

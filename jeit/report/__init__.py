@@ -11,6 +11,7 @@ from jeit.report.image_network import report_learnt_images, write_depths, write_
 from jeit.report.layout_comparison import draw_layout_comparison, report_layout_comparison, write_layout_comparison
 from jeit.report.layout_improvement import draw_improved_layout, report_improved_layout, write_improved_layout
 from jeit.report.learnt_skin import report_learnt_skin, write_learnt_skin, write_touches
+from jeit.report.listener import draw_heard, report_heard, report_listener, write_heard, write_listener
 from jeit.report.measurement import report_measurement
 from jeit.report.skin_health import draw_health, report_health, write_health
 from jeit.report.stream import write_stream
@@ -24,6 +25,7 @@ __all__ = [
     "draw_calibration",
     "draw_choice",
     "draw_health",
+    "draw_heard",
     "draw_image",
     "draw_improved_layout",
     "draw_layout_comparison",
@@ -32,11 +34,13 @@ __all__ = [
     "report_choice",
     "report_gestures",
     "report_health",
+    "report_heard",
     "report_image",
     "report_improved_layout",
     "report_layout_comparison",
     "report_learnt_images",
     "report_learnt_skin",
+    "report_listener",
     "report_measurement",
     "report_track",
     "report_watch",
@@ -46,11 +50,13 @@ __all__ = [
     "write_film",
     "write_gestures",
     "write_health",
+    "write_heard",
     "write_image",
     "write_improved_layout",
     "write_layout_comparison",
     "write_learnt_images",
     "write_learnt_skin",
+    "write_listener",
     "write_stream",
     "write_study_report",
     "write_touches",

@@ -2,16 +2,18 @@
 touches on them.
 
 The physics of pressing is in `jeit.simulate.contact`; what a sounding skin is made of (its layer, microphones and
-readout), in `jeit.simulate.acoustic`; how people touch, in `jeit.simulate.people`.
+readout), in `jeit.simulate.acoustic`; how people touch, in `jeit.simulate.people` and `jeit.simulate.acoustic.people`.
 """
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.simulate.acoustic.bursts import Burst
 from jeit.simulate.acoustic.calibration_taps import calibration_taps
 from jeit.simulate.acoustic.microphones import microphone_grid
+from jeit.simulate.acoustic.people import SoundClip, SoundingPerson, sound_clips
 from jeit.simulate.acoustic.sound import quiet
 from jeit.simulate.acoustic.sounding_skin import SoundingSkin
 from jeit.simulate.acoustic.touches import pat, stroke, tap, tickle
+from jeit.simulate.acoustic.wind import room_sound, wind
 from jeit.simulate.contact import (
     Bar,
     DepthMap,
@@ -70,6 +72,8 @@ __all__ = [
     "Revolved",
     "Ring",
     "RoundSkin",
+    "SoundClip",
+    "SoundingPerson",
     "SoundingSkin",
     "TwoSheets",
     "ball",
@@ -82,11 +86,14 @@ __all__ = [
     "pat",
     "quiet",
     "relative_changes",
+    "room_sound",
     "simulate_gesture_stream",
     "simulate_gestures",
     "simulate_press",
     "simulate_presses",
+    "sound_clips",
     "stroke",
     "tap",
     "tickle",
+    "wind",
 ]

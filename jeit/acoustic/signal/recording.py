@@ -5,14 +5,11 @@ metres and hertz. What a broken microphone writes (NaN, zeros, flat tops) is let
 it.
 """
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from struct import error as StructError
 
 import equinox as eqx
 import numpy as np
-import scipy.io.wavfile
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
@@ -29,6 +26,7 @@ from jeit.acoustic.signal._arrays import (
     short,
 )
 from jeit.acoustic.signal.faults import intensity_faults
+from jeit.acoustic.signal.sound_file import read_sound
 from jeit.arguments import need, npz_arrays
 from jeit.mesh.loops import check_loop
 
@@ -214,18 +212,19 @@ class Taps(eqx.Module):
 
 
 def read_recording(path: str | Path) -> Recording | Intensities:
-    """Read what a skin heard: a multichannel WAV file, or an NPZ file.
+    """Read what a skin heard: a WAV file of any number of channels, an NPZ file, or what `soundfile` reads (FLAC, Ogg,
+    AIFF …) where that is installed.
 
     An NPZ file holds `samples` (M, S) and `rate` in Hz, optionally `full_scale`; or `intensity` (F, M) and `times` (F,)
-    in seconds, optionally `floor` (M,), `freedom` and `overlap`. A WAV file's integers become parts of full scale, -1
+    in seconds, optionally `floor` (M,), `freedom` and `overlap`. A sound file's integers become parts of full scale, -1
     to 1. Raises `ValueError` for any other content, and `OSError` where there is no such file.
     """
     path = Path(path)
-    with path.open("rb") as file:
-        start = file.read(4)
     try:
-        if start in (b"RIFF", b"RIFX", b"RF64"):
-            return _read_wav(path)
+        sound = read_sound(path)
+        if sound is not None:
+            samples, rate, full_scale = sound
+            return Recording(samples, rate, full_scale=full_scale, name=path.stem)
         optional = ("floor", "freedom", "overlap")
         arrays = npz_arrays(
             path, "samples", "rate", "full_scale", "intensity", "times", *optional, otherwise=_OTHERWISE
@@ -285,27 +284,3 @@ def _write(path: str | Path, **arrays) -> None:
     # Through an open file: given a name, NumPy would add a suffix of its own.
     with Path(path).open("wb") as file:
         np.savez(file, allow_pickle=False, **{key: value for key, value in arrays.items() if value is not None})
-
-
-def _read_wav(path: Path) -> Recording:
-    problem, rate, data = None, 0, np.zeros(0)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        try:
-            rate, data = scipy.io.wavfile.read(path)
-        except (ValueError, EOFError, StructError, UnboundLocalError, ZeroDivisionError, TypeError) as error:
-            problem = error
-    # The reader only warns of these, or stumbles later; its other warnings are of chunks that hold no sound.
-    if any("prematurely" in str(one.message) for one in said):
-        raise ValueError("the WAV file is cut off: it holds fewer samples than its header says. Copy it again.")
-    if problem is not None:
-        raise ValueError(f"not a readable WAV file, or cut off ({problem}); write it as plain PCM or float.")
-    samples = data.T if data.ndim == 2 else data[None]
-    if data.dtype == np.uint8:
-        return Recording((samples - 128.0) / 128.0, rate, full_scale=1.0, name=path.stem)
-    if data.dtype.kind == "i":
-        # 24 bits come as the upper bits of 32, so that this holds for them too.
-        return Recording(samples / -float(np.iinfo(data.dtype.name).min), rate, full_scale=1.0, name=path.stem)
-    # Floats beyond 1 are in some other unit: then full scale is not known.
-    beyond = (np.abs(samples[np.isfinite(samples)]) > 1.0).any()
-    return Recording(samples, rate, full_scale=None if beyond else 1.0, name=path.stem)

@@ -66,6 +66,22 @@ class Forest:
         return cls._joined(trees, start, np.arange(len(models)))
 
     @classmethod
+    def of_boosted_classes(cls, model: Any) -> "Forest":
+        """Of scikit-learn's classifier of that kind: log-odds of its classes; of two, those of the second halved, and
+        the first's the same, negative."""
+        trees, number = [], len(model.classes_)
+        for one in model._predictors:
+            for target, tree in enumerate(one):
+                nodes = tree.nodes
+                own = np.array([-0.5, 0.5]) if number == 2 else np.eye(number)[target]
+                leaf = nodes["is_leaf"].astype(bool)
+                value = np.outer(nodes["value"], own)
+                trees.append((nodes["feature_idx"], nodes["num_threshold"], nodes["left"], nodes["right"], leaf, value))
+        start = np.ravel(model._baseline_prediction).astype(float)
+        start = np.array([-0.5, 0.5]) * start[0] if number == 2 else start
+        return cls._joined(trees, start, model.classes_)
+
+    @classmethod
     def of_averaged(cls, models: list[Any]) -> "Forest":
         """Of scikit-learn's regression trees: their mean."""
         trees = []

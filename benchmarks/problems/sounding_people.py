@@ -1,0 +1,89 @@
+"""People on the simulated skin of Park et al. (2022): windows of sound, heard in more noise, by fewer microphones.
+
+25 microphones under 200 × 200 × 10 mm, sampled at 10 kHz. How people differ, and how loud they are beside the noise, is
+in `jeit.simulate.acoustic.people`, fixed before accuracies were looked at.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jeit.acoustic import Recording
+from jeit.simulate import SoundingPerson, SoundingSkin, sound_clips
+from jeit.simulate.acoustic.people import MODALITIES, SOUND_MANNERS
+from jeit.touch.listening import SoundImages, sound_images
+
+# Decibels of noise more than the skin has; and of its 5 × 5 microphones those that are left: every other one of the
+# grid, its corners' square, and the one in the middle.
+LOUDER = (0.0, 5.0, 10.0, 15.0, 20.0)
+FEWER = {25: tuple(range(25)), 9: (0, 2, 4, 10, 12, 14, 20, 22, 24), 4: (6, 8, 16, 18), 1: (12,)}
+# Of the windows of a clip every third, 0.3 s apart: those between share most of their sound with them.
+_EVERY = 3
+# Changes with what the same set is simulated to.
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class HeardPeople:
+    """W windows: `images`, by (decibels of noise more, microphones); of each the number of its class, `right` (W,), of
+    `MODALITIES`, of its `person` and its `clip`."""
+
+    images: dict[tuple[float, int], SoundImages]
+    right: np.ndarray
+    person: np.ndarray
+    clip: np.ndarray
+
+
+def heard_people(people: int, each: int, seed: int, *, store: Path | None = None) -> HeardPeople:
+    """`each` clips of every modality by so many people drawn from `seed`, 2.9 s long; read from the folder `store`
+    where they were made before, and written there."""
+    decides = people, each, seed, SOUND_MANNERS, LOUDER, FEWER, _EVERY, _VERSION
+    path = None if store is None else store / f"sounds-{hashlib.sha256(repr(decides).encode()).hexdigest()[:12]}.npz"
+    if path is None or not path.exists():
+        made = _simulated(people, each, seed)
+        if path is None:
+            return made
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrays = {"right": made.right, "person": made.person, "clip": made.clip}
+        for (louder, number), images in made.images.items():
+            arrays |= {f"{louder:g} {number} {name}": getattr(images, name) for name in images.__dataclass_fields__}
+        np.savez(path, **arrays)
+        return made
+    with np.load(path) as held:
+        images = {
+            (louder, number): SoundImages(
+                *(held[f"{louder:g} {number} {name}"] for name in SoundImages.__dataclass_fields__)
+            )
+            for louder, number in _variants()
+        }
+        return HeardPeople(images, held["right"], held["person"], held["clip"])
+
+
+def _variants() -> list[tuple[float, int]]:
+    return [(louder, 25) for louder in LOUDER] + [(0.0, number) for number in FEWER if number < 25]
+
+
+def _simulated(people: int, each: int, seed: int) -> HeardPeople:
+    skin = SoundingSkin(jax.random.key(0))
+    for_people, for_clips = jax.random.split(jax.random.key(seed))
+    drawn = [SoundingPerson.draw(key) for key in jax.random.split(for_people, people)]
+    parts: dict[tuple[float, int], list[SoundImages]] = {one: [] for one in _variants()}
+    right, person = [], []
+    for clip in sound_clips(for_clips, skin, drawn, each):
+        for louder, number in parts:
+            heard = clip.noisier(louder)[list(FEWER[number])]
+            parts[louder, number].append(sound_images(Recording(heard, skin.rate))[::_EVERY])
+        right.append(MODALITIES.index(clip.modality))
+        person.append(clip.person)
+    count = len(parts[0.0, 25][0])
+    return HeardPeople(
+        {one: SoundImages.joined(own) for one, own in parts.items()},
+        np.repeat(right, count),
+        np.repeat(person, count),
+        np.repeat(np.arange(len(right)), count),
+    )

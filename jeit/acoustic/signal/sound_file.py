@@ -1,0 +1,66 @@
+"""Sound files: WAV by SciPy, and FLAC, Ogg, AIFF and others by `soundfile`, where that is installed."""
+
+import warnings
+from importlib.util import find_spec
+from pathlib import Path
+from struct import error as StructError
+
+import numpy as np
+import scipy.io.wavfile
+
+# What files of other formats begin with: FLAC, Ogg, AIFF, CAF, AU, MP3 with and without a tag.
+_OTHERS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"ID3", b"\xff\xfb", b"\xff\xf3", b"\xff\xf2")
+
+
+def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
+    """Samples (M, S), their rate in Hz and full scale of a sound file; None for a file that is none of those known.
+
+    Integers become parts of full scale, -1 to 1; floats stay as they are, and where they go beyond 1 full scale is not
+    known. Raises `ValueError` for files that are broken, and those that need `soundfile` where it is not installed.
+    """
+    with path.open("rb") as file:
+        start = file.read(4)
+    if start in (b"RIFF", b"RIFX", b"RF64"):
+        return _read_wav(path)
+    if start.startswith(_OTHERS):
+        return _read_other(path)
+    return None
+
+
+def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
+    problem, rate, data = None, 0, np.zeros(0)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            rate, data = scipy.io.wavfile.read(path)
+        except (ValueError, EOFError, StructError, UnboundLocalError, ZeroDivisionError, TypeError) as error:
+            problem = error
+    # The reader only warns of these, or stumbles later; its other warnings are of chunks that hold no sound.
+    if any("prematurely" in str(one.message) for one in said):
+        raise ValueError("the WAV file is cut off: it holds fewer samples than its header says. Copy it again.")
+    if problem is not None:
+        raise ValueError(f"not a readable WAV file, or cut off ({problem}); write it as plain PCM or float.")
+    samples = data.T if data.ndim == 2 else data[None]
+    if data.dtype == np.uint8:
+        return (samples - 128.0) / 128.0, rate, 1.0
+    if data.dtype.kind == "i":
+        # 24 bits come as the upper bits of 32, so that this holds for them too.
+        return samples / -float(np.iinfo(data.dtype.name).min), rate, 1.0
+    return samples, rate, _full_scale(samples)
+
+
+def _read_other(path: Path) -> tuple[np.ndarray, float, float | None]:
+    if find_spec("soundfile") is None:
+        raise ValueError("no WAV file, and others need soundfile: pip install 'jeit[sound]', or convert it to WAV.")
+    import soundfile  # pyright: ignore[reportMissingImports]
+
+    try:
+        data, rate = soundfile.read(path, dtype="float64", always_2d=True)
+    except (RuntimeError, TypeError, ValueError) as error:  # soundfile's own are RuntimeErrors
+        raise ValueError(f"not a sound file that soundfile reads ({' '.join(str(error).split())}).") from None
+    return data.T, rate, _full_scale(data)
+
+
+def _full_scale(samples: np.ndarray) -> float | None:
+    """Floats beyond 1 are in some other unit: then full scale is not known."""
+    return None if (np.abs(samples[np.isfinite(samples)]) > 1.0).any() else 1.0

@@ -1,0 +1,38 @@
+"""What was heard in time: how probable each name is, and which one is told."""
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from jeit.plot.axes import INK, SERIES_COLOURS, axes_or_new, draw_colour_bar, soften_axes
+from jeit.touch.listening import Heard
+from jeit.touch.listening.feature_images import EVERY
+
+
+def plot_heard(heard: Heard, *, title: str | None = None, ax: Axes | None = None) -> Axes:
+    """Draw the probabilities of all names in time, a row each, a bar under the name that is told; quiet is blank."""
+    ax = axes_or_new(ax, (8.0, 3.2))
+    names, times = heard.names, heard.times
+    shown = np.where((heard.told != "")[:, None], heard.probabilities, np.nan).T
+    extent = (float(times[0]) - EVERY / 2, float(times[-1]) + EVERY / 2, -0.5, len(names) - 0.5)
+    drawn = ax.imshow(
+        100 * shown,
+        aspect="auto",
+        origin="lower",
+        extent=extent,
+        cmap="Blues",
+        vmin=0,
+        vmax=100,
+        interpolation="nearest",
+    )
+    draw_colour_bar(ax, drawn, "Probability (%)")
+    for event in heard.events:
+        if event.name:
+            row, span = names.index(event.name) - 0.42, [event.start, event.end]
+            ax.plot(span, [row, row], color=SERIES_COLOURS[1], linewidth=2.5, solid_capstyle="butt")
+    ax.set_yticks(range(len(names)), names)
+    ax.set_xlabel("Time (s)", color=INK)
+    quiet = int((heard.told == "").sum())
+    said = f"{heard.name}: {quiet} of {len(heard)} windows quiet" if quiet else heard.name
+    ax.set_title(said if title is None else title)
+    soften_axes(ax)
+    return ax

@@ -1,0 +1,162 @@
+"""Feature images of sound: how loud every microphone is in time, over the spectrogram of the loudest one.
+
+As Park et al. (2022) have it: in a window of 0.5 s, 41 times 12 ms apart; M rows of intensity, one a microphone, and 64
+of the spectrogram, so that 25 microphones give 89 × 41. Sampled at 10 kHz a frame is 128 samples under a Hann window,
+120 samples after the one before, and its transform's bins 1 to 64 are the 64 bands.
+
+At any other rate frames are as long in time, and bands are made of bins by their frequency: nothing is resampled. Up to
+`highest` = 5 kHz all bands are as wide as a bin, 78 Hz; where sound is to be told up to a higher frequency, the lowest
+stays as wide, and each is wider than the one below it by one and the same factor.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.optimize import brentq
+
+from jeit.acoustic import Recording
+from jeit.arguments import check_kind, is_number, told
+
+BANDS, FRAMES = 64, 41
+# Seconds: of a frame, from frame to frame, from window to window.
+FRAME, HOP, EVERY = 0.0128, 0.012, 0.1
+LENGTH = FRAME + (FRAMES - 1) * HOP
+"""Seconds of a window."""
+# Hertz: bands that are all as wide as a bin reach as far. A lower highest frequency leaves less than 8 bins.
+EVEN, LOWEST = 5000.0, 625.0
+# Windows of which images are made at once.
+_AT_ONCE = 128
+
+
+@dataclass(frozen=True)
+class SoundImages:
+    """W windows of one recording: `times` (W,), seconds, their middles; `intensity` (W, M, 41), the power of each
+    microphone, and `spectrum` (W, 64, 41), that of the `strongest` one (W,) in each band, per bin; both in the square
+    of the samples' unit. `known` (W,): whether more than half of a window's samples are numbers."""
+
+    times: Float[np.ndarray, " W"]
+    intensity: Float[np.ndarray, "W M 41"]
+    spectrum: Float[np.ndarray, "W 64 41"]
+    strongest: Int[np.ndarray, " W"]
+    known: Bool[np.ndarray, " W"]
+
+    def __len__(self) -> int:
+        """Number of windows."""
+        return len(self.times)
+
+    def __getitem__(self, some) -> "SoundImages":
+        """Some of the windows: a slice, or numbers or truth values of them."""
+        return SoundImages(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
+
+    @property
+    def loudness(self) -> Float[np.ndarray, " W"]:
+        """Power of the loudest frame of each window, all microphones together."""
+        return self.intensity.sum(axis=1).max(axis=1)
+
+    @classmethod
+    def joined(cls, parts: "list[SoundImages]") -> "SoundImages":
+        """The windows of several, one after the other; those of each begin at their own zero."""
+        return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in cls.__dataclass_fields__))
+
+
+def check_highest(highest: float) -> float:
+    """Raises `ValueError` for what is no highest frequency of sound images, Hz."""
+    if not (is_number(highest) and LOWEST <= highest < np.inf):
+        raise ValueError(
+            f"highest must be a frequency in Hz, {LOWEST:g} or more, up to which sound is told; it is {told(highest)}."
+        )
+    return float(highest)
+
+
+def band_edges(highest: float) -> Float[np.ndarray, " 65"]:
+    """Where the 64 bands begin and end, Hz; `highest` is the middle of the last where all are even."""
+    bin_width = 1 / FRAME
+    if highest <= EVEN:
+        return bin_width * (0.5 + np.arange(BANDS + 1))
+    # f = a (e^(bk) - 1) from half a bin on, a b = one bin; brentq finds b with the last edge half a bin above highest.
+    number = np.arange(BANDS + 1)
+    factor: Any = brentq(lambda b: bin_width * np.expm1(b * BANDS) / b - highest, 1e-9, 1.0)
+    return bin_width * (0.5 + np.expm1(factor * number) / factor)
+
+
+def sound_images(recording: Recording, highest: float = EVEN) -> SoundImages:
+    """Images of all windows of a recording, every 0.1 s.
+
+    Sound above `highest` Hz is left out; bands above half the rate are empty. A recording shorter than 0.5 s is taken
+    with 0.3 s of silence before and after it. Samples that are not finite count as zero. Raises `ValueError` for what
+    is no recording of samples, rates below 1250 Hz, and no frequency.
+    """
+    return SoundImages.joined(list(image_blocks(recording, highest)))
+
+
+def image_blocks(recording: Recording, highest: float = EVEN) -> Iterator[SoundImages]:
+    """The same for recordings of any length, some windows at a time. Raises `ValueError` as `sound_images`."""
+    check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
+    check_highest(highest)
+    if recording.rate < 2 * LOWEST:
+        raise ValueError(
+            f"{recording.name}: at {recording.rate:g} samples a second there is no sound above "
+            f"{recording.rate / 2:g} Hz; record {2 * LOWEST:g} a second or more."
+        )
+    return _blocks(recording, highest)
+
+
+def _blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
+    rate, samples = recording.rate, recording.samples
+    length, hop = round(FRAME * rate), round(HOP * rate)
+    whole = length + (FRAMES - 1) * hop
+    before = 0
+    if samples.shape[1] < whole:
+        before = round(0.3 * rate)
+        after = max(before, whole - before - samples.shape[1])
+        samples = np.pad(samples, ((0, 0), (before, after)))
+    frames = 1 + (samples.shape[1] - length) // hop
+    number = 1 + int((frames - FRAMES + 0.5) * hop / (EVERY * rate))
+    # Windows begin with a frame: the one nearest to their time.
+    starts = np.minimum(np.round(EVERY * rate * np.arange(number) / hop).astype(int), frames - FRAMES)
+    weights = _weights(length, rate, highest)
+    taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
+    scale = 2 / (length * (taper**2).sum())
+    wide = np.maximum(weights.sum(axis=0), 1.0)
+    for first in range(0, number, _AT_ONCE):
+        own = starts[first : first + _AT_ONCE]
+        part = samples[:, own[0] * hop : (own[-1] + FRAMES - 1) * hop + length]
+        finite = np.isfinite(part)
+        lost = 0.0 if finite.all() else 1 - _per_frame(finite, length, hop).mean(axis=0)
+        power = np.stack([_powers(channel, taper, hop, weights) for channel in np.where(finite, part, 0.0)]) * scale
+        within = own[:, None] - own[0] + np.arange(FRAMES)
+        intensity = power.sum(axis=-1)[:, within].transpose(1, 0, 2)
+        strongest = intensity.sum(axis=2).argmax(axis=1)
+        spectrum = (power / wide)[strongest[:, None], within].transpose(0, 2, 1)
+        known = np.broadcast_to(lost, power.shape[1])[within].mean(axis=1) < 0.5
+        times = (own * hop + whole / 2 - before) / rate
+        yield SoundImages(times, intensity.astype(np.float32), spectrum.astype(np.float32), strongest, known)
+
+
+def _powers(channel: np.ndarray, taper: np.ndarray, hop: int, weights: np.ndarray) -> Float[np.ndarray, "F 64"]:
+    """Power in each band and frame, before it is scaled."""
+    frames = sliding_window_view(channel, len(taper))[::hop]
+    # What is constant would leak into the lowest band.
+    spectrum = np.fft.rfft((frames - frames.mean(axis=1, keepdims=True)) * taper)
+    return (np.real(spectrum) ** 2 + np.imag(spectrum) ** 2) @ weights
+
+
+def _per_frame(finite: np.ndarray, length: int, hop: int) -> np.ndarray:
+    """Share of each frame's samples that are finite (M, F)."""
+    return sliding_window_view(finite, length, axis=1)[:, ::hop].mean(axis=-1)
+
+
+def _weights(length: int, rate: float, highest: float) -> Float[np.ndarray, "K 64"]:
+    """The part of each bin's own stretch of frequency, (k ± 1/2) rate / length, that lies in each band; none of bin 0,
+    nor of what is above half the rate or `highest`."""
+    edges = band_edges(highest)
+    width = rate / length
+    low = (np.arange(length // 2 + 1) - 0.5) * width
+    high = np.minimum(low + width, highest + 0.5 / FRAME)
+    inside = np.clip(np.minimum(high[:, None], edges[1:]) - np.maximum(low[:, None], edges[:-1]), 0, None) / width
+    inside[0] = 0.0
+    return inside

@@ -1,0 +1,34 @@
+"""Which clips are held out together: never windows of one clip on both sides, nor clips of one person where known."""
+
+import numpy as np
+from jaxtyping import Int
+
+
+def held_out_folds(right: Int[np.ndarray, " N"], groups: Int[np.ndarray, " N"], most: int) -> Int[np.ndarray, " N"]:
+    """The fold (N,) that each of N clips is held out in, with all of its group; -1 for clips that are always learnt
+    from, since their class has no other group.
+
+    Groups are dealt in turn, those of each class by themselves, the largest first: at most `most` folds, so that every
+    class is learnt from in each.
+    """
+    fold = np.full(len(right), -1)
+    of_group: dict[int, int] = {}
+    counts = np.zeros(most, int)
+    classes = [np.unique(groups[right == one]) for one in np.unique(right)]
+    for own in sorted(classes, key=len):
+        if len(own) < 2:
+            continue
+        for group in sorted(own.tolist(), key=lambda one: -int((groups == one).sum())):
+            if group not in of_group:
+                taken = [sum(of_group.get(other) == number for other in own.tolist()) for number in range(most)]
+                of_group[group] = min(range(most), key=lambda number: (taken[number], counts[number], number))
+                counts[of_group[group]] += int((groups == group).sum())
+    for group, number in of_group.items():
+        fold[groups == group] = number
+    # A class all of whose groups are in one fold would be asked for where it was never learnt.
+    for one in np.unique(right):
+        own = right == one
+        if len(np.unique(fold[own])) < 2:
+            fold[own] = -1
+    used = np.unique(fold[fold >= 0])
+    return np.where(fold >= 0, np.searchsorted(used, fold), -1)

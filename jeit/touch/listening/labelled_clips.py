@@ -1,0 +1,163 @@
+"""Labelled clips of sound: a folder for each class, and what is read of them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jeit.acoustic import Intensities, Recording, read_recording
+from jeit.arguments import check_kind, counted
+from jeit.touch.listening.feature_images import LOWEST
+
+# Files that were not read, told by name at most.
+_TOLD = 3
+# Shares of a second: rates that differ by less are one.
+_SAME_RATE = 1e-3
+
+
+class _Files(Sequence):
+    """Recordings of files, read when they are asked for: all of them at once need not fit into memory."""
+
+    def __init__(self, paths: list[Path]):
+        self.paths = paths
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, index: Any) -> Any:
+        return read_recording(self.paths[index])
+
+
+@dataclass(frozen=True)
+class LabelledClips:
+    """n clips: `recordings`, a sequence of `Recording`; their `labels` (n,), names of classes; `groups` (n,), names of
+    who or what they are held out with; `channels`, how many all of them have, 1 where they are mixed; `highest`, Hz, up
+    to which all of them have sound. `notes` on them."""
+
+    recordings: Sequence[Recording]
+    labels: np.ndarray
+    groups: np.ndarray
+    channels: int
+    highest: float
+    notes: tuple[str, ...] = ()
+    name: str = "clips"
+
+    @classmethod
+    def of(
+        cls,
+        recordings: Sequence[Recording],
+        labels: ArrayLike,
+        groups: ArrayLike | None = None,
+        *,
+        notes: Sequence[str] = (),
+        name: str = "clips",
+    ) -> "LabelledClips":
+        """Clips `recordings` of classes `labels`: each is a group of its own unless `groups` are given.
+
+        Clips of various numbers of channels are mixed to one. `notes` are kept with what is noted here. Raises
+        `ValueError` for numbers that do not match, what is no recording of samples, and fewer than two classes.
+        """
+        check_kind("recordings", recordings, Sequence, "a list of Recording, as of read_recording(path)")
+        named = np.asarray(labels)
+        own = np.arange(len(recordings)).astype(str) if groups is None else np.asarray(groups).astype(str)
+        if not (named.shape == own.shape == (len(recordings),)) or (named.size and named.dtype.kind not in "UT"):
+            raise ValueError(f"labels and groups must be one name for each of the {len(recordings)} recordings.")
+        classes = np.unique(named)
+        if len(classes) < 2:
+            raise ValueError(
+                f"labels: there {'is one class only, ' + repr(str(classes[0])) if len(classes) else 'are no clips'}; "
+                "give clips of two classes or more."
+            )
+        channels, rates = [], []
+        for number in range(len(recordings)):
+            one = recordings[number]
+            check_kind(f"recordings[{number}]", one, Recording, "a Recording of samples, as of read_recording(path)")
+            channels.append(len(one.samples))
+            rates.append(one.rate)
+        said, several = list(notes), sorted(set(channels))
+        if len(several) > 1:
+            said.append(f"clips have {' or '.join(map(str, several))} channels: all were mixed to one.")
+        low, high = min(rates), max(rates)
+        if high > low * (1 + _SAME_RATE):
+            few = sum(rate < high * (1 - _SAME_RATE) for rate in rates)
+            said.append(
+                f"{few} of {counted(len(rates), 'clip')} have fewer than {high:g} samples a second: nothing above "
+                f"{low / 2:g} Hz is told, which all of them have."
+            )
+        width = several[0] if len(several) == 1 else 1
+        return cls(recordings, named.astype(str), own, width, low / 2, tuple(said), name)
+
+    def clip(self, number: int) -> Recording:
+        """One of them, mixed where all are."""
+        return self.recordings[number] if self.channels > 1 else mixed(self.recordings[number])
+
+    def __len__(self) -> int:
+        """Number of clips."""
+        return len(self.recordings)
+
+
+def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = None) -> LabelledClips:
+    """Read labelled clips: every sub-folder of `folder` is a class, and every file in it a clip of that class: WAV,
+    NPZ, or what `soundfile` reads where it is installed.
+
+    Clips in a folder within a class's, such as of a person or a day, are one group, together with those of the other
+    classes in a folder of that name; else every file is. Files that cannot be read are left out, and told of in
+    `notes`; hidden ones are not looked at. `progress` is called with how far it is. Raises `ValueError` where there is
+    no such folder, fewer than two classes, or a class none of whose clips can be read.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ValueError(f"'{folder}' is no folder; give one with a sub-folder of clips for each class.")
+    classes = sorted(one for one in folder.iterdir() if one.is_dir() and not one.name.startswith("."))
+    if len(classes) < 2:
+        held = f"only '{classes[0].name}'" if classes else "none"
+        raise ValueError(f"'{folder}' must have a sub-folder of clips for each of two classes or more; it has {held}.")
+    read, labels, groups, failed = [], [], [], []
+    for one in classes:
+        files = sorted(path for path in one.rglob("*") if path.is_file() and not _hidden(path.relative_to(folder)))
+        before = len(read)
+        for path in files:
+            try:
+                _check_clip(read_recording(path), path.name)
+            except (ValueError, OSError) as error:
+                failed.append(str(error).rstrip("."))
+                continue
+            within = path.relative_to(one).parts[:-1]
+            read.append(path)
+            labels.append(one.name)
+            groups.append("/".join(within) if within else f"{one.name}/{path.name}")
+            if progress is not None:
+                progress(f"{counted(len(read), 'clip')}")
+        if len(read) == before:
+            why = failed[-1] if files else "it is empty"
+            raise ValueError(f"'{one}': there is no clip in it that can be read ({why.rstrip('.')}).")
+    notes = []
+    if failed:
+        more = f"; and {len(failed) - _TOLD} more" if len(failed) > _TOLD else ""
+        notes.append(f"{counted(len(failed), 'file')} not read: {'; '.join(failed[:_TOLD])}{more}")
+    return LabelledClips.of(_Files(read), labels, groups, notes=notes, name=folder.name or str(folder))
+
+
+def _check_clip(clip: Recording | Intensities, name: str) -> None:
+    """Raise `ValueError` for what cannot be learnt from."""
+    if not isinstance(clip, Recording):
+        raise ValueError(f"{name}: it holds intensities, not samples.")
+    if not np.isfinite(clip.samples).any():
+        raise ValueError(f"{name}: none of its samples is a number.")
+    if clip.rate < 2 * LOWEST:
+        raise ValueError(f"{name}: {clip.rate:g} samples a second are too few; give {2 * LOWEST:g} or more.")
+
+
+def mixed(recording: Recording) -> Recording:
+    """All channels of a recording as one, their mean."""
+    if len(recording.samples) == 1:
+        return recording
+    mean = recording.samples.mean(axis=0, keepdims=True)
+    return Recording(mean, recording.rate, full_scale=recording.full_scale, name=recording.name)
+
+
+def _hidden(path: Path) -> bool:
+    return any(part.startswith(".") for part in path.parts)

@@ -1,0 +1,240 @@
+"""What learns windows of sound: the network, trees on hand-made features, and a linear discriminant on them.
+
+Each is a class with `learn`, `log_odds` of the classes 0 … C − 1, and arrays that a file keeps.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jeit.touch.learnt.classifiers import CLASSIFIERS
+from jeit.touch.learnt.extras import one_thread
+from jeit.touch.learnt.forest import Forest
+from jeit.touch.listening.feature_images import SoundImages
+from jeit.touch.listening.levels import Levels
+from jeit.touch.listening.modality_network import ModalityNetwork, NetworkAnswers, plan_of, train_network
+from jeit.touch.listening.window_features import sound_features
+
+# Rounds of boosting, leaves of a tree, and presses in a leaf at least, of sets that are large enough.
+_ROUNDS, _LEAVES, _IN_A_LEAF = 100, 15, 10
+BATCHES = 1500
+"""Batches of a training at most, unless told otherwise."""
+# Times through the windows of a small set, at most, and batches that are done all the same.
+_THROUGH, _FEWEST = 40, 100
+# Of the groups of each class one in so many is held out to stop the network's training.
+_STOPPING = 6
+
+
+class Lesson(NamedTuple):
+    """What is learnt: windows `images`, their classes `right` (W,), 0 … C − 1 of `classes`, and their `groups` (W,),
+    numbers of what was recorded together; by which `key` networks are drawn, how many `batches` they are trained for at
+    most, the file in which a training is kept on its way, and who is told how far it is."""
+
+    images: SoundImages
+    right: Int[np.ndarray, " W"]
+    groups: Int[np.ndarray, " W"]
+    classes: int
+    key: Array
+    batches: int = BATCHES
+    checkpoint: Path | None = None
+    progress: Callable[[str], None] | None = None
+
+
+@dataclass(frozen=True)
+class NetworkListener:
+    """A network, and the `levels` that its images are of."""
+
+    network: ModalityNetwork
+    levels: Levels
+    answers: NetworkAnswers
+
+    @classmethod
+    def learn(cls, lesson: Lesson) -> "NetworkListener":
+        """Train one, stopped by the loss of groups held out: one in six of each class, where there are as many."""
+        held = stopping_rows(lesson.right, lesson.groups)
+        levels = Levels.of(lesson.images[~held])
+        shown = levels(lesson.images)
+        if lesson.checkpoint is not None:
+            lesson.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        number = int((~held).sum())
+        enough = max(_FEWEST, _THROUGH * number // 64)
+        plan = plan_of(number, batches=min(lesson.batches, enough))
+        trained = train_network(
+            shown[~held],
+            lesson.right[~held],
+            (shown[held], lesson.right[held]) if held.any() else (shown, lesson.right),
+            classes=lesson.classes,
+            key=lesson.key,
+            plan=plan,
+            checkpoint=lesson.checkpoint,
+            progress=lesson.progress,
+        )
+        return cls.of(trained.network, levels)
+
+    @classmethod
+    def of(cls, network: ModalityNetwork, levels: Levels) -> "NetworkListener":
+        """One that is trained."""
+        return cls(network, levels, NetworkAnswers(network))
+
+    def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
+        """Log-odds (W, C) of the classes."""
+        return self.answers.log_odds(self.levels(images))
+
+    def kept(self) -> tuple[dict[str, Any], Any]:
+        """A head and arrays."""
+        levels = {name: getattr(self.levels, name).tolist() for name in Levels.__dataclass_fields__}
+        return {"levels": levels}, self.network
+
+    @staticmethod
+    def like(head: dict[str, Any], classes: int, rows: int) -> Any:
+        """Arrays of the same shapes."""
+        return ModalityNetwork.draw(jax.random.key(0), rows, 41, classes)
+
+    @classmethod
+    def made(cls, head: dict[str, Any], arrays: Any) -> "NetworkListener":
+        """Undo `kept`."""
+        return cls.of(arrays, Levels(**{name: np.array(value) for name, value in head["levels"].items()}))
+
+
+@dataclass(frozen=True)
+class TreesListener:
+    """Trees boosted by scikit-learn's `HistGradientBoostingClassifier`, on `sound_features`."""
+
+    forest: Forest
+
+    @classmethod
+    def learn(cls, lesson: Lesson) -> "TreesListener":
+        """Grow them; in small sets leaves may be smaller."""
+        from sklearn.ensemble import HistGradientBoostingClassifier
+
+        fewest = int(np.bincount(lesson.right, minlength=lesson.classes).min())
+        model = HistGradientBoostingClassifier(
+            max_iter=_ROUNDS,
+            max_leaf_nodes=_LEAVES,
+            min_samples_leaf=int(np.clip(fewest // 4, 1, _IN_A_LEAF)),
+            l2_regularization=1.0,
+            early_stopping=False,  # pyright: ignore[reportArgumentType]
+            random_state=0,
+        )
+        with one_thread():
+            model.fit(sound_features(lesson.images), lesson.right)
+        return cls(Forest.of_boosted_classes(model))
+
+    def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
+        """Log-odds (W, C) of the classes."""
+        return self.forest.decision_function(sound_features(images))
+
+    def kept(self) -> tuple[dict[str, Any], Any]:
+        """A head and arrays."""
+        own = self.forest
+        head = {"trees": own.value.shape[0], "nodes": own.value.shape[1], "depth": own.depth}
+        arrays = [own.feature, own.left, own.right, own.threshold, own.value, own.start]
+        return head, [np.asarray(one, np.int32 if place < 3 else np.float32) for place, one in enumerate(arrays)]
+
+    @staticmethod
+    def like(head: dict[str, Any], classes: int, rows: int) -> Any:
+        """Arrays of the same shapes."""
+        shape = (int(head["trees"]), int(head["nodes"]))
+        shapes = [(shape, np.int32)] * 3 + [
+            (shape, np.float32),
+            ((*shape, classes), np.float32),
+            ((classes,), np.float32),
+        ]
+        return [jax.numpy.zeros(one, kind) for one, kind in shapes]
+
+    @classmethod
+    def made(cls, head: dict[str, Any], arrays: Any) -> "TreesListener":
+        """Undo `kept`. Raises `ValueError` for trees that no features lead down."""
+        feature, left, right, threshold, value, start = (np.asarray(one) for one in arrays)
+        nodes = value.shape[1]
+        sound = (feature >= 0).all() and (feature < num_features()).all() and 0 < int(head["depth"]) < 1000
+        if not (sound and all(((one >= 0) & (one < nodes)).all() for one in (left, right))):
+            raise ValueError("its trees lead nowhere")
+        return cls(
+            Forest(
+                feature,
+                threshold.astype(float),
+                left,
+                right,
+                value.astype(float),
+                int(head["depth"]),
+                start.astype(float),
+                np.arange(len(start)),
+            )
+        )
+
+
+@dataclass(frozen=True)
+class LinearListener:
+    """A linear discriminant, its covariance shrunk as Ledoit and Wolf do, on `sound_features`: `weights` (k, C) and
+    `offset` (C,) of features less their `mean` (k,) over their `deviation` (k,)."""
+
+    mean: Float[np.ndarray, " k"]
+    deviation: Float[np.ndarray, " k"]
+    weights: Float[np.ndarray, "k C"]
+    offset: Float[np.ndarray, " C"]
+
+    @classmethod
+    def learn(cls, lesson: Lesson) -> "LinearListener":
+        """Fit it."""
+        features = sound_features(lesson.images)
+        mean, deviation = features.mean(axis=0), features.std(axis=0)
+        deviation = np.where(deviation > 1e-9, deviation, 1.0)
+        model = CLASSIFIERS["linear-discriminant"]((features - mean) / deviation, lesson.right)
+        weights, offset = model.coef_.T, model.intercept_
+        if weights.shape[1] == 1:  # of two classes, the odds of the second
+            weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
+        return cls(mean, deviation, weights, offset)
+
+    def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
+        """Log-odds (W, C) of the classes."""
+        return (sound_features(images) - self.mean) / self.deviation @ self.weights + self.offset
+
+    def kept(self) -> tuple[dict[str, Any], Any]:
+        """A head and arrays."""
+        return {}, [np.asarray(one, np.float32) for one in (self.mean, self.deviation, self.weights, self.offset)]
+
+    @staticmethod
+    def like(head: dict[str, Any], classes: int, rows: int) -> Any:
+        """Arrays of the same shapes."""
+        number = num_features()
+        return [jax.numpy.zeros(one, np.float32) for one in ((number,), (number,), (number, classes), (classes,))]
+
+    @classmethod
+    def made(cls, head: dict[str, Any], arrays: Any) -> "LinearListener":
+        """Undo `kept`."""
+        return cls(*(np.asarray(one, float) for one in arrays))
+
+
+LEARNERS: dict[str, Any] = {"network": NetworkListener, "trees": TreesListener, "linear": LinearListener}
+"""By name; of those that are right as often the last is taken, which is the plainest."""
+
+
+def num_features() -> int:
+    """How many hand-made features there are."""
+    return sound_features(_NOTHING).shape[1]
+
+
+_NOTHING = SoundImages(np.zeros(0), np.zeros((0, 1, 41)), np.zeros((0, 64, 41)), np.zeros(0, int), np.zeros(0, bool))
+
+
+def stopping_rows(right: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -> np.ndarray:
+    """Which windows (W,) tell a training when to stop: whole groups, spread over the classes; none of a class that has
+    fewer than three."""
+    held = np.zeros(len(right), bool)
+    chosen: set[int] = set()
+    for one in np.unique(right):
+        own = np.unique(groups[right == one])
+        wanted = len(own) // _STOPPING if len(own) >= _STOPPING else int(len(own) >= 3)
+        already = chosen & set(own.tolist())
+        rest = [group for group in own.tolist() if group not in chosen]
+        order = np.random.default_rng(int(one)).permutation(len(rest))
+        chosen |= {rest[place] for place in order[: max(0, wanted - len(already))]}
+    held = np.isin(groups, sorted(chosen))
+    # Whoever is held out, every class is learnt from.
+    return held if set(right[~held].tolist()) == set(right.tolist()) else np.zeros(len(right), bool)

@@ -1,0 +1,242 @@
+"""`Listener`: learns to name sounds from labelled clips, and says every 0.1 s of a recording what is heard."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from jeit.acoustic import Calibration, Recording, locate_touches
+from jeit.arguments import check_key, check_kind, check_name, counted
+from jeit.touch.learnt.answers import Standing
+from jeit.touch.learnt.classifiers import probabilities, sharpness_of
+from jeit.touch.listening.feature_images import BANDS, EVERY, image_blocks
+from jeit.touch.listening.folds import held_out_folds
+from jeit.touch.listening.heard import Heard
+from jeit.touch.listening.labelled_clips import LabelledClips, mixed
+from jeit.touch.listening.learners import BATCHES, LEARNERS
+from jeit.touch.listening.windows import LOUD, Windows
+from jeit.touch.needed import need_learning
+from jeit.touch.training import read_model, write_model
+
+METHODS = ("auto", *LEARNERS)
+# Folds in which it is chosen, at most. Windows whose power is this of the quietest that was learnt from are quiet.
+_FOLDS, _QUIET = 3, 0.25
+# Samples in which a microphone that works has moved.
+_LOOKED_AT = 100_000
+_KIND, _VERSION = "a jeit listener", 1
+
+
+@dataclass(frozen=True)
+class Listener:
+    """What names sounds.
+
+    **Fields**: `names` (C,); the `method` and what learnt, `model`; of how many `channels`, 1 where they are mixed; up
+    to which frequency `highest`, Hz; the `quietest` loudness that was learnt from, and the `sharpness` of its
+    probabilities. `standing`: what was said of each clip when it was held out, and the errors of all that was tried,
+    the best first, None of a listener that was read; `notes` on it.
+    """
+
+    names: tuple[str, ...]
+    method: str
+    model: Any
+    channels: int
+    highest: float
+    quietest: float
+    sharpness: float
+    standing: Standing | None = None
+    notes: tuple[str, ...] = ()
+    name: str = "clips"
+
+    @classmethod
+    def fit(
+        cls,
+        clips: LabelledClips,
+        *,
+        method: str = "auto",
+        key: Array | None = None,
+        batches: int = BATCHES,
+        folder: str | Path | None = None,
+        progress: Callable[[str], None] | None = None,
+    ) -> "Listener":
+        """Learn labelled clips, by a `method` of `METHODS`: of "auto", what is right most often of clips held out.
+
+        Clips are held out in three folds, with all of their group; a clip counts as right where it is named right as a
+        whole. Of every clip those windows are learnt from that are no more than 20 dB below its loudest: the rest of it
+        is not what it is labelled. `key` draws networks, each trained for `batches` at most; `folder`: where trainings
+        are kept, so that one that was killed goes on. `progress` is called with how far it is. Raises `ValueError` for
+        what are no clips, key, or method; `ImportError` without the extra `learn`.
+        """
+        need_learning()
+        check_kind("clips", clips, LabelledClips, "clips as of read_clips(folder)")
+        check_name("method", method, METHODS)
+        key = jax.random.key(0) if key is None else key
+        check_key(key)
+        tell = progress or (lambda said: None)
+        windows = Windows.of(clips, tell)
+        fold = held_out_folds(windows.right_of_clip, windows.group_of_clip, _FOLDS)
+        notes = list(clips.notes)
+        alone = np.unique(clips.labels[fold < 0])
+        if alone.size:
+            notes.append(
+                f"{', '.join(alone)}: clips of one group only, which are never held out; how well they are told is not "
+                "known."
+            )
+        names = tuple(LEARNERS) if method == "auto" else (method,)
+        found = []
+        for name in names:
+            odds = np.full((len(windows.images), windows.classes), np.nan)
+            for number in range(int(fold.max()) + 1):
+                tell(f"{name}, fold {number + 1} of {int(fold.max()) + 1}")
+                out = (fold == number)[windows.clip]
+                lesson = windows.lesson(~out, key, batches, _file(folder, f"{name}-{number}"), tell)
+                odds[out] = LEARNERS[name].learn(lesson).log_odds(windows.images[out])
+            found.append((name, odds))
+        kept = [(windows.errors(odds), place, name, odds) for place, (name, odds) in enumerate(found)]
+        # Of those that err as often the last, the plainest.
+        kept.sort(key=lambda one: (*one[0], -one[1]))
+        (_, _, chosen, odds) = kept[0]
+        tell(f"{chosen}, all clips")
+        everything = windows.lesson(np.ones(len(windows.clip), bool), key, batches, _file(folder, chosen), tell)
+        model = LEARNERS[chosen].learn(everything)
+        out = np.isfinite(odds).all(axis=1)
+        standing = None
+        if out.any():
+            said, right = windows.told(odds)
+            tried = [(name, errors[0]) for errors, _, name, _ in kept]
+            standing = Standing(chosen, tried, np.array(windows.names)[said], np.array(windows.names)[right])
+        else:
+            notes.append(
+                "no class has clips of two groups: nothing could be held out, and nobody knows how good it is."
+            )
+        # Few clips that all are told right would make it as sure as can be.
+        sharpness = min(1.0, sharpness_of(odds[out], windows.right[out])) if out.any() else 1.0
+        quietest = float(windows.images.loudness.min())
+        highest, channels = clips.highest, clips.channels
+        return cls(
+            windows.names, chosen, model, channels, highest, quietest, sharpness, standing, tuple(notes), clips.name
+        )
+
+    def hear(self, recording: Recording, *, calibration: Calibration | None = None) -> Heard:
+        """Name what is heard in every window of a recording, 0.5 s long and 0.1 s after the one before.
+
+        A recording shorter than that is taken with silence about it. With a `calibration` of the microphones, places
+        are told where the localiser finds one. A listener of one channel mixes those of a recording. Raises
+        `ValueError` for what is no recording of samples, another number of microphones, sound that does not reach up to
+        `highest`, and as `locate_touches` does.
+        """
+        check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
+        notes = []
+        whole = recording
+        if self.channels == 1 and len(recording.samples) > 1:
+            recording = mixed(recording)
+            notes.append(f"{len(whole.samples)} channels were mixed to one, as the listener has it.")
+        if len(recording.samples) != self.channels:
+            raise ValueError(
+                f"{recording.name} has {counted(len(recording.samples), 'microphone')}, and the listener was learnt "
+                f"from clips of {self.channels}; record with these, or fit one to clips of those."
+            )
+        if recording.rate < 2 * self.highest * (1 - 1e-3):
+            raise ValueError(
+                f"{recording.name} has {recording.rate:g} samples a second, sound up to {recording.rate / 2:g} Hz, and "
+                f"the listener tells by sound up to {self.highest:g} Hz; record {2 * self.highest:g} a second or more, "
+                "or fit one to clips of this rate."
+            )
+        bad = int((~np.isfinite(recording.samples)).sum())
+        if bad:
+            notes.append(f"{counted(bad, 'sample')} not finite: taken for silence.")
+        dead = np.flatnonzero([len(np.unique(one[np.isfinite(one)][:_LOOKED_AT])) < 2 for one in whole.samples])
+        if dead.size:
+            notes.append(f"microphones that never move: {', '.join(map(str, dead))}.")
+        parts = [
+            (one.times, one.loudness, one.known, one.strongest, self.model.log_odds(one))
+            for one in image_blocks(recording, self.highest)
+        ]
+        times, loudness, known, strongest, odds = (np.concatenate(own) for own in zip(*parts, strict=True))
+        quiet = loudness < _QUIET * self.quietest
+        if quiet.all() and loudness.max() > 0:
+            notes.append("all of it is quieter than anything learnt from: is the gain another?")
+        place, std = (None, None) if calibration is None else _places(whole, calibration, times)
+        return Heard(
+            times,
+            probabilities(odds, self.sharpness),
+            self.names,
+            quiet,
+            known,
+            strongest,
+            (loudness >= LOUD * loudness.max()) & (loudness > 0),
+            recording.name,
+            tuple(notes),
+            place,
+            std,
+        )
+
+    def write(self, path: str | Path) -> None:
+        """Write it to one file, without how it stood: a head of JSON, and arrays. Raises `ValueError` for a folder."""
+        own, arrays = self.model.kept()
+        head = {
+            "names": list(self.names),
+            "method": self.method,
+            "channels": self.channels,
+            "highest_Hz": self.highest,
+            "quietest": self.quietest,
+            "sharpness": self.sharpness,
+            "notes": list(self.notes),
+            "name": self.name,
+            "model": own,
+        }
+        write_model(path, _KIND, _VERSION, head, arrays)
+
+    @classmethod
+    def read(cls, path: str | Path) -> "Listener":
+        """Undo `write`, also of the folder that `jeit listen fit` made; nothing in the file is executed. Raises
+        `FileNotFoundError`, and `ValueError` for files of another kind."""
+        path = Path(path)
+        if path.is_dir():
+            path = path / "listener.jeit"
+        if not path.is_file():
+            raise FileNotFoundError(f"'{path}': there is no such file; `jeit listen fit` makes one.")
+
+        def make(head: dict[str, Any]) -> Any:
+            check_name("its method", head["method"], tuple(LEARNERS))
+            return LEARNERS[head["method"]].like(head["model"], len(head["names"]), head["channels"] + BANDS)
+
+        head, arrays = read_model(path, _KIND, _VERSION, make)
+        try:
+            model = LEARNERS[head["method"]].made(head["model"], arrays)
+            highest, quietest, sharpness = (float(head[name]) for name in ("highest_Hz", "quietest", "sharpness"))
+            names, notes = tuple(map(str, head["names"])), tuple(map(str, head["notes"]))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ValueError(f"'{path}' is not {_KIND} that can be read: {error}.") from None
+        return cls(
+            names,
+            head["method"],
+            model,
+            int(head["channels"]),
+            highest,
+            quietest,
+            sharpness,
+            notes=notes,
+            name=str(head["name"]),
+        )
+
+
+def _file(folder: str | Path | None, name: str) -> Path | None:
+    return None if folder is None else Path(folder) / f"{name}.training"
+
+
+def _places(recording: Recording, calibration: Calibration, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where it was touched (W, d), and standard deviations, by the smoothed track's frames about each window's middle;
+    NaN where there are none."""
+    found = locate_touches(recording, calibration)
+    place, spread = found.track.position, np.sqrt(np.diagonal(found.track.covariance, axis1=1, axis2=2))
+    near = np.abs(found.locations.times - times[:, None]) <= EVERY / 2
+    near &= np.isfinite(place).all(axis=1)
+    count = near.sum(axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        return (near @ np.nan_to_num(place)) / np.where(count, count, np.nan), (
+            near @ np.nan_to_num(spread)
+        ) / np.where(count, count, np.nan)

@@ -1,0 +1,200 @@
+"""The network of Park et al. (2022) that tells touch by its sound: trained with equinox and optax, asked in NumPy.
+
+A convolution of 5 × 5 to 32 channels, unpadded, normalised over the batch, rectified, pooled by greatest values; again,
+3 × 3 to 64; a dense layer and softmax. Adam with a rate of 2e-4, a tenth of it after every five epochs, batches of 64;
+held-out loss looked at every 50 batches, and an end after 20 looks without a decrease. The size of the second
+convolution and of the pools, 3 × 3 and 2 × 2, is this library's choice; so is the noise that images are augmented by.
+"""
+
+from collections.abc import Callable
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.lib.stride_tricks import sliding_window_view
+
+from jeit.touch.training import Objective, Plan, Trained, fit
+
+# Of both layers: pixels of kernels and of pools, and channels.
+_KERNELS, _POOLS, _CHANNELS = (5, 3), (3, 2), (32, 64)
+# Of each batch's mean and variance, what running ones take over; added to variances.
+_TAKEN, _LITTLE = 0.05, 1e-5
+NOISE, COPIES = 0.2, 5
+"""The deviation of the normal noise added to images, whose own is 1; and how many noisy copies of each image are an
+epoch, as in the paper."""
+# Windows that are asked at once.
+_AT_ONCE = 32
+
+
+class ModalityNetwork(eqx.Module):
+    """Weights, single precision: kernels `first` (5, 5, 1, 32) and `second` (3, 3, 32, 64); after each a `gain` and a
+    `shift`, and running `mean` and `variance`, a pair of each; `dense` (n, C) and `bias` (C,)."""
+
+    first: Float[Array, "5 5 1 32"]
+    second: Float[Array, "3 3 32 64"]
+    gain: tuple[Array, Array]
+    shift: tuple[Array, Array]
+    mean: tuple[Array, Array]
+    variance: tuple[Array, Array]
+    dense: Float[Array, "n C"]
+    bias: Float[Array, " C"]
+
+    @classmethod
+    def draw(cls, key: Array, rows: int, columns: int, classes: int) -> "ModalityNetwork":
+        """Untrained, for images (rows, columns): kernels normal with the variance of He et al. (2015)."""
+        for size, pool in zip(_KERNELS, _POOLS, strict=True):
+            rows, columns = ((side - size + 1) // pool for side in (rows, columns))
+        keys = jax.random.split(key, 3)
+        one, two = _KERNELS
+        shapes = (one, one, 1, _CHANNELS[0]), (two, two, *_CHANNELS), (rows * columns * _CHANNELS[1], classes)
+        first, second, dense = (
+            jax.random.normal(one, shape, jnp.float32) * jnp.float32(np.sqrt(2 / np.prod(shape[:-1])))
+            for one, shape in zip(keys, shapes, strict=True)
+        )
+        few, many = _CHANNELS
+        ones, zeros = ((jnp.full(few, own, jnp.float32), jnp.full(many, own, jnp.float32)) for own in (1.0, 0.0))
+        dense, bias = 0.1 * dense, jnp.zeros(classes, jnp.float32)
+        return cls(first, second, ones, zeros, zeros, ones, dense, bias)
+
+    def answer(self, images: Float[Array, "b rows columns"]) -> Float[Array, "b C"]:
+        """Log-odds of the classes, with the running means."""
+        return self._through(images, self.mean, self.variance)[0]
+
+    def learn(self, images: Float[Array, "b rows columns"]) -> tuple[Float[Array, "b C"], "ModalityNetwork"]:
+        """Log-odds with the batch's own means and variances, and the network with running ones that took from them."""
+        said, means, variances = self._through(images, None, None)
+        kept = jax.tree.map(
+            lambda old, new: (1 - _TAKEN) * old + _TAKEN * jax.lax.stop_gradient(new),
+            (self.mean, self.variance),
+            (means, variances),
+        )
+        return said, eqx.tree_at(lambda one: (one.mean, one.variance), self, kept)
+
+    def _through(self, images, mean, variance):
+        values, means, variances = images[..., None], [], []
+        for layer, kernel in enumerate((self.first, self.second)):
+            values = jax.lax.conv_general_dilated(
+                values, kernel, (1, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+            )
+            if mean is None:
+                middle = values.mean((0, 1, 2))
+                own = middle, (values**2).mean((0, 1, 2)) - middle**2
+            else:
+                own = mean[layer], variance[layer]
+            means.append(own[0])
+            variances.append(own[1])
+            factor = self.gain[layer] / jnp.sqrt(own[1] + _LITTLE)
+            values = values * factor + (self.shift[layer] - own[0] * factor)
+            values = _pooled(jnp.maximum(values, 0), _POOLS[layer], jnp)
+        return values.reshape(len(images), -1) @ self.dense + self.bias, tuple(means), tuple(variances)
+
+
+def _pooled(values, size: int, namespace):
+    """The greatest of every `size` × `size` (b, h, w, c); rows and columns that are left over are left out."""
+    height, width = (side // size * size for side in values.shape[1:3])
+    values = values[:, :height, :width]
+    taller = reduce(namespace.maximum, [values[:, row::size] for row in range(size)])
+    return reduce(namespace.maximum, [taller[:, :, column::size] for column in range(size)])
+
+
+class NetworkAnswers:
+    """A trained network asked in NumPy, where one window takes a few milliseconds, and no compiler is waited for."""
+
+    def __init__(self, network: ModalityNetwork):
+        whole = jax.tree.map(np.asarray, network)
+        # The normalisation is one factor and one offset a channel: they go into the kernels.
+        factors = [gain / np.sqrt(own + _LITTLE) for gain, own in zip(whole.gain, whole.variance, strict=True)]
+        self.kernels = [
+            np.ascontiguousarray((kernel * factor).transpose(2, 0, 1, 3).reshape(-1, kernel.shape[-1]))
+            for kernel, factor in zip((whole.first, whole.second), factors, strict=True)
+        ]
+        self.offsets = [
+            shift - factor * mean for shift, factor, mean in zip(whole.shift, factors, whole.mean, strict=True)
+        ]
+        self.dense, self.bias = whole.dense, whole.bias
+
+    def log_odds(self, images: Float[np.ndarray, "W rows columns"]) -> Float[np.ndarray, "W C"]:
+        """Log-odds (W, C) of the classes."""
+        parts = [self._some(images[first : first + _AT_ONCE]) for first in range(0, len(images), _AT_ONCE)]
+        return np.concatenate([np.zeros((0, len(self.bias)), np.float32), *parts]).astype(float)
+
+    def _some(self, images: np.ndarray) -> np.ndarray:
+        values = images[..., None]
+        for kernel, offset, size, pool in zip(self.kernels, self.offsets, _KERNELS, _POOLS, strict=True):
+            patches = sliding_window_view(values, (size, size), axis=(1, 2))
+            values = patches.reshape(*patches.shape[:3], -1) @ kernel
+            values += offset
+            values = _pooled(np.maximum(values, 0, out=values), pool, np)
+        return values.reshape(len(images), -1) @ self.dense + self.bias
+
+
+def plan_of(windows: int, *, batches: int, batch: int = 64) -> Plan:
+    """The paper's schedule for a training of so many windows, `batches` at most, but one time through the windows.
+
+    Noise is drawn anew in every batch, so that nothing is seen twice; `COPIES` times through the windows is what was
+    one epoch of copies.
+    """
+    least = min(batch, windows)
+    return Plan(
+        rate=2e-4,
+        batch=least,
+        epochs=max(1, round(batches / (windows // least))),
+        patience=20,
+        look_every=50,
+        decay=0.1,
+        decay_epochs=5 * COPIES,
+    )
+
+
+def train_network(
+    images: Float[np.ndarray, "N rows 41"],
+    right: Int[np.ndarray, " N"],
+    held: tuple[Float[np.ndarray, "n rows 41"], Int[np.ndarray, " n"]],
+    *,
+    classes: int,
+    key: Array,
+    plan: Plan,
+    noise: float = NOISE,
+    checkpoint: str | Path | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Trained:
+    """Train a network on images of the classes `right`, until its loss on images `held` out falls no more.
+
+    The same `key` gives the same bits. `plan`: as of `plan_of`; `noise`: the deviation of what is added to images;
+    `checkpoint` and `progress` as of `jeit.touch.training.fit`, whose errors are raised.
+    """
+    drawn, trained = jax.random.split(key)
+    network = ModalityNetwork.draw(drawn, images.shape[1], images.shape[2], classes)
+    moving = eqx.tree_at(
+        lambda one: (one.mean, one.variance), jax.tree.map(lambda _: True, network), ((False, False), (False, False))
+    )
+
+    def loss(network: ModalityNetwork, batch: Any, key: Array):
+        shown, label = batch
+        said, after = network.learn(shown + noise * jax.random.normal(key, shown.shape, jnp.float32))
+        return _cross_entropy(said, label).mean(), after
+
+    def held_out(network: ModalityNetwork, batch: Any):
+        return _cross_entropy(network.answer(batch[0]), batch[1])
+
+    data = (np.asarray(images, np.float32), np.asarray(right, np.int32))
+    validation = (np.asarray(held[0], np.float32), np.asarray(held[1], np.int32))
+    return fit(
+        network,
+        Objective(loss, held_out, moving),
+        data,
+        validation,
+        plan,
+        key=trained,
+        checkpoint=checkpoint,
+        progress=progress,
+    )
+
+
+def _cross_entropy(said: Float[Array, "b C"], label: Int[Array, " b"]) -> Float[Array, " b"]:
+    return -jnp.take_along_axis(jax.nn.log_softmax(said), label[:, None], axis=1)[:, 0]

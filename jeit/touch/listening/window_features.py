@@ -1,0 +1,136 @@
+"""Hand-made features of a window of sound: its loudness and rhythm, its colour, and how microphones share it."""
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.touch.listening.feature_images import BANDS, FRAMES, HOP, SoundImages
+
+# Decibels: below the loudest of a window nothing more is told; a peak stands out by so many from what is beside it.
+_RANGE, _PROMINENT = 60.0, 6.0
+# Bands of the mean spectrum, and of those that are followed in time; frames after the loudest in which it dies away.
+_COLOURS, _FEW, _AFTER = 16, 4, 8
+_MODULATIONS = 8
+
+
+def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
+    """Features (W, k) of windows, the same k for any number of microphones.
+
+    Of loudness in decibels (mean, greatest, spread, how long it stays near its greatest, its peaks and their intervals,
+    rise and decay, modulation up to 16 Hz); of the spectrogram (mean colour in 16 bands, middle, width, flatness, flux,
+    decay in 4 bands); of the microphones (share of the loudest, evenness, whether they rise and fall together, whether
+    what they share moves).
+    """
+    if not len(images):
+        return np.zeros((0, len(_time(np.zeros((1, FRAMES)))[0]) + _COLOURS + 2 * _FEW + 8 + 8))
+    loud = _level(images.intensity.sum(axis=1))
+    parts = [_time(loud), _colour(images.spectrum.astype(float), loud), _microphones(images.intensity.astype(float))]
+    return np.concatenate(parts, axis=1)
+
+
+def _level(power: np.ndarray) -> np.ndarray:
+    """Decibels (W, …), no less than 60 below the greatest of each window."""
+    level = 10 * np.log10(np.maximum(power, 1e-30))
+    return np.maximum(level, level.max(axis=tuple(range(1, level.ndim)), keepdims=True) - _RANGE)
+
+
+def _time(loud: Float[np.ndarray, "W 41"]) -> np.ndarray:
+    top = loud.max(axis=1)
+    below = top[:, None] - loud
+    at = loud.argmax(axis=1)
+    rows = np.arange(len(loud))
+    peaks = _peaks(loud)
+    count = peaks.sum(axis=1)
+    which = np.arange(FRAMES)
+    first = np.where(count > 0, np.argmax(peaks, axis=1), 0)
+    last = np.where(count > 0, FRAMES - 1 - np.argmax(peaks[:, ::-1], axis=1), 0)
+    interval = np.where(count > 1, (last - first) / np.maximum(count - 1, 1), FRAMES)
+    swing = np.abs(np.fft.rfft(loud - loud.mean(axis=1, keepdims=True), axis=1))[:, 1 : _MODULATIONS + 1]
+    step = np.diff(loud, axis=1)
+    after = loud[rows, np.minimum(at + _AFTER, FRAMES - 1)] - top
+    soon = loud[rows, np.minimum(at + _AFTER // 4, FRAMES - 1)] - top
+    before = loud[rows, np.maximum(at - _AFTER // 4, 0)] - top
+    return np.column_stack(
+        [
+            loud.mean(axis=1),
+            top,
+            loud.min(axis=1),
+            loud.std(axis=1),
+            *((below <= decibels).mean(axis=1) for decibels in (3, 6, 10, 20)),
+            count,
+            interval * HOP,
+            at * HOP,
+            (which * 10 ** (-below / 10)).sum(axis=1) / (10 ** (-below / 10)).sum(axis=1),
+            after,
+            soon,
+            before,
+            step.max(axis=1),
+            step.min(axis=1),
+            np.abs(step).mean(axis=1),
+            swing / FRAMES,
+            swing.argmax(axis=1),
+        ]
+    )
+
+
+def _peaks(loud: np.ndarray) -> np.ndarray:
+    """Which frames (W, 41) are peaks: the loudest of five, and 6 dB above the quietest of the ten before and after."""
+    padded = np.pad(loud, ((0, 0), (10, 10)), mode="edge")
+    near = np.lib.stride_tricks.sliding_window_view(padded, 21, axis=1)
+    top = near[..., 8:13].max(axis=-1)
+    low = np.maximum(near[..., :11].min(axis=-1), near[..., 10:].min(axis=-1))
+    # Of equal ones the first.
+    return (loud >= top) & (loud > np.pad(loud, ((0, 0), (1, 0)), mode="constant")[:, :-1]) & (loud - low >= _PROMINENT)
+
+
+def _colour(spectrum: Float[np.ndarray, "W 64 41"], loud: np.ndarray) -> np.ndarray:
+    rows = np.arange(len(spectrum))
+    power = spectrum.mean(axis=2) + 1e-30
+    share = power / power.sum(axis=1, keepdims=True)
+    band = np.arange(BANDS)
+    colours = _level(power.reshape(len(power), _COLOURS, -1).mean(axis=2))
+    colours = colours - colours.max(axis=1, keepdims=True)
+    middle = share @ band
+    width = np.sqrt(np.maximum(share @ band**2 - middle**2, 0))
+    flat = np.exp(np.log(power).mean(axis=1)) / power.mean(axis=1)
+    each = spectrum.sum(axis=1) + 1e-30
+    moving = np.einsum("wbt,b->wt", spectrum, band) / each
+    weight = each / each.sum(axis=1, keepdims=True)
+    mean = (moving * weight).sum(axis=1)
+    wanders = np.sqrt(np.maximum((moving**2 * weight).sum(axis=1) - mean**2, 0))
+    few = _level(spectrum.reshape(len(power), _FEW, -1, FRAMES).mean(axis=2))
+    at = loud.argmax(axis=1)
+    top, later = few[rows, :, at], few[rows, :, np.minimum(at + _AFTER, FRAMES - 1)]
+    flux = np.abs(np.diff(_level(spectrum.reshape(len(power), _COLOURS, -1, FRAMES).mean(axis=2)), axis=2))
+    steep = np.polyfit(np.log(np.arange(1, _COLOURS + 1)), colours.T, 1)[0]
+    numbers = [middle, width, flat, mean, wanders, flux.mean(axis=(1, 2)), flux.max(axis=2).mean(axis=1), steep]
+    return np.column_stack([colours, *numbers, later - top, few.std(axis=2)])
+
+
+def _microphones(intensity: Float[np.ndarray, "W M 41"]) -> np.ndarray:
+    mean = intensity.mean(axis=2) + 1e-30
+    share = mean / mean.sum(axis=1, keepdims=True)
+    ordered = np.sort(share, axis=1)[:, ::-1]
+    even = -(share * np.log(share)).sum(axis=1) / np.log(max(share.shape[1], 2))
+    level = _level(intensity)
+    own = level - level.mean(axis=2, keepdims=True)
+    # How much each microphone's history is like that of the loudest one.
+    loudest = own[np.arange(len(own)), share.argmax(axis=1)]
+    size = np.sqrt((own**2).sum(axis=2) * (loudest**2).sum(axis=1)[:, None]) + 1e-9
+    alike = np.einsum("wmt,wt->wm", own, loudest) / size
+    first, last = (intensity[..., part].mean(axis=2) + 1e-30 for part in (slice(FRAMES // 2), slice(FRAMES // 2, None)))
+    first, last = (np.sqrt(one / one.sum(axis=1, keepdims=True)) for one in (first, last))
+    moved = 1 - (first * last).sum(axis=1)
+    where = level.argmax(axis=1)
+    changes = (np.diff(where, axis=1) != 0).mean(axis=1)
+    return np.column_stack(
+        [
+            ordered[:, 0],
+            ordered[:, : max(1, share.shape[1] // 6)].sum(axis=1),
+            even,
+            alike.mean(axis=1),
+            np.sort(alike, axis=1)[:, share.shape[1] // 2],
+            moved,
+            changes,
+            level.mean(axis=2).std(axis=1),
+        ]
+    )

@@ -1,0 +1,234 @@
+"""`jeit listen` and `jeit listen fit`: clips in, a model out; a recording in, names and places out; every bad file."""
+
+import csv
+import json
+
+import jax
+import numpy as np
+import pytest
+from scipy.io import wavfile
+
+from jeit.acoustic import Calibration, Recording, calibrate_microphones, read_recording, write_recording
+from jeit.acoustic.signal.recording import Taps
+from jeit.cli import main
+from jeit.simulate import SoundingSkin, calibration_taps, microphone_grid, pat, quiet
+from jeit.touch.listening import Listener, read_clips
+
+RATE = 16_000
+
+
+def sounds(random: np.random.Generator, pitch: float, seconds: float = 0.3) -> np.ndarray:
+    times = np.arange(round(seconds * RATE)) / RATE
+    ring = np.sin(2 * np.pi * pitch * (1 + 0.03 * random.standard_normal()) * times) * np.exp(-times / 0.05)
+    return 0.3 * 10 ** (0.1 * random.standard_normal()) * ring + 1e-3 * random.standard_normal(len(times))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Clips of two classes, every format of WAV among them, with a broken one; and a model of them."""
+    folder, random = tmp_path_factory.mktemp("listen"), np.random.default_rng(0)
+    kinds = (np.int16, np.int32, np.uint8, np.float32, np.float64)
+    for name, pitch in (("low", 400.0), ("high", 3000.0)):
+        (folder / "clips" / name).mkdir(parents=True)
+        for number, kind in enumerate(kinds):
+            samples = sounds(random, pitch)
+            if kind == np.uint8:
+                samples = np.round(128 + 127 * samples)
+            elif np.issubdtype(kind, np.integer):
+                samples = np.round(np.iinfo(kind).max * samples)
+            wavfile.write(folder / "clips" / name / f"{number}.wav", RATE, samples.astype(kind))
+    (folder / "clips" / "low" / "notes.wav").write_text("text that is named as sound is", "utf-8")
+    wavfile.write(folder / "clips" / "low" / "nan.wav", RATE, np.full(9000, np.nan, np.float32))
+    wavfile.write(folder / "clips" / "low" / "slow.wav", 800, np.ones(9000, np.float32))
+    (folder / "clips" / "low" / ".DS_Store").write_text("hidden", "utf-8")
+    command = ["listen", "fit", str(folder / "clips"), "--output", str(folder / "model"), "--method", "trees"]
+    assert main(command) == 0
+    wavfile.write(folder / "one.wav", RATE, sounds(random, 400.0).astype(np.float32))
+    return folder
+
+
+def test_a_model_is_made_and_its_report_says_how_good(folder):
+    assert sorted(one.name for one in (folder / "model").iterdir()) == ["learning.png", "listener.jeit", "report.json"]
+    report = json.loads((folder / "model" / "report.json").read_text("utf-8"))
+    assert report["classes"] == ["high", "low"]
+    assert report["held_out"]["clips"] == 10
+    assert report["held_out"]["right"] > 0.8
+    assert report["held_out"]["tried"] == [{"method": "trees", "right": report["held_out"]["right"]}]
+    assert report["notes"][0].startswith("3 files not read: nan.wav: none of its samples is a number; notes.wav:")
+    assert "slow.wav: 800 samples a second are too few" in report["notes"][0]
+    assert (folder / "model" / "learning.png").stat().st_size > 10_000
+
+
+def test_a_recording_is_named(folder, tmp_path, capsys):
+    """Options may come before the recording, and the model may be its file."""
+    model = folder / "model" / "listener.jeit"
+    assert main(["listen", "--model", str(model), "--output", str(tmp_path), str(folder / "one.wav")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "as a whole low" in said
+    with open(tmp_path / "events.csv", encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["time_s", "heard", "probability", "p_high", "p_low", "microphone"]
+    assert float(rows[0]["p_high"]) + float(rows[0]["p_low"]) == pytest.approx(1, abs=1e-5)
+    report = json.loads((tmp_path / "report.json").read_text("utf-8"))
+    assert report["whole"]["heard"] == "low"
+    assert len(rows) == report["windows"]
+    assert (tmp_path / "timeline.png").stat().st_size > 5_000
+    heard = Listener.read(model).hear(read_recording(folder / "one.wav"))
+    assert [row["heard"] for row in rows] == heard.told.tolist()
+
+
+def test_folders_within_a_class_are_held_out_together(folder, tmp_path):
+    for name in ("low", "high"):
+        for number, person in enumerate(("ann", "ann", "bob", "bob")):
+            (tmp_path / name / person).mkdir(parents=True, exist_ok=True)
+            read = (folder / "clips" / name / f"{number}.wav").read_bytes()
+            (tmp_path / name / person / f"{number}.wav").write_bytes(read)
+    clips = read_clips(tmp_path)
+    assert sorted(set(clips.groups)) == ["ann", "bob"]
+    assert (clips.groups == "ann").sum() == 4
+
+
+@pytest.mark.slow
+def test_places_come_with_a_calibration(tmp_path):
+    """Pats on a simulated skin: named, and found to a centimetre."""
+    skin = SoundingSkin(jax.random.key(0), microphone_grid(3))
+    outline = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
+    taps = calibration_taps(skin, jax.random.key(1), microphone_grid(7))
+    fit = calibrate_microphones(
+        Taps(np.asarray(skin.microphones), outline, taps.positions, samples=taps.samples, rate=taps.rate)
+    )
+    fit.calibration.save(tmp_path / "skin.json")
+    assert isinstance(Calibration.load(tmp_path / "skin.json"), Calibration)
+    for number in range(3):
+        for name, made in (
+            ("pat", pat(skin, jax.random.key(10 + number), (0.01 * number, 0.02), duration=1.5)),
+            ("none", quiet(skin, jax.random.key(20 + number), duration=1.5)),
+        ):
+            (tmp_path / "clips" / name).mkdir(parents=True, exist_ok=True)
+            write_recording(tmp_path / "clips" / name / f"{number}.npz", Recording(made.samples, made.rate))
+    model = str(tmp_path / "model")
+    assert main(["listen", "fit", str(tmp_path / "clips"), "-o", model, "--method", "linear", "-q"]) == 0
+    heard = pat(skin, jax.random.key(30), (-0.03, 0.04), duration=1.5)
+    write_recording(tmp_path / "heard.npz", Recording(heard.samples, heard.rate))
+    command = ["listen", str(tmp_path / "heard.npz"), "-m", model, "-o", str(tmp_path / "out"), "-q"]
+    assert main([*command, "-c", str(tmp_path / "skin.json")]) == 0
+    with open(tmp_path / "out" / "events.csv", encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["x_m"]]
+    assert len(rows) >= 2
+    assert {row["heard"] for row in rows} == {"pat"}
+    found = np.array([[float(row["x_m"]), float(row["y_m"])] for row in rows])
+    assert np.abs(found - [-0.03, 0.04]).max() < 0.01
+
+
+def test_help_says_what_is_typed(capsys):
+    for command in (["listen"], ["listen", "--help"]):
+        assert main(command) == 0
+        said = capsys.readouterr().out
+        assert "Usage: jeit listen [OPTIONS]" in said
+        assert "jeit listen fit" in " ".join(said.split())
+    assert main(["listen", "fit", "--help"]) == 0
+    assert "Usage: jeit listen fit [OPTIONS]" in capsys.readouterr().out
+
+
+def _bad(folder) -> None:
+    """Recordings and folders that are none, or nearly."""
+    loud = sounds(np.random.default_rng(1), 400.0)
+    wavfile.write(folder / "empty.wav", RATE, np.zeros(0, np.int16))
+    wavfile.write(folder / "stereo_sample.wav", RATE, np.zeros((1, 2), np.int16))
+    wavfile.write(folder / "eight.wav", 8000, loud.astype(np.float32))
+    (folder / "text.wav").write_text("text", "utf-8")
+    (folder / "cut.wav").write_bytes((folder / "one.wav").read_bytes()[:2000])
+    (folder / "sound.flac").write_bytes(b"fLaC and no more")
+    np.savez(folder / "heard.npz", intensity=np.ones((3, 4)), times=0.05 * np.arange(3))
+    (folder / "lonely" / "low").mkdir(parents=True)
+    (folder / "hollow" / "low").mkdir(parents=True)
+    (folder / "hollow" / "high").mkdir()
+    (folder / "hollow" / "low" / "1.wav").write_bytes((folder / "one.wav").read_bytes())
+    (folder / "files").mkdir()
+    (folder / "files" / "1.wav").write_bytes((folder / "one.wav").read_bytes())
+
+
+HEAR = ["listen", "RECORDING", "-m", "model", "-o", "out"]
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        *(
+            (["listen", name, "-m", "model", "-o", "out"], said)
+            for name, said in (
+                ("empty.wav", "empty"),
+                ("stereo_sample.wav", "looks transposed"),
+                ("eight.wav", "has 8000 samples a second"),
+                ("text.wav", "neither an NPZ nor a WAV"),
+                ("cut.wav", "cut off"),
+                ("sound.flac", "soundfile"),
+                ("heard.npz", "holds intensities"),
+                ("missing.wav", "missing.wav"),
+            )
+        ),
+        (["listen", "one.wav", "-m", "clips", "-o", "out"], "jeit listen fit"),
+        (["listen", "one.wav", "-m", "one.wav", "-o", "out"], "another kind"),
+        (["listen", "one.wav", "-m", "model", "-o", "one.wav"], "is a file"),
+        (["listen", "one.wav", "-m", "model", "-o", "out", "-c", "one.wav"], "one.wav"),
+        (["listen", "fit", "lonely", "-o", "new"], "only 'low'"),
+        (["listen", "fit", "files", "-o", "new"], "it has none"),
+        (["listen", "fit", "hollow", "-o", "new"], "it is empty"),
+        (["listen", "fit", "missing", "-o", "new"], "is no folder"),
+        (["listen", "fit", "clips", "-o", "new", "--method", "magic"], "--method"),
+        (["listen", "fit", "clips", "-o", "new", "--batches", "0"], "--batches"),
+    ],
+)
+def test_bad_input_is_explained(command, said, folder, monkeypatch, capsys):
+    """Exit status 1, one line on standard error, and nothing like a traceback."""
+    monkeypatch.chdir(folder)
+    if not (folder / "text.wav").exists():
+        _bad(folder)
+    assert main(command) == 1
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+    assert "should not have happened" not in told
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (["listen", "one.wav"], "Missing option '--model' / '-m'. See 'jeit listen --help'"),
+        (["listen", "fit"], "Missing argument 'FOLDER-BY-CLASS'. See 'jeit listen fit --help'"),
+        (["listen", "one.wav", "two.wav", "-m", "model", "-o", "out"], "two.wav"),
+        (["listen", "one.wav", "--modle", "model"], "--modle"),
+    ],
+)
+def test_wrong_calls_are_explained(command, said, capsys):
+    assert main(command) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_odd_recordings_are_heard(folder, tmp_path, capsys):
+    """One sample, silence, NaN, two channels, another rate: named or quiet, and never a traceback."""
+    loud = sounds(np.random.default_rng(2), 400.0, seconds=1.0)
+    holed = loud.copy()
+    holed[100:4000] = np.nan
+    odd = {
+        "one": loud[:1],
+        "silent": np.zeros(RATE),
+        "holed": holed,
+        "nothing": np.full(RATE, np.nan),
+        "stereo": np.stack([loud, loud], axis=1),
+    }
+    for name, samples in odd.items():
+        wavfile.write(tmp_path / f"{name}.wav", RATE, samples.astype(np.float32))
+        command = ["listen", str(tmp_path / f"{name}.wav"), "-m", str(folder / "model"), "-o", str(tmp_path / name)]
+        assert main(command) == 0, name
+        report = json.loads((tmp_path / name / "report.json").read_text("utf-8"))
+        assert report["windows"] >= 1
+        if name in ("silent", "nothing"):
+            assert report["whole"]["heard"] is None
+            assert report["windows_of_each"] == {"quiet": report["windows"]}
+        if name in ("holed", "stereo"):
+            assert report["whole"]["heard"] == "low"
+            assert report["notes"]
+    capsys.readouterr()
+    wavfile.write(tmp_path / "fast.wav", 48_000, np.repeat(loud, 3).astype(np.float32))
+    assert main(["listen", str(tmp_path / "fast.wav"), "-m", str(folder / "model"), "-o", str(tmp_path / "fast")]) == 0

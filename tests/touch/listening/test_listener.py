@@ -1,0 +1,195 @@
+"""Listeners: what is learnt from clips, kept in a file, and told of recordings; who is held out; what is refused."""
+
+import jax
+import numpy as np
+import pytest
+from made_clips import MATERIALS, struck
+
+from jeit.acoustic import Recording
+from jeit.touch.listening import LabelledClips, Listener
+from jeit.touch.listening.folds import held_out_folds
+from jeit.touch.listening.learners import LEARNERS, stopping_rows
+
+KEY = jax.random.key(0)
+QUICK = tuple(method for method in LEARNERS if method != "network")
+
+
+def clips(each: int, seed: int = 0, **options) -> LabelledClips:
+    random = np.random.default_rng(seed)
+    labels = [name for name in MATERIALS for _ in range(each)]
+    return LabelledClips.of([struck(random, name, **options) for name in labels], labels)
+
+
+@pytest.fixture(scope="module")
+def learnt() -> dict[str, Listener]:
+    """A listener by each quick method, of five clips a class."""
+    few = clips(5)
+    return {method: Listener.fit(few, method=method) for method in QUICK}
+
+
+@pytest.mark.parametrize("method", QUICK)
+def test_materials_are_told_and_kept(method, learnt, tmp_path):
+    """Of clips of other seeds most are right; a file says the same; its probabilities add up."""
+    listener = learnt[method]
+    assert listener.standing is not None
+    assert (listener.standing.held_out == listener.standing.right).mean() > 0.7
+    listener.write(tmp_path / "listener.jeit")
+    again = Listener.read(tmp_path)
+    others, right = clips(6, seed=1), 0
+    for number in range(len(others)):
+        heard = listener.hear(others.clip(number))
+        same = again.hear(others.clip(number))
+        np.testing.assert_allclose(same.probabilities, heard.probabilities, rtol=1e-4, atol=1e-7)
+        np.testing.assert_allclose(heard.probabilities.sum(axis=1), 1)
+        right += heard.whole[0] == others.labels[number]
+    assert right >= 0.75 * len(others)
+
+
+@pytest.mark.slow
+def test_the_best_of_clips_held_out_is_taken(learnt, tmp_path):
+    """All three are tried; killed before the network's last fold, the same call goes on to the same bits."""
+    few = clips(5)
+
+    class Killed(Exception):
+        pass
+
+    def kill(said: str) -> None:
+        if said.startswith("network, fold 3"):
+            raise Killed
+
+    with pytest.raises(Killed):
+        Listener.fit(few, key=KEY, batches=30, folder=tmp_path, progress=kill)
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["network-0.training", "network-1.training"]
+    on = Listener.fit(few, key=KEY, batches=30, folder=tmp_path)
+    through = Listener.fit(few, key=KEY, batches=30)
+    assert on.standing is not None
+    assert through.standing is not None
+    tried = dict(on.standing.tried)
+    assert tried == dict(through.standing.tried)
+    assert set(tried) == set(LEARNERS)
+    assert tried[on.method] == min(tried.values())
+    for method, listener in learnt.items():
+        assert listener.standing is not None
+        assert listener.standing.tried == [(method, tried[method])]
+    heard, same = (one.hear(few.clip(0)) for one in (on, through))
+    np.testing.assert_array_equal(heard.probabilities, same.probabilities)
+
+
+def test_windows_of_silence_are_quiet(learnt):
+    """A tap a second: named where it is heard, and silence between."""
+    random = np.random.default_rng(3)
+    tap = struck(random, "metal")
+    long = np.zeros((1, 4 * 44_100))
+    for second in (0, 2):
+        long[:, second * 44_100 + 22_050 :][:, : tap.samples.shape[1]] += tap.samples
+    heard = learnt["linear"].hear(Recording(long, 44_100.0, name="long"))
+    assert heard.whole[0] == "metal"
+    # At its edges a window holds little of a tap, and may take that for another.
+    assert np.mean(heard.told[heard.loud] == "metal") > 0.6
+    assert heard.quiet.sum() > 10
+    assert [event.name for event in heard.events].count("") >= 2
+    nothing = learnt["linear"].hear(Recording(np.zeros((1, 44_100)), 44_100.0))
+    assert set(nothing.told) == {""}
+    assert nothing.whole == ("", 0.0)
+    faint = learnt["linear"].hear(Recording(1e-6 * tap.samples, 44_100.0))
+    assert "quieter than anything" in faint.notes[0]
+    assert faint.whole[0] == "metal"
+
+
+def test_what_does_not_fit_is_refused_with_the_difference(learnt):
+    tap = struck(np.random.default_rng(4), "glass")
+    mono = learnt["linear"]
+    both = mono.hear(Recording(tap.samples.repeat(2, axis=0), tap.rate))
+    assert "2 channels were mixed" in both.notes[0]
+    np.testing.assert_allclose(both.probabilities, mono.hear(tap).probabilities)
+    with pytest.raises(ValueError, match=r"has 8000 samples a second, sound up to 4000 Hz, and.* up to 22050 Hz"):
+        mono.hear(Recording(tap.samples[:, :8000], 8000.0))
+    stereo = LabelledClips.of(
+        [Recording(one.samples.repeat(2, axis=0), one.rate) for one in clips(3).recordings], clips(3).labels
+    )
+    two = Listener.fit(stereo, method="linear")
+    assert two.channels == 2
+    with pytest.raises(ValueError, match="has 1 microphone, and the listener was learnt from clips of 2"):
+        two.hear(tap)
+    holes = tap.samples.copy()
+    holes[:, 10:20] = np.nan
+    assert "10 samples not finite" in mono.hear(Recording(holes, tap.rate)).notes[0]
+
+
+def test_few_clips_are_enough_to_learn_and_what_is_not_known_is_said():
+    one = clips(1)
+    listener = Listener.fit(one, method="linear")
+    assert listener.standing is None
+    assert any("nobody knows" in note for note in listener.notes)
+    several = LabelledClips.of(
+        [*clips(3).recordings, struck(np.random.default_rng(9), "wood")], [*clips(3).labels, "cork"]
+    )
+    listener = Listener.fit(several, method="linear")
+    assert any(note.startswith("cork: clips of one group only") for note in listener.notes)
+    assert listener.standing is not None
+    assert "cork" not in listener.standing.right
+
+
+def test_no_group_is_on_both_sides_and_every_class_is_learnt_from():
+    random = np.random.default_rng(0)
+    for _ in range(50):
+        groups = random.integers(0, random.integers(2, 12), 40)
+        right = random.integers(0, 4, 40)
+        fold = held_out_folds(right, groups, 3)
+        for number in range(int(fold.max()) + 1):
+            out = fold == number
+            assert not set(groups[out]) & set(groups[~out])
+            assert set(right[out]) <= set(right[~out])
+        held = stopping_rows(right, groups)
+        assert not set(groups[held]) & set(groups[~held])
+        assert set(right[~held]) == set(right)
+
+
+def test_rates_and_channels_that_differ_are_told():
+    random = np.random.default_rng(5)
+    mixed = [struck(random, "wood"), struck(random, "metal", rate=16_000.0)]
+    mixed += [Recording(struck(random, name).samples.repeat(2, axis=0), 44_100.0) for name in ("wood", "metal")]
+    told = LabelledClips.of(mixed, ["wood", "metal", "wood", "metal"])
+    assert told.highest == 8000
+    assert told.channels == 1
+    assert "1 or 2 channels" in told.notes[0]
+    assert "1 of 4 clips have fewer than 44100" in told.notes[1]
+    listener = Listener.fit(told, method="linear")
+    assert listener.hear(mixed[1]).names == ("metal", "wood")
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: LabelledClips.of([], []), "there are no clips"),
+        (lambda: LabelledClips.of([struck(np.random.default_rng(0), "wood")], ["wood"]), "one class only, 'wood'"),
+        (lambda: LabelledClips.of([struck(np.random.default_rng(0), "wood")], ["wood", "metal"]), "one name for each"),
+        (lambda: LabelledClips.of([np.zeros(9), np.zeros(9)], ["a", "b"]), r"recordings\[0\] must be a Recording"),
+        (lambda: Listener.fit([1, 2]), "clips must be"),
+        (lambda: Listener.fit(clips(2), method="magic"), "method"),
+        (lambda: Listener.fit(clips(2), key=3), "key"),
+    ],
+)
+def test_bad_input_is_explained(call, said):
+    with pytest.raises(ValueError, match=said):
+        call()
+
+
+def test_files_of_another_kind_are_refused(learnt, tmp_path):
+    with pytest.raises(FileNotFoundError, match="jeit listen fit"):
+        Listener.read(tmp_path)
+    path = tmp_path / "listener.jeit"
+    path.write_text("no listener", "utf-8")
+    with pytest.raises(ValueError, match="another kind"):
+        Listener.read(path)
+    learnt["trees"].write(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-20])
+    with pytest.raises(ValueError, match=r"cut short|fewer than|EOF"):
+        Listener.read(path)
+    path.write_bytes(whole.replace(b'"method": "trees"', b'"method": "magic"'))
+    with pytest.raises(ValueError, match="magic"):
+        Listener.read(path)
+    path.write_bytes(whole.replace(b'"depth": ', b'"depth": -'))
+    with pytest.raises(ValueError, match="lead nowhere"):
+        Listener.read(path)
