@@ -93,6 +93,8 @@ def _times(given: np.ndarray, name: str, number: int) -> Float[np.ndarray, " F"]
     seconds = given.astype(float)
     if not np.isfinite(seconds).all():
         raise ValueError(f"{name}: some are not finite.")
+    if number > 1 and seconds[0] == seconds[-1] and not np.diff(seconds).any():
+        raise ValueError(f"{name} are all {seconds[0]:g}: give when each frame came.")
     falls = np.flatnonzero(np.diff(seconds) < 0)
     if falls.size:
         raise ValueError(f"{name} fall after frame {falls[0]}, {seconds[falls[0]]:g} s: sort frames by time.")

@@ -45,13 +45,22 @@ class GestureSet:
         if self.gesture.ndim != 1 or self.voltages.ndim != 2:
             raise ValueError("gesture must be (n,) and voltages (F, M), one row for each frame.")
         number, (frames, channels) = len(self.gesture), self.voltages.shape
-        shapes = (number,), (number + 1,), (frames,), (channels,)
-        if shapes != (self.person.shape, self.start.shape, self.seconds.shape, self.reference.shape) or (
-            self.untouched.shape[1:] != (channels,) or self.start[0] or self.start[-1] != frames
-        ):
-            raise ValueError("the arrays do not belong together: one gesture, person and start for each recording.")
+        wanted = {"person": (number,), "start": (number + 1,), "seconds": (frames,), "reference": (channels,)}
+        for name, shape in wanted.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(
+                    f"{name} has shape {getattr(self, name).shape}; with {number} gestures and voltages ({frames}, "
+                    f"{channels}) it is {shape}."
+                )
+        if self.untouched.shape[1:] != (channels,):
+            raise ValueError(f"untouched has shape {self.untouched.shape}; give (u, {channels}), as the voltages have.")
         if (np.diff(self.start) < 0).any():
             raise ValueError("start falls: give where each recording begins among the frames, in their order.")
+        if self.start[0] or self.start[-1] != frames:
+            raise ValueError(
+                f"start goes from {self.start[0]} to {self.start[-1]}; give 0 first, and last the number of frames, "
+                f"{frames}."
+            )
         if not np.isfinite(self.seconds).all():
             raise ValueError("seconds must be finite.")
 
@@ -77,8 +86,11 @@ class GestureSet:
     def read(cls, path: str | Path) -> "GestureSet":
         """Undo `write`; without `person`, all are of one. Raises `OSError` where there is no file, `ValueError` for one
         of another kind; nothing in it is executed."""
-        arrays = npz_arrays(Path(path), *_ARRAYS, otherwise="not a set of gestures")
-        if "gesture" in arrays:
-            arrays.setdefault("person", np.zeros(arrays["gesture"].shape, int))
-        need(arrays, *_ARRAYS)
-        return cls(**{name: arrays[name] for name in _ARRAYS})
+        try:
+            arrays = npz_arrays(Path(path), *_ARRAYS, otherwise="not a set of gestures")
+            if "gesture" in arrays:
+                arrays.setdefault("person", np.zeros(arrays["gesture"].shape, int))
+            need(arrays, *_ARRAYS)
+            return cls(**{name: arrays[name] for name in _ARRAYS})
+        except ValueError as error:
+            raise ValueError(f"'{path}': {error}") from None

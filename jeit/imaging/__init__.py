@@ -11,7 +11,7 @@ from jeit.imaging.compared_rules import ComparedRules, RuleOutcome, compare_on_d
 from jeit.imaging.difference import ImagedDifference, image_difference
 from jeit.imaging.frequencies import ImagedFrequencies, frequency_weight, image_frequencies
 from jeit.imaging.gesture_learning import LearntGestures, learn_gestures
-from jeit.imaging.health_learning import learn_health
+from jeit.imaging.health_learning import doubts_of, learn_health
 from jeit.imaging.method import METHODS
 from jeit.imaging.preparation import (
     PreparedDifference,
@@ -44,6 +44,7 @@ __all__ = [
     "WatchedFrame",
     "calibrated_model",
     "compare_on_data",
+    "doubts_of",
     "frames_of",
     "frequency_weight",
     "image_difference",

@@ -7,11 +7,12 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_kind, counted
+from jeit.arguments import check_kind, check_name, counted
 from jeit.data import GestureSet
 from jeit.data.description import Description
 from jeit.imaging.touch_images import TouchImages
 from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, find_touches
+from jeit.touch.gestures.gesture_model import METHODS, check_labels
 from jeit.touch.gestures.reading import Reading
 
 # Recordings from which it is told whether touches raise conductivity or lower it, at most.
@@ -42,6 +43,8 @@ def learn_gestures(
     """
     check_kind("recordings", recordings, GestureSet, "a GestureSet, as of GestureSet.read(path)")
     tell = progress or (lambda said: None)
+    check_name("method", method, METHODS)
+    check_labels(recordings.gesture)
     images = TouchImages.prepare(description, recordings.reference[None], progress=tell)
     still = images.changes(recordings.untouched)
     level, sign = _level_and_sign(images, still, recordings)
@@ -69,7 +72,7 @@ def learn_gestures(
         people=recordings.person[kept],
         method=method,
         form=form,
-        reading=Reading(level.level, sign, rate, images.num_channels, protocol.name),
+        reading=Reading(level.level, images.background, sign, rate, images.num_channels, protocol.name),
         notes=(f"{counted(len(untold), 'recording')} without a touch left out.",) if untold else (),
         progress=tell,
     )

@@ -11,6 +11,10 @@ from jeit.data.description import Description
 from jeit.imaging.touch_images import TouchImages
 from jeit.touch.health import SkinHealth
 
+# Of a frame's channels, how many have a reading at least; healthy frames of which little is known of drift; and between
+# recordings, how many times larger readings are of another unit.
+_READ, _FEW, _ANOTHER = 0.5, 250, 20.0
+
 
 def learn_health(
     healthy: FrameRecording,
@@ -50,3 +54,39 @@ def seconds_of(recording: FrameRecording, rate: float | None) -> Float[np.ndarra
     if recording.seconds is None:
         return None if rate is None else np.arange(len(recording.frames)) / rate
     return recording.seconds
+
+
+def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndarray, "F M"]) -> list[str]:
+    """What speaks against what a `health`, learnt from `healthy`, tells of frames (F, M): a sentence each.
+
+    Raises `ValueError` for frames of which none has enough readings.
+    """
+    known = health.healthy
+    there = np.isfinite(frames)
+    if not (there[:, known.used].mean(axis=1) >= _READ).any():
+        raise ValueError("frames: none of them has a reading in half of the healthy recording's channels.")
+    told = []
+    window = known.window * known.stride
+    if len(frames) < 2 * window:
+        told.append(
+            f"{len(frames)} frames are fewer than two windows of {window}: a change that lasts cannot be told from a "
+            "touch in them."
+        )
+    if len(healthy.frames) < _FEW:
+        told.append(
+            f"the healthy recording has {len(healthy.frames)} frames; of fewer than {_FEW} little is known of drift: "
+            "what is told may be false, and what is not may be there."
+        )
+    silent = np.flatnonzero(known.used & ~there.any(axis=0))
+    if silent.size:
+        told.append(f"without any reading: channels {', '.join(map(str, silent[:12]))}, counted from 0.")
+    first = np.where(there.any(axis=0), np.take_along_axis(frames, there.argmax(axis=0)[None], axis=0)[0], np.nan)
+    constant = np.flatnonzero(known.used & there.any(axis=0) & (~there | (frames == first)).all(axis=0))
+    if constant.size and len(frames) > 2:
+        told.append(f"constant throughout: channels {', '.join(map(str, constant[:12]))}, counted from 0.")
+    off = np.nanmedian(np.where(there, frames, np.nan)[:, known.used & there.any(axis=0)], axis=0)
+    own = known.reference[known.used & there.any(axis=0)]
+    ratio = float(np.median(np.abs(off)) / max(np.median(np.abs(own)), 1e-300))
+    if not 1 / _ANOTHER < ratio < _ANOTHER:
+        told.append(f"frames are {ratio:.3g} times the healthy ones: are both in the same unit?")
+    return told

@@ -108,8 +108,10 @@ def untouched_frames(
     first = recording.frames[seconds < seconds[0] + span]
     read = first[np.isfinite(first).any(axis=1)]
     if len(read) < _FEWEST:
+        step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0
+        hint = f" Frames are {step:.3g} s apart: are these milliseconds?" if step > span else ""
         raise ValueError(
             f"untouched: the first {span:g} s of '{recording.name}' have {counted(len(read), 'frame')} with a reading; "
-            f"{_FEWEST} are needed of the untouched skin. Give a longer time, or a reference."
+            f"{_FEWEST} are needed of the untouched skin. Give a longer time, or a reference.{hint}"
         )
     return read

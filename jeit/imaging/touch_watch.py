@@ -23,6 +23,9 @@ from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, TouchStre
 _GAP, _FRAMES_APART, _SETTLED, _FOLLOWED = 0.1, 2.5, 0.5, 2.0
 # Of the untouched frames at first, the share that may exceed the level that was learnt.
 _MOST_ABOVE = 0.1
+# Where the opposite of a touch is the greatest change, so many times the level, and for so many seconds, the skin is
+# more at rest than it was when its rest was read.
+_OPPOSITE, _LIFTED = 3.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,8 @@ class NamedTouch:
 class WatchedFrame:
     """What became of a frame at a `second`: its `image`, None of what comes after the last frame; the greatest change
     `peak`, S, NaN where it was refused; whether the skin is `touched`; the touch that was `named` with it, or None,
-    which may go on yet; those that have `ended` for good; and `latency`, seconds from the frame to all that."""
+    which may go on yet; those that have `ended` for good; `latency`, seconds from the frame to all that; and a `note`,
+    where there is something to be told."""
 
     second: float
     image: FrameImage | None
@@ -59,6 +63,7 @@ class WatchedFrame:
     named: NamedTouch | None
     ended: tuple[NamedTouch, ...]
     latency: float
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -98,7 +103,7 @@ class TouchWatch:
         if model.reading is None:
             raise ValueError("model does not say how its skin was read; learn it with learn_gestures.")
         protocol = images.calibration.model.protocol
-        model.reading.check_same_skin(protocol.num_measurements, protocol.name)
+        model.reading.check_same_skin(protocol.num_measurements, protocol.name, images.background)
         notes = []
         level = TouchLevel(images.mesh, model.reading.level)
         peaks = np.nanmax(model.reading.sign * images.changes(untouched), axis=1)
@@ -140,6 +145,7 @@ class _Session:
         self.came, self.second, self.last_seen = 0.0, -np.inf, -np.inf
         self.last_touched, self.number = -np.inf, 0
         self.named: NamedTouch | None = None
+        self.opposite_since: float | None = None
 
     def follow(self, frames: Iterable) -> Iterator[WatchedFrame]:
         """As `TouchWatch.follow`."""
@@ -178,15 +184,33 @@ class _Session:
         elif self.named is None and self.touches.touches:
             (over,) = self.touches.touches
             named = self.named = self._name(over)
-        if going and second - self.touches.open[0].seconds[0] >= self.watch.patience:
-            ended = (*ended, *(replace(self._ended(one), held=True) for one in self.touches.touches))
-            self.touches = replace(self.touches, open=(), held=0, lost=(0, 0))
-            self._follow_rest(image, 1.0)
+        note = ""
+        if self._lifted(image, change):
+            note = f"at {second:.2f} s the skin is more at rest than when its rest was read: was it touched? Read anew."
+            ended = (*ended, *self._rest_here(image))
+        elif going and second - self.touches.open[0].seconds[0] >= self.watch.patience:
+            ended = (*ended, *(replace(one, held=True) for one in self._rest_here(image)))
         elif second - self.last_touched >= _SETTLED and np.isfinite(self.last_seen):
             self._follow_rest(image, 1 - np.exp(-(second - self.last_seen) / _FOLLOWED))
         self.last_seen = second
         peak = float(change.max())
-        return WatchedFrame(second, image, peak, touched, named, ended, time.perf_counter() - self.came)
+        return WatchedFrame(second, image, peak, touched, named, ended, time.perf_counter() - self.came, note)
+
+    def _lifted(self, image: FrameImage, change: np.ndarray) -> bool:
+        """Whether what touched the skin when its rest was read has gone for good."""
+        if not image.imaged or -change.min() <= max(change.max(), _OPPOSITE * self.watch.level.level):
+            self.opposite_since = None
+        elif self.opposite_since is None:
+            self.opposite_since = self.second
+        return self.opposite_since is not None and self.second - self.opposite_since >= _LIFTED
+
+    def _rest_here(self, image: FrameImage) -> tuple[NamedTouch, ...]:
+        """Take the skin as it is now for untouched; the touch that this ends."""
+        ended = tuple(self._ended(one) for one in self.touches.touches)
+        self.touches = replace(self.touches, open=(), held=0, lost=(0, 0))
+        self.opposite_since = None
+        self._follow_rest(image, 1.0)
+        return ended
 
     def _follow_rest(self, image: FrameImage, share: float) -> None:
         """Take a `share` of what the last frame is off by for drift."""

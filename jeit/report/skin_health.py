@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +29,10 @@ def write_health(
     *,
     name: str = "recording",
     timed: bool = True,
+    notes: Sequence[str] = (),
 ) -> None:
     """Write `events.csv`, `report.json` and the picture `health.png` of what `watch` told of frames (F, M) at `times`
-    (F,) into `folder`; `timed`: whether these are seconds, or numbers of frames.
+    (F,) into `folder`; `timed`: whether these are seconds, or numbers of frames; `notes`, what speaks against it.
 
     A path is written as places x y in metres, parted by semicolons; electrodes are numbered from 1. Raises `ValueError`
     for what cannot be a folder.
@@ -40,7 +42,9 @@ def write_health(
         table = csv.writer(file)
         table.writerow(_EVENTS)
         table.writerows(_row(one) for one in health.events)
-    text = json.dumps(report_health(health, name, timed), indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(
+        report_health(health, name, timed) | {"notes": list(notes)}, indent=2, ensure_ascii=False, allow_nan=False
+    )
     (folder / "report.json").write_text(text + "\n", "utf-8")
     draw_health(health, times, frames, timed).savefig(folder / "health.png", dpi=130)
 

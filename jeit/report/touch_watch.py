@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jeit.arguments import counted
 from jeit.imaging import NamedTouch, TouchWatch, WatchedFrame
 from jeit.report.describe import plain, version_of
 from jeit.report.folder import results_folder
@@ -27,7 +28,7 @@ _EVENTS = (
 class WrittenWatch:
     """What `write_watch` has written: `touches`; of every frame its second and greatest change, `seconds` and `peaks`
     (F,); `latency` (K,), seconds from a frame to what was told of it, of those that named a touch; `counts` of frames
-    by status, and the `first_reason` of one that was refused, empty if there is none."""
+    by status, and the `first_reason` of one that was refused, empty if there is none; `notes`, what frames told."""
 
     touches: tuple[NamedTouch, ...]
     seconds: Float[np.ndarray, " F"]
@@ -35,6 +36,7 @@ class WrittenWatch:
     latency: Float[np.ndarray, " K"]
     counts: dict[str, int]
     first_reason: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def write_watch(
@@ -46,7 +48,7 @@ def write_watch(
     progress: Callable[[WatchedFrame], None] | None = None,
 ) -> WrittenWatch:
     """Write `events.csv`, a line for every touch as it ends, `paths.csv`, where it was in each of its frames, and at
-    the end `report.json` and the picture `timeline.png` into `folder`.
+    the end `report.json` and the picture `timeline.png` into `folder`. A touch unlike any learnt from has no gesture.
 
     `watched`: what `watch.follow(frames)` gives. Places are in metres, changes in S; `named_s` is the second of the
     stream at which a touch was named, `latency_ms` how long after that frame. `progress` is called with every frame.
@@ -56,7 +58,7 @@ def write_watch(
     for earlier in WATCH_FILES[2:]:
         (folder / earlier).unlink(missing_ok=True)  # would not go with these touches
     touches: list[NamedTouch] = []
-    seconds, peaks, latency, counts, reason = [], [], [], {}, ""
+    seconds, peaks, latency, counts, reason, notes = [], [], [], {}, "", []
     with (
         open(folder / "events.csv", "w", newline="", encoding="utf-8") as events,
         open(folder / "paths.csv", "w", newline="", encoding="utf-8") as paths,
@@ -78,11 +80,20 @@ def write_watch(
                 counts[str(one.image.status)] = counts.get(str(one.image.status), 0) + 1
                 reason = reason or ("" if one.image.imaged else one.image.reason)
             latency += [one.latency] if one.named is not None else []
+            notes += [one.note] if one.note else []
             if progress is not None:
                 progress(one)
     if not seconds:
         raise ValueError(f"'{name}': there was no frame in it.")
-    written = WrittenWatch(tuple(touches), np.array(seconds), np.array(peaks), np.array(latency), counts, reason)
+    written = WrittenWatch(
+        touches=tuple(touches),
+        seconds=np.array(seconds),
+        peaks=np.array(peaks),
+        latency=np.array(latency),
+        counts=counts,
+        first_reason=reason,
+        notes=tuple(notes),
+    )
     text = json.dumps(report_watch(written, watch, name), indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "report.json").write_text(text + "\n", "utf-8")
     draw_watch(written, watch).savefig(folder / "timeline.png", dpi=130)
@@ -114,7 +125,7 @@ def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[st
             if quick.size
             else None,
             "background_S": watch.images.background,
-            "notes": [*watch.notes, *watch.model.notes, *watch.images.reference.notes],
+            "notes": [*watch.notes, *written.notes, *watch.model.notes, *watch.images.reference.notes],
             "units": {"length": "m", "time": "s", "change": "S"},
             "versions": {package: version_of(package) for package in _PACKAGES},
         }
@@ -132,7 +143,9 @@ def draw_watch(written: WrittenWatch, watch: TouchWatch):
     grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1), height_ratios=(1, 1.25))
     above = figure.add_subplot(grid[0, 0])
     lanes = figure.add_subplot(grid[1, 0], sharex=above)
-    said = f"{len(written.touches)} touches in {written.seconds[-1] - written.seconds[0]:.4g} s"
+    refused = int(np.isnan(written.peaks).sum())
+    said = f"{counted(len(written.touches), 'touch')} in {written.seconds[-1] - written.seconds[0]:.4g} s"
+    said += f"; {counted(refused, 'frame')} refused" if refused else ""
     plot_changes(written.seconds, written.peaks, watch.level.level, title=said, ax=above)
     plot_timeline(list(written.touches), names, ax=lanes)
     above.set_xlim(*_ends(written.seconds))
@@ -162,7 +175,7 @@ def _event(one: NamedTouch) -> list[object]:
         one.number,
         f"{one.touch.onset:.4f}",
         f"{one.touch.offset:.4f}",
-        one.gesture,
+        "" if one.unlike else one.gesture,
         f"{one.probability:.4f}",
         int(one.unlike),
         *(f"{value:.5f}" for value in course.centroid[at]),

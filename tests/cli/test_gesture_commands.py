@@ -23,6 +23,9 @@ def files(tmp_path_factory):
     np.savez(folder / "fewer.npz", frames=stream.voltages[:, :40], seconds=stream.seconds)
     np.savez(folder / "falling.npz", frames=stream.voltages, seconds=stream.seconds[::-1])
     np.savez(folder / "short.npz", frames=stream.voltages, seconds=stream.seconds[:-1])
+    np.savez(folder / "same.npz", frames=stream.voltages, seconds=0 * stream.seconds)
+    np.savez(folder / "thousandths.npz", frames=stream.voltages, seconds=1e3 * stream.seconds)
+    np.savez(folder / "millivolts.npz", frames=1e3 * stream.voltages, seconds=stream.seconds)
     np.savez(folder / "broken.npz", frames=np.full_like(stream.voltages, np.nan), seconds=stream.seconds)
     (folder / "bare.toml").write_text(TOML[TOML.index("[protocol]") :] + "number = 8\n", "utf-8")
     (folder / "text.npz").write_text("text", "utf-8")
@@ -114,6 +117,9 @@ def test_standard_input_is_watched(files, model, run, tmp_path, monkeypatch):
         ("fewer.npz", {}, "of 48 channels"),
         ("falling.npz", {}, "seconds fall after frame 0"),
         ("short.npz", {}, "give seconds for each of"),
+        ("same.npz", {}, "seconds are all 0: give when each frame came"),
+        ("thousandths.npz", {}, "are these milliseconds?"),
+        ("millivolts.npz", {}, "times the conductivity of that which gestures were learnt on"),
         ("broken.npz", {}, "--untouched: the first 1 s of 'broken.npz' have 0 frames with a reading"),
         ("text.npz", {}, "not an NPZ file"),
         ("missing.npz", {}, "there is no such file"),
@@ -150,6 +156,6 @@ def test_recordings_that_are_none(files, run, tmp_path):
     np.savez(tmp_path / "few.npz", **{**vars(made), "gesture": np.full(len(made), "tap")})
     assert "two gestures, or more" in run("touch", "gestures", tmp_path / "few.npz", *skin)[2]
     np.savez(tmp_path / "odd.npz", gesture=made.gesture)
-    assert "there is no array 'start'" in run("touch", "gestures", tmp_path / "odd.npz", *skin)[2]
+    assert "odd.npz': there is no array 'start'" in run("touch", "gestures", tmp_path / "odd.npz", *skin)[2]
     status, _, error = run("touch", "gestures", folder / "gestures.npz", *skin, "--method", "oracle")
     assert (status, "--method must be one of" in error) == (1, True)

@@ -9,6 +9,9 @@ from gesture_skin import RATE, TOML, gestures_and_stream
 
 from jeit.data.description import parse_description
 from jeit.imaging import TouchImages, TouchWatch, learn_gestures
+from jeit.imaging.touch_images import TOUCH_IMAGES
+from jeit.layout import perimeter
+from jeit.mesh import Rectangle
 from jeit.touch import GestureModel
 
 DESCRIPTION = parse_description(tomllib.loads(TOML), "skin.toml")
@@ -162,6 +165,20 @@ def test_what_is_held_is_told_and_then_is_how_the_skin_is(made, watch):
     assert not watched[-1].touched
 
 
+def test_a_skin_held_from_the_first_frame_is_noticed_when_it_is_let_go(made, learnt):
+    """Rest is read in the midst of a push; the push is lifted, and then comes again."""
+    still, frames = push(made)
+    strongest = frames[np.argmax(np.abs(frames - still.mean(axis=0)).sum(axis=1))]
+    held = strongest + np.vstack([still - still.mean(axis=0)] * 2)
+    run = np.vstack([held, still, still, still, frames, still])
+    own = TouchWatch.create(TouchImages.prepare(DESCRIPTION, held[:60]), learnt.model, held[:60], rate=RATE)
+    watched, touches = followed(own, np.arange(len(run)) / RATE, run)
+    (note,) = [one.note for one in watched if one.note]
+    assert "more at rest than when its rest was read" in note
+    assert touches[-1].touch.onset == pytest.approx(300 / RATE, abs=0.2)
+    assert not watched[-1].touched or watched[-1].second - touches[-1].touch.onset > 1
+
+
 def test_of_nothing_nothing_is_told(watch):
     assert list(watch.follow([])) == []
 
@@ -187,6 +204,9 @@ def test_what_cannot_be_is_said(made, learnt, watch):
     other = replace(learnt.model, reading=replace(learnt.model.reading, num_channels=7))
     with pytest.raises(ValueError, match="of 7 channels, and this skin has 48"):
         TouchWatch.create(images, other, still, rate=RATE)
+    bulk = replace(learnt.model, reading=replace(learnt.model.reading, background=1e3 * images.background))
+    with pytest.raises(ValueError, match=r"has 0\.001 times the conductivity"):
+        TouchWatch.create(images, bulk, still, rate=RATE)
     with pytest.raises(ValueError, match=r"\[geometry\]"):
         TouchImages.prepare(replace(DESCRIPTION, domain=None), still)
     silent = replace(made[0], voltages=np.tile(made[0].reference, (len(made[0].voltages), 1)))
@@ -195,6 +215,22 @@ def test_what_cannot_be_is_said(made, learnt, watch):
     slow = TouchWatch.create(images, learnt.model, still, rate=10.0)
     assert "learnt at 60 frames/s" in slow.notes[0]
     assert slow.gap == 0.25
+
+
+def test_a_dead_electrode_of_many_leaves_an_image():
+    """What only the channels left out tell has no inverse; with sixteen electrodes and a common one it was NaN."""
+    places = np.vstack([perimeter(Rectangle(0.3, 0.18), 16, start=0.03), [[0.0, 0.0]]])
+    table = tomllib.loads(TOML)
+    table["electrodes"]["positions"] = places.tolist()
+    description = parse_description(table, "skin.toml")
+    model = description.model("skin.toml", num_points=300)
+    rest = np.asarray(model.voltages(0.0125))
+    images = TouchImages.prepare(description, rest[None], replace(TOUCH_IMAGES, num_points=300))
+    dead = rest.copy()
+    dead[np.asarray(model.protocol.channels_touching(5))] = 0.0
+    (found,) = images.stream([dead])
+    assert "Electrode 6 seems to be dead" in found[0].reason
+    assert np.isfinite(found[1]).all()
 
 
 def test_a_file_keeps_how_the_skin_was_read(learnt, tmp_path):

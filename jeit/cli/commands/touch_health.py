@@ -58,7 +58,7 @@ def health(
     from jeit.arguments import counted
     from jeit.cli.console import Steps
     from jeit.data import load_description, read_frame_recording
-    from jeit.imaging import learn_health
+    from jeit.imaging import doubts_of, learn_health
     from jeit.imaging.health_learning import seconds_of
     from jeit.report.skin_health import HEALTH_FILES, write_health
     from jeit.touch import watch
@@ -87,16 +87,20 @@ def health(
         step("watch")
         seconds = seconds_of(judged, rate)
         times = np.arange(len(judged.frames), dtype=float) if seconds is None else seconds
+        with naming_options({"frames": f"'{recording}'"}):
+            doubts = doubts_of(sound, known, judged.frames)
         now = sound
         for first in range(0, len(times), _AT_ONCE):
             step.tell(f"{first:,} of {counted(len(times), 'frame')}")
             now = watch(now, judged.frames[first : first + _AT_ONCE], times[first : first + _AT_ONCE])
         step("write")
-        write_health(now, times, judged.frames, output, name=recording.name, timed=seconds is not None)
+        write_health(now, times, judged.frames, output, name=recording.name, timed=seconds is not None, notes=doubts)
     if quiet:
         return
     unit = "frame" if seconds is None else "s"
     console.print(f"\n{counted(now.frames, 'frame')}: {counted(len(now.events), 'event')}")
+    for note in doubts:
+        console.print(f"  note: {note}", soft_wrap=True, markup=False)
     for one in now.events:
         where = "" if one.electrode is None else f" {one.electrode + 1}"
         long = "" if one.path is None else f", {1e3 * one.length:.0f} ± {1e3 * one.deviation:.0f} mm long"

@@ -147,7 +147,9 @@ def watch(
         live = None
         if stream == "-":
             live = LiveFrames(parse_frames(sys.stdin), rate, usual)
-            still = live.untouched(untouched) if still is None else still
+            if still is None:
+                step(f"untouched, for {untouched:g} s")
+                still = live.untouched(untouched)
             frames, own = live, live.rate_seen
         else:
             frames, still, own = _recorded(Path(stream), description, still, untouched, rate or usual)
@@ -157,7 +159,12 @@ def watch(
     for note in () if quiet else watch.notes:
         console.print(f"  note: {note}", soft_wrap=True, markup=False)
 
+    if live is not None and not quiet:
+        console.print("  ready: the skin may be touched")
+
     def show(one) -> None:
+        if one.note and not quiet:
+            console.print(f"  note: {one.note}", soft_wrap=True, markup=False)
         # Live, a touch is named with the first frame that has none; of a file it is told once, as it was in the end.
         told = one.ended if stream != "-" else () if one.named is None else (one.named,)
         for touch in () if quiet else told:
@@ -203,6 +210,7 @@ def _line(one) -> str:
     course = one.touch.course
     x, y = 1e3 * course.centroid[int(course.peak.argmax())]
     name = "unlike any" if one.unlike else f"{one.gesture:<12}{100 * one.probability:3.0f} %"
+    name += ", held" if one.held else ", cut off" if one.touch.cut_off else ""
     return (
         f"  {one.touch.onset:8.2f} s  {one.touch.offset - one.touch.onset:5.2f} s  {name:<18} ({x:+.0f}, {y:+.0f}) mm"
     )

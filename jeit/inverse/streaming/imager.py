@@ -36,8 +36,9 @@ FRAME_STEPS = 4
 """Most iterations that a frame is given, unless the solver says otherwise."""
 # The tolerance, alike; and what a shape must tell to be kept.
 _RTOL, _INFORMATIVE = 1e-3, 0.03
-# Standard deviation of a masked channel over the largest noise.
-_BLIND = 1e5
+# Standard deviation of a masked channel over the largest noise: more, and what only they tell has no inverse in double
+# precision.
+_BLIND = 1e3
 
 
 def check_memory(memory) -> None:

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind
 from jeit.plot.axes import INK, SERIES_COLOURS, SOFT, axes_or_new, soften_axes
 from jeit.touch.health import EventKind, SkinHealth
+from jeit.touch.health.lasting import size_of
 
 # Events that are written beside their lines, at most; and the least height of the axes, times the limit.
 _WRITTEN, _LEAST = 12, 1.5
@@ -18,18 +19,16 @@ def plot_health_course(
     """Draw how far frames (F, M) at `times` (F,) are from the healthy skin, times the limit that a lasting change
     exceeds, and a line for every event at the time that it began.
 
-    Touches stand out and come back; damage stays. Raises `ValueError` for shapes that disagree.
+    Touches stand out, as far as damage may, and come back; damage stays. Raises `ValueError` for shapes that disagree.
     """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of watch(health, frames)")
     when, read = np.asarray(times, float), np.asarray(frames, float)
     if read.shape != (len(when), health.reference.size):
         raise ValueError(f"frames have shape {read.shape}; give ({len(when)}, {health.reference.size}).")
     healthy = health.healthy
-    off = (read - healthy.reference) / np.where(healthy.used, healthy.scale, np.inf)
     there = healthy.used & np.isfinite(read)
-    number = there.sum(axis=1)
-    total = np.sum(np.where(there, off, 0.0) ** 2, axis=1)
-    size = np.where(number > 0, np.sqrt(total / np.maximum(number, 1)) / healthy.limit, np.nan)
+    off = np.where(there, (read - healthy.reference) / np.where(healthy.used, healthy.scale, np.inf), np.nan)
+    size = np.where(there.any(axis=1), size_of(off) / healthy.limit, np.nan)
     ax = axes_or_new(ax, (9.0, 3.2))
     ax.plot(when, size, color=INK, linewidth=0.8)
     ax.axhline(1.0, color=SOFT, linewidth=1, linestyle=(0, (4, 3)))
@@ -50,6 +49,7 @@ def plot_health_course(
                 fontsize=8,
             )
     ax.set_yscale("symlog", linthresh=1.0)
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     ax.set_ylim(0, max(_LEAST, 1.6 * float(np.nanmax(size, initial=1.0))))
     ax.set_ylabel("Change, times the limit", color=INK)
     soften_axes(ax)

@@ -25,8 +25,9 @@ from jeit.plot.axes import (
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.mesh import draw_outline
 
-# Points of a curve, at most; the shortest bar, of the whole time; touches that are numbered, at most.
-_POINTS, _SHORTEST, _NUMBERED = 3000, 0.003, 60
+# A curve is broken where nothing came for so many times the usual; points of a curve, at most; the shortest bar, of the
+# whole time; touches that are numbered, at most.
+_UNSEEN, _POINTS, _SHORTEST, _NUMBERED = 10.0, 3000, 0.003, 60
 _UNLIKE = "#b9bdc4"
 
 
@@ -48,7 +49,7 @@ def plot_changes(
         raise ValueError(f"peaks have shape {values.shape} and seconds {when.shape}; give one of each for every frame.")
     ax = axes_or_new(ax, (9.0, 2.6))
     factor, name = prefixed(float(np.nanmax(values, initial=level)), unit)
-    ax.plot(*_thinned(when, factor * values), color=INK, linewidth=0.8)
+    ax.plot(*_thinned(*_broken(when, factor * values)), color=INK, linewidth=0.8)
     ax.axhline(factor * level, color=SOFT, linewidth=1, linestyle=(0, (4, 3)))
     ax.text(1, factor * level, " level", color=SOFT, fontsize=8, va="center", transform=ax.get_yaxis_transform())
     ax.set_ylabel(f"Greatest change ({name})", color=INK)
@@ -110,7 +111,8 @@ def plot_touch_paths(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the skin and where touches went, each a line from a dot where it began, in the colour of its gesture.
+    """Draw the skin and where touches went, each a line from a dot where it began, in the colour of its gesture, with
+    its number.
 
     Raises `ValueError` for what are no named touches.
     """
@@ -127,6 +129,10 @@ def plot_touch_paths(
             colour = gesture_colour(one, names)
             ax.plot(*place.T, color=colour, linewidth=1.4, alpha=_alpha(one), zorder=3)
             ax.plot(*place[0], marker="o", markersize=4.5, color=colour, alpha=_alpha(one), markeredgewidth=0, zorder=4)
+            if len(touches) <= _NUMBERED:
+                ax.annotate(
+                    f"{one.number}", place[0], (4, 2), textcoords="offset points", color=INK, fontsize=7, zorder=5
+                )
     bare(ax, extent)
     draw_scale_bar(ax, extent)
     if title is not None:
@@ -148,6 +154,13 @@ def check_named(touches) -> None:
 
 def _alpha(one: NamedTouch) -> float:
     return 1.0 if one.unlike else 0.35 + 0.65 * one.probability
+
+
+def _broken(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """With NaN wherever no frame came for long."""
+    passed = np.diff(when)
+    gaps = 1 + np.flatnonzero(passed > _UNSEEN * np.median(passed)) if passed.size else np.zeros(0, int)
+    return np.insert(when, gaps, when[gaps]), np.insert(values, gaps, np.nan)
 
 
 def _thinned(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -35,7 +35,7 @@ _FOLDS, _LIKE = 10, 0.99
 _AT_ONCE = 1000
 GESTURE_FILE = "gestures.skops"
 """What a model is called in the folder of `jeit touch gestures`."""
-_KIND, _VERSION = "a jeit gesture model", 2
+_KIND, _VERSION = "a jeit gesture model", 3
 
 
 @dataclass(frozen=True)
@@ -197,12 +197,19 @@ def _checked(touches, labels, people) -> tuple[np.ndarray, np.ndarray | None]:
     given = None if people is None else np.asarray(people)
     if given is not None and given.shape != named.shape:
         raise ValueError(f"people must be {len(touches)}, one for each touch; they have shape {given.shape}.")
-    names, count = np.unique(named, return_counts=True)
+    check_labels(named)
+    return named.astype(str), given
+
+
+def check_labels(labels: np.ndarray) -> None:
+    """Raise `ValueError` for names (n,) of fewer than two gestures, empty ones, and gestures that are there once."""
+    names, count = np.unique(labels, return_counts=True)
+    if any(not str(one).strip() for one in names):
+        raise ValueError("labels: some are empty; give every touch the name of a gesture.")
     if len(names) < 2:
         raise ValueError("labels: give touches of two gestures, or more.")
     if count.min() < 2:
         raise ValueError(f"labels: there is only one touch of '{names[count.argmin()]}'; give two of each, or more.")
-    return named.astype(str), given
 
 
 def _nearest(known: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " n"]:
