@@ -174,9 +174,12 @@ def shrinkage_of(features, label) -> float:
 
 
 def log_odds(model, features) -> Float[np.ndarray, "n C"]:
-    """What a classifier says for each class (n, C): logarithms of probabilities, or distances from borders."""
+    """What a classifier says for each class (n, C): logarithms of probabilities, alone or beside every other class, or
+    distances from borders."""
     if hasattr(model, "predict_proba"):
         return np.log(np.maximum(model.predict_proba(features), 1e-6))
+    if hasattr(model, "pair_odds"):
+        return model.pair_odds(features)
     said = model.decision_function(features)
     return np.column_stack([-said, said]) if said.ndim == 1 else said
 

@@ -44,6 +44,20 @@ class Machine:
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
         """Borders won by each class (n, C), and less than a half more by how far."""
+        pairs, side = self._borders(features)
+        votes = (pairs > 0) @ (side > 0).astype(float) + (pairs <= 0) @ (side < 0).astype(float)
+        sure = pairs @ side
+        return votes + sure / (3 * (np.abs(sure) + 1))
+
+    def pair_odds(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
+        """Logarithms of how likely each class is beside every other in turn, summed (n, C): beside one, 1 / (1 +
+        exp(-2 d)) at a distance d from their border, in units of its margin. Unlike votes it says how sure that is."""
+        pairs, side = self._borders(features)
+        won, lost = -np.logaddexp(0.0, -2 * pairs), -np.logaddexp(0.0, 2 * pairs)
+        return won @ (side > 0).astype(float) + lost @ (side < 0).astype(float)
+
+    def _borders(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n P"], Float[np.ndarray, "P C"]]:
+        """Distances from the borders of all pairs of classes, and which class is on which side."""
         count = len(self.classes_)
         first, second = np.triu_indices(count, 1)
         if self.slopes is not None:
@@ -57,6 +71,4 @@ class Machine:
             pairs = sums[:, second - 1, first] + sums[:, first, second] + self.intercepts
         side = np.zeros((len(first), count))
         side[np.arange(len(first)), first], side[np.arange(len(first)), second] = 1.0, -1.0
-        votes = (pairs > 0) @ (side > 0).astype(float) + (pairs <= 0) @ (side < 0).astype(float)
-        sure = pairs @ side
-        return votes + sure / (3 * (np.abs(sure) + 1))
+        return pairs, side

@@ -153,3 +153,24 @@ def test_what_cannot_be_learnt_is_said(change, said):
     given = {"touches": made, "labels": labels, "method": "nearest"} | change
     with pytest.raises(ValueError, match=said):
         GestureModel.fit(**given)
+
+
+def test_how_sure_a_support_vector_machine_is_differs():
+    """Votes of pairs are the same for nearly all touches; distances from borders are not, and err less."""
+    from sklearn.svm import SVC
+
+    from jeit.touch.learnt.classifiers import log_odds
+    from jeit.touch.learnt.machine import Machine
+
+    rng = np.random.default_rng(0)
+    right = rng.integers(0, 4, 600)
+    values = 1.5 * np.eye(4)[right] + rng.normal(size=(600, 4))
+    machine = Machine.of(SVC(kernel="poly", degree=2, coef0=1.0).fit(values[:300], right[:300]))
+    odds = log_odds(machine, values[300:])
+    said = np.exp(odds - np.logaddexp.reduce(odds, axis=1, keepdims=True))
+    sure = said.max(axis=1)
+    assert np.quantile(sure, 0.9) - np.quantile(sure, 0.1) > 0.2
+    correct = said.argmax(axis=1) == right[300:]
+    assert correct[sure > np.median(sure)].mean() > correct[sure <= np.median(sure)].mean() + 0.1
+    voted = machine.decision_function(values[300:]).argmax(axis=1)
+    assert np.mean(voted == odds.argmax(axis=1)) > 0.9
