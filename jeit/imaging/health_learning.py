@@ -72,10 +72,10 @@ def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndar
             f"{len(frames)} frames are fewer than two windows of {window}: a change that lasts cannot be told from a "
             "touch in them."
         )
-    if len(healthy.frames) < _FEW:
+    if known.brief or len(healthy.frames) < _FEW:
         told.append(
-            f"the healthy recording has {len(healthy.frames)} frames; of fewer than {_FEW} little is known of drift: "
-            "what is told may be false, and what is not may be there."
+            f"the healthy recording has {len(healthy.frames)} frames, few beside the length of touches, or at all: what "
+            "is told may be false, and what is not may be there. Forty of the longest touches, and a minute, are enough."
         )
     silent = np.flatnonzero(known.used & ~there.any(axis=0))
     if silent.size:

@@ -142,7 +142,7 @@ def test_what_speaks_against_it_is_said(files, run, tmp_path):
         assert any(said in one for one in report["notes"])
     np.save(tmp_path / "few.npy", healthy[:60])
     _, output, _ = run("touch", "health", files / "hurt.csv", "--healthy", tmp_path / "few.npy", "-o", tmp_path / "few")
-    assert "little is known of drift" in " ".join(output.split())
+    assert "few beside the length of touches" in " ".join(output.split())
     np.save(tmp_path / "nothing.npy", np.full_like(hurt, np.nan))
     status, _, error = run(
         *("touch", "health", tmp_path / "nothing.npy", "--healthy", files / "healthy.csv", "-o", tmp_path / "nothing")

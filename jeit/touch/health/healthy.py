@@ -16,6 +16,9 @@ _LEAST_ALWAYS, _MOST_ALWAYS = 12, 64
 _LONGEST, _LEAST_SHARE = 3.0, 1 / 40
 # Of what healthy windows did at most, and in deviations of normal ones: a change below is none. Few windows say less.
 _BEYOND, _LEAST_SIZE, _FEW = 2.0, 4.0, 20.0
+# Where windows are so many times shorter than touches ask for, touches look as if they stayed: limits are so much
+# higher.
+_SHORT, _DOUBT = 1.5, 2.0
 # A step is still there when so much of it is.
 _STILL = 0.4
 # The same from the healthy recording to another.
@@ -43,7 +46,8 @@ class Healthy:
     `size_of` a step that stays, and `sudden` of one that may be a touch; `level`
     (M,), volts, how far any two are apart, and its `level_limit`; `touches` (M, k): directions of touches, orthonormal
     in units of noise; `unlike`: the share of a change that no touch has outside of those; `steadiness` of single
-    channels; `period`, seconds a frame, or 1.
+    channels; `period`, seconds a frame, or 1; whether the recording was too `brief` for its touches, with limits
+    twice as high for it.
     """
 
     reference: Float[np.ndarray, " M"]
@@ -61,6 +65,7 @@ class Healthy:
     unlike: float
     steadiness: Steadiness
     period: float
+    brief: bool
 
     @classmethod
     def learn(cls, frames: Float[np.ndarray, "F M"], period: float = 1.0, longest: float | None = None) -> "Healthy":
@@ -86,7 +91,9 @@ class Healthy:
             )
         noise = np.where(used, noise, np.inf)
         frames = np.where(used, frames, np.nan)
-        window = _window(frames, noise, period, longest)
+        window, wanted = _window(frames, noise, period, longest)
+        brief = wanted > _SHORT * window
+        doubt = _DOUBT if brief else 1.0
         stride = max(1, -(-window // _MOST))
         steps = averaged(frames, stride)
         window = max(_FEWEST, window // stride)
@@ -105,14 +112,15 @@ class Healthy:
             stride=stride,
             window=window,
             scale=scale,
-            limit=limit,
-            sudden=sudden,
+            limit=doubt * limit,
+            sudden=doubt * sudden,
             level=level,
-            level_limit=level_limit,
+            level_limit=doubt * level_limit,
             touches=touches,
             unlike=unlike,
             steadiness=steadiness,
             period=period,
+            brief=brief,
         )
 
     def outside(self, change: Float[np.ndarray, " M"]) -> float:
@@ -148,20 +156,21 @@ def _noise(frames: np.ndarray) -> np.ndarray:
     return np.where(quiet > 0.05 * whole, quiet, whole)
 
 
-def _window(frames: np.ndarray, noise: np.ndarray, period: float, longest: float | None) -> int:
-    """Frames of a window."""
+def _window(frames: np.ndarray, noise: np.ndarray, period: float, longest: float | None) -> tuple[int, float]:
+    """Frames of a window, and as many as it would have were the recording long enough."""
     most = max(_FEWEST, len(frames) // _WINDOWS)
     if longest is not None:
-        return int(np.clip(np.ceil(longest / period), _FEWEST, most))
+        return int(np.clip(np.ceil(longest / period), _FEWEST, most)), longest / period
     off = size_of((frames - median(frames)) / noise)
     quiet = np.quantile(off, _QUIET)
     touched = off > _STANDS_OUT * quiet
     edges = np.flatnonzero(np.diff(np.concatenate([[0], touched.astype(int), [0]])))
     runs = edges[1::2] - edges[::2]
     least = min(max(_LEAST_ALWAYS, int(_LEAST_SHARE * len(frames))), most)
+    wanted = _LONGEST * float(runs.max(initial=0))
     if runs.size and runs.max() > most:
-        return int(np.clip(most // 2, least, max(least, _MOST_ALWAYS)))
-    return int(np.clip(_LONGEST * runs.max(initial=0), least, most))
+        return int(np.clip(most // 2, least, max(least, _MOST_ALWAYS))), wanted
+    return int(np.clip(wanted, least, most)), wanted
 
 
 def _floor(noise: np.ndarray, frames: int) -> np.ndarray:

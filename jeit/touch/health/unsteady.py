@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 # Of a window's steps, the smallest that are noise; those that have to have a reading.
 _SMALL, _READ = 0.5, 0.5
 # Beyond so many times the usual, and what healthy windows did at most, a channel is unsteady; few windows say less.
-_LEAST, _BEYOND, _FEW = 3.0, 2.0, 4.0
+_LEAST, _BEYOND, _FEW = 3.0, 2.0, 12.0
 # Of its steps, so many move a channel of which it tells something that none does.
 _MOVES = 0.6
 # Of the channels, those that may be so at once.
