@@ -74,8 +74,8 @@ def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndar
         )
     if known.brief or len(healthy.frames) < _FEW:
         told.append(
-            f"the healthy recording has {len(healthy.frames)} frames, few beside the length of touches, or at all: what "
-            "is told may be false, and what is not may be there. Forty of the longest touches, and a minute, are enough."
+            f"the healthy recording has {len(healthy.frames)} frames, few beside the length of touches, or at all: "
+            "what is told may be false, and what is not may be there. Give forty of the longest touches, and a minute."
         )
     silent = np.flatnonzero(known.used & ~there.any(axis=0))
     if silent.size:
