@@ -92,7 +92,7 @@ class TouchLevel(eqx.Module):
         images = check_images(images, len(self.areas))
         seconds = check_seconds(seconds, len(images))
         if not np.isfinite(images).all():
-            raise ValueError("images have NaN or infinite values; leave out those frames, as `touches_of` does.")
+            raise ValueError("images have NaN or infinite values; leave out those frames, as `find_touches` does.")
         peak = images.max(axis=1, initial=-np.inf)
         above = images > self.level
         number = np.maximum(above.sum(axis=1), 1)
