@@ -46,12 +46,12 @@ class Preset:
 
 
 PRESETS = {
-    "quick": Preset(1000, 250, Plan(rate=2e-3, batch=32, epochs=6, patience=6, decay=0.7)),
+    "quick": Preset(1000, 250, Plan(rate=2e-3, batch=32, epochs=10, patience=6, decay=0.8)),
     "full": Preset(
-        12_000,
-        1500,
-        Plan(rate=2e-3, batch=64, epochs=14, patience=6, decay=0.82),
-        Plan(rate=1e-3, batch=128, epochs=60, patience=8, decay=0.97),
+        24_000,
+        2000,
+        Plan(rate=2e-3, batch=64, epochs=20, patience=8, decay=0.87),
+        Plan(rate=1e-3, batch=128, epochs=30, patience=5, decay=0.92),
     ),
 }
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jeit.touch.networks.layers import Chain, Convolution, Dense, doubled
+from jeit.touch.networks.layers import Chain, Convolution, Dense
 
 _HIDDEN, _LATENT, _DROPOUT = 256, 84, 0.03
 _CHANNELS, _CODE = (16, 32, 64), 128
@@ -77,7 +77,7 @@ class DepthDecoder(eqx.Module):
         """Of a batch."""
         image = self.first(code).reshape(len(code), *self.shape, -1)
         for layer in self.layers:
-            image = layer(doubled(jax.nn.elu(image)))
+            image = layer.of_doubled(jax.nn.elu(image))
         return image[..., 0]
 
 

@@ -16,8 +16,9 @@ from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.training import Objective, Plan, Trained, fit
 
 # Of the unrolled network: how much the maps of its first steps count, and the misfit beside the last map; the model's
-# own error, relative to the changes; deviations of logarithms of contact impedances that drift, at most.
-_EARLY, _MISFIT, _MODEL_ERROR, _DRIFT = 0.3, 0.05, 0.1, 0.1
+# own error, relative to the changes; deviations of logarithms of contact impedances that drift, at most; and how many
+# times the noise it is to stand, at most.
+_EARLY, _MISFIT, _MODEL_ERROR, _DRIFT, _LOUDER = 0.3, 0.05, 0.1, 0.1, 6.0
 # Squares of depths, so that losses are about one before training.
 _SCALE = 0.002
 
@@ -118,15 +119,17 @@ def train_unrolled(
 
     def loss(network, batch, key):
         change, wanted = batch
-        keys = jax.random.split(key, 3)
-        drift = jax.random.normal(keys[1], (len(change), len(contacts)), change.dtype)
-        drift = drift * _DRIFT * jax.random.uniform(keys[2], (len(change), 1), change.dtype) ** 2
-        noisy = change + noise * jax.random.normal(keys[0], change.shape, change.dtype) + drift @ contacts
+        keys = jax.random.split(key, 4)
+        # Most are near what is usual: squares of uniform shares.
+        much, loud = (jax.random.uniform(one, (len(change), 1), change.dtype) ** 2 for one in keys[2:])
+        drift = _DRIFT * much * jax.random.normal(keys[1], (len(change), len(contacts)), change.dtype)
+        own = noise * _LOUDER**loud
+        noisy = change + own * jax.random.normal(keys[0], change.shape, change.dtype) + drift @ contacts
         *early, last = network.each(noisy)
         value = jnp.mean((last - wanted) ** 2)
         for one in early:
             value = value + _EARLY * jnp.mean((one - wanted) ** 2)
-        off = noise**2 + _MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
+        off = own[:, 0] ** 2 + _MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
         missed = jnp.mean((network.felt(last) - change) ** 2, axis=1) / off
         # Its logarithm: touches on electrodes, which the model explains least, would count for more than all others.
         return value / _SCALE + _MISFIT * jnp.mean(jnp.log1p(missed)), network

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jeit.touch.networks.layers import Convolution, doubled, unfolded
 from jeit.touch.networks.sensed import Sensed, depth_of, rounded, strength
 
-_WIDE, _NARROW = 32, 16
+_WIDE, _NARROW = 24, 16
 # The prior: deviation of a pixel's strength, and length of its correlation over the skin's longer side; how many times
 # the noise is taken for each of the images without drift, the first of which is where maps start; and the drift of
 # logarithms of contacts with which one more is made.
