@@ -66,7 +66,7 @@ def test_no_such_preset(run, tmp_path):
 
 @pytest.mark.slow
 def test_the_quick_preset(run, tmp_path):
-    """It explains 0.67 of squared depth. A network taught other touches' maps explains 0.12; linear images, which an
+    """It explains 0.64 of squared depth. A network taught other touches' maps explains 0.12; linear images, which an
     untrained one of this design is, 0.44, and an untrained one of the other design is worse than empty maps."""
     import xarray
 
