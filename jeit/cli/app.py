@@ -22,7 +22,7 @@ from jeit.cli.commands.reconstruct import reconstruct
 from jeit.cli.commands.stream import stream
 from jeit.cli.commands.study import study
 from jeit.cli.commands.touch import touch
-from jeit.cli.options import naming_options
+from jeit.cli.options import naming_options, remove_empty_folders
 from jeit.start import discarded_damaged
 
 # Commands that run one program again and again: a frame in a third of the time.
@@ -93,6 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _fail("stopped.", 130)
     except Exception as error:
+        remove_empty_folders()
         if os.environ.get("JEIT_DEBUG"):
             raise
         return _explain(error)

@@ -2,9 +2,11 @@
 
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
@@ -69,6 +71,11 @@ def pairs(title: str, rows: list[tuple[str, str]]) -> Table:
     for name, value in rows:
         table.add_row(name, value)
     return table
+
+
+def say_written(console: Console, first: Path, *others: str) -> None:
+    """Say which files there are now: the `first` with its folder, others by name."""
+    console.print("[dim]Written:[/dim]", escape(", ".join([str(first), *others])), soft_wrap=True)
 
 
 def scaled(value: float | None, unit: str) -> str:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -51,6 +51,9 @@ Window = Annotated[float | None, typer.Option(help="Length of a window, seconds 
 Hop = Annotated[
     float | None, typer.Option(help="From one window to the next, seconds (default 0.0125, or the calibration's).")
 ]
+
+# Folders that make_folder made, the innermost of each first.
+_MADE: list[Path] = []
 
 
 @contextmanager
@@ -113,11 +116,21 @@ def intensity_settings(low: float | None, high: float | None, window: float | No
 
 
 def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json")) -> None:
-    """Make the folder for results of these names before any work is done. Raises `ValueError` if it cannot be one."""
+    """Make the folder for results of these names before any work is done; `remove_empty_folders` undoes it. Raises
+    `ValueError` if it cannot be one."""
     from jeit.report.folder import results_folder
 
+    missing = [one for one in (output, *output.parents) if not one.exists()]
     with naming_options({"folder": "--output"}):
         results_folder(output, names)
+    _MADE.extend(missing)
+
+
+def remove_empty_folders() -> None:
+    """Remove what `make_folder` made and nothing was written to."""
+    while _MADE:
+        with suppress(OSError):
+            _MADE.pop(0).rmdir()
 
 
 def number_or_name(text: str, number: type = float):

@@ -59,7 +59,7 @@ def calibrate_microphones(
     from jeit.acoustic import read_taps
     from jeit.acoustic.calibration.calibrate import AUTO
     from jeit.acoustic.decay import find_decay
-    from jeit.cli.console import Steps
+    from jeit.cli.console import Steps, say_written
     from jeit.report import write_calibration
     from jeit.report.calibration import calibration_files
 
@@ -77,7 +77,7 @@ def calibrate_microphones(
             write_calibration(fit, output)
     if not quiet:
         _show(console, fit, touched)
-        console.print(f"[dim]Written:[/dim] {output}, {files[1].name}", soft_wrap=True)
+        say_written(console, output, files[1].name)
 
 
 def _show(console, fit: "CalibrationFit", taps: "Taps") -> None:

@@ -48,7 +48,7 @@ def choose(
     """Compare the rules that choose the hyperparameter of DATA's image; writes choice.png and choice.json."""
     from rich.console import Console
 
-    from jeit.cli.console import Steps
+    from jeit.cli.console import Steps, say_written
     from jeit.data import read
     from jeit.imaging import ImagingSettings, compare_on_data
     from jeit.report import write_choice
@@ -68,7 +68,7 @@ def choose(
         write_choice(result, output)
     if not quiet:
         show(console, result)
-        console.print(f"[dim]Written:[/dim] {output / 'choice.png'}, choice.json", soft_wrap=True)
+        say_written(console, output / "choice.png", "choice.json")
 
 
 def show(console, result: "ComparedRules") -> None:

@@ -23,7 +23,7 @@ def demo(
     import numpy as np
     from rich.console import Console
 
-    from jeit.cli.console import Steps, pairs
+    from jeit.cli.console import Steps, pairs, say_written
     from jeit.imaging import image_difference
     from jeit.report import write_image
     from jeit.simulate.round_skin import RoundSkin, simulate_press
@@ -52,4 +52,4 @@ def demo(
     console.print()
     console.print(pairs("A simulated press", rows))
     console.print()
-    console.print(f"[dim]Written:[/dim] {output / 'image.png'}, image.npz, report.json", soft_wrap=True)
+    say_written(console, output / "image.png", "image.npz", "report.json")

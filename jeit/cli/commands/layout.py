@@ -86,7 +86,7 @@ def compare(
     """Touch two layouts all over, and say what each feels: sensitivity, blind spots, virtual taxels."""
     from rich.console import Console
 
-    from jeit.cli.console import Steps
+    from jeit.cli.console import Steps, say_written
     from jeit.design import compare_layouts
     from jeit.design.comparison import check_same_outline
     from jeit.design.skin.protocol import skin_protocol
@@ -122,7 +122,7 @@ def compare(
         write_layout_comparison(result, output)
     if not quiet:
         _show(console, result)
-        console.print(f"[dim]Written:[/dim] {output / 'report.json'}, comparison.png", soft_wrap=True)
+        say_written(console, output / "report.json", "comparison.png")
 
 
 def _show(console, result: "LayoutComparison") -> None:

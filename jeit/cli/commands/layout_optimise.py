@@ -69,7 +69,7 @@ def optimise(
     """
     from rich.console import Console
 
-    from jeit.cli.console import Steps
+    from jeit.cli.console import Steps, say_written
     from jeit.design import DesignSpace, improve_layout
     from jeit.report import write_improved_layout
 
@@ -98,7 +98,7 @@ def optimise(
         write_improved_layout(result, output)
     if not quiet:
         _show(console, result)
-        console.print(f"[dim]Written:[/dim] {output / RESULTS[0]}, {', '.join(RESULTS[1:])}", soft_wrap=True)
+        say_written(console, output / RESULTS[0], *RESULTS[1:])
 
 
 def _show(console, result: "ImprovedLayout") -> None:

@@ -51,7 +51,7 @@ def image(
     from rich.console import Console
 
     from jeit.cli.commands.study import connected
-    from jeit.cli.console import Steps, pairs
+    from jeit.cli.console import Steps, pairs, say_written
     from jeit.design import read_described_skin
     from jeit.report.image_network import LEARNT_FILES, write_learnt_images
     from jeit.touch.networks import learn_images
@@ -85,4 +85,4 @@ def image(
     ]
     console.print()
     console.print(pairs(f"Learnt of {skin.name}", rows))
-    console.print(f"[dim]Written:[/dim] {output / 'network.jeit'}, report.json, learning.png", soft_wrap=True)
+    say_written(console, output / "network.jeit", "report.json", "learning.png")

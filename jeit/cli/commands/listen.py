@@ -77,7 +77,7 @@ def hear(
     from rich.console import Console
 
     from jeit.acoustic import Calibration, Recording, read_recording
-    from jeit.cli.console import Steps
+    from jeit.cli.console import Steps, say_written
     from jeit.report.listener import HEARD_FILES, write_heard
     from jeit.touch.listening import Listener
 
@@ -96,7 +96,7 @@ def hear(
         write_heard(heard, output, model=str(model))
     if not quiet:
         _show(console, heard)
-        console.print(f"[dim]Written:[/dim] {output / 'events.csv'}, report.json, timeline.png", soft_wrap=True)
+        say_written(console, output / "events.csv", "report.json", "timeline.png")
 
 
 @listen.command()
@@ -133,7 +133,7 @@ def fit(
     from rich.console import Console
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, pairs
+    from jeit.cli.console import Steps, pairs, say_written
     from jeit.report.listener import LISTENER_FILES, summary, write_listener
     from jeit.touch.listening import Listener, read_clips
     from jeit.touch.listening.learners import BATCHES
@@ -171,7 +171,7 @@ def fit(
     rows += [("note", note) for note in listener.notes]
     console.print()
     console.print(pairs(f"Learnt from {listener.name}", rows))
-    console.print(f"[dim]Written:[/dim] {output / 'listener.jeit'}, report.json, learning.png", soft_wrap=True)
+    say_written(console, output / "listener.jeit", "report.json", "learning.png")
 
 
 def _show(console, heard: "Heard") -> None:

@@ -64,7 +64,7 @@ def locate(
     from jeit.acoustic import Calibration, locate_touches, read_recording
     from jeit.acoustic.localisation.localiser import METHODS
     from jeit.arguments import check_name
-    from jeit.cli.console import Steps
+    from jeit.cli.console import Steps, say_written
     from jeit.report import write_track
 
     check_name("--method", method, METHODS)
@@ -84,7 +84,7 @@ def locate(
         write_track(found, output)
     if not quiet:
         _show(console, found)
-        console.print(f"[dim]Written:[/dim] {output / 'track.csv'}, report.json, track.png", soft_wrap=True)
+        say_written(console, output / "track.csv", "report.json", "track.png")
 
 
 def _silence(path: Path, sound) -> "Recording":

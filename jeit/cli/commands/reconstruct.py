@@ -99,7 +99,7 @@ def reconstruct(
         return
     from rich.console import Console
 
-    from jeit.cli.console import Steps
+    from jeit.cli.console import Steps, say_written
     from jeit.data import read
     from jeit.imaging import METHODS, ImagingSettings, image_difference
     from jeit.report import write_image
@@ -131,7 +131,7 @@ def reconstruct(
         write_image(result, output)
     if not quiet:
         show(console, result)
-        console.print(f"[dim]Written:[/dim] {output / 'image.png'}, image.npz, report.json", soft_wrap=True)
+        say_written(console, output / "image.png", "image.npz", "report.json")
 
 
 def show(console, result: "ImagedDifference") -> None:

@@ -95,7 +95,7 @@ def stream(
     from rich.console import Console
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, scaled
+    from jeit.cli.console import Steps, say_written, scaled
     from jeit.data import read
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as images_of
@@ -151,7 +151,4 @@ def stream(
     console.print(f"\n{counted(written.number, 'frame')}: {said}; background {background}")
     middle, high = 1e3 * np.quantile(written.latency, (0.5, 0.99))
     console.print(f"latency: median {middle:.2f} ms, 99 % within {high:.2f} ms")
-    console.print(
-        f"[dim]Written:[/dim] {', '.join([str(output / 'frames.csv'), 'images.npz', 'frames.png', *films])}",
-        soft_wrap=True,
-    )
+    say_written(console, output / "frames.csv", "images.npz", "frames.png", *films)

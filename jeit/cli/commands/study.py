@@ -108,6 +108,7 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
+    from jeit.cli.console import say_written
     from jeit.design.study import run_study
     from jeit.design.study.store import require
     from jeit.report.study import write_study_report
@@ -129,7 +130,7 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
         run_study(sweep, store, client=client, progress=show)
     write_study_report(sweep, store, where)
     if not quiet:
-        console.print(f"[dim]Written:[/dim] {store}, {where}", soft_wrap=True)
+        say_written(console, store, str(where))
 
 
 def connected(scheduler: str):

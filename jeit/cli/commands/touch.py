@@ -72,7 +72,7 @@ def fit(
     """
     from rich.console import Console
 
-    from jeit.cli.console import Steps, pairs
+    from jeit.cli.console import Steps, pairs, say_written
     from jeit.data import load_description
     from jeit.report.learnt_skin import SKIN_FILES, summary, write_learnt_skin
     from jeit.touch import LearntSkin, read_presses
@@ -104,7 +104,7 @@ def fit(
     console.print()
     console.print(pairs(f"Learnt from {recorded.name}", rows))
     _print_notes(console, skin.notes)
-    console.print(f"[dim]Written:[/dim] {output / 'skin.skops'}, report.json, learning.png", soft_wrap=True)
+    say_written(console, output / "skin.skops", "report.json", "learning.png")
 
 
 @touch.command()
@@ -131,7 +131,7 @@ def predict(
     from rich.console import Console
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps
+    from jeit.cli.console import Steps, say_written
     from jeit.report.learnt_skin import TOUCH_FILES, write_touches
     from jeit.touch import read_frames, read_skin
 
@@ -154,7 +154,7 @@ def predict(
             said[-1] += f", standard deviation {1e3 * np.median(touches.position_std[placed]):.3g} mm (median)"
     console.print("\n" + "; ".join(said))
     _print_notes(console, touches.notes)
-    console.print(f"[dim]Written:[/dim] {output / 'touches.csv'}, report.json, touches.png", soft_wrap=True)
+    say_written(console, output / "touches.csv", "report.json", "touches.png")
 
 
 def _print_notes(console, notes) -> None:

@@ -56,7 +56,7 @@ def health(
     from rich.console import Console
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps
+    from jeit.cli.console import Steps, say_written
     from jeit.data import load_description, read_frame_recording
     from jeit.imaging import doubts_of, learn_health
     from jeit.imaging.health_learning import seconds_of
@@ -108,4 +108,4 @@ def health(
         console.print(f"  {at}: {one.kind}{where}{long}, {one.status}. {one.reason}", soft_wrap=True, markup=False)
     if (held := now.held) is not None:
         console.print(f"  held at the end: {held.reason}", soft_wrap=True, markup=False)
-    console.print(f"[dim]Written:[/dim] {output / 'events.csv'}, report.json, health.png", soft_wrap=True)
+    say_written(console, output / "events.csv", "report.json", "health.png")

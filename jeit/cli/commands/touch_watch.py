@@ -45,7 +45,7 @@ def gestures(
     """
     from rich.console import Console
 
-    from jeit.cli.console import Steps, pairs
+    from jeit.cli.console import Steps, pairs, say_written
     from jeit.data import GestureSet, load_description
     from jeit.imaging import learn_gestures
     from jeit.report.gestures import GESTURE_FILES, write_gestures
@@ -74,7 +74,7 @@ def gestures(
     rows += [("note", note) for note in model.notes]
     console.print()
     console.print(pairs(f"Learnt from {recordings.name}", rows))
-    console.print(f"[dim]Written:[/dim] {output / 'gestures.skops'}, report.json, gestures.png", soft_wrap=True)
+    say_written(console, output / "gestures.skops", "report.json", "gestures.png")
 
 
 def watch(
@@ -125,7 +125,7 @@ def watch(
     from rich.console import Console
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps
+    from jeit.cli.console import Steps, say_written
     from jeit.cli.live_frames import LiveFrames
     from jeit.data import load_description, read_frame_recording
     from jeit.imaging import TouchImages, TouchWatch
@@ -184,7 +184,7 @@ def watch(
         console.print(f"{counted(live.left_out, 'frame')} left out that had come before they could be read")
     if written.first_reason:
         console.print(f"first refusal: {written.first_reason}", soft_wrap=True, markup=False)
-    console.print(f"[dim]Written:[/dim] {output / 'events.csv'}, paths.csv, report.json, timeline.png", soft_wrap=True)
+    say_written(console, output / "events.csv", "paths.csv", "report.json", "timeline.png")
 
 
 def _recorded(path: Path, description, still, span: float, rate: float):
