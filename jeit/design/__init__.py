@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from jeit.design.skin.indentation import Bell as Bell
     from jeit.design.skin.indentation import Hemisphere as Hemisphere
     from jeit.design.skin.skin import Skin as Skin
+    from jeit.design.skin.skin_file import describes_skin as describes_skin
     from jeit.design.skin.skin_file import read_described_skin as read_described_skin
     from jeit.design.skin.touch_grid import touch_grid as touch_grid
     from jeit.design.skin.touch_grid import touches_away_from_the_edge as touches_away_from_the_edge
@@ -50,6 +51,7 @@ _HOMES = {
     "layout_scores": "scores",
     "open_results": "study",
     "optimise_layout": "optimisation.optimise",
+    "describes_skin": "skin.skin_file",
     "read_described_skin": "skin.skin_file",
     "read_study": "study",
     "run_study": "study",

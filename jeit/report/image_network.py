@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -83,37 +84,45 @@ def draw_learnt_images(learnt: LearntImages):
 
 
 def write_depths(
-    depth: Float[np.ndarray, "n rows columns"], network: ImageNetwork, folder: str | Path, *, name: str
+    depth: Float[np.ndarray, "n rows columns"],
+    network: ImageNetwork,
+    folder: str | Path,
+    *,
+    name: str,
+    numbers: Sequence[int] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Write what a network told of the frames `name`: `frames.csv`, with a line for each, from 0: `x_m`, `y_m`, the
-    middle of what is deepest, and `depth_m`, how deep; `depth.npz` with all maps; `depth.png`; `report.json`.
+    """Write what a network told of the frames `name`: `frames.csv`, with a line for each, by their `numbers`, from 0 on
+    unless given: `x_m`, `y_m`, the middle of what is deepest, and `depth_m`, how deep; `depth.npz` with all maps;
+    `depth.png`; `report.json`.
 
-    Maps of frames that were refused are NaN. Returns the columns. Raises `ValueError` for what cannot be a folder, and
-    where no frame was imaged.
+    Maps of frames that were refused are NaN; where nothing is deeper than noise makes it, there is no middle. Returns
+    the columns. Raises `ValueError` for what cannot be a folder, and where no frame was imaged.
     """
     where = results_folder(folder, DEPTH_FILES)
     if not np.isfinite(depth).any():
         raise ValueError(f"depth: none of {len(depth)} frames was imaged; there is nothing to write.")
     places = pixel_places(network.extent, network.shape)
     imaged = np.isfinite(depth.reshape(len(depth), -1)).all(axis=1)
+    number = np.arange(len(depth)) if numbers is None else np.asarray(numbers)
     middles = centroids_of(np.nan_to_num(depth), places)
-    middles[~imaged] = np.nan
     deepest = depth.reshape(len(depth), -1).max(axis=1)
+    middles[~(deepest > network.floor)] = np.nan
     columns = {"x_m": middles[:, 0], "y_m": middles[:, 1], "depth_m": deepest}
     with open(where / "frames.csv", "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(["frame", *columns])
-        for number, row in enumerate(zip(*columns.values(), strict=True)):
-            table.writerow([number, *(f"{value:.6g}" if np.isfinite(value) else "" for value in row)])
+        for own, row in zip(number, zip(*columns.values(), strict=True), strict=True):
+            table.writerow([own, *(f"{value:.6g}" if np.isfinite(value) else "" for value in row)])
     np.savez_compressed(where / "depth.npz", depth=depth, extent=np.array(network.extent))
-    _draw_depths(depth, np.flatnonzero(imaged), network).savefig(where / "depth.png", dpi=130)
+    _draw_depths(depth, np.flatnonzero(imaged), network, number).savefig(where / "depth.png", dpi=130)
     report = {
         "frames": name,
         "number": len(depth),
-        "refused": np.flatnonzero(~imaged),
+        "refused": number[~imaged],
         "design": network.design,
         "map": {"shape": network.shape, "extent_m": network.extent},
         "deepest_m": deepest[imaged].max(),
+        "depth_by_noise_alone_m": network.floor,
         "units": {"length": "m"},
         "versions": {package: version_of(package) for package in _PACKAGES},
     }
@@ -121,17 +130,25 @@ def write_depths(
     return columns
 
 
-def _draw_depths(depth: Float[np.ndarray, "n rows columns"], imaged: Int[np.ndarray, " k"], network: ImageNetwork):
+def _draw_depths(
+    depth: Float[np.ndarray, "n rows columns"],
+    imaged: Int[np.ndarray, " k"],
+    network: ImageNetwork,
+    numbers: Int[np.ndarray, " n"],
+):
     from matplotlib.figure import Figure
 
     from jeit.plot import plot_depth_map
 
     chosen = imaged[np.unique(np.linspace(0, len(imaged) - 1, _DRAWN).round().astype(int))]
     figure = Figure(figsize=(4.2 * len(chosen), 4.2), layout="constrained")
+    # What noise alone makes of the untouched skin is not stretched over the colours.
+    most = max(float(depth[imaged].max()), 4 * network.floor)
     for ax, number in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, strict=True):
-        most = float(depth[imaged].max()) or network.thickness
         last = number == chosen[-1]
-        plot_depth_map(depth[number], network.extent, most=most, colour_bar=last, title=f"frame {number}", ax=ax)
+        plot_depth_map(
+            depth[number], network.extent, most=most, colour_bar=last, title=f"frame {numbers[number]}", ax=ax
+        )
     return figure
 
 

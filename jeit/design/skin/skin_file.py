@@ -38,6 +38,14 @@ _KEYS: dict[str, dict[str, Quantity | Words]] = {
 }
 
 
+def describes_skin(path: str | Path) -> bool:
+    """True for a TOML file with a table "skin", whatever else is wrong with it; False for any other file."""
+    try:
+        return isinstance(tomllib.loads(Path(path).read_text("utf-8")).get("skin"), dict)
+    except (OSError, ValueError):
+        return False
+
+
 def read_described_skin(path: str | Path) -> Skin:
     """The skin that a TOML file describes: tables skin, electrodes (with `layout`, a name or a file beside it),
     measurement and mesh, as in a study file, each key with one value and all but the layout with a default.

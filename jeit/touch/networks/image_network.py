@@ -18,7 +18,9 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, check_name, is_number, real_array
 from jeit.design import Skin
 from jeit.protocol import Protocol
+from jeit.simulate.contact.indent_sets import pixel_places
 from jeit.simulate.contact.indents import relative_to
+from jeit.touch.networks.missing import MOST_MISSING, filled
 from jeit.touch.networks.three_stages import ThreeStages
 from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.training import check_same, read_model, write_model
@@ -28,6 +30,10 @@ _KIND, _VERSION = "a jeit image network", 1
 FILE = "network.jeit"
 # Frames that are imaged at once, at most: more leave the cache. JAX compiles for every number of them that is 2ⁿ.
 _AT_ONCE = 64
+# Maps are not to be believed where so much of the squared change is explained by no touch, in frames whose change is so
+# many times the noise, and where they are so many times as deep as the skin. Touches with three times the noise, and
+# those with contacts that had drifted by 10 %, were at most 0.45; channels in another order 0.6 in the median.
+_UNEXPLAINED, _LOUD, _TOO_DEEP = 0.6, 3.0, 1.2
 
 
 @dataclass(frozen=True)
@@ -60,20 +66,84 @@ class ImageNetwork:
         """How deep the skin is indented, metres, of frames (M,) or (n, M), volts, and a `reference` (M,) of the skin
         that nobody touches.
 
-        Raises `ValueError` for other numbers of channels, and for what is not finite: a network has no use for frames
-        with channels missing.
+        Channels without a reading are NaN; the "unrolled" design takes for them what the others lead it to expect.
+        Maps are the network's answer, whatever it is asked: `doubts` says which of them to believe. Raises
+        `ValueError` for other numbers of channels, and as `changes` does.
         """
+        change = self.changes(voltages, reference)
+        maps = self.thickness * self.share(change)
+        return maps if np.ndim(voltages) == 2 else maps[0]
+
+    def changes(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "n M"]:
+        """Relative changes (n, M) of frames and a reference, missing channels filled in. Raises `ValueError` where they
+        are infinite, or too many missing: any in the design "three-stages", half of them in the other."""
         channels = self.made_for["channels"]
         frames = real_array("voltages", voltages, f"frames ({channels},) or (n, {channels}), volts")
         rest = real_array("reference", reference, f"a frame ({channels},), volts")
         for name, given in (("voltages", frames), ("reference", rest)):
             if given.shape[-1:] != (channels,) or given.ndim > (2 if name == "voltages" else 1):
                 raise ValueError(f"{name} has shape {given.shape}; this network takes {channels} channels.")
-            if not np.isfinite(given).all():
-                raise ValueError(f"{name} is not finite everywhere, and this network needs every channel.")
-        change = relative_to(rest, np.atleast_2d(frames))
-        maps = self.thickness * self.share(change)
-        return maps if frames.ndim == 2 else maps[0]
+            if np.isinf(given).any():
+                raise ValueError(f"{name} is infinite in channel {np.flatnonzero(np.isinf(given))[0] % channels}.")
+        frames = np.atleast_2d(frames)
+        lost = np.isnan(frames) | np.isnan(rest)
+        most = MOST_MISSING * channels if isinstance(self.network, Unrolled) else 0
+        worst = int(lost.sum(axis=1).argmax()) if len(lost) else 0
+        if lost.any() and lost[worst].sum() > most:
+            which = np.flatnonzero(lost[worst])
+            named = ", ".join(map(str, which[:6])) + (", …" if len(which) > 6 else "")
+            raise ValueError(
+                f"voltages: no reading of {len(which)} of {channels} channels ({named}); "
+                + ("half of them are needed." if most else "a network of three stages needs all, another does not.")
+            )
+        change = np.where(lost, np.nan, relative_to(np.nan_to_num(rest), np.nan_to_num(frames)))
+        return filled(change, self._covariance, self.noise) if lost.any() else change
+
+    def doubts(self, change: Float[np.ndarray, "n M"], share: Float[np.ndarray, "n rows columns"]) -> list[str]:
+        """Why each of some maps, of `share(change)`, is not to be believed; "" where nothing speaks against it.
+
+        Nothing presses deeper than the skin is thick; and by the model, "unrolled" alone has it, what is pressed in has
+        to explain what changed.
+        """
+        found = ["" for _ in share]
+        size = np.linalg.norm(change, axis=1)
+        loud = size > _LOUD * self.noise * np.sqrt(change.shape[1])
+        missed = np.zeros(len(share))
+        if isinstance(self.network, Unrolled) and loud.any():
+            felt = np.asarray(self._felt(np.maximum(share, 0)))
+            missed[loud] = (np.linalg.norm(change - felt, axis=1)[loud] / size[loud]) ** 2
+        for number, one in enumerate(share):
+            if missed[number] > _UNEXPLAINED:
+                found[number] = (
+                    f"{100 * min(missed[number], 1):.0f} % of the squared change is of no touch; are the channels in "
+                    "order, are signs and units those of the reference, did the skin move?"
+                )
+            elif one.max() > _TOO_DEEP:
+                found[number] = (
+                    f"{1e3 * self.thickness * float(one.max()):.3g} mm deep, and the skin is "
+                    f"{1e3 * self.thickness:.3g} mm thick; are units those of the reference?"
+                )
+        return found
+
+    @functools.cached_property
+    def floor(self) -> float:
+        """How deep the untouched skin seems to be indented by noise as in the training, metres: the deepest place of
+        64 maps."""
+        random = np.random.default_rng(0)
+        return self.thickness * float(
+            self.share(self.noise * random.normal(size=(64, self.made_for["channels"]))).max()
+        )
+
+    @functools.cached_property
+    def _covariance(self) -> Float[np.ndarray, "M M"]:
+        assert isinstance(self.network, Unrolled)
+        return self.network.covariance(pixel_places(self.extent, self.shape))
+
+    @functools.cached_property
+    def _felt(self) -> Callable[..., Any]:
+        network = self.network
+        assert isinstance(network, Unrolled)
+        return jax.jit(lambda maps: network.felt(jnp.asarray(maps, jnp.float32)))
 
     def share(self, change: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n rows columns"]:
         """Depths over the thickness, of changes relative to a reference, as of `jeit.simulate.relative_changes`."""

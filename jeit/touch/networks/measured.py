@@ -10,6 +10,7 @@ from jaxtyping import Float
 from jeit.arguments import check_kind
 from jeit.data import Measurement
 from jeit.touch.networks.image_network import ImageNetwork
+from jeit.touch.networks.missing import MOST_MISSING
 
 # Metres that electrodes may be elsewhere than those that a network was trained for.
 _OFF = 1e-3
@@ -25,19 +26,14 @@ class FrameDepth(NamedTuple):
     latency: float
 
 
-def resting_frame(network: ImageNetwork, reference: Measurement) -> Float[np.ndarray, " M"]:
-    """The mean (M,) of the frames of a skin that nobody touches, volts. Raises `ValueError` where they are of another
-    skin or protocol than the network was trained for, with the difference, and for channels that no frame has."""
-    check_measured(network, reference)
-    mask, voltages = np.asarray(reference.mask), np.asarray(reference.voltages)
-    number = mask.sum(axis=0)
-    if not number.all():
-        lost = np.flatnonzero(number == 0)
-        raise ValueError(
-            f"'{reference.name}' has no voltage of {len(lost)} of {len(number)} channels, the first is number "
-            f"{lost[0]}; a network needs all of them."
-        )
-    return np.where(mask, voltages, 0).sum(axis=0) / number
+def resting_frame(frames: Float[np.ndarray, "r M"], name: str = "reference") -> Float[np.ndarray, " M"]:
+    """The mean (M,) of frames (r, M) of a skin that nobody touches, volts, NaN where no frame has a reading. Raises
+    `ValueError` where most channels have none."""
+    known = np.isfinite(frames)
+    number = known.sum(axis=0)
+    if np.mean(number == 0) > MOST_MISSING:
+        raise ValueError(f"'{name}' has no voltage of {int(np.sum(number == 0))} of {len(number)} channels.")
+    return np.where(number, np.where(known, frames, 0).sum(axis=0) / np.maximum(number, 1), np.nan)
 
 
 def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
@@ -47,6 +43,7 @@ def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
     network.check_protocol(measurement.protocol, measurement.name)
     if np.iscomplexobj(measurement.voltages):
         raise ValueError(f"'{measurement.name}' is complex, and the network was trained on real voltages.")
+    _check_extent(network, measurement)
     places = getattr(measurement.electrodes, "position", None)
     if places is None or np.ndim(places) != 2:
         return
@@ -59,16 +56,33 @@ def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
         )
 
 
+def _check_extent(network: ImageNetwork, measurement: Measurement) -> None:
+    domain = measurement.domain
+    here = getattr(domain, "extent", None)
+    if here is None or np.shape(here) != (4,):
+        return
+    own, given = (np.subtract(one[1::2], one[::2]) for one in (network.extent, np.asarray(here, float)))
+    if np.abs(own - given).max() > _OFF:
+        raise ValueError(
+            f"'{measurement.name}': its skin is {1e3 * given[0]:.4g} × {1e3 * given[1]:.4g} mm, and the network's "
+            f"{1e3 * own[0]:.4g} × {1e3 * own[1]:.4g} mm; train one for this skin."
+        )
+
+
 def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarray, " M"]) -> Iterator[FrameDepth]:
     """Maps of frames (M,), volts, one after the other, beside the frame `rest` (M,) of the untouched skin; everything
     is compiled before the first is asked for. A frame is refused, and the stream goes on, when it has another number of
-    channels, or any of them is missing. Raises `ValueError` for what are no frames."""
+    channels, too many of them are missing, or its map is not to be believed (`ImageNetwork.doubts`). Raises
+    `ValueError` for what are no frames."""
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
-    network.depth(rest, rest)
+    network.doubts(np.ones((1, len(rest))), network.share(np.zeros((1, len(rest)))))
     for number, frame in enumerate(frames):
         begin = time.perf_counter()
         try:
-            depth, reason = network.depth(np.asarray(frame, float), rest), ""
+            change = network.changes(np.asarray(frame, float), rest)
+            share = network.share(change)
+            (reason,) = network.doubts(change, share)
+            depth = None if reason else network.thickness * share[0]
         except (ValueError, TypeError) as error:
             depth, reason = None, " ".join(str(error).split())
         yield FrameDepth(number, depth, reason, time.perf_counter() - begin)

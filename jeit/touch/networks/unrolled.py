@@ -107,6 +107,13 @@ class Unrolled(eqx.Module):
         nothing = jax.tree.map(lambda _: False, self)
         return eqx.tree_at(lambda one: one.steps, nothing, jax.tree.map(eqx.is_inexact_array, self.steps))
 
+    def covariance(self, places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "M M"]:
+        """Of the changes of channels, where pixels at these places have strengths of the prior."""
+        rows, columns = self.shape[0] // 2, self.shape[1] // 2
+        operator = np.asarray(self.operator, float).reshape(-1, rows, 2, columns, 2).sum(axis=(2, 4))
+        operator = operator.reshape(len(operator), -1)
+        return operator @ _covariance(places[::2, ::2].reshape(-1, 2)) @ operator.T
+
     def felt(self, maps: Float[Array, "b r c"]) -> Float[Array, "b M"]:
         """Relative changes that the model gives maps."""
         return strength(maps).reshape(len(maps), -1) @ self.operator.T

@@ -12,6 +12,16 @@ from jeit.data.export import write_table
 from jeit.protocol import adjacent
 from jeit.simulate import Disc, Indent, relative_changes
 
+SKIN = """
+[skin]
+width_mm = 100
+height_mm = 100
+thickness_mm = 10
+[electrodes]
+layout = "grid-4x4"
+[mesh]
+cell_mm = 6
+"""
 PLACES = ((0.01, -0.02), (-0.025, 0.01))
 
 
@@ -60,15 +70,63 @@ def test_reconstruct(learnt, recorded, run, tmp_path):
 
 
 def test_stream(learnt, recorded, run, tmp_path):
+    """A frame without one of its channels is imaged; one of channels in another order is not."""
+    with np.load(recorded / "touched.npz") as one:
+        arrays = dict(one)
+    arrays["voltages"][2, :] = arrays["voltages"][2, ::-1]
+    np.savez(tmp_path / "touched.npz", frames=np.where(arrays["mask"], arrays["voltages"], np.nan))
     given = "--reference", recorded / "rest.npz", "--method", "network", "--model", learnt[0], "--output", tmp_path
     status, out, error = run("stream", recorded / "touched.npz", *given)
     assert (status, error) == (0, "")
-    assert "2 frames imaged" in out
-    assert "frame 2: refused. voltages is not finite" in " ".join(out.split())
-    lines = told(tmp_path)
-    assert (np.linalg.norm(lines[:2, 1:3] - PLACES, axis=1) < 0.015).all()
-    assert np.isnan(lines[2, 1:]).all()
+    assert "3 frames imaged" in out
+    assert (np.linalg.norm(told(tmp_path)[:, 1:3] - [*PLACES, PLACES[0]], axis=1) < 0.015).all()
+    status, out, error = run("stream", tmp_path / "touched.npz", *given)
+    assert (status, error) == (0, "")
+    assert "frame 2: refused." in " ".join(out.split())
+    assert np.isnan(told(tmp_path)[2, 1:]).all()
     assert json.loads((tmp_path / "report.json").read_text())["refused"] == [2]
+
+
+def test_a_table_that_nothing_describes(learnt, recorded, run, tmp_path):
+    """The network knows what its channels are; the file that the skin is described by is a description too."""
+    for name in ("rest", "touched"):
+        with np.load(recorded / f"{name}.npz") as one:
+            np.savez(tmp_path / f"{name}.npz", frames=one["voltages"])
+    (tmp_path / "skin.toml").write_text(SKIN)
+    given = "--reference", tmp_path / "rest.npz", "--method", "network", "--model", learnt[0], "--output", tmp_path
+    for more in ((), ("--description", tmp_path / "skin.toml")):
+        status, out, error = run("reconstruct", tmp_path / "touched.npz", *given, "--frame", -2, *more)
+        assert (status, error) == (0, "")
+        assert "in frame 1" in out
+        line = told(tmp_path)
+        assert line[0] == 1
+        assert np.linalg.norm(line[1:3] - PLACES[1]) < 0.015
+    (tmp_path / "skin.toml").write_text(SKIN.replace("grid-4x4", "grid-3x3"))
+    status, _, error = run("reconstruct", tmp_path / "touched.npz", *given, "--description", tmp_path / "skin.toml")
+    assert status == 1
+    assert "was trained for another skin or protocol" in error
+    np.savez(tmp_path / "few.npz", frames=np.ones((2, 5)))
+    status, _, error = run("reconstruct", tmp_path / "few.npz", *given)
+    assert status == 1
+    assert "has 5 channels, and the network was trained for 94" in error
+
+
+def test_an_untouched_skin(learnt, recorded, run, tmp_path):
+    """Nothing is said to be touched."""
+    given = "--reference", recorded / "rest.npz", "--method", "network", "--model", learnt[0], "--output", tmp_path
+    status, out, _ = run("stream", recorded / "rest.npz", *given)
+    assert status == 0
+    assert "untouched: nothing is deeper than noise makes it" in out
+    assert np.isnan(told(tmp_path)[1:3]).all()
+
+
+def test_nothing_is_left_of_what_fails(learnt, recorded, run, tmp_path):
+    """No empty folder, and those above it stay away too."""
+    given = "--method", "network", "--model", learnt[0], "--output", tmp_path / "new" / "out"
+    status, _, error = run("reconstruct", recorded / "touched.npz", *given)
+    assert status == 1
+    assert "--reference" in error
+    assert not (tmp_path / "new").exists()
 
 
 def test_stream_from_standard_input(learnt, recorded, run, tmp_path, monkeypatch):
