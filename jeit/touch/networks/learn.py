@@ -15,11 +15,12 @@ from jeit.design import Skin, touches_away_from_the_edge
 from jeit.simulate import Indent, IndentSet, ball, relative_changes, simulate_presses
 from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.needed import need_learning
+from jeit.touch.networks.examples import Examples, StoredTouches
 from jeit.touch.networks.image_network import DESIGNS, FILE, ImageNetwork, write_network
 from jeit.touch.networks.places import centroids_of, errors
 from jeit.touch.networks.sensed import Sensed
 from jeit.touch.networks.touches import detection_noise, touch_draws
-from jeit.touch.networks.training import Examples, Runs, train_three_stages, train_unrolled
+from jeit.touch.networks.training import Runs, train_three_stages, train_unrolled
 from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.training import Plan, Trained
 
@@ -117,28 +118,29 @@ def learn_images(
     ):
         indents = IndentSet(skin, touch_draws(skin), number, seed=3 * seed + own, shape=SHAPE, chunk=_CHUNK)
         where = work / f"{name}.zarr"
-        found = simulate_presses(
+        simulate_presses(
             indents,
             where,
             client=client,
             progress=lambda now, name=name: tell(f"touches {name}: {now.points} of {now.all_points}"),
         )
-        sets[name] = Examples(found["change"].to_numpy(), found["depth"].to_numpy())
+        sets[name] = StoredTouches(indents, where)
+    held, judged = (sets[name].in_memory() for name in ("held-out", "standing"))
     seconds["touches"] = time.monotonic() - start
     key = jax.random.key(seed)
     runs = Runs(preset.plan_of(design), key, work, progress)
     if design == "unrolled":
         sensed = Sensed.of(skin, SHAPE)
-        start_network = Unrolled(sets["learnt"].change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
+        start_network = Unrolled(held.change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
         places = image_places(skin, SHAPE[1], SHAPE[0])
         start_network = start_network.of_skin(sensed, places, skin.layout.centres, noise)
-        learnt = train_unrolled(start_network, sensed, sets["learnt"], sets["held-out"], noise, runs)
+        learnt = train_unrolled(start_network, sensed, sets["learnt"], held, noise, runs)
     else:
-        learnt = train_three_stages(sets["learnt"], sets["held-out"], noise, runs)
+        learnt = train_three_stages(sets["learnt"], held, noise, runs)
     seconds["training"] = time.monotonic() - start - seconds["touches"]
     network = ImageNetwork.of_skin(learnt.network, skin, noise, SHAPE)
     tell("standing")
-    standing = stand(network, skin, sets["standing"])
+    standing = stand(network, skin, judged)
     seconds["all"] = time.monotonic() - start
     write_network(network, Path(folder) / FILE)
     return LearntImages(network, learnt.courses, standing, seconds)
