@@ -7,6 +7,7 @@ from small_networks import bits
 
 from jeit.simulate import IndentSet, simulate_presses
 from jeit.touch.networks.examples import Examples, StoredTouches
+from jeit.touch.networks.sensed import Sensed
 from jeit.touch.networks.three_stages import ThreeStages
 from jeit.touch.networks.touches import touch_draws
 from jeit.touch.networks.training import Runs, mean_and_deviation, train_three_stages, train_unrolled
@@ -96,8 +97,8 @@ def test_a_set_larger_than_memory(design, stored, small_skin, tmp_path):
         if design == "three-stages":
             return train_three_stages(touches, held, 1e-3, runs)
         start = Unrolled(channels, (16, 16), key=jax.random.key(1))
-        contacts = np.zeros((16, channels))
-        return train_unrolled(start, type("Of", (), {"contacts": contacts}), touches, held, 1e-3, runs)
+        sensed = Sensed(np.zeros((channels, 256)), np.zeros((16, channels)), (16, 16))
+        return train_unrolled(start, sensed, touches, held, 1e-3, runs)
 
     whole = train(None)
     assert {number for _, number in loaded} == {0, 1, 2}
