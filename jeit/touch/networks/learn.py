@@ -1,5 +1,6 @@
 """`learn_images`: from a skin's description to a network that images its touches; its data, trainings and standing."""
 
+import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,8 +11,9 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_kind, check_name
+from jeit.arguments import check_kind, check_name, told
 from jeit.design import Skin, touches_away_from_the_edge
+from jeit.design.study.store import require
 from jeit.simulate import Indent, IndentSet, ball, relative_changes, simulate_presses
 from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.needed import need_learning
@@ -88,6 +90,7 @@ def learn_images(
     *,
     preset: str | Preset = "full",
     design: str = "unrolled",
+    touches: int | None = None,
     seed: int = 0,
     client: Any = None,
     progress: Callable[[str], None] | None = None,
@@ -96,16 +99,23 @@ def learn_images(
 
     Killed at any moment, the same call goes on where it was: touches are in chunks in stores in the folder `work`, and
     trainings in checkpoints. `preset`: "quick", under two minutes, "full", or one of one's own; `design`: "unrolled", a
-    network that knows the skin's physics, or "three-stages", that of Park et al. 2022. `client`: of a dask cluster,
-    which then simulates. `progress` is called with how far it is. Raises `ValueError` for names that there are not and
-    a folder of another skin's work; `ImportError` without the extras `learn` and `cluster`.
+    network that knows the skin's physics, or "three-stages", that of Park et al. 2022. `touches`: how many to learn
+    from, as many as fit on the disk; the preset's unless given. `client`: of a dask cluster, which then simulates.
+    `progress` is called with how far it is. Raises `ValueError` for names that there are not, no number, and a folder
+    of another skin's work; `ImportError` without the extras `learn` and `cluster`.
     """
     need_learning()
+    for package in ("xarray", "zarr"):
+        require(package)
     check_kind("skin", skin, Skin, "a Skin, as of read_described_skin('skin.toml')")
     check_name("design", design, DESIGNS)
     if not isinstance(preset, Preset):
         check_name("preset", preset, PRESETS)
         preset = PRESETS[preset]
+    if touches is not None:
+        if not (isinstance(touches, int) and touches >= 1):
+            raise ValueError(f"touches must be a whole number, 1 or more; it is {told(touches)}.")
+        preset = dataclasses.replace(preset, number=touches)
     tell = (lambda _: None) if progress is None else progress
     work = Path(folder) / "work"
     work.mkdir(parents=True, exist_ok=True)
