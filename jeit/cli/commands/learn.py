@@ -34,6 +34,9 @@ def image(
         str,
         typer.Option(help="unrolled: a network that knows the skin's physics; three-stages: that of Park et al. 2022."),
     ] = "unrolled",
+    touches: Annotated[
+        int | None, typer.Option(help="How many touches to learn from; as the preset says unless given.", min=1)
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of touches and starting weights.", min=0)] = 0,
     scheduler: Annotated[
         str | None,
@@ -66,7 +69,14 @@ def image(
         client = None if scheduler is None else stack.enter_context(connected(scheduler))
         step("learn")
         learnt = learn_images(
-            described, output, preset=preset, design=design, seed=seed, client=client, progress=step.tell
+            described,
+            output,
+            preset=preset,
+            design=design,
+            touches=touches,
+            seed=seed,
+            client=client,
+            progress=step.tell,
         )
         step("write")
         write_learnt_images(learnt, output)

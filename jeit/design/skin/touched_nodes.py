@@ -24,12 +24,13 @@ class TouchedNodes(eqx.Module):
     corners: Int[np.ndarray, "n c q"]
 
 
-def touched_nodes(model: ForwardModel, touches: TouchedCells) -> TouchedNodes:
-    """Nodes of the cells that touches change."""
+def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | None = None) -> TouchedNodes:
+    """Nodes of the cells that touches change; `strips` of these and more nodes, of these alone unless given."""
     mesh, cells, real = model.mesh, np.asarray(touches.cells), np.asarray(touches.change) != 0
     touched = np.zeros(mesh.num_points, bool)
     touched[np.asarray(mesh.cells)[cells[real]]] = True
-    strips = Strips.create(model.system.pattern, np.asarray(mesh.points), touched)
+    if strips is None:
+        strips = Strips.create(model.system.pattern, np.asarray(mesh.points), touched)
     nowhere = strips.number * strips.wanted  # a place for all that is not touched
     place = np.where(touched, strips.place, nowhere).astype(np.int32)[np.asarray(mesh.cells)]
     corners, found = np.zeros((*cells.shape, mesh.cells.shape[1]), np.int32), []

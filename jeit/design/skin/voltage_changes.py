@@ -25,6 +25,7 @@ from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity, stiffness
 from jeit.forward.model import check_model, evaluate, select_channels, solved_system_of
 from jeit.forward.transfer import fields_and_inverse
+from jeit.protocol import Protocol
 from jeit_solvers import over_cores
 from jeit_solvers.engines import has_values, on_device
 
@@ -36,7 +37,7 @@ _CUT_OFF, _MOST_WEAKENED = 10.0, 1e6
 # Of the voltages, relative to the load's energy: below, they are rounding.
 _SMALLEST = 1e-12
 # Touches worked on at once: their blocks of the inverse are to stay in the cache, or of the Jacobian.
-_EXACT, _LINEAR = 2, 8
+EXACT_AT_ONCE, _LINEAR = 2, 8
 # What the inverse's reach is a multiple of: programs are compiled for each.
 _STRIPS = 3
 
@@ -88,25 +89,39 @@ def _exact(model: ForwardModel, conductivity, touched: TouchedCells):
     solved = evaluate(model, solved_system_of, conductivity)
     known = fields_and_inverse(solved, model.electrodes, touched_at.strips, reach)
     touches = on_device((touched.cells, touched.change, touched_at.nodes, touched_at.corners))
-    number = len(touched.cells)
-    found = over_cores(partial(_changes, model, conductivity, known, touches), number, _EXACT)[:number]
-    lost = np.flatnonzero(~np.isfinite(np.asarray(found)).all(axis=1))
-    if lost.size:
-        x, y = np.asarray(touched.places)[lost[0]]
-        raise RuntimeError(
-            f"the changes by {lost.size} of {number} touches were not found in {_MOST_STEPS} steps, the first at "
-            f"({1e3 * x:.4g}, {1e3 * y:.4g}) mm; does it cut an electrode off, or are conductivities many orders of "
-            "magnitude apart?"
-        )
+    number, element = len(touched.cells), cell_stiffness(model, conductivity)
+    work = partial(changes_between, model.protocol, element, known, touches)
+    found = over_cores(work, number, EXACT_AT_ONCE)[:number]
+    check_found(found, np.asarray(touched.places))
     return found
 
 
+def check_found(changes, places: Float[np.ndarray, "n 2"]) -> None:
+    """Raise `RuntimeError` where changes by touches at `places`, metres, were not found."""
+    lost = np.flatnonzero(~np.isfinite(np.asarray(changes)).all(axis=1))
+    if lost.size:
+        x, y = places[lost[0]]
+        raise RuntimeError(
+            f"the changes by {lost.size} of {len(places)} touches were not found in {_MOST_STEPS} steps, the first at "
+            f"({1e3 * x:.4g}, {1e3 * y:.4g}) mm; does it cut an electrode off, or are conductivities many orders of "
+            "magnitude apart?"
+        )
+
+
 @jax.jit
-def _changes(model: ForwardModel, conductivity, known, touches, index):
-    """Changes of the voltages by the touches with these numbers (c, s), s of them at a time."""
+def cell_stiffness(model: ForwardModel, conductivity) -> Float[Array, "m q q"]:
+    """Each cell's part of the system matrix, siemens; `conductivity` of the cells."""
+    return _symmetric(stiffness(model.mesh, conductivity), model.mesh.dimension + 1)
+
+
+@jax.jit
+def changes_between(protocol: Protocol, element, known, touches, index):
+    """Changes of the voltages by the touches with these numbers (c, s), s of them at a time.
+
+    `element` as of `cell_stiffness`; `known` as of `fields_and_inverse`; `touches`: their cells, changes, nodes and
+    corners, as of `TouchedCells` and `touched_nodes`."""
     fields, inverse = known
-    element = _symmetric(stiffness(model.mesh, conductivity), model.mesh.dimension + 1)  # (m, q, q)
-    select = jax.vmap(lambda change: select_channels(model.protocol, change))
+    select = jax.vmap(lambda change: select_channels(protocol, change))
 
     def some(index):
         cells, change, nodes, corners = (array[index] for array in touches)

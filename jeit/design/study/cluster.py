@@ -1,5 +1,6 @@
 """Chunks of work on the workers of a cluster."""
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
@@ -14,11 +15,19 @@ def over_cluster(
     """Numbers of chunks with what `solve(work, number)` returns, as they are solved by the workers of a
     `dask.distributed.Client`; those of a worker that is lost are solved again."""
     distributed = require("distributed")
-    # The work goes with every chunk: scattered, it would be lost with a worker that alone has it.
-    futures = {client.submit(solve, work, number, pure=False, retries=2): number for number in numbers}
+    # The work is sent once, as a task: where the only worker that has it is lost, it is sent again. Scattered, it would
+    # be lost; with every chunk, a layer of 70 MB would go out a thousand times.
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sending large graph")
+        sent = client.submit(_same, work, pure=False)
+    futures = {client.submit(solve, sent, number, pure=False, retries=2): number for number in numbers}
     try:
         for future, results in distributed.as_completed(futures, with_results=True):
             yield futures[future], results
             future.release()
     finally:
-        client.cancel(list(futures))
+        client.cancel([sent, *futures])
+
+
+def _same(work: Any) -> Any:
+    return work

@@ -192,7 +192,9 @@ def require(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError:
-        raise ImportError(f"Studies need {name}: pip install 'jeit[cluster]', or in a clone '.[cluster]'.") from None
+        raise ImportError(
+            f"Studies and sets of touches need {name}: pip install 'jeit[cluster]', or in a clone '.[cluster]'."
+        ) from None
 
 
 def _shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:

@@ -1,7 +1,8 @@
 """Sets of drawn indents, with what a skin reads of them and their depth maps: in chunks, as sets of presses are."""
 
 import hashlib
-from functools import cached_property
+from functools import cached_property, lru_cache
+from threading import Lock
 from typing import Any
 
 import jax
@@ -9,11 +10,14 @@ import numpy as np
 
 from jeit.arguments import check_kind, told
 from jeit.design import Skin
+from jeit.design.skin.resting_skin import RestingSkin
 from jeit.design.study.contents import Contents
-from jeit.simulate.contact.indents import IndentDraws, depth_maps, relative_changes
+from jeit.simulate.contact.indents import IndentDraws, depth_maps, relative_changes, resting_skin
 
 # Changes with what the same set is simulated to.
-_VERSION = 1
+_VERSION = 2
+# Of a worker's threads, one works out what the chunks share, and the others wait for it.
+_ONE = Lock()
 _MEANINGS = {
     "change": ("1", "change of each channel's voltage, relative to the skin at rest"),
     "depth": ("1", "depth of the indentation over the thickness of the skin, row 0 at the least y"),
@@ -65,18 +69,17 @@ class IndentSet:
         """SHA-256 of all that decides the results."""
         model = self.skin.model
         parts = model.mesh, model.electrodes, model.protocol, self.skin.conductivity, self.skin.thickness, self.draws
-        leaves, structure = jax.tree.flatten(parts)
-        digest = hashlib.sha256(f"{_VERSION, self.number, self.seed, self.chunk, self.shape} {structure}".encode())
-        for leaf in leaves:
-            digest.update(np.asarray(leaf).tobytes())
-        return digest.hexdigest()
+        own = _VERSION, self.number, self.seed, self.chunk, self.shape
+        return _digest(parts, str(own))
 
     def solve(self, number: int) -> dict[str, np.ndarray]:
         """Changes (k, M) and depths (k, rows, columns) of one chunk, as they stand in the store."""
         key = jax.random.fold_in(jax.random.key(self.seed), number)
         touches = self.draws.draw(key, len(self.chunks[number]))
         depth = depth_maps(touches, self.places) / float(self.skin.thickness)
-        return {"change": relative_changes(self.skin, touches), "depth": depth.astype(np.float32)}
+        with _ONE:
+            resting = _resting(_Deep(self.skin, self.draws.depth[1]))
+        return {"change": relative_changes(self.skin, touches, resting), "depth": depth.astype(np.float32)}
 
     def contents(self) -> Contents:
         """What its store holds."""
@@ -102,6 +105,36 @@ class IndentSet:
         names = [*_MEANINGS]
         attributes = {"seed": self.seed}
         return Contents("indent set", "simulate_presses", self.fingerprint, self.chunks, names, attributes, fill)
+
+
+class _Deep:
+    """A skin that is indented up to a depth, metres; equal to any like it."""
+
+    def __init__(self, skin: Skin, depth: float):
+        self.skin, self.depth = skin, depth
+        model = skin.model
+        self._all = _digest((model.mesh, model.electrodes, model.protocol, skin.model_conductivity), str(depth))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Deep) and other._all == self._all
+
+    def __hash__(self) -> int:
+        return hash(self._all)
+
+
+@lru_cache(maxsize=1)
+def _resting(deep: _Deep) -> RestingSkin | None:
+    """What all chunks share, of all sets of a skin; a gigabyte, of a layer."""
+    return resting_skin(deep.skin, deep.depth)
+
+
+def _digest(parts: Any, text: str) -> str:
+    """SHA-256 of a tree of arrays, and a text."""
+    leaves, structure = jax.tree.flatten(parts)
+    digest = hashlib.sha256(f"{text} {structure}".encode())
+    for leaf in leaves:
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()
 
 
 def image_places(skin: Skin, columns: int, rows: int) -> np.ndarray:

@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 
 from jeit.arguments import check_kind, check_metres
 from jeit.design import Skin
+from jeit.design.skin.resting_skin import RestingSkin
 from jeit.design.skin.touched_cells import TouchedCells, padded
 from jeit.mesh import Domain, centroids
 from jeit.simulate.contact.cell_pressure import lattice
@@ -129,13 +130,33 @@ def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCe
     return TouchedCells(as_array(places), as_array(cells), as_array(change), mesh.num_cells)
 
 
-def relative_changes(skin: Skin, touches: Sequence[Sequence[Indent]]) -> Float[np.ndarray, "n M"]:
-    """Exact changes (n, M) of a skin's voltages by n touches, relative to those at rest, see `relative_to`. Raises
-    `ValueError` as `indented_cells` does."""
+def relative_changes(
+    skin: Skin, touches: Sequence[Sequence[Indent]], resting: RestingSkin | None = None
+) -> Float[np.ndarray, "n M"]:
+    """Exact changes (n, M) of a skin's voltages by n touches, relative to those at rest, see `relative_to`.
+
+    `resting`: the same skin at rest, as of `resting_skin`, which many calls may share. Raises `ValueError` as
+    `indented_cells` does.
+    """
+    touched = indented_cells(skin, touches)
+    if resting is not None:
+        rest = np.asarray(resting.rest)
+        return relative_to(rest, rest + resting.changes(touched))
     # Gains and noise of the material are those of its readings; these voltages are the model's own.
     pressed = PressedSkin(jax.random.key(0), skin.model, material("hydrogel"), conductivity=skin.model_conductivity)
     rest = np.asarray(skin.model.voltages(skin.model_conductivity))
-    return relative_to(rest, pressed.voltages_under(indented_cells(skin, touches)))
+    return relative_to(rest, pressed.voltages_under(touched))
+
+
+def resting_skin(skin: Skin, depth: float) -> RestingSkin | None:
+    """A skin at rest, for indents up to a `depth`, metres; None where it would take too much memory."""
+    mesh = skin.model.mesh
+    touchable = np.ones(mesh.num_points, bool)
+    if skin.num_layers:
+        height = lattice(np.asarray(mesh.points)[np.asarray(mesh.cells)], _LATTICE)[..., 2]
+        touchable[:] = False
+        touchable[np.asarray(mesh.cells)[(height.max() - height < depth).any(axis=1)]] = True
+    return RestingSkin.create(skin.model, skin.model_conductivity, touchable)
 
 
 def relative_to(reference: Float[np.ndarray, " M"], voltages: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n M"]:

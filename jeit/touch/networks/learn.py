@@ -1,5 +1,6 @@
 """`learn_images`: from a skin's description to a network that images its touches; its data, trainings and standing."""
 
+import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,16 +11,18 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_kind, check_name
+from jeit.arguments import check_kind, check_name, told
 from jeit.design import Skin, touches_away_from_the_edge
+from jeit.design.study.store import require
 from jeit.simulate import Indent, IndentSet, ball, relative_changes, simulate_presses
 from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.needed import need_learning
+from jeit.touch.networks.examples import Examples, StoredTouches
 from jeit.touch.networks.image_network import DESIGNS, FILE, ImageNetwork, write_network
 from jeit.touch.networks.places import centroids_of, errors
 from jeit.touch.networks.sensed import Sensed
 from jeit.touch.networks.touches import detection_noise, touch_draws
-from jeit.touch.networks.training import Examples, Runs, train_three_stages, train_unrolled
+from jeit.touch.networks.training import Runs, train_three_stages, train_unrolled
 from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.training import Plan, Trained
 
@@ -87,6 +90,7 @@ def learn_images(
     *,
     preset: str | Preset = "full",
     design: str = "unrolled",
+    touches: int | None = None,
     seed: int = 0,
     client: Any = None,
     progress: Callable[[str], None] | None = None,
@@ -95,16 +99,23 @@ def learn_images(
 
     Killed at any moment, the same call goes on where it was: touches are in chunks in stores in the folder `work`, and
     trainings in checkpoints. `preset`: "quick", under two minutes, "full", or one of one's own; `design`: "unrolled", a
-    network that knows the skin's physics, or "three-stages", that of Park et al. 2022. `client`: of a dask cluster,
-    which then simulates. `progress` is called with how far it is. Raises `ValueError` for names that there are not and
-    a folder of another skin's work; `ImportError` without the extras `learn` and `cluster`.
+    network that knows the skin's physics, or "three-stages", that of Park et al. 2022. `touches`: how many to learn
+    from, as many as fit on the disk; the preset's unless given. `client`: of a dask cluster, which then simulates.
+    `progress` is called with how far it is. Raises `ValueError` for names that there are not, no number, and a folder
+    of another skin's work; `ImportError` without the extras `learn` and `cluster`.
     """
     need_learning()
+    for package in ("xarray", "zarr"):
+        require(package)
     check_kind("skin", skin, Skin, "a Skin, as of read_described_skin('skin.toml')")
     check_name("design", design, DESIGNS)
     if not isinstance(preset, Preset):
         check_name("preset", preset, PRESETS)
         preset = PRESETS[preset]
+    if touches is not None:
+        if not (isinstance(touches, int) and touches >= 1):
+            raise ValueError(f"touches must be a whole number, 1 or more; it is {told(touches)}.")
+        preset = dataclasses.replace(preset, number=touches)
     tell = (lambda _: None) if progress is None else progress
     work = Path(folder) / "work"
     work.mkdir(parents=True, exist_ok=True)
@@ -117,28 +128,29 @@ def learn_images(
     ):
         indents = IndentSet(skin, touch_draws(skin), number, seed=3 * seed + own, shape=SHAPE, chunk=_CHUNK)
         where = work / f"{name}.zarr"
-        found = simulate_presses(
+        simulate_presses(
             indents,
             where,
             client=client,
             progress=lambda now, name=name: tell(f"touches {name}: {now.points} of {now.all_points}"),
         )
-        sets[name] = Examples(found["change"].to_numpy(), found["depth"].to_numpy())
+        sets[name] = StoredTouches(indents, where)
+    held, judged = (sets[name].in_memory() for name in ("held-out", "standing"))
     seconds["touches"] = time.monotonic() - start
     key = jax.random.key(seed)
     runs = Runs(preset.plan_of(design), key, work, progress)
     if design == "unrolled":
         sensed = Sensed.of(skin, SHAPE)
-        start_network = Unrolled(sets["learnt"].change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
+        start_network = Unrolled(held.change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
         places = image_places(skin, SHAPE[1], SHAPE[0])
         start_network = start_network.of_skin(sensed, places, skin.layout.centres, noise)
-        learnt = train_unrolled(start_network, sensed, sets["learnt"], sets["held-out"], noise, runs)
+        learnt = train_unrolled(start_network, sensed, sets["learnt"], held, noise, runs)
     else:
-        learnt = train_three_stages(sets["learnt"], sets["held-out"], noise, runs)
+        learnt = train_three_stages(sets["learnt"], held, noise, runs)
     seconds["training"] = time.monotonic() - start - seconds["touches"]
     network = ImageNetwork.of_skin(learnt.network, skin, noise, SHAPE)
     tell("standing")
-    standing = stand(network, skin, sets["standing"])
+    standing = stand(network, skin, judged)
     seconds["all"] = time.monotonic() - start
     write_network(network, Path(folder) / FILE)
     return LearntImages(network, learnt.courses, standing, seconds)

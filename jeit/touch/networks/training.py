@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit.touch.networks.examples import Examples, Touches
 from jeit.touch.networks.sensed import Sensed
 from jeit.touch.networks.three_stages import DepthAutoencoder, ThreeStages, VoltageAutoencoder
 from jeit.touch.networks.unrolled import Unrolled
-from jeit.touch.training import Objective, Plan, Trained, fit
+from jeit.touch.training import MappedRows, Objective, Plan, Rows, Trained, fit
 
 # Of the unrolled network: how much the maps of its first steps count, and the misfit beside the last map; the model's
 # own error, relative to the changes; deviations of logarithms of contact impedances that drift, at most; and how many
@@ -21,13 +22,6 @@ from jeit.touch.training import Objective, Plan, Trained, fit
 _EARLY, _MISFIT, _MODEL_ERROR, _DRIFT, _LOUDER = 0.3, 0.05, 0.1, 0.1, 6.0
 # Squares of depths, so that losses are about one before training.
 _SCALE = 0.002
-
-
-class Examples(NamedTuple):
-    """Touches: relative changes (n, M) without noise, and depth maps (n, rows, columns) over the thickness."""
-
-    change: Float[np.ndarray, "n M"]
-    depth: Float[np.ndarray, "n r c"]
 
 
 class Learnt(NamedTuple):
@@ -54,19 +48,20 @@ class Runs(NamedTuple):
         return fit(network, objective, training, validation, self.plan, key=key, checkpoint=kept, progress=said)
 
 
-def train_three_stages(training: Examples, validation: Examples, noise: float, runs: Runs) -> Learnt:
+def train_three_stages(training: Touches, validation: Examples, noise: float, runs: Runs) -> Learnt:
     """The paper's: an autoencoder of the changes, one of the maps, and what leads from the one to the other while both
     stay. `noise`: deviation of relative changes."""
-    shape = training.depth.shape[1:]
-    start = ThreeStages(training.change.shape[1], shape, key=runs.key)
-    noisy = np.hypot(training.change.std(axis=0), noise)
+    shape = validation.depth.shape[1:]
+    start = ThreeStages(validation.change.shape[1], shape, key=runs.key)
+    mean, deviation = mean_and_deviation(training.rows("change"))
+    noisy = np.hypot(deviation, noise)
     start = eqx.tree_at(
         lambda one: (one.mean, one.deviation),
         start,
-        (jnp.asarray(training.change.mean(axis=0), jnp.float32), jnp.asarray(noisy, jnp.float32)),
+        (jnp.asarray(mean, jnp.float32), jnp.asarray(noisy, jnp.float32)),
     )
     own = jnp.asarray(noise / noisy, jnp.float32)
-    changes = [np.asarray(start.standard(jnp.asarray(one.change, jnp.float32))) for one in (training, validation)]
+    changes = MappedRows(training.rows("change"), start.standard, f"standardised under noise of {noise}")
     voltages, depth = (jax.random.fold_in(runs.key, one) for one in (1, 2))
 
     def denoised(network, batch, key):
@@ -80,15 +75,16 @@ def train_three_stages(training: Examples, validation: Examples, noise: float, r
     found = {
         "voltages": runs.run(
             "voltages",
-            VoltageAutoencoder(changes[0].shape[1], key=voltages),
+            VoltageAutoencoder(validation.change.shape[1], key=voltages),
             Objective(denoised, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=1)),
-            *changes,
+            changes,
+            start.standard(jnp.asarray(validation.change, jnp.float32)),
         ),
         "maps": runs.run(
             "maps",
             DepthAutoencoder(shape, key=depth),
             Objective(redrawn, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=(1, 2)) / _SCALE),
-            training.depth,
+            training.rows("depth"),
             validation.depth,
         ),
     }
@@ -105,13 +101,13 @@ def train_three_stages(training: Examples, validation: Examples, noise: float, r
         noisy = change + noise * jax.random.normal(key, change.shape, change.dtype)
         return jnp.mean((network(noisy) - wanted) ** 2) / _SCALE, network
 
-    rows = [(np.asarray(one.change, np.float32), one.depth) for one in (training, _noisy(validation, noise))]
+    rows = training.rows("change", "depth"), _noisy(validation, noise)
     found["projection"] = runs.run("projection", start, Objective(projected, _map_errors, trained), *rows)
     return Learnt(found["projection"].network, found)
 
 
 def train_unrolled(
-    start: Unrolled, sensed: Sensed, training: Examples, validation: Examples, noise: float, runs: Runs
+    start: Unrolled, sensed: Sensed, training: Touches, validation: Examples, noise: float, runs: Runs
 ) -> Learnt:
     """The network `start`, of a skin already: its maps are to be right, and so are the voltages that the skin's model
     gives them, under `noise` and contacts that drift."""
@@ -134,7 +130,7 @@ def train_unrolled(
         # Its logarithm: touches on electrodes, which the model explains least, would count for more than all others.
         return value / _SCALE + _MISFIT * jnp.mean(jnp.log1p(missed)), network
 
-    rows = [(np.asarray(one.change, np.float32), one.depth) for one in (training, _noisy(validation, noise))]
+    rows = training.rows("change", "depth"), _noisy(validation, noise)
     found = runs.run("unrolled", start, Objective(loss, _map_errors, start.trained), *rows)
     return Learnt(found.network, {"unrolled": found})
 
@@ -150,7 +146,20 @@ def _map_errors(network, batch):
     return jnp.mean((network(change) - wanted) ** 2, axis=(1, 2)) / _SCALE
 
 
-def _noisy(examples: Examples, noise: float) -> Examples:
-    """With noise that stays: what is held out is the same at every look."""
+def mean_and_deviation(rows: Rows) -> tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]]:
+    """Of each column of rows that are arrays (n, M), over all their chunks."""
+    number, mean, squares = 0, np.zeros(()), np.zeros(())
+    for chunk, size in enumerate(rows.sizes):
+        own = np.asarray(rows.chunk(chunk), float)
+        middle = own.mean(axis=0)
+        # Squares about the mean of both parts together (Chan, Golub and LeVeque 1983).
+        off, number = middle - mean, number + size
+        squares = squares + ((own - middle) ** 2).sum(axis=0) + off**2 * (number - size) * size / number
+        mean = mean + off * size / number
+    return mean, np.sqrt(squares / number)
+
+
+def _noisy(examples: Examples, noise: float) -> tuple[Float[np.ndarray, "n M"], Float[np.ndarray, "n r c"]]:
+    """Changes and maps, with noise that stays: what is held out is the same at every look."""
     random = np.random.default_rng(0).normal(size=examples.change.shape)
-    return examples._replace(change=examples.change + noise * random)
+    return np.asarray(examples.change + noise * random, np.float32), examples.depth

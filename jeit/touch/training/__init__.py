@@ -4,12 +4,13 @@
 keep networks as numbers with a JSON head, never a pickle. Training needs the extra `learn`; what is trained does not.
 """
 
-from jeit.touch.training.batches import ArrayRows, Rows
+from jeit.touch.training.batches import ArrayRows, MappedRows, Rows
 from jeit.touch.training.fitting import Objective, Plan, Trained, fit
 from jeit.touch.training.model_file import check_same, read_head, read_model, write_model
 
 __all__ = [
     "ArrayRows",
+    "MappedRows",
     "Objective",
     "Plan",
     "Rows",

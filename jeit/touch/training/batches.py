@@ -1,7 +1,7 @@
 """Rows to train on, in memory or chunk by chunk, and which of them make up each batch."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -57,6 +57,28 @@ class ArrayRows:
     def chunk(self, number: int) -> Any:
         """All of them."""
         return self.arrays
+
+
+class MappedRows:
+    """Other rows, of whose chunks a `function` makes others of as many rows; `name` says what it does, and all that it
+    depends on but the rows."""
+
+    def __init__(self, rows: Rows, function: Callable[[Any], Any], name: str):
+        self.rows, self.function, self.name = rows, function, name
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Those of the rows."""
+        return self.rows.sizes
+
+    @property
+    def fingerprint(self) -> str:
+        """That of the rows, with the name."""
+        return f"{self.rows.fingerprint}, {self.name}"
+
+    def chunk(self, number: int) -> Any:
+        """What the function makes of that of the rows."""
+        return self.function(self.rows.chunk(number))
 
 
 class Leg(NamedTuple):

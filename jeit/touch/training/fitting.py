@@ -122,6 +122,7 @@ def fit(
         upto = min(last, (state.step // look_every + 1) * look_every)
         for leg in order.legs(state.step, upto, _LEG):
             if loaded[0] != leg.chunk:
+                loaded = -1, None  # never two chunks in memory
                 loaded = leg.chunk, jax.tree.map(jnp.asarray, rows.chunk(leg.chunk))
             state = run.leg(state, loaded[1], leg.rows)
             if state.step < upto and kept is not None and time.monotonic() - saved >= plan.seconds:

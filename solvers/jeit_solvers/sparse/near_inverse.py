@@ -73,27 +73,28 @@ class Strips(eqx.Module):
 
 
 class NearInverse(eqx.Module):
-    """G between places of strips up to some strips apart: `band` (strips, wanted, columns) of G_ij, j from that many
-    strips before the row's to as many after."""
+    """G between places of strips up to some strips apart: `band` (strips, wanted, columns) of G_ij, j from the row's
+    strip to as many after, for G is symmetric; and what was added to it, as `left` and `right` (p, r)."""
 
     band: Inexact[Array, "s p q"]
+    left: Inexact[Array, "p r"]
+    right: Inexact[Array, "p r"]
 
     def blocks(self, places: Int[Array, "g k"]) -> Inexact[Array, "g k k"]:
         """G between the places of each group."""
         _, wanted, width = self.band.shape
+        added = self.left[places] @ jnp.swapaxes(self.right[places], 1, 2)
         if self.band.size >= 2**31:  # places are 32-bit integers, and so are their products
             places = places.astype(jnp.int64)
-        strip = places // wanted
-        row = places * width - (strip - width // wanted // 2) * wanted
-        return self.band.reshape(-1).at[row[:, :, None] + places[:, None]].get(mode="promise_in_bounds")
+        row, column = places[:, :, None], places[:, None]
+        row, column = jnp.minimum(row, column), jnp.maximum(row, column)
+        index = row * width + column - row // wanted * wanted
+        return self.band.reshape(-1).at[index].get(mode="promise_in_bounds") + added
 
     def add(self, left: Inexact[Array, "p r"], right: Inexact[Array, "p r"]) -> "NearInverse":
-        """G + left rightᵀ; both in the order of places."""
-        number, wanted, width = self.band.shape
-        margin = width // wanted // 2 * wanted
-        right = jnp.pad(right, ((margin, margin), (0, 0)))
-        across = right[wanted * np.arange(number)[:, None] + np.arange(width)]  # (strips, columns, r)
-        return NearInverse(self.band + left.reshape(number, wanted, -1) @ jnp.swapaxes(across, 1, 2))
+        """G + left rightᵀ, which must be symmetric; both in the order of places."""
+        joined = (jnp.concatenate(pair, axis=1) for pair in ((self.left, left), (self.right, right)))
+        return NearInverse(self.band, *joined)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -122,10 +123,8 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, reach: int) -> NearI
     _, eliminated = jax.lax.scan(eliminate, nothing, (blocks, couplings))
     nothing = jnp.zeros((size, size + (reach - 1) * wanted), operator.values.dtype)
     _, upper = jax.lax.scan(substitute, nothing, eliminated, reverse=True)
-    upper = upper.reshape(strips.number, wanted, reach + 1, wanted)
-    before = [jnp.swapaxes(jnp.roll(upper[:, :, k], k, axis=0), 1, 2) for k in range(reach, 0, -1)]
-    band = jnp.concatenate([jnp.stack(before, axis=2), upper], axis=2)
-    return NearInverse(band.reshape(strips.number, wanted, -1))
+    none = jnp.zeros((strips.number * wanted, 0), upper.dtype)
+    return NearInverse(upper, none, none)
 
 
 def _blocks(strips: Strips, operator: SparseSymmetric):

@@ -111,6 +111,8 @@ def test_a_set_goes_on(sheet, draws, tmp_path):
     assert depth.shape == (40, 12, 12)
     assert 0 <= depth.min() <= depth.max() <= 0.6
     assert np.abs(whole["change"].to_numpy()).max(axis=1).min() > 0
+    drawn = draws.draw(jax.random.fold_in(jax.random.key(3), 1), 16)
+    assert np.allclose(whole["change"].to_numpy()[16:32], relative_changes(sheet, drawn), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

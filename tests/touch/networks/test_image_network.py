@@ -155,7 +155,14 @@ def test_the_paper_s_network(small_skin, learnt):
     assert min(right.validation) < min(wrong.validation)
 
 
-@pytest.mark.parametrize(("change", "said"), [({"preset": "fast"}, "preset must be"), ({"design": "u"}, "design must")])
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"preset": "fast"}, "preset must be"),
+        ({"design": "u"}, "design must"),
+        ({"touches": 0}, "touches must be a whole number, 1 or more; it is 0"),
+    ],
+)
 def test_no_such_thing(small_skin, tmp_path, change, said):
     with pytest.raises(ValueError, match=said):
         learn_images(small_skin, tmp_path, **change)
@@ -164,3 +171,23 @@ def test_no_such_thing(small_skin, tmp_path, change, said):
 def test_work_of_another_set_is_refused(small_skin, learnt):
     with pytest.raises(ValueError, match="another"):
         learn_images(small_skin, learnt[0], preset=Preset(201, 50, Plan()))
+
+
+@pytest.mark.parametrize("package", ["xarray", "zarr"])
+def test_without_the_extra(small_skin, tmp_path, monkeypatch, package):
+    """Said before anything is simulated."""
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(ImportError, match=rf"sets of touches need {package}: pip install 'jeit\[cluster\]'"):
+        learn_images(small_skin, tmp_path)
+    assert not any(tmp_path.iterdir())
+
+
+def test_so_many_touches(small_skin, tmp_path):
+    """In place of the preset's; more in the same folder are another set."""
+    import zarr
+
+    few = Preset(1000, 20, Plan(batch=20, epochs=1))
+    learn_images(small_skin, tmp_path, preset=few, touches=40)
+    assert zarr.open_group(str(tmp_path / "work" / "learnt.zarr"), mode="r")["change"].shape[0] == 40  # pyright: ignore
+    with pytest.raises(ValueError, match="another"):
+        learn_images(small_skin, tmp_path, preset=few, touches=50)

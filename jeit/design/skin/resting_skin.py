@@ -1,0 +1,88 @@
+"""`RestingSkin`: what exact changes by touches need of a skin at rest, worked out once for any number of touches."""
+
+from functools import partial
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jeit.design.skin.touched_cells import TouchedCells
+from jeit.design.skin.touched_nodes import touched_nodes
+from jeit.design.skin.voltage_changes import EXACT_AT_ONCE, cell_stiffness, changes_between, check_found
+from jeit.forward import ForwardModel
+from jeit.forward.assembly import cell_conductivity, check_conductivity
+from jeit.forward.model import check_model, evaluate, select_channels, solved_system_of
+from jeit.forward.transfer import fields_and_inverse
+from jeit_solvers import NearInverse, Strips, over_cores
+from jeit_solvers.engines import on_device
+
+# Touches that a compiled program works on; and sizes that nodes and cells are filled up to: programs are compiled for
+# each, and the work of a touch grows with the square of its nodes.
+_TOGETHER, _NODES, _CELLS = 2 * EXACT_AT_ONCE, 2**0.5, 2.0
+
+
+class RestingSkin(eqx.Module):
+    """A skin that nobody touches, known between all nodes that may be touched.
+
+    **Fields**: `model`; `rest` (M,), its voltages, volts; `element` (m, q, q), the cells' parts of its matrix; `strips`
+    of the nodes that may be touched; the `fields` there and the `inverse` between any two of them.
+    """
+
+    model: ForwardModel
+    rest: Float[Array, " M"]
+    element: Float[Array, "m q q"]
+    strips: Strips
+    fields: Float[Array, "p L"]
+    inverse: NearInverse
+
+    @classmethod
+    def create(
+        cls, model: ForwardModel, conductivity, touchable: Bool[np.ndarray, " n"], *, most: float = 2**31
+    ) -> "RestingSkin | None":
+        """Of a model with a `conductivity`, S/m (2-D: S), whose nodes `touchable` (n,) touches may reach; None where
+        the inverse would take more than `most` bytes, 8 for each pair of these nodes and some more. Raises `ValueError`
+        for what is no model and no conductivity."""
+        check_model(model)
+        conductivity = cell_conductivity(model.mesh, check_conductivity(model.mesh, conductivity))
+        strips = Strips.create(model.system.pattern, np.asarray(model.mesh.points), np.asarray(touchable))
+        if 8 * float(strips.number * strips.wanted) ** 2 > most:
+            return None
+        solved = evaluate(model, solved_system_of, conductivity)
+        _, impedance = solved.fields_and_impedance(model.electrodes)
+        rest = select_channels(model.protocol, impedance)
+        known = fields_and_inverse(solved, model.electrodes, strips, max(strips.number - 1, 1))
+        return cls(model, rest, cell_stiffness(model, conductivity), strips, *known)
+
+    def changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
+        """Changes (n, M) of its voltages by n touches, one at a time, volts; exact, as of `touch_changes`, and raises
+        `RuntimeError` as that does."""
+        at = touched_nodes(self.model, touched, self.strips)
+        cells, change = np.asarray(touched.cells), np.asarray(touched.change)
+        used = np.count_nonzero(change, axis=1)
+        sizes = np.stack([_size((at.nodes < at.nodes[:, -1:]).sum(axis=1) + 1, _NODES), _size(used, _CELLS)], axis=1)
+        found = np.zeros((len(cells), self.model.protocol.num_measurements))
+        known = self.fields, self.inverse
+        for size in np.unique(sizes[used > 0], axis=0):
+            alike = np.flatnonzero((sizes == size).all(axis=1) & (used > 0))
+            nodes = _wide(at.nodes, size[0], "edge")
+            arrays = (_wide(one, size[1], "constant") for one in (cells, change, at.corners))
+            cells_of, change_of, corners = arrays
+            for some in np.split(alike, range(_TOGETHER, len(alike), _TOGETHER)):
+                rows = some[np.minimum(np.arange(_TOGETHER), len(some) - 1)]
+                touches = on_device((cells_of[rows], change_of[rows], nodes[rows], corners[rows]))
+                work = partial(changes_between, self.model.protocol, self.element, known, touches)
+                found[some] = np.asarray(over_cores(work, _TOGETHER, EXACT_AT_ONCE))[: len(some)]
+        check_found(found, np.asarray(touched.places))
+        return found
+
+
+def _size(number, factor: float):
+    """The least of some sizes, each `factor` times the one before, that is not less; multiples of 16."""
+    power = np.ceil(np.log(np.maximum(number, 16) / 16) / np.log(factor) - 1e-9)
+    return (np.ceil(factor**power - 1e-9) * 16).astype(int)
+
+
+def _wide(rows: np.ndarray, size: int, mode) -> np.ndarray:
+    """Rows (n, k, …) of `size` entries: cut short, or filled up."""
+    missing = max(size - rows.shape[1], 0)
+    return np.pad(rows[:, :size], [(0, 0), (0, missing), *[(0, 0)] * (rows.ndim - 2)], mode)

@@ -1,0 +1,74 @@
+"""A skin at rest whose touches are worked out in many calls, against changes of each call's own."""
+
+import numpy as np
+import pytest
+
+from jeit.design import Skin
+from jeit.design.skin.resting_skin import RestingSkin
+from jeit.design.skin.touched_cells import TouchedCells
+from jeit.design.skin.voltage_changes import touch_changes
+from jeit.layout import named_layout
+from jeit.mesh import Rectangle
+from jeit.simulate import Bar, Disc, Indent, indented_cells
+from jeit.simulate.contact.indents import resting_skin
+from jeit_solvers.engines import as_array
+
+# One to three contacts, of few cells and many, in a group that one program works on and beyond.
+TOUCHES = [
+    [Indent(Disc(0.004), 3e-3, (0.01, 0.0))],
+    [Indent(Disc(0.02), 6e-3, (-0.01, 0.01))],
+    [Indent(Bar(0.05, 0.01), 7e-3), Indent(Disc(0.01), 2e-3, (0.02, 0.02))],
+    [Indent(Disc(0.01), 4e-3, place) for place in [(-0.02, -0.02), (0.02, 0.02), (0.02, -0.02)]],
+    *([Indent(Disc(0.01), 4e-3, (0.001 * number, -0.005))] for number in range(5)),
+]
+
+
+def made(num_layers: int) -> Skin:
+    return Skin.create(named_layout("grid-3x3", Rectangle(0.06, 0.06)), num_layers=num_layers, cell_size=5e-3)
+
+
+@pytest.fixture(scope="module", params=[0, 4])
+def skin(request):
+    return made(request.param)
+
+
+def test_changes_are_those_of_each_call(skin):
+    touched = indented_cells(skin, TOUCHES)
+    right = np.asarray(touch_changes(skin.model, skin.model_conductivity, touched))
+    resting = resting_skin(skin, 8e-3)
+    assert resting is not None
+    found = resting.changes(touched)
+    assert np.abs(found - right).max() < 1e-12 * np.abs(right).max()
+    assert np.allclose(resting.rest, skin.model.voltages(skin.model_conductivity), rtol=1e-12)
+    again = resting.changes(indented_cells(skin, TOUCHES[1:2]))
+    assert np.abs(again[0] - right[1]).max() < 1e-12 * np.abs(right).max()
+
+
+def test_a_layer_knows_the_nodes_that_are_reached():
+    """Those of the upper cells, where less is touched; 0 where nothing is."""
+    layer = made(4)
+    shallow, deep = (resting_skin(layer, depth) for depth in (2e-3, 8e-3))
+    assert shallow is not None
+    assert deep is not None
+    assert shallow.inverse.band.size < 0.5 * deep.inverse.band.size
+    touched = indented_cells(layer, [[Indent(Disc(0.02), 1.5e-3)], []])
+    found = shallow.changes(touched)
+    assert np.abs(found - deep.changes(touched)).max() < 1e-12 * np.abs(found).max()
+    assert not found[1].any()
+
+
+def test_no_more_than_fits():
+    sheet = made(0)
+    everywhere = np.ones(sheet.model.mesh.num_points, bool)
+    assert RestingSkin.create(sheet.model, sheet.model_conductivity, everywhere, most=1e5) is None
+
+
+def test_what_is_not_found():
+    """By conductors of any contrast, as of `touch_changes`."""
+    sheet = made(0)
+    resting = resting_skin(sheet, 8e-3)
+    assert resting is not None
+    cells = np.arange(sheet.model.mesh.num_cells)[None]
+    touched = TouchedCells(as_array(np.zeros((1, 2))), as_array(cells), as_array(np.full(cells.shape, 1e9)), cells.size)
+    with pytest.raises(RuntimeError, match="the changes by 1 of 1 touches were not found"):
+        resting.changes(touched)
