@@ -160,7 +160,7 @@ HEAR = ["listen", "RECORDING", "-m", "model", "-o", "out"]
                 ("empty.wav", "empty"),
                 ("stereo_sample.wav", "looks transposed"),
                 ("eight.wav", "has 8000 samples a second"),
-                ("text.wav", "neither an NPZ nor a WAV"),
+                ("text.wav", "neither an NPZ nor a sound"),
                 ("cut.wav", "cut off"),
                 ("sound.flac", "soundfile"),
                 ("heard.npz", "holds intensities"),
