@@ -74,7 +74,6 @@ def test_a_small_training_tells_people_it_never_met():
         "shuffled": share("network", shuffled),
         **{method: share(method, right) for method in ("network", "trees", "spectrum", "linear")},
     }
-    print(found)
     assert max(found["untrained"], found["shuffled"]) < 0.4, found
-    assert found["network"] > 0.55, found
+    assert found["network"] > 0.65, found
     assert min(found["trees"], found["linear"]) > 0.8, found
