@@ -22,8 +22,8 @@ from jeit.touch.listening import SoundImages, sound_images
 # grid, its corners' square, and the one in the middle.
 LOUDER = (0.0, 5.0, 10.0, 15.0, 20.0)
 FEWER = {25: tuple(range(25)), 9: (0, 2, 4, 10, 12, 14, 20, 22, 24), 4: (6, 8, 16, 18), 1: (12,)}
-# Of the windows of a clip every third, 0.3 s apart: those between share most of their sound with them.
-_EVERY = 3
+# Of the windows of a clip every other, 0.2 s apart: those between share most of their sound with them.
+_EVERY = 2
 # Changes with what the same set is simulated to.
 _VERSION = 1
 

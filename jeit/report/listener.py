@@ -66,6 +66,7 @@ def report_listener(listener: Listener) -> dict[str, Any]:
             "method": listener.method,
             "channels": listener.channels,
             "highest_frequency_Hz": listener.highest,
+            "loudness_counts": listener.loudness,
             "held_out": held_out,
             "notes": list(listener.notes),
             "versions": {package: version_of(package) for package in _PACKAGES},

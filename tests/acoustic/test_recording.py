@@ -274,8 +274,8 @@ def files(folder):
     scipy.io.wavfile.write(folder / "good.wav", 8000, SAMPLES.T)
     np.savez(folder / "good.npz", **SOUND)
     for name, content, word in (
-        ("empty.npz", b"", "neither an NPZ nor a WAV"),
-        ("text.npz", b"1,2,3\n4,5,6\n", "neither an NPZ nor a WAV"),
+        ("empty.npz", b"", "neither an NPZ nor a sound"),
+        ("text.npz", b"1,2,3\n4,5,6\n", "neither an NPZ nor a sound"),
         ("cut.npz", (folder / "good.npz").read_bytes()[:2000], "not a readable NPZ"),
         ("spoilt.npz", (folder / "good.npz").read_bytes().replace(SAMPLES[1].tobytes(), SAMPLES[2].tobytes()), "CRC"),
         ("cut.wav", (folder / "good.wav").read_bytes()[:2000], "cut off"),

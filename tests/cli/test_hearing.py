@@ -283,7 +283,7 @@ def instead(command, **changes):
         (instead(LOCATE, recording_npz="few.npz"), "has 4 microphones"),
         (instead(LOCATE, recording_npz="dead.npz"), "three are needed"),
         (instead(LOCATE, recording_npz="milliseconds.npz"), "times in seconds"),
-        (instead(LOCATE, recording_npz="text.npz"), "neither an NPZ nor a WAV"),
+        (instead(LOCATE, recording_npz="text.npz"), "neither an NPZ nor a sound"),
         (instead(LOCATE, recording_npz="sounds.npz"), "read_taps"),
         (instead(LOCATE, recording_npz="missing.wav"), "missing.wav"),
         ([*LOCATE, "--method", "magic"], "likelihood, consistency"),

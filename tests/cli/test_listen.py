@@ -160,7 +160,7 @@ HEAR = ["listen", "RECORDING", "-m", "model", "-o", "out"]
                 ("empty.wav", "empty"),
                 ("stereo_sample.wav", "looks transposed"),
                 ("eight.wav", "has 8000 samples a second"),
-                ("text.wav", "neither an NPZ nor a WAV"),
+                ("text.wav", "neither an NPZ nor a sound"),
                 ("cut.wav", "cut off"),
                 ("sound.flac", "soundfile"),
                 ("heard.npz", "holds intensities"),
@@ -177,6 +177,7 @@ HEAR = ["listen", "RECORDING", "-m", "model", "-o", "out"]
         (["listen", "fit", "missing", "-o", "new"], "is no folder"),
         (["listen", "fit", "clips", "-o", "new", "--method", "magic"], "--method"),
         (["listen", "fit", "clips", "-o", "new", "--batches", "0"], "--batches"),
+        (["listen", "fit", "clips", "-o", "new", "--loudness", "loud"], "--loudness must be one of auto, counts"),
     ],
 )
 def test_bad_input_is_explained(command, said, folder, monkeypatch, capsys):

@@ -31,7 +31,7 @@ from jeit.arguments import need, npz_arrays
 from jeit.mesh.loops import check_loop
 
 # Said of files that are neither.
-_OTHERWISE = "neither an NPZ nor a WAV file"
+_OTHERWISE = "neither an NPZ nor a sound file"
 
 
 class Recording(eqx.Module):

@@ -8,8 +8,10 @@ from struct import error as StructError
 import numpy as np
 import scipy.io.wavfile
 
-# What files of other formats begin with: FLAC, Ogg, AIFF, CAF, AU, MP3 with and without a tag.
-_OTHERS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"ID3", b"\xff\xfb", b"\xff\xf3", b"\xff\xf2")
+# What files of other formats begin with: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
+_OTHERS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
+# And those that soundfile does not read either: MP4 from its fifth byte on, WebM, WMA, AMR.
+_MP4, _CLOSED = b"ftyp", (b"\x1aE\xdf\xa3", b"0&\xb2u", b"#!AMR")
 
 
 def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
@@ -19,12 +21,22 @@ def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
     known. Raises `ValueError` for files that are broken, and those that need `soundfile` where it is not installed.
     """
     with path.open("rb") as file:
-        start = file.read(4)
-    if start in (b"RIFF", b"RIFX", b"RF64"):
+        start = file.read(8)
+    if start.startswith((b"RIFF", b"RIFX", b"RF64")):
         return _read_wav(path)
-    if start.startswith(_OTHERS):
+    if start.startswith(_OTHERS) or _is_mp3(start):
         return _read_other(path)
+    if start[4:] == _MP4 or start.startswith(_CLOSED):
+        raise ValueError(
+            f"a format that is not read (M4A, MP4, WebM, WMA, AMR); convert it: ffmpeg -i '{path.name}' "
+            f"'{path.stem}.wav'."
+        )
     return None
+
+
+def _is_mp3(start: bytes) -> bool:
+    """Whether a frame of MPEG layer III begins: eleven bits that are set, any version, and the layer."""
+    return len(start) > 1 and start[0] == 0xFF and start[1] & 0xE6 == 0xE2
 
 
 def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
@@ -38,6 +50,8 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
     # The reader only warns of these, or stumbles later; its other warnings are of chunks that hold no sound.
     if any("prematurely" in str(one.message) for one in said):
         raise ValueError("the WAV file is cut off: it holds fewer samples than its header says. Copy it again.")
+    if "Unknown wave file format" in str(problem):  # A-law, ADPCM, and such
+        return _read_other(path)
     if problem is not None:
         raise ValueError(f"not a readable WAV file, or cut off ({problem}); write it as plain PCM or float.")
     samples = data.T if data.ndim == 2 else data[None]
@@ -51,14 +65,16 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
 
 def _read_other(path: Path) -> tuple[np.ndarray, float, float | None]:
     if find_spec("soundfile") is None:
-        raise ValueError("no WAV file, and others need soundfile: pip install 'jeit[sound]', or convert it to WAV.")
+        raise ValueError("this format needs soundfile: pip install 'jeit[sound]', or convert it to plain WAV.")
     import soundfile  # pyright: ignore[reportMissingImports]
 
     try:
-        data, rate = soundfile.read(path, dtype="float64", always_2d=True)
+        with soundfile.SoundFile(path) as file:
+            data, rate, kind = file.read(file.frames, "float64", always_2d=True), file.samplerate, file.subtype
     except (RuntimeError, TypeError, ValueError) as error:  # soundfile's own are RuntimeErrors
         raise ValueError(f"not a sound file that soundfile reads ({' '.join(str(error).split())}).") from None
-    return data.T, rate, _full_scale(data)
+    # What is compressed may overshoot 1 a little; its full scale is 1 all the same.
+    return data.T, rate, _full_scale(data) if kind in ("FLOAT", "DOUBLE") else 1.0
 
 
 def _full_scale(samples: np.ndarray) -> float | None:

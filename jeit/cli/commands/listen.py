@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from jeit.touch.listening import Heard
 
 
+_LOUDNESS = {"auto": None, "counts": True, "ignored": False}
+
+
 class _ByArguments(TyperCommand):
     """A command that is called by the name of its group, and says so in its help and its errors."""
 
@@ -114,7 +117,17 @@ def fit(
         Path, typer.Option("--output", "-o", metavar="MODEL", help="Folder for the model.", show_default=False)
     ],
     method: Annotated[
-        str, typer.Option(help="network, trees or linear; auto: what is right most often of clips held out.")
+        str,
+        typer.Option(
+            help="network, paper-network, trees, spectrum or linear; auto: what is right most often of clips held out."
+        ),
+    ] = "auto",
+    loudness: Annotated[
+        str,
+        typer.Option(
+            help="counts, or ignored, so that gain does not matter; auto: counts where more clips held out are then "
+            "named right."
+        ),
     ] = "auto",
     batches: Annotated[
         int | None, typer.Option(help="Batches a network is trained for, at most (default 1500).")
@@ -138,6 +151,8 @@ def fit(
     from jeit.touch.listening import Listener, read_clips
     from jeit.touch.listening.learners import BATCHES
 
+    if loudness not in _LOUDNESS:
+        raise ValueError(f"--loudness must be one of {', '.join(_LOUDNESS)}; it is '{loudness}'.")
     check_at_least({"--batches": (batches, 1), "--seed": (seed, 0)})
     make_folder(output, LISTENER_FILES)
     console = Console(highlight=False)
@@ -151,6 +166,7 @@ def fit(
             listener = Listener.fit(
                 labelled,
                 method=method,
+                loudness=_LOUDNESS[loudness],
                 key=jax.random.key(seed),
                 batches=batches or BATCHES,
                 folder=under_way,
@@ -161,10 +177,11 @@ def fit(
         shutil.rmtree(under_way, ignore_errors=True)
     if quiet:
         return
-    channels = "mixed to one channel" if listener.channels == 1 else f"{listener.channels} channels"
+    channels = counted(listener.channels, "channel")
     rows = [
         ("clips", f"{counted(len(labelled), 'clip')} of {len(listener.names)} classes, {channels}"),
         ("sound", f"up to {listener.highest:g} Hz"),
+        ("loudness", "counts" if listener.loudness else "ignored"),
         ("method", listener.method),
         ("held out", summary(listener)),
     ]

@@ -10,7 +10,7 @@ stays as wide, and each is wider than the one below it by one and the same facto
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,12 @@ class SoundImages:
     def loudness(self) -> Float[np.ndarray, " W"]:
         """Power of the loudest frame of each window, all microphones together."""
         return self.intensity.sum(axis=1).max(axis=1)
+
+    @property
+    def levelled(self) -> "SoundImages":
+        """The same, all windows equally loud: powers over the `loudness` of each; silence stays as it is."""
+        least = np.where(self.loudness > 0, self.loudness, 1.0)[:, None, None]
+        return replace(self, intensity=self.intensity / least, spectrum=self.spectrum / least)
 
     @classmethod
     def joined(cls, parts: "list[SoundImages]") -> "SoundImages":

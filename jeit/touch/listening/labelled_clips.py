@@ -13,7 +13,7 @@ from jeit.arguments import check_kind, counted
 from jeit.touch.listening.feature_images import LOWEST
 
 # Files that were not read, told by name at most.
-_TOLD = 3
+_TOLD = 4
 # Shares of a second: rates that differ by less are one.
 _SAME_RATE = 1e-3
 
@@ -123,7 +123,7 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
             try:
                 _check_clip(read_recording(path), path.name)
             except (ValueError, OSError) as error:
-                failed.append(str(error).rstrip("."))
+                failed.append((path.suffix.lower() or "no suffix", str(error).rstrip(".")))
                 continue
             within = path.relative_to(one).parts[:-1]
             read.append(path)
@@ -132,13 +132,22 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
             if progress is not None:
                 progress(f"{counted(len(read), 'clip')}")
         if len(read) == before:
-            why = failed[-1] if files else "it is empty"
-            raise ValueError(f"'{one}': there is no clip in it that can be read ({why.rstrip('.')}).")
-    notes = []
-    if failed:
-        more = f"; and {len(failed) - _TOLD} more" if len(failed) > _TOLD else ""
-        notes.append(f"{counted(len(failed), 'file')} not read: {'; '.join(failed[:_TOLD])}{more}")
+            why = failed[-1][1] if files else "it is empty"
+            raise ValueError(f"'{one}': there is no clip in it that can be read ({why}).")
+    notes = [_not_read(failed)] if failed else []
     return LabelledClips.of(_Files(read), labels, groups, notes=notes, name=folder.name or str(folder))
+
+
+def _not_read(failed: list[tuple[str, str]]) -> str:
+    """How many files were not read, and why: one of each kind first."""
+    seen: dict[str, int] = {}
+    order = []
+    for place, (kind, why) in enumerate(failed):
+        seen[kind] = seen.get(kind, -1) + 1
+        order.append((seen[kind], place, why))
+    said = [why for *_, why in sorted(order)]
+    more = f"; and {len(said) - _TOLD} more" if len(said) > _TOLD else ""
+    return f"{counted(len(said), 'file')} not read: {'; '.join(said[:_TOLD])}{more}"
 
 
 def _check_clip(clip: Recording | Intensities, name: str) -> None:

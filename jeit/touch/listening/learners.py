@@ -1,4 +1,5 @@
-"""What learns windows of sound: the network, trees on hand-made features, and a linear discriminant on them.
+"""What learns windows of sound: the network, trees on hand-made features, and linear discriminants, on them alone or
+with the spectrum in all its bands.
 
 Each is a class with `learn`, `log_odds` of the classes 0 … C − 1, and arrays that a file keeps.
 """
@@ -17,8 +18,9 @@ from jeit.touch.learnt.extras import one_thread
 from jeit.touch.learnt.forest import Forest
 from jeit.touch.listening.feature_images import SoundImages
 from jeit.touch.listening.levels import Levels
-from jeit.touch.listening.modality_network import ModalityNetwork, NetworkAnswers, plan_of, train_network
-from jeit.touch.listening.window_features import sound_features
+from jeit.touch.listening.modality_network import ModalityNetwork, NetworkAnswers, paper_plan, plan_of, train_network
+from jeit.touch.listening.window_features import sound_features, spectrum_features
+from jeit.touch.training import Plan
 
 # Rounds of boosting, leaves of a tree, and presses in a leaf at least, of sets that are large enough.
 _ROUNDS, _LEAVES, _IN_A_LEAF = 100, 15, 10
@@ -47,34 +49,11 @@ class Lesson(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkListener:
-    """A network, and the `levels` that its images are of."""
+    """A trained network, and the `levels` that its images are of."""
 
     network: ModalityNetwork
     levels: Levels
     answers: NetworkAnswers
-
-    @classmethod
-    def learn(cls, lesson: Lesson) -> "NetworkListener":
-        """Train one, stopped by the loss of groups held out: one in six of each class, where there are as many."""
-        held = stopping_rows(lesson.right, lesson.groups)
-        levels = Levels.of(lesson.images[~held])
-        shown = levels(lesson.images)
-        if lesson.checkpoint is not None:
-            lesson.checkpoint.parent.mkdir(parents=True, exist_ok=True)
-        number = int((~held).sum())
-        enough = max(_FEWEST, _THROUGH * number // 64)
-        plan = plan_of(number, batches=min(lesson.batches, enough))
-        trained = train_network(
-            shown[~held],
-            lesson.right[~held],
-            (shown[held], lesson.right[held]) if held.any() else (shown, lesson.right),
-            classes=lesson.classes,
-            key=lesson.key,
-            plan=plan,
-            checkpoint=lesson.checkpoint,
-            progress=lesson.progress,
-        )
-        return cls.of(trained.network, levels)
 
     @classmethod
     def of(cls, network: ModalityNetwork, levels: Levels) -> "NetworkListener":
@@ -90,15 +69,44 @@ class NetworkListener:
         levels = {name: getattr(self.levels, name).tolist() for name in Levels.__dataclass_fields__}
         return {"levels": levels}, self.network
 
+
+@dataclass(frozen=True)
+class NetworkLearner:
+    """What trains a network, by the schedule of `plan(windows, batches=)`."""
+
+    plan: Callable[..., Plan]
+
+    def learn(self, lesson: Lesson) -> NetworkListener:
+        """Train one, stopped by the loss of groups held out: one in six of each class, where there are as many."""
+        held = stopping_rows(lesson.right, lesson.groups)
+        levels = Levels.of(lesson.images[~held])
+        shown = levels(lesson.images)
+        if lesson.checkpoint is not None:
+            lesson.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        number = int((~held).sum())
+        enough = max(_FEWEST, _THROUGH * number // 64)
+        plan = self.plan(number, batches=min(lesson.batches, enough))
+        trained = train_network(
+            shown[~held],
+            lesson.right[~held],
+            (shown[held], lesson.right[held]) if held.any() else (shown, lesson.right),
+            classes=lesson.classes,
+            key=lesson.key,
+            plan=plan,
+            checkpoint=lesson.checkpoint,
+            progress=lesson.progress,
+        )
+        return NetworkListener.of(trained.network, levels)
+
     @staticmethod
     def like(head: dict[str, Any], classes: int, rows: int) -> Any:
         """Arrays of the same shapes."""
         return ModalityNetwork.draw(jax.random.key(0), rows, 41, classes)
 
-    @classmethod
-    def made(cls, head: dict[str, Any], arrays: Any) -> "NetworkListener":
-        """Undo `kept`."""
-        return cls.of(arrays, Levels(**{name: np.array(value) for name, value in head["levels"].items()}))
+    @staticmethod
+    def made(head: dict[str, Any], arrays: Any) -> NetworkListener:
+        """Undo `NetworkListener.kept`."""
+        return NetworkListener.of(arrays, Levels(**{name: np.array(value) for name, value in head["levels"].items()}))
 
 
 @dataclass(frozen=True)
@@ -118,6 +126,7 @@ class TreesListener:
             max_leaf_nodes=_LEAVES,
             min_samples_leaf=int(np.clip(fewest // 4, 1, _IN_A_LEAF)),
             l2_regularization=1.0,
+            class_weight="balanced",
             early_stopping=False,  # pyright: ignore[reportArgumentType]
             random_state=0,
         )
@@ -171,48 +180,62 @@ class TreesListener:
 
 @dataclass(frozen=True)
 class LinearListener:
-    """A linear discriminant, its covariance shrunk as Ledoit and Wolf do, on `sound_features`: `weights` (k, C) and
+    """A linear discriminant, its covariance shrunk as Ledoit and Wolf do, on `features` of images: `weights` (k, C) and
     `offset` (C,) of features less their `mean` (k,) over their `deviation` (k,)."""
 
+    features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
     mean: Float[np.ndarray, " k"]
     deviation: Float[np.ndarray, " k"]
     weights: Float[np.ndarray, "k C"]
     offset: Float[np.ndarray, " C"]
 
-    @classmethod
-    def learn(cls, lesson: Lesson) -> "LinearListener":
-        """Fit it."""
-        features = sound_features(lesson.images)
-        mean, deviation = features.mean(axis=0), features.std(axis=0)
-        deviation = np.where(deviation > 1e-9, deviation, 1.0)
-        model = CLASSIFIERS["linear-discriminant"]((features - mean) / deviation, lesson.right)
-        weights, offset = model.coef_.T, model.intercept_
-        if weights.shape[1] == 1:  # of two classes, the odds of the second
-            weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
-        return cls(mean, deviation, weights, offset)
-
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
         """Log-odds (W, C) of the classes."""
-        return (sound_features(images) - self.mean) / self.deviation @ self.weights + self.offset
+        return (self.features(images) - self.mean) / self.deviation @ self.weights + self.offset
 
     def kept(self) -> tuple[dict[str, Any], Any]:
         """A head and arrays."""
         return {}, [np.asarray(one, np.float32) for one in (self.mean, self.deviation, self.weights, self.offset)]
 
-    @staticmethod
-    def like(head: dict[str, Any], classes: int, rows: int) -> Any:
+
+@dataclass(frozen=True)
+class LinearLearner:
+    """What fits a `LinearListener` to `features` of images."""
+
+    features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
+
+    def learn(self, lesson: Lesson) -> LinearListener:
+        """Fit it; all classes are as likely beforehand, however many windows they have."""
+        features = self.features(lesson.images)
+        mean, deviation = features.mean(axis=0), features.std(axis=0)
+        # What is constant but for rounding tells nothing.
+        deviation = np.where(deviation > 1e-5, deviation, 1.0)
+        model = CLASSIFIERS["linear-discriminant"]((features - mean) / deviation, lesson.right)
+        share = np.log(model.priors_)
+        weights, offset = model.coef_.T, model.intercept_ - (share if len(share) > 2 else share[1] - share[0])
+        if weights.shape[1] == 1:  # of two classes, the odds of the second
+            weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
+        return LinearListener(self.features, mean, deviation, weights, offset)
+
+    def like(self, head: dict[str, Any], classes: int, rows: int) -> Any:
         """Arrays of the same shapes."""
-        number = num_features()
+        number = self.features(_NOTHING).shape[1]
         return [jax.numpy.zeros(one, np.float32) for one in ((number,), (number,), (number, classes), (classes,))]
 
-    @classmethod
-    def made(cls, head: dict[str, Any], arrays: Any) -> "LinearListener":
-        """Undo `kept`."""
-        return cls(*(np.asarray(one, float) for one in arrays))
+    def made(self, head: dict[str, Any], arrays: Any) -> LinearListener:
+        """Undo `LinearListener.kept`."""
+        return LinearListener(self.features, *(np.asarray(one, float) for one in arrays))
 
 
-LEARNERS: dict[str, Any] = {"network": NetworkListener, "trees": TreesListener, "linear": LinearListener}
-"""By name; of those that are right as often the last is taken, which is the plainest."""
+LEARNERS: dict[str, Any] = {
+    "paper-network": NetworkLearner(paper_plan),
+    "network": NetworkLearner(plan_of),
+    "trees": TreesListener,
+    "spectrum": LinearLearner(spectrum_features),
+    "linear": LinearLearner(sound_features),
+}
+"""By name; the network by the schedule of the paper, and by our own. Of those that are right as often the last is
+taken, which is the plainest."""
 
 
 def num_features() -> int:

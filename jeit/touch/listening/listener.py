@@ -23,11 +23,15 @@ from jeit.touch.needed import need_learning
 from jeit.touch.training import read_model, write_model
 
 METHODS = ("auto", *LEARNERS)
+# What "auto" tries: our own schedule gives a network that is as good for less.
+_TRIED = tuple(name for name in LEARNERS if name != "paper-network")
 # Folds in which it is chosen, at most. Windows whose power is this of the quietest that was learnt from are quiet.
 _FOLDS, _QUIET = 3, 0.25
+# Of the softest clip's power what a recording of lower gain has at least; windows from which on a network is tried.
+_SOFTER, _FOR_NETWORKS = 1 / 16, 3000
 # Samples in which a microphone that works has moved.
 _LOOKED_AT = 100_000
-_KIND, _VERSION = "a jeit listener", 1
+_KIND, _VERSION = "a jeit listener", 2
 
 
 @dataclass(frozen=True)
@@ -35,9 +39,10 @@ class Listener:
     """What names sounds.
 
     **Fields**: `names` (C,); the `method` and what learnt, `model`; of how many `channels`, 1 where they are mixed; up
-    to which frequency `highest`, Hz; the `quietest` loudness that was learnt from, and the `sharpness` of its
-    probabilities. `standing`: what was said of each clip when it was held out, and the errors of all that was tried,
-    the best first, None of a listener that was read; `notes` on it.
+    to which frequency `highest`, Hz; whether `loudness` counts, or all windows are made equally loud; the `quietest`
+    loudness that was learnt from, that of the softest and of the loudest clip, `clips_loudness`, and the `sharpness` of
+    its probabilities. `standing`: what was said of each clip when it was held out, and the errors of all that was
+    tried, the best first, None of a listener that was read; `notes` on it.
     """
 
     names: tuple[str, ...]
@@ -45,7 +50,9 @@ class Listener:
     model: Any
     channels: int
     highest: float
+    loudness: bool
     quietest: float
+    clips_loudness: tuple[float, float]
     sharpness: float
     standing: Standing | None = None
     notes: tuple[str, ...] = ()
@@ -57,6 +64,7 @@ class Listener:
         clips: LabelledClips,
         *,
         method: str = "auto",
+        loudness: bool | None = None,
         key: Array | None = None,
         batches: int = BATCHES,
         folder: str | Path | None = None,
@@ -66,9 +74,11 @@ class Listener:
 
         Clips are held out in three folds, with all of their group; a clip counts as right where it is named right as a
         whole. Of every clip those windows are learnt from that are no more than 20 dB below its loudest: the rest of it
-        is not what it is labelled. `key` draws networks, each trained for `batches` at most; `folder`: where trainings
-        are kept, so that one that was killed goes on. `progress` is called with how far it is. Raises `ValueError` for
-        what are no clips, key, or method; `ImportError` without the extra `learn`.
+        is not what it is labelled; of clips longer than 4 s every sound counts as a clip. `loudness`: whether it tells
+        classes apart; unless given it does where a linear discriminant names more clips right by it, and more than by
+        chance. "auto" leaves out the network where windows are few. `key` draws networks, each trained for `batches` at
+        most; `folder`: where trainings are kept, so that one that was killed goes on. `progress` is called with how far
+        it is. Raises `ValueError` for what are no clips, key, or method; `ImportError` without the extra `learn`.
         """
         need_learning()
         check_kind("clips", clips, LabelledClips, "clips as of read_clips(folder)")
@@ -78,23 +88,28 @@ class Listener:
         tell = progress or (lambda said: None)
         windows = Windows.of(clips, tell)
         fold = held_out_folds(windows.right_of_clip, windows.group_of_clip, _FOLDS)
-        notes = list(clips.notes)
-        alone = np.unique(clips.labels[fold < 0])
+        notes = [*clips.notes, *windows.notes]
+        alone = np.array(windows.names)[np.unique(windows.right_of_clip[fold < 0])]
         if alone.size:
             notes.append(
                 f"{', '.join(alone)}: clips of one group only, which are never held out; how well they are told is not "
                 "known."
             )
-        names = tuple(LEARNERS) if method == "auto" else (method,)
+        names = _TRIED if method == "auto" else (method,)
+        if method == "auto" and len(windows.clip) < _FOR_NETWORKS:
+            names = tuple(name for name in names if name != "network")
+            notes.append(
+                f"no network was tried: {len(windows.clip)} windows are few for one, and {_FOR_NETWORKS} would not be."
+            )
+        loud = windows.images.loudness
+        of_clips = np.maximum.reduceat(loud, np.flatnonzero(np.diff(windows.clip, prepend=-1)))
+        if loudness is None:
+            loudness = _loudness_counts(windows, fold, key, tell)
+        if not loudness:
+            windows = windows.levelled
         found = []
         for name in names:
-            odds = np.full((len(windows.images), windows.classes), np.nan)
-            for number in range(int(fold.max()) + 1):
-                tell(f"{name}, fold {number + 1} of {int(fold.max()) + 1}")
-                out = (fold == number)[windows.clip]
-                lesson = windows.lesson(~out, key, batches, _file(folder, f"{name}-{number}"), tell)
-                odds[out] = LEARNERS[name].learn(lesson).log_odds(windows.images[out])
-            found.append((name, odds))
+            found.append((name, _held_out(name, windows, fold, key, batches, folder, tell)))
         kept = [(windows.errors(odds), place, name, odds) for place, (name, odds) in enumerate(found)]
         # Of those that err as often the last, the plainest.
         kept.sort(key=lambda one: (*one[0], -one[1]))
@@ -114,10 +129,19 @@ class Listener:
             )
         # Few clips that all are told right would make it as sure as can be.
         sharpness = min(1.0, sharpness_of(odds[out], windows.right[out])) if out.any() else 1.0
-        quietest = float(windows.images.loudness.min())
-        highest, channels = clips.highest, clips.channels
         return cls(
-            windows.names, chosen, model, channels, highest, quietest, sharpness, standing, tuple(notes), clips.name
+            windows.names,
+            chosen,
+            model,
+            clips.channels,
+            clips.highest,
+            loudness,
+            float(loud.min()),
+            (float(of_clips.min()), float(of_clips.max())),
+            sharpness,
+            standing,
+            tuple(notes),
+            clips.name,
         )
 
     def hear(self, recording: Recording, *, calibration: Calibration | None = None) -> Heard:
@@ -152,11 +176,17 @@ class Listener:
         if dead.size:
             notes.append(f"microphones that never move: {', '.join(map(str, dead))}.")
         parts = [
-            (one.times, one.loudness, one.known, one.strongest, self.model.log_odds(one))
+            (
+                one.times,
+                one.loudness,
+                one.known,
+                one.strongest,
+                self.model.log_odds(one if self.loudness else one.levelled),
+            )
             for one in image_blocks(recording, self.highest)
         ]
         times, loudness, known, strongest, odds = (np.concatenate(own) for own in zip(*parts, strict=True))
-        quiet = loudness < _QUIET * self.quietest
+        quiet = loudness < self._quiet(float(loudness.max()))
         if quiet.all() and loudness.max() > 0:
             notes.append("all of it is quieter than anything learnt from: is the gain another?")
         place, std = (None, None) if calibration is None else _places(whole, calibration, times)
@@ -174,6 +204,13 @@ class Listener:
             std,
         )
 
+    def _quiet(self, loudest: float) -> float:
+        """Below which loudness windows of a recording are quiet, whose loudest is `loudest`. Where loudness does not
+        count, its gain may be another than that of the clips: up to 12 dB less, or any more."""
+        softest, greatest = self.clips_loudness
+        gain = 1.0 if self.loudness else float(np.clip(loudest / softest, _SOFTER, 1)) * max(1.0, loudest / greatest)
+        return _QUIET * self.quietest * gain
+
     def write(self, path: str | Path) -> None:
         """Write it to one file, without how it stood: a head of JSON, and arrays. Raises `ValueError` for a folder."""
         own, arrays = self.model.kept()
@@ -182,7 +219,9 @@ class Listener:
             "method": self.method,
             "channels": self.channels,
             "highest_Hz": self.highest,
+            "loudness_counts": self.loudness,
             "quietest": self.quietest,
+            "clips_loudness": list(self.clips_loudness),
             "sharpness": self.sharpness,
             "notes": list(self.notes),
             "name": self.name,
@@ -208,6 +247,7 @@ class Listener:
         try:
             model = LEARNERS[head["method"]].made(head["model"], arrays)
             highest, quietest, sharpness = (float(head[name]) for name in ("highest_Hz", "quietest", "sharpness"))
+            softest, greatest = map(float, head["clips_loudness"])
             names, notes = tuple(map(str, head["names"])), tuple(map(str, head["notes"]))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ValueError(f"'{path}' is not {_KIND} that can be read: {error}.") from None
@@ -217,11 +257,37 @@ class Listener:
             model,
             int(head["channels"]),
             highest,
+            bool(head["loudness_counts"]),
             quietest,
+            (softest, greatest),
             sharpness,
             notes=notes,
             name=str(head["name"]),
         )
+
+
+def _held_out(name: str, windows: Windows, fold: np.ndarray, key: Array, batches: int, folder, tell) -> np.ndarray:
+    """Log-odds (W, C) of windows when their clip's fold was held out; NaN of those that never were."""
+    odds = np.full((len(windows.images), windows.classes), np.nan)
+    for number in range(int(fold.max()) + 1):
+        tell(f"{name}, fold {number + 1} of {int(fold.max()) + 1}")
+        out = (fold == number)[windows.clip]
+        lesson = windows.lesson(~out, key, batches, _file(folder, f"{name}-{number}"), tell)
+        odds[out] = LEARNERS[name].learn(lesson).log_odds(windows.images[out])
+    return odds
+
+
+def _loudness_counts(windows: Windows, fold: np.ndarray, key: Array, tell) -> bool:
+    """Whether a discriminant that knows how loud windows are names more clips right, by more than a standard deviation
+    of chance. Where nothing can be held out, what several microphones hear is of one gain, and it does."""
+    if fold.max() < 0:
+        return windows.images.intensity.shape[1] > 1
+    right = []
+    for own in (windows, windows.levelled):
+        said, truth = own.told(_held_out("linear", own, fold, key, 1, None, tell))
+        right.append(said == truth)
+    more, fewer = (right[0] & ~right[1]).sum(), (right[1] & ~right[0]).sum()
+    return bool(more - fewer > np.sqrt(more + fewer))
 
 
 def _file(folder: str | Path | None, name: str) -> Path | None:

@@ -7,6 +7,7 @@ convolution and of the pools, 3 × 3 and 2 × 2, is this library's choice; so is
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -133,7 +134,7 @@ class NetworkAnswers:
         return values.reshape(len(images), -1) @ self.dense + self.bias
 
 
-def plan_of(windows: int, *, batches: int, batch: int = 64) -> Plan:
+def paper_plan(windows: int, *, batches: int, batch: int = 64) -> Plan:
     """The paper's schedule for a training of so many windows, `batches` at most, but one time through the windows.
 
     Noise is drawn anew in every batch, so that nothing is seen twice; `COPIES` times through the windows is what was
@@ -149,6 +150,13 @@ def plan_of(windows: int, *, batches: int, batch: int = 64) -> Plan:
         decay=0.1,
         decay_epochs=5 * COPIES,
     )
+
+
+def plan_of(windows: int, *, batches: int, batch: int = 64) -> Plan:
+    """Our own schedule, which learns as much of small sets in fewer batches: a rate of 1e-3, a tenth of it in the last
+    third."""
+    plan = paper_plan(windows, batches=batches, batch=batch)
+    return replace(plan, rate=1e-3, decay_epochs=max(1, round(2 * plan.epochs / 3)))
 
 
 def train_network(

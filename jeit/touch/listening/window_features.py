@@ -27,6 +27,18 @@ def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
     return np.concatenate(parts, axis=1)
 
 
+def spectrum_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
+    """The `sound_features` and, of each of the 64 bands, its level under the loudest of the window, decibels: mean,
+    greatest and spread over the window; in the loudest frame and the two after it, and in the next five."""
+    level = _level(images.spectrum.astype(float))
+    level -= level.max(axis=(1, 2), keepdims=True, initial=-np.inf)
+    at = images.intensity.sum(axis=1).argmax(axis=1)
+    rows = np.arange(len(level))
+    after = [level[rows, :, np.minimum(at + step, FRAMES - 1)] for step in range(_AFTER)]
+    bands = [level.mean(axis=2), level.max(axis=2), level.std(axis=2), np.mean(after[:3], 0), np.mean(after[3:], 0)]
+    return np.hstack([sound_features(images), *bands])
+
+
 def _level(power: np.ndarray) -> np.ndarray:
     """Decibels (W, …), no less than 60 below the greatest of each window."""
     level = 10 * np.log10(np.maximum(power, 1e-30))

@@ -1,27 +1,34 @@
-"""Windows of labelled clips, with which clip and class each is of, and what is told of whole clips."""
+"""Windows of labelled clips, with which clip and class each is of, and what is told of whole clips.
+
+A long recording, many taps one after the other, counts as many clips: it is cut into pieces where it is quiet.
+"""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import counted
-from jeit.touch.listening.feature_images import SoundImages, sound_images
+from jeit.touch.listening.feature_images import LENGTH, SoundImages, sound_images
 from jeit.touch.listening.labelled_clips import LabelledClips
 from jeit.touch.listening.learners import Lesson
 
 LOUD = 0.01
 """A recording sounds like those of its windows whose loudest frame has this share of its loudest one's power."""
-# Windows of one clip that are learnt from, at most, spread evenly: more of one recording teach little.
-_OF_A_CLIP = 40
+# Windows of one piece that are learnt from, at most, spread evenly: more of one sound teach little.
+_OF_A_PIECE = 40
+# Seconds: clips that are longer are cut into pieces; so long is a piece of a sound that does not end.
+_LONG, _PIECE = 4.0, 2.0
+# Pieces of one clip, at most, and parts of a class's only clip that are held out by themselves.
+_PIECES, _PARTS = 60, 6
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows that are learnt from: `images`, of which `clip` (W,) each, and `right` (W,), numbers of the `names`; of
-    each clip the class, `right_of_clip`, and the group, `group_of_clip`."""
+    """Windows that are learnt from: `images`, of which `clip` (W,) each, or piece of a longer one, and `right` (W,),
+    numbers of the `names`; of each clip the class, `right_of_clip`, and the group, `group_of_clip`. `notes` on them."""
 
     images: SoundImages
     clip: np.ndarray
@@ -29,24 +36,47 @@ class Windows:
     names: tuple[str, ...]
     right_of_clip: np.ndarray
     group_of_clip: np.ndarray
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, clips: LabelledClips, tell: Callable[[str], None]) -> "Windows":
         """Of clips: those near the loudest of each. Raises `ValueError` for clips without numbers."""
         names, right = np.unique(clips.labels, return_inverse=True)
         group = np.unique(clips.groups, return_inverse=True)[1]
-        parts = []
+        alone = {one for one in range(len(names)) if len(np.unique(group[right == one])) < 2}
+        parts, of_piece, group_of_piece, cut = [], [], [], set()
         for number in range(len(clips)):
             images = sound_images(clips.clip(number), clips.highest)
             loud = np.flatnonzero(images.known & (images.loudness >= LOUD * images.loudness.max()))
-            some = np.linspace(0, len(loud) - 1, min(len(loud), _OF_A_CLIP)).round().astype(int)
-            parts.append(images[loud[some]])
+            if not len(loud):
+                raise ValueError(f"recordings[{number}], {clips.recordings[number].name}: it holds no numbers.")
+            only = right[number] in alone
+            long = images.times[-1] - images.times[0] > _LONG
+            pieces = _pieces(images.times[loud]) if long or only else [np.arange(len(loud))]
+            for place, piece in enumerate(pieces):
+                some = piece[np.linspace(0, len(piece) - 1, min(len(piece), _OF_A_PIECE)).round().astype(int)]
+                parts.append(images[loud[some]])
+                of_piece.append(number)
+                group_of_piece.append((group[number], place * _PARTS // max(len(pieces), _PARTS) if only else 0))
+            if only and len(pieces) > 1:
+                cut.add(str(names[right[number]]))
             tell(f"{counted(number + 1, 'clip')} of {len(clips)}")
-        if not all(map(len, parts)):
-            empty = next(number for number, one in enumerate(parts) if not len(one))
-            raise ValueError(f"recordings[{empty}], {clips.recordings[empty].name}: it holds no numbers.")
         clip = np.repeat(np.arange(len(parts)), [len(one) for one in parts])
-        return cls(SoundImages.joined(parts), clip, right[clip], tuple(map(str, names)), right, group)
+        right_of_clip = right[of_piece]
+        notes = ()
+        if cut:
+            notes = (
+                f"{', '.join(sorted(cut))}: one recording only, cut into the sounds in it, which are held out in turn; "
+                "how well another recording is told is not known, and likely less well.",
+            )
+        named = tuple(map(str, names))
+        own_group = np.unique(group_of_piece, axis=0, return_inverse=True)[1].ravel()
+        return cls(SoundImages.joined(parts), clip, right_of_clip[clip], named, right_of_clip, own_group, notes)
+
+    @property
+    def levelled(self) -> "Windows":
+        """The same, all of them equally loud."""
+        return replace(self, images=self.images.levelled)
 
     @property
     def classes(self) -> int:
@@ -74,3 +104,20 @@ class Windows:
             return 0.0, 0.0
         said, right = self.told(odds)
         return float(np.mean(said != right)), float(np.mean(odds[out].argmax(axis=1) != self.right[out]))
+
+
+def _pieces(times: Float[np.ndarray, " n"]) -> list[np.ndarray]:
+    """Which of the loud windows, at `times`, are pieces of their own: no sample is in two. Those without a gap of a
+    window's length between them are one sound, which is cut every 2 s, and what is on both sides of a cut left out."""
+    pieces, every = [], _PIECE + LENGTH
+    for sound in np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > LENGTH) + 1):
+        since = times[sound] - times[sound[0]]
+        if since[-1] <= every:
+            pieces.append(sound)
+            continue
+        number, within = np.divmod(since, every)
+        inside = sound[within <= _PIECE]
+        pieces += np.split(inside, np.flatnonzero(np.diff(number[within <= _PIECE])) + 1)
+    if len(pieces) > _PIECES:
+        pieces = [pieces[place] for place in np.linspace(0, len(pieces) - 1, _PIECES).round().astype(int)]
+    return pieces

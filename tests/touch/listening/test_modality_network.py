@@ -10,7 +10,7 @@ from jeit.simulate.acoustic.microphones import MicrophoneModel
 from jeit.simulate.acoustic.people import MODALITIES
 from jeit.touch.listening import Levels, Listener, ModalityNetwork, SoundImages, sound_images
 from jeit.touch.listening.learners import LEARNERS, Lesson, NetworkListener
-from jeit.touch.listening.modality_network import NetworkAnswers, plan_of
+from jeit.touch.listening.modality_network import NetworkAnswers, paper_plan, plan_of
 
 KEY = jax.random.key(1)
 
@@ -31,17 +31,19 @@ def test_answers_in_numpy_are_the_networks():
 
 
 def test_the_plan_is_the_papers():
-    plan = plan_of(20_000, batches=20_000)
+    plan = paper_plan(20_000, batches=20_000)
     assert (plan.rate, plan.batch, plan.decay, plan.patience, plan.look_every) == (2e-4, 64, 0.1, 20, 50)
     # Five epochs of five noisy copies each.
     assert plan.decay_epochs == 25
-    assert plan_of(10, batches=1).batch == 10
+    assert paper_plan(10, batches=1).batch == 10
+    own = plan_of(20_000, batches=20_000)
+    assert (own.rate, own.patience, own.decay_epochs) == (1e-3, 20, round(2 * own.epochs / 3))
 
 
 def test_a_network_is_kept_with_its_levels(tmp_path):
     heard = sound_images(Recording(np.random.default_rng(0).standard_normal((4, 9000)), 10_000.0))
     own = NetworkListener.of(ModalityNetwork.draw(KEY, 68, 41, 3), Levels.of(heard))
-    listener = Listener(("a", "b", "c"), "network", own, 4, 5000.0, 0.0, 1.0)
+    listener = Listener(("a", "b", "c"), "network", own, 4, 5000.0, True, 0.0, (1.0, 2.0), 1.0)
     listener.write(tmp_path / "listener.jeit")
     again = Listener.read(tmp_path)
     np.testing.assert_array_equal(again.model.log_odds(heard), own.log_odds(heard))
@@ -70,8 +72,8 @@ def test_a_small_training_tells_people_it_never_met():
     found = {
         "untrained": float(np.mean(untrained.argmax(axis=1) == right)),
         "shuffled": share("network", shuffled),
-        **{method: share(method, right) for method in LEARNERS},
+        **{method: share(method, right) for method in ("network", "trees", "spectrum", "linear")},
     }
     assert max(found["untrained"], found["shuffled"]) < 0.4, found
-    assert found["network"] > 0.55, found
+    assert found["network"] > 0.65, found
     assert min(found["trees"], found["linear"]) > 0.8, found
