@@ -186,6 +186,9 @@ def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) ->
             f"{path.name}: there is no array '{missing[0]}'; the file has {', '.join(sorted(arrays))}. Name "
             "the voltages with [data] keys in the description."
         )
+    for key in keys:
+        if arrays[key].dtype.kind not in "biufc":
+            raise ValueError(f"{path.name}: '{key}' holds {arrays[key].dtype}; give numbers, in volts.")
     return arrays[keys[0]] if len(keys) == 1 else np.stack([arrays[key].ravel() for key in keys])
 
 

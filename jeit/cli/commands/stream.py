@@ -86,6 +86,7 @@ def stream(
             "contact": contact,
             "num-points": num_points,
             "rate": rate,
+            "film": None if film in ("film.gif", "none") else film,
             "as-is": as_is or None,
         }
         given = data if data == "-" else Path(data), reference, format, description

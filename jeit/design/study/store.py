@@ -24,6 +24,10 @@ from jeit.design.study.store_check import ArrayShape, damage, danger
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 
 
+class OtherContents(ValueError):
+    """A store holds something else than is asked for."""
+
+
 class Store:
     """The store of a study, or of other `Contents`, at `path`; made empty if there is none."""
 
@@ -51,7 +55,7 @@ class Store:
                 "place where nothing is."
             )
         if attributes.get("fingerprint") != self.contents.fingerprint:
-            raise ValueError(
+            raise OtherContents(
                 f"{self.path} holds the results of another {kind}, or of this one before it was changed; move it away "
                 "or choose another path."
             )

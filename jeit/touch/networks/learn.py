@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from jeit.arguments import check_kind, check_name, told
 from jeit.design import Skin, touches_away_from_the_edge
-from jeit.design.study.store import require
+from jeit.design.study.store import OtherContents, require
 from jeit.simulate import Indent, IndentSet, ball, relative_changes, simulate_presses
 from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.needed import need_learning
@@ -64,12 +64,14 @@ class ImageStanding:
     """How well a network images touches that nothing was learnt from.
 
     **Fields**: `explained`, the share of the squares of depths in the touches of a test set that its maps get right,
-    at most 1; `place`, errors of the middle of a single ball, metres, over a grid of places (mean, sd, rms);
-    `examples`, some maps, right and told, (k, rows, columns) over the thickness.
+    at most 1; `place`, errors of the middle of a single ball, metres, over a grid of places (mean, sd, rms), and
+    `deepest`, how deep it is told to be, over its depth, in the median; `right` and `told`, some maps, (k, rows,
+    columns) over the thickness.
     """
 
     explained: float
     place: dict[str, float]
+    deepest: float
     right: Float[np.ndarray, "k rows columns"]
     told: Float[np.ndarray, "k rows columns"]
 
@@ -128,12 +130,18 @@ def learn_images(
     ):
         indents = IndentSet(skin, touch_draws(skin), number, seed=3 * seed + own, shape=SHAPE, chunk=_CHUNK)
         where = work / f"{name}.zarr"
-        simulate_presses(
-            indents,
-            where,
-            client=client,
-            progress=lambda now, name=name: tell(f"touches {name}: {now.points} of {now.all_points}"),
-        )
+        try:
+            simulate_presses(
+                indents,
+                where,
+                client=client,
+                progress=lambda now, name=name: tell(f"touches {name}: {now.points} of {now.all_points}"),
+            )
+        except OtherContents:
+            raise ValueError(
+                f"folder '{folder}' was begun for another skin, seed or number of touches; give another folder, or "
+                f"delete '{work}' to learn anew."
+            ) from None
         sets[name] = StoredTouches(indents, where)
     held, judged = (sets[name].in_memory() for name in ("held-out", "standing"))
     seconds["touches"] = time.monotonic() - start
@@ -170,4 +178,5 @@ def stand(network: ImageNetwork, skin: Skin, examples: Examples, seed: int = 0) 
     found = told(relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places]))
     rows, columns = network.shape
     place = errors(centroids_of(found, image_places(skin, columns, rows)), grid.places)
-    return ImageStanding(explained, place, examples.depth[:6], maps[:6])
+    deepest = float(np.median(found.max(axis=(1, 2)))) * float(skin.thickness) / depth
+    return ImageStanding(explained, place, deepest, examples.depth[:6], maps[:6])

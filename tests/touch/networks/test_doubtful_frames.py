@@ -1,0 +1,64 @@
+"""Frames with channels missing, and frames that no touch makes."""
+
+import numpy as np
+import pytest
+
+from jeit.simulate import Disc, Indent, relative_changes
+from jeit.touch.networks.missing import filled
+
+PLACE = (0.012, -0.02)
+
+
+@pytest.fixture(scope="module")
+def change(small_skin):
+    return relative_changes(small_skin, [[Indent(Disc(0.02), 5e-3, PLACE)]])
+
+
+def test_missing_channels_are_what_is_expected_of_them():
+    """The mean of a normal distribution, given some of it, as by the inverse of its covariance."""
+    rng = np.random.default_rng(0)
+    factor = rng.normal(size=(6, 6))
+    covariance, noise = factor @ factor.T, 0.3
+    values = rng.normal(size=(3, 6))
+    values[0, [1, 4]] = values[2, 0] = np.nan
+    found = filled(values, covariance, noise)
+    whole = np.linalg.inv(covariance + noise**2 * np.eye(6))
+    for row, given in zip(found, values, strict=True):
+        lost = np.isnan(given)
+        np.testing.assert_array_equal(row[~lost], given[~lost])
+        # Λ₂₂ (x₂ − µ₂) + Λ₂₁ x₁ = 0 at the mean.
+        np.testing.assert_allclose(whole[lost] @ row, 0, atol=1e-9)
+
+
+def test_an_electrode_that_says_nothing(small_skin, learnt, change):
+    """All channels of one electrode lost: the touch stays where it is, where zeros move it."""
+    network, protocol = learnt[1].network, small_skin.model.protocol
+    drive, measured = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
+    for electrode in (5, 10):
+        lost = (drive[:, electrode] != 0) | (measured[:, electrode] != 0)
+        frame = np.where(lost, np.nan, 1 + change[0])
+        whole, without = (network.depth(one, np.ones(94)) for one in (1 + change[0], frame))
+        assert np.isfinite(without).all()
+        zeros = network.depth(np.where(lost, 1.0, frame), np.ones(94))
+        assert np.linalg.norm(without - whole) < 0.7 * np.linalg.norm(zeros - whole)
+
+
+def test_what_no_touch_makes(learnt, change):
+    """Signs turned round, and other units, are told; a touch is not doubted, nor what is not touched."""
+    network = learnt[1].network
+
+    def doubted(frames):
+        return network.doubts(frames, network.share(frames))
+
+    assert doubted(np.concatenate([change, 0 * change])) == ["", ""]
+    assert "of no touch" in doubted(-change)[0]
+    assert all(doubted(40 * change))
+    with pytest.raises(ValueError, match="times those of the reference; are units the same"):
+        network.depth(1e3 * np.ones(94), np.ones(94))
+
+
+def test_noise_alone_is_not_deep(learnt, change):
+    network = learnt[1].network
+    noise = network.noise * np.random.default_rng(3).normal(size=(20, 94))
+    assert network.thickness * network.share(noise).max() < 1.5 * network.floor
+    assert network.thickness * network.share(change).max() > 3 * network.floor
