@@ -59,6 +59,55 @@ def test_a_model_is_made_and_its_report_says_how_good(folder):
     assert (folder / "model" / "learning.png").stat().st_size > 10_000
 
 
+def test_nothing_is_surer_than_clips_can_show(folder):
+    """Ten clips, all of them right: 11 in 12 of the next, half of the twelfth its own; silence is nothing at all."""
+    listener = Listener.read(folder / "model")
+    assert listener.doubt == pytest.approx(1 / 12)
+    heard = listener.hear(read_recording(folder / "one.wav"))
+    assert heard.probabilities.max() <= 1 - 1 / 24 + 1e-9
+    np.testing.assert_allclose(heard.probabilities.sum(axis=1), 1)
+    hush = listener.hear(Recording(1e-9 * np.random.default_rng(0).normal(size=(1, RATE)), RATE))
+    assert hush.whole == ("", 0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--output", "CLIPS/model"), "lies in the folder of clips"),
+        (("--output", "model", "--method", "linear", "--batches", "10"), "--batches is for networks"),
+    ],
+)
+def test_what_is_not_begun(folder, tmp_path, capsys, options, said):
+    """And nothing is left of it."""
+    clips = folder / "clips"
+    options = [one.replace("CLIPS", str(clips)).replace("model", str(tmp_path / "model")) for one in options]
+    options = [str(clips / "model") if one.startswith(str(clips)) else one for one in options]
+    assert main(["listen", "fit", str(clips), *options]) == 1
+    assert said in " ".join(capsys.readouterr().err.split())
+    assert not (clips / "model").exists()
+    assert not (tmp_path / "model").exists()
+
+
+def test_names_are_printed_as_they_are(folder, tmp_path, capsys):
+    """Square brackets are no markup."""
+    output = tmp_path / "out [bold]x[/bold]"
+    command = ["listen", str(folder / "one.wav"), "--model", str(folder / "model"), "--output", str(output)]
+    assert main(command) == 0
+    assert "out [bold]x[/bold]" in capsys.readouterr().out
+
+
+def test_files_beside_the_classes_and_silent_clips_are_told_of(tmp_path):
+    random = np.random.default_rng(0)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        wavfile.write(tmp_path / name / "1.wav", RATE, sounds(random, 400.0).astype(np.float32))
+    wavfile.write(tmp_path / "a" / "still.wav", RATE, np.zeros(RATE, np.float32))
+    wavfile.write(tmp_path / "c.wav", RATE, np.zeros(RATE, np.float32))
+    notes = " ".join(read_clips(tmp_path).notes)
+    assert "still.wav: it is silent" in notes
+    assert "1 file of no class, beside their folders, left out ('c.wav')" in notes
+
+
 def test_a_recording_is_named(folder, tmp_path, capsys):
     """Options may come before the recording, and the model may be its file."""
     model = folder / "model" / "listener.jeit"

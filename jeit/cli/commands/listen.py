@@ -154,6 +154,10 @@ def fit(
     if loudness not in _LOUDNESS:
         raise ValueError(f"--loudness must be one of {', '.join(_LOUDNESS)}; it is '{loudness}'.")
     check_at_least({"--batches": (batches, 1), "--seed": (seed, 0)})
+    if batches is not None and method in ("trees", "spectrum", "linear"):
+        raise ValueError(f"--batches is for networks, and --method {method} has none; leave one out.")
+    if clips.resolve() in output.resolve().parents or clips.resolve() == output.resolve():
+        raise ValueError(f"--output {output} lies in the folder of clips, where it would be a class; give another.")
     make_folder(output, LISTENER_FILES)
     console = Console(highlight=False)
     # Trainings on their way; gone when all is done.
@@ -193,6 +197,7 @@ def fit(
 
 def _show(console, heard: "Heard") -> None:
     """The whole, and a line for each event."""
+    from rich.markup import escape
     from rich.table import Table
 
     from jeit.cli.console import pairs
@@ -211,6 +216,6 @@ def _show(console, heard: "Heard") -> None:
     for event in heard.events:
         where = [""] * (2 * placed) if event.place is None else [f"{1e3 * value:z.1f}" for value in event.place[:2]]
         sure = f"{100 * event.probability:.0f}" if event.name else ""
-        table.add_row(event.name or "quiet", f"{event.start:.2f}", f"{event.end:.2f}", sure, *where)
+        table.add_row(escape(event.name) or "quiet", f"{event.start:.2f}", f"{event.end:.2f}", sure, *where)
     console.print(table)
     console.print()

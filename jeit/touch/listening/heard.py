@@ -58,8 +58,9 @@ class Heard:
     @property
     def whole(self) -> tuple[str, float]:
         """The recording as one sound: the name that is likeliest of its loud windows together, and how probable it is
-        (the geometric mean of the windows', so that windows which overlap do not count as many); "" without any."""
-        some = self.loud & self.known
+        (the geometric mean of the windows', so that windows which overlap do not count as many); "" where all
+        are quiet."""
+        some = self.loud & self.known & ~self.quiet
         if not some.any():
             return "", 0.0
         mean = np.exp(np.log(np.maximum(self.probabilities[some], 1e-9)).mean(axis=0))

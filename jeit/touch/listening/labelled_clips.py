@@ -84,8 +84,9 @@ class LabelledClips:
         if high > low * (1 + _SAME_RATE):
             few = sum(rate < high * (1 - _SAME_RATE) for rate in rates)
             said.append(
-                f"{few} of {counted(len(rates), 'clip')} have fewer than {high:g} samples a second: nothing above "
-                f"{low / 2:g} Hz is told, which all of them have."
+                f"{few} of {counted(len(rates), 'clip')} have fewer than {high:g} samples a second, the fewest "
+                f"'{recordings[int(np.argmin(rates))].name}': nothing above {low / 2:g} Hz is told, which all of them "
+                "have."
             )
         width = several[0] if len(several) == 1 else 1
         return cls(recordings, named.astype(str), own, width, low / 2, tuple(said), name)
@@ -115,6 +116,7 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
     if len(classes) < 2:
         held = f"only '{classes[0].name}'" if classes else "none"
         raise ValueError(f"'{folder}' must have a sub-folder of clips for each of two classes or more; it has {held}.")
+    beside = [one.name for one in folder.iterdir() if one.is_file() and not one.name.startswith(".")]
     read, labels, groups, failed = [], [], [], []
     for one in classes:
         files = sorted(path for path in one.rglob("*") if path.is_file() and not _hidden(path.relative_to(folder)))
@@ -135,6 +137,8 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
             why = failed[-1][1] if files else "it is empty"
             raise ValueError(f"'{one}': there is no clip in it that can be read ({why}).")
     notes = [_not_read(failed)] if failed else []
+    if beside:
+        notes.append(f"{counted(len(beside), 'file')} of no class, beside their folders, left out ('{min(beside)}').")
     return LabelledClips.of(_Files(read), labels, groups, notes=notes, name=folder.name or str(folder))
 
 
@@ -154,10 +158,13 @@ def _check_clip(clip: Recording | Intensities, name: str) -> None:
     """Raise `ValueError` for what cannot be learnt from."""
     if not isinstance(clip, Recording):
         raise ValueError(f"{name}: it holds intensities, not samples.")
-    if not np.isfinite(clip.samples).any():
+    known = clip.samples[np.isfinite(clip.samples)]
+    if not known.size:
         raise ValueError(f"{name}: none of its samples is a number.")
     if clip.rate < 2 * LOWEST:
         raise ValueError(f"{name}: {clip.rate:g} samples a second are too few; give {2 * LOWEST:g} or more.")
+    if known.min() == known.max():
+        raise ValueError(f"{name}: it is silent, all of its samples are {known[0]:g}.")
 
 
 def mixed(recording: Recording) -> Recording:

@@ -40,9 +40,10 @@ class Listener:
 
     **Fields**: `names` (C,); the `method` and what learnt, `model`; of how many `channels`, 1 where they are mixed; up
     to which frequency `highest`, Hz; whether `loudness` counts, or all windows are made equally loud; the `quietest`
-    loudness that was learnt from, that of the softest and of the loudest clip, `clips_loudness`, and the `sharpness` of
-    its probabilities. `standing`: what was said of each clip when it was held out, and the errors of all that was
-    tried, the best first, None of a listener that was read; `notes` on it.
+    loudness that was learnt from, that of the softest and of the loudest clip, `clips_loudness`; the `sharpness` of its
+    probabilities, and the share of each that is dealt to all names alike, `doubt`, 1 / (n + 2) of n clips held out:
+    nothing is surer than they can show. `standing`: what was said of each clip when it was held out, and the errors of
+    all that was tried, the best first, None of a listener that was read; `notes` on it.
     """
 
     names: tuple[str, ...]
@@ -54,6 +55,7 @@ class Listener:
     quietest: float
     clips_loudness: tuple[float, float]
     sharpness: float
+    doubt: float
     standing: Standing | None = None
     notes: tuple[str, ...] = ()
     name: str = "clips"
@@ -127,8 +129,9 @@ class Listener:
             notes.append(
                 "no class has clips of two groups: nothing could be held out, and nobody knows how good it is."
             )
-        # Few clips that all are told right would make it as sure as can be.
+        # Few clips that all are told right would make it as sure as can be; by the rule of succession the next is not.
         sharpness = min(1.0, sharpness_of(odds[out], windows.right[out])) if out.any() else 1.0
+        asked = 0 if standing is None else len(standing.right)
         return cls(
             windows.names,
             chosen,
@@ -139,6 +142,7 @@ class Listener:
             float(loud.min()),
             (float(of_clips.min()), float(of_clips.max())),
             sharpness,
+            1 / (asked + 2),
             standing,
             tuple(notes),
             clips.name,
@@ -190,9 +194,10 @@ class Listener:
         if quiet.all() and loudness.max() > 0:
             notes.append("all of it is quieter than anything learnt from: is the gain another?")
         place, std = (None, None) if calibration is None else _places(whole, calibration, times)
+        share = probabilities(odds, self.sharpness)
         return Heard(
             times,
-            probabilities(odds, self.sharpness),
+            (1 - self.doubt) * share + self.doubt / share.shape[1],
             self.names,
             quiet,
             known,
@@ -223,6 +228,7 @@ class Listener:
             "quietest": self.quietest,
             "clips_loudness": list(self.clips_loudness),
             "sharpness": self.sharpness,
+            "doubt": self.doubt,
             "notes": list(self.notes),
             "name": self.name,
             "model": own,
@@ -246,7 +252,8 @@ class Listener:
         head, arrays = read_model(path, _KIND, _VERSION, make)
         try:
             model = LEARNERS[head["method"]].made(head["model"], arrays)
-            highest, quietest, sharpness = (float(head[name]) for name in ("highest_Hz", "quietest", "sharpness"))
+            numbers = (float(head[name]) for name in ("highest_Hz", "quietest", "sharpness", "doubt"))
+            highest, quietest, sharpness, doubt = numbers
             softest, greatest = map(float, head["clips_loudness"])
             names, notes = tuple(map(str, head["names"])), tuple(map(str, head["notes"]))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -261,6 +268,7 @@ class Listener:
             quietest,
             (softest, greatest),
             sharpness,
+            doubt,
             notes=notes,
             name=str(head["name"]),
         )

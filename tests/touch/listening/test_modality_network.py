@@ -43,7 +43,7 @@ def test_the_plan_is_the_papers():
 def test_a_network_is_kept_with_its_levels(tmp_path):
     heard = sound_images(Recording(np.random.default_rng(0).standard_normal((4, 9000)), 10_000.0))
     own = NetworkListener.of(ModalityNetwork.draw(KEY, 68, 41, 3), Levels.of(heard))
-    listener = Listener(("a", "b", "c"), "network", own, 4, 5000.0, True, 0.0, (1.0, 2.0), 1.0)
+    listener = Listener(("a", "b", "c"), "network", own, 4, 5000.0, True, 0.0, (1.0, 2.0), 1.0, 0.0)
     listener.write(tmp_path / "listener.jeit")
     again = Listener.read(tmp_path)
     np.testing.assert_array_equal(again.model.log_odds(heard), own.log_odds(heard))
