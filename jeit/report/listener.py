@@ -128,7 +128,10 @@ def draw_listener(listener: Listener):
         ax.set_title("No clips could be held out")
         return figure
     right = 100 * np.mean(listener.standing.held_out == listener.standing.right)
-    plot_confusion(listener.standing, title=f"{listener.method}: {right:.1f} % right of clips held out", ax=ax)
+    number = len(listener.standing.right)
+    plot_confusion(
+        listener.standing, title=f"{listener.method}: {right:.1f} % of {number} clips held out are told right", ax=ax
+    )
     return figure
 
 

@@ -30,9 +30,10 @@ def plot_heard(heard: Heard, *, title: str | None = None, ax: Axes | None = None
             row, span = names.index(event.name) - 0.42, [event.start, event.end]
             ax.plot(span, [row, row], color=SERIES_COLOURS[1], linewidth=2.5, solid_capstyle="butt")
     ax.set_yticks(range(len(names)), names)
+    ax.set_xlim(0, extent[1])
     ax.set_xlabel("Time (s)", color=INK)
     quiet = int((heard.told == "").sum())
-    said = f"{heard.name}: {quiet} of {len(heard)} windows quiet" if quiet else heard.name
+    said = f"{heard.name}: red, what is told" + (f"; blank, {quiet} of {len(heard)} windows quiet" if quiet else "")
     ax.set_title(said if title is None else title)
     soften_axes(ax)
     return ax

@@ -71,6 +71,9 @@ class Heard:
     def events(self) -> tuple[Event, ...]:
         """Stretches of one name, one after the other."""
         told, found = self.told, []
+        # A name holds to half way to the next window.
+        steps = [self.times[:1] - EVERY / 2, (self.times[1:] + self.times[:-1]) / 2, self.times[-1:] + EVERY / 2]
+        edges = np.maximum(np.concatenate(steps), 0).tolist()
         cuts = np.flatnonzero(told[1:] != told[:-1]) + 1
         for some in np.split(np.arange(len(told)), cuts):
             if not some.size:
@@ -79,6 +82,9 @@ class Heard:
             if self.position is not None:
                 located = self.position[some][np.isfinite(self.position[some]).all(axis=1)]
                 place = located.mean(axis=0) if len(located) else None
-            start, end = max(0.0, float(self.times[some[0]]) - EVERY / 2), float(self.times[some[-1]]) + EVERY / 2
-            found.append(Event(start, end, str(told[some[0]]), float(self.probability[some].mean()), place))
+            found.append(
+                Event(
+                    edges[some[0]], edges[some[-1] + 1], str(told[some[0]]), float(self.probability[some].mean()), place
+                )
+            )
         return tuple(found)
