@@ -28,15 +28,14 @@ from jeit.touch.listening.modality_network import COPIES
 # Where sets and trainings are kept from one run to the next.
 STORE = Path(tempfile.gettempdir()) / "jeit-modality"
 PEOPLE, CLIPS, SEED = 10, 8, 1
-# Folds by person, of two each, and how many of them networks are trained in: a training takes minutes.
-FOLDS, NETWORK_FOLDS = 5, 1
+# Folds by person, of two each.
+FOLDS = 5
 # Batches at most, of the paper's schedule, of our own, and of shuffled labels.
 BATCHES, OWN_BATCHES, SHUFFLED_BATCHES = 1000, 400, 100
 # Decibels by which the copies of the paper's split differ from each window.
 _COPIED = 2.0
 PAPER = 98.7
 METHODS = tuple(LEARNERS)
-NETWORKS = "paper-network", "network"
 
 
 @dataclass
@@ -54,28 +53,18 @@ class Experiment:
         kept = None if self.folder is None else self.folder / f"{name}-{batches}.training"
         return LEARNERS[method].learn(Lesson(images, right, groups, len(MODALITIES), jax.random.key(0), batches, kept))
 
-    def fold(self, method: str) -> np.ndarray:
-        """The fold of each window that it is held out in, with all of its person; -1 of those that never are."""
-        each = -(-(int(self.heard.person.max()) + 1) // FOLDS)
-        fold = self.heard.person // each
-        return np.where(fold < (NETWORK_FOLDS if method in NETWORKS else FOLDS), fold, -1)
-
-    def by_person(
-        self, method: str, variants: list[tuple[float, int]], number: int = 25, folds: int = FOLDS
-    ) -> np.ndarray:
-        """Confusions (V, F, C, C), counts, of the windows of each fold's people when they were held out, in each of the
-        `variants` of noise and microphones; what is learnt from is heard by `number` microphones without more noise.
-        The first `folds` at most."""
+    def by_person(self, method: str, variants: list[tuple[float, int]], number: int = 25) -> np.ndarray:
+        """Confusions (V, C, C), counts, of the windows of each fold's people when they were held out, in each of the
+        `variants` of noise and microphones; what is learnt from is heard by `number` microphones without more noise."""
         images, right, person = self.heard.images[0.0, number], self.heard.right, self.heard.person
-        fold = self.fold(method)
-        folds = min(folds, int(fold.max()) + 1)
-        counts = np.zeros((len(variants), folds, len(MODALITIES), len(MODALITIES)))
-        for one in range(folds):
+        fold = person // -(-(int(person.max()) + 1) // FOLDS)
+        counts = np.zeros((len(variants), len(MODALITIES), len(MODALITIES)))
+        for one in range(int(fold.max()) + 1):
             out = fold == one
             model = self.learnt(method, f"{method}-{number}-{one}", images[~out], right[~out], person[~out])
             for place, variant in enumerate(variants):
                 said = model.log_odds(self.heard.images[variant][out]).argmax(axis=1)
-                np.add.at(counts[place, one], (right[out], said), 1)
+                np.add.at(counts[place], (right[out], said), 1)
             say(f"{method}, {number} microphones: fold {one + 1}; {_percent(counts[0])} so far")
         return counts
 
@@ -128,32 +117,24 @@ def run(options: Options) -> Result:
             say(f"{method}: {100 * leaky:.1f} % of the paper's split, {100 * fair:.1f} % by recording")
         persons[method] = experiment.by_person(method, noisier)
         splits[method] = leaky, fair, _right(persons[method][0])
-    tried = min(persons["network"].shape[1], persons["trees"].shape[1])
-    for method in METHODS:
-        first, every = persons[method][0, :tried], persons[method][0]
-        shares = ["" if one is None else f"{100 * one:.1f} %" for one in splits[method][:2]]
-        rows.append([method, *shares, _percent(first), "" if method in NETWORKS else _percent(every)])
+        rows.append([method, *("" if one is None else f"{100 * one:.1f} %" for one in splits[method])])
     rows += [
-        [f"{name} network", "", f"{100 * one:.1f} %", "", ""]
+        [f"{name} network", "", f"{100 * one:.1f} %", ""]
         for name, one in zip(("untrained", "shuffled"), nothing, strict=True)
     ]
-    best = max((method for method in METHODS if method not in NETWORKS), key=lambda method: splits[method][2])
-    noise = [[method, *(_percent(one[:tried]) for one in persons[method])] for method in METHODS]
+    best = max(METHODS, key=lambda method: splits[method][2])
+    noise = [[method, *(_percent(one) for one in persons[method])] for method in METHODS]
     fewer = [
-        [
-            method,
-            *(_percent(experiment.by_person(method, [(0.0, number)], number, NETWORK_FOLDS)[0]) for number in FEWER),
-        ]
+        [method, *(_percent(experiment.by_person(method, [(0.0, number)], number)[0]) for number in FEWER)]
         for method in ("trees", "linear")
     ]
-    confusion = persons[best][0].sum(axis=0)
+    confusion = persons[best][0]
     confusion /= np.maximum(confusion.sum(axis=1, keepdims=True), 1)
     told = [[name, *(f"{100 * share:.0f}" for share in row)] for name, row in zip(MODALITIES, confusion, strict=True)]
     seconds = _seconds(experiment)
-    people = len(np.unique(experiment.heard.person[experiment.fold("network") >= 0]))
     tables = [
         Table(
-            ["told by", "the paper's split", "by recording", f"by person, the first {people}", "by person, all"],
+            ["told by", "the paper's split", "by recording", "by person"],
             rows,
             "Three splits",
             f"Right of windows of 0.5 s held out. {PEOPLE} people, {len(experiment.heard.right)} windows; two people "
@@ -165,17 +146,16 @@ def run(options: Options) -> Result:
             ["told by", *(f"+{louder:g} dB" for louder in LOUDER)],
             noise,
             "More noise",
-            f"The first {people} people held out; learnt from without more noise.",
+            "By person; learnt from without more noise.",
         ),
-        Table(["told by", *map(str, FEWER)], fewer, "Fewer microphones", f"The first {people} people held out."),
+        Table(["told by", *map(str, FEWER)], fewer, "Fewer microphones", "By person."),
         Table(["what", "a window"], [[name, duration(own)] for name, own in seconds.items()], "Times"),
     ]
     return Result(tables, [] if options.quick else _asked(splits, nothing, best, seconds))
 
 
 def _right(counts: np.ndarray) -> float:
-    """Of confusions of several folds (F, C, C)."""
-    return float(np.trace(counts, axis1=-2, axis2=-1).sum() / counts.sum())
+    return float(counts.trace() / counts.sum())
 
 
 def _percent(counts: np.ndarray) -> str:
