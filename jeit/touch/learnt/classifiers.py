@@ -31,7 +31,12 @@ def linear_discriminant(features, label) -> Any:
     """Normal classes with one covariance, shrunk as Ledoit and Wolf do."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-    return LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features, label)
+    try:
+        return LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features, label)
+    except (
+        np.linalg.LinAlgError
+    ):  # LAPACK's least squares give up on some covariances that are singular, finite ones too
+        return LinearDiscriminantAnalysis(solver="eigen", shrinkage="auto").fit(features, label)
 
 
 @dataclass(frozen=True)

@@ -208,11 +208,14 @@ class LinearLearner:
         """Fit it; all classes are as likely beforehand, however many windows they have."""
         features = self.features(lesson.images)
         mean, deviation = features.mean(axis=0), features.std(axis=0)
-        # What is constant but for rounding tells nothing.
-        deviation = np.where(deviation > 1e-5, deviation, 1.0)
-        model = CLASSIFIERS["linear-discriminant"]((features - mean) / deviation, lesson.right)
+        # What is constant but for rounding tells nothing, and leaves a covariance that cannot be solved with.
+        varies = deviation > 1e-5
+        deviation = np.where(varies, deviation, 1.0)
+        model = CLASSIFIERS["linear-discriminant"](((features - mean) / deviation)[:, varies], lesson.right)
         share = np.log(model.priors_)
-        weights, offset = model.coef_.T, model.intercept_ - (share if len(share) > 2 else share[1] - share[0])
+        weights = np.zeros((len(mean), len(model.coef_)))
+        weights[varies] = model.coef_.T
+        offset = model.intercept_ - (share if len(share) > 2 else share[1] - share[0])
         if weights.shape[1] == 1:  # of two classes, the odds of the second
             weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
         return LinearListener(self.features, mean, deviation, weights, offset)

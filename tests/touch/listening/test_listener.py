@@ -8,10 +8,11 @@ import pytest
 from made_clips import MATERIALS, struck
 
 from jeit.acoustic import Recording
+from jeit.touch.learnt.classifiers import CLASSIFIERS
 from jeit.touch.listening import LabelledClips, Listener
-from jeit.touch.listening.feature_images import LENGTH
+from jeit.touch.listening.feature_images import LENGTH, SoundImages
 from jeit.touch.listening.folds import held_out_folds
-from jeit.touch.listening.learners import LEARNERS, stopping_rows
+from jeit.touch.listening.learners import LEARNERS, Lesson, LinearLearner, stopping_rows
 from jeit.touch.listening.windows import _pieces
 
 KEY = jax.random.key(0)
@@ -254,3 +255,36 @@ def test_files_of_another_kind_are_refused(learnt, tmp_path):
     path.write_bytes(whole.replace(b'"depth": ', b'"depth": -'))
     with pytest.raises(ValueError, match="lead nowhere"):
         Listener.read(path)
+
+
+def test_features_that_never_change_count_for_nothing():
+    """They leave a covariance that is singular, on which least squares may fail."""
+    random = np.random.default_rng(0)
+    told = random.normal(size=(30, 3)) + np.repeat(np.eye(3), 10, axis=0)
+    given = np.concatenate([told, np.full((30, 2), 7.0)], axis=1)
+    nothing = SoundImages(
+        np.zeros(30), np.zeros((30, 1, 41)), np.zeros((30, 64, 41)), np.zeros(30, int), np.ones(30, bool)
+    )
+    right = np.repeat(np.arange(3), 10)
+    lesson = Lesson(nothing, right, np.arange(30), 3, jax.random.key(0))
+    found, plain = (LinearLearner(lambda _, own=own: own).learn(lesson) for own in (given, told))
+    assert not found.weights[3:].any()
+    np.testing.assert_allclose(found.weights[:3], plain.weights, atol=1e-9)
+
+
+def test_a_covariance_that_least_squares_fail_on(monkeypatch):
+    """Is solved with by its eigenvectors: the same odds."""
+    from sklearn.discriminant_analysis import LinearDiscriminantAnalysis as Discriminant
+
+    random = np.random.default_rng(0)
+    right = np.repeat(np.arange(3), 10)
+    features = random.normal(size=(30, 4)) + np.eye(4)[right]
+    usual = CLASSIFIERS["linear-discriminant"](features, right)
+
+    def fails(self, *arguments, **more):
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    monkeypatch.setattr(Discriminant, "_solve_lstsq", fails)
+    other = CLASSIFIERS["linear-discriminant"](features, right)
+    odds = [one.decision_function(features) for one in (usual, other)]
+    np.testing.assert_allclose(*[one - one[:, :1] for one in odds], atol=1e-9)
