@@ -149,7 +149,8 @@ TYPED = [
     "docs/choosing-a-hyperparameter.md",
     "README.md",
 ]
-LONG = ("jeit layout optimise", "jeit study run")  # minutes; each has tests of its own
+# Minutes, or files that no page makes; each has tests of its own.
+LONG = ("jeit layout optimise", "jeit study run", "jeit learn image", "jeit listen")
 
 
 @pytest.mark.slow
