@@ -6,6 +6,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from small_networks import SKIN
 
 from jeit.design import read_described_skin
 from jeit.simulate.contact.indent_sets import image_places
@@ -15,16 +16,6 @@ from jeit.touch.networks.sensed import Sensed
 from jeit.touch.networks.three_stages import ThreeStages
 from jeit.touch.networks.training import Examples, Runs, shuffled, train_unrolled
 from jeit.touch.networks.unrolled import Unrolled
-
-SKIN = """
-[skin]
-width_mm = 100
-height_mm = 100
-[electrodes]
-layout = "grid-4x4"
-[mesh]
-cell_mm = 6
-"""
 
 
 @pytest.mark.parametrize(

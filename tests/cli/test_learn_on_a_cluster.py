@@ -8,16 +8,7 @@ import sys
 import time
 
 import pytest
-
-SKIN = """
-[skin]
-width_mm = 100
-height_mm = 100
-[electrodes]
-layout = "grid-4x4"
-[mesh]
-cell_mm = 8
-"""
+from small_networks import SKIN
 
 
 def finished(model) -> int:
@@ -31,7 +22,7 @@ def finished(model) -> int:
 def test_killed_with_its_workers(tmp_path):
     distributed = pytest.importorskip("distributed")
     skin = tmp_path / "skin.toml"
-    skin.write_text(SKIN)
+    skin.write_text(SKIN.replace("cell_mm = 6", "cell_mm = 8"))
 
     def start(name, *options):
         command = [sys.executable, "-m", "jeit", "learn", "image", str(skin), "--output", str(tmp_path / name)]

@@ -33,9 +33,8 @@ def linear_discriminant(features, label) -> Any:
 
     try:
         return LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features, label)
-    except (
-        np.linalg.LinAlgError
-    ):  # LAPACK's least squares give up on some covariances that are singular, finite ones too
+    except np.linalg.LinAlgError:
+        # LAPACK's least squares give up on some covariances that are singular, finite as they are.
         return LinearDiscriminantAnalysis(solver="eigen", shrinkage="auto").fit(features, label)
 
 

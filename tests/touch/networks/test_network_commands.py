@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+from small_networks import SKIN
 
 from jeit.cli import main
 from jeit.data import Measurement, screen
@@ -12,16 +13,6 @@ from jeit.data.export import write_table
 from jeit.protocol import adjacent
 from jeit.simulate import Disc, Indent, relative_changes
 
-SKIN = """
-[skin]
-width_mm = 100
-height_mm = 100
-thickness_mm = 10
-[electrodes]
-layout = "grid-4x4"
-[mesh]
-cell_mm = 6
-"""
 PLACES = ((0.01, -0.02), (-0.025, 0.01))
 
 
