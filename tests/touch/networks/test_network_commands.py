@@ -61,10 +61,11 @@ def test_reconstruct(learnt, recorded, run, tmp_path):
 
 
 def test_stream(learnt, recorded, run, tmp_path):
-    """A frame without one of its channels is imaged; one of channels in another order is not."""
+    """A frame without one of its channels is imaged; one of signs turned round is not."""
     with np.load(recorded / "touched.npz") as one:
         arrays = dict(one)
-    arrays["voltages"][2, :] = arrays["voltages"][2, ::-1]
+    with np.load(recorded / "rest.npz") as one:
+        arrays["voltages"][2] = 2 * one["voltages"][0] - arrays["voltages"][2]
     np.savez(tmp_path / "touched.npz", frames=np.where(arrays["mask"], arrays["voltages"], np.nan))
     given = "--reference", recorded / "rest.npz", "--method", "network", "--model", learnt[0], "--output", tmp_path
     status, out, error = run("stream", recorded / "touched.npz", *given)
