@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from jeit.arguments import need, npz_arrays
+from jeit.files import need, npz_arrays
 
 _ARRAYS = ("gesture", "person", "start", "seconds", "voltages", "reference", "untouched")
 

@@ -27,7 +27,7 @@ from jeit.acoustic.signal._arrays import (
 )
 from jeit.acoustic.signal.faults import intensity_faults
 from jeit.acoustic.signal.sound_file import read_sound
-from jeit.arguments import need, npz_arrays
+from jeit.files import need, npz_arrays
 from jeit.mesh.loops import check_loop
 
 # Said of files that are neither.

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.arguments import check_kind, need, npz_arrays
+from jeit.arguments import check_kind
+from jeit.files import need, npz_arrays
 from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
