@@ -10,7 +10,7 @@ from jeit.arguments.counts import counted, percent
 from jeit.arguments.keys import check_key
 from jeit.arguments.kinds import check_kind, is_number, told
 from jeit.arguments.lengths import IN_MILLIMETRES, check_metres
-from jeit.arguments.names import check_name, did_you_mean
+from jeit.arguments.names import check_name, did_you_mean, listed
 from jeit.arguments.traced import check_has_values
 
 __all__ = [
@@ -23,6 +23,7 @@ __all__ = [
     "counted",
     "did_you_mean",
     "is_number",
+    "listed",
     "percent",
     "real_array",
     "told",

@@ -10,6 +10,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
+from jeit.files.foreign import reason
 from jeit.files.limits import check_memory
 
 _ARRAY, _ARCHIVE = b"\x93NUM", b"PK\x03\x04"
@@ -77,6 +78,20 @@ def npy_array(path: Path) -> np.ndarray:
             raise _unreadable("NPY file of plain numbers", error) from None
 
 
+def check_archive(path: Path) -> None:
+    """Raise `ValueError` for an archive of members, of numbers and of text, that would not fit in memory
+    (`check_memory`), or in which arrays say to be larger than they are; and for what is no archive."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            check_memory(path.name, sum(one.file_size for one in members))
+            for one in members:
+                if one.filename.endswith(".npy"):
+                    _member_header(archive, one.filename, one)
+    except FAULTS as error:
+        raise _unreadable("archive", error) from None
+
+
 def need(arrays: dict[str, np.ndarray], *keys: str) -> None:
     """Raise `ValueError` where an array is missing, with the names of those that are there."""
     missing = [key for key in keys if key not in arrays]
@@ -128,8 +143,8 @@ def _read(file: IO[bytes]) -> np.ndarray:
 
 
 def _unreadable(kind: str, error: Exception) -> ValueError:
-    message = " ".join(str(error).split()).rstrip(".")[:200]
+    message = str(error)
     if "GB in memory" in message:
-        return ValueError(f"{message}.")
+        return ValueError(message)
     hint = "" if "object" not in message.lower() else " as numbers and text, not objects"
-    return ValueError(f"not a readable {kind} ({message}); write it again{hint}.")
+    return ValueError(f"not a readable {kind} ({reason(error)}); write it again{hint}.")

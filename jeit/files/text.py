@@ -5,32 +5,34 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from jeit.files.foreign import reason
 from jeit.files.limits import check_memory
 
-# Bytes of a file that a person writes, at most; characters of what is said of one that cannot be read.
-_LONGEST, _SAID = 2**22, 120
+# Bytes of a file that a person writes, at most; bytes of memory for each of a text's.
+_LONGEST, _TEXT = 2**22, 4
 
 
 def read_text(path: str | Path, *, encoding: str = "utf-8", most: int | None = None) -> str:
     """The text of a file of at most `most` bytes, or of what may be in memory (`check_memory`).
 
-    Raises `ValueError`, with the file's name, for larger ones and for what is no text; `OSError` where there is none.
+    Raises `ValueError`, with the file's name, for larger ones, `UnicodeError`, which is one too, for what is no text,
+    and `OSError` where there is none.
     """
     path = Path(path)
-    with path.open("rb") as file:
-        file.seek(0, 2)
-        size = file.tell()
-        if most is not None and size > most:
-            raise ValueError(
-                f"{path.name} has {size} bytes, and a file of its kind {most} at most: is it what it should be?"
-            )
-        check_memory(path.name, 4 * size)
-        file.seek(0)
-        content = file.read(size)
+    check_size(path, most)
+    content = path.read_bytes()
     try:
         return content.decode(encoding)
     except UnicodeDecodeError:
-        raise ValueError(f"{path.name} is no text in UTF-8.") from None
+        raise UnicodeError(f"{path.name} is no text in UTF-8.") from None
+
+
+def check_size(path: Path, most: int | None = None) -> None:
+    """Raise `ValueError` for a file of more than `most` bytes, or of more than may be in memory (`check_memory`)."""
+    size = path.stat().st_size
+    if most is not None and size > most:
+        raise ValueError(f"{path.name} has {size} bytes, and a file of its kind {most} at most: is it the right one?")
+    check_memory(path.name, _TEXT * size)
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
@@ -46,7 +48,7 @@ def parsed_toml(text: str, name: str) -> dict[str, Any]:
     except RecursionError:
         raise ValueError(f"{name} is nested too deep.") from None
     except ValueError as error:  # TOMLDecodeError, and numbers of too many digits
-        raise ValueError(f"{name} is no TOML file: {_short(error)}.") from None
+        raise ValueError(f"{name} is no TOML file: {reason(error)}.") from None
 
 
 def read_json(path: str | Path, *, most: int = 2**26) -> Any:
@@ -58,9 +60,4 @@ def read_json(path: str | Path, *, most: int = 2**26) -> Any:
     except RecursionError:
         raise ValueError(f"{path.name} is nested too deep.") from None
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path.name} is no JSON file: {_short(error)}.") from None
-
-
-def _short(error: Exception) -> str:
-    said = " ".join(str(error).split()).rstrip(".")
-    return said if len(said) <= _SAID else f"{said[: _SAID - 1]}…"
+        raise ValueError(f"{path.name} is no JSON file: {reason(error)}.") from None
