@@ -17,12 +17,13 @@ KNOWN = {"gmsh": "GPL-2.0-or-later: the extra 'mesh' alone imports it; what is g
 
 
 def licence_of(name: str) -> str:
-    """As its metadata say: the expression, else the classifiers, else the first line of the text."""
+    """As its metadata say: the expression, else the classifiers, else the first words of the text."""
     about = metadata.metadata(name)
     own = [one.rpartition(" :: ")[2] for one in about.get_all("Classifier", []) if one.startswith("License ::")]
     own = [one for one in own if one != "OSI Approved"]
-    text = (about.get("License") or "").strip().splitlines()[:1]
-    return about.get("License-Expression") or ", ".join(own) or " ".join(text)[:60] or "not told"
+    files = [one for one in metadata.files(name) or [] if re.match(r"(?i)licen[cs]e|copying", one.name)]
+    text = about.get("License") or (files[0].locate().read_text("utf-8") if files else "")
+    return about.get("License-Expression") or ", ".join(own) or " ".join(text.split())[:40] or "not told"
 
 
 def needed(name: str, extras: set[str], seen: set[tuple[str, str]]) -> None:
