@@ -44,11 +44,7 @@ class Table(BaseModel):
             return made(given)
         except ValidationError as error:
             faults = [
-                InitErrorDetails(
-                    type=fault(cls._said(one)),
-                    loc=(*one["loc"], *filter(None, [one.get("ctx", {}).get("key")])),
-                    input=0,
-                )
+                InitErrorDetails(type=fault(cls._said(one)), loc=_steps(one), input=0)
                 for one in error.errors(include_url=False)
             ]
             raise ValidationError.from_exception_data(cls.what, faults) from None
@@ -222,9 +218,19 @@ class Swept:
         def read(given: Any, inner: Callable[[list], list]) -> list:
             if isinstance(given, list):
                 return inner(_listed(given))
-            return inner([given])
+            try:
+                return inner([given])
+            except ValidationError as error:
+                one = error.errors(include_url=False)[0]
+                alone = InitErrorDetails(type=one["type"], loc=one["loc"][1:], input=given, ctx=one.get("ctx", {}))
+            raise ValidationError.from_exception_data("", [alone])
 
         return core_schema.no_info_wrap_validator_function(read, handler(source))
+
+
+Item = TypeVar("Item")
+Several = Annotated[list[Item], FailFast(), Swept()]
+"""A list of things, each once, or one of them."""
 
 
 class OneOf:
@@ -262,7 +268,7 @@ def validated(table: type[T], given: Any, origin: str) -> T:
         return table.model_validate(given)
     except ValidationError as error:
         faults = error.errors(include_url=False, include_input=False)
-    raise ValueError(told_faults(origin, [f"{_place(one['loc'])}{one['msg']}" for one in faults]))
+    raise ValueError(told_faults(origin, [f"{_place(_steps(one))}{one['msg']}" for one in faults]))
 
 
 def told_faults(origin: str, sentences: list[str]) -> str:
@@ -284,6 +290,12 @@ def not_among(given: Any, words: Iterable[str]) -> str:
     return f"must be one of {_few(known)}; it is {told(given)}{meant}."
 
 
+def _steps(one: Any) -> tuple[int | str, ...]:
+    """Where a fault is."""
+    key = one.get("ctx", {}).get("key")
+    return (*one["loc"], key) if key else one["loc"]
+
+
 def _place(steps: tuple[int | str, ...]) -> str:
     """The key that a fault is about, as it would be asked for: microphones[3].b."""
     said = ""
@@ -294,7 +306,7 @@ def _place(steps: tuple[int | str, ...]) -> str:
 
 def _key(name: str) -> str:
     short = _cut(name, _KEY)
-    return short if re.fullmatch(r"[\w-]+…?", short) else repr(short)
+    return short if re.fullmatch(r"[\w.-]+…?", short) else repr(short)
 
 
 def _listed(given: Any) -> list:

@@ -11,6 +11,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from jeit.data import load_description
+from jeit.design import read_described_skin
+from jeit.design.study import read_study
 
 DESCRIPTIONS = {
     "disk": {
@@ -87,6 +89,34 @@ DESCRIPTIONS = {
             "name": "my pairs",
         }
     },
+}
+
+STUDY = {
+    "name": "a study",
+    "chunk_points": 4,
+    "skin": {
+        "model": "sheet",
+        "width_mm": 100,
+        "height_mm": 100.0,
+        "thickness_mm": [5, 10],
+        "conductivity_S_per_m": 1.0,
+    },
+    "electrodes": {
+        "layouts": ["grid-4x4", "perimeter-8"],
+        "diameter_mm": [6, 8],
+        "contact_impedance_ohm_m2": 1e-3,
+        "minimum_gap_mm": 1,
+    },
+    "measurement": {"protocol": ["two-terminal"], "pairs": [0, 20], "current_mA": 1, "noise_V": [1e-5, 1e-6]},
+    "touch": {"indentation": "bell", "depth_mm": 2, "deviation_mm": 7.5, "contrast": 0, "columns": 10, "rows": 10},
+    "mesh": {"cell_mm": 4.5},
+    "scores": {"wanted": ["minimum", "taxels", "information"], "num_taxels": 9, "threshold": 0.7, "seed": 1},
+}
+SKIN = {
+    "skin": {"model": "sheet", "width_mm": 100, "height_mm": 100.0, "thickness_mm": 10, "conductivity_S_per_m": 1.0},
+    "electrodes": {"layout": "grid-4x4", "diameter_mm": 6, "contact_impedance_ohm_m2": 1e-3},
+    "measurement": {"protocol": "two-terminal", "pairs": 20, "current_mA": 1},
+    "mesh": {"cell_mm": 6, "layers": 3},
 }
 
 # What a person may write, and what somebody may who means no good.
@@ -180,15 +210,39 @@ def file(tmp_path_factory):
     return tmp_path_factory.mktemp("files") / "a_30uA.toml"
 
 
+def write(file, table):
+    file.write_text("\n".join(f"{json.dumps(key)} = {toml(value)}" for key, value in table.items()), "utf-8")
+
+
 @given(case=changed(DESCRIPTIONS.values()))
 @quick
 def test_descriptions(file, case):
-    table, names = case
-    file.write_text("\n".join(f"{json.dumps(key)} = {toml(value)}" for key, value in table.items()), "utf-8")
-    check(told(lambda: load_description(file).protocol(file)), names)
+    write(file, case[0])
+    check(told(lambda: load_description(file).protocol(file)), case[1])
+
+
+@given(case=changed([STUDY]))
+@quick
+def test_studies(file, case):
+    write(file, case[0])
+    check(told(lambda: read_study(file)), case[1])
+
+
+@given(case=changed([SKIN]))
+@quick
+def test_skins(file, case):
+    write(file, case[0])
+    check(told(lambda: read_described_skin(file)), case[1])
 
 
 @pytest.mark.parametrize("name", DESCRIPTIONS)
 def test_descriptions_that_changes_begin_with_are_read(file, name):
-    file.write_text("\n".join(f"{key} = {toml(value)}" for key, value in DESCRIPTIONS[name].items()), "utf-8")
+    write(file, DESCRIPTIONS[name])
     assert load_description(file).protocol(file).num_measurements > 0
+
+
+def test_studies_and_skins_that_changes_begin_with_are_read(file):
+    write(file, STUDY)
+    assert len(read_study(file).points) == 32
+    write(file, SKIN)
+    assert read_described_skin(file).model.protocol.num_measurements == 20
