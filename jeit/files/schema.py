@@ -13,6 +13,7 @@ read, not before.
 
 import math
 import re
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
@@ -26,6 +27,7 @@ from jeit.arguments import IN_MILLIMETRES, did_you_mean, told
 
 # Characters of a whole message, of a key and of names listed in it, at most; and how many faults are told.
 _LONGEST, _KEY, _NAMES, _FAULTS = 390, 40, 160, 4
+_LARGEST = sys.float_info.max
 
 
 class Table(BaseModel):
@@ -75,6 +77,8 @@ class Table(BaseModel):
                 return f"is text of {len(given)} characters; write {context['max_length']} or fewer."
             case "list_type":
                 return f"must be a list; it is {told(given)}."
+            case "too_short":
+                return f"has {context['actual_length']} things in it; give {context['min_length']} at least."
             case "too_long":
                 return f"has more than the {context['max_length']} that it may."
             case "model_type":
@@ -124,6 +128,8 @@ class Number:
         if not _is_number(given, whole):
             wanted = "a whole number" if whole else "a number"
             raise fault(f"must be {wanted}{otherwise}, {self.span}; it is {told(given)}.")
+        if given > _LARGEST and math.isinf(self.high):
+            raise fault(f"is {told(given)}, beyond double precision.")
         if not self.low <= given <= self.high:
             shown = f"{given:g}" if isinstance(given, float) else told(given)
             hint = f" {self.beyond}" if self.beyond and given > self.high else "" if whole else self._hint(given)
@@ -133,11 +139,14 @@ class Number:
     @property
     def span(self) -> str:
         """From where to where, and in which unit."""
-        return f"from {_plain(self.low)} to {_plain(self.high)}{f' {self.unit}' if self.unit else ''}"
+        low = "above 0" if 0 < self.low < 1e-300 else f"from {_plain(self.low)}"
+        high = " up" if low[0] == "f" else ""
+        high = high if math.isinf(self.high) else f" to {_plain(self.high)}"
+        return f"{low}{high}{f' {self.unit}' if self.unit else ''}"
 
     def _hint(self, given: float) -> str:
         """What a number would be that is off by a factor of 1000."""
-        if abs(given) > 1e100:
+        if not self.unit or math.isinf(self.high) or abs(given) > 1e100:
             return ""
         for larger, metric in ((True, "metres"), (False, "micrometres")):
             if not (self.low <= 1000 * given <= self.high if larger else self.low <= given / 1000 <= self.high):
@@ -195,7 +204,7 @@ class Numbers:
     def _right(self, item: Any) -> bool:
         if self.kind is bool:
             return isinstance(item, bool)
-        return _is_number(item, self.kind is int) and self.low <= item <= self.high
+        return _is_number(item, self.kind is int) and max(self.low, -_LARGEST) <= item <= min(self.high, _LARGEST)
 
     @property
     def _counts(self) -> str:
@@ -207,7 +216,7 @@ class Numbers:
     @property
     def _wanted(self) -> str:
         name = {float: "numbers", int: "whole numbers", bool: "true or false"}[self.kind]
-        unbounded = math.isinf(self.low) or math.isinf(self.high)
+        unbounded = math.isinf(self.low)
         return f"{self._counts} {name}{'' if unbounded else f', {Number(self.low, self.high, self.unit).span}'}"
 
 

@@ -2,17 +2,25 @@
 
 import copy
 import datetime
+import inspect
 import json
 import math
 import warnings
+from typing import Annotated, get_args
 
 import hypothesis.strategies as st
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from jeit.data import load_description
+from jeit import protocol
+from jeit.acoustic import Calibration
+from jeit.acoustic.calibration.calibration_tables import CalibrationTable, MicrophoneTable
+from jeit.acoustic.decay import DECAYS
+from jeit.data import description_tables, load_description
+from jeit.data.described_body import ELECTRODES, SHAPES
 from jeit.design import read_described_skin
 from jeit.design.study import read_study
+from jeit.files.schema import Number, Table, validated
 
 DESCRIPTIONS = {
     "disk": {
@@ -119,6 +127,46 @@ SKIN = {
     "mesh": {"cell_mm": 6, "layers": 3},
 }
 
+NOISE = {
+    "relative_noise": 0.1,
+    "noise_floor": 1e-9,
+    "noise_deviation": 1e-9,
+    "noise_cross": 0,
+    "usable": True,
+    "reason": "",
+}
+PLANE = {
+    "format": "jeit microphone calibration",
+    "version": 1,
+    "units": {"length": "m", "intensity": "square of the samples' unit"},
+    "scale": "strength 1 is a typical one",
+    "name": "taps of Friday",
+    "decay": "inverse-square",
+    "surface": {"outline": [[0, 0], [0.2, 0], [0.2, 0.2]], "holes": [[[0.1, 0.05], [0.11, 0.05], [0.11, 0.06]]]},
+    "intensity": {"low": 50, "high": 1000.0, "window": 0.05, "hop": 0.0125},
+    "strengths": [0.1, 2],
+    "widening": 1.5,
+    "microphones": [
+        {"position": place, "a": 1e-3, "b": 0.5, "relative_standard_error": {"a": 0.01, "b": None}, **NOISE}
+        for place in ([0.0, 0.0], [0.2, 0.0], [0.2, 0.2])
+    ],
+}
+CURVE = {"origin": [0, 0, 0], "axes": [[1, 0], [0, 1], [0, 0]], "normal": [0, 0, 1]}
+CURVE |= {"knots": [[0, 0], [0.2, 0], [0, 0.2]], "weights": [0, 0, 0], "affine": [0.01, 0, 0]}
+CURVED = PLANE | {
+    "decay": "attenuated",
+    "surface": {"outline": [[0, 0], [0.2, 0], [0.2, 0.2]], "holes": [], "curve": CURVE},
+    "microphones": [
+        {
+            **one,
+            "position": [*one["position"], 0.01],
+            "length": 0.1,
+            "relative_standard_error": dict.fromkeys(("a", "b", "length")),
+        }
+        for one in PLANE["microphones"]
+    ],
+}
+
 # What a person may write, and what somebody may who means no good.
 NUMBERS = [0, 1, 2, 3, -1, 7, 1000, 10**6, 2**63, 10**400, -(10**400), b"ff" * 2500]
 REALS = [0.0, -0.0, 0.5, -1.5, 1e-300, 1e308, 30.0, 0.02, math.nan, math.inf, -math.inf]
@@ -202,6 +250,15 @@ def check(message, names):
         assert any(name[:20] in message for name in names if name), message
 
 
+def jsoned(value):
+    """A value as JSON writes it; a number that Python does not write, as a one with as many noughts."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{json.dumps(key)}: {jsoned(inner)}' for key, inner in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(jsoned, value))}]"
+    return f"1{'0' * 5000}" if isinstance(value, bytes) else json.dumps(value)
+
+
 quick = settings(max_examples=200, deadline=None, derandomize=True, database=None, suppress_health_check=[*HealthCheck])
 
 
@@ -229,10 +286,17 @@ def test_studies(file, case):
 
 
 @given(case=changed([SKIN]))
-@quick
+@settings(quick, max_examples=120)
 def test_skins(file, case):
     write(file, case[0])
     check(told(lambda: read_described_skin(file)), case[1])
+
+
+@given(case=changed([PLANE, CURVED], dates=[None]))
+@quick
+def test_calibrations(file, case):
+    file.write_text(jsoned(case[0]), "utf-8")
+    check(told(lambda: Calibration.load(file)), case[1] | {"calibration"})
 
 
 @pytest.mark.parametrize("name", DESCRIPTIONS)
@@ -246,3 +310,50 @@ def test_studies_and_skins_that_changes_begin_with_are_read(file):
     assert len(read_study(file).points) == 32
     write(file, SKIN)
     assert read_described_skin(file).model.protocol.num_measurements == 20
+
+
+def test_calibrations_that_changes_begin_with_are_read(file):
+    for one in (PLANE, CURVED):
+        file.write_text(jsoned(one), "utf-8")
+        assert Calibration.load(file).num_microphones == 3
+
+
+def test_tables_know_all_that_there_is():
+    assert {*get_args(CalibrationTable.model_fields["decay"].annotation)} == {*DECAYS}
+    assert {name for kind in DECAYS.values() for name in kind.parameters} <= {*MicrophoneTable.model_fields}
+    assert {*kinds(description_tables.GeometryTable, "shape")} == {*SHAPES}
+    assert {*kinds(description_tables.ElectrodesTable, "kind")} == {*ELECTRODES, "facets"}
+    constructed = kinds(description_tables.ConstructedTable, "kind")
+    assert {*constructed} == {*protocol.__all__} - {"Protocol", "from_channels", "from_matrices"}
+    for kind, table in constructed.items():
+        options = {*inspect.signature(getattr(protocol, kind)).parameters} - {"num_electrodes", "num_boundary"}
+        assert options <= {*table.model_fields}, kind
+
+
+def kinds(tables, key):
+    """Tables of a union by the word that says which."""
+    keyed = [table for table in get_args(tables) if key in table.model_fields]
+    return {word: table for table in keyed for word in get_args(table.model_fields[key].annotation)}
+
+
+def test_every_key_is_told_by_its_place():
+    with pytest.raises(ValueError, match=r"^a\.json: microphones\[1\]\.a is -1, and must be above 0\. strengths"):
+        validated(Small, {"microphones": [{"a": 1}, {"a": -1}], "strengths": 3}, "a.json")
+    with pytest.raises(ValueError, match=r"^a\.json: 'a b' is no key of a list; there are microphones, strengths\.$"):
+        validated(Small, {"microphones": [], "strengths": [], "a b": 1}, "a.json")
+    with pytest.raises(ValueError, match=r" And 997 more\.$"):
+        validated(Small, {str(key): 1 for key in range(999)}, "a" * 1000)
+
+
+class One(Table):
+    """A line of it."""
+
+    a: Annotated[float, Number(5e-324, math.inf)]
+
+
+class Small(Table):
+    """A table of tables."""
+
+    what = "a list"
+    microphones: list[One]
+    strengths: list[float]
