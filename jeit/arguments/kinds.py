@@ -29,7 +29,11 @@ def told(given: Any) -> str:
     if isinstance(thing, (np.ndarray, jax.Array)):
         return f"an array of {thing.dtype} of shape {thing.shape}"
     if isinstance(thing, _PLAIN):
-        text = repr(thing)
+        try:
+            text = repr(thing)
+        except ValueError:
+            # A whole number of more digits than Python writes.
+            return "a number without end"
         return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
     if isinstance(thing, type):
         return f"the class {thing.__name__} itself"

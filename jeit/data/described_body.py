@@ -1,21 +1,23 @@
-"""The sections `[geometry]` and `[electrodes]` of a description: the body, and what touches it."""
+"""The body that `[geometry]` of a description says, and the electrodes that `[electrodes]` puts on it."""
 
-import inspect
+from __future__ import annotations
+
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jeit.data._sections import choice, located, need, refuse_unknown
 from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes, FaceDiscs, FacePatches, PointElectrodes, SheetDiscs
 from jeit.electrodes.facets import plates
+from jeit.files import check_electrodes
 from jeit.layout import perimeter, ring
 from jeit.mesh import Body, Disk, Domain, OwnMesh, Rectangle, Solid
 from jeit.mesh import read as read_mesh
 from jeit.mesh.outline import OUTLINES
 
-_GEOMETRY, _ELECTRODES = "[geometry]", "[electrodes]"
+if TYPE_CHECKING:
+    from jeit.data.description_tables import ElectrodesTable, FacetsTable, GeometryTable, MeshTable, PlacedTable
 
 
 def _box(width: float, depth: float, height: float) -> Solid:
@@ -28,10 +30,6 @@ def _cylinder(radius: float, height: float) -> Solid:
 
 SHAPES: dict[str, Callable[..., Body]] = {**OUTLINES, "box": _box, "cylinder": _cylinder}
 """What makes each body, by the name of its shape."""
-_ARGUMENTS = {
-    shape: {name: one.default is one.empty for name, one in inspect.signature(make).parameters.items()}
-    for shape, make in SHAPES.items()
-}
 ELECTRODES: dict[str, dict[int, type[Any]]] = {
     "boundary": {2: BoundaryElectrodes},
     "disc": {2: SheetDiscs, 3: FaceDiscs},
@@ -39,112 +37,108 @@ ELECTRODES: dict[str, dict[int, type[Any]]] = {
     "point": {2: PointElectrodes, 3: PointElectrodes},
 }
 """Electrodes at positions, by kind and the number of their coordinates."""
-SIZES = {"boundary": ("width",), "disc": ("radius",), "patch": ("width", "height"), "point": ()}
-"""What must be said of the size of each kind, metres."""
-KEYS = {
-    "geometry": {"shape", "thickness", "mesh", "scale"}.union(*_ARGUMENTS.values()),
-    "electrodes": {
-        "kind", "layout", "number", "start_angle_degrees", "clockwise", "start", "levels", "positions", "tags",
-        "contact_impedance",
-    }.union(*SIZES.values()),
-}  # fmt: skip
+_SIZES = {"boundary": ("width",), "disc": ("radius",), "patch": ("width", "height"), "point": ()}
+# Keys of a shape's table that are no arguments of what makes it.
+_NO_ARGUMENT = {"shape", "thickness"}
 
 
-def described_body(section: dict[str, Any], folder: Path, origin: str) -> Body:
-    """The body of a section `[geometry]`; a mesh's file is looked for in `folder`. Raises `ValueError`."""
-    if "mesh" in section:
-        return _own_mesh(section, folder, origin)
-    shape = choice(need(section, "shape", origin, f"{_GEOMETRY} (or 'mesh')"), SHAPES, origin, f"{_GEOMETRY} shape")
-    arguments = {
-        name: need(section, name, origin, f"{_GEOMETRY} {shape}") if needed else section[name]
-        for name, needed in _ARGUMENTS[shape].items()
-        if needed or name in section
-    }
-    known = {"shape", *_ARGUMENTS[shape]} | ({"thickness"} if shape in OUTLINES else set())
-    refuse_unknown(section, known, origin, f"{_GEOMETRY} {shape}")
+def described_body(table: GeometryTable, folder: Path, origin: str) -> Body:
+    """The body of a table `[geometry]`; a mesh's file is looked for in `folder`. Raises `ValueError`."""
+    from jeit.data.description_tables import MeshTable  # it was imported when the table was read
+
+    if isinstance(table, MeshTable):
+        return _own_mesh(table, folder, origin)
+    arguments = {name: getattr(table, name) for name in type(table).model_fields if name not in _NO_ARGUMENT}
     try:
-        body = SHAPES[shape](**arguments)
-        return Solid(body, section["thickness"]) if isinstance(body, Domain) and "thickness" in section else body
+        body = SHAPES[table.shape](**arguments)
+        thickness = getattr(table, "thickness", None)
+        return Solid(body, thickness) if isinstance(body, Domain) and thickness is not None else body
     except ValueError as error:
-        raise located(error, origin, _GEOMETRY) from None
+        raise located(error, origin, "geometry") from None
 
 
-def _own_mesh(section: dict[str, Any], folder: Path, origin: str) -> OwnMesh:
-    refuse_unknown(section, {"mesh", "scale"}, origin, f"{_GEOMETRY} with a mesh")
-    if not isinstance(section["mesh"], str):
-        raise ValueError(f"{origin}: {_GEOMETRY} mesh must be the name of a file; got {section['mesh']!r}.")
-    file = folder / section["mesh"]
+def _own_mesh(table: MeshTable, folder: Path, origin: str) -> OwnMesh:
+    file = folder / table.mesh
+    if Path(table.mesh).name != table.mesh or ":" in table.mesh:
+        raise located(f"must be the name of a file beside {origin}, without folders.", origin, "geometry.mesh")
     if not file.is_file():
-        raise ValueError(f"{origin}: {_GEOMETRY} mesh: there is no file {file}; name it from where {origin} is.")
+        raise located(f"there is no file {table.mesh[:80]}; put it beside {origin}.", origin, "geometry.mesh")
+    if file.resolve().parent != folder.resolve():
+        raise located(f"is a link to another place; put the file beside {origin}.", origin, "geometry.mesh")
     try:
-        return OwnMesh(read_mesh(file, scale=section.get("scale", 1.0)))
+        return OwnMesh(read_mesh(file, scale=table.scale))
     except (ValueError, OSError) as error:
-        raise located(error, origin, f"{_GEOMETRY} mesh") from None
+        raise located(error, origin, "geometry.mesh") from None
 
 
-def described_electrodes(section: dict[str, Any], body: Body | None, origin: str) -> AbstractElectrodes:
-    """The electrodes of a section `[electrodes]` on a body, if that is described. Raises `ValueError`."""
-    kind = choice(section.get("kind", "boundary"), (*ELECTRODES, "facets"), origin, f"{_ELECTRODES} kind")
+def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str) -> AbstractElectrodes:
+    """The electrodes of a table `[electrodes]` on a body, if that is described. Raises `ValueError`."""
     try:
-        if kind == "facets":
-            return _facets(section, body, origin)
-        position = _positions(section, body, origin)
-        coordinates = position.shape[-1] if position.ndim == 2 else 2
-        if coordinates not in ELECTRODES[kind]:
+        if table.kind == "facets":
+            return _facets(table, body)
+        position = _positions(table, body, origin)
+        coordinates = position.shape[-1]
+        if coordinates not in ELECTRODES[table.kind]:
             raise ValueError(
-                f"positions: {coordinates} coordinates are not those of kind = '{kind}', which lies on "
-                f"{'an edge: give x and y' if kind == 'boundary' else 'a solid: give x, y and z'}."
+                f"positions: {coordinates} coordinates are not those of kind = '{table.kind}', which lies on "
+                f"{'an edge: give x and y' if table.kind == 'boundary' else 'a solid: give x, y and z'}."
             )
-        make = ELECTRODES[kind][coordinates]
-        if kind == "point":
+        make = ELECTRODES[table.kind][coordinates]
+        if table.kind == "point":
             return make(position)
-        sizes = [np.asarray(need(section, size, origin, f"{_ELECTRODES} {kind}"), float) for size in SIZES[kind]]
-        contact_impedance = need(section, "contact_impedance", origin, _ELECTRODES)
-        return make(position, *sizes, np.asarray(contact_impedance, float))
-    except (ValueError, TypeError) as error:
-        raise located(error, origin, _ELECTRODES) from None
+        return make(position, *(getattr(table, size) for size in _SIZES[table.kind]), table.contact_impedance)
+    except ValueError as error:
+        raise located(error, origin, "electrodes") from None
 
 
-def _facets(section: dict[str, Any], body: Body | None, origin: str) -> AbstractElectrodes:
+def _facets(table: FacetsTable, body: Body | None) -> AbstractElectrodes:
     """Groups of facets that the mesh has names for."""
     if not isinstance(body, OwnMesh):
         raise ValueError("kind = 'facets' is of facets that a mesh has names for: give [geometry] mesh.")
-    tags = need(section, "tags", origin, f"{_ELECTRODES} facets")
-    return plates(body.given, tags, need(section, "contact_impedance", origin, _ELECTRODES))
+    return plates(body.given, table.tags, table.contact_impedance)
 
 
-def _positions(section: dict[str, Any], body: Body | None, origin: str) -> np.ndarray:
-    if "positions" in section:
-        return np.asarray(section["positions"], dtype=float)
-    layout = need(section, "layout", origin, f"{_ELECTRODES} (or 'positions')")
-    choice(layout, ("ring", "perimeter"), origin, f"{_ELECTRODES} layout")
-    number = need(section, "number", origin, _ELECTRODES)
+def _positions(table: PlacedTable, body: Body | None, origin: str) -> np.ndarray:
+    if table.positions is not None:
+        return table.positions
     if body is None:
-        raise ValueError(f"layout = {layout!r} needs [geometry] to lie on.")
+        raise ValueError(f"layout = {table.layout!r} needs [geometry] to lie on.")
     if isinstance(body, OwnMesh):
-        raise ValueError(f"layout = {layout!r} needs a shape to lie on; on a mesh of your own give 'positions'.")
+        raise ValueError(f"layout = {table.layout!r} needs a shape to lie on; on a mesh of your own give 'positions'.")
     outline = body.outline if isinstance(body, Solid) else body
     assert isinstance(outline, Domain)
-    around = _around(section, layout, outline, number)
+    assert table.number is not None
     if not isinstance(body, Solid):
-        return around
-    levels = np.atleast_1d(np.asarray(need(section, "levels", origin, f"{_ELECTRODES} on a solid"), float))
-    if levels.ndim != 1 or not ((levels >= 0) & (levels <= body.thickness)).all():
-        raise ValueError(f"levels must be heights from 0 to {body.thickness:g} m; they are {levels.tolist()}.")
+        if table.levels is not None:
+            raise ValueError("levels are heights on a solid, and this is a sheet; leave them out, or give a thickness.")
+        return _around(table, outline, table.number)
+    if table.levels is None:
+        raise ValueError("on a solid it needs 'levels', heights in metres.")
+    levels = np.atleast_1d(table.levels)
+    check_electrodes(f"{origin}: electrodes", len(levels) * table.number)
+    if levels.max() > body.thickness:
+        raise ValueError(f"levels must be heights from 0 to {body.thickness:g} m; one is {levels.max():g}.")
+    around = _around(table, outline, table.number)
     # Level after level, each with as many electrodes.
     return np.concatenate([np.column_stack([around, np.full(len(around), level)]) for level in levels])
 
 
-def _around(section: dict[str, Any], layout: str, outline: Domain, number: int) -> np.ndarray:
+def _around(table: PlacedTable, outline: Domain, number: int) -> np.ndarray:
     """Places (L, 2) along the edge of an outline."""
-    if layout == "perimeter":
-        return perimeter(outline, number, start=section.get("start", 0.0))
+    if table.layout == "perimeter":
+        return perimeter(outline, number, start=table.start)
     if not isinstance(outline, Disk):
         raise ValueError('layout = "ring" needs a disk or a cylinder; use "perimeter" for other shapes.')
     return ring(
         outline.radius,
         number,
-        start_angle=np.radians(section.get("start_angle_degrees", 90.0)),
-        clockwise=section.get("clockwise", False),
+        start_angle=np.radians(table.start_angle_degrees),
+        clockwise=table.clockwise,
         centre=outline.centre,
     )
+
+
+def located(error: Exception | str, origin: str, where: str) -> ValueError:
+    """An error, in 400 characters, with the file and the key that it is about."""
+    text = str(error).removeprefix(f"{origin}: ")
+    return ValueError(f"{origin[:80]}: {text if text.startswith(where) else f'{where}: {text}'}"[:400])

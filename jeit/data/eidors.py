@@ -52,7 +52,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
             raise ValueError(f"{path.name}: variables {', '.join(keys)} differ in length ({sorted(lengths)}).")
         table = np.stack([vector.ravel() for vector in vectors])
     protocol = None
-    if not described.protocol_section:
+    if described.protocol_section is None:
         protocol = _own_protocol(content, path)
     frames = frames_from(table, described.layout, path.name)
     measurement = measurement_from(path, described, frames, protocol, None)

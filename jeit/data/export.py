@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jeit.data.described_body import ELECTRODES
-from jeit.data.description import PROTOCOL_ARRAYS
+from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.measurement import Measurement
 from jeit.electrodes import AbstractElectrodes
 from jeit.files import whole_files

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from jeit.arguments import listed
-from jeit.data.description import PROTOCOL_ARRAYS, Description, TableLayout, load_description
+from jeit.data.described_protocol import PROTOCOL_ARRAYS
+from jeit.data.description import Description, TableLayout, load_description
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.files import check_memory, npy_array, npz_arrays
@@ -61,7 +62,7 @@ def read(path: Path, description: str | Path | None = None, like: Measurement | 
     if path.suffix.lower() in (".npz", ".npy"):
         arrays = _from_numpy(path, described.layout.keys)
         table, mask, protocol = _voltages(arrays, described.layout, path), arrays.get("mask"), None
-        if not described.protocol_section:
+        if described.protocol_section is None:
             protocol = _own_protocol(arrays)
         described = _with_words(described, arrays)
     else:
@@ -82,7 +83,7 @@ def _borrowed(like: Measurement) -> Description:
         electrodes=like.electrodes,
         layout=layout,
         notes=(f"described as '{like.name}' is, for it has no description of its own.",),
-        protocol_section={},
+        protocol_section=None,
     )
 
 

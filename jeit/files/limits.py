@@ -30,6 +30,11 @@ def check_electrodes(name: str, number: int) -> None:
         )
 
 
+def most_bytes() -> float:
+    """Bytes of memory that a file may take, as the environment says. Raises `ValueError` where it says no number."""
+    return 1e9 * _most()
+
+
 def _most() -> float:
     """Gigabytes, as the environment says."""
     try:

@@ -91,6 +91,8 @@ def _check_park(name: str, outline: Domain) -> None:
 def _lattice(name: str, outline: Domain, diameter: float, columns: int, rows: int) -> np.ndarray:
     if min(columns, rows) < 1:
         raise ValueError(f"name: {name!r} has no electrodes; give at least one column and one row.")
+    if columns * rows > _MOST:
+        raise ValueError(f"name: {name!r} has {columns * rows} electrodes; give {_MOST} or fewer.")
     x_min, x_max, y_min, y_max = outline.extent
     pitches = (x_max - x_min) / columns, (y_max - y_min) / rows
     if min(pitches) < diameter:

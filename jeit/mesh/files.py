@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Mapping
+from contextlib import nullcontext
 from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jeit.mesh import _topology
+from jeit.mesh._foreign import bounded_inflation, check_foreign
 from jeit.mesh.mesh import Mesh
 
 if TYPE_CHECKING:
@@ -20,24 +22,35 @@ if TYPE_CHECKING:
 
 _CELLS = {2: "triangle", 3: "tetra"}
 _FACETS = {2: "line", 3: "triangle"}
+# Of what a file holds that meshio did not look at; and letters of what is said of it.
+_FAULTS = (LookupError, TypeError, AttributeError, ArithmeticError, MemoryError)
+_SAID = 80
 
 
-def read(path: str | Path, *, scale: float = 1.0) -> Mesh:
-    """Read a mesh of triangles (2-D) or tetrahedra (3-D) from any file meshio knows.
+def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh:
+    """Read a mesh of triangles (2-D) or tetrahedra (3-D) from a .vtu, .vtk, .msh (Gmsh), .inp, .xdmf or other file.
 
     `scale` is the length of the file's unit in metres: 1e-3 for millimetres. Groups of boundary facets (Gmsh's physical
     groups, or meshio's cell sets) become tags; groups that hold no boundary facet are left out, and so are
-    nodes that no cell uses. A flat mesh in the plane z = constant becomes 2-D.
+    nodes that no cell uses. A flat mesh in the plane z = constant becomes 2-D. Nothing but the file itself is read, and
+    no more of it than memory may hold (the environment variable JEIT_FILE_GB), unless it is `trusted`: then whatever
+    meshio knows is read as meshio reads it, with the files that it leads to.
 
-    Raises `FileNotFoundError` if there is no such file and `ValueError` if it is not a mesh file, holds other
-    cells than linear triangles or tetrahedra, or a mesh that `Mesh.create` refuses.
+    Raises `FileNotFoundError` if there is no such file and `ValueError` if it is not a mesh file, leads to others,
+    holds other cells than linear triangles or tetrahedra, or a mesh that `Mesh.create` refuses.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
     if not isinstance(scale, Real) or not 0 < scale < np.inf:
         raise ValueError(f"scale: expected the file's unit in metres, such as 1e-3 for millimetres, got {scale!r}.")
-    return _from_meshio(_quietly(path, lambda meshio: meshio.read(path)), float(scale), str(path))
+    kind = None if trusted else check_foreign(path)
+    with bounded_inflation(path) if kind == "vtu" else nullcontext():
+        content = _quietly(path, lambda meshio: meshio.read(path, file_format=kind))
+    try:
+        return _from_meshio(content, float(scale), path.name[:80])
+    except _FAULTS as error:
+        raise ValueError(f"path: {path.name[:80]} holds no mesh ({_short(error)}).") from None
 
 
 def write(
@@ -109,11 +122,19 @@ def _quietly(path: Path, action: Any) -> Any:
     except OSError:
         raise
     except (Exception, SystemExit) as error:
-        reason = " ".join(said.getvalue().split()) or str(error) or type(error).__name__
+        if "GB in memory" in str(error):
+            raise
+        reason = _short(said.getvalue().strip() or error)
         raise ValueError(
-            f"path: {path} does not work as a mesh file: {reason.rstrip('.')}. The ending of the name "
-            "tells the format: .vtu, .vtk, .msh, .inp and others that meshio knows."
+            f"path: {path.name[:80]} does not work as a mesh file: {reason}. The ending of the name tells the format: "
+            ".vtu, .vtk, .msh, .inp and others that meshio knows."
         ) from None
+
+
+def _short(error: BaseException | str) -> str:
+    """What is said, in one short line."""
+    said = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    return said if len(said) <= _SAID else f"{said[: _SAID - 1]}…"
 
 
 def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shutil
 import tempfile
 from pathlib import Path
 from types import ModuleType
@@ -13,6 +14,9 @@ from jeit.mesh.files import read
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Domain
 
+# Of these Gmsh reads the geometry, whatever is in the file; all else it takes for a script.
+_PLAIN = (".step", ".stp", ".iges", ".igs", ".brep", ".stl")
+
 
 def from_gmsh(
     source: str | Path | Domain | None = None,
@@ -20,17 +24,24 @@ def from_gmsh(
     cell_size: float | None = None,
     dimension: int | None = None,
     scale: float = 1.0,
+    scripts: bool = False,
 ) -> Mesh:
     """Mesh a geometry with Gmsh.
 
-    **Arguments**: `source`, a geometry file (.geo, .step, .brep, …), an outline such as `Disk`, or None
+    **Arguments**: `source`, a geometry file (.step, .iges, .brep, .stl), an outline such as `Disk`, or None
     for the model that is current in the `gmsh` module; `cell_size` in the geometry's own unit (metres for a domain),
-    the largest edge; `dimension` 2 or 3 (by default the geometry's own); `scale`, the geometry's unit in metres.
-    Physical groups of the boundary become tags.
+    the largest edge; `dimension` 2 or 3 (by default the geometry's own); `scale`, the geometry's unit in metres;
+    `scripts`, whether `source` may be of Gmsh's own kind (.geo and all others), which can run any command and open any
+    file: of your own only. Physical groups of the boundary become tags.
 
     Raises `ImportError` if the gmsh package or a system library it needs is missing, and `ValueError`
-    if Gmsh refuses the geometry.
+    if Gmsh refuses the geometry, and for scripts unless they are allowed.
     """
+    if isinstance(source, (str, Path)) and not scripts and Path(source).suffix.lower() not in _PLAIN:
+        raise ValueError(
+            f"source: {Path(source).name[:80]} may be a script of Gmsh's, which can run any command. Give a file of "
+            f"{', '.join(_PLAIN)}; or scripts=True, where it is your own."
+        )
     gmsh = _import()
     if cell_size is not None and not (np.isfinite(cell_size) and cell_size > 0):
         raise ValueError(f"cell_size: expected a positive length, got {cell_size!r}.")
@@ -50,6 +61,9 @@ def from_gmsh(
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "mesh.msh"
+            if isinstance(source, (str, Path)) and not scripts:
+                # Beside it there may be options, which Gmsh opens with it, and they are a script.
+                source = shutil.copy(str(source), Path(folder) / f"geometry{Path(source).suffix.lower()}")
             _write(gmsh, source, cell_size, dimension, path)
             return read(path, scale=scale)
     finally:
@@ -95,7 +109,7 @@ def _write(
         if added:
             gmsh.model.removePhysicalGroups(added)
     except Exception as error:
-        raise ValueError(f"source: Gmsh could not mesh the geometry: {error}.") from error
+        raise ValueError(f"source: Gmsh could not mesh the geometry: {str(error)[:80]}.") from error
 
 
 class _Kernel:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jeit.mesh._topology import signed_area
+
+# Pairs of sides that are compared at once.
+_PAIRS = 250_000
 
 
 def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray:
@@ -82,26 +85,42 @@ def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
 
 
-def _meeting(first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether each side of one loop crosses or comes within `tolerance` of each side of another, (k, l)."""
-    a, b = first[:, None], np.roll(first, -1, axis=0)[:, None]
-    c, d = second[None], np.roll(second, -1, axis=0)[None]
+def _meeting(first: np.ndarray, second: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
+    """Pairs (p, 2) of a side of one loop and a side of another that cross or come within `tolerance` of each other, in
+    order, some at a time: only sides whose boxes do are looked at, and never all with all at once."""
+    a, b, c, d = first, np.roll(first, -1, axis=0), second, np.roll(second, -1, axis=0)
+    low, high = np.minimum(a, b) - tolerance, np.maximum(a, b) + tolerance
+    other_low, other_high = np.minimum(c, d), np.maximum(c, d)
+    rows = max(1, _PAIRS // len(second))
+    for start in range(0, len(first), rows):
+        block = slice(start, start + rows)
+        near = ((low[block, None] <= other_high) & (other_low <= high[block, None])).all(axis=-1)
+        one, other = np.nonzero(near)
+        one += start
+        yield np.column_stack([one, other])[_meet(a[one], b[one], c[other], d[other], tolerance)]
+
+
+def _meet(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, tolerance: float) -> np.ndarray:
+    """Whether each segment from a to b crosses or comes within `tolerance` of that from c to d, all (p, 2)."""
     crosses = (_turn(a, b, c) * _turn(a, b, d) < 0) & (_turn(c, d, a) * _turn(c, d, b) < 0)
-    to_second = distance(first, second, np.roll(second, -1, axis=0)) <= tolerance
-    to_first = (distance(second, first, np.roll(first, -1, axis=0)) <= tolerance).T
-    near = to_second | np.roll(to_second, -1, axis=0) | to_first | np.roll(to_first, -1, axis=1)
-    return crosses | near
+    near = (_apart(a, c, d) <= tolerance) | (_apart(b, c, d) <= tolerance)
+    return crosses | near | (_apart(c, a, b) <= tolerance) | (_apart(d, a, b) <= tolerance)
+
+
+def _apart(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Distance (p,) of each of points (p, 2) from its own segment."""
+    along, offset = end - start, points - start
+    fraction = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
+    return np.linalg.norm(offset - fraction[:, None] * along, axis=-1)
 
 
 def _first_crossing(loop: np.ndarray) -> tuple[int, int] | None:
     count = len(loop)
-    meeting = _meeting(loop, loop, 1e-9 * np.ptp(loop, axis=0).max())
-    index = np.arange(count)
-    apart = np.abs(index[:, None] - index)
-    neighbours = (apart <= 1) | (apart == count - 1)
-    pairs = np.argwhere(meeting & ~neighbours)
-    if len(pairs):
-        return int(pairs[0].min()), int(pairs[0].max())
+    for pairs in _meeting(loop, loop, 1e-9 * np.ptp(loop, axis=0).max()):
+        apart = np.abs(pairs[:, 0] - pairs[:, 1])
+        others = pairs[(apart > 1) & (apart < count - 1)]
+        if len(others):
+            return int(others[0].min()), int(others[0].max())
     # Neighbouring sides share a vertex and can only meet elsewhere by folding back onto each other.
     before, after = np.roll(loop, 1, axis=0) - loop, np.roll(loop, -1, axis=0) - loop
     cosine = (before * after).sum(1) / (np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1))
@@ -113,4 +132,4 @@ def _first_crossing(loop: np.ndarray) -> tuple[int, int] | None:
 
 
 def _touching(first: np.ndarray, second: np.ndarray) -> bool:
-    return bool(_meeting(first, second, 1e-9 * np.ptp(second, axis=0).max()).any())
+    return any(len(pairs) for pairs in _meeting(first, second, 1e-9 * np.ptp(second, axis=0).max()))

@@ -89,7 +89,7 @@ def test_places_are_as_wide_as_the_calibration_says(tmp_path):
     (tmp_path / "older.json").write_text(text.replace(' "widening": 2.5,\n', ""), "utf-8")
     assert Calibration.load(tmp_path / "older.json").widening == 1
     (tmp_path / "narrow.json").write_text(text.replace('"widening": 2.5', '"widening": 0.5'), "utf-8")
-    with pytest.raises(ValueError, match=r"widening is 0\.5; it must be 1 or more"):
+    with pytest.raises(ValueError, match=r"widening is 0\.5, and must be from 1 up\.$"):
         Calibration.load(tmp_path / "narrow.json")
 
 

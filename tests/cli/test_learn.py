@@ -23,7 +23,7 @@ from jeit.touch.networks.unrolled import Unrolled
     [
         ("[electrodes]\nlayout = 'grid-4x4'\n[skin]\nthick = 3", "skin.thick is no key of a skin"),
         ("[skin]\nwidth_mm = 100", "electrodes.layout is missing"),
-        ("[electrode]\nlayout = 'grid-4x4'", "electrode is no table of a skin"),
+        ("[electrode]\nlayout = 'grid-4x4'", "electrode is no key of a skin"),
         ("[electrodes]\nlayout = 'spiral'", "spiral"),
         ("not toml", "is no TOML file"),
     ],

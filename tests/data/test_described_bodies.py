@@ -85,22 +85,62 @@ def test_named_facets_of_a_mesh(folder):
     found.electrodes.check(found.domain.mesh())
 
 
+FACETS = {"kind": "facets", "tags": ["a"], "contact_impedance": 1e-3}
+PATCH = {"kind": "patch", "width": 0.01, "height": 0.01}
 WRONG = {
-    "no height": ({"shape": "cylinder", "radius": 0.05}, RING, r"\[geometry\] cylinder needs 'height'"),
-    "two shapes": (CYLINDER | {"mesh": "a.msh"}, RING, r"\[geometry\] with a mesh has no '(height|radius|shape)'"),
-    "two heights": (CYLINDER | {"thickness": 0.1}, RING, r"\[geometry\] cylinder has no 'thickness'"),
-    "another's size": ({"shape": "disk", "radius": 0.1, "width": 0.1}, RING, r"\[geometry\] disk has no 'width'"),
-    "no thickness": ({"shape": "disk", "radius": 0.1, "thickness": -1.0}, RING, r"\[geometry\]: thickness.*positive"),
-    "no mesh": ({"mesh": "none.msh"}, RING, r"mesh: there is no file .*none\.msh; name it from where d\.toml is"),
-    "no levels": (CYLINDER, {k: v for k, v in RING.items() if k != "levels"}, "on a solid needs 'levels'"),
-    "above": (CYLINDER, RING | {"levels": [0.05]}, r"levels must be heights from 0 to 0\.04 m"),
-    "arcs": (CYLINDER, RING | {"kind": "boundary", "width": 0.01}, "3 coordinates are not those of kind = 'boundary'"),
-    "flat patch": ({"shape": "disk", "radius": 0.1}, RING | {"kind": "patch"}, "give x, y and z"),
-    "facets": (
-        CYLINDER,
-        {"kind": "facets", "tags": ["a"]},
-        r"facets that a mesh has names for: give \[geometry\] mesh",
+    "no height": ({"shape": "cylinder", "radius": 0.05}, RING, r"geometry\.height is missing; give it"),
+    "two shapes": (CYLINDER | {"mesh": "a.msh"}, RING, r"geometry\.(height|radius|shape) is no key of a mesh"),
+    "two heights": (CYLINDER | {"thickness": 0.1}, RING, r"geometry\.thickness is no key of a cylinder"),
+    "another's size": ({"shape": "disk", "radius": 0.1, "width": 0.1}, RING, r"geometry\.width is no key of a disk"),
+    "no thickness": (
+        {"shape": "disk", "radius": 0.1, "thickness": -1.0},
+        RING,
+        r"geometry\.thickness is -1, and must be from 1e-09 to 1000 m\.$",
     ),
+    "millimetres": (
+        {"shape": "disk", "radius": 1500},
+        RING,
+        r"geometry\.radius is 1500, and must be .* m\. Were millimetres given for metres\?$",
+    ),
+    "all at once": (
+        {"shape": "disk", "radius": "0.1", "centre": [0, True]},
+        RING | {"number": 5000, "kind": "dics"},
+        r"geometry\.radius must be a number, .*; it is '0\.1'\. geometry\.centre must be 2 numbers, .*; it has True in"
+        r" it.* electrodes\.kind must be one of .*; it is 'dics' \(did you mean 'disc'\?\)\.$",
+    ),
+    "many electrodes": (
+        CYLINDER,
+        RING | {"number": 5000},
+        r"number is 5000, .* to 1024\. Channels grow with its square",
+    ),
+    "many in levels": (
+        CYLINDER,
+        RING | {"number": 800, "levels": [0.01, 0.02]},
+        r"electrodes.* describes 1600 electrodes",
+    ),
+    "two places": (CYLINDER, RING | {"positions": [[0, 0, 0]]}, r"electrodes\.layout has no effect beside positions"),
+    "levels of a sheet": ({"shape": "disk", "radius": 0.1}, RING, r"electrodes: levels are heights on a solid"),
+    "many vertices": (
+        {"shape": "polygon", "vertices": SQUARE * 1000, "holes": [SQUARE * 100]},
+        RING,
+        r"geometry\.vertices and holes are 4400 points, .* give 4096 at most",
+    ),
+    "no mesh": ({"mesh": "none.msh"}, RING, r"geometry\.mesh: there is no file none\.msh; put it beside d\.toml"),
+    "a mesh elsewhere": ({"mesh": "../none.msh"}, RING, r"geometry\.mesh: must be the name of a file beside d\.toml"),
+    "a mesh on the web": ({"mesh": "https://a.org"}, RING, r"geometry\.mesh: must be the name of a file beside"),
+    "no levels": (CYLINDER, {k: v for k, v in RING.items() if k != "levels"}, "on a solid it needs 'levels'"),
+    "above": (CYLINDER, RING | {"levels": [0.05]}, r"levels must be heights from 0 to 0\.04 m"),
+    "arcs": (
+        CYLINDER,
+        {k: v for k, v in RING.items() if k != "radius"} | {"kind": "boundary", "width": 0.01},
+        "3 coordinates are not those of kind = 'boundary'",
+    ),
+    "flat patch": (
+        {"shape": "disk", "radius": 0.1},
+        {k: v for k, v in RING.items() if k not in ("radius", "levels")} | PATCH,
+        "give x, y and z",
+    ),
+    "facets": (CYLINDER, FACETS, r"facets that a mesh has names for: give \[geometry\] mesh"),
 }
 
 

@@ -153,18 +153,21 @@ REFUSED = {
     "metre key": (one(electrodes="diameter_m = 0.006"), r"electrodes\.diameter_m is no key.*'diameter_mm'"),
     "one side": (one(rest="[skin]\nwidth_mm = 100"), r"skin\.width_mm is given alone; give both"),
     "no layouts": ("[skin]\nwidth_mm = 100", r"electrodes\.layouts is missing"),
-    "no table": ("skin = 5\n" + one(), r"skin must be a table: a line \[skin\]"),
+    "no table": ("skin = 5\n" + one(), r"skin must be a table, with keys of its own; it is 5"),
     "metres, skin": (one(rest="[skin]\nwidth_mm = 0.2"), r"skin\.width_mm is 0\.2.*in metres\? Then write 200"),
     "metres, sweep": (one(electrodes="diameter_mm = [6, 0.008]"), r"diameter_mm is 0\.008.*metres\? Then write 8\."),
     "metres, cells": (one(rest="[mesh]\ncell_mm = 0.005"), r"mesh\.cell_mm is 0\.005.*metres\? Then write 5\."),
     "micrometres": (one(electrodes="diameter_mm = 6000"), r"diameter_mm is 6000.*micrometres\? Then write 6\."),
     "siemens": (one(rest="[skin]\nconductivity_S_per_m = 1e-8"), r"conductivity_S_per_m is 1e-08.*factor of 1000"),
-    "no number": (one(rest='[skin]\nwidth_mm = "200"'), r"skin\.width_mm must be a number; it has '200'"),
-    "not whole": (one(rest="[touch]\nrows = 2.5"), r"touch\.rows must be a whole number; it has 2\.5"),
-    "true": (one(rest="[touch]\nrows = true"), r"touch\.rows must be a whole number; it has True"),
+    "no number": (
+        one(rest='[skin]\nwidth_mm = "200"'),
+        r"skin\.width_mm must be a number, from 5 to 5000 mm; it is '200'",
+    ),
+    "not whole": (one(rest="[touch]\nrows = 2.5"), r"touch\.rows must be a whole number, from 1 to 1000; it is 2\.5"),
+    "true": (one(rest="[touch]\nrows = true"), r"touch\.rows must be a whole number, .*; it is True"),
     "infinite": (
         one(rest="[skin]\nthickness_mm = inf"),
-        r"thickness_mm must be a number or a list of them; it has inf",
+        r"thickness_mm must be a number or a list of them, from 0\.05 to 200 mm; it is inf",
     ),
     "not swept": (one(rest="[skin]\nwidth_mm = [100, 200]"), r"skin\.width_mm takes one value, not a list"),
     "empty list": (one(electrodes="diameter_mm = []"), r"diameter_mm is an empty list"),
@@ -185,7 +188,7 @@ REFUSED = {
     ),
     "protocol": (
         one(rest='[measurement]\nprotocol = "adjcent"'),
-        r"protocol has no 'adjcent' \(did you mean 'adjacent'",
+        r"protocol must be one of .*; it is 'adjcent' \(did you mean 'adjacent'",
     ),
     "opposite": (one("grid-5x3", rest='[measurement]\nprotocol = "opposite"'), r"has 15 electrodes.*even number"),
     "pairs, other protocol": (
@@ -201,9 +204,12 @@ REFUSED = {
         r"measurement\.pairs must be a whole number or a list",
     ),
     "contrast": (one(rest="[touch]\ncontrast = 1"), r"touch\.contrast is 1, which changes nothing"),
-    "exact": (one(rest='[touch]\nexact = "yes"'), r"touch\.exact must be true or false, without quotes; it has 'yes'"),
+    "exact": (one(rest='[touch]\nexact = "yes"'), r"touch\.exact must be true or false, without quotes; it is 'yes'"),
     "exact, swept": (one(rest="[touch]\nexact = [true, false]"), r"touch\.exact takes one value, not a list"),
-    "model": (one(rest='[skin]\nmodel = "leyer"'), r"skin\.model has no 'leyer' \(did you mean 'layer'"),
+    "model": (
+        one(rest='[skin]\nmodel = "leyer"'),
+        r"skin\.model must be one of sheet, layer; it is 'leyer' \(did you mean 'layer'",
+    ),
     "layers": (
         one(rest='[skin]\nmodel = "layer"\n[mesh]\nlayers = 0'),
         r"mesh\.layers is 0, and must be from 1 to 50\.$",
@@ -241,7 +247,45 @@ REFUSED = {
         one(rest='[touch]\ncolumns = 5\nrows = 5\n[scores]\nwanted = "taxels"'),
         r"scores\.num_taxels is 90, and there are 25 touches",
     ),
-    "score": (one(rest='[scores]\nwanted = ["mean", "minimun"]'), r"scores\.wanted has no 'minimun' \(did you mean"),
+    "score": (
+        one(rest='[scores]\nwanted = ["mean", "minimun"]'),
+        r"scores\.wanted\[1\] must be one of .*; it is 'minimun' \(did you mean",
+    ),
+    "all at once": (
+        one(electrodes='diameter_mm = ["6", 7]', rest="[touch]\nrows = 0\n[mesh]\ncell_mm = true\nsize = 3"),
+        r"diameter_mm must be .*; it is '6'\. touch\.rows is 0, .*\. mesh\.cell_mm must .* mesh\.size is no key",
+    ),
+    "points": (
+        one(
+            electrodes=f"diameter_mm = {[*range(1, 101)]}\ncontact_impedance_ohm_m2 = {[*range(1, 21)]}",
+            rest=f"[skin]\nthickness_mm = {[*range(3, 103)]}",
+        ),
+        r"electrodes\.layouts makes 200,000 points with the other lists, more than the 100,000 of a study; split it",
+    ),
+    "layouts": (
+        one(electrodes=f"diameter_mm = {[*range(1, 101)]}\ncontact_impedance_ohm_m2 = {[*range(1, 101)]}"),
+        r"electrodes\.layouts makes 10,000 layouts with diameters",
+    ),
+    "electrodes": (one("grid-900x900"), r"electrodes\.layouts: 'grid-900x900': 'grid-900x900' has 810000 electrodes"),
+    "results": (
+        one(
+            electrodes=f"contact_impedance_ohm_m2 = {[*range(1, 1001)]}",
+            rest="[touch]\ncolumns = 1000\nrows = 1000\n[measurement]\npairs = 4\n[skin]\nthickness_mm = [5, 6, 7]",
+        ),
+        r"touch\.columns × touch\.rows × 3,000 points are 24 GB of results, more than the 20 GB of a study",
+    ),
+    "covariance of touches": (
+        one(rest='[touch]\ncolumns = 1000\nrows = 1000\n[scores]\nwanted = "information"'),
+        r"scores\.wanted = 'information' of 1,000,000 touches .* would take 2\.4e\+04 GB",
+    ),
+    "taxels of touches": (
+        one(rest='[touch]\ncolumns = 1000\nrows = 1000\n[scores]\nwanted = "taxels"\nnum_taxels = 10000'),
+        r"scores\.num_taxels × touch\.columns × touch\.rows would take 80 GB",
+    ),
+    "all pairs": (
+        one("grid-32x32", electrodes="diameter_mm = 2", rest="[measurement]\npairs = 0\n[mesh]\ncell_mm = 2"),
+        r"measurement\.pairs: 523,776 of 'grid-32x32', touched at 576 places, would take 19\.6 GB",
+    ),
     "no TOML": ("[electrodes\n", r"study\.toml is no TOML file"),
 }
 
@@ -312,5 +356,5 @@ def test_no_study_file(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no file .*none\.toml"):
         read_study(tmp_path / "none.toml")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match="not text in UTF-8"):
+    with pytest.raises(ValueError, match="no text in UTF-8"):
         read_study(tmp_path / "binary.toml")

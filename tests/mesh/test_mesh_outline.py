@@ -1,5 +1,7 @@
 """Outlines: area, extent, what they contain, and their boundary by arc length."""
 
+import tracemalloc
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -98,3 +100,21 @@ def test_what_it_is_described_by_makes_it_again(domain):
     assert type(again) is type(domain)
     for loop, wanted in zip(again.loops(), domain.loops(), strict=True):
         np.testing.assert_array_equal(loop, wanted)
+
+
+def test_many_vertices_are_compared_some_at_a_time():
+    """A circle, a comb and a path through random points, as they are or turned on themselves; in little memory."""
+    angle = np.linspace(0, 2 * np.pi, 2000, endpoint=False)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    spikes = circle * np.where(np.arange(2000) % 2, 1, 0.001)[:, None]
+    swapped = circle.copy()
+    swapped[[1500, 1502]] = swapped[[1502, 1500]]
+    tracemalloc.start()
+    try:
+        assert float(Polygon(circle).area) == pytest.approx(np.pi, rel=1e-5)
+        Polygon(spikes)
+        with pytest.raises(ValueError, match=r"side 1499 .* meets side 150[12]"):
+            Polygon(swapped)
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()

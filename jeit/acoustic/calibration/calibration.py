@@ -1,9 +1,11 @@
 """What is known of an array of microphones after its calibration, and the file that keeps it."""
 
+from __future__ import annotations
+
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
@@ -12,18 +14,24 @@ from jaxtyping import Array, Bool, Float
 from jeit.acoustic.decay import DECAYS
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.noise import IntensityNoise
-from jeit.acoustic.signal._arrays import check_extent, check_microphones, real
+from jeit.acoustic.signal._arrays import check_extent, check_microphones
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.surface import AbstractSurface, CurvedSurface, Plane
-from jeit.files import written_whole
+from jeit.arguments import told
+from jeit.files import read_json, written_whole
 from jeit.mesh import Polygon
 from jeit_solvers.engines import as_array, on_host
+
+if TYPE_CHECKING:
+    from jeit.acoustic.calibration.calibration_tables import CalibrationTable, SurfaceTable
 
 FORMAT, VERSION = "jeit microphone calibration", 1
 _UNITS = {"length": "m", "intensity": "square of the samples' unit"}
 _SCALE = "strength 1 is the source whose intensity upon a microphone has geometric mean 1 over the usable ones"
-# Shapes of the arrays of a curved surface; -1 is any length.
-_CURVE = {"origin": (3,), "axes": (3, 2), "normal": (3,), "knots": (-1, 2), "weights": (-1,), "affine": (3,)}
+# The arrays of a curved surface.
+_CURVE = ("origin", "axes", "normal", "knots", "weights", "affine")
+# Bytes of a file: some hundred for each microphone.
+_LARGEST = 2**24
 
 
 class Calibration(eqx.Module):
@@ -62,29 +70,32 @@ class Calibration(eqx.Module):
             file.write(f"{text}\n".encode())
 
     @classmethod
-    def load(cls, path: str | Path) -> "Calibration":
+    def load(cls, path: str | Path) -> Calibration:
         """Read what `save` wrote. Raises `ValueError` for another format, version or unit, and for values that no
         calibration has; `OSError` where there is no such file."""
+        # pydantic takes longer to import than most of what jeit does with a calibration.
+        from jeit.acoustic.calibration.calibration_tables import CalibrationTable
+        from jeit.files.schema import told_faults, validated
+
         name = Path(path).name
         try:
-            content = json.loads(Path(path).read_text("utf-8"))
-        except (ValueError, RecursionError):
+            content = read_json(path, most=_LARGEST)
+        except ValueError:
             content = None
         if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise ValueError(f"{name} is no calibration of microphones; make one with 'jeit calibrate-microphones'.")
+            raise ValueError(
+                f"{name[:80]} is no calibration of microphones; make one with 'jeit calibrate-microphones'."
+            )
         if content.get("version") != VERSION:
             raise ValueError(
-                f"{name} is of version {content.get('version')!r} of the format; this jeit reads version {VERSION}. "
-                "Calibrate again, or use the jeit that wrote it."
+                f"{name[:80]} is of version {told(content.get('version'))} of the format; this jeit reads version "
+                f"{VERSION}. Calibrate again, or use the jeit that wrote it."
             )
-        if content.get("units") != _UNITS:
-            raise ValueError(f"{name}: units are {content.get('units')}; they must be {_UNITS}. Calibrate again.")
+        table = validated(CalibrationTable, content, name)
         try:
-            return cls._from_content(content)
-        except (KeyError, TypeError, AttributeError, OverflowError) as error:
-            raise ValueError(f"{name}: incomplete or changed by hand ({error!r}); calibrate again.") from None
+            return cls._from_table(table)
         except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
+            raise ValueError(told_faults(name, [str(error)])) from None
 
     def _content(self) -> dict[str, Any]:
         microphone_array = on_host(self.microphone_array)
@@ -130,27 +141,24 @@ class Calibration(eqx.Module):
         }
 
     @classmethod
-    def _from_content(cls, content: dict[str, Any]) -> "Calibration":
-        each = content["microphones"]
-        if each == []:
-            raise ValueError("it lists no microphones; calibrate again.")
-        if content["decay"] not in DECAYS:
-            raise ValueError(f"decay is {content['decay']!r}; it must be one of {', '.join(DECAYS)}.")
-        kind = DECAYS[content["decay"]]
-        surface = _surface(content["surface"])
+    def _from_table(cls, table: CalibrationTable) -> Calibration:
+        each, kind, surface = table.microphones, DECAYS[table.decay], _surface(table.surface)
+        for number, one in enumerate(each):
+            if len(one.position) != surface.dimension:
+                raise ValueError(
+                    f"microphones[{number}].position must be {surface.dimension} coordinates in metres; it has "
+                    f"{len(one.position)}."
+                )
+            missing = [key for key in kind.parameters if getattr(one, key) is None]
+            unknown = [key for key in kind.parameters if key not in one.relative_standard_error.model_fields_set]
+            if missing or unknown:
+                key = missing[0] if missing else f"relative_standard_error.{unknown[0]}"
+                raise ValueError(f"microphones[{number}].{key} is missing; decay is '{kind.name}', which has it.")
 
         def column(key: str) -> Array:
-            values = np.array([_real(one[key], f"{key} of microphone {k}") for k, one in enumerate(each)])
-            return as_array(values)
+            return as_array(np.array([getattr(one, key) for one in each]))
 
-        parameters = [column(key) for key in kind.parameters]
-        for key, values in zip(kind.parameters, parameters, strict=True):
-            if not (np.asarray(values) > 0).all():
-                raise ValueError(f"{key} of microphone {int(np.argmin(values))} is not positive.")
-        noise = [column(f"noise_{key}") for key in ("floor", "deviation", "cross")]
-        if min(np.asarray(values).min() for values in (*noise, column("relative_noise"))) < 0:
-            raise ValueError("noise of a microphone is negative.")
-        positions = np.array([_place(one["position"], surface.dimension, k) for k, one in enumerate(each)])
+        positions = np.array([one.position for one in each])
         at_hand = on_host(surface)
         known: Any = at_hand.outline.vertices
         if isinstance(at_hand, CurvedSurface):
@@ -159,73 +167,42 @@ class Calibration(eqx.Module):
         microphone_array = MicrophoneArray(
             as_array(positions),
             surface,
-            kind(*parameters),
-            IntensityNoise(noise[0], noise[1], noise[2], column("relative_noise")),
+            kind(*(column(key) for key in kind.parameters)),
+            IntensityNoise(
+                column("noise_floor"), column("noise_deviation"), column("noise_cross"), column("relative_noise")
+            ),
         )
-        errors = [[one["relative_standard_error"][key] for one in each] for key in kind.parameters]
-        what = "relative_standard_error of a microphone"
-        settings, strengths = content["intensity"], content["strengths"]
+        errors = [[getattr(one.relative_standard_error, key) for one in each] for key in kind.parameters]
+        settings = table.intensity
         return cls(
             microphone_array,
-            np.array([_flag(one["usable"], f"usable of microphone {k}") for k, one in enumerate(each)]),
-            tuple(str(one["reason"]) for one in each),
-            np.array([[math.nan if value is None else _real(value, what) for value in row] for row in errors]),
-            None if settings is None else IntensitySettings(**settings),
-            str(content["name"]),
-            None if strengths is None else _strengths(strengths),
-            _widening(content.get("widening", 1.0)),  # files of older jeits have none
+            np.array([one.usable for one in each]),
+            tuple(one.reason for one in each),
+            np.array([[math.nan if value is None else value for value in row] for row in errors]),
+            None if settings is None else IntensitySettings(**settings.model_dump()),
+            table.name,
+            None if table.strengths is None else _strengths(table.strengths),
+            table.widening,
         )
 
 
-def _surface(content: dict[str, Any]) -> AbstractSurface:
-    vertices = _array(content["outline"], "outline", (-1, 2))
-    check_extent(vertices, "outline")
-    outline = Polygon(vertices, [_array(hole, f"holes[{k}]", (-1, 2)) for k, hole in enumerate(content["holes"])])
-    if "curve" not in content:
+def _surface(table: SurfaceTable) -> AbstractSurface:
+    check_extent(table.outline, "surface.outline")
+    outline, curve = Polygon(table.outline, table.holes), table.curve
+    if curve is None:
         return Plane(outline)
-    arrays = [_array(content["curve"][key], f"curve, {key}", shape) for key, shape in _CURVE.items()]
-    if len(arrays[3]) != len(arrays[4]):
-        raise ValueError(f"curve: {len(arrays[3])} knots and {len(arrays[4])} weights; give a weight for each knot.")
-    return CurvedSurface(outline, *(as_array(array) for array in arrays))
+    if len(curve.knots) != len(curve.weights):
+        raise ValueError(
+            f"surface.curve has {len(curve.knots)} knots and {len(curve.weights)} weights; give a weight for each knot."
+        )
+    return CurvedSurface(outline, *(as_array(getattr(curve, key)) for key in _CURVE))
 
 
-def _array(value, what: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Finite numbers of this shape, in which -1 is any length."""
-    wanted = ", ".join("n" if length < 0 else str(length) for length in shape)
-    array = real(value, what, wanted)
-    if any(length not in (-1, found) for length, found in zip(shape, array.shape, strict=True)):
-        raise ValueError(f"{what} has shape {array.shape}; it must be ({wanted}).")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{what} holds NaN or infinity; every number must be finite.")
-    return array
-
-
-def _place(value, dimension: int, number: int) -> list[float]:
-    what = f"position of microphone {number}"
-    if not isinstance(value, list) or len(value) != dimension:
-        raise ValueError(f"{what} is {value!r}; it must be {dimension} coordinates in metres.")
-    return [_real(coordinate, f"a coordinate of the {what}") for coordinate in value]
-
-
-def _strengths(value) -> tuple[float, float]:
-    if not isinstance(value, list) or len(value) != 2:
-        raise ValueError(f"strengths is {value!r}; it must be the weakest and the strongest tap's.")
-    low, high = (_real(one, "one of strengths") for one in value)
-    if not 0 < low <= high:
-        raise ValueError(f"strengths are {low:g} and {high:g}; they must be positive, the weaker first.")
+def _strengths(given: np.ndarray) -> tuple[float, float]:
+    low, high = map(float, given)
+    if low > high:
+        raise ValueError(f"strengths are {low:g} and {high:g}; give the weaker first.")
     return low, high
-
-
-def _widening(value) -> float:
-    if not _real(value, "widening") >= 1:
-        raise ValueError(f"widening is {value!r}; it must be 1 or more.")
-    return float(value)
-
-
-def _flag(value, what: str) -> bool:
-    if not isinstance(value, bool):
-        raise ValueError(f"{what} is {value!r}; it must be true or false.")
-    return value
 
 
 def _list(array) -> list:
@@ -234,9 +211,3 @@ def _list(array) -> list:
 
 def _number(value) -> float | None:
     return float(value) if np.isfinite(value) else None
-
-
-def _real(value, what: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ValueError(f"{what} is {value!r}; it must be a finite number.")
-    return float(value)

@@ -20,7 +20,7 @@ from jeit.design.skin.skin import Skin, model_conductivity
 from jeit.design.skin.touch_grid import TouchGrid, touch_grid
 from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.skin.voltage_changes import touch_changes
-from jeit.design.study.keys import OPTIMALITY
+from jeit.design.study.scores import OPTIMALITY
 from jeit.design.study.spec import Point, Shape, Study
 from jeit.design.taxels import find_taxels
 from jeit.electrodes import FaceDiscs, SheetDiscs

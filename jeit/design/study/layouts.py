@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jeit.arguments import told
 from jeit.design.defaults import CONTACT_IMPEDANCE
 from jeit.layout import Layout, named_layout, read_layout
 from jeit.layout.names import DIAMETER, same_outline
@@ -24,7 +25,7 @@ def study_layout(
     try:
         layout = _make(name, folder, outline, diameter)
     except (ValueError, OSError) as error:
-        raise ValueError(f"electrodes.layouts: {name!r}: {str(error).removeprefix('name: ')}") from None
+        raise ValueError(f"electrodes.layouts: {told(name)}: {str(error).removeprefix('name: ')}") from None
     _check_gap(layout, minimum_gap)
     if not math.isnan(contact_impedance):
         impedance = contact_impedance

@@ -1,13 +1,14 @@
 """`Study`: a sweep over layouts and what surrounds them, as a TOML file says; checked before anything runs."""
 
+from __future__ import annotations
+
 import hashlib
+import itertools
 import json
-import math
-import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -16,17 +17,24 @@ from jeit.design.skin.cell_size import check_cell_size
 from jeit.design.skin.indentation import AbstractIndentation, Bell, Hemisphere
 from jeit.design.skin.protocol import ProtocolName, skin_protocol
 from jeit.design.skin.skin import longer_side, skin_electrodes
-from jeit.design.study.keys import OPTIMALITY, read_keys
 from jeit.design.study.layouts import is_file, study_layout
+from jeit.design.study.scores import OPTIMALITY
 from jeit.electrodes import FaceDiscs, SheetDiscs
+from jeit.files import check_memory, read_text
+from jeit.files.text import parsed_toml
 from jeit.layout import Layout
 from jeit.mesh import Rectangle
 from jeit.protocol import Protocol
+
+if TYPE_CHECKING:
+    from jeit.design.study.study_tables import StudyTable
 
 # Bump when the same study would give other numbers.
 _VERSION = 2
 # Fewest electrodes of a protocol.
 _FEWEST = {"adjacent": 4, "opposite": 4, "two-terminal": 2}
+# Bytes of a study's file, and of its store of results.
+_LONGEST, _MOST_STORED = 2**22, 20e9
 
 
 class Shape(NamedTuple):
@@ -183,133 +191,169 @@ def read_study(path: str | Path) -> Study:
         # of sheets also "information", "mean_variance", "largest_variance", "localisation_error": correlation_mm
 
     Only `electrodes.layouts` must be there; defaults are those of `jeit.design.defaults`. Files are looked for
-    beside the study's. Raises `FileNotFoundError` if there is no such file and `ValueError`, naming the key and what to
-    do, for keys that are not known or have no effect beside the others, values out of range (such as metres for
-    millimetres), electrodes that overlap, impossible spacings, and layouts that do not have the electrodes that a
-    protocol needs.
+    beside the study's. Raises `FileNotFoundError` if there is no such file and `ValueError`, naming the keys and what
+    to do, for keys that are not known or have no effect beside the others, values of another kind or out of range (such
+    as metres for millimetres), electrodes that overlap, impossible spacings, layouts that do not have the electrodes
+    that a protocol needs, and what would take more memory or disk than a study may.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
+    # pydantic takes longer to import than most of what jeit does with a study's file.
+    from jeit.design.study.study_tables import StudyTable
+    from jeit.files.schema import told_faults, validated
+
+    text = read_text(path, most=_LONGEST)
+    table = validated(StudyTable, parsed_toml(text, path.name), path.name)
     try:
-        text = path.read_text("utf-8")
-        return _study(text, read_keys(tomllib.loads(text)), path.parent)
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path.name} is no TOML file: {error}") from None
-    except UnicodeDecodeError:
-        raise ValueError(f"{path.name} is no TOML file: it is not text in UTF-8.") from None
+        return _study(text, table, path.parent)
     except ValueError as error:
-        raise ValueError(f"{path.name}: {error}") from None
+        raise ValueError(told_faults(path.name, [str(error)])) from None
 
 
-def _study(text: str, values: dict, folder: Path) -> Study:
-    outline = Rectangle(1e-3 * values["skin.width_mm"], 1e-3 * values["skin.height_mm"])
-    depth, thinnest = values["touch.depth_mm"], min(values["skin.thickness_mm"])
-    if depth >= thinnest:
-        raise ValueError(f"touch.depth_mm is {depth:g}, and the skin {thinnest:g} mm thick; press less.")
-    if values["touch.indentation"] == "bell":
-        indentation = Bell(1e-3 * depth, 1e-3 * values["touch.deviation_mm"])
-    else:
-        across = values["touch.diameter_mm"]
-        if depth > across / 2:
-            raise ValueError(
-                f"touch.depth_mm is {depth:g}, and a hemisphere {across:g} mm across goes in no deeper than "
-                f"{across / 2:g}; press less, or give a larger touch.diameter_mm."
-            )
-        indentation = Hemisphere(1e-3 * depth, 1e-3 * across)
-    if values["touch.contrast"] == 1:
+def _study(text: str, table: StudyTable, folder: Path) -> Study:
+    skin, measurement, scores = table.skin, table.measurement, table.scores
+    outline = Rectangle(1e-3 * skin.width_mm, 1e-3 * skin.height_mm)
+    indentation = _indentation(table)
+    _check_touches(table)
+    layers = table.mesh.layers if skin.model == "layer" else 0
+    electrodes = table.electrodes
+    layouts = [
+        study_layout(name, folder, outline, diameter, impedance, 1e-3 * electrodes.minimum_gap_mm)
+        for name, diameter, impedance in itertools.product(
+            electrodes.layouts, _metres(electrodes.diameter_mm), electrodes.contact_impedance_ohm_m2
+        )
+    ]
+    for layout in layouts:
+        _check_layout(layout, outline, layers, table)
+    points = tuple(
+        Point(layout, thickness, conductivity, protocol, _pairs(layout, protocol, pairs), noise, cell_size, layers)
+        for layout, thickness, conductivity, protocol, pairs, noise, cell_size in itertools.product(
+            layouts,
+            _metres(skin.thickness_mm),
+            skin.conductivity_S_per_m,
+            measurement.protocol,
+            measurement.pairs or [None],
+            measurement.noise_V,
+            _metres(table.mesh.cell_mm),
+        )
+    )
+    return Study(
+        name=table.name,
+        points=points,
+        outline=outline,
+        indentation=indentation,
+        contrast=table.touch.contrast,
+        exact=table.touch.exact,
+        columns=table.touch.columns,
+        rows=table.touch.rows,
+        current=1e-3 * measurement.current_mA,
+        scores=tuple(scores.wanted),
+        num_taxels=scores.num_taxels,
+        threshold=scores.threshold,
+        correlation=1e-3 * scores.correlation_mm,
+        seed=scores.seed,
+        chunk_points=table.chunk_points,
+        text=text,
+    )
+
+
+def _indentation(table: StudyTable) -> AbstractIndentation:
+    touch, thinnest = table.touch, min(table.skin.thickness_mm)
+    if touch.depth_mm >= thinnest:
+        raise ValueError(f"touch.depth_mm is {touch.depth_mm:g}, and the skin {thinnest:g} mm thick; press less.")
+    if touch.contrast == 1:
         raise ValueError(
             "touch.contrast is 1, which changes nothing; take 0 for an insulator, above 1 for a conductor."
         )
-    layers = values["mesh.layers"] if values["skin.model"] == "layer" else 0
-    layouts = [
-        study_layout(name, folder, outline, diameter, impedance, 1e-3 * values["electrodes.minimum_gap_mm"])
-        for name in values["electrodes.layouts"]
-        for diameter in _metres(values["electrodes.diameter_mm"])
-        for impedance in values["electrodes.contact_impedance_ohm_m2"]
-    ]
-    points = (
-        Point(
-            layout, thickness, float(conductivity), protocol, _pairs(layout, protocol, pairs), noise, cell_size, layers
+    if touch.indentation == "bell":
+        return Bell(1e-3 * touch.depth_mm, 1e-3 * touch.deviation_mm)
+    if touch.depth_mm > touch.diameter_mm / 2:
+        raise ValueError(
+            f"touch.depth_mm is {touch.depth_mm:g}, and a hemisphere {touch.diameter_mm:g} mm across goes in no deeper "
+            f"than {touch.diameter_mm / 2:g}; press less, or give a larger touch.diameter_mm."
         )
-        for layout in layouts
-        for thickness in _metres(values["skin.thickness_mm"])
-        for conductivity in map(float, values["skin.conductivity_S_per_m"])
-        for protocol in values["measurement.protocol"]
-        for pairs in values["measurement.pairs"]
-        for noise in map(float, values["measurement.noise_V"])
-        for cell_size in _metres(values["mesh.cell_mm"])
-    )
-    study = Study(
-        name=values["name"],
-        points=tuple(points),
-        outline=outline,
-        indentation=indentation,
-        contrast=float(values["touch.contrast"]),
-        exact=values["touch.exact"],
-        columns=values["touch.columns"],
-        rows=values["touch.rows"],
-        current=1e-3 * values["measurement.current_mA"],
-        scores=tuple(values["scores.wanted"]),
-        num_taxels=values["scores.num_taxels"],
-        threshold=float(values["scores.threshold"]),
-        correlation=1e-3 * values["scores.correlation_mm"],
-        seed=values["scores.seed"],
-        chunk_points=values["chunk_points"],
-        text=text,
-    )
-    _check(study)
-    return study
+    return Hemisphere(1e-3 * touch.depth_mm, 1e-3 * touch.diameter_mm)
 
 
-def _pairs(layout: Layout, protocol: str, pairs: float) -> int:
-    """As many as are asked for, 0 for all; where nobody says, as many as other skins have, or all."""
-    if not math.isnan(pairs):
-        return int(pairs)
-    all_pairs = layout.num_electrodes * (layout.num_electrodes - 1) // 2
-    return defaults.NUM_PAIRS if protocol == "two-terminal" and all_pairs > defaults.NUM_PAIRS else 0
-
-
-def _check(study: Study) -> None:
-    touches = study.columns * study.rows
-    if "taxels" in study.scores and study.num_taxels > touches:
-        raise ValueError(f"scores.num_taxels is {study.num_taxels}, and there are {touches} touches; ask for fewer.")
-    of_sheets = [score for score in OPTIMALITY if score in study.scores]
-    if of_sheets and study.points[0].layers:
+def _check_touches(table: StudyTable) -> None:
+    """Whether touches are enough for the scores, and few enough for memory."""
+    scores, touches = table.scores, table.touch.columns * table.touch.rows
+    of_sheets = [score for score in OPTIMALITY if score in scores.wanted]
+    stored = 8.0 * table.num_points * touches
+    if stored > _MOST_STORED:
+        raise ValueError(
+            f"touch.columns × touch.rows × {table.num_points:,} points are {stored / 1e9:.3g} GB of results, more than "
+            f"the {_MOST_STORED / 1e9:g} GB of a study; ask for fewer, or split the study."
+        )
+    if "taxels" in scores.wanted:
+        if scores.num_taxels > touches:
+            raise ValueError(
+                f"scores.num_taxels is {scores.num_taxels}, and there are {touches} touches; ask for fewer."
+            )
+        check_memory("scores.num_taxels × touch.columns × touch.rows", 8.0 * scores.num_taxels * touches)
+    if not of_sheets:
+        return
+    if table.skin.model == "layer":
         raise ValueError(
             f"scores.wanted has {', '.join(of_sheets)}, known for sheets only, and skin.model is 'layer'; leave them "
             "out, or take 'sheet'."
         )
-    for point in study.points:
-        _check_measurement(point)
-        if point.thickness > longer_side(study.outline):
-            wide = f"{1e3 * longer_side(study.outline):g}"
-            raise ValueError(f"skin.thickness_mm is {1e3 * point.thickness:g}, more than the skin is wide: {wide} mm.")
-        check_cell_size("mesh.cell_mm", point.cell_size, point.layout, study.outline.area, point.layers)
+    # Of the covariance of all touches, and what its eigenvectors take.
+    check_memory(f"scores.wanted = {of_sheets[0]!r} of {touches:,} touches (columns × rows)", 24.0 * touches**2)
 
 
-def _check_measurement(point: Point) -> None:
+def _check_layout(layout: Layout, outline: Rectangle, layers: int, table: StudyTable) -> None:
+    """Whether a layout, whatever else is swept, can be measured and meshed."""
+    widest, thickest = 1e3 * longer_side(outline), max(table.skin.thickness_mm)
+    if thickest > widest:
+        raise ValueError(f"skin.thickness_mm is {thickest:g}, more than the skin is wide: {widest:g} mm.")
+    touches = table.touch.columns * table.touch.rows
+    for protocol in table.measurement.protocol:
+        for pairs in table.measurement.pairs or [None]:
+            number = _pairs(layout, protocol, pairs)
+            _check_measurement(layout, protocol, number)
+            if protocol == "two-terminal":
+                patterns = number or _all_pairs(layout)
+                size = 8.0 * patterns * (4 * layout.num_electrodes + touches)
+                check_memory(
+                    f"measurement.pairs: {patterns:,} of {layout.name!r}, touched at {touches:,} places,", size
+                )
+    for cell_size in _metres(table.mesh.cell_mm):
+        check_cell_size("mesh.cell_mm", cell_size, layout, outline.area, layers)
+
+
+def _pairs(layout: Layout, protocol: str, pairs: int | None) -> int:
+    """As many as are asked for, 0 for all; where nobody says, as many as other skins have, or all."""
+    if pairs is not None:
+        return pairs
+    return defaults.NUM_PAIRS if protocol == "two-terminal" and _all_pairs(layout) > defaults.NUM_PAIRS else 0
+
+
+def _all_pairs(layout: Layout) -> int:
+    return layout.num_electrodes * (layout.num_electrodes - 1) // 2
+
+
+def _check_measurement(layout: Layout, protocol: str, pairs: int) -> None:
     """Whether the layout has electrodes enough for its protocol and pairs."""
-    name, number = point.layout.name, point.layout.num_electrodes
-    fewest = _FEWEST[point.protocol]
+    name, number, fewest = layout.name, layout.num_electrodes, _FEWEST[protocol]
     if number < fewest:
         raise ValueError(
-            f"measurement.protocol: {name!r} has {number} electrodes, and {point.protocol!r} needs {fewest} at least."
+            f"measurement.protocol: {name!r} has {number} electrodes, and {protocol!r} needs {fewest} at least."
         )
-    if point.protocol == "opposite" and number % 2:
+    if protocol == "opposite" and number % 2:
         raise ValueError(
             f"measurement.protocol: {name!r} has {number} electrodes, and 'opposite' needs an even number."
         )
-    if point.pairs and point.protocol != "two-terminal":
+    if pairs and protocol != "two-terminal":
         raise ValueError(
-            f"measurement.pairs is {point.pairs}, and measurement.protocol {point.protocol!r}: only 'two-terminal' has "
-            "pairs; put other protocols into a study of their own."
+            f"measurement.pairs is {pairs}, and measurement.protocol {protocol!r}: only 'two-terminal' has pairs; put "
+            "other protocols into a study of their own."
         )
-    all_pairs = number * (number - 1) // 2
-    if point.pairs > all_pairs:
+    if pairs > _all_pairs(layout):
         raise ValueError(
-            f"measurement.pairs is {point.pairs}, and {name!r} has {all_pairs} pairs of electrodes; ask for fewer, or "
-            "for 0: all."
+            f"measurement.pairs is {pairs}, and {name!r} has {_all_pairs(layout)} pairs of electrodes; ask for fewer, "
+            "or for 0: all."
         )
 
 

@@ -1,0 +1,99 @@
+"""The tables of a calibration's file, key by key: what each may hold, from where to where, in which unit."""
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import FailFast, Field
+
+from jeit.files.schema import Number, Numbers, Table
+
+_MOST_MICROPHONES, _MOST_VERTICES, _MOST_HOLES = 4096, 4096, 64
+
+Positive = Annotated[float, Number(5e-324, math.inf)]
+NotNegative = Annotated[float, Number(0, math.inf)]
+Text = Annotated[str, Field(max_length=10_000)]
+Vector = Annotated[np.ndarray, Numbers(((3, 3),))]
+Loop = Annotated[np.ndarray, Numbers(((3, _MOST_VERTICES), (2, 2)), -1e6, 1e6, "m")]
+
+
+class UnitsTable(Table):
+    """Of the units of all that is in the file."""
+
+    what = "units"
+    length: Literal["m"]
+    intensity: Literal["square of the samples' unit"]
+
+
+class CurveTable(Table):
+    """Of how a surface curves above its plane: see `CurvedSurface`."""
+
+    what = "a curve"
+    origin: Vector
+    axes: Annotated[np.ndarray, Numbers(((3, 3), (2, 2)))]
+    normal: Vector
+    knots: Annotated[np.ndarray, Numbers(((1, 4096), (2, 2)))]
+    weights: Annotated[np.ndarray, Numbers(((1, 4096),))]
+    affine: Vector
+
+
+class SurfaceTable(Table):
+    """Of the surface, metres."""
+
+    what = "a surface"
+    outline: Loop
+    holes: Annotated[list[Loop], FailFast()] = Field(max_length=_MOST_HOLES)
+    curve: CurveTable | None = None
+
+
+class IntensityTable(Table):
+    """Of how samples were read: see `IntensitySettings`."""
+
+    what = "intensity"
+    low: Annotated[float, Number(0, 1e9, "Hz")] = 50.0
+    high: Annotated[float, Number(0, 1e9, "Hz")] = 1000.0
+    window: Annotated[float, Number(1e-9, 10, "s")] = 0.05
+    hop: Annotated[float, Number(1e-9, 10, "s")] = 0.0125
+
+
+class ErrorsTable(Table):
+    """Of relative standard errors, of each parameter of the decay model; null where not known."""
+
+    what = "relative standard errors"
+    a: NotNegative | None = None
+    b: NotNegative | None = None
+    length: NotNegative | None = None
+
+
+class MicrophoneTable(Table):
+    """Of a microphone: place, parameters of the decay model, noise."""
+
+    what = "a microphone"
+    position: Annotated[np.ndarray, Numbers(((2, 3),), -1e6, 1e6, "m")]
+    a: Positive | None = None
+    b: Positive | None = None
+    length: Positive | None = None
+    relative_standard_error: ErrorsTable
+    relative_noise: NotNegative
+    noise_floor: NotNegative
+    noise_deviation: NotNegative
+    noise_cross: NotNegative
+    usable: bool
+    reason: Text
+
+
+class CalibrationTable(Table):
+    """Of a whole calibration."""
+
+    what = "a calibration"
+    format: Literal["jeit microphone calibration"]
+    version: Literal[1]
+    units: UnitsTable
+    scale: Text = ""
+    name: Text
+    decay: Literal["inverse-square", "exponential", "attenuated"]
+    surface: SurfaceTable
+    intensity: IntensityTable | None
+    strengths: Annotated[np.ndarray, Numbers(((2, 2),), 5e-324, math.inf)] | None
+    widening: Annotated[float, Number(1, math.inf)] = 1.0
+    microphones: Annotated[list[MicrophoneTable], FailFast()] = Field(min_length=1, max_length=_MOST_MICROPHONES)

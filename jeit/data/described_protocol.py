@@ -1,0 +1,137 @@
+"""The protocol that `[protocol]` of a description says, and the current that a file's name says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jeit import protocol as protocols
+from jeit.data.described_body import located
+from jeit.files import check_memory
+from jeit.protocol import Protocol
+
+if TYPE_CHECKING:
+    from jeit.data.description_tables import ConstructedTable, DrivenTable, ProtocolTable
+
+PROTOCOL_ARRAYS = ("drive", "measurement", "drive_index", "measurement_index")
+_CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
+# Keys that are no options of a constructor.
+_COMMON = {"kind", "number", "name", "current", "current_from_name", "current_unit"}
+# Keys that number electrodes, from 0.
+_NUMBERING = ("common", "reference", "pairs", "drive_pairs", "measurement_pairs")
+# Bytes that are taken for every channel, and copies of the patterns, while a protocol is made.
+_CHANNEL, _COPIES = 64, 2
+
+
+def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
+    """The protocol of a table `[protocol]` for the file at `path`; of so many electrodes, if they are described.
+
+    Raises `ValueError` where what is described makes no protocol, or one that would not fit in memory.
+    """
+    try:
+        if table.kind == "matrices":
+            channels = len(table.drive) * len(table.measurement)
+            _check_size(len(table.drive), len(table.measurement), table.drive.shape[1], channels, origin)
+            return protocols.from_matrices(table.drive, table.measurement, table.select, name=table.name)
+        if table.kind == "channels":
+            return Protocol(**{part: getattr(table, part) for part in PROTOCOL_ARRAYS}, name=table.name)
+        return _constructed(table, num_electrodes, path, origin)
+    except ValueError as error:
+        raise located(error, origin, "protocol") from None
+
+
+def _constructed(table: ConstructedTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
+    """By the constructor of that name."""
+    # That of a reference electrode counts those on the boundary only.
+    apart = 1 if table.kind == "reference_electrode" else 0
+    number = table.number if num_electrodes is None or table.number is not None else num_electrodes - apart
+    if number is None:
+        raise ValueError("protocol needs 'number' (of electrodes), or a table [electrodes].")
+    options = {name: getattr(table, name) for name in table.model_fields_set - _COMMON}
+    for name in _NUMBERING:
+        given = options.get(name)
+        largest = None if given is None else int(np.max(given))
+        if largest is not None and largest >= number + apart:
+            raise ValueError(
+                f"protocol.{name} has electrode {largest}, and there are {number + apart}, numbered from 0 to "
+                f"{number + apart - 1}."
+            )
+    _check_size(*_counts(table.kind, number, options), origin)
+    made = getattr(protocols, table.kind)(number, current=_current(table, path), **options)
+    return made if table.name is None else replace(made, name=table.name)
+
+
+def _counts(kind: str, number: int, options: dict[str, Any]) -> tuple[int, int, int, int]:
+    """How many drive and measurement patterns, electrodes and channels a protocol has at most."""
+    if kind == "two_terminal":
+        pairs = number * (number - 1) // 2 if options.get("pairs") is None else len(options["pairs"])
+        return pairs, pairs, number, pairs
+    if kind == "bipolar":
+        drives, measurements = len(options["drive_pairs"]), len(options["measurement_pairs"])
+        return drives, measurements, number, drives * measurements
+    return number, number, number, number**2
+
+
+def _check_size(drives: int, measurements: int, number: int, channels: int, origin: str) -> None:
+    check_memory(f"{origin}: protocol", 8 * _COPIES * number * (drives + measurements) + _CHANNEL * channels)
+
+
+def _current(table: DrivenTable, path: Path) -> float:
+    """Amperes."""
+    unit = _CURRENT_UNITS[table.current_unit]
+    if table.current_from_name is None:
+        assert table.current is not None
+        return table.current * unit
+    found = number_in_name(table.current_from_name, path.name)
+    if found is None:
+        raise ValueError(
+            f"protocol.current_from_name = {table.current_from_name[:60]!r} finds no current in the name "
+            f"{path.name[:60]!r}. Give 'current' instead."
+        )
+    return found * unit
+
+
+def number_in_name(pattern: str, name: str) -> float | None:
+    """The first number, such as 30 or 0.5, that stands in a `name` where a `pattern` has {current}; * in the pattern
+    stands for anything. None where there is none."""
+    before, _, after = pattern.partition("{current}")
+    start = 0
+    while start < len(name):
+        end = _number_end(name, start)
+        if end > start and _matches(before, name[:start]) and _matches(after, name[end:]):
+            return float(name[start:end])
+        start = max(end, start + 1)
+    return None
+
+
+def _number_end(text: str, start: int) -> int:
+    """Where a number that begins at `start` ends."""
+    end = start
+    while end < len(text) and text[end] in "0123456789":
+        end += 1
+    if start < end < len(text) - 1 and text[end] == "." and text[end + 1] in "0123456789":
+        end += 1
+        while end < len(text) and text[end] in "0123456789":
+            end += 1
+    return end
+
+
+def _matches(pattern: str, text: str) -> bool:
+    """Whether a text is as a pattern in which * stands for anything: each part as early as it can be, so that no part
+    is ever looked for twice."""
+    first, *others = pattern.split("*")
+    if not others:
+        return pattern == text
+    *middle, last = others
+    if not (text.startswith(first) and text.endswith(last) and len(text) >= len(first) + len(last)):
+        return False
+    place, end = len(first), len(text) - len(last)
+    for part in middle:
+        found = text.find(part, place, end)
+        if found < 0:
+            return False
+        place = found + len(part)
+    return True

@@ -1,0 +1,349 @@
+"""The tables of a description, key by key: what each may hold, from where to where, in which unit."""
+
+import math
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import FailFast, Field, model_validator
+
+from jeit.files import MOST_ELECTRODES
+from jeit.files.schema import Number, Numbers, OneOf, Table, Word, Words, fault
+
+# Vertices of a polygon and holes in it: each side is compared with every other, each hole with every other.
+_MOST_VERTICES, _MOST_HOLES = 4096, 64
+_COUNT = Number(2, MOST_ELECTRODES, beyond="Channels grow with its square; in Python there is no such limit.")
+_INDEX = Number(0, MOST_ELECTRODES)
+
+Length = Annotated[float, Number(1e-9, 1e3, "m")]
+Sizes = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-9, 1e3, "m", single=True)]
+Place = Annotated[np.ndarray, Numbers(((2, 2),), -1e3, 1e3, "m")]
+Loop = Annotated[np.ndarray, Numbers(((3, _MOST_VERTICES), (2, 2)), -1e3, 1e3, "m")]
+Positions = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES), (2, 3)), -1e3, 1e3, "m")]
+Levels = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 0, 1e3, "m", single=True)]
+# Of arcs on the edge of a sheet in ohm·m.
+Impedances = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-15, 1e12, "ohm·m²", single=True)]
+Patterns = Annotated[np.ndarray, Numbers(((1, math.inf), (2, MOST_ELECTRODES)), -1e12, 1e12)]
+Pairs = Annotated[np.ndarray, Numbers(((1, math.inf), (2, 2)), 0, MOST_ELECTRODES, kind=int)]
+Indices = Annotated[np.ndarray, Numbers(((1, math.inf),), 0, 2**31 - 1, kind=int)]
+Choices = Annotated[np.ndarray, Numbers(((1, math.inf), (1, math.inf)), kind=bool)]
+
+
+class DiskTable(Table):
+    """Of a disk, or with a thickness a cylinder."""
+
+    what = "a disk"
+    shape: Literal["disk"]
+    radius: Length
+    centre: Place = np.zeros(2)
+    thickness: Length | None = None
+
+
+class RectangleTable(Table):
+    """Of a rectangle, or with a thickness a box."""
+
+    what = "a rectangle"
+    shape: Literal["rectangle"]
+    width: Length
+    height: Length
+    centre: Place = np.zeros(2)
+    thickness: Length | None = None
+
+
+class PolygonTable(Table):
+    """Of a polygon, or with a thickness what stands upright on it."""
+
+    what = "a polygon"
+    shape: Literal["polygon"]
+    vertices: Loop
+    holes: Annotated[list[Loop], FailFast()] = Field(default=[], max_length=_MOST_HOLES)
+    thickness: Length | None = None
+
+    @model_validator(mode="after")
+    def _small_enough(self) -> "PolygonTable":
+        number = len(self.vertices) + sum(map(len, self.holes))
+        if number > _MOST_VERTICES:
+            raise fault(
+                f"and holes are {number} points, and each side is compared with every other: give {_MOST_VERTICES} at "
+                "most, or a mesh.",
+                "vertices",
+            )
+        return self
+
+
+class BoxTable(Table):
+    """Of a box."""
+
+    what = "a box"
+    shape: Literal["box"]
+    width: Length
+    depth: Length
+    height: Length
+
+
+class CylinderTable(Table):
+    """Of a cylinder."""
+
+    what = "a cylinder"
+    shape: Literal["cylinder"]
+    radius: Length
+    height: Length
+
+
+class MeshTable(Table):
+    """Of a mesh in a file beside the description. `scale`: its unit."""
+
+    what = "a mesh"
+    mesh: Word
+    scale: Annotated[float, Number(1e-9, 1e3, "m")] = 1.0
+
+
+class PlacedTable(Table):
+    """What electrodes of all kinds but facets have: where they are."""
+
+    layout: Literal["ring", "perimeter"] | None = None
+    number: Annotated[int, _COUNT] | None = None
+    start_angle_degrees: Annotated[float, Number(-3600, 3600, "degrees")] = 90.0
+    clockwise: bool = False
+    start: Annotated[float, Number(-1e3, 1e3, "m")] = 0.0
+    levels: Levels | None = None
+    positions: Positions | None = None
+
+    @model_validator(mode="after")
+    def _placed(self) -> "PlacedTable":
+        round_it = ("layout", "number", "start_angle_degrees", "clockwise", "start", "levels")
+        if self.positions is not None:
+            idle = [key for key in round_it if key in self.model_fields_set]
+            if idle:
+                raise fault("has no effect beside positions; leave out one or the other.", idle[0])
+        elif self.layout is None:
+            raise fault("is missing; give it, or positions.", "layout")
+        elif self.number is None:
+            raise fault("is missing; give it: how many electrodes.", "number")
+        return self
+
+
+class BoundaryTable(PlacedTable):
+    """Of arcs on the edge of a sheet. `contact_impedance`: ohm·m."""
+
+    what = "electrodes of kind 'boundary'"
+    kind: Literal["boundary"] = "boundary"
+    width: Sizes
+    contact_impedance: Impedances
+
+
+class DiscTable(PlacedTable):
+    """Of discs."""
+
+    what = "electrodes of kind 'disc'"
+    kind: Literal["disc"]
+    radius: Sizes
+    contact_impedance: Impedances
+
+
+class PatchTable(PlacedTable):
+    """Of rectangles on a solid."""
+
+    what = "electrodes of kind 'patch'"
+    kind: Literal["patch"]
+    width: Sizes
+    height: Sizes
+    contact_impedance: Impedances
+
+
+class PointTable(PlacedTable):
+    """Of points."""
+
+    what = "electrodes of kind 'point'"
+    kind: Literal["point"]
+
+
+class FacetsTable(Table):
+    """Of groups of a mesh's facets, by their names."""
+
+    what = "electrodes of kind 'facets'"
+    kind: Literal["facets"]
+    tags: Annotated[list[Word], Field(min_length=1, max_length=MOST_ELECTRODES), FailFast()]
+    contact_impedance: Impedances
+
+
+class DrivenTable(Table):
+    """What protocols of all kinds but matrices and channels have."""
+
+    number: Annotated[int, _COUNT] | None = None
+    name: Word | None = None
+    current: Annotated[float, Number(1e-15, 1e12, "in current_unit")] | None = None
+    current_from_name: Word | None = None
+    current_unit: Literal["A", "mA", "uA", "µA"] = "A"
+
+    @model_validator(mode="after")
+    def _driven(self) -> "DrivenTable":
+        pattern = self.current_from_name
+        if pattern is None and self.current is None:
+            raise fault("is missing; give it, or current_from_name.", "current")
+        if pattern is not None and self.current is not None:
+            raise fault("has no effect beside current_from_name; leave out one or the other.", "current")
+        if pattern is not None and pattern.count("{current}") != 1:
+            raise fault(
+                "must be the file's name with {current} in place of the number, once, and * for anything, such as "
+                f"'*_{{current}}uA_*' (older jeits took a regular expression); it is {pattern[:60]!r}.",
+                "current_from_name",
+            )
+        return self
+
+
+class AdjacentTable(DrivenTable):
+    """Of `jeit.protocol.adjacent`."""
+
+    what = "the protocol 'adjacent'"
+    kind: Literal["adjacent"]
+    driven_electrodes: bool = False
+    reciprocal: Literal["all", "half"] = "all"
+    order: Literal["rotating", "fixed"] = "rotating"
+
+
+class SkipTable(DrivenTable):
+    """Of `jeit.protocol.skip`."""
+
+    what = "the protocol 'skip'"
+    kind: Literal["skip"]
+    skipped: Annotated[int, _INDEX]
+    measurement_skipped: Annotated[int, _INDEX] | None = None
+    driven_electrodes: bool = False
+    reciprocal: Literal["all", "half"] = "all"
+    order: Literal["rotating", "fixed"] = "rotating"
+
+
+class OppositeTable(DrivenTable):
+    """Of `jeit.protocol.opposite`."""
+
+    what = "the protocol 'opposite'"
+    kind: Literal["opposite"]
+    drives: Literal["distinct", "all"] = "distinct"
+    driven_electrodes: bool = False
+    order: Literal["rotating", "fixed"] = "rotating"
+
+
+class AgainstOneTable(DrivenTable):
+    """Of `jeit.protocol.all_against_one`."""
+
+    what = "the protocol 'all_against_one'"
+    kind: Literal["all_against_one"]
+    common: Annotated[int, _INDEX] = 0
+    measurement: Literal["common", "adjacent"] = "common"
+    driven_electrodes: bool | None = None
+    reciprocal: Literal["all", "half"] = "all"
+
+
+class ReferenceTable(DrivenTable):
+    """Of `jeit.protocol.reference_electrode`. `number`: on the boundary."""
+
+    what = "the protocol 'reference_electrode'"
+    kind: Literal["reference_electrode"]
+    skipped: Annotated[int, _INDEX] = 0
+    reference: Annotated[int, _INDEX] | None = None
+    driven_electrodes: bool = False
+    order: Literal["rotating", "fixed"] = "rotating"
+
+
+class TwoTerminalTable(DrivenTable):
+    """Of `jeit.protocol.two_terminal`."""
+
+    what = "the protocol 'two_terminal'"
+    kind: Literal["two_terminal"]
+    pairs: Pairs | None = None
+
+
+class TrigonometricTable(DrivenTable):
+    """Of `jeit.protocol.trigonometric`."""
+
+    what = "the protocol 'trigonometric'"
+    kind: Literal["trigonometric"]
+    measurement: Literal["adjacent", "mean"] = "adjacent"
+
+
+class BipolarTable(DrivenTable):
+    """Of `jeit.protocol.bipolar`."""
+
+    what = "the protocol 'bipolar'"
+    kind: Literal["bipolar"]
+    drive_pairs: Pairs
+    measurement_pairs: Pairs
+    driven_electrodes: bool = False
+    reciprocal: Literal["all", "half"] = "all"
+
+
+class MatricesTable(Table):
+    """Of every drive pattern, amperes, with every measurement pattern that `select` says."""
+
+    what = "a protocol of matrices"
+    kind: Literal["matrices"]
+    name: Word = "matrices"
+    drive: Patterns
+    measurement: Patterns
+    select: Choices | None = None
+
+
+class ChannelsTable(Table):
+    """Of a drive pattern, amperes, and a measurement pattern for each channel, by their numbers from 0."""
+
+    what = "a protocol of channels"
+    kind: Literal["channels"]
+    name: Word = "channels"
+    drive: Patterns
+    measurement: Patterns
+    drive_index: Indices
+    measurement_index: Indices
+
+
+class DataTable(Table):
+    """Of how numbers lie in a file."""
+
+    what = "[data]"
+    frames_in: Literal["rows", "columns"] = "rows"
+    delimiter: Annotated[str, Field(max_length=10)] = ","
+    skip_rows: Annotated[int, Number(0, 10**9)] = 0
+    complex_pairs: bool = False
+    component: Literal["real", "imaginary", "magnitude", "complex"] = "real"
+    gain: Annotated[float, Number(1e-12, 1e12)] = 1.0
+    polarity: Literal["normal", "reversed"] = "normal"
+    unit: Literal["V", "mV", "uV", "µV"] = "V"
+    saturation: Annotated[float, Number(1e-12, 1e12, "in the file's unit")] | None = None
+    frame_names: Words = Field(default=[])
+    keys: Words = Field(default=[])
+
+
+class NotesTable(Table):
+    """Of sentences to carry along."""
+
+    what = "[notes]"
+    text: Annotated[list[Annotated[str, Field(max_length=10_000)]], FailFast()] = Field(default=[])
+
+
+GeometryTable = DiskTable | RectangleTable | PolygonTable | BoxTable | CylinderTable | MeshTable
+ElectrodesTable = BoundaryTable | DiscTable | PatchTable | PointTable | FacetsTable
+ConstructedTable = (
+    AdjacentTable | SkipTable | OppositeTable | AgainstOneTable | ReferenceTable | TwoTerminalTable | TrigonometricTable
+    | BipolarTable
+)  # fmt: skip
+ProtocolTable = ConstructedTable | MatricesTable | ChannelsTable
+
+_SHAPE = OneOf(
+    "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable, mark="mesh", other=MeshTable
+)  # fmt: skip
+_ELECTRODES = OneOf("kind", BoundaryTable, DiscTable, PatchTable, PointTable, FacetsTable)
+_PROTOCOL = OneOf(
+    "kind", AdjacentTable, SkipTable, OppositeTable, AgainstOneTable, ReferenceTable, TwoTerminalTable,
+    TrigonometricTable, BipolarTable, MatricesTable, ChannelsTable,
+)  # fmt: skip
+
+
+class DescriptionTable(Table):
+    """Of a whole description."""
+
+    what = "a description"
+    title: Annotated[str, Field(max_length=1000)] = ""
+    geometry: Annotated[GeometryTable, _SHAPE] | None = None
+    electrodes: Annotated[ElectrodesTable, _ELECTRODES] | None = None
+    protocol: Annotated[ProtocolTable, _PROTOCOL] | None = None
+    data: DataTable = DataTable()
+    notes: NotesTable = NotesTable()

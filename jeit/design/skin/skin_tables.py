@@ -1,0 +1,68 @@
+"""The tables of a skin's file, key by key: what each may hold, from where to where, in which unit."""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from jeit.design import defaults
+from jeit.design.skin.protocol import ProtocolName
+from jeit.files import MOST_ELECTRODES
+from jeit.files.schema import Number, Table, Word
+
+SIDE = Number(5, 5000, "mm")
+THICKNESS = Number(0.05, 200, "mm")
+CONDUCTIVITY = Number(1e-6, 1e8, "S/m")
+DIAMETER = Number(0.1, 200, "mm")
+IMPEDANCE = Number(1e-9, 1e3, "ohm·m²")
+PAIRS = Number(0, MOST_ELECTRODES * (MOST_ELECTRODES - 1) // 2)
+CURRENT = Number(1e-4, 1e3, "mA")
+CELL = Number(0.1, 200, "mm")
+LAYERS = Number(1, 50)
+
+
+class MaterialTable(Table):
+    """Of what the skin is."""
+
+    what = "a skin"
+    model: Literal["sheet", "layer"] = "sheet"
+    width_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
+    height_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
+    thickness_mm: Annotated[float, THICKNESS] = 1e3 * defaults.THICKNESS
+    conductivity_S_per_m: Annotated[float, CONDUCTIVITY] = defaults.CONDUCTIVITY
+
+
+class LayoutTable(Table):
+    """Of its electrodes. NaN is for the layout to say."""
+
+    what = "a skin"
+    layout: Word
+    diameter_mm: Annotated[float, DIAMETER] = math.nan
+    contact_impedance_ohm_m2: Annotated[float, IMPEDANCE] = math.nan
+
+
+class MeasurementTable(Table):
+    """Of what is measured of it."""
+
+    what = "a skin"
+    protocol: ProtocolName = defaults.PROTOCOL
+    pairs: Annotated[int, PAIRS] | None = None
+    current_mA: Annotated[float, CURRENT] = 1e3 * defaults.CURRENT
+
+
+class CellsTable(Table):
+    """Of its mesh."""
+
+    what = "a skin"
+    cell_mm: Annotated[float, CELL] = 1e3 * defaults.CELL_SIZE
+    layers: Annotated[int, LAYERS] = defaults.NUM_LAYERS
+
+
+class SkinTable(Table):
+    """Of a whole skin."""
+
+    what = "a skin"
+    skin: MaterialTable = MaterialTable()
+    electrodes: LayoutTable = Field(default_factory=dict, validate_default=True)
+    measurement: MeasurementTable = MeasurementTable()
+    mesh: CellsTable = CellsTable()

@@ -1,0 +1,17 @@
+"""The scores that a study can give its skins."""
+
+from typing import Literal
+
+ScoreName = Literal[
+    "minimum",
+    "mean",
+    "uniformity",
+    "blind_spot",
+    "taxels",
+    "information",
+    "mean_variance",
+    "largest_variance",
+    "localisation_error",
+]
+# Of linear changes of a sheet's voltages, with a prior: see `jeit.design.layout_scores`.
+OPTIMALITY = ("information", "mean_variance", "largest_variance", "localisation_error")

@@ -1,0 +1,172 @@
+"""The tables of a study's file, key by key: what each may hold, from where to where, in which unit; lists are swept."""
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from jeit.design import defaults
+from jeit.design.skin.protocol import ProtocolName
+from jeit.design.skin.skin_tables import (
+    CELL,
+    CONDUCTIVITY,
+    CURRENT,
+    DIAMETER,
+    IMPEDANCE,
+    LAYERS,
+    PAIRS,
+    SIDE,
+    THICKNESS,
+)
+from jeit.design.study.scores import OPTIMALITY, ScoreName
+from jeit.files.schema import Number, Several, Table, Word, fault
+
+# Layouts, and points, that are made before anything runs: some milliseconds and some kilobytes each.
+_MOST_LAYOUTS, _MOST_POINTS = 2000, 100_000
+
+
+class MaterialSweep(Table):
+    """Of what the skins are."""
+
+    what = "a study"
+    model: Literal["sheet", "layer"] = "sheet"
+    width_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
+    height_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
+    thickness_mm: Annotated[list[float], THICKNESS] = Field(default=[1e3 * defaults.THICKNESS])
+    conductivity_S_per_m: Annotated[list[float], CONDUCTIVITY] = Field(default=[defaults.CONDUCTIVITY])
+
+    @model_validator(mode="after")
+    def _both_sides(self) -> "MaterialSweep":
+        given = {"width_mm", "height_mm"} & self.model_fields_set
+        if len(given) == 1:
+            raise fault("is given alone; give both skin.width_mm and skin.height_mm.", given.pop())
+        return self
+
+
+class LayoutSweep(Table):
+    """Of their electrodes. NaN is for the layout to say."""
+
+    what = "a study"
+    layouts: Several[Word]
+    diameter_mm: Annotated[list[float], DIAMETER] = Field(default=[math.nan])
+    contact_impedance_ohm_m2: Annotated[list[float], IMPEDANCE] = Field(default=[math.nan])
+    minimum_gap_mm: Annotated[float, Number(0, 1000, "mm")] = 0.0
+
+
+class MeasurementSweep(Table):
+    """Of what is measured of them."""
+
+    what = "a study"
+    protocol: Several[ProtocolName] = Field(default=[defaults.PROTOCOL])
+    pairs: Annotated[list[int], PAIRS] | None = None
+    current_mA: Annotated[float, CURRENT] = 1e3 * defaults.CURRENT
+    noise_V: Annotated[list[float], Number(1e-12, 1, "V")] = Field(default=[defaults.NOISE])
+
+
+class TouchTable(Table):
+    """Of where and how they are touched."""
+
+    what = "a study"
+    indentation: Literal["bell", "hemisphere"] = "bell"
+    depth_mm: Annotated[float, Number(0.01, 100, "mm")] = 1e3 * defaults.DEPTH
+    deviation_mm: Annotated[float, Number(0.1, 200, "mm")] = 1e3 * defaults.DEVIATION
+    diameter_mm: Annotated[float, Number(0.1, 200, "mm")] = 1e3 * defaults.BALL_DIAMETER
+    contrast: Annotated[float, Number(0, defaults.MOST_CONTRAST)] = defaults.CONTRAST
+    exact: bool = False
+    columns: Annotated[int, Number(1, 1000)] = defaults.STUDY_PLACES
+    rows: Annotated[int, Number(1, 1000)] = defaults.STUDY_PLACES
+
+
+class CellsSweep(Table):
+    """Of their meshes."""
+
+    what = "a study"
+    cell_mm: Annotated[list[float], CELL] = Field(default=[1e3 * defaults.CELL_SIZE])
+    layers: Annotated[int, LAYERS] = defaults.NUM_LAYERS
+
+
+class ScoresTable(Table):
+    """Of what is wanted."""
+
+    what = "a study"
+    wanted: Several[ScoreName] = Field(default=["minimum", "mean", "uniformity"])
+    num_taxels: Annotated[int, Number(1, 10_000)] = defaults.NUM_TAXELS
+    threshold: Annotated[float, Number(0.01, 0.99)] = defaults.THRESHOLD
+    correlation_mm: Annotated[float, Number(0.1, 1000, "mm")] = 1e3 * defaults.CORRELATION
+    seed: Annotated[int, Number(0, 2**31 - 1)] = 0
+
+
+class StudyTable(Table):
+    """Of a whole study."""
+
+    what = "a study"
+    name: Word = "study"
+    chunk_points: Annotated[int, Number(1, 4096)] = 16
+    skin: MaterialSweep = MaterialSweep()
+    electrodes: LayoutSweep = Field(default_factory=dict, validate_default=True)
+    measurement: MeasurementSweep = MeasurementSweep()
+    touch: TouchTable = TouchTable()
+    mesh: CellsSweep = CellsSweep()
+    scores: ScoresTable = ScoresTable()
+
+    @property
+    def num_layouts(self) -> int:
+        """How many layouts it makes."""
+        one = self.electrodes
+        return math.prod(map(len, (one.layouts, one.diameter_mm, one.contact_impedance_ohm_m2)))
+
+    @property
+    def num_points(self) -> int:
+        """How many points: every combination."""
+        skin, measurement = self.skin, self.measurement
+        of_points = (measurement.protocol, measurement.pairs or [0], measurement.noise_V, self.mesh.cell_mm)
+        return self.num_layouts * math.prod(map(len, (skin.thickness_mm, skin.conductivity_S_per_m, *of_points)))
+
+    def at(self, where: str) -> Any:
+        """The value of a key by its dotted name."""
+        section, name = where.split(".")
+        return getattr(getattr(self, section), name)
+
+    @model_validator(mode="after")
+    def _all_of_it_matters(self) -> "StudyTable":
+        for where, (other, words) in _NEEDS.items():
+            section, name = where.split(".")
+            there = self.at(other) if isinstance(self.at(other), list) else [self.at(other)]
+            if name in getattr(self, section).model_fields_set and not set(words) & set(there):
+                raise fault(
+                    f"has no effect: it applies where {other} is {' or '.join(map(repr, words))}, and that is "
+                    f"{', '.join(map(repr, there))}; leave it out, or change the other.",
+                    where,
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _few_enough(self) -> "StudyTable":
+        layouts, points = self.num_layouts, self.num_points
+        if layouts > _MOST_LAYOUTS:
+            raise fault(
+                f"makes {layouts:,} layouts with diameters and contact impedances, more than the {_MOST_LAYOUTS:,} of "
+                "a study; split it into several.",
+                "electrodes.layouts",
+            )
+        if points > _MOST_POINTS:
+            raise fault(
+                f"makes {points:,} points with the other lists, more than the {_MOST_POINTS:,} of a study; split it "
+                "into several.",
+                "electrodes.layouts",
+            )
+        return self
+
+
+# Keys without effect unless another has one of these words.
+_NEEDS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "mesh.layers": ("skin.model", ("layer",)),
+    "touch.deviation_mm": ("touch.indentation", ("bell",)),
+    "touch.diameter_mm": ("touch.indentation", ("hemisphere",)),
+    "measurement.pairs": ("measurement.protocol", ("two-terminal",)),
+    "measurement.noise_V": ("scores.wanted", ("blind_spot", *OPTIMALITY)),
+    "scores.num_taxels": ("scores.wanted", ("taxels",)),
+    "scores.threshold": ("scores.wanted", ("taxels",)),
+    "scores.seed": ("scores.wanted", ("taxels",)),
+    "scores.correlation_mm": ("scores.wanted", ("information", "mean_variance", "largest_variance")),
+}

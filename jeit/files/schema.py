@@ -1,0 +1,348 @@
+"""What a person writes into a file, as tables of keys with types, ranges and units; and all that is wrong, at once.
+
+A table is a class derived from `Table`, a line for each key:
+
+    class SkinTable(Table):
+        what = "a skin"
+        model: Literal["sheet", "layer"] = "sheet"
+        width_mm: Annotated[float, Number(5, 5000, "mm")]
+
+and `validated` makes one of what TOML or JSON hold. This module brings pydantic with it: readers import it when they
+read, not before.
+"""
+
+import math
+import re
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from numbers import Integral, Real
+from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, FailFast, Field, GetCoreSchemaHandler, ValidationError, model_validator
+from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
+
+from jeit.arguments import IN_MILLIMETRES, did_you_mean, told
+
+# Characters of a whole message, of a key and of names listed in it, at most; and how many faults are told.
+_LONGEST, _KEY, _NAMES, _FAULTS = 390, 40, 160, 4
+_LARGEST = sys.float_info.max
+
+
+class Table(BaseModel):
+    """Base of tables of keys: no other keys than those named, no text for a number, and no truth value either."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True, defer_build=True)
+
+    what: ClassVar[str] = "the file"
+    """What it describes, for messages: "a study"."""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _in_words(cls, given: Any, made: Callable[[Any], Any]) -> Any:
+        """Say what is wrong as a sentence that begins with the key."""
+        try:
+            return made(given)
+        except ValidationError as error:
+            faults = [
+                InitErrorDetails(type=fault(cls._said(one)), loc=_steps(one), input=0)
+                for one in error.errors(include_url=False)
+            ]
+            raise ValidationError.from_exception_data(cls.what, faults) from None
+
+    @classmethod
+    def _said(cls, one: Any) -> str:
+        given, context = one["input"], one.get("ctx", {})
+        match one["type"]:
+            case "fault":
+                return context["said"]
+            case "missing":
+                return "is missing; give it."
+            case "extra_forbidden":
+                known = [*cls.model_fields]
+                meant = did_you_mean(str(one["loc"][-1])[:_KEY], known)
+                return f"is no key of {cls.what}{meant}; there are {_few(known)}."
+            case "literal_error":
+                return not_among(given, re.findall("'([^']+)'", context["expected"]))
+            case "bool_type" if not isinstance(given, list):
+                return f"must be true or false, without quotes; it is {told(given)}."
+            case "bool_type":
+                return "takes one value, not a list: true or false."
+            case "string_type":
+                return f"must be text in quotes; it is {told(given)}."
+            case "string_too_short":
+                return "is empty text; write some."
+            case "string_too_long":
+                return f"is text of {len(given)} characters; write {context['max_length']} or fewer."
+            case "list_type":
+                return f"must be a list; it is {told(given)}."
+            case "too_short":
+                return f"has {context['actual_length']} things in it; give {context['min_length']} at least."
+            case "too_long":
+                return f"has more than the {context['max_length']} that it may."
+            case "model_type":
+                return f"must be a table, with keys of its own; it is {told(given)}."
+            case kind:
+                return f"is {told(given)}, which cannot be ({kind})."
+
+
+T = TypeVar("T", bound=Table)
+
+Word = Annotated[str, Field(min_length=1, max_length=200)]
+"""Text of a line."""
+Words = Annotated[list[Word], FailFast()]
+"""A list of it."""
+
+
+def fault(said: str, key: str = "") -> PydanticCustomError:
+    """What a check of a table raises: `said` of the `key` in it, or of the table, whose name goes before."""
+    return PydanticCustomError("fault", "{said}", {"said": said, "key": key})
+
+
+@dataclass(frozen=True)
+class Number:
+    """Of a key that is a number from `low` to `high`: whole, where its type is int. Where its type is a list it is
+    swept: one number, or a list of them, each once. `beyond`: what is said of larger numbers."""
+
+    low: float
+    high: float
+    unit: str = ""
+    beyond: str = ""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        swept = get_origin(source) is list
+        whole = (get_args(source)[0] if swept else source) is int
+
+        def read(given: Any) -> Any:
+            if swept:
+                return [self.read(one, whole, " or a list of them") for one in _listed(given)]
+            if isinstance(given, list):
+                raise fault("takes one value, not a list: it cannot be swept.")
+            return self.read(given, whole)
+
+        return core_schema.no_info_plain_validator_function(read)
+
+    def read(self, given: Any, whole: bool = False, otherwise: str = "") -> float:
+        """The number. Raises `fault`."""
+        if not _is_number(given, whole):
+            wanted = "a whole number" if whole else "a number"
+            raise fault(f"must be {wanted}{otherwise}, {self.span}; it is {told(given)}.")
+        if given > _LARGEST and math.isinf(self.high):
+            raise fault(f"is {told(given)}, beyond double precision.")
+        if not self.low <= given <= self.high:
+            shown = f"{given:g}" if isinstance(given, float) else told(given)
+            hint = f" {self.beyond}" if self.beyond and given > self.high else "" if whole else self._hint(given)
+            raise fault(f"is {shown}, and must be {self.span}.{hint}")
+        return int(given) if whole else float(given)
+
+    @property
+    def span(self) -> str:
+        """From where to where, and in which unit."""
+        low = "above 0" if 0 < self.low < 1e-300 else f"from {_plain(self.low)}"
+        high = " up" if low[0] == "f" else ""
+        high = high if math.isinf(self.high) else f" to {_plain(self.high)}"
+        return f"{low}{high}{f' {self.unit}' if self.unit else ''}"
+
+    def _hint(self, given: float) -> str:
+        """What a number would be that is off by a factor of 1000."""
+        if not self.unit or math.isinf(self.high) or abs(given) > 1e100:
+            return ""
+        for larger, metric in ((True, "metres"), (False, "micrometres")):
+            if not (self.low <= 1000 * given <= self.high if larger else self.low <= given / 1000 <= self.high):
+                continue
+            if self.unit == "m":
+                return "" if larger else f" {IN_MILLIMETRES.capitalize()}"
+            other = f"in {metric}" if self.unit == "mm" else "off by a factor of 1000"
+            return f" Is it {other}? Then write {1000 * given if larger else given / 1000:g}."
+        return ""
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Of a key that is an array of numbers from `low` to `high`, or of whole numbers or truth values, as `kind` says.
+
+    `axes`: how many along each axis, at least and at most. `single`: one number for all will do as well.
+    """
+
+    axes: tuple[tuple[int, float], ...]
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ""
+    kind: type = float
+    single: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self._read)
+
+    def _read(self, given: Any) -> np.ndarray:
+        given = given.tolist() if isinstance(given, np.ndarray) else given
+        if self.single and not isinstance(given, (list, tuple)):
+            number = Number(self.low, self.high, self.unit)
+            return np.asarray(number.read(given, self.kind is int, f" or a list, {self._counts}"))
+        rows = self._counted(given, 0) if len(self.axes) == 2 else [given]
+        for row in rows:
+            if len(self._counted(row, -1)) != len(rows[0]):
+                raise fault(f"must be {self._wanted}; it has rows of {len(rows[0])} and of {len(row)}.")
+        wrong = next((item for row in rows for item in row if not self._right(item)), None)
+        if wrong is not None:
+            raise fault(f"must be {self._wanted}; it has {told(wrong)} in it.")
+        return np.array(given, self.kind)
+
+    def _counted(self, given: Any, axis: int) -> Any:
+        if not isinstance(given, (list, tuple)):
+            raise fault(
+                f"must be {self._wanted}; {'it is' if axis == 0 or len(self.axes) == 1 else 'a row is'} {told(given)}."
+            )
+        least, most = self.axes[axis]
+        if not least <= len(given) <= most:
+            raise fault(
+                f"must be {self._wanted}; it has {len(given)}{' in a row' if axis and len(self.axes) == 2 else ''}."
+            )
+        return given
+
+    def _right(self, item: Any) -> bool:
+        if self.kind is bool:
+            return isinstance(item, bool)
+        return _is_number(item, self.kind is int) and max(self.low, -_LARGEST) <= item <= min(self.high, _LARGEST)
+
+    @property
+    def _counts(self) -> str:
+        return " × ".join(
+            str(least) if least == most else f"{least} or more" if math.isinf(most) else f"{least} to {most:g}"
+            for least, most in self.axes
+        )
+
+    @property
+    def _wanted(self) -> str:
+        name = {float: "numbers", int: "whole numbers", bool: "true or false"}[self.kind]
+        unbounded = math.isinf(self.low)
+        return f"{self._counts} {name}{'' if unbounded else f', {Number(self.low, self.high, self.unit).span}'}"
+
+
+class Swept:
+    """Of a key that is a list, each thing in it once; what is no list stands for a list of one."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        def read(given: Any, inner: Callable[[list], list]) -> list:
+            if isinstance(given, list):
+                return inner(_listed(given))
+            try:
+                return inner([given])
+            except ValidationError as error:
+                one = error.errors(include_url=False)[0]
+                alone = InitErrorDetails(type=one["type"], loc=one["loc"][1:], input=given, ctx=one.get("ctx", {}))
+            raise ValidationError.from_exception_data("", [alone])
+
+        return core_schema.no_info_wrap_validator_function(read, handler(source))
+
+
+Item = TypeVar("Item")
+Several = Annotated[list[Item], FailFast(), Swept()]
+"""A list of things, each once, or one of them."""
+
+
+class OneOf:
+    """Of a key that is one of several tables, as the word under `key` in it says; one that has a default for the word
+    is meant where there is none, and `other` where there is `mark`."""
+
+    def __init__(self, key: str, *tables: type[Table], mark: str = "", other: type[Table] | None = None):
+        self.key, self.mark, self.other = key, mark, other
+        self.tables = {word: one for one in tables for word in get_args(one.model_fields[key].annotation)}
+        self.usual = next((one for one in tables if not one.model_fields[key].is_required()), None)
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self._read)
+
+    def _read(self, given: Any) -> Table:
+        if not isinstance(given, Mapping):
+            raise fault(f"must be a table, with keys of its own; it is {told(given)}.")
+        if self.other is not None and self.mark in given:
+            return self.other.model_validate(given)
+        if self.key not in given:
+            if self.usual is None:
+                end = f", or {self.mark}" if self.mark else ""
+                raise fault(f"is missing; give it, one of {_few(self.tables)}{end}.", self.key)
+            return self.usual.model_validate(given)
+        word = given[self.key]
+        if not (isinstance(word, str) and word in self.tables):
+            raise fault(not_among(word, self.tables), self.key)
+        return self.tables[word].model_validate(given)
+
+
+def validated(table: type[T], given: Any, origin: str) -> T:
+    """What is `given`, checked as a whole. Raises one `ValueError` that begins with `origin`, the file's name, and has
+    a sentence on each key at fault, or on some of them, in 400 characters at most."""
+    try:
+        return table.model_validate(given)
+    except ValidationError as error:
+        faults = error.errors(include_url=False, include_input=False)
+    raise ValueError(told_faults(origin, [f"{_place(_steps(one))}{one['msg']}" for one in faults]))
+
+
+def told_faults(origin: str, sentences: list[str]) -> str:
+    """One message of several `sentences` about the file `origin`: the first, and more as far as there is room."""
+    message = _cut(f"{_cut(origin, 2 * _KEY)}: {sentences[0]}", _LONGEST - 20)
+    shown = 1
+    for one in sentences[1:_FAULTS]:
+        if len(message) + len(one) > _LONGEST - 20:
+            break
+        message += f" {one}"
+        shown += 1
+    return f"{message} And {len(sentences) - shown} more." if len(sentences) > shown else message
+
+
+def not_among(given: Any, words: Iterable[str]) -> str:
+    """What is said of a word that is none of `words`."""
+    known = [*words]
+    meant = did_you_mean(given[:_KEY] if isinstance(given, str) else given, known)
+    return f"must be one of {_few(known)}; it is {told(given)}{meant}."
+
+
+def _steps(one: Any) -> tuple[int | str, ...]:
+    """Where a fault is."""
+    key = one.get("ctx", {}).get("key")
+    return (*one["loc"], key) if key else one["loc"]
+
+
+def _place(steps: tuple[int | str, ...]) -> str:
+    """The key that a fault is about, as it would be asked for: microphones[3].b."""
+    said = ""
+    for step in steps:
+        said += f"[{step}]" if isinstance(step, int) else f"{'.' if said else ''}{_key(step)}"
+    return f"{said} " if said else ""
+
+
+def _key(name: str) -> str:
+    short = _cut(name, _KEY)
+    return short if re.fullmatch(r"[\w.-]+…?", short) else repr(short)
+
+
+def _listed(given: Any) -> list:
+    """A swept key's values."""
+    if not isinstance(given, list):
+        return [given]
+    if not given:
+        raise fault("is an empty list; give one value at least.")
+    plain = [one for one in given if isinstance(one, (str, Real))]
+    if len(set(plain)) < len(plain):
+        raise fault("lists a value twice; give each once.")
+    return given
+
+
+def _is_number(given: Any, whole: bool) -> bool:
+    if isinstance(given, bool) or not isinstance(given, Integral if whole else Real):
+        return False
+    return not isinstance(given, float) or math.isfinite(given)
+
+
+def _plain(number: float) -> str:
+    return str(number) if isinstance(number, int) else f"{number:g}"
+
+
+def _few(names: Iterable[str]) -> str:
+    return _cut(", ".join(names), _NAMES)
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most - 1]}…"
