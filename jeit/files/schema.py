@@ -11,6 +11,7 @@ and `validated` makes one of what TOML or JSON hold. This module brings pydantic
 read, not before.
 """
 
+import itertools
 import math
 import re
 import sys
@@ -28,6 +29,8 @@ from jeit.arguments import IN_MILLIMETRES, did_you_mean, told
 # Characters of a whole message, of a key and of names listed in it, at most; and how many faults are told.
 _LONGEST, _KEY, _NAMES, _FAULTS = 390, 40, 160, 4
 _LARGEST = sys.float_info.max
+# Keys of a table that are looked at though they are not known.
+_UNKNOWN = 100
 
 
 class Table(BaseModel):
@@ -42,6 +45,10 @@ class Table(BaseModel):
     @classmethod
     def _in_words(cls, given: Any, made: Callable[[Any], Any]) -> Any:
         """Say what is wrong as a sentence that begins with the key."""
+        if isinstance(given, Mapping) and len(given) > len(cls.model_fields) + _UNKNOWN:
+            # Each of a million would be told.
+            unknown = itertools.islice((key for key in given if key not in cls.model_fields), _UNKNOWN)
+            given = {key: given[key] for key in [*(key for key in cls.model_fields if key in given), *unknown]}
         try:
             return made(given)
         except ValidationError as error:

@@ -261,9 +261,9 @@ COMMANDS = {
         "--rule must be one of gcv, l-curve",
     ),
     "no description": (lambda t: with_data(t, t.touched, description=None)[:2], "nothing says what they mean"),
-    "description is no TOML": (lambda t: spoilt(t, "[geometry]", "[geometry"), "not valid TOML"),
-    "unknown key": (lambda t: spoilt(t, "radius", "diameter"), "no 'diameter'"),
-    "negative radius": (lambda t: spoilt(t, "radius = 0.1", "radius = -0.1"), "positive length"),
+    "description is no TOML": (lambda t: spoilt(t, "[geometry]", "[geometry"), "is no TOML file"),
+    "unknown key": (lambda t: spoilt(t, "radius", "diameter"), "geometry.diameter is no key of a disk"),
+    "negative radius": (lambda t: spoilt(t, "radius = 0.1", "radius = -0.1"), "geometry.radius is -0.1, and must be"),
     "no geometry": (
         lambda t: spoilt(
             t, t.description.split("[protocol]")[0], f"[electrodes]\nkind = 'point'\npositions = {POINTS}\n"

@@ -77,6 +77,8 @@ def test_refused_before_it_is_made(protocol, message):
         ("[0-9]{current}uA*", "30uA.csv", None),
         ("*{current}uA*", "uA.csv", None),
         ("a*a{current}", "a1", None),
+        ("*aa*aa*{current}", "aaa1", None),
+        ("*aa*aa*{current}", "aaaa1", 1),
     ],
 )
 def test_a_current_in_a_name(pattern, name, number):

