@@ -11,6 +11,7 @@ from jeit.arguments.keys import check_key
 from jeit.arguments.kinds import check_kind, is_number, told
 from jeit.arguments.lengths import IN_MILLIMETRES, check_metres
 from jeit.arguments.names import check_name, did_you_mean, listed
+from jeit.arguments.readings import readings
 from jeit.arguments.traced import check_has_values
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "is_number",
     "listed",
     "percent",
+    "readings",
     "real_array",
     "told",
 ]

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from jeit.arguments import readings
 from jeit.data import table
 from jeit.data.description import Description, TableLayout
 from jeit.files import npz_arrays
@@ -83,8 +84,7 @@ def _checked(name: str, given: np.ndarray, channels: int) -> Float[np.ndarray, "
         raise ValueError(f"{name} have shape {given.shape}; give one row for each frame, of {channels} channels.")
     if not len(given):
         raise ValueError(f"{name}: there is none.")
-    values = given.astype(float)
-    return np.where(np.isfinite(values), values, np.nan)
+    return readings(given.astype(float))
 
 
 def _times(given: np.ndarray, name: str, number: int) -> Float[np.ndarray, " F"]:

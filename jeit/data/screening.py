@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
+from jeit.arguments import readings
 from jeit.data.electrode_order import order_note
 from jeit.data.measurement import Measurement
 from jeit.electrodes import AbstractElectrodes
@@ -33,8 +34,8 @@ def screen(
 
     Noted too are electrodes that are not numbered as they follow each other along the edge.
 
-    Masked are: what `mask` (True = usable) excludes; NaN and infinity; saturated voltages (at or beyond
-    `saturation` volts, or, when that is not given, stuck at exactly the same extreme value); drives that read
+    Masked are: what `mask` (True = usable) excludes; NaN, infinity and more than 1e12 V; saturated voltages (at or
+    beyond `saturation` volts, or, when that is not given, stuck at exactly the same extreme value); drives that read
     nothing at all, because their current never flowed, and what reads an electrode of which that holds for all its
     drives; and frames that are all zero.
 
@@ -55,9 +56,8 @@ def screen(
         if given.dtype != bool:
             raise ValueError(f"mask is {given.dtype}; give booleans, True where a voltage is usable.")
         exclude(~given, "excluded by the mask given.")
-    finite = np.isfinite(values)
-    values = np.where(finite, values, np.nan)
-    exclude(~finite, "NaN or infinite (an electrode missing or not connected).")
+    values = readings(values)
+    exclude(np.isnan(values), "NaN, infinite or beyond any instrument (an electrode missing or not connected).")
     dead = ~np.any(np.where(usable, values, 0) != 0, axis=1)
     if dead.all():
         raise ValueError(

@@ -214,6 +214,10 @@ def _own_protocol(arrays: dict[str, np.ndarray]) -> Protocol | None:
 
 def _with_words(described: Description, arrays: dict[str, np.ndarray]) -> Description:
     """With the frames' names, where the description has none, and the notes of a file of `write_table`."""
-    names = described.layout.frame_names or tuple(str(one) for one in arrays.get("frame_names", ()))
-    notes = (*described.notes, *(str(one) for one in arrays.get("notes", ())))
+    names = described.layout.frame_names or _texts(arrays, "frame_names")
+    notes = (*described.notes, *_texts(arrays, "notes"))
     return replace(described, layout=replace(described.layout, frame_names=names), notes=notes)
+
+
+def _texts(arrays: dict[str, np.ndarray], name: str) -> tuple[str, ...]:
+    return tuple(str(one) for one in np.ravel(arrays.get(name, np.zeros(0))))

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from jeit.arguments import readings
 from jeit.files import need, npz_arrays
 
 # No skin is known that is longer: its coordinates would be in millimetres.
@@ -133,7 +134,8 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 
 def check_frames(name: str, given) -> Float[np.ndarray, "N M"]:
-    """Frames (N, M) as numbers, infinite ones as NaN; raises `ValueError` for anything else."""
+    """Frames (N, M) as numbers, infinite ones and those beyond any instrument as NaN; raises `ValueError` for what is
+    none."""
     try:
         frames = np.asarray(given)
     except ValueError:
@@ -143,8 +145,7 @@ def check_frames(name: str, given) -> Float[np.ndarray, "N M"]:
             f"{name} is {frames.dtype} of shape {frames.shape}; give real numbers, (frames, channels), one row for "
             "each frame."
         )
-    frames = frames.astype(float)
-    return np.where(np.isfinite(frames), frames, np.nan)
+    return readings(frames.astype(float))
 
 
 def check_reference(given, frames) -> Float[np.ndarray, "N M"]:
