@@ -25,15 +25,35 @@ def exact(model, conductivity) -> Exact:
     """Of a model with a conductivity per cell (m,), S/m (2-D: S)."""
     with localcontext() as context:
         context.prec = DIGITS
-        gradient, measure = _gradients(model.mesh)
-        conductivity, cells = _decimal(np.asarray(conductivity)), np.asarray(model.mesh.cells)
-        fields, impedance = _solved(model, cells, gradient, measure * conductivity)
-        drive, measurement = _decimal(np.asarray(model.protocol.drive)), _decimal(np.asarray(model.protocol.measurement))
-        driven, measured = np.asarray(model.protocol.drive_index), np.asarray(model.protocol.measurement_index)
-        voltages = (measurement @ impedance @ drive.T)[measured, driven]
+        fields, impedance, gradient, measure = _of(model, conductivity)
+        drive, measurement, driven, measured = _protocol(model)
+        cells = np.asarray(model.mesh.cells)
         flow = [_along(fields @ patterns.T, cells, gradient) for patterns in (drive, measurement)]
-        product = (flow[0][:, :, driven] * flow[1][:, :, measured]).sum(axis=1)
-        return Exact(*(np.asarray(one, float) for one in (voltages, impedance, -(measure[:, None] * product).T)))
+        jacobian = -measure[:, None] * (flow[0][:, :, driven] * flow[1][:, :, measured]).sum(axis=1)
+        voltages = (measurement @ impedance @ drive.T)[measured, driven]
+        return Exact(*(np.asarray(one, float) for one in (voltages, impedance, jacobian.T)))
+
+
+def exact_change(model, before, after) -> np.ndarray:
+    """Of the voltages (M,), from one conductivity per cell (m,) to another, S/m (2-D: S)."""
+    with localcontext() as context:
+        context.prec = DIGITS
+        first, second = (_of(model, one)[1] for one in (before, after))
+        drive, measurement, driven, measured = _protocol(model)
+        return np.asarray((measurement @ (second - first) @ drive.T)[measured, driven], float)
+
+
+def _protocol(model):
+    protocol = model.protocol
+    indices = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
+    return _decimal(np.asarray(protocol.drive)), _decimal(np.asarray(protocol.measurement)), *indices
+
+
+def _of(model, conductivity):
+    """Fields, Z, and the gradients and measures of the cells."""
+    gradient, measure = _gradients(model.mesh)
+    weight = measure * _decimal(np.asarray(conductivity))
+    return *_solved(model, np.asarray(model.mesh.cells), gradient, weight), gradient, measure
 
 
 def _gradients(mesh):
