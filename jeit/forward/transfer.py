@@ -55,7 +55,7 @@ def transfer_impedance(mesh: Mesh, conductivity: ArrayLike, electrodes: Abstract
 
 
 def impedance_parts(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> ElectrodeImpedance:
-    """The same in its two parts."""
+    """The same in its two parts; `conductivity` in S/m (2-D: S)."""
     formula = _quadratic if namespace(mesh, conductivity, electrodes) is np else _differentiable
     return formula(mesh, conductivity, electrodes, system)
 
