@@ -22,6 +22,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 from jeit.start import keep_compiled_code as _keep_compiled_code
+from jeit.start import refuse_compiled_code_in_forks as _refuse_compiled_code_in_forks
 from jeit.start import take_double_precision as _take_double_precision
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 _take_double_precision()
 _keep_compiled_code()
+_refuse_compiled_code_in_forks()
 
 _ROOMS = (
     "acoustic",

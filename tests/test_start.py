@@ -117,3 +117,23 @@ def test_a_relative_cache_folder_is_not_taken(monkeypatch):
 
 def test_double_precision_unless_told_otherwise():
     assert jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize(("told", "said"), [("0", True), ("false", True), ("1", False), (None, False)])
+def test_single_precision_is_warned_of(told, said):
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_ENABLE_X64"}
+    environment |= {} if told is None else {"JAX_ENABLE_X64": told}
+    program = "import jax, jeit; assert jax.config.jax_enable_x64 == " + str(not said)
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert ("wrong by 1e-5 of the largest" in done.stderr) == said
+
+
+def test_single_precision_that_jax_has_been_told_of_is_taken_for_its_default():
+    """JAX does not say whether it was told; so a False before the import does not last, as docs/conventions.md says."""
+    program = (
+        "import jax; jax.config.update('jax_enable_x64', False); import jeit; assert jax.config.jax_enable_x64; "
+        "jax.config.update('jax_enable_x64', False); assert jax.numpy.ones(1).dtype == 'float32'"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr

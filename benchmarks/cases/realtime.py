@@ -120,7 +120,7 @@ def breakdown(imager) -> list[tuple[str, float, float]]:
     start, mesh = imager.start, model.mesh
     conductivity = inversion.conductivity(start)
     contact = model.electrodes.contact(mesh)
-    operator = model.system.operator(mesh, cell_conductivity(mesh, conductivity), model.electrodes, contact)
+    operator, load = model.system.grounded(mesh, cell_conductivity(mesh, conductivity), model.electrodes, contact)
     plan = model.system.solver.plan
     factor = factorise(plan, operator.values)
     residual, jacobian = jax.jit(type(inversion).linearise)(inversion, start)
@@ -134,7 +134,7 @@ def breakdown(imager) -> list[tuple[str, float, float]]:
     forward = 4 * m * patterns * electrodes + 4 * r * m + plan.num_operations
     parts = [
         ("factorise", _median(jax.jit(factorise), plan, operator.values), plan.num_operations),
-        ("solve", _median(jax.jit(solve), plan, factor, contact.load), 4 * plan.num_factor_entries * electrodes),
+        ("solve", _median(jax.jit(solve), plan, factor, load), 4 * plan.num_factor_entries * electrodes),
         ("voltages and Jacobian, those two included", _median(everything, inversion, conductivity), forward),
         ("Jacobian times the prior's shapes", _median(restrict, inversion.basis, full), r * m * n),
         ("normal equations and step", _median(step, residual, jacobian, start, inversion.data), 2 * r * r * n + r**3),

@@ -19,8 +19,8 @@ class PlainTouches:
 
         mesh = model.mesh
         contact = model.electrodes.contact(mesh)
-        operator = model.system.operator(mesh, conductivity, model.electrodes, contact)
-        self.load = np.asarray(contact.load)
+        operator, load = model.system.grounded(mesh, conductivity, model.electrodes, contact)
+        self.load = np.asarray(load)
         self.cells = np.asarray(mesh.cells)
         packed = np.asarray(stiffness(mesh, conductivity))
         rows, columns = np.tril_indices(self.cells.shape[1])
@@ -35,9 +35,7 @@ class PlainTouches:
         """Of the protocol, from a matrix of stiffness and contacts."""
         factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         product = self.load.T @ factor.solve(self.load)
-        schur = np.diag(self.load.sum(axis=0)) - product
-        count = len(schur)
-        impedance = np.linalg.inv(schur + np.trace(schur) / count**2)
+        impedance = np.linalg.inv((np.diag(self.load.sum(axis=0)) - product)[:-1, :-1])  # against the ground
         table = self.measurement @ impedance @ self.drive.T
         return table[self.protocol.measurement_index, self.protocol.drive_index]
 

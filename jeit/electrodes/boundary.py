@@ -79,14 +79,19 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         xp = namespace(self, mesh)
         start, end = _covered(self.position, self.width, mesh)
         length = facet_measures(mesh)[:, None]
-        # Basis functions on an edge: φ_1 = t / length, φ_0 = 1 - φ_1; these are their integrals over [start, end].
-        one = end - start
-        first = (end**2 - start**2) / (2 * length)
-        second = (end**3 - start**3) / (3 * length**2)
+        # Basis functions on an edge are φ_1 = t / length and φ_0 = 1 - φ_1. Simpson's rule is exact for their products
+        # over [start, end], and sums nothing but positive terms: what an electrode hardly covers keeps all its digits.
+        after = xp.stack([start, (start + end) / 2, end]) / length
+        before = 1 - after
+        share = (end - start) * np.array([1.0, 4.0, 1.0], start.dtype)[:, None, None, None] / 6
+
         # Over the turns, (b, L), written out: XLA makes a slow matrix product of a sum over so short an axis.
-        one, first, second = (integral[0] + integral[1] + integral[2] for integral in (one, first, second))
-        phi = xp.stack([one - first, first])
-        phi_phi = xp.stack([one - 2 * first + second, first - second, second])
+        def integral(values):
+            values = share[0] * values[0] + share[1] * values[1] + share[2] * values[2]
+            return values[0] + values[1] + values[2]
+
+        phi = xp.stack([integral(before), integral(after)])
+        phi_phi = xp.stack([integral(before**2), integral(before * after), integral(after**2)])
         admittance = 1 / self.contact_impedance
         entries = phi_phi @ admittance  # (3, b)
         mass = xp.stack([entries[:2], entries[1:]]).transpose(2, 0, 1)

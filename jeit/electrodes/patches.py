@@ -111,7 +111,9 @@ def _frames(mesh: Mesh, position):
     """Unit vectors (L, 3) at each electrode: normal of the nearest facet, across, and up. Not differentiated."""
     xp = namespace(mesh, position)
     centres = mesh.points[mesh.facets].mean(axis=1)
-    nearest = xp.argmin(xp.sum((position[:, None] - centres) ** 2, axis=-1), axis=1)
+    apart = xp.sum((position[:, None] - centres) ** 2, axis=-1)
+    # The first of those that are equally near, whatever the unit of length rounds to.
+    nearest = xp.argmax(apart <= (1 + 1e-9) * apart.min(axis=1, keepdims=True), axis=1)
     normal = facet_normals(mesh)[nearest]
     horizontal = abs(normal[:, 2:]) > 0.9
     upward = xp.where(horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(normal.dtype)

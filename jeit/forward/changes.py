@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.forward.assembly import field_gradients
-from jeit.forward.model import ForwardModel, evaluate, fields_of, select_channels
+from jeit.forward.model import ForwardModel, channel_voltages, evaluate, fields_and_impedance_of, select_channels
+from jeit.forward.transfer import ElectrodeImpedance
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
@@ -21,17 +22,17 @@ class Change(NamedTuple):
 
 
 class SolvedFields(NamedTuple):
-    """**Fields**: `mesh` and `protocol` of a model; `fields` F (n, L) and `impedance` Z (L, L), ohms; all in NumPy."""
+    """**Fields**: `mesh` and `protocol` of a model; `fields` F (n, L) and `impedance`, ohms; all in NumPy."""
 
     mesh: Mesh
     protocol: Protocol
     fields: Float[np.ndarray, "n L"]
-    impedance: Float[np.ndarray, "L L"]
+    impedance: ElectrodeImpedance
 
     @property
     def voltages(self) -> Float[np.ndarray, " M"]:
         """Voltages of the channels (M,)."""
-        return select_channels(self.protocol, self.impedance)  # pyright: ignore[reportReturnType]
+        return channel_voltages(self.protocol, self.impedance)  # pyright: ignore[reportReturnType]
 
     def derivatives(self, changes: Sequence[Change]) -> Float[np.ndarray, "M n"]:
         """Their derivatives by the coefficients of all `changes`: each -∫ dσ ∇u_drive · ∇u_measure, worked out for
@@ -43,7 +44,7 @@ class SolvedFields(NamedTuple):
 
 def solved_fields(model: ForwardModel, conductivity: Float[np.ndarray, " m"]) -> SolvedFields:
     """The fields of a model for a `conductivity` per cell, S/m (2-D: S); checks nothing."""
-    fields, impedance = evaluate(model, fields_of, conductivity)
+    fields, impedance = evaluate(model, fields_and_impedance_of, conductivity)
     return SolvedFields(*on_host((model.mesh, model.protocol, fields, impedance)))
 
 

@@ -17,7 +17,7 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.forward.assembly import check_conductivity, field_gradients
 from jeit.forward.integrated import IntegratedModel, host_model, integrated_model
 from jeit.forward.system import System
-from jeit.forward.transfer import electrode_fields, solved_system, transfer_impedance
+from jeit.forward.transfer import ElectrodeImpedance, electrode_fields, impedance_parts, solved_system
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 from jeit_solvers import SparseCholesky, in_turn
@@ -180,19 +180,33 @@ def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
     return gather(table.reshape(-1), protocol.measurement_index * len(driven) + protocol.drive_index)
 
 
+def channel_voltages(protocol: Protocol, impedance: ElectrodeImpedance) -> Inexact[Array, " M"]:
+    """Voltages of the channels; what contacts add, only where current is read that goes through them."""
+    across = select_channels(protocol, namespace(impedance.contact).diag(impedance.contact))
+    return select_channels(protocol, impedance.body) + across
+
+
 def transfer_impedance_of(model: ForwardModel | IntegratedModel, conductivity):
     """Z (L, L) in ohms, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
-    return transfer_impedance(model.mesh, conductivity, model.electrodes, model.system)
+    return impedance_parts(model.mesh, conductivity, model.electrodes, model.system).transfer
 
 
 def voltages_of(model: ForwardModel | IntegratedModel, conductivity):
     """Voltages (M,) of the channels, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
-    return select_channels(model.protocol, transfer_impedance_of(model, conductivity))
+    impedance = impedance_parts(model.mesh, conductivity, model.electrodes, model.system)
+    return channel_voltages(model.protocol, impedance)
 
 
 def fields_of(model: ForwardModel | IntegratedModel, conductivity):
     """F (n, L) and Z (L, L) in ohms, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
     return electrode_fields(model.mesh, conductivity, model.electrodes, model.system)
+
+
+def fields_and_impedance_of(model: ForwardModel | IntegratedModel, conductivity):
+    """F (n, L) in ohms, against a reference near the body, and the `ElectrodeImpedance`, of a `conductivity` in S/m
+    (2-D: S); for `evaluate`."""
+    solved = solved_system_of(model, conductivity)
+    return solved.fields()[0], solved.impedance()
 
 
 def solved_system_of(model: ForwardModel | IntegratedModel, conductivity):
@@ -209,7 +223,7 @@ def voltages_and_jacobian_of(model: ForwardModel | IntegratedModel, conductivity
     """Voltages (M,) and their Jacobian (M, m), of a `conductivity` in S/m (2-D: S); for `evaluate`."""
     mesh, protocol, jacobian = model.mesh, model.protocol, host.zeros(())
     xp = namespace(conductivity, mesh)
-    fields, impedance = fields_of(model, conductivity)
+    fields, impedance = fields_and_impedance_of(model, conductivity)
     # One product for all patterns and axes: it also keeps XLA from computing the gradients anew for every channel.
     patterns = xp.concatenate([-protocol.drive, protocol.measurement])
     gradient = field_gradients(mesh, fields)
@@ -224,13 +238,14 @@ def voltages_and_jacobian_of(model: ForwardModel | IntegratedModel, conductivity
         shape = mesh.num_points, protocol.num_measurements
         corners = [sum_into(shape, mesh.cells[:, k], per_corner) for k in range(mesh.cells.shape[1])]
         jacobian = functools.reduce(operator.add, corners).T
-    return select_channels(protocol, impedance), jacobian
+    return channel_voltages(protocol, impedance), jacobian
 
 
 _COMPILED = {
     transfer_impedance_of: jax.jit(transfer_impedance_of),
     voltages_of: jax.jit(voltages_of),
     fields_of: jax.jit(fields_of),
+    fields_and_impedance_of: jax.jit(fields_and_impedance_of),
     solved_system_of: jax.jit(solved_system_of),
     potentials_of: jax.jit(potentials_of),
     voltages_and_jacobian_of: jax.jit(in_turn(voltages_and_jacobian_of)),

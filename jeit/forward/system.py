@@ -54,17 +54,24 @@ class System(eqx.Module):
                 raise ValueError(f"solver must be 'auto', 'cholesky', 'cg' or a lineax solver, not '{solver}'.")
         return cls(pattern, solver)
 
-    def operator(self, mesh: Mesh, conductivity, electrodes: AbstractElectrodes, contact: Contact) -> SparseSymmetric:
-        """The symmetric positive-definite matrix A of stiffness and contact mass, (n, n) in siemens.
+    def grounded(
+        self, mesh: Mesh, conductivity, electrodes: AbstractElectrodes, contact: Contact
+    ) -> tuple[SparseSymmetric, Inexact[Array, "n c"]]:
+        """The symmetric positive-definite matrix A of stiffness, contact mass and ground, (n, n) in siemens, and the
+        loads of the electrodes, and of the ground where these are not points (n, L + 1).
 
         `conductivity` per cell, S/m (2-D: S).
         """
-        packed = stiffness(mesh, conductivity)
-        mass = grounded_mass(electrodes, contact, packed)
-        return SparseSymmetric(self.pattern.assemble(packed, *mass), self.pattern)
+        nothing = (None,) * len(contact.mass)
+        conducted = self.pattern.assemble(stiffness(mesh, conductivity), *nothing)
+        ground = ground_conductance(self.pattern.diagonal(conducted), contact.load)
+        values = conducted if electrodes.is_point else conducted + self.pattern.assemble(None, *contact.mass)
+        values = values + namespace(values).concatenate([ground, np.zeros(len(values) - len(ground))])
+        load = contact.load if electrodes.is_point else with_ground(contact.load, ground)
+        return SparseSymmetric(values, self.pattern), load
 
-    def solve(self, operator: SparseSymmetric, load: Inexact[Array, "n L"]) -> Inexact[Array, "n L"]:
-        """A⁻¹ load, one column per electrode. Differentiable by the implicit rule, whichever solver."""
+    def solve(self, operator: SparseSymmetric, load: Inexact[Array, "n c"]) -> Inexact[Array, "n c"]:
+        """A⁻¹ load, one column per load. Differentiable by the implicit rule, whichever solver."""
         load = load.astype(operator.values.dtype)
         if isinstance(self.solver, SparseCholesky) and isinstance(load, np.ndarray):
             return solve(self.solver.plan, factorise(self.solver.plan, operator.values), load)
@@ -86,7 +93,7 @@ class System(eqx.Module):
 
         return jax.vmap(column, in_axes=1, out_axes=1)(load)
 
-    def quadratic_form(self, operator: SparseSymmetric, load: Inexact[Array, "n L"]) -> Inexact[Array, "L L"]:
+    def quadratic_form(self, operator: SparseSymmetric, load: Inexact[Array, "n c"]) -> Inexact[Array, "c c"]:
         """loadᵀ A⁻¹ load; half the work of `solve` where there is a factor."""
         load = load.astype(operator.values.dtype)
         if isinstance(self.solver, SparseCholesky):
@@ -94,11 +101,18 @@ class System(eqx.Module):
         return load.T @ self.solve(operator, load)
 
 
-def grounded_mass(electrodes: AbstractElectrodes, contact: Contact, packed) -> tuple[Inexact[Array, "q k k"], ...]:
-    """Contact mass of the electrodes; or for point electrodes, which leave the constant potential free, a conductance
-    to ground at node 0 that fixes it. Currents that sum to zero send nothing through it, so its size does not matter:
-    it is of the order of the `packed` stiffness."""
-    if not electrodes.is_point:
-        return contact.mass
-    level = undifferentiated(abs(packed[-1]).mean())
-    return (namespace(packed).full((1, 1, 1), level, packed.dtype),)
+def ground_conductance(stiffness: Inexact[Array, " n"], load: Inexact[Array, "n L"]) -> Inexact[Array, " n"]:
+    """A conductance (n,) to ground at one node under an electrode, of the order of the `stiffness` (n,) there.
+
+    Currents that sum to zero send nothing through it, so it changes nothing; but the constant potential, which contacts
+    that are all but open leave free, and point electrodes altogether, is fixed by it. Not differentiated.
+    """
+    xp = namespace(stiffness, load)
+    stiffness = undifferentiated(abs(stiffness))
+    node = xp.argmax(xp.where((undifferentiated(load) != 0).any(axis=1), stiffness, 0))
+    return xp.where(np.arange(len(stiffness)) == node, stiffness, 0)
+
+
+def with_ground(load: Inexact[Array, "n L"], ground: Inexact[Array, " n"]) -> Inexact[Array, "n c"]:
+    """Loads of electrodes and, the last, of a `ground` (n,), (n, L + 1)."""
+    return namespace(load, ground).concatenate([load, ground[:, None]], axis=1)

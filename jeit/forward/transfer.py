@@ -25,7 +25,24 @@ from jeit.forward.assembly import cell_conductivity, field_gradients
 from jeit.forward.system import System
 from jeit.mesh import Mesh
 from jeit_solvers import NearInverse, SparseSymmetric, Strips, near_inverse, symmetric_inverse
-from jeit_solvers.engines import namespace
+from jeit_solvers.engines import namespace, undifferentiated
+
+
+class ElectrodeImpedance(NamedTuple):
+    """Z, but for what currents that sum to zero do not see, in two parts: a contact that is all but open has a
+    resistance beside which what the body adds would be lost.
+
+    **Fields**: `body` (L, L), the mean potentials under the electrodes for unit currents, and `contact` (L,), what
+    contacts add to the potential of their own electrode, z / |e|, zeros for point electrodes; ohms.
+    """
+
+    body: Inexact[Array, "L L"]
+    contact: Inexact[Array, " L"]
+
+    @property
+    def transfer(self) -> Inexact[Array, "L L"]:
+        """Z (L, L): the mean of every row and column is zero."""
+        return centred(self.body + namespace(self.body).diag(self.contact))
 
 
 def transfer_impedance(mesh: Mesh, conductivity: ArrayLike, electrodes: AbstractElectrodes, system: System):
@@ -34,29 +51,38 @@ def transfer_impedance(mesh: Mesh, conductivity: ArrayLike, electrodes: Abstract
     `conductivity` in S/m (2-D: S), (m,), (n,) or (m, d, d). Rows and columns of Z sum to zero, i.e. the mean electrode
     potential is the reference. Symmetric. Checks nothing: `ForwardModel.transfer_impedance` does.
     """
+    return impedance_parts(mesh, conductivity, electrodes, system).transfer
+
+
+def impedance_parts(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> ElectrodeImpedance:
+    """The same in its two parts; `conductivity` in S/m (2-D: S)."""
     formula = _quadratic if namespace(mesh, conductivity, electrodes) is np else _differentiable
     return formula(mesh, conductivity, electrodes, system)
 
 
 def _quadratic(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
     contact = electrodes.contact(mesh)
-    operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
-    return electrode_impedance(electrodes, system.quadratic_form(operator, contact.load))
+    operator, load = system.grounded(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
+    return electrode_impedance(system.quadratic_form(operator, load), contact_resistance(electrodes, contact))
 
 
 _differentiable = eqx.filter_custom_jvp(_quadratic)
 
 
 @_differentiable.def_jvp
-def _transfer_impedance_jvp(primals, tangents):
+def _impedance_parts_jvp(primals, tangents):
     mesh, conductivity, electrodes, system = primals
-    fields, impedance = electrode_fields(mesh, conductivity, electrodes, system)
+    solved = solved_system(mesh, conductivity, electrodes, system)
+    impedance, (fields, potentials) = solved.impedance(), solved.fields()
 
     def stationary(mesh, conductivity, electrodes):
-        return _stationary_form(mesh, conductivity, electrodes, fields, impedance)
+        form = _stationary_form(mesh, conductivity, electrodes, fields, potentials)
+        resistance = contact_resistance(electrodes, electrodes.contact(mesh))
+        if resistance is None:
+            return ElectrodeImpedance(form, jnp.zeros_like(impedance.contact))
+        return ElectrodeImpedance(form - jnp.diag(resistance), resistance)
 
-    _, derivative = eqx.filter_jvp(stationary, (mesh, conductivity, electrodes), tangents[:3])
-    return impedance, derivative
+    return impedance, eqx.filter_jvp(stationary, (mesh, conductivity, electrodes), tangents[:3])[1]
 
 
 def electrode_fields(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
@@ -65,65 +91,100 @@ def electrode_fields(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, s
     Volts per ampere; `conductivity` in S/m (2-D: S). Differentiable by the implicit rule of the linear solve (one more
     solve per direction).
     """
-    return solved_system(mesh, conductivity, electrodes, system).fields_and_impedance(electrodes)
+    solved = solved_system(mesh, conductivity, electrodes, system)
+    fields, potentials = solved.fields()
+    return fields - potentials.mean(axis=0), solved.impedance().transfer
 
 
 class SolvedSystem(NamedTuple):
-    """The matrix A of stiffness and contact mass, siemens, the `load` (n, L) of the electrodes and X = A⁻¹ load."""
+    """The grounded matrix A, siemens, the `load` (n, c) and X = A⁻¹ load, as of `System.grounded`; and the `resistance`
+    of the contacts, as of `contact_resistance`."""
 
     operator: SparseSymmetric
-    load: Inexact[Array, "n L"]
-    solution: Inexact[Array, "n L"]
+    load: Inexact[Array, "n c"]
+    solution: Inexact[Array, "n c"]
+    resistance: Inexact[Array, " L"] | None
 
-    def fields_and_impedance(self, electrodes: AbstractElectrodes):
-        """F (n, L) and Z (L, L), as of `electrode_fields`."""
-        impedance = electrode_impedance(electrodes, self.load.T @ self.solution)
-        if not electrodes.is_point:
-            return self.solution @ impedance, impedance
-        fields = self.solution - self.solution.mean(axis=1, keepdims=True)
-        return fields - (self.load.T @ fields).mean(axis=0), impedance
+    @property
+    def product(self) -> Inexact[Array, "c c"]:
+        """loadᵀ A⁻¹ load."""
+        return self.load.T @ self.solution
+
+    def impedance(self) -> ElectrodeImpedance:
+        """Of the electrodes."""
+        return electrode_impedance(self.product, self.resistance)
+
+    def fields(self) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
+        """Potentials F (n, L) of the nodes and U (L, L) of the electrodes for a unit current into each that leaves
+        evenly through all: each against one reference near the body, whatever the contacts."""
+        return unit_fields(self.solution, self.product, self.resistance)
+
+
+def unit_fields(
+    solution: Inexact[Array, "k c"], product: Inexact[Array, "c c"], resistance: Inexact[Array, " L"] | None
+) -> tuple[Inexact[Array, "k L"], Inexact[Array, "L L"]]:
+    """F at some nodes and U as of `SolvedSystem.fields`, from the rows of X at these nodes and loadᵀ X."""
+    potentials = product
+    if resistance is not None:
+        terminals = terminal_impedance(product)[:, :-1]
+        solution, potentials = solution @ terminals, terminals[:-1]
+    return solution - solution.mean(axis=1, keepdims=True), potentials - potentials.mean(axis=1, keepdims=True)
 
 
 def solved_system(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> SolvedSystem:
     """The system of the electrodes' loads, solved; `conductivity` in S/m (2-D: S)."""
     contact = electrodes.contact(mesh)
-    operator = system.operator(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
-    return SolvedSystem(operator, contact.load, system.solve(operator, contact.load))
+    operator, load = system.grounded(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
+    return SolvedSystem(operator, load, system.solve(operator, load), contact_resistance(electrodes, contact))
 
 
 @eqx.filter_jit
-def fields_and_inverse(
-    solved: SolvedSystem, electrodes: AbstractElectrodes, strips: Strips, reach: int
-) -> tuple[Inexact[Array, "p L"], NearInverse]:
-    """F at places of strips of the nodes, and K⁻¹ between them, up to `reach` strips apart, ohms, but for a constant.
+def fields_and_inverse(solved: SolvedSystem, strips: Strips, reach: int) -> tuple[Inexact[Array, "p L"], NearInverse]:
+    """F at places of strips of the nodes, and K⁻¹ between them, up to `reach` strips apart, ohms.
 
-    K is the matrix of the electrode model with all electrodes floating: the potential at one node for a unit current
-    into another. What it leaves open, a constant, no change of conductivity sees.
+    K is the matrix of the electrode model with the ground and all electrodes floating but one: the potential at one
+    node for a unit current into another. Which one is not, no change of conductivity sees.
     """
-    fields = strips.spread(solved.fields_and_impedance(electrodes)[0])
+    fields, solution = strips.spread(solved.fields()[0]), strips.spread(solved.solution)
     inverse = near_inverse(strips, solved.operator, reach)
-    if electrodes.is_point:
+    if solved.resistance is None:
         return fields, inverse
-    # Electrodes carry what enters at the nodes back out: with X = A⁻¹ load, K⁻¹ = A⁻¹ + X Z Xᵀ, and X Z = F.
-    return fields, inverse.add(strips.spread(solved.solution), fields)
+    # Electrodes carry what enters at the nodes back out: with X = A⁻¹ load, K⁻¹ = A⁻¹ + X Z Xᵀ.
+    return fields, inverse.add(solution, solution @ terminal_impedance(solved.product))
 
 
-def electrode_impedance(electrodes: AbstractElectrodes, product: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:
-    """Z from the product loadᵀ A⁻¹ load, A being the stiffness with contact mass (complete) or grounding (point).
+def contact_resistance(electrodes: AbstractElectrodes, contact: Contact) -> Inexact[Array, " L"] | None:
+    """z / |e| (L,) of the electrodes' contacts, ohms; none of point electrodes."""
+    return None if electrodes.is_point else 1 / contact.load.sum(axis=0)
 
-    Complete electrodes: eliminating the nodes leaves (D - BᵀA⁻¹B) U = I. Its columns sum to zero, so the diagonal
-    is minus the sum of the others, which spares the cancellation in D - BᵀA⁻¹B at small contact impedance.
+
+def electrode_impedance(product: Inexact[Array, "c c"], resistance: Inexact[Array, " L"] | None) -> ElectrodeImpedance:
+    """From the product loadᵀ A⁻¹ load, A and the loads being those of `System.grounded`, and the contacts' resistance.
+
+    The mean potentials under complete electrodes are D⁻¹ Bᵀ u = D⁻¹ BᵀA⁻¹B U with their loads B and D⁻¹, the contacts'
+    resistance; that of what U has more, D⁻¹ I, nothing is lost at large contact impedance.
+    """
+    if resistance is None:
+        return ElectrodeImpedance((product + product.T) / 2, namespace(product).zeros_like(product[0]))
+    body = resistance[:, None] * (product[:-1] @ terminal_impedance(product)[:, :-1])
+    return ElectrodeImpedance((body + body.T) / 2, resistance.astype(body.dtype))
+
+
+def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
+    """Potentials of the electrodes, and of the ground, for a unit current into each that leaves through one of them.
+
+    Eliminating the nodes leaves (D - BᵀA⁻¹B) U = I. Its columns sum to zero, so the diagonal is the sum of the others,
+    which spares the cancellation in D - BᵀA⁻¹B at small contact impedance. The one that is best connected to the others
+    is the reference, and each is scaled by its own: contacts may be any orders of magnitude apart.
     """
     xp = namespace(product)
-    product = (product + product.T) / 2
-    size = product.shape[0]
-    if electrodes.is_point:
-        return centred(product)
-    others = product * (1 - np.eye(size))
-    schur = xp.diag(others.sum(axis=0)) - others
-    # The constant vector is the null space; weight it like the rest, invert, and take it out again.
-    level = xp.trace(schur) / size**2
-    return centred(symmetric_inverse(schur + level))
+    others = (product + product.T) / 2 * (1 - np.eye(len(product)))
+    diagonal = others.sum(axis=0)
+    kept = np.arange(len(product)) != xp.argmax(undifferentiated(abs(diagonal)))
+    pairs = kept * kept[:, None]
+    scale = undifferentiated(1 / xp.sqrt(xp.where(kept, abs(diagonal), 1)))
+    scale = scale * scale[:, None]
+    return symmetric_inverse((xp.diag(xp.where(kept, diagonal, 1)) - pairs * others) * scale) * scale * pairs
 
 
 def centred(matrix: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:
@@ -134,7 +195,7 @@ def centred(matrix: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:
 
 
 def _stationary_form(mesh, conductivity, electrodes, fields, impedance):
-    """2⟨load, F⟩ - a(F, F) as a matrix (L, L): equals Z, and its derivative at fixed F is that of Z."""
+    """2⟨load, F⟩ - a(F, F) as a matrix (L, L): its derivative at fixed F and Z is that of Z."""
     conductivity = cell_conductivity(mesh, conductivity)
     contact = electrodes.contact(mesh)
     gradient = field_gradients(mesh, fields)
@@ -144,7 +205,7 @@ def _stationary_form(mesh, conductivity, electrodes, fields, impedance):
         energy = jnp.einsum("imp,mij,jmq->pq", gradient, conductivity, gradient)
     if electrodes.is_point:
         source = contact.load.T @ fields
-        return centred(source + source.T - energy)
+        return source + source.T - energy
     return -energy - _contact_energy(contact, fields, impedance)
 
 

@@ -99,7 +99,8 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
     misfit_of = _comparison(model, measurement, orders)
 
     def least(tried: Iterable[Wiring], so_far: Wiring) -> Wiring:
-        best = min((misfit_of(one) for one in tried), key=lambda one: one.misfit)
+        # The first of those that rounding alone tells apart, as of orders that hold the same voltages by reciprocity.
+        best = min((misfit_of(one) for one in tried), key=lambda one: round(one.misfit, 9))
         return best if best.misfit < _STEP * so_far.misfit else so_far
 
     def with_exchanges(best: Wiring) -> Wiring:

@@ -7,6 +7,7 @@ through both.
 """
 
 import functools
+import os
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -18,6 +19,7 @@ from jaxtyping import Array, Inexact, Int, Shaped
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
+_PROCESS = os.getpid()
 # So small that its square is nothing beside any number.
 _COMPLEX_STEP = 1e-100
 
@@ -34,6 +36,11 @@ def namespace(*trees: Any) -> Any:
 def has_values(*trees: Any) -> bool:
     """Whether all arrays of these pytrees have values that can be looked at, i.e. none is being traced."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def is_forked() -> bool:
+    """Whether this process was forked from the one that imported this: nothing compiled need run here."""
+    return os.getpid() != _PROCESS
 
 
 def on_host(tree: Any) -> Any:

@@ -74,9 +74,11 @@ def test_two_exchanges_and_a_ring_of_three_are_found():
 
 @pytest.mark.parametrize("order", list(channel_orders(adjacent(COUNT)))[1:])
 def test_another_order_of_channels_is_found(order):
+    """By reciprocity they hold the same voltages, measurement by measurement and drive by drive: the first is named."""
     wiring = find_wiring(MODEL, measured(order=order))
-    assert (wiring.order, wiring.reversed_signs, wiring.places) == (order, False, PLACES)
-    assert f"the channels look ordered {order}" in wiring.told
+    first = list(channel_orders(MODEL.protocol))[1]
+    assert (wiring.order, wiring.reversed_signs, wiring.places) == (first, False, PLACES)
+    assert f"the channels look ordered {first}" in wiring.told
 
 
 def test_a_fixed_order_described_as_rotating_is_the_protocols_own_fixed_order():

@@ -11,7 +11,7 @@ from jeit.design.skin.touched_nodes import touched_nodes
 from jeit.design.skin.voltage_changes import EXACT_AT_ONCE, cell_stiffness, changes_between, check_found
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity
-from jeit.forward.model import check_model, evaluate, select_channels, solved_system_of
+from jeit.forward.model import channel_voltages, check_model, evaluate, solved_system_of
 from jeit.forward.transfer import fields_and_inverse
 from jeit_solvers import NearInverse, Strips, over_cores
 from jeit_solvers.engines import on_device
@@ -48,9 +48,8 @@ class RestingSkin(eqx.Module):
         if 8 * float(strips.number * strips.wanted) ** 2 > most:
             return None
         solved = evaluate(model, solved_system_of, conductivity)
-        _, impedance = solved.fields_and_impedance(model.electrodes)
-        rest = select_channels(model.protocol, impedance)
-        known = fields_and_inverse(solved, model.electrodes, strips, max(strips.number - 1, 1))
+        rest = channel_voltages(model.protocol, solved.impedance())
+        known = fields_and_inverse(solved, strips, max(strips.number - 1, 1))
         return cls(model, rest, cell_stiffness(model, conductivity), strips, *known)
 
     def changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:

@@ -87,7 +87,7 @@ def _exact(model: ForwardModel, conductivity, touched: TouchedCells):
     touched_at = touched_nodes(model, touched)
     reach = -(-touched_at.strips.reach(touched_at.nodes) // _STRIPS) * _STRIPS
     solved = evaluate(model, solved_system_of, conductivity)
-    known = fields_and_inverse(solved, model.electrodes, touched_at.strips, reach)
+    known = fields_and_inverse(solved, touched_at.strips, reach)
     touches = on_device((touched.cells, touched.change, touched_at.nodes, touched_at.corners))
     number, element = len(touched.cells), cell_stiffness(model, conductivity)
     work = partial(changes_between, model.protocol, element, known, touches)

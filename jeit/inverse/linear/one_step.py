@@ -17,7 +17,7 @@ from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.mesh import Mesh
-from jeit_solvers.engines import as_array, has_values, on_host
+from jeit_solvers.engines import as_array, has_values, is_forked, on_device, on_host
 
 
 @functools.partial(
@@ -100,7 +100,8 @@ class LinearReconstruction:
             raise ValueError(f"difference is {voltages.dtype}; give numbers, in volts.")
         if not np.isfinite(voltages).all():
             raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
-        return _handed_over(_product(self._parts, voltages))
+        image = _product(self._parts, voltages)
+        return on_device(image) if is_forked() else _handed_over(image)
 
     @functools.cached_property
     def _parts(self) -> tuple[Any, ...]:
@@ -116,7 +117,8 @@ def _product(parts, difference) -> Any:
 
 @jax.jit
 def _handed_over(image) -> Any:
-    """JAX's array of NumPy's, in a quarter of the time of `jax.device_put`, which would be half of an image's."""
+    """JAX's array of NumPy's, in a quarter of the time of `jax.device_put`, which would be half of an image's; not in
+    forked processes, where nothing compiled runs."""
     return image
 
 

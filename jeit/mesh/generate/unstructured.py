@@ -251,8 +251,9 @@ def _corrected(
             f"num_points: the outline and refinement alone need about {least} nodes, more than the {num_points} asked. "
             "Ask for more nodes, less refinement (larger cell_size, smaller factor) or faster growth."
         )
-    low, high = np.log(value / 1e3), np.log(value * 1e3)
+    # Factors of `value`: the mesh of a body twice as large is twice as large, to the last bit.
+    low, high = -np.log(1e3), np.log(1e3)
     for _ in range(30):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if total(float(np.exp(middle))) > wanted else (low, middle)
-    return float(np.exp(0.5 * (low + high)))
+        low, high = (middle, high) if total(value * float(np.exp(middle))) > wanted else (low, middle)
+    return value * float(np.exp(0.5 * (low + high)))

@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike
 
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity, stiffness
-from jeit.forward.model import check_model, select_channels
-from jeit.forward.transfer import electrode_impedance
+from jeit.forward.model import channel_voltages, check_model
+from jeit.forward.system import ground_conductance, with_ground
+from jeit.forward.transfer import contact_resistance, electrode_impedance
 from jeit.mesh import measures
 from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, quadratic_form
 from jeit_solvers.engines import host, on_host
@@ -70,9 +71,13 @@ class TwoSheets(eqx.Module):
         element = host.block([[lower + coupling, -coupling], [-coupling, upper + coupling]])
         contact = electrodes.contact(mesh)
         load = host.concatenate([contact.load, np.zeros_like(contact.load)])
-        factor = factorise(self.plan, self.pattern.assemble(element, *contact.mass))
-        impedance = electrode_impedance(electrodes, quadratic_form(self.plan, factor, load))
-        return np.asarray(select_channels(on_host(self.model.protocol), impedance))
+        matrix = self.pattern.assemble(element, *[None] * len(contact.mass))
+        ground = ground_conductance(self.pattern.diagonal(matrix), load)
+        matrix = matrix + self.pattern.assemble(None, *contact.mass)
+        matrix[: len(ground)] += ground
+        product = quadratic_form(self.plan, factorise(self.plan, matrix), with_ground(load, ground))
+        impedance = electrode_impedance(product, contact_resistance(electrodes, contact))
+        return np.asarray(channel_voltages(on_host(self.model.protocol), impedance))
 
 
 def _matrices(packed: Float[np.ndarray, "6 m"]) -> Float[np.ndarray, "m 3 3"]:

@@ -1,9 +1,12 @@
 """Voltages of a model whose conductivity changes in one region only, again and again: a dense update of one solve.
 
-With the matrix A of stiffness and contact mass, the electrodes' loads B and a change D of the stiffness between a few
-nodes t, the Woodbury identity gives Bᵀ(A + D)⁻¹B = BᵀX − X_tᵀ (1 + D G)⁻¹ D X_t, with X = A⁻¹B and G = A⁻¹ between the
-nodes t. G is found once for all nodes of the region; a change then costs a system of as many unknowns as it has nodes.
+With the grounded matrix A of stiffness and contact mass, the loads B (`jeit.forward.transfer`) and a change D of the
+stiffness between a few nodes t, the Woodbury identity gives Bᵀ(A + D)⁻¹B = BᵀX − X_tᵀ (1 + D G)⁻¹ D X_t, with X = A⁻¹B
+and G = A⁻¹ between the nodes t. G is found once for all nodes of the region; a change then costs a system of as many
+unknowns as it has nodes.
 """
+
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -13,8 +16,9 @@ from jaxtyping import Float, Int
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import gradients
 from jeit.forward.model import evaluate, solved_system_of
-from jeit.forward.transfer import centred, electrode_impedance
+from jeit.forward.transfer import SolvedSystem, centred, electrode_impedance, unit_fields
 from jeit.mesh import centroids, measures
+from jeit_solvers.engines import on_host
 
 # Nodes of a region at most.
 _MOST_NODES = 2500
@@ -43,22 +47,22 @@ class LocalChange:
         self.gradients = np.asarray(gradients(mesh))[self.cells]  # (c, k, d)
         self.measures = np.asarray(measures(mesh))[self.cells]
         self.centres = np.asarray(centroids(mesh))[self.cells][:, :2]
-        solved = evaluate(model, solved_system_of, conductivity)
-        self.at_rest = np.asarray(solved.load.T @ solved.solution)
+        solved: SolvedSystem = on_host(evaluate(model, solved_system_of, conductivity))
+        self.at_rest, self.resistance = solved.product, solved.resistance
         self.solution = np.asarray(solved.solution)[nodes]
-        matrix = solved.operator.pattern.to_scipy(np.asarray(solved.operator.values)).tocsr()
+        matrix = solved.operator.pattern.to_scipy(solved.operator.values).tocsr()
         self.inverse = _inverse_between(matrix, nodes)
 
     def impedance(self, change: Float[np.ndarray, "c ..."]) -> Float[np.ndarray, "L L"]:
         """Transfer impedance (L, L), ohms, when conductivity has changed by (c,) or tensors (c, d, d)."""
-        return self._solved(change)[1]
+        return self._impedance(self._solved(change)[1])
 
     def slopes(
         self, change: Float[np.ndarray, "c ..."], ways: list[Float[np.ndarray, "c ..."]]
     ) -> tuple[Float[np.ndarray, "L L"], list[Float[np.ndarray, "L L"]]]:
         """The impedance, and its derivatives (L, L) in directions of conductivity, where it has `change`d."""
-        cells, impedance, solution = self._solved(change)
-        fields = solution if self.model.electrodes.is_point else solution @ impedance
+        cells, product, solution = self._solved(change)
+        fields: Any = unit_fields(solution, product, self.resistance)[0]  # pyright: ignore[reportArgumentType]
         table = np.zeros((self.solution.shape[0], fields.shape[1]))
         nodes = np.unique(self.corners[cells])
         table[nodes] = fields
@@ -67,17 +71,16 @@ class LocalChange:
         for way in ways:
             part = way[cells] * self.measures[cells].reshape((-1,) + (1,) * (way.ndim - 1))
             turned = np.einsum("cab,bcl->acl", part, slope) if part.ndim == 3 else part[:, None] * slope
-            # What a grounded node adds is taken out again, as in the impedance.
             energy = np.tensordot(slope, turned, axes=([0, 1], [0, 1]))
             found.append(-np.asarray(centred(energy)))  # pyright: ignore[reportArgumentType]
-        return impedance, found
+        return self._impedance(product), found
 
     def _solved(self, change: np.ndarray):
-        """The cells that change, the impedance, and A⁻¹B at these cells' nodes, in order."""
+        """The cells that change, Bᵀ(A + D)⁻¹B, and (A + D)⁻¹B at these cells' nodes, in order."""
         size = np.abs(change).reshape(len(change), -1).max(axis=1)
         cells = np.flatnonzero(size > 0)
         if not len(cells):
-            return cells, self._impedance(self.at_rest), np.zeros((0, len(self.at_rest)))
+            return cells, np.asarray(self.at_rest), np.zeros((0, len(self.at_rest)))
         nodes, corners = np.unique(self.corners[cells], return_inverse=True)
         corners = corners.reshape(len(cells), -1)
         slope = self.gradients[cells]
@@ -89,10 +92,10 @@ class LocalChange:
         before = self.solution[nodes]
         now = np.linalg.solve(np.eye(len(nodes)) + self.inverse[np.ix_(nodes, nodes)] @ stiffness, before)
         product = self.at_rest - before.T @ (stiffness @ now)
-        return cells, self._impedance(product), now
+        return cells, product, now
 
-    def _impedance(self, product: np.ndarray) -> Float[np.ndarray, "L L"]:
-        return np.asarray(electrode_impedance(self.model.electrodes, product))  # pyright: ignore[reportArgumentType]
+    def _impedance(self, product: Any) -> Float[np.ndarray, "L L"]:
+        return np.asarray(electrode_impedance(product, self.resistance).transfer)
 
 
 def _inverse_between(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:

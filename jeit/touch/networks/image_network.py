@@ -5,7 +5,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -67,6 +67,10 @@ class ImageNetwork:
         extent = low_x, high_x, low_y, high_y
         made_for = described(skin.model.protocol, skin.layout.centres, extent)
         return cls(network, design, float(skin.thickness), shape, extent, float(noise), made_for)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What it is made of: compiled programs are not pickled, they are made anew."""
+        return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def depth(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "*n rows columns"]:
         """How deep the skin is indented, metres, of frames (M,) or (n, M), volts, and a `reference` (M,) of the skin

@@ -79,8 +79,12 @@ def _symmetric_inverse_jvp(primals, tangents):
 
 
 def _by_lapack(matrices: Inexact[np.ndarray, "batch s s"]) -> Any:
+    # To a diagonal of order one, by powers of two: LAPACK's inverse loses what rows of other orders have.
+    diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
+    scale = np.ldexp(1.0, -(np.frexp(diagonal)[1] // 2)).astype(matrices.dtype)
     try:
-        return np.tril(np.linalg.inv(np.linalg.cholesky(matrices)))
+        lower = np.linalg.cholesky(matrices * scale[:, None] * scale[..., None])
+        return np.tril(np.linalg.inv(lower)) * scale[:, None]
     except np.linalg.LinAlgError:
         return np.full_like(matrices, np.nan)
 

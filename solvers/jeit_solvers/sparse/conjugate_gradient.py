@@ -15,7 +15,9 @@ from jeit_solvers.sparse.operator import SparseSymmetric, require_sparse_symmetr
 class ConjugateGradient(lineax.AbstractLinearSolver[SparseSymmetric]):
     """Conjugate gradients, preconditioned with the diagonal, for `SparseSymmetric` operators.
 
-    Stops when |b - A x| <= `tolerance` |b|. `max_steps` defaults to ten steps for each unknown, at most 10,000.
+    Stops when |M^-1 (b - A x)| <= `tolerance` |M^-1 b|, M being the diagonal: where loads enter by large entries, as
+    through good contacts, a residual that is small beside them is large elsewhere. `max_steps` defaults to ten steps
+    for each unknown, at most 10,000.
     Reports `RESULTS.max_steps_reached` if it runs out of steps, `RESULTS.breakdown` if it meets a direction p with
     p^T A p <= 0, which a positive definite matrix does not have. Complex symmetric systems are solved by the conjugate
     orthogonal variant, with p^T in place of p^* (van der Vorst and Melissen, IEEE Trans. Magn. 26, 1990).
@@ -84,7 +86,8 @@ def conjugate_gradient(
 ) -> Iterate:
     """The last iterate of conjugate gradients from x = 0, preconditioned with the matrix's diagonal M."""
     inverse_diagonal = 1 / operator.pattern.diagonal(operator.values)
-    target = tolerance * jnp.linalg.norm(vector)
+    direction = inverse_diagonal * vector
+    target = tolerance * jnp.linalg.norm(direction)
 
     def keep_going(now: Iterate):
         return ~now.converged & ~now.broken_down & (now.step < max_steps)
@@ -102,11 +105,10 @@ def conjugate_gradient(
             preconditioned + weight / now.weight * now.direction,
             weight,
             now.step + 1,
-            jnp.linalg.norm(residual) <= target,
+            jnp.linalg.norm(preconditioned) <= target,
             ~((jnp.vdot(now.direction, image).real > 0) & jnp.isfinite(curvature)),
         )
 
-    direction = inverse_diagonal * vector
     start = Iterate(
         jnp.zeros_like(vector),
         vector,

@@ -1,12 +1,15 @@
 """Networks that image a skin: what they learn, that they go on, and their files."""
 
+import copy
 import dataclasses
 import os
+import pickle
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import cloudpickle
 import equinox as eqx
 import jax
 import numpy as np
@@ -26,9 +29,25 @@ from jeit.touch.networks.training import Examples, Runs, shuffled, train_three_s
 from jeit.touch.training import Plan
 
 
+def cloudpickle_copy(one):
+    return cloudpickle.loads(cloudpickle.dumps(one))
+
+
 def voltages(skin, touches):
     rest = np.asarray(skin.model.voltages(skin.model_conductivity))
     return rest * (1 + relative_changes(skin, touches)), rest
+
+
+@pytest.mark.parametrize("change", [lambda one: pickle.loads(pickle.dumps(one)), cloudpickle_copy, copy.deepcopy])
+def test_a_network_that_has_imaged_is_pickled_and_copied(learnt, change):
+    """With all that it has compiled, which is left behind."""
+    network = learnt[1].network
+    frames = 0.01 * np.random.default_rng(0).normal(size=(3, network.made_for["channels"]))
+    expected = network.share(frames)
+    other = change(network)
+    np.testing.assert_array_equal(other.share(frames), expected)
+    assert other.floor == network.floor
+    assert other.doubts(frames, expected) == network.doubts(frames, expected)
 
 
 def test_it_learns(learnt):

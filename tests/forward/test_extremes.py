@@ -1,0 +1,167 @@
+"""Conductivities, contacts and sizes of any order of magnitude: right beside arithmetic in which nothing is rounded."""
+
+from contextlib import nullcontext
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from exact_arithmetic import exact, exact_change
+from extremes import CONTACTS, KINDS, middles, miss, uneven, with_contacts
+
+from jeit.design.skin.resting_skin import RestingSkin
+from jeit.design.skin.touched_cells import TouchedCells
+from jeit.design.skin.voltage_changes import touch_changes
+from jeit.forward import ForwardModel
+from jeit.inverse import calibrate, one_step
+
+UNITS = {"micrometres": 1e-5, "a power of two": 2.0**-17, "kilometres": 1e4}
+
+
+@eqx.filter_jit
+def compiled(model, conductivity):
+    return model.voltages(conductivity), model.voltages_and_jacobian(conductivity)[1]
+
+
+QUICK = ("boundary", "face")
+
+
+@pytest.fixture(
+    params=[name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in KINDS], scope="module"
+)
+def kind(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def model(kind):
+    return KINDS[kind](1.0)
+
+
+def worst(model, conductivity):
+    """Error of the voltages and the Jacobian of both engines, and of Z; each relative to its largest."""
+    expected = exact(model, conductivity)
+    voltages, jacobian = model.voltages(conductivity), model.jacobian(conductivity)
+    misses = [miss(voltages, expected.voltages), miss(jacobian, expected.jacobian)]
+    misses.append(miss(model.transfer_impedance(conductivity), expected.impedance))
+    voltages, jacobian = compiled(model, conductivity)
+    return max(*misses, miss(voltages, expected.voltages), miss(jacobian, expected.jacobian))
+
+
+@pytest.mark.parametrize("contacts", CONTACTS)
+def test_contacts_of_any_impedance(model, contacts):
+    """All but short-circuited, all but open, or some the one and some the other."""
+    if model.electrodes.is_point:
+        return
+    assert worst(with_contacts(model, CONTACTS[contacts]), uneven(model)) < 1e-10
+
+
+@pytest.mark.parametrize(("contacts", "most"), [("tight", 1e-4), ("good", 1e-7), ("open", 1e-8), ("unlike", 1e-4)])
+def test_conjugate_gradients_with_contacts_of_any_impedance(kind, model, contacts, most):
+    """They stop at a residual: where loads enter by entries a billion times the others, one that counts these too."""
+    if kind not in QUICK:
+        return
+    model = with_contacts(model, CONTACTS[contacts])
+    iterative = ForwardModel(model.mesh, model.electrodes, model.protocol, solver="cg")
+    assert miss(iterative.voltages(uneven(model)), exact(model, uneven(model)).voltages) < most
+
+
+@pytest.mark.parametrize("level", [1e-12, 1e12])
+def test_conductivities_of_any_level(model, level):
+    """At the same contact impedances, which are as good as none then, or all that there is."""
+    assert worst(model, level * uneven(model)) < 1e-10
+
+
+@pytest.mark.parametrize("contrast", [1e-6, 1e6])
+def test_inclusions_of_any_contrast(model, contrast):
+    inside = np.linalg.norm(middles(model) - [0.02, 0.03], axis=1) < 0.035
+    assert worst(model, np.where(inside, contrast, 1.0) * uneven(model)) < 1e-7
+    assert worst(model, np.where(inside, 1.0, contrast) * uneven(model)) < 1e-7
+
+
+def test_neighbouring_cells_of_any_contrast(model):
+    draw = np.random.default_rng(1)
+    for conductivity in (
+        10 ** draw.uniform(-3, 3, model.mesh.num_cells),
+        10.0 ** draw.choice([-3, 3], model.mesh.num_cells),
+    ):
+        assert worst(model, conductivity) < 1e-8
+
+
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_unit_of_length_does_not_matter(kind, model, unit):
+    """Voltages of a body so many times as large, at σ and z that go with it: the same in a sheet, fewer in a solid."""
+    large = pytest.warns(UserWarning, match="m is large") if UNITS[unit] > 1 else nullcontext()
+    with large:
+        other = KINDS[kind](UNITS[unit])
+    ratio = UNITS[unit] ** (model.mesh.dimension - 2)
+    conductivity = uneven(model)
+    for one, another in zip(
+        model.voltages_and_jacobian(conductivity), other.voltages_and_jacobian(conductivity), strict=True
+    ):
+        assert miss(ratio * np.asarray(another), one) < 1e-12
+
+
+def test_images_and_calibrations_scale_with_the_units():
+    small = KINDS["boundary"](1.0)
+    expected, fit = _image_and_fit(small, 1.0)
+    for unit, level in ((1e-5, 1e-12), (2.0**-17, 1e12), (1e-5, 1.0)):
+        model = with_contacts(KINDS["boundary"](unit), 1 / level)
+        image, conductivity = _image_and_fit(model, level)
+        assert miss(image, expected) < 1e-11
+        assert conductivity == pytest.approx(fit, rel=1e-11)
+
+
+def _image_and_fit(model, level):
+    inside = np.linalg.norm(middles(model) / np.ptp(model.mesh.points[:, 0]) - [0.1, 0.15], axis=1) < 0.15
+    before, after = (np.asarray(model.voltages(level * (1.0 + k * inside))) for k in (0.0, 0.5))
+    return np.asarray(one_step(model, level).image(after - before)) / level, float(
+        calibrate(model, before).conductivity
+    ) / level
+
+
+@pytest.mark.parametrize("contacts", ["tight", "open", "unlike"])
+def test_touches_are_exact_whatever_the_contacts(model, contacts):
+    if model.electrodes.is_point:
+        return
+    model = with_contacts(model, CONTACTS[contacts])
+    conductivity, places = uneven(model), np.array([[0.0, 0.01], [-0.02, -0.01], [0.03, 0.02]])
+    cells = np.array([np.argsort(np.linalg.norm(middles(model) - place, axis=1))[:6] for place in places])
+    change = np.array([[-0.5] * 6, [-0.9, -0.2, -0.1, 0.0, 0.0, -0.3], [3.0, 1.0, 2.0, -0.99, 0.0, -0.7]])
+    touched = TouchedCells(jnp.asarray(places), jnp.asarray(cells), jnp.asarray(change), model.mesh.num_cells)
+    expected = []
+    for some, by in zip(cells, change, strict=True):
+        factor = np.ones(model.mesh.num_cells)
+        factor[some] += by
+        expected.append(exact_change(model, conductivity, conductivity * factor))
+    known = RestingSkin.create(model, conductivity, np.ones(model.mesh.num_points, bool))
+    assert known is not None
+    for found in (np.asarray(touch_changes(model, conductivity, touched)), known.changes(touched)):
+        assert max(map(miss, found, expected)) < 1e-8
+
+
+def test_contacts_do_not_drown_derivatives_of_the_compiled_model(model):
+    """Of an electrode's own impedance and of the conductivity, where contacts are all but open."""
+    if model.electrodes.is_point:
+        return
+    opened = with_contacts(model, 1e9)
+    conductivity = uneven(model)
+    expected = exact(opened, conductivity).jacobian
+    assert miss(jax.jit(jax.jacrev(opened.voltages))(conductivity), expected) < 1e-10
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_not_a_number_is_refused_or_stays_none(model, bad):
+    """Where values can be seen it is refused; in compiled code every voltage is NaN, and no number is made up."""
+    conductivity = uneven(model)
+    conductivity[3] = bad
+    with pytest.raises(ValueError, match="NaN or infinite"):
+        model.voltages(conductivity)
+    voltages, jacobian = compiled(model, jnp.asarray(conductivity))
+    assert np.isnan(voltages).all()
+    assert np.isnan(jacobian).all()
+
+
+def test_a_conductivity_below_zero_is_not_a_number_in_compiled_code(model):
+    assert np.isnan(compiled(model, jnp.asarray(-uneven(model)))[0]).all()

@@ -1,0 +1,87 @@
+"""Models, reconstructions, imagers and skins that are pickled (by Dask, too) or copied: the same bits."""
+
+import copy
+import pickle
+import subprocess
+import sys
+
+import cloudpickle
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from extremes import KINDS, uneven
+
+from jeit.design import Skin
+from jeit.forward import ForwardModel
+from jeit.inverse import Imager, one_step
+from jeit.layout import named_layout
+from jeit.mesh import Rectangle
+
+WAYS = {
+    "pickle": lambda one: pickle.loads(pickle.dumps(one)),
+    "cloudpickle": lambda one: cloudpickle.loads(cloudpickle.dumps(one)),
+    "deep copy": copy.deepcopy,
+    "copy": copy.copy,
+}
+
+
+@eqx.filter_jit
+def compiled(model, conductivity):
+    return model.voltages(conductivity)
+
+
+def assert_same_bits(original, use):
+    """Before it has been used, with all that it keeps empty, and after."""
+    fresh = {way: change(original) for way, change in WAYS.items()}
+    expected = jax.tree.map(np.asarray, use(original))
+    for found in (*map(use, fresh.values()), *(use(change(original)) for change in WAYS.values())):
+        assert jax.tree.all(jax.tree.map(np.array_equal, jax.tree.map(np.asarray, found), expected))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_models(kind):
+    model = KINDS[kind](1.0)
+    conductivity = uneven(model)
+    assert_same_bits(model, lambda one: one.voltages_and_jacobian(conductivity))
+    if kind in ("boundary", "face"):
+        assert_same_bits(model, lambda one: compiled(one, conductivity))
+
+
+def test_a_model_with_conjugate_gradients():
+    model = KINDS["boundary"](1.0)
+    model = ForwardModel(model.mesh, model.electrodes, model.protocol, solver="cg")
+    assert_same_bits(model, lambda one: one.voltages(1.0))
+
+
+def test_reconstructions_and_imagers():
+    model = KINDS["boundary"](1.0)
+    frame, rest = (np.asarray(model.voltages(one)) for one in (uneven(model), 1.0))
+    assert_same_bits(one_step(model, 1.0), lambda one: one.image(frame - rest))
+    usable = np.ones(len(rest), bool)
+    imager = Imager.create(model, 1.0, noise=1e-6)
+    assert_same_bits(imager, lambda one: one.estimate(frame, one.weighing(usable), one.start))
+
+
+def test_skins():
+    skin = Skin.create(named_layout("grid-4x4", Rectangle(0.1, 0.1)), num_layers=0, cell_size=8e-3)
+    places = np.array([[0.0, 0.0], [0.01, 0.02]])
+    assert_same_bits(skin, lambda one: one.voltage_changes(one.touched_cells(places)))
+
+
+ANOTHER = """
+import pickle, sys, numpy as np, jeit
+model, conductivity = pickle.load(sys.stdin.buffer)
+again = pickle.loads(pickle.dumps(model))
+assert hash(model.system.pattern.layout) == hash(again.system.pattern.layout)
+sys.stdout.buffer.write(np.asarray(model.voltages(conductivity)).tobytes())
+"""
+
+
+def test_another_process_finds_the_same():
+    """As Dask's workers do: they hash otherwise, and know nothing of this one."""
+    model = KINDS["boundary"](1.0)
+    given = pickle.dumps((model, uneven(model)))
+    done = subprocess.run([sys.executable, "-c", ANOTHER], input=given, capture_output=True, timeout=120)
+    assert done.returncode == 0, done.stderr.decode()
+    assert done.stdout == np.asarray(model.voltages(uneven(model))).tobytes()
