@@ -76,7 +76,7 @@ def _frames(given: np.ndarray, layout: TableLayout, name: str, channels: int | N
     frames = table.frames_from(given, layout, name)
     if np.iscomplexobj(frames):
         raise ValueError("frames are complex; choose a part with [data] component: real, imaginary or magnitude.")
-    return _checked("frames", frames * layout.scale, frames.shape[-1] if channels is None else channels)
+    return _checked("frames", readings(frames) * layout.scale, frames.shape[-1] if channels is None else channels)
 
 
 def _checked(name: str, given: np.ndarray, channels: int) -> Float[np.ndarray, "F M"]:

@@ -1,0 +1,77 @@
+"""What may come of a file: it is taken, or one clear error says why not; soon, in little memory, and nothing else."""
+
+import resource
+import signal
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+LONGEST, SECONDS, MEMORY = 400, 60, 2 * 10**9
+# Errors that say what is wrong with a file, and what is not installed.
+CLEAR = (ValueError, FileNotFoundError, ImportError)
+
+
+class Hung(BaseException):
+    """It took too long; no `except Exception` holds it up."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one file: "accepted", "refused", or the fault, and what was said."""
+
+    kind: str
+    said: str
+    seconds: float
+
+    @property
+    def faulty(self) -> bool:
+        return self.kind not in ("accepted", "refused")
+
+
+def outcome(use: Callable[[], object], seconds: float = SECONDS) -> Outcome:
+    """Of using a file, within limits of time and address space."""
+    start = time.perf_counter()
+    try:
+        with _limits(seconds), warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            use()
+        kind, said = "accepted", ""
+    except Hung:
+        kind, said = "hung", "".join(traceback.format_exc(limit=-3))
+    except CLEAR as error:
+        said = str(error)
+        foreign = type(error) not in (ValueError, FileNotFoundError, ImportError, UnicodeError)
+        foreign &= not type(error).__module__.startswith("jeit")
+        kind = "refused" if said and len(said) <= LONGEST and not foreign else "unclear"
+        said = f"{type(error).__name__} ({len(said)}): {said[:LONGEST]}"
+    except (Exception, RecursionError) as error:
+        kind = type(error).__name__
+        said = f"{str(error)[:200]} | {_where(error)}"
+    return Outcome(kind, said, time.perf_counter() - start)
+
+
+def _where(error: BaseException) -> str:
+    frames = traceback.extract_tb(error.__traceback__)
+    return " < ".join(f"{one.filename.rpartition('/')[2]}:{one.lineno}" for one in reversed(frames[-6:]))
+
+
+@contextmanager
+def _limits(seconds: float):
+    def stop(number, frame):
+        raise Hung
+
+    before = signal.signal(signal.SIGALRM, stop)
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    with open("/proc/self/statm") as file:
+        taken = int(file.read().split()[0]) * resource.getpagesize()
+    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # again, where it was raised where nothing can be
+    resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)

@@ -1,0 +1,63 @@
+"""Two thousand files made wrong at random: each is taken, or refused in one clear error, soon, and leaves nothing."""
+
+import pytest
+from commands import COMMANDS, READERS
+from fuzz import changed_files, tried
+from oracle import outcome
+
+FILES = [name for name in READERS if name not in COMMANDS]
+EACH = -(-2000 // len(FILES))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", FILES)
+def test_a_sound_file_is_taken(name, tmp_path):
+    for one, content in READERS[name].files.items():
+        (tmp_path / one).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / one).write_bytes(content)
+    READERS[name].use(tmp_path)
+
+
+def faults(name: str, number: int) -> list[str]:
+    """Of so many inputs."""
+    return [f"{at}: {one.kind}: {one.said}" for at, one in tried(READERS[name], range(number)) if one.faulty]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", FILES)
+def test_no_input_makes_a_fault(name):
+    assert faults(name, EACH) == []
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_input_makes_a_command_fail_otherwise(name):
+    assert faults(name, 20) == []
+
+
+def test_an_input_is_told_by_its_number():
+    reader = READERS["layout, csv"]
+    assert changed_files(reader, 3) == changed_files(reader, 3) != changed_files(reader, 4)
+
+
+def _hang():
+    while True:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("use", "kind"),
+    [
+        (lambda: None, "accepted"),
+        (lambda: int("x"), "refused"),
+        (lambda: 1 / 0, "ZeroDivisionError"),
+        (lambda: b"\xff".decode(), "unclear"),
+        (lambda: (_ for _ in ()).throw(ValueError("x" * 500)), "unclear"),
+        (lambda: (_ for _ in ()).throw(ValueError("")), "unclear"),
+        (_hang, "hung"),
+        (lambda: bytearray(5 * 10**9), "MemoryError"),
+    ],
+)
+def test_the_oracle_sees_faults(use, kind):
+    assert outcome(use, seconds=0.2).kind == kind
