@@ -13,6 +13,7 @@ NAMES = (
     "gauss_newton",
     "optimisers",
     "realtime",
+    "soak",
     "hearing",
     "design",
     "contact",
