@@ -1,5 +1,5 @@
 """What is said of arguments and files that cannot be right: another kind of thing, a name there is not, a length in
-millimetres, an NPZ file of something else.
+millimetres.
 
 One sentence each, before anything is compiled: which argument, what was given, what to give. Beneath all rooms, and
 light: nothing of the library is imported here.
@@ -10,8 +10,7 @@ from jeit.arguments.counts import counted, percent
 from jeit.arguments.keys import check_key
 from jeit.arguments.kinds import check_kind, is_number, told
 from jeit.arguments.lengths import IN_MILLIMETRES, check_metres
-from jeit.arguments.names import check_name, did_you_mean
-from jeit.arguments.npz_file import need, npz_arrays
+from jeit.arguments.names import check_name, did_you_mean, listed
 from jeit.arguments.traced import check_has_values
 
 __all__ = [
@@ -24,8 +23,7 @@ __all__ = [
     "counted",
     "did_you_mean",
     "is_number",
-    "need",
-    "npz_arrays",
+    "listed",
     "percent",
     "real_array",
     "told",

@@ -21,3 +21,11 @@ def did_you_mean(given: Any, names: Iterable[str]) -> str:
     begun = [name for name in known if word and name.startswith(word)]
     close = difflib.get_close_matches(word, known, n=1) or begun
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def listed(names: Iterable[Any], most: int = 8) -> str:
+    """The first names, such as are in a file, in one short line, and how many more there are."""
+    known = [str(name) for name in names]
+    shown = [name if len(name) <= 24 else f"{name[:23]}…" for name in known[:most]]
+    more = f" and {len(known) - most} more" if len(known) > most else ""
+    return (", ".join(shown) or "nothing") + more

@@ -37,6 +37,9 @@ _REPEATING = (
     "listen fit",
 )
 
+# Letters of what is said of an error.
+_LONGEST = 390
+
 app = typer.Typer(
     name="jeit",
     add_completion=False,
@@ -140,14 +143,21 @@ def _explain(error: Exception) -> int:
 
 
 def _fail(message: str, status: int) -> int:
-    print(f"jeit: {' '.join(message.split())}", file=sys.stderr)
+    print(f"jeit: {_told(message)}", file=sys.stderr)
     return status
+
+
+def _told(message: str) -> str:
+    """One line that a terminal shows as it is, of its beginning and its end where it is long."""
+    line = "".join(letter if letter.isprintable() else "�" for letter in " ".join(message.split()))
+    half = (_LONGEST - 3) // 2
+    return line if len(line) <= _LONGEST else f"{line[:half]} … {line[-half:]}"
 
 
 def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
     if discarded_damaged(str(message)):
         return
-    print(f"jeit: warning: {' '.join(str(message).split())}", file=sys.stderr)
+    print(f"jeit: warning: {_told(str(message))}", file=sys.stderr)
 
 
 def _start(*, quickly: bool) -> None:

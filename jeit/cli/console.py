@@ -6,14 +6,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
     from jeit.image import Inclusion
 
 
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
+
+
+def plain_console() -> Console:
+    """Standard output, on which text is shown as it is: what a file holds is never taken for rich's markup."""
+    return Console(highlight=False, markup=False)
 
 
 class Steps:
@@ -33,7 +38,7 @@ class Steps:
         self._finish()
         self._step, self._start = step, time.perf_counter()
         if not self.quiet:
-            self._status = self.console.status(f"{step} …")
+            self._status = self.console.status(Text(f"{step} …"))
             self._status.start()
 
     @property
@@ -44,7 +49,7 @@ class Steps:
     def tell(self, detail: str) -> None:
         """Say how far the step under way is, beside its spinner."""
         if self._status is not None:
-            self._status.update(f"{self._step} … {detail}")
+            self._status.update(Text(f"{self._step} … {detail}"))
 
     def __enter__(self) -> "Steps":
         return self
@@ -65,19 +70,17 @@ class Steps:
 
 def pairs(title: str, rows: list[tuple[str, str]]) -> Table:
     """A table of names and values."""
-    table = Table(
-        title=escape(title), title_justify="left", title_style="bold", show_header=False, box=None, padding=(0, 2)
-    )
+    table = Table(title=title, title_justify="left", title_style="bold", show_header=False, box=None, padding=(0, 2))
     table.add_column(style="dim")
     table.add_column(overflow="fold")
     for name, value in rows:
-        table.add_row(escape(name), escape(value))
+        table.add_row(name, value)
     return table
 
 
 def say_written(console: Console, first: Path, *others: str) -> None:
     """Say which files there are now: the `first` with its folder, others by name."""
-    console.print("[dim]Written:[/dim]", escape(", ".join([str(first), *others])), soft_wrap=True)
+    console.print(Text("Written:", "dim"), ", ".join([str(first), *others]), soft_wrap=True)
 
 
 def scaled(value: float | None, unit: str) -> str:

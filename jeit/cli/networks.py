@@ -39,10 +39,9 @@ def image_by_network(
     or protocol, and where no frame could be imaged.
     """
     import numpy as np
-    from rich.console import Console
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, say_written
+    from jeit.cli.console import Steps, plain_console, say_written
     from jeit.cli.options import make_folder
     from jeit.design import describes_skin, read_described_skin
     from jeit.imaging.stream_preparation import parse_frames
@@ -57,7 +56,7 @@ def image_by_network(
         raise ValueError(f"--{idle[0]} has no use with --method network; leave it out.")
     data, reference, kind, description = given
     make_folder(output, DEPTH_FILES)
-    console = Console(highlight=False)
+    console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
         skin = None
@@ -83,7 +82,7 @@ def image_by_network(
             found.append(one._replace(number=own))
             step.tell(f"frame {own}")
             if one.depth is None and not quiet:
-                console.print(f"  frame {own}: refused. {one.reason}", soft_wrap=True, markup=False)
+                console.print(f"  frame {own}: refused. {one.reason}", soft_wrap=True)
         imaged = [one for one in found if one.depth is not None]
         if not imaged:
             reason = found[0].reason if found else "there is none"

@@ -1,50 +1,169 @@
-"""MATLAB files, with errors that a person can act on."""
+"""MATLAB files: variables of numbers, with errors that a person can act on.
 
+What a file says of its variables is read here (format 5, "MAT-File Format" by The MathWorks), so that nothing larger
+than that is ever unpacked; the numbers are then read by SciPy, from what is wanted alone.
+"""
+
+import io
+import math
+import struct
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import scipy.io
 
+from jeit.arguments import listed
+from jeit.files import check_memory, read_as
+
+# Bytes of the header, and of an element's beginning that holds flags, shape and name; types of elements.
+_HEADER, _BEGINNING = 128, 4096
+_MATRIX, _COMPRESSED = 14, 15
+# Classes of arrays by the file's number; bytes of a number at most, and of all that is told beside them.
+_SPARSE, _NUMERIC, _BYTES, _BESIDE = 5, range(6, 16), 16, 2**16
+
+
+class _Variable(NamedTuple):
+    name: str
+    shape: tuple[int, ...]
+    kind: int
+    content: bytes  # of the element in the file, packed or not
+    packed: bool
+
+    @property
+    def size(self) -> int:
+        """Bytes of its numbers at most, as it says."""
+        return _BYTES * math.prod(self.shape)
+
 
 def variable_names(path: Path) -> set[str]:
     """Names of the variables in a .mat file. Raises `ValueError` when it is not a readable .mat file."""
-    return {name for name, _, _ in _guard(path, scipy.io.whosmat)}
+    check_memory(path.name, path.stat().st_size)
+    with read_as(_unreadable(path)):
+        if _is_format_4(path):
+            return {name for name, _, _ in scipy.io.whosmat(str(path))}
+        start = path.read_bytes()[:_HEADER]
+    _refuse_hdf(start, path)
+    with read_as(_unreadable(path)):
+        return {one.name for one in _variables(path.read_bytes())}
 
 
-def load(path: Path) -> dict[str, np.ndarray]:
-    """The variables of a .mat file, sparse matrices made dense.
+def load(path: Path, *wanted: str) -> dict[str, np.ndarray]:
+    """Of the variables `wanted` those that hold numbers, by name, sparse matrices made dense, and under "" the names of
+    all that there are. What is not wanted is not unpacked.
 
-    Raises `ValueError` when it cannot be read.
+    Raises `ValueError` when it cannot be read, and for what would not fit in memory (`check_memory`).
     """
-    content = _guard(path, scipy.io.loadmat)
-    return {
-        name: value.toarray() if hasattr(value, "toarray") else value
-        for name, value in content.items()
-        if not name.startswith("__")
-    }
+    names = variable_names(path)
+    held = {"": np.array(sorted(names), dtype=str)}
+    if _is_format_4(path):
+        with read_as(_unreadable(path)):  # never compressed: of no more numbers than bytes
+            return held | _plain(scipy.io.loadmat(str(path), variable_names=list(wanted)), wanted)
+    content = path.read_bytes()
+    asked = [one for one in _variables(content) if one.name in wanted and one.kind in (_SPARSE, *_NUMERIC)]
+    check_memory(path.name, sum(one.size for one in asked))
+    with read_as(_unreadable(path)):
+        file = io.BytesIO(content[:_HEADER] + b"".join(_unpacked(one) for one in asked))
+        return held | (_plain(scipy.io.loadmat(file), wanted) if asked else {})
 
 
 def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
     """The numeric variable `key`. Raises `ValueError` when it is missing or not numeric."""
+    if key not in content and key in content[""]:
+        raise ValueError(f"{path.name}: variable '{key}' holds other things, not numbers.")
     if key not in content:
-        known = ", ".join(sorted(content))
-        raise ValueError(f"{path.name}: there is no variable '{key}'; the file has {known}.")
-    value = np.asarray(content[key])
+        raise ValueError(f"{path.name}: there is no variable '{key}'; the file has {listed(content[''])}.")
+    value = content[key]
     if value.dtype.kind not in "fiuc" or value.size == 0:
         raise ValueError(f"{path.name}: variable '{key}' holds {value.dtype} of shape {value.shape}, not numbers.")
     return value
 
 
-def _guard(path: Path, reader):
-    try:
-        return reader(str(path))
-    except NotImplementedError:
+def _plain(read: dict, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
+    arrays = {}
+    for name in wanted:
+        if name in read:
+            value = read[name]
+            if hasattr(value, "toarray"):
+                value.check_format(full_check=True)  # else indices beyond its shape would be written to
+                value = value.toarray()
+            arrays[name] = np.asarray(value)
+    return arrays
+
+
+def _unreadable(path: Path) -> str:
+    return f"{path.name} is not a readable .mat file; is it complete?"
+
+
+def _is_format_4(path: Path) -> bool:
+    """Format 4 begins with a number below 5,000; others with text."""
+    with path.open("rb") as file:
+        return 0 in file.read(4)
+
+
+def _refuse_hdf(start: bytes, path: Path) -> None:
+    """Of MATLAB's version 7.3, whose files are HDF5."""
+    if len(start) == _HEADER and (start[:8] == b"\x89HDF\r\n\x1a\n" or 2 in start[124:126]):
         raise ValueError(
             f"{path.name} was saved in MATLAB's version 7.3 (HDF5). Save it again with `save(name, '-v7')`."
-        ) from None
-    except OSError as error:
-        if error.errno is not None:
-            raise
-        raise ValueError(f"{path.name} is not a readable .mat file ({error}). Is it complete?") from None
-    except Exception as error:  # scipy raises many kinds on damaged files
-        raise ValueError(f"{path.name} is not a readable .mat file ({error}). Is it complete?") from None
+        )
+
+
+def _variables(content: bytes) -> Iterator[_Variable]:
+    """What a file of format 5 says that it holds."""
+    if len(content) < _HEADER or content[126:128] not in (b"IM", b"MI"):
+        raise ValueError("it is of another kind")
+    order = "<" if content[126:128] == b"IM" else ">"
+    place = _HEADER
+    while place + 8 <= len(content):
+        kind, size = struct.unpack_from(f"{order}II", content, place)
+        start, packed = place + 8, kind == _COMPRESSED
+        if start + size > len(content):
+            raise ValueError("it is cut short")
+        element = content[start : start + size]
+        if packed:
+            beginning = zlib.decompressobj().decompress(element, _BEGINNING)
+            kind, beginning = struct.unpack_from(f"{order}I", beginning)[0], beginning[8:]
+        else:
+            beginning = element[:_BEGINNING]
+        if kind == _MATRIX:
+            yield _Variable(*_told(beginning, order), content[place : start + size], packed)
+        place = start + size
+
+
+def _told(beginning: bytes, order: str) -> tuple[str, tuple[int, ...], int]:
+    """Name, shape and class of an array, from its first three sub-elements."""
+    flags, place = _part(beginning, 0, order)
+    shape, place = _part(beginning, place, order)
+    name, _ = _part(beginning, place, order)
+    kind = struct.unpack_from(f"{order}I", flags)[0] & 0xFF
+    lengths = struct.unpack(f"{order}{len(shape) // 4}i", shape)
+    if any(length < 0 for length in lengths):
+        raise ValueError("an array of it has a negative length")
+    return name.decode("latin-1"), lengths, kind
+
+
+def _part(content: bytes, place: int, order: str) -> tuple[bytes, int]:
+    """One sub-element, and where the next begins; those of four bytes and less lie in their own head."""
+    head = struct.unpack_from(f"{order}I", content, place)[0]
+    if head >> 16:
+        size, start, after = head >> 16, place + 4, place + 8
+    else:
+        size, start = struct.unpack_from(f"{order}I", content, place + 4)[0], place + 8
+        after = start + -(-size // 8) * 8
+    if start + size > len(content):
+        raise ValueError("what it says of an array is cut short, or too long")
+    return content[start : start + size], after
+
+
+def _unpacked(variable: _Variable) -> bytes:
+    """An element as it is without compression: no larger than it says."""
+    if not variable.packed:
+        return variable.content
+    most = variable.size + _BESIDE
+    element = zlib.decompressobj().decompress(variable.content[8:], most + 1)
+    if len(element) > most:
+        raise ValueError(f"'{variable.name[:40]}' is larger than its shape {variable.shape} says")
+    return element

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jeit.arguments import listed
 from jeit.data import _matlab
 from jeit.data.description import Description, load_description, parse_description
 from jeit.data.measurement import Measurement
@@ -39,8 +40,8 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
     beside = path.with_suffix(".toml")
     which = beside if description is None and beside.is_file() else description
     described = parse_description({}, path.name) if which is None else load_description(which)
-    content = _matlab.load(path)
-    keys, names = _keys(content, described, path)
+    keys, names = _keys(_matlab.variable_names(path), described, path)
+    content = _matlab.load(path, *keys, *PATTERN)
     vectors = [_matlab.numbers(content, key, path) for key in keys]
     if len(vectors) == 1:
         # A vector is one frame however it lies; a matrix holds a frame per column, as EIDORS stores them.
@@ -58,7 +59,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
     return measurement if measurement.frame_names or not names else _named(measurement, names)
 
 
-def _keys(content: dict, described: Description, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _keys(content: set[str], described: Description, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     if described.layout.keys:
         return described.layout.keys, ()
     reference = [name for name in REFERENCE_NAMES if name in content]
@@ -69,7 +70,7 @@ def _keys(content: dict, described: Description, path: Path) -> tuple[tuple[str,
         return ((reference + objects)[0],), ()
     raise ValueError(
         f"{path.name}: none of {', '.join(REFERENCE_NAMES + OBJECT_NAMES)} is there; the file has "
-        f'{", ".join(sorted(content))}. Name the voltages in a description: [data] keys = ["..."].'
+        f'{listed(sorted(content))}. Name the voltages in a description: [data] keys = ["..."].'
     )
 
 

@@ -10,6 +10,7 @@ from jeit.data.described_body import ELECTRODES
 from jeit.data.description import PROTOCOL_ARRAYS
 from jeit.data.measurement import Measurement
 from jeit.electrodes import AbstractElectrodes
+from jeit.files import whole_files
 from jeit.mesh import Body
 from jeit.mesh.outline import OUTLINES
 from jeit.protocol import Protocol
@@ -39,17 +40,18 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
     component = "complex" if np.iscomplexobj(measurement.voltages) else "real"
     lines += ["", "[data]", *_assignments({"frames_in": "rows", "component": component})]
     arrays: dict[str, Any] = {part: np.asarray(getattr(protocol, part)) for part in PROTOCOL_ARRAYS}
-    np.savez_compressed(
-        file,
-        voltages=np.asarray(measurement.voltages),
-        mask=np.asarray(measurement.mask),
-        frame_names=np.array(measurement.frame_names, str),
-        notes=np.array(measurement.notes, str),
-        protocol_name=np.asarray(protocol.name),
-        **arrays,
-    )
     description = file.with_suffix(".toml")
-    description.write_text("\n".join(lines) + "\n", "utf-8")
+    with whole_files(file.parent) as made:
+        np.savez_compressed(
+            made / file.name,
+            voltages=np.asarray(measurement.voltages),
+            mask=np.asarray(measurement.mask),
+            frame_names=np.array(measurement.frame_names, str),
+            notes=np.array(measurement.notes, str),
+            protocol_name=np.asarray(protocol.name),
+            **arrays,
+        )
+        (made / description.name).write_text("\n".join(lines) + "\n", "utf-8")
     return file, description
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import npz_arrays
 from jeit.data import table
 from jeit.data.description import Description, TableLayout
+from jeit.files import npz_arrays
 
 _FRAMES, _TIMES = ("voltages", "frames"), ("seconds", "time")
 

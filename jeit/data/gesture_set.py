@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from jeit.arguments import need, npz_arrays
+from jeit.files import need, npz_arrays, written_whole
 
 _ARRAYS = ("gesture", "person", "start", "seconds", "voltages", "reference", "untouched")
 
@@ -80,7 +80,8 @@ class GestureSet:
 
     def write(self, path: str | Path) -> None:
         """Write it to an NPZ file. Raises `OSError` where it cannot be written."""
-        np.savez_compressed(path, **{name: getattr(self, name) for name in _ARRAYS})
+        with written_whole(path) as file:
+            np.savez_compressed(file, **{name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
     def read(cls, path: str | Path) -> "GestureSet":

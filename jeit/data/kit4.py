@@ -32,10 +32,9 @@ def read(path: Path) -> Measurement:
 
     Raises `ValueError` for a file of another shape.
     """
-    content = _matlab.load(path)
-    voltages, current, difference = (
-        _matlab.numbers(content, key, path) for key in ("Uel", "CurrentPattern", "MeasPattern")
-    )
+    keys = "Uel", "CurrentPattern", "MeasPattern"
+    content = _matlab.load(path, *keys)
+    voltages, current, difference = (_matlab.numbers(content, key, path) for key in keys)
     electrodes, drives = current.shape
     if difference.shape[0] != electrodes or voltages.shape != (difference.shape[1], drives):
         raise ValueError(

@@ -36,11 +36,10 @@ def read(path: Path) -> Measurement:
 
     Raises `ValueError` for a file of another shape.
     """
-    content = _matlab.load(path)
-    suffix = "" if "Inj" in content else "ref"
-    current, voltages, difference = (
-        _matlab.numbers(content, key, path) for key in (f"Inj{suffix}", f"Uel{suffix}", "Mpat")
-    )
+    suffix = "" if "Inj" in _matlab.variable_names(path) else "ref"
+    keys = f"Inj{suffix}", f"Uel{suffix}", "Mpat"
+    content = _matlab.load(path, *keys)
+    current, voltages, difference = (_matlab.numbers(content, key, path) for key in keys)
     electrodes, drives = current.shape
     channels = drives * difference.shape[1]
     if difference.shape[0] != electrodes or voltages.size != channels:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from jeit.arguments import check_name
+from jeit.arguments import check_name, listed
 from jeit.data import _matlab, eidors, kit4, ktc2023, table
 from jeit.data.measurement import Measurement
 
@@ -82,7 +82,7 @@ def _recognise(file: Path, description: str | Path | None) -> str:
             return "eidors"
         raise ValueError(
             f"{file.name} is a .mat file of no known kind; it holds "
-            f"{', '.join(sorted(_matlab.variable_names(file)))}. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; "
+            f"{listed(sorted(_matlab.variable_names(file)))}. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; "
             f"{eidors.DESCRIPTION}."
         )
     raise ValueError(

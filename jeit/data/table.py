@@ -1,19 +1,25 @@
 """Reader of plain tables: CSV, text, NPY and NPZ with a TOML description."""
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
+from jeit.arguments import listed
 from jeit.data.description import PROTOCOL_ARRAYS, Description, TableLayout, load_description
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
+from jeit.files import check_memory, npy_array, npz_arrays
 from jeit.protocol import Protocol
 
 DESCRIPTION = "table (.csv, .txt, .npy, .npz) with a TOML description beside it"
 SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
+# What `write_table` puts beside the voltages and the protocol.
+_WORDS = ("mask", "protocol_name", "frame_names", "notes")
+# Bytes in memory of a number of two letters, twice: as rows, and as the table that they make.
+_IN_MEMORY = 8
 
 
 def recognises(path: Path) -> bool:
@@ -53,7 +59,7 @@ def read(path: Path, description: str | Path | None = None, like: Measurement | 
             f"beside it, {path.with_suffix('.toml').name} (geometry, electrodes, protocol), or name one."
         )
     if path.suffix.lower() in (".npz", ".npy"):
-        arrays = _from_numpy(path)
+        arrays = _from_numpy(path, described.layout.keys)
         table, mask, protocol = _voltages(arrays, described.layout, path), arrays.get("mask"), None
         if not described.protocol_section:
             protocol = _own_protocol(arrays)
@@ -115,7 +121,7 @@ def measurement_from(
 def numbers(path: Path, layout: TableLayout) -> np.ndarray:
     """The numbers of a text or NPY file, as they lie in it. Raises `ValueError` for what is not numbers."""
     if path.suffix.lower() == ".npy":
-        return _voltages(_from_numpy(path), layout, path)
+        return _voltages(_from_numpy(path, ()), layout, path)
     return _from_text(path, layout)
 
 
@@ -141,16 +147,13 @@ def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray
 
 def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
     delimiter = None if layout.delimiter.strip() == "" and layout.delimiter != "\t" else layout.delimiter
-    try:
-        lines = path.read_text("utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise ValueError(f"{path.name} is not a text file. If it is a spreadsheet, export it as CSV.") from None
-    rows = []
-    for number, line in enumerate(lines[layout.skip_rows :], start=layout.skip_rows + 1):
-        if not line.strip() or line.lstrip().startswith("#"):
+    check_memory(path.name, _IN_MEMORY * path.stat().st_size)
+    rows: list[np.ndarray] = []
+    for number, line in enumerate(_lines(path), start=1):
+        if number <= layout.skip_rows or not line.strip() or line.lstrip().startswith("#"):
             continue
         try:
-            rows.append([float(cell) for cell in line.split(delimiter)])
+            rows.append(np.array([float(cell) for cell in line.split(delimiter)]))
         except ValueError:
             raise ValueError(
                 f"{path.name}, line {number}: {line.strip()[:40]!r} is not numbers separated by "
@@ -166,25 +169,33 @@ def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
     return np.array(rows)
 
 
-def _from_numpy(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file by name; the one of an NPY is its voltages."""
+def _lines(path: Path) -> Iterator[str]:
+    """Of a text file, one after the other."""
     try:
-        with path.open("rb") as file:
-            content = np.load(file, allow_pickle=False)
-            if isinstance(content, np.ndarray):
-                return {"voltages": content}
-            return {name: content[name] for name in content.files}
-    except (ValueError, EOFError, OSError, BadZipFile) as error:
-        raise ValueError(f"{path.name} is not a readable NumPy file of plain arrays ({error}).") from None
+        with path.open(encoding="utf-8") as file:
+            yield from file
+    except UnicodeDecodeError:
+        raise ValueError(f"{path.name} is not a text file. If it is a spreadsheet, export it as CSV.") from None
+
+
+def _from_numpy(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Those arrays of a file that are asked for by name; the one of an NPY is its voltages."""
+    try:
+        if path.suffix.lower() == ".npy":
+            return {"voltages": npy_array(path)}
+        return npz_arrays(path, *(keys or ("voltages",)), *PROTOCOL_ARRAYS, *_WORDS)
+    except ValueError as error:
+        raise ValueError(f"{path.name}: {error}") from None
 
 
 def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) -> np.ndarray:
     keys = layout.keys if layout.keys and path.suffix.lower() == ".npz" else ("voltages",)
     missing = [key for key in keys if key not in arrays]
     if missing:
+        held = listed(sorted(arrays.get("", arrays)))
         raise ValueError(
-            f"{path.name}: there is no array '{missing[0]}'; the file has {', '.join(sorted(arrays))}. Name "
-            "the voltages with [data] keys in the description."
+            f"{path.name}: there is no array '{missing[0]}'; the file has {held}. Name the voltages with [data] keys "
+            "in the description."
         )
     for key in keys:
         if arrays[key].dtype.kind not in "biufc":

@@ -1,13 +1,17 @@
 """Layouts as CSV: one electrode a line, the unit in the name of the column."""
 
 import csv
+import io
 import math
 import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
+from jeit.arguments import listed, told
+from jeit.files import check_electrodes, read_as, read_text
 from jeit.layout.layout import LARGEST, SMALLEST, Layout, bounds, check_discs_fit
 from jeit.mesh import Domain
 
@@ -16,6 +20,8 @@ _LENGTHS = ("x", "y", "diameter")
 # "x_mm", "x [mm]", "x (mm)", "xmm"
 _LENGTH = re.compile(rf"({'|'.join(_LENGTHS)})[ _]*[\[(]?({'|'.join(_UNITS)})[\])]?")
 _LABEL, _IMPEDANCE = "label", "contact_impedance_ohm_m2"
+MOST_BYTES = 2**24
+"""Of a file of a layout: electrodes of more could not be read in a minute."""
 _TEMPLATE = f"x_mm, y_mm, diameter_mm and, if wanted, {_LABEL} and {_IMPEDANCE}"
 
 
@@ -24,7 +30,7 @@ def millimetres(metres: float) -> float:
     return round(1e3 * float(metres), 9) + 0.0
 
 
-def write_csv(layout: Layout, path: Path) -> None:
+def write_csv(layout: Layout, file: BinaryIO) -> None:
     """Write the electrodes; the outline has no place in a table."""
     lengths = np.column_stack([layout.centres, layout.diameters])
     header = [*(f"{name}_mm" for name in _LENGTHS), _LABEL]
@@ -32,10 +38,11 @@ def write_csv(layout: Layout, path: Path) -> None:
     if layout.contact_impedance is not None:
         header.append(_IMPEDANCE)
         columns.append(np.asarray(layout.contact_impedance).tolist())
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        writer.writerows(zip(*columns, strict=True))
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(header)
+    writer.writerows(zip(*columns, strict=True))
+    file.write(text.getvalue().encode())
 
 
 def read_csv(path: Path, outline: Domain | None) -> Layout:
@@ -44,6 +51,7 @@ def read_csv(path: Path, outline: Domain | None) -> Layout:
     delimiter = next((mark for mark in ";\t" if mark in lines[0][1]), ",")
     (_, header), *rows = [(number, _cells(line, delimiter)) for number, line in lines]
     columns = _columns(header)
+    check_electrodes("the table", len(rows))
     if not rows:
         raise ValueError("there is no electrode below the names of the columns.")
     for number, row in rows:
@@ -78,12 +86,12 @@ def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -
     size = max(x_max - x_min, y_max - y_min)
     if size < SMALLEST:
         raise ValueError(
-            f"the electrodes would span {1e3 * size:.3g} mm under the columns {', '.join(titles)}; if the values are "
+            f"the electrodes would span {1e3 * size:.3g} mm under the columns {listed(titles)}; if the values are "
             "in metres, multiply them by 1000 and call the columns x_mm, y_mm, diameter_mm."
         )
     if size > LARGEST:
         raise ValueError(
-            f"the electrodes would span {size:.3g} m under the columns {', '.join(titles)}; if the values are in "
+            f"the electrodes would span {size:.3g} m under the columns {listed(titles)}; if the values are in "
             "millimetres, call the columns x_mm, y_mm, diameter_mm."
         )
 
@@ -91,8 +99,8 @@ def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Lines that hold something, with their numbers from 1."""
     try:
-        text = path.read_text("utf-8-sig")
-    except UnicodeDecodeError:
+        text = read_text(path, encoding="utf-8-sig", most=MOST_BYTES)
+    except UnicodeError:
         raise ValueError("this is not a text file in UTF-8; in the spreadsheet, save it as 'CSV UTF-8'.") from None
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]
     lines = [(number, line) for number, line in lines if line.strip(" \t,;") and not line.lstrip().startswith("#")]
@@ -102,7 +110,8 @@ def _lines(path: Path) -> list[tuple[int, str]]:
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
+    with read_as("a line is no row of a table"):
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
 
 
 def _columns(header: list[str]) -> dict[str, tuple[int, float]]:
@@ -112,10 +121,12 @@ def _columns(header: list[str]) -> dict[str, tuple[int, float]]:
         length = _LENGTH.fullmatch(title.lower())
         name = length[1] if length else title.lower()
         if name in _LENGTHS and not length:
-            raise ValueError(f"the column {title!r} does not say its unit; call it {name}_mm (or {name}_cm, {name}_m).")
+            raise ValueError(
+                f"the column {told(title)} does not say its unit; call it {name}_mm (or {name}_cm, {name}_m)."
+            )
         if name not in (*_LENGTHS, _LABEL, _IMPEDANCE):
             raise ValueError(
-                f"there is no column {title!r} in a layout; the first line names the columns: {_TEMPLATE}."
+                f"there is no column {told(title)} in a layout; the first line names the columns: {_TEMPLATE}."
             )
         if name in columns:
             raise ValueError(f"there are two columns for {name}; keep one.")
@@ -132,5 +143,5 @@ def _number(cell: str, delimiter: str, where: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{where} is {cell!r}; give a finite number, such as 12.5.")
+        raise ValueError(f"{where} is {told(cell)}; give a finite number, such as 12.5.")
     return value

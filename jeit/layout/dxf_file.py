@@ -1,12 +1,17 @@
 """Layouts as DXF drawings, through ezdxf."""
 
 import importlib
+import io
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from jeit.arguments import listed
+from jeit.files import check_electrodes, check_size, read_as
+from jeit.layout.csv_file import MOST_BYTES
 from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Polygon
 
@@ -15,7 +20,7 @@ _OUTLINE, _ELECTRODES, _LABELS = "OUTLINE", "ELECTRODES", "LABELS"
 _COLOURS = {_OUTLINE: 1, _ELECTRODES: 5, _LABELS: 8}
 
 
-def write_dxf(layout: Layout, path: Path) -> None:
+def write_dxf(layout: Layout, file: BinaryIO) -> None:
     """Write a drawing in millimetres, of the format of AutoCAD 2007: the first that holds labels in any script.
 
     Raises `ImportError` where the extra `cad` is not installed.
@@ -35,7 +40,9 @@ def write_dxf(layout: Layout, path: Path) -> None:
         discs.circle(centre, float(diameter) / 2)
         text = space.add_text(label, height=1e3 * float(diameter) / 3, dxfattribs={"layer": _LABELS})
         text.set_placement(1e3 * np.asarray(centre), align=centred)
-    drawing.saveas(path)
+    text = io.StringIO()
+    drawing.write(text)
+    file.write(text.getvalue().encode(drawing.output_encoding, errors="dxfreplace"))
 
 
 class _Pen:
@@ -51,76 +58,98 @@ class _Pen:
         self.space.add_lwpolyline(1e3 * vertices, close=True, dxfattribs=self.on)
 
 
+class _Entity(NamedTuple):
+    """What is drawn on one of the layers: of what kind, and what of it is looked at, in the drawing's unit."""
+
+    kind: str
+    circle: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    place: tuple[float, float] = (0.0, 0.0)
+    text: str = ""
+    loop: Any = None
+    arcs: bool = False
+    closed: bool = False
+
+
 def read_dxf(path: Path, outline: Domain | None) -> Layout:
     """Read what `write_dxf` wrote, or a CAD program with the same layers. Raises `ValueError`."""
     ezdxf = _import()
-    try:
+    check_size(path, MOST_BYTES)
+    with read_as("this is not a DXF drawing that is read"):
         drawing = ezdxf.readfile(path)
-    except (OSError, ezdxf.DXFError, UnicodeError, ValueError) as error:
-        raise ValueError(f"this is not a DXF drawing: {error}") from None
-    units = ezdxf.units
-    unit = units.conversion_factor(units.InsertUnits(drawing.units or units.MM), units.InsertUnits.Meters)
-    entities: dict[str, list[Any]] = {name: [] for name in _COLOURS}
-    for entity in drawing.modelspace():
-        entities.get(entity.dxf.layer.upper(), []).append(entity)
-    if not entities[_ELECTRODES]:
-        used = sorted({entity.dxf.layer for entity in drawing.modelspace()})
+        units = ezdxf.units
+        unit = units.conversion_factor(units.InsertUnits(drawing.units or units.MM), units.InsertUnits.Meters)
+        space = [(entity.dxf.layer, entity) for entity in drawing.modelspace()]
+        drawn = {name: [one for layer, one in space if layer.upper() == name] for name in _COLOURS}
+    if not drawn[_ELECTRODES]:
         raise ValueError(
             f"nothing is drawn on the layer {_ELECTRODES}, where electrodes are circles; "
-            f"the layers in use are {', '.join(used) or 'none'}."
+            f"the layers in use are {listed(sorted({layer for layer, _ in space}))}."
         )
-    circles = np.array([_circle(entity) for entity in entities[_ELECTRODES]]) * unit
+    check_electrodes("the drawing", len(drawn[_ELECTRODES]))
+    with read_as("this is not a DXF drawing that is read"):
+        decode = ezdxf.lldxf.encoding.decode_dxf_unicode
+        entities = {name: [_entity(one, decode) for one in ones] for name, ones in drawn.items()}
+    circles = np.array([_circle(one) for one in entities[_ELECTRODES]]) * unit
     centres, radii = circles[:, :2], circles[:, 2]
-    texts = [entity for entity in entities[_LABELS] if entity.dxftype() == "TEXT"]
-    places = np.array([_point(text, text.get_placement()[1]) for text in texts]).reshape(-1, 2) * unit
-    inside = np.linalg.norm(centres[:, None] - places, axis=-1) <= radii[:, None]
-    decode, labels = ezdxf.lldxf.encoding.decode_dxf_unicode, []
-    for electrode, held in enumerate(inside, start=1):
-        # Older formats than 2007 write letters beyond Latin as \U+0162.
-        written = [decode(texts[index].dxf.text).strip() for index in np.flatnonzero(held)]
+    texts = [one for one in entities[_LABELS] if one.kind == "TEXT"]
+    places = np.array([one.place for one in texts]).reshape(-1, 2) * unit
+    labels = []
+    for electrode, (centre, radius) in enumerate(zip(centres, radii, strict=True), start=1):
+        inside = np.linalg.norm(centre - places, axis=-1) <= radius
+        written = [texts[index].text for index in np.flatnonzero(inside)]
         if len(written) > 1:
-            raise ValueError(f"electrode {electrode} has several labels: {', '.join(map(repr, written))}.")
+            raise ValueError(f"electrode {electrode} has several labels: {listed(map(repr, written))}.")
         labels += written or [str(electrode)]
-    drawn = _outline(entities[_OUTLINE], unit)
-    return Layout(centres, 2 * radii, outline=drawn or outline, labels=labels, name=path.stem)
+    found = _outline(entities[_OUTLINE], unit)
+    return Layout(centres, 2 * radii, outline=found or outline, labels=labels, name=path.stem)
 
 
-def _point(entity, place) -> tuple[float, float]:
-    """A point of an entity in the plane: mirrored entities have axes of their own."""
-    x, y, _ = entity.ocs().to_wcs(place)
-    return x, y
+def _entity(entity, decode: Callable[[str], str]) -> _Entity:
+    """In the plane: mirrored entities have axes of their own. Older formats than 2007 write letters beyond Latin as
+    \\U+0162."""
+    kind = entity.dxftype()
+    if kind == "CIRCLE":
+        x, y, _ = entity.ocs().to_wcs(entity.dxf.center)
+        return _Entity(kind, circle=(x, y, float(entity.dxf.radius)))
+    if kind == "TEXT":
+        x, y, _ = entity.ocs().to_wcs(entity.get_placement()[1])
+        return _Entity(kind, place=(x, y), text=decode(entity.dxf.text).strip())
+    if kind in ("LWPOLYLINE", "POLYLINE"):
+        points = entity.vertices_in_wcs() if kind == "LWPOLYLINE" else entity.points_in_wcs()
+        loop = np.array([(x, y) for x, y, _ in points]).reshape(-1, 2)
+        return _Entity(kind, loop=loop, arcs=bool(entity.has_arc), closed=bool(entity.is_closed))
+    return _Entity(kind)
 
 
-def _circle(entity) -> tuple[float, float, float]:
-    if entity.dxftype() != "CIRCLE":
+def _circle(entity: _Entity) -> tuple[float, float, float]:
+    if entity.kind != "CIRCLE":
         raise ValueError(
-            f"there is a {entity.dxftype()} on the layer {_ELECTRODES}; electrodes are circles, and blocks must be "
+            f"there is a {entity.kind[:40]} on the layer {_ELECTRODES}; electrodes are circles, and blocks must be "
             "exploded to circles."
         )
-    return *_point(entity, entity.dxf.center), entity.dxf.radius
+    return entity.circle
 
 
-def _outline(entities: list[Any], unit: float) -> Domain | None:
+def _outline(entities: list[_Entity], unit: float) -> Domain | None:
     if not entities:
         return None
-    if len(entities) == 1 and entities[0].dxftype() == "CIRCLE":
+    if len(entities) == 1 and entities[0].kind == "CIRCLE":
         x, y, radius = _circle(entities[0])
         return Disk(unit * radius, (unit * x, unit * y))
     loops = sorted((unit * _loop(entity) for entity in entities), key=lambda loop: -np.prod(np.ptp(loop, axis=0)))
     return Polygon(loops[0], loops[1:])
 
 
-def _loop(entity) -> np.ndarray:
+def _loop(entity: _Entity) -> np.ndarray:
     """Vertices (k, 2) of a closed polyline of straight sides, in the drawing's unit; `ValueError` if it is none."""
     advice = f"on the layer {_OUTLINE}; draw closed polylines of straight sides, or one circle."
-    if entity.dxftype() not in ("LWPOLYLINE", "POLYLINE"):
-        raise ValueError(f"there is a {entity.dxftype()} {advice}")
-    if entity.has_arc:
+    if entity.loop is None:
+        raise ValueError(f"there is a {entity.kind[:40]} {advice}")
+    if entity.arcs:
         raise ValueError(f"there is a polyline with arcs {advice}")
-    points = entity.vertices_in_wcs() if entity.dxftype() == "LWPOLYLINE" else entity.points_in_wcs()
-    loop = np.array([(x, y) for x, y, _ in points])
+    loop = entity.loop
     closes = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-9 * np.ptp(loop))
-    if not (entity.is_closed or closes):
+    if not (entity.closed or closes):
         raise ValueError(f"there is an open polyline {advice}")
     return loop[:-1] if closes else loop
 

@@ -8,6 +8,7 @@
 
 from pathlib import Path
 
+from jeit.files import written_whole
 from jeit.layout.csv_file import read_csv, write_csv
 from jeit.layout.dxf_file import read_dxf, write_dxf
 from jeit.layout.layout import Layout
@@ -60,7 +61,8 @@ def write_layout(layout: Layout, path: str | Path) -> None:
     if not isinstance(layout, Layout):
         raise ValueError(f"layout must be a Layout, not {type(layout).__name__}; see jeit.layout.Layout.")
     try:
-        writer(layout, path)
+        with written_whole(path) as file:
+            writer(layout, file)
     except OSError as error:
         raise ValueError(f"path: {path} cannot be written: {error.strerror}. Is there such a folder?") from None
 

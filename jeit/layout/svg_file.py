@@ -5,10 +5,13 @@ import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-from jeit.layout.csv_file import millimetres
+from jeit.arguments import told
+from jeit.files import check_electrodes, check_size, read_as
+from jeit.layout.csv_file import MOST_BYTES, millimetres
 from jeit.layout.layout import Layout
 from jeit.layout.svg_shapes import (
     NUMBER,
@@ -35,7 +38,7 @@ _UNSEEN = ("defs", "clipPath", "mask", "pattern", "symbol", "marker", "metadata"
 _STRAIGHT = ("rect", "polygon", "polyline", "path")
 
 
-def write_svg(layout: Layout, path: Path) -> None:
+def write_svg(layout: Layout, file: BinaryIO) -> None:
     """Write a drawing whose y, running down, is minus the layout's; its origin is the layout's origin."""
     x_min, x_max, y_min, y_max = layout.extent
     left, top = millimetres(x_min - _MARGIN), millimetres(-y_max - _MARGIN)
@@ -56,17 +59,16 @@ def write_svg(layout: Layout, path: Path) -> None:
         place = {"x": circle["cx"], "y": circle["cy"], "font-size": str(millimetres(diameter / 3))}
         _add(names, "text", **place).text = label
     ElementTree.indent(root)
-    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+    ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
 
 
 def read_svg(path: Path, outline: Domain | None) -> Layout:
     """Read what `write_svg` wrote, or a drawing made by hand. Raises `ValueError` for what can be read in two ways."""
-    try:
+    check_size(path, MOST_BYTES)
+    with read_as("this is not an SVG drawing that is read"):
         root = ElementTree.parse(path, ElementTree.XMLParser(target=_Builder())).getroot()
-    except (ElementTree.ParseError, UnicodeError) as error:
-        raise ValueError(f"this is not an SVG drawing: {error}.") from None
     if root.tag != f"{{{_SPACE}}}svg":
-        raise ValueError(f"this is not an SVG drawing: it begins with <{root.tag}>.")
+        raise ValueError(f"this is not an SVG drawing: it begins with <{str(root.tag)[:40]}>.")
     shapes = list(_shapes(root))
     roles = {role for _, role, _ in shapes}
     labels = ["".join(one.itertext()).strip() for one, role, _ in shapes if role == "LABELS" and tag_of(one) == "text"]
@@ -74,6 +76,7 @@ def read_svg(path: Path, outline: Domain | None) -> Layout:
     electrodes = [(one, to) for one, role, to in shapes if role == chosen and (chosen or tag_of(one) in ROUND)]
     if not electrodes:
         raise ValueError("there is no circle in the drawing; electrodes are circles, in a group ELECTRODES or all.")
+    check_electrodes("the drawing", len(electrodes))
     circles = np.array([disc_of(one, to) for one, to in electrodes])
     drawn = _outline([(one, to) for one, role, to in shapes if role == "OUTLINE"]) if "OUTLINE" in roles else None
     if "OUTLINE" not in roles:
@@ -141,14 +144,15 @@ def _to_metres(root: ElementTree.Element) -> np.ndarray:
         size = re.fullmatch(rf"({NUMBER})\s*({'|'.join(_UNITS)})", root.get(name, "").strip())
         if size is None:
             raise ValueError(
-                f'{name} is {root.get(name)!r}, which says no length; set the document\'s size in mm ({name}="200mm").'
+                f"{name} is {told(root.get(name))}, which says no length; set the document's size in mm "
+                f'({name}="200mm").'
             )
         if box and (len(box) != 4 or not inside[0] > 0):
-            raise ValueError(f"viewBox is {root.get('viewBox')!r}; it is four numbers, the last two positive.")
+            raise ValueError(f"viewBox is {told(root.get('viewBox'))}; it is four numbers, the last two positive.")
         scales.append(float(size[1]) * _UNITS[size[2]] / inside[0] if box else _UNITS["px"])
     if not math.isclose(*scales, rel_tol=1e-3):
         raise ValueError(
-            f"viewBox is {root.get('viewBox')!r}, so that a unit is {1e3 * scales[0]:.4g} mm across and "
+            f"viewBox is {told(root.get('viewBox'))}, so that a unit is {1e3 * scales[0]:.4g} mm across and "
             f"{1e3 * scales[1]:.4g} mm up; make its sides as width and height."
         )
     return np.array([[scales[0], 0, 0], [0, -scales[0], 0]])

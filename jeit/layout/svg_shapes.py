@@ -6,15 +6,18 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 
-NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+from jeit.arguments import told
+
+# Possessive: what is no number is found so in one pass, however long it is.
+NUMBER = r"[-+]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?+\d++)?+"
 ROUND = ("circle", "ellipse")
 
 
 def transform_of(element: ElementTree.Element) -> np.ndarray:
     """The matrix (2, 3) of an element's transform. Raises `ValueError` for one that cannot be read."""
     text, found = element.get("transform", "").strip(), np.eye(2, 3)
-    if re.fullmatch(r"(\w+\s*\([^()]*\)[\s,]*)*", text) is None:
-        raise ValueError(f"transform of {described(element)} is {text!r}, not a list of transforms.")
+    if re.fullmatch(r"(\w++\s*+\([^()]*+\)[\s,]*+)*+", text) is None:
+        raise ValueError(f"transform of {described(element)} is {told(text)}, not a list of transforms.")
     for kind, inside in re.findall(r"(\w+)\s*\(([^()]*)\)", text):
         numbers = [number_of(element, "transform", part) for part in re.split(r"[\s,]+", inside.strip()) if part]
         match kind, numbers:
@@ -30,7 +33,8 @@ def transform_of(element: ElementTree.Element) -> np.ndarray:
                 one = np.column_stack([turn, middle - turn @ middle])
             case _:
                 raise ValueError(
-                    f"{described(element)} has {kind}({inside}); jeit reads matrix, translate, scale and rotate."
+                    f"{described(element)} has {kind[:20]}({inside[:40]}); jeit reads matrix, translate, scale and "
+                    "rotate."
                 )
         found = composed(found, one)
     return found
@@ -53,13 +57,17 @@ def tag_of(element: ElementTree.Element) -> str:
 
 def described(element: ElementTree.Element) -> str:
     """An element as messages name it."""
-    return f"<{tag_of(element)} id={element.get('id')!r}>" if "id" in element.attrib else f"a <{tag_of(element)}>"
+    return (
+        f"<{tag_of(element)[:20]} id={told(element.get('id'))}>"
+        if "id" in element.attrib
+        else f"a <{tag_of(element)[:20]}>"
+    )
 
 
 def number_of(element: ElementTree.Element, name: str, text: str | None) -> float:
     """The number that `text`, of the attribute `name`, is. Raises `ValueError`."""
     if text is None or re.fullmatch(NUMBER, text.strip()) is None:
-        raise ValueError(f"{name} of {described(element)} is {text!r}, not a number.")
+        raise ValueError(f"{name} of {described(element)} is {told(text)}, not a number.")
     return float(text)
 
 
@@ -101,7 +109,7 @@ def loops_of(element: ElementTree.Element) -> list[np.ndarray]:
 
 def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
     text = element.get("d", "")
-    if re.fullmatch(rf"(?:[MmLlHhVvZz]|{NUMBER}|[\s,])*", text) is None or not text.strip():
+    if re.fullmatch(rf"(?:[MmLlHhVvZz]|{NUMBER}|[\s,])*+", text) is None or not text.strip():
         raise ValueError(f"{described(element)} has curves, or is no path; draw the skin with straight sides.")
     loops: list[tuple[list[np.ndarray], bool]] = []
     place = np.zeros(2)
@@ -114,7 +122,7 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
             place = loops[-1][0][0]
             continue
         if kind == "Z" or not numbers or len(numbers) % size or (kind != "M" and not loops):
-            raise ValueError(f"d of {described(element)} is not a path: {letter}{inside.strip()}.")
+            raise ValueError(f"d of {described(element)} is not a path: {letter}{inside.strip()[:40]}.")
         for index in range(0, len(numbers), size):
             origin = place if relative else np.array({"H": [0, place[1]], "V": [place[0], 0]}.get(kind, [0, 0]))
             step = {"H": [numbers[index], 0], "V": [0, numbers[index]]}.get(kind, numbers[index : index + 2])

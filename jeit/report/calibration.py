@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from jeit.acoustic.calibration.calibrate import CalibrationFit
-from jeit.report.folder import results_folder
+from jeit.report.folder import results
 
 
 def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
@@ -11,9 +11,9 @@ def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
     `.png`; the folder is made if need be. Raises `ValueError` for a path that is a folder, in no folder, or that of the
     picture."""
     path, picture = calibration_files(path)
-    results_folder(path.parent, (path.name, picture.name))
-    fit.calibration.save(path)
-    draw_calibration(fit).savefig(picture, dpi=130)
+    with results(path.parent, (path.name, picture.name)) as made:
+        fit.calibration.save(made / path.name)
+        draw_calibration(fit).savefig(made / picture.name, dpi=130)
 
 
 def calibration_files(path: str | Path) -> tuple[Path, Path]:

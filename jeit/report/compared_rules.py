@@ -1,6 +1,5 @@
 """What every rule for the hyperparameter chose on a measured difference, on disk: a picture and a report."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from jeit.arguments import counted
 from jeit.imaging.compared_rules import ComparedRules, RuleOutcome
 from jeit.mesh import Mesh
 from jeit.report.describe import describe_measurement, plain
-from jeit.report.folder import results_folder
+from jeit.report.folder import results, write_json
 
 # Inclusions in one image of the picture; more lie over each other.
 _MOST_MARKED = 8
@@ -22,10 +21,9 @@ def write_choice(result: ComparedRules, folder: str | Path) -> None:
 
     Raises `ValueError` for what cannot be one.
     """
-    folder = results_folder(folder, ("choice.png", "choice.json"))
-    draw_choice(result).savefig(folder / "choice.png", dpi=120)
-    text = json.dumps(report_choice(result), indent=1, ensure_ascii=False, allow_nan=False)
-    (folder / "choice.json").write_text(text + "\n", "utf-8")
+    with results(folder, ("choice.png", "choice.json")) as made:
+        draw_choice(result).savefig(made / "choice.png", dpi=120)
+        write_json(report_choice(result), made / "choice.json")
 
 
 def draw_choice(result: ComparedRules):

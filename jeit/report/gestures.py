@@ -1,6 +1,5 @@
 """What is left of learnt gestures in a folder: the model, a report, and a picture of what was taken for what."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 
 from jeit.imaging import LearntGestures
 from jeit.report.describe import plain, version_of
-from jeit.report.folder import results_folder
+from jeit.report.folder import results, write_json
 from jeit.touch.gestures.gesture_model import GESTURE_FILE
 
 GESTURE_FILES = (GESTURE_FILE, "report.json", "gestures.png")
@@ -18,11 +17,10 @@ _PACKAGES = ("jeit", "numpy", "scikit-learn", "skops")
 def write_gestures(learnt: LearntGestures, folder: str | Path, *, name: str = "recordings") -> None:
     """Write `gestures.skops`, `report.json` and the picture `gestures.png` into `folder`, made if need be; `name`: of
     the recordings. Raises `ValueError` for what cannot be a folder."""
-    folder = results_folder(folder, GESTURE_FILES)
-    learnt.model.write(folder / GESTURE_FILE)
-    text = json.dumps(report_gestures(learnt, name), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "report.json").write_text(text + "\n", "utf-8")
-    draw_gestures(learnt).savefig(folder / "gestures.png", dpi=150)
+    with results(folder, GESTURE_FILES) as made:
+        learnt.model.write(made / GESTURE_FILE)
+        write_json(report_gestures(learnt, name), made / "report.json")
+        draw_gestures(learnt).savefig(made / "gestures.png", dpi=150)
 
 
 def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """What is left of an imaged difference on disk: a picture, arrays, and a report."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from jeit.imaging.settings import ImagingSettings
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.protocol import Protocol
 from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain, version_of
-from jeit.report.folder import results_folder
+from jeit.report.folder import results, write_json
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix", "matplotlib")
 
@@ -28,8 +27,14 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
     `labels` (rows, columns), if the image was segmented: 0 background, 1 resistive, 2 conductive. `truth`: a known
     position (x, y) in metres, marked in the picture. Raises `ValueError` for what cannot be a folder.
     """
-    folder = results_folder(folder, ("image.png", "image.npz", "report.json"))
-    draw_image(result, truth=truth).savefig(folder / "image.png", dpi=150)
+    with results(folder, ("image.png", "image.npz", "report.json")) as made:
+        draw_image(result, truth=truth).savefig(made / "image.png", dpi=150)
+        np.savez_compressed(made / "image.npz", **_arrays(result))
+        write_json(report_image(result), made / "report.json")
+
+
+def _arrays(result: ImagedDifference) -> dict[str, Any]:
+    """What the NPZ holds."""
     arrays: dict[str, Any] = {
         "raster": np.asarray(result.raster),
         "extent": np.asarray(result.extent),
@@ -40,9 +45,7 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
     }
     if result.labels is not None:
         arrays["labels"] = result.labels
-    np.savez_compressed(folder / "image.npz", **arrays)
-    text = json.dumps(report_image(result), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "report.json").write_text(text + "\n", "utf-8")
+    return arrays
 
 
 def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = None):

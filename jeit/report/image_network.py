@@ -1,7 +1,6 @@
 """What is left of learning to image, and of the frames that a network imaged, in folders."""
 
 import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jeit.report.describe import plain, version_of
-from jeit.report.folder import results_folder
+from jeit.report.folder import results, results_folder, write_json
 from jeit.simulate.contact.indent_sets import pixel_places
 from jeit.touch.networks import ImageNetwork, LearntImages
 from jeit.touch.networks.places import centroids_of
@@ -27,9 +26,9 @@ def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
 
     Raises `ValueError` for what cannot be a folder.
     """
-    where = results_folder(folder, LEARNT_FILES)
-    _write_json(report_learnt_images(learnt), where)
-    draw_learnt_images(learnt).savefig(where / "learning.png", dpi=130)
+    with results(folder, LEARNT_FILES) as made:
+        write_json(report_learnt_images(learnt), made / "report.json")
+        draw_learnt_images(learnt).savefig(made / "learning.png", dpi=130)
 
 
 def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
@@ -127,7 +126,7 @@ def write_depths(
         "units": {"length": "m"},
         "versions": {package: version_of(package) for package in _PACKAGES},
     }
-    _write_json(plain(report), where)
+    write_json(plain(report), where / "report.json")
     return columns
 
 
@@ -151,8 +150,3 @@ def _draw_depths(
             depth[number], network.extent, most=most, colour_bar=last, title=f"frame {numbers[number]}", ax=ax
         )
     return figure
-
-
-def _write_json(report: dict, folder: Path) -> None:
-    text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "report.json").write_text(text + "\n", "utf-8")

@@ -1,12 +1,11 @@
 """What two layouts feel, on disk: a picture and a report."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from jeit.design.comparison import LayoutComparison
 from jeit.report.describe import plain
-from jeit.report.folder import results_folder
+from jeit.report.folder import results, write_json
 
 # Letters of a name in the picture.
 _LONGEST = 32
@@ -17,10 +16,9 @@ def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> Non
 
     Raises `ValueError` for what cannot be one.
     """
-    folder = results_folder(folder, ("comparison.png", "report.json"))
-    text = json.dumps(report_layout_comparison(result), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "report.json").write_text(text + "\n", "utf-8")
-    draw_layout_comparison(result).savefig(folder / "comparison.png", dpi=130)
+    with results(folder, ("comparison.png", "report.json")) as made:
+        write_json(report_layout_comparison(result), made / "report.json")
+        draw_layout_comparison(result).savefig(made / "comparison.png", dpi=130)
 
 
 def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """A better layout on disk: for the laser cutter, as a picture of how it came about, and a report."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ from jeit.design.scores import Scores
 from jeit.layout import write_layout
 from jeit.mesh import Disk, Domain, Rectangle
 from jeit.report.describe import describe_domain, plain
-from jeit.report.folder import results_folder
+from jeit.report.folder import results, write_json
 
 
 def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
@@ -17,12 +16,11 @@ def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
 
     Raises `ValueError` for what cannot be one.
     """
-    folder = results_folder(folder, ("layout.csv", "layout.svg", "travel.png", "report.json"))
-    write_layout(result.layout, folder / "layout.csv")
-    write_layout(result.layout, folder / "layout.svg")
-    draw_improved_layout(result).savefig(folder / "travel.png", dpi=150)
-    text = json.dumps(report_improved_layout(result), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "report.json").write_text(text + "\n", "utf-8")
+    with results(folder, ("layout.csv", "layout.svg", "travel.png", "report.json")) as made:
+        write_layout(result.layout, made / "layout.csv")
+        write_layout(result.layout, made / "layout.svg")
+        draw_improved_layout(result).savefig(made / "travel.png", dpi=150)
+        write_json(report_improved_layout(result), made / "report.json")
 
 
 def draw_improved_layout(result: ImprovedLayout):

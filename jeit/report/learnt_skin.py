@@ -1,14 +1,12 @@
 """What is left of a learnt skin, and of what it said of frames, in folders."""
 
-import csv
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jeit.report.describe import plain, version_of
-from jeit.report.folder import results_folder
+from jeit.report.folder import results, write_json, write_rows
 from jeit.touch import LearntSkin, Standing, Touches, write_skin
 
 SKIN_FILES = ("skin.skops", "report.json", "learning.png")
@@ -21,10 +19,10 @@ def write_learnt_skin(skin: LearntSkin, folder: str | Path) -> None:
 
     Raises `ValueError` for what cannot be a folder.
     """
-    folder = results_folder(folder, SKIN_FILES)
-    write_skin(skin, folder / "skin.skops")
-    _write_json(report_learnt_skin(skin), folder)
-    draw_learning(skin).savefig(folder / "learning.png", dpi=150)
+    with results(folder, SKIN_FILES) as made:
+        write_skin(skin, made / "skin.skops")
+        write_json(report_learnt_skin(skin), made / "report.json")
+        draw_learning(skin).savefig(made / "learning.png", dpi=150)
 
 
 def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str) -> None:
@@ -35,12 +33,7 @@ def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str)
     learnt; `unlike`, 1 for frames unlike any learnt from, of which nothing is said. Raises `ValueError` for what
     cannot be a folder.
     """
-    folder = results_folder(folder, TOUCH_FILES)
     columns = _columns(touches)
-    with open(folder / "touches.csv", "w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(columns)
-        table.writerows(zip(*columns.values(), strict=True))
     dead = np.flatnonzero(~touches.alive.any(axis=0))
     report = {
         "frames": name,
@@ -55,8 +48,10 @@ def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str)
     if touches.label is not None:
         kinds, counts = np.unique(touches.label[~touches.unlike], return_counts=True)
         report["labels"] = dict(zip(kinds.tolist(), counts.tolist(), strict=True))
-    _write_json(plain(report), folder)
-    draw_touches(touches).savefig(folder / "touches.png", dpi=150)
+    with results(folder, TOUCH_FILES) as made:
+        write_rows(made / "touches.csv", list(columns), zip(*columns.values(), strict=True))
+        write_json(plain(report), made / "report.json")
+        draw_touches(touches).savefig(made / "touches.png", dpi=150)
 
 
 def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
@@ -169,8 +164,3 @@ def _columns(touches: Touches) -> dict[str, list]:
 
 def _texts(values: np.ndarray) -> list[str]:
     return [f"{value:.6g}" if np.isfinite(value) else "" for value in values]
-
-
-def _write_json(report: dict, folder: Path) -> None:
-    text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "report.json").write_text(text + "\n", "utf-8")

@@ -1,14 +1,12 @@
 """What is left of a listener, and of what it heard in a recording, in folders."""
 
-import csv
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jeit.report.describe import plain, version_of
-from jeit.report.folder import results_folder
+from jeit.report.folder import results, write_json, write_rows
 from jeit.touch.listening import Heard, Listener
 from jeit.touch.listening.feature_images import EVERY, LENGTH
 
@@ -22,10 +20,10 @@ def write_listener(listener: Listener, folder: str | Path) -> None:
 
     Raises `ValueError` for what cannot be a folder.
     """
-    folder = results_folder(folder, LISTENER_FILES)
-    listener.write(folder / "listener.jeit")
-    _write_json(report_listener(listener), folder)
-    draw_listener(listener).savefig(folder / "learning.png", dpi=150)
+    with results(folder, LISTENER_FILES) as made:
+        listener.write(made / "listener.jeit")
+        write_json(report_listener(listener), made / "report.json")
+        draw_listener(listener).savefig(made / "learning.png", dpi=150)
 
 
 def write_heard(heard: Heard, folder: str | Path, *, model: str) -> None:
@@ -37,14 +35,11 @@ def write_heard(heard: Heard, folder: str | Path, *, model: str) -> None:
     told, `x_m`, `y_m` (`z_m`) and `std_x_m` …, empty where there is none. Raises `ValueError` for what cannot be a
     folder.
     """
-    folder = results_folder(folder, HEARD_FILES)
-    with open(folder / "events.csv", "w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        columns = _columns(heard)
-        table.writerow(columns)
-        table.writerows(zip(*columns.values(), strict=True))
-    _write_json(report_heard(heard, model=model), folder)
-    draw_heard(heard).savefig(folder / "timeline.png", dpi=150)
+    columns = _columns(heard)
+    with results(folder, HEARD_FILES) as made:
+        write_rows(made / "events.csv", list(columns), zip(*columns.values(), strict=True))
+        write_json(report_heard(heard, model=model), made / "report.json")
+        draw_heard(heard).savefig(made / "timeline.png", dpi=150)
 
 
 def report_listener(listener: Listener) -> dict[str, Any]:
@@ -163,8 +158,3 @@ def _columns(heard: Heard) -> dict[str, list]:
 
 def _texts(values: np.ndarray) -> list[str]:
     return [f"{value:.6g}" if np.isfinite(value) else "" for value in values]
-
-
-def _write_json(report: dict, folder: Path) -> None:
-    text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "report.json").write_text(text + "\n", "utf-8")

@@ -1,7 +1,5 @@
 """What became of a watched skin, in a folder: its events, a report, and a picture of them in time and on the skin."""
 
-import csv
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.report.describe import plain, version_of
-from jeit.report.folder import results_folder
+from jeit.report.folder import results, write_json, write_rows
 from jeit.touch.health import HealthEvent, SkinHealth
 
 HEALTH_FILES = ("events.csv", "report.json", "health.png")
@@ -37,16 +35,10 @@ def write_health(
     A path is written as places x y in metres, parted by semicolons; electrodes are numbered from 1. Raises `ValueError`
     for what cannot be a folder.
     """
-    folder = results_folder(folder, HEALTH_FILES)
-    with open(folder / "events.csv", "w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(_EVENTS)
-        table.writerows(_row(one) for one in health.events)
-    text = json.dumps(
-        report_health(health, name, timed) | {"notes": list(notes)}, indent=2, ensure_ascii=False, allow_nan=False
-    )
-    (folder / "report.json").write_text(text + "\n", "utf-8")
-    draw_health(health, times, frames, timed).savefig(folder / "health.png", dpi=130)
+    with results(folder, HEALTH_FILES) as made:
+        write_rows(made / "events.csv", _EVENTS, (_row(one) for one in health.events))
+        write_json(report_health(health, name, timed) | {"notes": list(notes)}, made / "report.json")
+        draw_health(health, times, frames, timed).savefig(made / "health.png", dpi=130)
 
 
 def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """What is left of a located recording on disk: a table of its frames, a report, and a picture."""
 
-import csv
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.overlay import brightness, fade
 from jeit.acoustic.tracking import Track
 from jeit.report.describe import plain, version_of
-from jeit.report.folder import results_folder
+from jeit.report.folder import results, write_json, write_rows
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 # Maps of so many pixels a side, so many frames at once.
@@ -30,14 +28,11 @@ def write_track(found: LocatedTouches, folder: str | Path) -> None:
     for z follow. Empty where there is nothing. Raises `ValueError` for what cannot be a
     folder.
     """
-    folder = results_folder(folder, ("track.csv", "report.json", "track.png"))
-    with open(folder / "track.csv", "w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(_columns(found.locations.position.shape[1]))
-        table.writerows(_rows(found.locations, found.track))
-    text = json.dumps(report_track(found), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "report.json").write_text(text + "\n", "utf-8")
-    draw_track(found).savefig(folder / "track.png", dpi=150)
+    with results(folder, ("track.csv", "report.json", "track.png")) as made:
+        columns = _columns(found.locations.position.shape[1])
+        write_rows(made / "track.csv", columns, _rows(found.locations, found.track))
+        write_json(report_track(found), made / "report.json")
+        draw_track(found).savefig(made / "track.png", dpi=150)
 
 
 def report_track(found: LocatedTouches) -> dict[str, Any]:

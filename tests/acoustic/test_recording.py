@@ -169,7 +169,7 @@ MISSING = np.where(np.arange(10).reshape(5, 2) == 3, np.nan, 0.1)
         ({"samples": SAMPLES + 0j, "rate": 40e3}, "complex128; give real"),
         ({"samples": SAMPLES.astype(str), "rate": 40e3}, "<U"),
         ({"samples": SAMPLES > 0, "rate": 40e3}, "bool"),
-        ({"samples": SAMPLES.astype(object), "rate": 40e3}, "Object arrays"),
+        ({"samples": SAMPLES.astype(object), "rate": 40e3}, "holds objects"),
         ({"samples": SAMPLES, "rate": 0.0}, "rate is 0"),
         ({"samples": SAMPLES, "rate": -40e3}, "rate is -40000"),
         ({"samples": SAMPLES, "rate": np.nan}, "rate is nan"),

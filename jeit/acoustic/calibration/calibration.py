@@ -15,6 +15,7 @@ from jeit.acoustic.noise import IntensityNoise
 from jeit.acoustic.signal._arrays import check_extent, check_microphones, real
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.surface import AbstractSurface, CurvedSurface, Plane
+from jeit.files import written_whole
 from jeit.mesh import Polygon
 from jeit_solvers.engines import as_array, on_host
 
@@ -56,9 +57,9 @@ class Calibration(eqx.Module):
 
     def save(self, path: str | Path) -> None:
         """Write a JSON file, with its version and units."""
-        Path(path).write_text(
-            json.dumps(self._content(), indent=1, ensure_ascii=False, allow_nan=False) + "\n", "utf-8"
-        )
+        text = json.dumps(self._content(), indent=1, ensure_ascii=False, allow_nan=False)
+        with written_whole(path) as file:
+            file.write(f"{text}\n".encode())
 
     @classmethod
     def load(cls, path: str | Path) -> "Calibration":

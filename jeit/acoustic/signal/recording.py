@@ -27,7 +27,7 @@ from jeit.acoustic.signal._arrays import (
 )
 from jeit.acoustic.signal.faults import intensity_faults
 from jeit.acoustic.signal.sound_file import read_sound
-from jeit.arguments import need, npz_arrays
+from jeit.files import need, npz_arrays, written_whole
 from jeit.mesh.loops import check_loop
 
 # Said of files that are neither.
@@ -281,6 +281,5 @@ def write_taps(path: str | Path, taps: Taps) -> None:
 
 
 def _write(path: str | Path, **arrays) -> None:
-    # Through an open file: given a name, NumPy would add a suffix of its own.
-    with Path(path).open("wb") as file:
+    with written_whole(path) as file:
         np.savez(file, allow_pickle=False, **{key: value for key, value in arrays.items() if value is not None})

@@ -3,11 +3,14 @@
 import warnings
 from importlib.util import find_spec
 from pathlib import Path
-from struct import error as StructError
 
 import numpy as np
 import scipy.io.wavfile
 
+from jeit.files import check_memory, read_as, reason
+
+# Bytes of memory for each of a file of eight bits a sample.
+_IN_MEMORY = 8
 # What files of other formats begin with: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
 _OTHERS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
 # And those that soundfile does not read either: MP4 from its fifth byte on, WebM, WMA, AMR.
@@ -20,6 +23,7 @@ def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
     Integers become parts of full scale, -1 to 1; floats stay as they are, and where they go beyond 1 full scale is not
     known. Raises `ValueError` for files that are broken, and those that need `soundfile` where it is not installed.
     """
+    check_memory(path.name, _IN_MEMORY * path.stat().st_size)
     with path.open("rb") as file:
         start = file.read(8)
     if start.startswith((b"RIFF", b"RIFX", b"RF64")):
@@ -45,7 +49,7 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
         warnings.simplefilter("always")
         try:
             rate, data = scipy.io.wavfile.read(path)
-        except (ValueError, EOFError, StructError, UnboundLocalError, ZeroDivisionError, TypeError) as error:
+        except Exception as error:  # of many kinds: it stumbles over what is damaged
             problem = error
     # The reader only warns of these, or stumbles later; its other warnings are of chunks that hold no sound.
     if any("prematurely" in str(one.message) for one in said):
@@ -53,7 +57,7 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
     if "Unknown wave file format" in str(problem):  # A-law, ADPCM, and such
         return _read_other(path)
     if problem is not None:
-        raise ValueError(f"not a readable WAV file, or cut off ({problem}); write it as plain PCM or float.")
+        raise ValueError(f"not a readable WAV file, or cut off ({reason(problem)}); write it as plain PCM or float.")
     samples = data.T if data.ndim == 2 else data[None]
     if data.dtype == np.uint8:
         return (samples - 128.0) / 128.0, rate, 1.0
@@ -68,11 +72,13 @@ def _read_other(path: Path) -> tuple[np.ndarray, float, float | None]:
         raise ValueError("this format needs soundfile: pip install 'jeit[sound]', or convert it to plain WAV.")
     import soundfile  # pyright: ignore[reportMissingImports]
 
-    try:
-        with soundfile.SoundFile(path) as file:
+    unread = "not a sound file that soundfile reads"
+    with read_as(unread):
+        file = soundfile.SoundFile(path)
+    with file:
+        check_memory(path.name, 8.0 * file.frames * file.channels)
+        with read_as(unread):
             data, rate, kind = file.read(file.frames, "float64", always_2d=True), file.samplerate, file.subtype
-    except (RuntimeError, TypeError, ValueError) as error:  # soundfile's own are RuntimeErrors
-        raise ValueError(f"not a sound file that soundfile reads ({' '.join(str(error).split())}).") from None
     # What is compressed may overshoot 1 a little; its full scale is 1 all the same.
     return data.T, rate, _full_scale(data) if kind in ("FLOAT", "DOUBLE") else 1.0
 

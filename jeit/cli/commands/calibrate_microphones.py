@@ -53,18 +53,16 @@ def calibrate_microphones(
     quiet: Quiet = False,
 ) -> None:
     """Calibrate an array of microphones from taps at known places; writes the calibration and a picture of it."""
-    from rich.console import Console
-
     from jeit.acoustic import calibrate_microphones as calibrate
     from jeit.acoustic import read_taps
     from jeit.acoustic.calibration.calibrate import AUTO
     from jeit.acoustic.decay import find_decay
-    from jeit.cli.console import Steps, say_written
+    from jeit.cli.console import Steps, plain_console, say_written
     from jeit.report import write_calibration
     from jeit.report.calibration import calibration_files
 
     settings = intensity_settings(low, high, window, hop)
-    console = Console(highlight=False)
+    console = plain_console()
     with naming_options(_OPTIONS):
         kind = decay if decay == AUTO else find_decay(decay)
         files = calibration_files(output)

@@ -46,9 +46,7 @@ def choose(
     quiet: Quiet = False,
 ) -> None:
     """Compare the rules that choose the hyperparameter of DATA's image; writes choice.png and choice.json."""
-    from rich.console import Console
-
-    from jeit.cli.console import Steps, say_written
+    from jeit.cli.console import Steps, plain_console, say_written
     from jeit.data import read
     from jeit.imaging import ImagingSettings, compare_on_data
     from jeit.report import write_choice
@@ -56,7 +54,7 @@ def choose(
     given = {"prior": prior, "contact": contact, "num_points": num_points, "as_is": as_is}
     settings = ImagingSettings(**{name: value for name, value in given.items() if value is not None})
     make_folder(output, ("choice.png", "choice.json"))
-    console = Console(highlight=False)
+    console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
         base = None if reference is None else read(reference, format, description)
@@ -89,7 +87,7 @@ def show(console, result: "ComparedRules") -> None:
             str(len(outcome.inclusions)),
         )
     console.print()
-    console.print(f"[bold]{result.prepared.measurement.name}[/bold]")
+    console.print(result.prepared.measurement.name, style="bold")
     console.print(table)
     for outcome in result.outcomes.values():
         if outcome.choice.edge:

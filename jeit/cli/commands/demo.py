@@ -21,15 +21,14 @@ def demo(
     """Press a simulated skin (100 mm across, 16 electrodes), image it, and compare. Needs no data."""
     import jax
     import numpy as np
-    from rich.console import Console
 
-    from jeit.cli.console import Steps, pairs, say_written
+    from jeit.cli.console import Steps, pairs, plain_console, say_written
     from jeit.imaging import image_difference
     from jeit.report import write_image
     from jeit.simulate.round_skin import RoundSkin, simulate_press
 
     make_folder(output)
-    console = Console(highlight=False)
+    console = plain_console()
     skin = RoundSkin()
     with Steps(console, quiet=quiet) as step:
         step("simulate a press")

@@ -14,10 +14,8 @@ def info(
     description: Description = None,
 ) -> None:
     """Say what DATA holds: frames, electrodes, protocol, noise, and what was assumed or masked."""
-    from rich.console import Console
-
     from jeit.arguments import counted, percent
-    from jeit.cli.console import pairs, scaled
+    from jeit.cli.console import pairs, plain_console, scaled
     from jeit.data import read
     from jeit.report import report_measurement
 
@@ -46,4 +44,4 @@ def info(
     ]
     rows.append(("wiring", found["wiring"] or "not known: the file does not say where electrodes are"))
     rows += [("note", note) for note in found["notes"]]
-    Console(highlight=False).print(pairs(measurement.name, rows))
+    plain_console().print(pairs(measurement.name, rows))

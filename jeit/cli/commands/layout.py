@@ -84,9 +84,7 @@ def compare(
     quiet: Quiet = False,
 ) -> None:
     """Touch two layouts all over, and say what each feels: sensitivity, blind spots, virtual taxels."""
-    from rich.console import Console
-
-    from jeit.cli.console import Steps, say_written
+    from jeit.cli.console import Steps, plain_console, say_written
     from jeit.design import compare_layouts
     from jeit.design.comparison import check_same_outline
     from jeit.design.skin.protocol import skin_protocol
@@ -101,7 +99,7 @@ def compare(
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
     both = [skins.read_with_outline(name, width, height) for name in (first, second)]
     make_folder(output, _FILES)
-    console = Console(highlight=False)
+    console = plain_console()
     with naming_options(_OPTIONS), Steps(console, quiet=quiet) as step:
         check_same_outline(*both)
         step("mesh")
@@ -141,5 +139,5 @@ def _show(console, result: "LayoutComparison") -> None:
                 table.add_row(f"taxel area, {part} / cm²", *(f"{one['taxel_area_cm2'][part]:.3g}" for one in figures))
     console.print()
     console.print(table)
-    console.print("[dim]blind spot: less sensitive than the other layout's least sensitive place[/dim]")
+    console.print("blind spot: less sensitive than the other layout's least sensitive place", style="dim")
     console.print()

@@ -67,9 +67,7 @@ def optimise(
     All two-terminal pairs are measured, so the order of electrodes does not matter. Figures of both layouts are on a
     finer mesh than the one optimised on.
     """
-    from rich.console import Console
-
-    from jeit.cli.console import Steps, say_written
+    from jeit.cli.console import Steps, plain_console, say_written
     from jeit.design import DesignSpace, improve_layout
     from jeit.report import write_improved_layout
 
@@ -87,7 +85,7 @@ def optimise(
     space = DesignSpace(minimum_spacing=1e-3 * minimum_spacing, keep_out=free, symmetry=symmetry, sizes=sizes)
     search = {"noise": noise, "steps": steps, "starts": starts, "seed": seed, "num_points": num_points}
     material = {"thickness": 1e-3 * thickness, "conductivity": conductivity, "contact_impedance": contact_impedance}
-    console = Console(highlight=False)
+    console = plain_console()
 
     def say(done: int, values) -> None:
         step.tell(f"step {done} of at most {steps}, best score {values.max():.3f}")

@@ -51,16 +51,14 @@ def image(
     """
     from contextlib import ExitStack
 
-    from rich.console import Console
-
     from jeit.cli.commands.study import connected
-    from jeit.cli.console import Steps, pairs, say_written
+    from jeit.cli.console import Steps, pairs, plain_console, say_written
     from jeit.design import read_described_skin
     from jeit.report.image_network import LEARNT_FILES, write_learnt_images
     from jeit.touch.networks import learn_images
 
     make_folder(output, LEARNT_FILES)
-    console = Console(highlight=False)
+    console = plain_console()
     with ExitStack() as stack:
         step = stack.enter_context(Steps(console, quiet=quiet))
         step("read")

@@ -77,15 +77,13 @@ def hear(
 
     What is named, a MODEL has learnt from labelled clips: see 'jeit listen fit --help'.
     """
-    from rich.console import Console
-
     from jeit.acoustic import Calibration, Recording, read_recording
-    from jeit.cli.console import Steps, say_written
+    from jeit.cli.console import Steps, plain_console, say_written
     from jeit.report.listener import HEARD_FILES, write_heard
     from jeit.touch.listening import Listener
 
     make_folder(output, HEARD_FILES)
-    console = Console(highlight=False)
+    console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
         listener = Listener.read(model)
@@ -143,10 +141,9 @@ def fit(
     import shutil
 
     import jax
-    from rich.console import Console
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, pairs, say_written
+    from jeit.cli.console import Steps, pairs, plain_console, say_written
     from jeit.report.listener import LISTENER_FILES, summary, write_listener
     from jeit.touch.listening import Listener, read_clips
     from jeit.touch.listening.learners import BATCHES
@@ -159,7 +156,7 @@ def fit(
     if clips.resolve() in output.resolve().parents or clips.resolve() == output.resolve():
         raise ValueError(f"--output {output} lies in the folder of clips, where it would be a class; give another.")
     make_folder(output, LISTENER_FILES)
-    console = Console(highlight=False)
+    console = plain_console()
     # Trainings on their way; gone when all is done.
     under_way = output / "training"
     with Steps(console, quiet=quiet) as step:
@@ -197,7 +194,6 @@ def fit(
 
 def _show(console, heard: "Heard") -> None:
     """The whole, and a line for each event."""
-    from rich.markup import escape
     from rich.table import Table
 
     from jeit.cli.console import pairs
@@ -216,6 +212,6 @@ def _show(console, heard: "Heard") -> None:
     for event in heard.events:
         where = [""] * (2 * placed) if event.place is None else [f"{1e3 * value:z.1f}" for value in event.place[:2]]
         sure = f"{100 * event.probability:.0f}" if event.name else ""
-        table.add_row(escape(event.name) or "quiet", f"{event.start:.2f}", f"{event.end:.2f}", sure, *where)
+        table.add_row(event.name or "quiet", f"{event.start:.2f}", f"{event.end:.2f}", sure, *where)
     console.print(table)
     console.print()

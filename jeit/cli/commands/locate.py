@@ -59,12 +59,10 @@ def locate(
     quiet: Quiet = False,
 ) -> None:
     """Locate every touch of a recording; writes track.csv, report.json and track.png."""
-    from rich.console import Console
-
     from jeit.acoustic import Calibration, locate_touches, read_recording
     from jeit.acoustic.localisation.localiser import METHODS
     from jeit.arguments import check_name
-    from jeit.cli.console import Steps, say_written
+    from jeit.cli.console import Steps, plain_console, say_written
     from jeit.report import write_track
 
     check_name("--method", method, METHODS)
@@ -72,7 +70,7 @@ def locate(
         raise ValueError(f"--gap must be positive, in seconds; it is {gap}.")
     settings = intensity_settings(low, high, window, hop)
     make_folder(output, ("track.csv", "report.json", "track.png"))
-    console = Console(highlight=False)
+    console = plain_console()
     with Steps(console, quiet=quiet) as step, naming_options(_OPTIONS):
         step("read")
         known = Calibration.load(calibration)

@@ -97,9 +97,7 @@ def reconstruct(
             quiet=quiet,
         )
         return
-    from rich.console import Console
-
-    from jeit.cli.console import Steps, say_written
+    from jeit.cli.console import Steps, plain_console, say_written
     from jeit.data import read
     from jeit.imaging import METHODS, ImagingSettings, image_difference
     from jeit.report import write_image
@@ -120,7 +118,7 @@ def reconstruct(
     if hyperparameter is not None and not chosen_method.takes_hyperparameter:
         raise ValueError(f"--hyperparameter: plain {settings.method} has none; leave it out.")
     make_folder(output)
-    console = Console(highlight=False)
+    console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
         base = None if reference is None else read(reference, format, description)

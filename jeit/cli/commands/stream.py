@@ -93,10 +93,9 @@ def stream(
         image_by_network(model, given, output, method=method, unused=unused, quiet=quiet, streamed=True)
         return
     import numpy as np
-    from rich.console import Console
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, say_written, scaled
+    from jeit.cli.console import Steps, plain_console, say_written, scaled
     from jeit.data import read
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as images_of
@@ -118,7 +117,7 @@ def stream(
     with naming_options({"film": "--film"}):
         films = () if wanted is None else (check_film(wanted),)
     make_folder(output, ("frames.csv", "images.npz", "frames.png", *films))
-    console = Console(highlight=False)
+    console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
         empty = read(reference, format, description)

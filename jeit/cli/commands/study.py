@@ -108,11 +108,10 @@ def _page(file: Path, store: Path, page: Path | None) -> Path:
 def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: str | None, quiet: bool) -> None:
     from contextlib import ExitStack
 
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
-    from jeit.cli.console import say_written
+    from jeit.cli.console import plain_console, say_written
     from jeit.design.study import run_study
     from jeit.design.study.store import require
     from jeit.report.study import write_study_report
@@ -120,11 +119,12 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
     where = _page(file, store, page)
     for package in ("zarr", "xarray"):
         require(package)  # before a bar says that it has begun
-    console = Console(highlight=False)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    console = plain_console()
+    done, left = (TextColumn(f"{{{said}}}", markup=False) for said in ("task.description", "task.fields[left]"))
+    columns = (done, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), left)
     with ExitStack() as stack:
         client = None if scheduler is None else stack.enter_context(connected(scheduler))
-        bar = stack.enter_context(Bar(*columns, TextColumn("{task.fields[left]}"), console=console, disable=quiet))
+        bar = stack.enter_context(Bar(*columns, console=console, disable=quiet))
         task = bar.add_task("points", total=len(sweep.points), left="")
 
         def show(now: "Progress") -> None:

@@ -70,15 +70,13 @@ def fit(
 
     Writes skin.skops, report.json and learning.png, a picture of the errors, to the folder SKIN.
     """
-    from rich.console import Console
-
-    from jeit.cli.console import Steps, pairs, say_written
+    from jeit.cli.console import Steps, pairs, plain_console, say_written
     from jeit.data import load_description
     from jeit.report.learnt_skin import SKIN_FILES, summary, write_learnt_skin
     from jeit.touch import LearntSkin, read_presses
 
     make_folder(output, SKIN_FILES)
-    console = Console(highlight=False)
+    console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
         recorded = read_presses(presses)
@@ -128,15 +126,14 @@ def predict(
 ) -> None:
     """Say of each frame where, how hard and by what the skin is touched, and how sure that is."""
     import numpy as np
-    from rich.console import Console
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, say_written
+    from jeit.cli.console import Steps, plain_console, say_written
     from jeit.report.learnt_skin import TOUCH_FILES, write_touches
     from jeit.touch import read_frames, read_skin
 
     make_folder(output, TOUCH_FILES)
-    console = Console(highlight=False)
+    console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
         learnt, given = read_skin(skin), read_frames(frames)
@@ -159,4 +156,4 @@ def predict(
 
 def _print_notes(console, notes) -> None:
     for note in notes:
-        console.print(f"  note: {note}", soft_wrap=True, markup=False)
+        console.print(f"  note: {note}", soft_wrap=True)

@@ -53,10 +53,9 @@ def health(
     Writes events.csv, report.json and health.png. Nothing is asked of the skin: any number of channels, any unit.
     """
     import numpy as np
-    from rich.console import Console
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, say_written
+    from jeit.cli.console import Steps, plain_console, say_written
     from jeit.data import load_description, read_frame_recording
     from jeit.imaging import doubts_of, learn_health
     from jeit.imaging.health_learning import seconds_of
@@ -67,7 +66,7 @@ def health(
         {name: value for name, value in {"--rate": rate, "--patience": patience}.items() if value is not None}
     )
     make_folder(output, HEALTH_FILES)
-    console = Console(highlight=False)
+    console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
         with naming_options({"description": "--skin"}):
@@ -100,12 +99,12 @@ def health(
     unit = "frame" if seconds is None else "s"
     console.print(f"\n{counted(now.frames, 'frame')}: {counted(len(now.events), 'event')}")
     for note in doubts:
-        console.print(f"  note: {note}", soft_wrap=True, markup=False)
+        console.print(f"  note: {note}", soft_wrap=True)
     for one in now.events:
         where = "" if one.electrode is None else f" {one.electrode + 1}"
         long = "" if one.path is None else f", {1e3 * one.length:.0f} ± {1e3 * one.deviation:.0f} mm long"
         at = f"{unit} {one.time:.0f}" if seconds is None else f"{one.time:.2f} s"
-        console.print(f"  {at}: {one.kind}{where}{long}, {one.status}. {one.reason}", soft_wrap=True, markup=False)
+        console.print(f"  {at}: {one.kind}{where}{long}, {one.status}. {one.reason}", soft_wrap=True)
     if (held := now.held) is not None:
-        console.print(f"  held at the end: {held.reason}", soft_wrap=True, markup=False)
+        console.print(f"  held at the end: {held.reason}", soft_wrap=True)
     say_written(console, output / "events.csv", "report.json", "health.png")

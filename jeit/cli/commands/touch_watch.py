@@ -43,15 +43,13 @@ def gestures(
 
     Writes gestures.skops, report.json and gestures.png, what was taken for what, to the folder MODEL.
     """
-    from rich.console import Console
-
-    from jeit.cli.console import Steps, pairs, say_written
+    from jeit.cli.console import Steps, pairs, plain_console, say_written
     from jeit.data import GestureSet, load_description
     from jeit.imaging import learn_gestures
     from jeit.report.gestures import GESTURE_FILES, write_gestures
 
     make_folder(output, GESTURE_FILES)
-    console = Console(highlight=False)
+    console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
         with naming_options({"which": "--skin", "description": "--skin"}):
@@ -122,10 +120,9 @@ def watch(
     from dataclasses import replace
 
     import numpy as np
-    from rich.console import Console
 
     from jeit.arguments import counted
-    from jeit.cli.console import Steps, say_written
+    from jeit.cli.console import Steps, plain_console, say_written
     from jeit.cli.live_frames import LiveFrames
     from jeit.data import load_description, read_frame_recording
     from jeit.imaging import TouchImages, TouchWatch
@@ -136,7 +133,7 @@ def watch(
 
     check_positive({"--untouched": untouched, "--patience": patience} | ({} if rate is None else {"--rate": rate}))
     make_folder(output, WATCH_FILES)
-    console = Console(highlight=False)
+    console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
         with naming_options({"description": "--skin"}):
@@ -157,18 +154,18 @@ def watch(
         images = TouchImages.prepare(description, still, replace(TOUCH_IMAGES, as_is=as_is), progress=step.tell)
         watch = TouchWatch.create(images, model, still, rate=own, patience=patience)
     for note in () if quiet else watch.notes:
-        console.print(f"  note: {note}", soft_wrap=True, markup=False)
+        console.print(f"  note: {note}", soft_wrap=True)
 
     if live is not None and not quiet:
         console.print("  ready: the skin may be touched")
 
     def show(one) -> None:
         if one.note and not quiet:
-            console.print(f"  note: {one.note}", soft_wrap=True, markup=False)
+            console.print(f"  note: {one.note}", soft_wrap=True)
         # Live, a touch is named with the first frame that has none; of a file it is told once, as it was in the end.
         told = one.ended if stream != "-" else () if one.named is None else (one.named,)
         for touch in () if quiet else told:
-            console.print(_line(touch), markup=False)
+            console.print(_line(touch))
 
     written = write_watch(watch.follow(frames), watch, output, name=stream, progress=show)
     if quiet:
@@ -183,7 +180,7 @@ def watch(
     if live is not None and live.left_out:
         console.print(f"{counted(live.left_out, 'frame')} left out that had come before they could be read")
     if written.first_reason:
-        console.print(f"first refusal: {written.first_reason}", soft_wrap=True, markup=False)
+        console.print(f"first refusal: {written.first_reason}", soft_wrap=True)
     say_written(console, output / "events.csv", "paths.csv", "report.json", "timeline.png")
 
 

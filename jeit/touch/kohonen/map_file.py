@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.arguments import check_kind, need, npz_arrays
+from jeit.arguments import check_kind
+from jeit.files import need, npz_arrays, written_whole
 from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
@@ -21,7 +22,7 @@ def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
     plain = learnt.learnt if placed else learnt
     more = {name: getattr(learnt, name) for name in _OF_PLACES} if placed else {}
     more = {name: value for name, value in more.items() if value is not None}
-    with Path(path).open("wb") as file:  # NumPy would add .npz to another name
+    with written_whole(path) as file:
         np.savez_compressed(file, weights=plain.weights, scale=plain.scale, **more)
 
 

@@ -1,12 +1,12 @@
 """Learnt skins as files: arrays and scikit-learn's estimators as skops keeps them, never a pickle."""
 
-import zipfile
-import zlib
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from jeit.arguments import listed, told
+from jeit.files import check_archive, reason, written_whole
 from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 from jeit.touch.learnt.channels import Channels
@@ -56,18 +56,6 @@ _OURS = {
         Whitened,
     )
 }
-_FAULTS = (
-    ValueError,
-    TypeError,
-    KeyError,
-    AttributeError,
-    EOFError,
-    OSError,
-    RuntimeError,
-    NotImplementedError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 def write_skin(skin: LearntSkin, path: str | Path) -> None:
@@ -98,7 +86,8 @@ def write_plain(path: str | Path, kind: str, version: int, own: dict[str, Any], 
     need_learning()
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / example}.")
-    dump({"kind": kind, "version": version, "skin": _plain(own)}, path)
+    with written_whole(path) as file:
+        dump({"kind": kind, "version": version, "skin": _plain(own)}, file)
 
 
 def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[dict[str, Any]], Any]) -> Any:
@@ -108,19 +97,19 @@ def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[d
 
     need_learning()
     try:
+        check_archive(path)
         strange = sorted(get_untrusted_types(file=path))
         if strange:
-            raise ValueError(f"it holds {', '.join(strange[:3])}, which no {said} does")
+            raise ValueError(f"it holds {listed(strange, most=3)}, which no {said} does")
         content = load(path, trusted=[])
         if not isinstance(content, dict) or content.get("kind") != kind:
             raise ValueError("it is of another kind")
         if content["version"] != version:
-            raise ValueError(f"it is of version {content['version']}, and this jeit reads {version}")
+            raise ValueError(f"it is of version {told(content['version'])}, and this jeit reads {version}")
         own: Any = _whole(content["skin"])
         return make(own)
-    except _FAULTS as error:
-        told = " ".join(str(error).split())
-        raise ValueError(f"'{path}' is not a {said} that can be read ({told}); fit it again.") from None
+    except Exception as error:  # of any kind: classes of many packages are made of what the file says
+        raise ValueError(f"'{path}' is not a {said} that can be read ({reason(error)}); fit it again.") from None
 
 
 def _plain(value):

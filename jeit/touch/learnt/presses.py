@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import need, npz_arrays
+from jeit.files import need, npz_arrays
 
 # No skin is known that is longer: its coordinates would be in millimetres.
 _LONGEST = 5.0  # m

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from jeit.arguments import told
+from jeit.files import written_whole
 
 # Of the file: how it begins; bytes of the head, and of all arrays together, at most.
 _MAGIC, _LONGEST_HEAD, _LARGEST = b"jeit model\n", 2**20, 2**31
@@ -82,20 +83,6 @@ def check_same(path: str | Path, made_for: dict[str, Any], here: dict[str, Any])
                 f"'{path}' was trained for another skin or protocol: its {name} is {_said(made_for.get(name))}, and "
                 f"here it is {_said(here[name])}; train one for this."
             )
-
-
-@contextmanager
-def written_whole(path: Path) -> Iterator[BinaryIO]:
-    """A file that takes the place of `path` when all of it is on the disk: one killed before leaves what was there."""
-    other = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with other.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        other.replace(path)
-    finally:
-        other.unlink(missing_ok=True)
 
 
 @contextmanager

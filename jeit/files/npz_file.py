@@ -1,0 +1,150 @@
+"""The arrays of NPZ and NPY files: plain numbers and text, nothing that would be executed, of no more than they say."""
+
+import math
+import struct
+import tokenize
+import zipfile
+import zlib
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+
+from jeit.files.foreign import reason
+from jeit.files.limits import check_memory
+
+_ARRAY, _ARCHIVE = b"\x93NUM", b"PK\x03\x04"
+# What NumPy, and zipfile beneath it, say of files that are broken, encrypted, or compressed in ways they do not know.
+FAULTS = (
+    ValueError,
+    EOFError,
+    TypeError,
+    SyntaxError,
+    OverflowError,
+    LookupError,
+    RuntimeError,  # NotImplementedError and RecursionError are
+    MemoryError,
+    tokenize.TokenError,
+    struct.error,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+def npz_arrays(
+    path: Path, *keys: str, otherwise: str = "not an NPZ file", every: bool = False
+) -> dict[str, np.ndarray]:
+    """The arrays named, or `every` one, as far as an NPZ file has them, and under "" the names of all that it holds.
+
+    What is not asked for is not read. Raises `ValueError` for other files (`otherwise` says which), broken ones, arrays
+    of objects, and those that would not fit in memory (`check_memory`); `OSError` where there is no such file.
+    """
+    with path.open("rb") as file:
+        start = file.read(4)
+        if start == _ARRAY:
+            raise ValueError(
+                "it holds a single array without names; save it with numpy.savez and the names of its arrays."
+            )
+        if start != _ARCHIVE:
+            raise ValueError(f"{otherwise}; save the arrays with numpy.savez.")
+        file.seek(0)
+        try:
+            with zipfile.ZipFile(file) as archive:
+                members = {one.filename.removesuffix(".npy"): one for one in archive.infolist()}
+                asked = {name: one for name, one in members.items() if every or name in keys}
+                headers = {name: _member_header(archive, name, one) for name, one in asked.items()}
+                check_memory(path.name, sum(one.size for one in headers.values()))
+                arrays = {}
+                for name, one in asked.items():
+                    with archive.open(one) as member:
+                        arrays[name] = _read(member)
+        except FAULTS as error:
+            raise _unreadable("NPZ file of plain arrays", error) from None
+    return {"": np.array([*members], dtype=str), **arrays}
+
+
+def npy_array(path: Path) -> np.ndarray:
+    """The array of an NPY file. Raises `ValueError` as `npz_arrays`, `OSError` where there is no such file."""
+    with path.open("rb") as file:
+        try:
+            header = _header(file)
+            check_memory(path.name, header.size)
+            left = path.stat().st_size - file.tell()
+            if header.size > left:
+                raise ValueError(f"it says {header.size} bytes of numbers, and has {left}; is it cut off?")
+            file.seek(0)
+            return _read(file)
+        except FAULTS as error:
+            raise _unreadable("NPY file of plain numbers", error) from None
+
+
+def check_archive(path: Path) -> None:
+    """Raise `ValueError` for an archive of members, of numbers and of text, that would not fit in memory
+    (`check_memory`), or in which arrays say to be larger than they are; and for what is no archive."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            check_memory(path.name, sum(one.file_size for one in members))
+            for one in members:
+                if one.filename.endswith(".npy"):
+                    _member_header(archive, one.filename, one)
+    except FAULTS as error:
+        raise _unreadable("archive", error) from None
+
+
+def need(arrays: dict[str, np.ndarray], *keys: str) -> None:
+    """Raise `ValueError` where an array is missing, with the names of those that are there."""
+    missing = [key for key in keys if key not in arrays]
+    if missing:
+        held = ", ".join(str(name)[:40] for name in arrays[""][:12]) or "nothing"
+        raise ValueError(f"there is no array '{missing[0]}'; the file holds {held}.")
+
+
+class _Header(NamedTuple):
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def size(self) -> int:
+        """Bytes of the numbers."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def _header(file: IO[bytes]) -> _Header:
+    """What an array says of itself."""
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError(f"an array of it is in format {version}")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    if dtype.hasobject:
+        raise ValueError("it holds objects, which would be executed")
+    if any(length < 0 for length in shape) or math.prod(shape) > 2**62:
+        raise ValueError(f"an array of it has shape {str(shape)[:60]}")
+    return _Header(shape, dtype)
+
+
+def _member_header(archive: zipfile.ZipFile, name: str, member: zipfile.ZipInfo) -> _Header:
+    """What a member says of itself; as much has to be in the archive."""
+    if not member.filename.endswith(".npy"):
+        raise ValueError(f"'{name[:40]}' in it is a file of another kind")
+    with archive.open(member) as file:
+        try:
+            header = _header(file)
+        except FAULTS as error:
+            raise ValueError(f"'{name[:40]}': {error}") from None
+    if header.size > member.file_size:
+        raise ValueError(f"'{name[:40]}' says {header.size} bytes of numbers, and has {member.file_size}")
+    return header
+
+
+def _read(file: IO[bytes]) -> np.ndarray:
+    return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def _unreadable(kind: str, error: Exception) -> ValueError:
+    message = str(error)
+    if "GB in memory" in message:
+        return ValueError(message)
+    hint = "" if "object" not in message.lower() else " as numbers and text, not objects"
+    return ValueError(f"not a readable {kind} ({reason(error)}); write it again{hint}.")

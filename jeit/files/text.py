@@ -1,0 +1,63 @@
+"""Text that a person wrote or another program: of a size that such files have, in UTF-8, as TOML or JSON."""
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from jeit.files.foreign import reason
+from jeit.files.limits import check_memory
+
+# Bytes of a file that a person writes, at most; bytes of memory for each of a text's.
+_LONGEST, _TEXT = 2**22, 4
+
+
+def read_text(path: str | Path, *, encoding: str = "utf-8", most: int | None = None) -> str:
+    """The text of a file of at most `most` bytes, or of what may be in memory (`check_memory`).
+
+    Raises `ValueError`, with the file's name, for larger ones, `UnicodeError`, which is one too, for what is no text,
+    and `OSError` where there is none.
+    """
+    path = Path(path)
+    check_size(path, most)
+    content = path.read_bytes()
+    try:
+        return content.decode(encoding)
+    except UnicodeDecodeError:
+        raise UnicodeError(f"{path.name} is no text in UTF-8.") from None
+
+
+def check_size(path: Path, most: int | None = None) -> None:
+    """Raise `ValueError` for a file of more than `most` bytes, or of more than may be in memory (`check_memory`)."""
+    size = path.stat().st_size
+    if most is not None and size > most:
+        raise ValueError(f"{path.name} has {size} bytes, and a file of its kind {most} at most: is it the right one?")
+    check_memory(path.name, _TEXT * size)
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """The tables of a TOML file that a person wrote. Raises `ValueError`, with its name and line, for what is none, and
+    `OSError` where there is no such file."""
+    return parsed_toml(read_text(path, most=_LONGEST), Path(path).name)
+
+
+def parsed_toml(text: str, name: str) -> dict[str, Any]:
+    """The same of a `text` from the file `name`."""
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError(f"{name} is nested too deep.") from None
+    except ValueError as error:  # TOMLDecodeError, and numbers of too many digits
+        raise ValueError(f"{name} is no TOML file: {reason(error)}.") from None
+
+
+def read_json(path: str | Path, *, most: int = 2**26) -> Any:
+    """What a JSON file of at most `most` bytes holds. Raises `ValueError`, with its name and place, for what is none,
+    and `OSError` where there is no such file."""
+    path = Path(path)
+    try:
+        return json.loads(read_text(path, most=most))
+    except RecursionError:
+        raise ValueError(f"{path.name} is nested too deep.") from None
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path.name} is no JSON file: {reason(error)}.") from None
