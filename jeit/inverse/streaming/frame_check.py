@@ -14,7 +14,7 @@ _LARGEST_DIFFERENCE = 0.5
 _SUSPICIOUS, _EXPLAINED, _LOST = 0.15, 0.5, 0.5
 _LEAST_CHANNELS = 0.5
 # Beyond the same, so many channels that read exactly the same, and more or less than all others, are at a rail.
-_AT_RAIL = 3
+_AT_RAIL, _ALIKE = 3, 1e-6
 # Reciprocal channels of nothing but noise are alike by chance: so many standard deviations of that, of so many pairs
 # at least, tell of a change; and a change of less than this, relative to an undisturbed frame, is none.
 _CHANCE, _FEWEST_PAIRS, _EQUAL = 3.0, 10, 1e-12
@@ -145,7 +145,10 @@ class FrameCheck:
         rail = np.zeros_like(usable)
         for end in (values[usable].max(), values[usable].min()):
             same = usable & (values == end)
-            if end and np.count_nonzero(same) >= _AT_RAIL and far[same].all():
+            if np.count_nonzero(same) < _AT_RAIL or not end:
+                continue
+            # Channels that symmetry makes equal, in numbers that nobody measured, are so undisturbed too.
+            if far[same].all() and np.ptp(self.expected[same]) > _ALIKE * np.abs(self.expected[same]).max():
                 rail |= same
         return rail
 
