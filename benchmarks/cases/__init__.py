@@ -30,6 +30,7 @@ NAMES = (
     "untuned_arrays",
     "ktc2023",
     "real_skins",
+    "crash",
     "discriminants",
     "gestures",
     "modality",
