@@ -18,9 +18,10 @@ from benchmarks.harness.case import Case, Options, Result, Table, judged
 from benchmarks.harness.timing import say
 from benchmarks.problems.killed_commands import Command, study, tank, unreadable, watch
 
-KILLS, QUICK = 30, 2
+# Of a study; of another command; of any in a quick run.
+KILLS, FEWER, QUICK = 30, 15, 2
 # A command that is not resumed is run to its end after so many kills.
-ANEW = 10
+ANEW = 5
 HEADER = ["command", "kills", "while it wrote", "readable after", "runs that ended after", "equal to undisturbed"]
 
 
@@ -69,6 +70,7 @@ def _survive_all(folder: Path, kills: int, random: np.random.Generator, *, quick
         with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster, Client(cluster):
             command = study(folder / "cluster", "study run --scheduler", cluster.scheduler_address)
             yield survive_resumed(command, kills, random), command
+    kills = min(kills, FEWER)
     commands = tank(folder / "tank")
     for one in ("stream", "reconstruct", "compiling"):
         yield survive_anew(commands[one], kills, random), commands[one]
@@ -87,11 +89,11 @@ def survive_resumed(command: Command, kills: int, random: np.random.Generator) -
     killed = writing = readable = ends = equal = 0
     wrong: list[str] = []
     while killed < kills or not ends:
-        again = store.exists()
-        moment = _moment(random, begun, span) if killed < kills else None
-        if _killed(command, moment, again=again):
+        moment = Moment.draw(random, begun, span) if killed < kills else None
+        done = run_until(command, moment, again=store.exists())
+        if done != "ended":
             killed += 1
-            writing += (store.parent / ".study.zarr.lock").exists()
+            writing += done == "killed while it wrote"
             readable += _reads(lambda: study_progress(sweep, store) if store.exists() else None, wrong)
             continue
         ends += 1
@@ -110,17 +112,18 @@ def survive_anew(command: Command, kills: int, random: np.random.Generator) -> S
     wrong: list[str] = []
     while killed < kills:
         command.clear()
-        moment = _moment(random, begun, span)
-        if not _killed(command, moment):
+        moment = Moment.draw(random, begun, span)
+        done = run_until(command, moment)
+        if done == "ended":
             continue
         killed += 1
-        writing += moment > begun
+        writing += done == "killed while it wrote"
         broken = unreadable(command.output)
         readable += not broken
-        wrong += [f"{command.name}: killed after {moment:.2f} s: {one}" for one in broken]
+        wrong += [f"{command.name}: killed at {moment}: {one}" for one in broken]
         if killed % ANEW and killed < kills:
             continue
-        _killed(command, None)  # with what the killed ones left, caches included
+        run_until(command, None)  # with what the killed ones left, caches included
         ends += 1
         same = command.written() == whole
         equal += same
@@ -128,24 +131,35 @@ def survive_anew(command: Command, kills: int, random: np.random.Generator) -> S
     return Survived(killed, writing, readable, ends, equal, wrong)
 
 
-def _moment(random: np.random.Generator, begun: float, span: float) -> float:
-    """Seconds after the start: any, or any after it has begun to write."""
-    return float(random.uniform(begun if random.random() < 0.5 else 0.0, span))
+class Moment(NamedTuple):
+    """So many seconds after a command is started, or after it has begun to write."""
+
+    seconds: float
+    writing: bool
+
+    @classmethod
+    def draw(cls, random: np.random.Generator, begun: float, span: float) -> Moment:
+        """Any of all of a command's time, or any of that in which it writes."""
+        writing = bool(random.random() < 0.5)
+        return cls(float(random.uniform(0.0, span - begun if writing else span)), writing)
 
 
-def _killed(command: Command, moment: float | None, *, again: bool = False) -> bool:
-    """Whether a process of the command was still running when it was killed, so many seconds after its start."""
+def run_until(command: Command, moment: Moment | None, *, again: bool = False) -> str:
+    """Run a command, and kill it at a moment: "ended" where it ended before, "killed", or "killed while it wrote"."""
+    stamp, start = time.time(), time.perf_counter()
     process = command.start(again=again)
-    if moment is not None:
-        end = time.perf_counter() + moment
-        while process.poll() is None and time.perf_counter() < end:
-            time.sleep(0.005)
-        if process.poll() is None:
+    wrote = False
+    while moment is not None and process.poll() is None:
+        wrote = wrote or command.writes(stamp)
+        if moment.writing and not wrote:
+            start = time.perf_counter()
+        if time.perf_counter() - start >= moment.seconds:
             process.kill()
             process.communicate()
-            return True
+            return "killed while it wrote" if wrote or command.writes(stamp) else "killed"
+        time.sleep(0.005)
     command.ended(process)
-    return False
+    return "ended"
 
 
 def _reads(read: Callable[[], object], wrong: list[str]) -> bool:
