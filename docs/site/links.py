@@ -11,6 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # Files outside `docs/` that are pages of the site as well.
 OUTSIDE = {
     "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "security.md",
     "benchmarks/README.md": "benchmarks.md",
     "benchmarks/RESULTS.md": "results.md",
 }
@@ -48,7 +49,7 @@ def on_files(files, config):
 
 def on_config(config):
     """Put the pages that stand outside `docs/` into the menu, those that there are."""
-    there = [page for path, page in OUTSIDE.items() if (ROOT / path).is_file() and page != "changelog.md"]
+    there = [page for path, page in OUTSIDE.items() if path.startswith("benchmarks/") and (ROOT / path).is_file()]
     for entry in config.nav:
         if isinstance(entry, dict) and "Benchmarks" in entry:
             entry["Benchmarks"] = there

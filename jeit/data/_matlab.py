@@ -1,10 +1,9 @@
 """MATLAB files: variables of numbers, with errors that a person can act on.
 
-What a file says of its variables is read here (format 5, "MAT-File Format" by The MathWorks), so that nothing larger
-than that is ever unpacked; the numbers are then read by SciPy, from what is wanted alone.
+Format 5 ("MAT-File Format" by The MathWorks) is read here, arrays of numbers alone: nothing is unpacked that is larger
+than the file says before, and SciPy's reader can be brought down by files that are made for it.
 """
 
-import io
 import math
 import struct
 import zlib
@@ -21,16 +20,25 @@ from jeit.files import check_memory, read_as
 # Bytes of the header, and of an element's beginning that holds flags, shape and name; types of elements.
 _HEADER, _BEGINNING = 128, 4096
 _MATRIX, _COMPRESSED = 14, 15
-# Classes of arrays by the file's number; bytes of a number at most, and of all that is told beside them.
-_SPARSE, _NUMERIC, _BYTES, _BESIDE = 5, range(6, 16), 16, 2**16
+# Classes of arrays by the file's number: sparse ones, and those of numbers with their types.
+_SPARSE = 5
+_NUMERIC = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+# Types in which numbers are stored; the flag of complex ones.
+_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_COMPLEX = 0x800
+# Bytes of a number at most, in memory, and of all that is told beside them.
+_BYTES, _BESIDE = 16, 2**16
 
 
 class _Variable(NamedTuple):
     name: str
     shape: tuple[int, ...]
     kind: int
-    content: bytes  # of the element in the file, packed or not
+    complex: bool
+    begin: int  # where its numbers do, in what is said of it
+    content: bytes  # of the element in the file, without its tag
     packed: bool
+    order: str  # of bytes: "<" or ">"
 
     @property
     def size(self) -> int:
@@ -61,12 +69,13 @@ def load(path: Path, *wanted: str) -> dict[str, np.ndarray]:
     if _is_format_4(path):
         with read_as(_unreadable(path)):  # never compressed: of no more numbers than bytes
             return held | _plain(scipy.io.loadmat(str(path), variable_names=list(wanted)), wanted)
-    content = path.read_bytes()
-    asked = [one for one in _variables(content) if one.name in wanted and one.kind in (_SPARSE, *_NUMERIC)]
+    with read_as(_unreadable(path)):
+        asked = [
+            one for one in _variables(path.read_bytes()) if one.name in wanted and one.kind in (_SPARSE, *_NUMERIC)
+        ]
     check_memory(path.name, sum(one.size for one in asked))
     with read_as(_unreadable(path)):
-        file = io.BytesIO(content[:_HEADER] + b"".join(_unpacked(one) for one in asked))
-        return held | (_plain(scipy.io.loadmat(file), wanted) if asked else {})
+        return held | {one.name: _values(one) for one in asked}
 
 
 def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
@@ -82,15 +91,9 @@ def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
 
 
 def _plain(read: dict, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
-    arrays = {}
-    for name in wanted:
-        if name in read:
-            value = read[name]
-            if hasattr(value, "toarray"):
-                value.check_format(full_check=True)  # else indices beyond its shape would be written to
-                value = value.toarray()
-            arrays[name] = np.asarray(value)
-    return arrays
+    """Of SciPy's, of format 4."""
+    found = {name: read[name] for name in wanted if name in read}
+    return {name: value.toarray() if hasattr(value, "toarray") else value for name, value in found.items()}
 
 
 def _unreadable(path: Path) -> str:
@@ -129,41 +132,68 @@ def _variables(content: bytes) -> Iterator[_Variable]:
         else:
             beginning = element[:_BEGINNING]
         if kind == _MATRIX:
-            yield _Variable(*_told(beginning, order), content[place : start + size], packed)
+            yield _Variable(*_told(beginning, order), element, packed, order)
         place = start + size
 
 
-def _told(beginning: bytes, order: str) -> tuple[str, tuple[int, ...], int]:
-    """Name, shape and class of an array, from its first three sub-elements."""
-    flags, place = _part(beginning, 0, order)
-    shape, place = _part(beginning, place, order)
-    name, _ = _part(beginning, place, order)
-    kind = struct.unpack_from(f"{order}I", flags)[0] & 0xFF
+def _told(beginning: bytes, order: str) -> tuple[str, tuple[int, ...], int, bool, int]:
+    """Name, shape, class, whether complex, and where numbers begin, of an array's first three sub-elements."""
+    _, flags, place = _part(beginning, 0, order)
+    _, shape, place = _part(beginning, place, order)
+    _, name, place = _part(beginning, place, order)
+    flag = struct.unpack_from(f"{order}I", flags)[0]
     lengths = struct.unpack(f"{order}{len(shape) // 4}i", shape)
-    if any(length < 0 for length in lengths):
-        raise ValueError("an array of it has a negative length")
-    return name.decode("latin-1"), lengths, kind
+    if len(lengths) < 2 or any(length < 0 for length in lengths):
+        raise ValueError("an array of it has no length, or a negative one")
+    return name.decode("latin-1"), lengths, flag & 0xFF, bool(flag & _COMPLEX), place
 
 
-def _part(content: bytes, place: int, order: str) -> tuple[bytes, int]:
-    """One sub-element, and where the next begins; those of four bytes and less lie in their own head."""
-    head = struct.unpack_from(f"{order}I", content, place)[0]
-    if head >> 16:
-        size, start, after = head >> 16, place + 4, place + 8
+def _part(content: bytes, place: int, order: str) -> tuple[int, bytes, int]:
+    """Type and bytes of a sub-element, and where the next begins; those of four bytes and less lie in their own tag."""
+    kind = struct.unpack_from(f"{order}I", content, place)[0]
+    if kind >> 16:
+        kind, size, start, after = kind & 0xFFFF, kind >> 16, place + 4, place + 8
     else:
         size, start = struct.unpack_from(f"{order}I", content, place + 4)[0], place + 8
         after = start + -(-size // 8) * 8
     if start + size > len(content):
         raise ValueError("what it says of an array is cut short, or too long")
-    return content[start : start + size], after
+    return kind, content[start : start + size], after
+
+
+def _numbers(content: bytes, place: int, order: str) -> tuple[np.ndarray, int]:
+    """Those of a sub-element, and where the next begins."""
+    kind, stored, place = _part(content, place, order)
+    if kind not in _STORED:
+        raise ValueError(f"an array of it is stored as type {kind}")
+    return np.frombuffer(stored, np.dtype(order + _STORED[kind])), place
+
+
+def _values(variable: _Variable) -> np.ndarray:
+    """The numbers of a variable in its shape; those of a sparse one too."""
+    content, place, order = _unpacked(variable), variable.begin, variable.order
+    rows = starts = None
+    if variable.kind == _SPARSE:
+        rows, place = _numbers(content, place, order)
+        starts, place = _numbers(content, place, order)
+    values, place = _numbers(content, place, order)
+    if variable.complex:
+        values = values + 1j * _numbers(content, place, order)[0]
+    if rows is None or starts is None:
+        values = values.reshape(variable.shape, order="F")
+        return values if variable.complex else values.astype(_NUMERIC[variable.kind])
+    columns = np.repeat(np.arange(variable.shape[1]), np.diff(starts))
+    dense = np.zeros(variable.shape, complex if variable.complex else float)
+    dense[rows[: len(columns)], columns] = values[: len(columns)]
+    return dense
 
 
 def _unpacked(variable: _Variable) -> bytes:
-    """An element as it is without compression: no larger than it says."""
+    """An element without its tag and compression: no larger than it says."""
     if not variable.packed:
         return variable.content
     most = variable.size + _BESIDE
-    element = zlib.decompressobj().decompress(variable.content[8:], most + 1)
+    element = zlib.decompressobj().decompress(variable.content, most + 1)
     if len(element) > most:
         raise ValueError(f"'{variable.name[:40]}' is larger than its shape {variable.shape} says")
-    return element
+    return element[8:]

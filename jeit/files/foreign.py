@@ -10,7 +10,7 @@ _LONGEST = 120
 @contextmanager
 def read_as(said: str) -> Iterator[None]:
     """Within it only other packages read: whatever they raise becomes a `ValueError`, `said` (such as "not a readable
-    WAV file") with their reason in brackets; `OSError` of the system itself, that there is no such file, stays.
+    WAV file") with their reason in brackets; that there is no such file, or that it may not be read, stays as it is.
 
     What they print as warnings is not shown: a file that is read is as it should be.
     """
@@ -19,7 +19,7 @@ def read_as(said: str) -> Iterator[None]:
             warnings.simplefilter("ignore")
             yield
     except Exception as error:  # of any kind: packages that read formats raise what they stumble over
-        if isinstance(error, OSError) and error.errno is not None:
+        if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError):
             raise
         raise ValueError(f"{said} ({reason(error)}).") from None
 

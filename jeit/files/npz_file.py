@@ -1,7 +1,9 @@
 """The arrays of NPZ and NPY files: plain numbers and text, nothing that would be executed, of no more than they say."""
 
+import errno
 import math
 import struct
+import sys
 import tokenize
 import zipfile
 import zlib
@@ -58,7 +60,7 @@ def npz_arrays(
                 for name, one in asked.items():
                     with archive.open(one) as member:
                         arrays[name] = _read(member)
-        except FAULTS as error:
+        except (*FAULTS, OSError) as error:  # members may say that they lie before the file's beginning
             raise _unreadable("NPZ file of plain arrays", error) from None
     return {"": np.array([*members], dtype=str), **arrays}
 
@@ -88,7 +90,9 @@ def check_archive(path: Path) -> None:
             for one in members:
                 if one.filename.endswith(".npy"):
                     _member_header(archive, one.filename, one)
-    except FAULTS as error:
+    except (*FAULTS, OSError) as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOENT:
+            raise
         raise _unreadable("archive", error) from None
 
 
@@ -139,7 +143,12 @@ def _member_header(archive: zipfile.ZipFile, name: str, member: zipfile.ZipInfo)
 
 
 def _read(file: IO[bytes]) -> np.ndarray:
-    return np.lib.format.read_array(file, allow_pickle=False)
+    array = np.lib.format.read_array(file, allow_pickle=False)
+    if array.dtype.kind == "U" and array.size and array.dtype.itemsize:
+        letters = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("=")).reshape(-1).view(np.uint32)
+        if letters.max() > sys.maxunicode:
+            raise ValueError("a text in it holds what is no letter")
+    return array
 
 
 def _unreadable(kind: str, error: Exception) -> ValueError:

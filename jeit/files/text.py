@@ -42,7 +42,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def parsed_toml(text: str, name: str) -> dict[str, Any]:
-    """The same of a `text` from the file `name`."""
+    """The same of a `text` from the file `name`. Raises `ValueError` for what is none."""
     try:
         return tomllib.loads(text)
     except RecursionError:

@@ -10,6 +10,8 @@ from jeit.arguments import told
 
 # Possessive: what is no number is found so in one pass, however long it is.
 NUMBER = r"[-+]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?+\d++)?+"
+# Of numbers in a drawing, whose squares are still of use when they have been moved and scaled.
+_LARGEST = 1e30
 ROUND = ("circle", "ellipse")
 
 
@@ -68,7 +70,10 @@ def number_of(element: ElementTree.Element, name: str, text: str | None) -> floa
     """The number that `text`, of the attribute `name`, is. Raises `ValueError`."""
     if text is None or re.fullmatch(NUMBER, text.strip()) is None:
         raise ValueError(f"{name} of {described(element)} is {told(text)}, not a number.")
-    return float(text)
+    value = float(text)
+    if not abs(value) < _LARGEST:
+        raise ValueError(f"{name} of {described(element)} is {told(text)}, too large for a drawing.")
+    return value
 
 
 def disc_of(element: ElementTree.Element, to: np.ndarray) -> tuple[float, float, float]:
@@ -114,7 +119,7 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
     loops: list[tuple[list[np.ndarray], bool]] = []
     place = np.zeros(2)
     for letter, inside in re.findall(r"([MmLlHhVvZz])([^MmLlHhVvZz]*)", text):
-        numbers = [float(number) for number in re.findall(NUMBER, inside)]
+        numbers = [number_of(element, "d", number) for number in re.findall(NUMBER, inside)]
         kind, relative = letter.upper(), letter.islower()
         size = {"H": 1, "V": 1}.get(kind, 2)
         if kind == "Z" and loops:

@@ -11,6 +11,8 @@ LOWEST_RATE = 100.0  # Hz
 LARGEST_EXTENT = 5.0  # m
 # Taps may miss the outline by so much of the skin's length; microphones nearer than this are at one place.
 _BESIDE, _SAME = 0.05, 1e-6  # of the length; m
+# Metres from the origin beyond which squares of lengths are of no use.
+_FARTHEST = 1e9
 
 
 def either(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
@@ -78,9 +80,10 @@ def coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
             f"{label} has shape {points.shape}; give one row of 2 or 3 coordinates each, as many for microphones, "
             "outline and positions."
         )
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(points) < _FARTHEST).all(axis=1))
     if bad.size:
-        raise ValueError(f"{label}: row {bad[0]} is {points[bad[0]].tolist()}; every coordinate must be finite.")
+        row = points[bad[0]].tolist()
+        raise ValueError(f"{label}: row {bad[0]} is {row}; every coordinate must be finite, in metres.")
     return points
 
 

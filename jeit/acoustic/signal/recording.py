@@ -34,10 +34,15 @@ from jeit.mesh.loops import check_loop
 _OTHERWISE = "neither an NPZ nor a sound file"
 
 
+# No sample is so loud, in any unit; squares of louder ones would be infinite in single precision.
+_LOUDEST = 1e15
+
+
 class Recording(eqx.Module):
     """Sound of M microphones, sampled together.
 
-    - `samples`: (M, S) in any unit (volts, counts, parts of full scale); NaN or infinite where the device said so.
+    - `samples`: (M, S) in any unit (volts, counts, parts of full scale); NaN or infinite where the device said so, and
+      infinite where they are beyond any (1e15).
     - `rate`: samples a second of each microphone, Hz.
     - `full_scale`: the largest |sample| that the device can give, or None when that is not known.
     - `name`: where it comes from.
@@ -52,7 +57,9 @@ class Recording(eqx.Module):
         self, samples: ArrayLike, rate: ArrayLike, *, full_scale: ArrayLike | None = None, name: str = "recording"
     ):
         """Raises `ValueError` for what is not real, not (M, S), transposed, or sampled at no plausible rate."""
-        self.samples = real(samples, "samples", "microphones, samples")
+        given = real(samples, "samples", "microphones, samples")
+        beyond = np.abs(given) > _LOUDEST if given.dtype.kind == "f" else np.zeros(0, bool)
+        self.samples = np.where(beyond, np.inf, given) if beyond.any() else given
         count, length = self.samples.shape
         if count > length:
             raise ValueError(

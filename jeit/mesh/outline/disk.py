@@ -15,7 +15,7 @@ from jeit.mesh.generate.curve import circle
 from jeit.mesh.generate.refine import Refine, Refinement
 from jeit.mesh.generate.unstructured import Target, check_count, check_positions, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
-from jeit.mesh.outline.domain import Domain, Pen, check_length, check_position, numerics
+from jeit.mesh.outline.domain import Domain, Pen, check_length, check_near_origin, check_position, numerics
 from jeit_solvers.engines import as_array
 
 
@@ -29,6 +29,7 @@ class Disk(Domain):
         """`radius` > 0 and `centre` (x, y) in metres; raises `ValueError` otherwise."""
         self.radius = check_length("radius", radius)
         self.centre = check_position("centre", centre)
+        check_near_origin("centre", self.centre, self.radius)
 
     @property
     def area(self) -> float:

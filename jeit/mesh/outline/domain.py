@@ -17,6 +17,9 @@ from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
 from jeit_solvers.engines import has_values
 
+# How many times an outline's size it may lie away from the origin: ten digits of its shape are left there.
+_FARTHEST = 1e6
+
 
 class Pen(Protocol):
     """What outlines are drawn with: a drawing's file, or a geometry kernel. The first stroke encloses the others."""
@@ -114,6 +117,17 @@ def check_length(name: str, value: Any) -> Any:
         raise ValueError(f"{name}: expected a positive length in metres, got {told(value)}.")
     warn_large(number, name)
     return number
+
+
+def check_near_origin(name: str, far: Any, size: Any) -> None:
+    """Raise `ValueError`, about the argument `name`, for an outline of `size` metres that lies so `far` away, metres,
+    that rounding of its coordinates would be seen in it (traced values pass)."""
+    if has_values(far, size) and float(np.max(np.abs(np.asarray(far)))) > _FARTHEST * float(size):
+        away = float(np.max(np.abs(np.asarray(far))))
+        raise ValueError(
+            f"{name}: {away:.3g} m from the origin, and only {float(size):.3g} m across; give its coordinates about a "
+            "point of its own."
+        )
 
 
 def check_position(name: str, value: Any) -> Any:

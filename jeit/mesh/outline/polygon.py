@@ -16,7 +16,7 @@ from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.generate.unstructured import Target, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import polyline
-from jeit.mesh.outline.domain import Domain, Pen
+from jeit.mesh.outline.domain import Domain, Pen, check_near_origin
 from jeit_solvers.engines import as_array, has_values
 
 
@@ -40,6 +40,7 @@ class Polygon(Domain):
         outer = loops.check_loop(vertices, "vertices", clockwise=False)
         inner = [loops.check_loop(hole, f"holes[{k}]", clockwise=True) for k, hole in enumerate(holes)]
         loops.check_apart(outer, inner)
+        check_near_origin("vertices", outer, np.ptp(outer, axis=0).max())
         warn_large(float(np.ptp(outer, axis=0).max()), "vertices")
         self.vertices = as_array(outer)
         self.holes = tuple(as_array(hole) for hole in inner)

@@ -14,8 +14,8 @@ from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.generate.unstructured import Target, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import polyline
-from jeit.mesh.outline.domain import Domain, Pen, check_length, check_position
-from jeit_solvers.engines import as_array, either_engine, namespace
+from jeit.mesh.outline.domain import Domain, Pen, check_length, check_near_origin, check_position
+from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 
 
 class Rectangle(Domain):
@@ -30,6 +30,8 @@ class Rectangle(Domain):
         self.width = check_length("width", width)
         self.height = check_length("height", height)
         self.centre = check_position("centre", centre)
+        if has_values(self.width, self.height):
+            check_near_origin("centre", self.centre, min(self.width, self.height))
 
     @property
     def area(self) -> float:

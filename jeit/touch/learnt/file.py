@@ -23,6 +23,7 @@ from jeit.touch.learnt.nearest import Nearest
 from jeit.touch.learnt.neighbourhood import Neighbourhood
 from jeit.touch.learnt.network import Network
 from jeit.touch.learnt.numbers import LearntNumbers
+from jeit.touch.learnt.sealed_archive import check_seal, write_sealed
 from jeit.touch.learnt.spread import Spread
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 from jeit.touch.learnt.whitening import Whitened
@@ -81,13 +82,11 @@ def read_skin(path: str | Path) -> LearntSkin:
 def write_plain(path: str | Path, kind: str, version: int, own: dict[str, Any], example: str) -> None:
     """Write what an object holds, by name, to one file: arrays, estimators, and objects of this room's classifiers.
     Raises `ValueError` for a folder; `example`: a file's name, that is told then."""
-    from skops.io import dump
-
     need_learning()
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / example}.")
     with written_whole(path) as file:
-        dump({"kind": kind, "version": version, "skin": _plain(own)}, file)
+        write_sealed({"kind": kind, "version": version, "skin": _plain(own)}, file)
 
 
 def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[dict[str, Any]], Any]) -> Any:
@@ -106,6 +105,7 @@ def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[d
             raise ValueError("it is of another kind")
         if content["version"] != version:
             raise ValueError(f"it is of version {told(content['version'])}, and this jeit reads {version}")
+        check_seal(path)
         own: Any = _whole(content["skin"])
         return make(own)
     except Exception as error:  # of any kind: classes of many packages are made of what the file says

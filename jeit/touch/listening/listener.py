@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from jeit.acoustic import Calibration, Recording, locate_touches
 from jeit.arguments import check_key, check_kind, check_name, counted
+from jeit.files import reason
 from jeit.touch.learnt.answers import Standing
 from jeit.touch.learnt.classifiers import probabilities, sharpness_of
 from jeit.touch.listening.feature_images import BANDS, EVERY, image_blocks
@@ -255,22 +256,23 @@ class Listener:
             numbers = (float(head[name]) for name in ("highest_Hz", "quietest", "sharpness", "doubt"))
             highest, quietest, sharpness, doubt = numbers
             softest, greatest = map(float, head["clips_loudness"])
-            names, notes = tuple(map(str, head["names"])), tuple(map(str, head["notes"]))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ValueError(f"'{path}' is not {_KIND} that can be read: {error}.") from None
+            names, notes, name = tuple(map(str, head["names"])), tuple(map(str, head["notes"])), str(head["name"])
+            channels, loudness = int(head["channels"]), bool(head["loudness_counts"])
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise ValueError(f"'{path}' is not {_KIND} that can be read: {reason(error)}.") from None
         return cls(
             names,
             head["method"],
             model,
-            int(head["channels"]),
+            channels,
             highest,
-            bool(head["loudness_counts"]),
+            loudness,
             quietest,
             (softest, greatest),
             sharpness,
             doubt,
             notes=notes,
-            name=str(head["name"]),
+            name=name,
         )
 
 

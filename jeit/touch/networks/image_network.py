@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, check_name, is_number, real_array
+from jeit.arguments import check_kind, check_name, is_number, real_array, told
 from jeit.design import Skin
 from jeit.protocol import Protocol
 from jeit.simulate.contact.indent_sets import pixel_places
@@ -29,6 +29,8 @@ from jeit.touch.training import check_same, read_model, write_model
 
 DESIGNS = ("unrolled", "three-stages")
 _KIND, _VERSION = "a jeit image network", 1
+# Of an unrolled network.
+_MOST_STEPS = 100
 FILE = "network.jeit"
 # Frames that are imaged at once, at most: more leave the cache. JAX compiles for every number of them that is 2ⁿ.
 _AT_ONCE = 64
@@ -236,13 +238,15 @@ def _untrained(head: dict[str, Any]) -> ThreeStages | Unrolled:
     channels, key = head["made_for"]["channels"], jax.random.key(0)
     for number in (rows, columns, channels):
         if not (isinstance(number, int) and 1 <= number <= 10_000):
-            raise ValueError(f"its head tells of {number!r} rows, columns or channels")
+            raise ValueError(f"its head tells of {told(number)} rows, columns or channels")
     numbers = [head["thickness_m"], head["noise"], *head["extent_m"]]
     if len(numbers) != 6 or not all(is_number(one) for one in numbers):
         raise ValueError("its head tells of no thickness, noise and extent")
+    if not (isinstance(head["steps"], int) and 0 <= head["steps"] <= _MOST_STEPS):
+        raise ValueError(f"its head tells of {told(head['steps'])} steps")
     if head["design"] == "three-stages":
         return ThreeStages(channels, (rows, columns), key=key)
-    return Unrolled(channels, (rows, columns), int(head["steps"]), key=key)
+    return Unrolled(channels, (rows, columns), head["steps"], key=key)
 
 
 def _channels_of(protocol: Protocol) -> dict[str, Any]:

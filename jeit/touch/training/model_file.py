@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 from jeit.arguments import told
-from jeit.files import written_whole
+from jeit.files import reason, written_whole
 
 # Of the file: how it begins; bytes of the head, and of all arrays together, at most.
 _MAGIC, _LONGEST_HEAD, _LARGEST = b"jeit model\n", 2**20, 2**31
@@ -63,7 +63,9 @@ def read_model(
         try:
             like = eqx.filter_eval_shape(make, head)
         except (KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
-            raise ValueError(f"its head does not say what it is made of ({type(error).__name__}: {error})") from None
+            raise ValueError(
+                f"its head does not say what it is made of ({type(error).__name__}: {reason(error)})"
+            ) from None
         arrays = [leaf for leaf in jax.tree.leaves(like) if isinstance(leaf, jax.ShapeDtypeStruct)]
         left = os.fstat(file.fileno()).st_size - file.tell()
         if not _size(arrays) <= min(left, _LARGEST):
@@ -95,9 +97,8 @@ def _opened(path: Path, kind: str) -> Iterator[BinaryIO]:
     try:
         with path.open("rb") as file:
             yield file
-    except (ValueError, EOFError) as error:
-        said = " ".join(str(error).split()).rstrip(".")
-        raise ValueError(f"'{path}' is not {kind} that can be read: {said}.") from None
+    except Exception as error:  # of any kind: what the head says is made before it can be checked
+        raise ValueError(f"'{path}' is not {kind} that can be read: {reason(error)}.") from None
 
 
 def _head(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
@@ -136,6 +137,8 @@ def _read_array(file: BinaryIO, leaf: Any) -> Any:
     if len(data) != _size([leaf]):
         raise ValueError("it is cut short")
     values = np.frombuffer(data, dtype).reshape(shape, order="F" if columns_first else "C")
+    if np.isnan(values).any():
+        raise ValueError("numbers of it are NaN")
     return jax.numpy.asarray(values)
 
 

@@ -78,3 +78,25 @@ def test_other_files_are_refused_and_nothing_runs(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="of version 1, and this jeit reads 2"):
         read_skin("older")
     assert not (tmp_path / "ran").exists()
+
+
+def test_a_changed_file_is_told(quick, tmp_path):
+    """Numbers that do not belong together would end in errors of NumPy, or in wrong places."""
+    write_skin(quick, tmp_path / "skin.skops")
+    with zipfile.ZipFile(tmp_path / "skin.skops") as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+        seal = archive.comment
+    largest = max(members, key=lambda name: len(members[name]) * name.endswith(".npy"))
+    members[largest] = members[largest][:-8] + bytes(8)
+    with zipfile.ZipFile(tmp_path / "changed.skops", "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+        archive.comment = seal
+    with pytest.raises(ValueError, match="changed since it was written"):
+        read_skin(tmp_path / "changed.skops")
+
+
+def test_the_same_skin_is_the_same_bytes(quick, tmp_path):
+    write_skin(quick, tmp_path / "one.skops")
+    write_skin(read_skin(tmp_path / "one.skops"), tmp_path / "two.skops")
+    assert (tmp_path / "one.skops").read_bytes() == (tmp_path / "two.skops").read_bytes()

@@ -1,0 +1,47 @@
+"""MATLAB files read as SciPy writes and reads them, whatever the types; and no larger than they say."""
+
+import numpy as np
+import pytest
+import scipy.io
+import scipy.sparse
+
+from jeit.data import _matlab
+
+RNG = np.random.default_rng(0)
+ARRAYS = {
+    "double": RNG.random((3, 4)),
+    "whole": np.arange(6.0).reshape(2, 3),  # stored in bytes
+    "single": RNG.random((2, 2)).astype("f4"),
+    "complex": RNG.random((2, 3)) + 1j,
+    "cube": RNG.random((2, 3, 4)),
+    "small": np.array([[7]], "u1"),
+    "signed": np.array([[-3, 70000]], "i4"),
+    "long": np.array([[2**60, -1]], "i8"),
+    "flags": np.array([[True, False]]),
+    "sparse": scipy.sparse.csc_matrix(np.diag([1.0, 0, 3])[:, :2]),
+}
+
+
+@pytest.mark.parametrize("options", [{"do_compression": True}, {"do_compression": False}, {"format": "4"}])
+def test_as_scipy_reads_them(tmp_path, options):
+    old = options.get("format") == "4"
+    held = {name: one for name, one in ARRAYS.items() if not (old and name in ("cube", "long", "signed", "flags"))}
+    others = {} if old else {"text": "abc", "cell": np.array([1, "a"], object), "record": {"a": 1.0}}
+    scipy.io.savemat(tmp_path / "a.mat", held | others, **options)
+    read = _matlab.load(tmp_path / "a.mat", *held, *others)
+    assert set(read[""]) == set(held | others) == _matlab.variable_names(tmp_path / "a.mat")
+    assert set(read) - {""} == set(held)
+    for name, one in held.items():
+        expected = one.toarray() if name == "sparse" else one
+        np.testing.assert_array_equal(read[name], expected)
+        assert read[name].shape == expected.shape
+        assert old or read[name].dtype == scipy.io.loadmat(tmp_path / "a.mat")[name].dtype
+
+
+def test_what_is_not_wanted_is_not_unpacked(tmp_path):
+    scipy.io.savemat(tmp_path / "a.mat", {"a": np.ones((2, 2)), "b": np.zeros((3, 3))}, do_compression=True)
+    whole = (tmp_path / "a.mat").read_bytes()
+    (tmp_path / "a.mat").write_bytes(whole[:-8] + b"\xff" * 8)  # the end of b is no zlib stream any more
+    assert set(_matlab.load(tmp_path / "a.mat", "a")) == {"", "a"}
+    with pytest.raises(ValueError, match=r"not a readable \.mat file"):
+        _matlab.load(tmp_path / "a.mat", "b")
