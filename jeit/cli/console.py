@@ -42,9 +42,9 @@ class Steps:
             self._status.start()
 
     @property
-    def under_way(self) -> bool:
-        """Whether a step has begun and not ended."""
-        return self._status is not None
+    def under_way(self) -> str:
+        """The name of the step that was begun last, empty before the first."""
+        return self._step
 
     def tell(self, detail: str) -> None:
         """Say how far the step under way is, beside its spinner."""

@@ -1,7 +1,5 @@
 """Frames of standard input, and the seconds they come at: by a rate, or by the clock."""
 
-import signal
-import threading
 import time
 from collections.abc import Iterator
 
@@ -14,7 +12,7 @@ _WAITED, _IN_A_ROW, _BEFORE = 0.4, 3, 5.0
 
 
 class LiveFrames:
-    """Pairs of a second and a frame, of `lines` as `parse_frames` gives them, that end with them or as Ctrl-C says.
+    """Pairs of a second and a frame, of `lines` as `parse_frames` gives them, that end with them.
 
     By a `rate`, frames/s, all frames count. Without one the clock tells their seconds, which it cannot of frames that
     came while nobody read: those are left out, `left_out` of them; and where all have come already, as of a file, the
@@ -26,7 +24,6 @@ class LiveFrames:
         self.by_clock, self.left_out = rate is None, 0
         self.read: list[tuple[float, object]] = []
         self.begun, self.number = 0.0, 0
-        self.waiting, self.stopped = False, False
 
     @property
     def rate_seen(self) -> float:
@@ -52,18 +49,10 @@ class LiveFrames:
         return np.array([one for one in rows if len(one) == usual])
 
     def __iter__(self) -> Iterator[tuple[float, object]]:
-        on_main = threading.current_thread() is threading.main_thread()
-        earlier = signal.signal(signal.SIGINT, self._stop) if on_main else None
-        try:
-            self._catch_up()
-            yield from self.read
-            while not self.stopped and (frame := self._next()) is not None:
-                yield self._second(), frame
-        except KeyboardInterrupt:
-            return
-        finally:
-            if on_main:
-                signal.signal(signal.SIGINT, earlier)
+        self._catch_up()
+        yield from self.read
+        while (frame := self._next()) is not None:
+            yield self._second(), frame
 
     def _catch_up(self) -> None:
         """Leave out what came before it was read; if that is all there is, keep it, by a rate."""
@@ -96,14 +85,4 @@ class LiveFrames:
 
     def _next(self) -> object | None:
         """The next frame, waited for; None after the last."""
-        self.waiting = True
-        try:
-            return next(self.lines, None)
-        finally:
-            self.waiting = False
-
-    def _stop(self, *_) -> None:
-        """What is under way is finished; waiting ends at once."""
-        self.stopped = True
-        if self.waiting:
-            raise KeyboardInterrupt
+        return next(self.lines, None)

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     import numpy as np
     from jaxtyping import Float, Int
 
-    from jeit.touch.networks import ImageNetwork
+    from jeit.touch.networks import FrameDepth, ImageNetwork
 
 
 class _Given(NamedTuple):
@@ -43,9 +43,11 @@ def image_by_network(
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written
     from jeit.cli.options import make_folder
+    from jeit.cli.stopping import FramesTold, Stopping
     from jeit.design import describes_skin, read_described_skin
     from jeit.imaging.stream_preparation import parse_frames
     from jeit.report.image_network import DEPTH_FILES, write_depths
+    from jeit.report.stream import PICTURES
     from jeit.touch.networks import read_network, resting_frame, stream_depths
 
     if method != "network":
@@ -55,9 +57,9 @@ def image_by_network(
     if idle := [name for name, value in unused.items() if value is not None]:
         raise ValueError(f"--{idle[0]} has no use with --method network; leave it out.")
     data, reference, kind, description = given
-    make_folder(output, DEPTH_FILES)
     console = plain_console()
-    with Steps(console, quiet=quiet) as step:
+    with Stopping() as stopping, Steps(console, quiet=quiet) as step:
+        make_folder(output, DEPTH_FILES)
         step("read")
         skin = None
         if description is not None and describes_skin(description):
@@ -76,31 +78,26 @@ def image_by_network(
             raise ValueError("--reference: give a file of frames of the skin that nobody touches.")
         rest = resting_frame(still, str(reference or data))
         step("image")
-        found = []
-        for one in stream_depths(network, frames, rest):
-            own = one.number if numbers is None else int(numbers[one.number])
-            found.append(one._replace(number=own))
-            step.tell(f"frame {own}")
+        come = FramesTold(step, None if numbers is None else len(numbers))
+
+        def show(one: "FrameDepth") -> None:
+            come.one_more()
             if one.depth is None and not quiet:
-                console.print(f"  frame {own}: refused. {one.reason}", soft_wrap=True)
-        imaged = [one for one in found if one.depth is not None]
-        if not imaged:
-            reason = found[0].reason if found else "there is none"
-            raise ValueError(f"'{data}': {counted(len(found), 'frame')}, and none could be imaged; the first: {reason}")
-        step("write")
-        nothing = np.full(network.shape, np.nan)
-        maps = np.stack([nothing if one.depth is None else one.depth for one in found])
-        columns = write_depths(maps, network, output, name=str(data), numbers=[one.number for one in found])
+                console.print(f"  frame {one.number}: refused. {one.reason}", soft_wrap=True)
+
+        found = stream_depths(network, stopping.until(frames), rest)
+        if numbers is not None:
+            found = (one._replace(number=int(numbers[one.number])) for one in found)
+        drawing = stopping.before(PICTURES, step)
+        with stopping.ending(come, "frames.csv", "depth.npz"):
+            written = write_depths(found, network, output, name=str(data), progress=show, drawing=drawing)
     if quiet:
         return
-    deepest = columns["depth_m"]
-    most = int(np.nanargmax(deepest))
-    latency = 1e3 * np.median([one.latency for one in found])
-    console.print(f"\n{counted(len(imaged), 'frame')} imaged, median {latency:.2f} ms each")
-    if deepest[most] > network.floor:
-        x, y = 1e3 * columns["x_m"][most], 1e3 * columns["y_m"][most]
-        number = found[most].number
-        console.print(f"deepest: {1e3 * deepest[most]:.2f} mm at ({x:.1f}, {y:.1f}) mm, in frame {number}")
+    deepest, latency = written.deepest, 1e3 * np.median(written.latency)
+    console.print(f"\n{counted(written.imaged, 'frame')} imaged, median {latency:.2f} ms each")
+    if deepest.depth > network.floor:
+        x, y = 1e3 * deepest.middle
+        console.print(f"deepest: {1e3 * deepest.depth:.2f} mm at ({x:.1f}, {y:.1f}) mm, in frame {deepest.number}")
     else:
         console.print(f"untouched: nothing is deeper than noise makes it, {1e3 * network.floor:.2g} mm")
     say_written(console, output / "frames.csv", "depth.npz", "depth.png", "report.json")

@@ -10,8 +10,10 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
 
 FILMS = (".gif", ".mp4")
-# Frames of a film at most, in a second at most, and in a second where the stream's rate is not known.
-_MOST, _FASTEST, _PACE = 120, 25.0, 10.0
+FILM_FRAMES = 120
+"""Frames of a film at most."""
+# In a second at most, and where the stream's rate is not known.
+_FASTEST, _PACE = 25.0, 10.0
 
 
 def check_film(name: str) -> str:
@@ -55,7 +57,7 @@ def write_film(
     check_film(path.name)
     said = [f"frame {number}" for number in range(len(values))] if titles is None else list(titles)
     figure = Figure(figsize=(5.0, 4.4), layout="constrained")
-    fitted, chosen = fit_scale(values, mesh, ColourScale(limit=limit)), chosen_frames(len(values), _MOST)
+    fitted, chosen = fit_scale(values, mesh, ColourScale(limit=limit)), chosen_frames(len(values), FILM_FRAMES)
     picture = FramePicture(figure.subplots(), mesh, electrodes, fitted)
     fitted.draw_bar(picture.ax, picture.drawn)
     picture.show(values[chosen[0]], said[chosen[0]])

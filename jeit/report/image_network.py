@@ -1,17 +1,22 @@
 """What is left of learning to image, and of the frames that a network imaged, in folders."""
 
-import csv
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jeit.arguments import counted
+from jeit.files import written_whole
 from jeit.report.describe import plain, version_of
 from jeit.report.folder import results, results_folder, write_json
+from jeit.report.growing import GrowingRows, GrowingTable, Sample, clear_parts, saying_what_is_left
+from jeit.report.stream import PICTURES
 from jeit.simulate.contact.indent_sets import pixel_places
 from jeit.touch.networks import ImageNetwork, LearntImages
+from jeit.touch.networks.measured import FrameDepth
 from jeit.touch.networks.places import centroids_of
 
 LEARNT_FILES = ("network.jeit", "report.json", "learning.png")
@@ -19,6 +24,8 @@ DEPTH_FILES = ("frames.csv", "depth.npz", "depth.png", "report.json")
 _PACKAGES = ("jeit", "jax", "equinox", "optax", "numpy")
 # Maps that are drawn, at most.
 _DRAWN = 6
+# Numbers of refused frames that a report lists, at most.
+_LISTED = 1000
 
 
 def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
@@ -83,70 +90,140 @@ def draw_learnt_images(learnt: LearntImages):
     return figure
 
 
+class DeepestFrame(NamedTuple):
+    """The number of a frame in its file, how deep, metres, and where the middle of that is, (2,) metres, NaN where
+    nothing is deeper than noise makes it."""
+
+    number: int
+    depth: float
+    middle: Float[np.ndarray, "2"]
+
+
+@dataclass(frozen=True)
+class WrittenDepths:
+    """What `write_depths` has written: the `number` of frames, how many were `imaged`, the `deepest`, and the `latency`
+    in seconds of those that were imaged, (K,), of many frames some of them, evenly chosen."""
+
+    number: int
+    imaged: int
+    deepest: DeepestFrame
+    latency: Float[np.ndarray, " K"]
+
+
 def write_depths(
-    depth: Float[np.ndarray, "n rows columns"],
+    found: Iterable[FrameDepth],
     network: ImageNetwork,
     folder: str | Path,
     *,
     name: str,
-    numbers: Sequence[int] | None = None,
-) -> dict[str, np.ndarray]:
-    """Write what a network told of the frames `name`: `frames.csv`, with a line for each, by their `numbers`, from 0 on
-    unless given: `x_m`, `y_m`, the middle of what is deepest, and `depth_m`, how deep; `depth.npz` with all maps;
-    `depth.png`; `report.json`.
+    progress: Callable[[FrameDepth], None] | None = None,
+    drawing: Callable[[str], None] | None = None,
+) -> WrittenDepths:
+    """Write what a network told of the frames `name`: `frames.csv`, a line for each as it comes: `x_m`, `y_m`, the
+    middle of what is deepest, and `depth_m`, how deep; and at the end `depth.npz` with all maps; `depth.png`;
+    `report.json`. There may be any number of frames: their maps grow on the disk, not in memory.
 
-    Maps of frames that were refused are NaN; where nothing is deeper than noise makes it, there is no middle. Returns
-    the columns. Raises `ValueError` for what cannot be a folder, and where no frame was imaged.
+    `found`: those of `stream_depths`. Maps of frames that were refused are NaN; where nothing is deeper than noise
+    makes it, there is no middle. `progress` is called with every frame, and `drawing` as by `write_stream`. Each file
+    is whole, or not there. Raises `ValueError` for what cannot be a folder, and, leaving no file, where no frame was
+    imaged; `OSError` on a full disk.
     """
     where = results_folder(folder, DEPTH_FILES)
-    if not np.isfinite(depth).any():
-        raise ValueError(f"depth: none of {len(depth)} frames was imaged; there is nothing to write.")
-    places = pixel_places(network.extent, network.shape)
-    imaged = np.isfinite(depth.reshape(len(depth), -1)).all(axis=1)
-    number = np.arange(len(depth)) if numbers is None else np.asarray(numbers)
-    middles = centroids_of(np.nan_to_num(depth), places)
-    deepest = depth.reshape(len(depth), -1).max(axis=1)
-    middles[~(deepest > network.floor)] = np.nan
-    columns = {"x_m": middles[:, 0], "y_m": middles[:, 1], "depth_m": deepest}
-    with open(where / "frames.csv", "w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(["frame", *columns])
-        for own, row in zip(number, zip(*columns.values(), strict=True), strict=True):
-            table.writerow([own, *(f"{value:.6g}" if np.isfinite(value) else "" for value in row)])
-    np.savez_compressed(where / "depth.npz", depth=depth, extent=np.array(network.extent))
-    _draw_depths(depth, np.flatnonzero(imaged), network, number).savefig(where / "depth.png", dpi=130)
-    report = {
-        "frames": name,
-        "number": len(depth),
-        "refused": number[~imaged],
-        "design": network.design,
-        "map": {"shape": network.shape, "extent_m": network.extent},
-        "deepest_m": deepest[imaged].max(),
-        "depth_by_noise_alone_m": network.floor,
-        "units": {"length": "m"},
-        "versions": {package: version_of(package) for package in _PACKAGES},
-    }
-    write_json(plain(report), where / "report.json")
-    return columns
+    for earlier in DEPTH_FILES[1:]:
+        (where / earlier).unlink(missing_ok=True)  # would not go with these frames
+    clear_parts(where, *DEPTH_FILES)
+    tell = drawing or (lambda said: None)
+    with GrowingRows(where, network.shape) as rows:
+        told = _Told(network)
+        with GrowingTable(where / "frames.csv", ("frame", "x_m", "y_m", "depth_m")) as table:
+            for one in found:
+                line, depth = told.take(one)
+                with saying_what_is_left(rows):
+                    table.write(line)
+                    rows.append(depth)
+                if progress is not None:
+                    progress(one)
+        if not told.imaged:
+            (where / "frames.csv").unlink()
+            reason = told.first_reason or "there is none"
+            raise ValueError(
+                f"'{name}': {counted(rows.number, 'frame')}, and none could be imaged; the first: {reason}"
+            )
+        tell("images")
+        with saying_what_is_left(rows):
+            extent = np.array(network.extent)
+            rows.write_npz(where / "depth.npz", "depth", {"extent": extent}, lambda far: tell(f"images: {far}"))
+        with results(where, ("report.json",)) as made:
+            write_json(told.report(name, rows.number), made / "report.json")
+        tell(PICTURES[0])
+        row, number = told.row.values().astype(int), told.number.values().astype(int)
+        chosen = np.unique(np.linspace(0, len(row) - 1, _DRAWN).round().astype(int))
+        with written_whole(where / "depth.png") as file:
+            _draw_depths(rows.read(row[chosen]), number[chosen], told.deepest.depth, network).savefig(file, dpi=130)
+        return WrittenDepths(rows.number, told.imaged, told.deepest, told.latency.values())
+
+
+class _Told:
+    """What is kept of the frames that a network imaged, whose number may be any."""
+
+    def __init__(self, network: ImageNetwork):
+        self.network, self._places = network, pixel_places(network.extent, network.shape)
+        self._nothing = np.full(network.shape, np.nan)
+        self.imaged, self.number_refused, self.first_reason = 0, 0, ""
+        self.refused: list[int] = []
+        self.row, self.number, self.latency = Sample(), Sample(), Sample()
+        self.deepest = DeepestFrame(-1, -np.inf, np.full(2, np.nan))
+
+    def take(self, one: FrameDepth) -> tuple[list[object], Float[np.ndarray, "rows columns"]]:
+        """The line of a frame in the table, and its map."""
+        if one.depth is None:
+            self.number_refused += 1
+            self.first_reason = self.first_reason or one.reason
+            self.refused += [one.number] if len(self.refused) < _LISTED else []
+            return [one.number, "", "", ""], self._nothing
+        for sample, value in ((self.row, self.imaged + self.number_refused), (self.number, one.number)):
+            sample.append(value)
+        self.latency.append(one.latency)
+        self.imaged += 1
+        depth = float(one.depth.max())
+        middle = centroids_of(one.depth[None], self._places)[0]
+        if not depth > self.network.floor:
+            middle = np.full(2, np.nan)
+        if depth > self.deepest.depth:
+            self.deepest = DeepestFrame(one.number, depth, middle)
+        said = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*middle, depth)]
+        return [one.number, *said], one.depth
+
+    def report(self, name: str, number: int) -> dict[str, Any]:
+        """As plain numbers, strings, lists and dictionaries."""
+        network = self.network
+        return plain(
+            {
+                "frames": name,
+                "number": number,
+                "refused": self.refused,
+                "number_refused": self.number_refused,
+                "design": network.design,
+                "map": {"shape": network.shape, "extent_m": network.extent},
+                "deepest_m": self.deepest.depth,
+                "depth_by_noise_alone_m": network.floor,
+                "units": {"length": "m"},
+                "versions": {package: version_of(package) for package in _PACKAGES},
+            }
+        )
 
 
 def _draw_depths(
-    depth: Float[np.ndarray, "n rows columns"],
-    imaged: Int[np.ndarray, " k"],
-    network: ImageNetwork,
-    numbers: Int[np.ndarray, " n"],
+    maps: Float[np.ndarray, "k rows columns"], numbers: Int[np.ndarray, " k"], deepest: float, network: ImageNetwork
 ):
     from matplotlib.figure import Figure
 
     from jeit.plot import plot_depth_map
 
-    chosen = imaged[np.unique(np.linspace(0, len(imaged) - 1, _DRAWN).round().astype(int))]
-    figure = Figure(figsize=(4.2 * len(chosen), 4.2), layout="constrained")
+    figure = Figure(figsize=(4.2 * len(maps), 4.2), layout="constrained")
     # What noise alone makes of the untouched skin is not stretched over the colours.
-    most = max(float(depth[imaged].max()), 4 * network.floor)
-    for ax, number in zip(figure.subplots(1, len(chosen), squeeze=False)[0], chosen, strict=True):
-        last = number == chosen[-1]
-        plot_depth_map(
-            depth[number], network.extent, most=most, colour_bar=last, title=f"frame {numbers[number]}", ax=ax
-        )
+    most = max(deepest, 4 * network.floor)
+    for ax, one, number in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, numbers, strict=True):
+        last = number == numbers[-1]
+        plot_depth_map(one, network.extent, most=most, colour_bar=last, title=f"frame {number}", ax=ax)
     return figure

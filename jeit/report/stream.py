@@ -1,7 +1,8 @@
-"""What is left of a stream on disk: a line for every frame as it comes, and at the end all images and pictures."""
+"""What is left of a stream on disk: a line and an image for every frame as it comes, and at the end pictures."""
 
-import csv
-from collections.abc import Callable, Iterable
+import contextlib
+import os
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,23 +10,31 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.arguments import is_number, told
+from jeit.files import written_whole
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.streaming.frame_check import FrameStatus
 from jeit.inverse.streaming.stream import FrameImage
 from jeit.mesh import centroids
-from jeit.report.film import check_film, write_film
+from jeit.report.film import FILM_FRAMES, check_film, write_film
 from jeit.report.folder import results_folder
+from jeit.report.growing import GrowingRows, GrowingTable, Sample, clear_parts, saying_what_is_left
+
+PICTURES = ("contact sheet", "film")
+"""What is drawn of a stream, by the names that are told."""
 
 _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
 _NOTHING = (FrameStatus.REFUSED, FrameStatus.UNCHANGED)
 # Share of the background at the end of a colour scale on which nothing is to be seen.
 _FAINT = 0.01
+# Refused frames that are named beneath the sheet, at most.
+_NAMED = 8
 
 
 @dataclass(frozen=True)
 class WrittenStream:
     """What `write_stream` has written: the `number` of frames, `counts` of them by status, the `latency` in seconds of
-    those that were imaged, (K,), and of the others the `first_reason`, empty if there is none."""
+    those that were imaged, (K,), of long streams some of them, evenly chosen, and of the others the `first_reason`,
+    empty if there is none."""
 
     number: int
     counts: dict[str, int]
@@ -45,17 +54,19 @@ def write_stream(
     drawing: Callable[[str], None] | None = None,
 ) -> WrittenStream:
     """Write `frames.csv`, a line for every image as it comes, and at the end `images.npz`, `frames.png`, a contact
-    sheet, and a film, into `folder`.
+    sheet, and a film, into `folder`. A stream may be of any length: its images grow on the disk, not in memory.
 
     `images`: those of `jeit.inverse.stream`, of an imager made with `calibration`, see `jeit.imaging.prepare_imager`.
     The table has the place in metres and the height, S (3-D: S/m), of each image's strongest change, of frames that are
     unchanged none. The NPZ holds
     `conductivity` (frames, cells), NaN for frames that were refused, `background`, `points` and `cells`. `film`: the
     name of its file, ending in .gif or, where ffmpeg is installed, .mp4; None for none. `rate`: frames in a second, for
-    times in place of numbers, and the pace of the film. Pictures show refused frames as such; where all are, there is
-    none. `progress` is called with every image, and `drawing` then with what is drawn. An earlier stream's images and
-    pictures are taken away first. Raises `ValueError`, with the `name` of the stream, if no frame came, and for what
-    cannot be a folder, a film or a rate.
+    times in place of numbers, and the pace of the film. Pictures are of some frames, evenly chosen, and show refused
+    ones as such; where all are, there is none. `progress` is called with every image, and `drawing` then with what is
+    written ("images") and drawn (one of `PICTURES`), a colon, and how far it is; what it raises leaves what is written
+    by then. An earlier stream's images and pictures are taken away first; each file is whole, or not there. Raises
+    `ValueError`, with the `name` of the stream, if no frame came, and for what cannot be a folder, a film or a rate;
+    `OSError` on a full disk.
     """
     if film is not None:
         check_film(film)
@@ -65,64 +76,122 @@ def write_stream(
     folder = results_folder(folder, made)
     for earlier in made[1:]:
         (folder / earlier).unlink(missing_ok=True)  # would not go with these frames
-    mesh, background = calibration.model.mesh, float(calibration.conductivity)
-    centre = np.asarray(centroids(mesh))[:, :2]
-    nothing = np.full(mesh.num_cells, np.nan, np.float32)
-    kept, latency, counts, refusals = [], [], {}, []
-    with open(folder / "frames.csv", "w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(_COLUMNS)
-        for one in images:
-            table.writerow(_row(one, centre, background))
-            file.flush()  # whoever follows the file sees every frame at once
-            kept.append(nothing if one.conductivity is None else one.conductivity.astype(np.float32))
-            latency += [one.latency] if one.imaged else []
-            refusals += [] if one.imaged else [one.reason]
-            counts[str(one.status)] = counts.get(str(one.status), 0) + 1
-            if progress is not None:
-                progress(one)
-    if not kept:
-        raise ValueError(f"'{name}': there was no frame in it.")
-    np.savez_compressed(
-        folder / "images.npz",
-        conductivity=np.stack(kept),
-        background=np.asarray(calibration.conductivity),
-        points=np.asarray(mesh.points),
-        cells=np.asarray(mesh.cells),
-    )
-    if latency:
-        # Where all is noise, it is not to fill the colours.
-        changed = len(kept) > sum(counts.get(status, 0) for status in _NOTHING)
-        limit = None if changed else _FAINT * background
-        pictures = _Pictures(folder, film, rate, limit, drawing or (lambda said: None))
-        pictures.draw(np.stack(kept) - np.float32(background), calibration)
-    return WrittenStream(len(kept), counts, np.array(latency), refusals[0] if refusals else "")
+    clear_parts(folder, *made[1:])
+    tell = drawing or (lambda said: None)
+    mesh, seen = calibration.model.mesh, _Seen(calibration)
+    with GrowingRows(folder, (mesh.num_cells,)) as rows:
+        with GrowingTable(folder / "frames.csv", _COLUMNS) as table:
+            for one in images:
+                row, image = seen.take(one)
+                with saying_what_is_left(rows):
+                    table.write(row)
+                    rows.append(image)
+                if progress is not None:
+                    progress(one)
+        if not rows.number:
+            raise ValueError(f"'{name}': there was no frame in it.")
+        others = {"background": calibration.conductivity, "points": mesh.points, "cells": mesh.cells}
+        tell("images")
+        with saying_what_is_left(rows):
+            rows.write_npz(folder / "images.npz", "conductivity", others, lambda far: tell(f"images: {far}"))
+        latency = seen.latency.values()
+        if latency.size:
+            _Pictures(folder, film, rate, tell).draw(rows, seen)
+        return WrittenStream(rows.number, seen.counts, latency, seen.first_reason)
+
+
+class _Seen:
+    """What is kept of the frames of a stream, whose number may be any."""
+
+    def __init__(self, calibration: Calibration):
+        self.calibration = calibration
+        mesh, self.background = calibration.model.mesh, float(calibration.conductivity)
+        self._centre = np.asarray(centroids(mesh))[:, :2]
+        self._nothing = np.full(mesh.num_cells, np.nan, np.float32)
+        self.latency, self.counts, self.first_reason = Sample(), {}, ""
+        self.refused, self.first_imaged, self.largest = [], -1, 0.0
+
+    def take(self, one: FrameImage) -> tuple[list[object], Float[np.ndarray, " m"]]:
+        """The line of a frame in the table, and its image."""
+        self.counts[str(one.status)] = self.counts.get(str(one.status), 0) + 1
+        if one.conductivity is None:
+            self.first_reason = self.first_reason or one.reason
+            self.refused += [one.number] if len(self.refused) < _NAMED else []
+            return _row(one, self._centre, self.background), self._nothing
+        self.first_imaged = one.number if self.first_imaged < 0 else self.first_imaged
+        self.latency.append(one.latency)
+        image = one.conductivity.astype(np.float32)
+        self.largest = max(self.largest, float(np.abs(image - np.float32(self.background)).max()))
+        return _row(one, self._centre, self.background), image
+
+    @property
+    def limit(self) -> float:
+        """The end of the colour scale: where all is noise, it is not to fill the colours."""
+        changed = sum(self.counts.values()) > sum(self.counts.get(status, 0) for status in _NOTHING)
+        return self.largest if changed else _FAINT * self.background
 
 
 @dataclass(frozen=True)
 class _Pictures:
-    """Which are drawn into a folder, where their scale ends, and who is told."""
+    """Which are drawn into a folder, and who is told."""
 
     folder: Path
     film: str | None
     rate: float | None
-    limit: float | None
     tell: Callable[[str], None]
 
-    def draw(self, changes: Float[np.ndarray, "F m"], calibration: Calibration) -> None:
-        """The contact sheet, and the film."""
+    def draw(self, rows: GrowingRows, seen: _Seen) -> None:
+        """The contact sheet, and the film, of some of the rows."""
         from jeit.plot import ColourScale, plot_frames
+        from jeit.plot.imaging.frames import SHEET_FRAMES, FrameCount
 
-        model, rate = calibration.model, self.rate
-        titles = [f"frame {one}" if rate is None else f"{one / rate:.2f} s" for one in range(len(changes))]
-        self.tell("contact sheet")
-        sheet = plot_frames(model.mesh, changes, model.electrodes, titles=titles, scale=ColourScale(limit=self.limit))
-        sheet.savefig(self.folder / "frames.png", dpi=120)
-        if self.film is not None:
-            path, told = self.folder / self.film, lambda far: self.tell(f"film: {far}")
+        model, limit = seen.calibration.model, seen.limit
+        self.tell(PICTURES[0])
+        changes, titles = self._some(rows, seen, SHEET_FRAMES)
+        count = FrameCount(rows.number, seen.counts.get("refused", 0), self._titles(seen.refused))
+        scale = ColourScale(limit=limit)
+        sheet = plot_frames(model.mesh, changes, model.electrodes, titles=titles, scale=scale, count=count)
+        with written_whole(self.folder / "frames.png") as file:
+            sheet.savefig(file, dpi=120)
+        if self.film is None:
+            return
+        changes, titles = self._some(rows, seen, FILM_FRAMES)
+        pace = None if self.rate is None else self.rate * len(changes) / rows.number
+        with _named_part(self.folder / self.film) as path:
             write_film(
-                path, model.mesh, changes, model.electrodes, titles=titles, rate=rate, limit=self.limit, progress=told
+                path,
+                model.mesh,
+                changes,
+                model.electrodes,
+                titles=titles,
+                rate=pace,
+                limit=limit,
+                progress=lambda far: self.tell(f"{PICTURES[1]}: {far}"),
             )
+
+    def _some(self, rows: GrowingRows, seen: _Seen, most: int) -> tuple[Float[np.ndarray, "k m"], list[str]]:
+        from jeit.plot.imaging.frames import chosen_frames
+
+        chosen = chosen_frames(rows.number, most)
+        images = rows.read(chosen)
+        if not np.isfinite(images).any():  # one that is to be seen
+            chosen = sorted({seen.first_imaged, *chosen[1:]})
+            images = rows.read(chosen)
+        return images - np.float32(seen.background), self._titles(chosen)
+
+    def _titles(self, numbers: Iterable[int]) -> list[str]:
+        return [f"frame {one}" if self.rate is None else f"{one / self.rate:.2f} s" for one in numbers]
+
+
+@contextlib.contextmanager
+def _named_part(path: Path) -> Iterator[Path]:
+    """Another name, of the same ending, for a file that takes its place at `path` when it is whole."""
+    other = path.with_name(f".{path.name}.{os.getpid()}.part{path.suffix}")
+    try:
+        yield other
+        other.replace(path)
+    finally:
+        other.unlink(missing_ok=True)
 
 
 def _row(one: FrameImage, centre, background: float) -> list[object]:

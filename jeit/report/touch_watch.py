@@ -1,7 +1,5 @@
 """What was told of a watched skin, in a folder: touches as they end, their paths, a report, a picture."""
 
-import csv
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +11,8 @@ from jaxtyping import Float
 from jeit.arguments import counted
 from jeit.imaging import NamedTouch, TouchWatch, WatchedFrame
 from jeit.report.describe import plain, version_of
-from jeit.report.folder import results_folder
+from jeit.report.folder import results, results_folder, write_json
+from jeit.report.growing import GrowingTable
 
 WATCH_FILES = ("events.csv", "paths.csv", "report.json", "timeline.png")
 _PACKAGES = ("jeit", "jax", "numpy", "scikit-learn")
@@ -22,6 +21,7 @@ _EVENTS = (
     "displacement_m", "peak_S", "area_m2", "begun_before", "cut_off", "held", "lost_frames", "longest_gap_s", "named_s",
     "latency_ms",
 )  # fmt: skip
+_PATHS = ("touch", "time_s", "x_m", "y_m", "peak_S")
 
 
 @dataclass(frozen=True)
@@ -59,21 +59,13 @@ def write_watch(
         (folder / earlier).unlink(missing_ok=True)  # would not go with these touches
     touches: list[NamedTouch] = []
     seconds, peaks, latency, counts, reason, notes = [], [], [], {}, "", []
-    with (
-        open(folder / "events.csv", "w", newline="", encoding="utf-8") as events,
-        open(folder / "paths.csv", "w", newline="", encoding="utf-8") as paths,
-    ):
-        event_table, path_table = csv.writer(events), csv.writer(paths)
-        event_table.writerow(_EVENTS)
-        path_table.writerow(("touch", "time_s", "x_m", "y_m", "peak_S"))
-        events.flush()
+    with GrowingTable(folder / "events.csv", _EVENTS) as events, GrowingTable(folder / "paths.csv", _PATHS) as paths:
         for one in watched:
             for touch in one.ended:
                 touches.append(touch)
-                event_table.writerow(_event(touch))
-                path_table.writerows(_path(touch))
-                events.flush()  # whoever follows the file sees every touch at once
-                paths.flush()
+                events.write(_event(touch))
+                for row in _path(touch):
+                    paths.write(row)
             if one.image is not None:
                 seconds.append(one.second)
                 peaks.append(one.peak)
@@ -94,9 +86,9 @@ def write_watch(
         first_reason=reason,
         notes=tuple(notes),
     )
-    text = json.dumps(report_watch(written, watch, name), indent=2, ensure_ascii=False, allow_nan=False)
-    (folder / "report.json").write_text(text + "\n", "utf-8")
-    draw_watch(written, watch).savefig(folder / "timeline.png", dpi=130)
+    with results(folder, WATCH_FILES[2:]) as made:
+        write_json(report_watch(written, watch, name), made / "report.json")
+        draw_watch(written, watch).savefig(made / "timeline.png", dpi=130)
     return written
 
 

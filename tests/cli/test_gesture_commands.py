@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -107,6 +108,30 @@ def test_standard_input_is_watched(files, model, run, tmp_path, monkeypatch):
     assert (status, error) == (0, "")
     assert "1 refused" in output
     assert len(events(tmp_path)) >= 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_and_all_is_written(files, model, run, tmp_path, monkeypatch, number):
+    folder, stream = files
+
+    def lines():
+        yield from (" ".join(map(repr, map(float, row))) for row in stream.voltages[:420])
+        signal.raise_signal(number)
+
+    monkeypatch.setattr("sys.stdin", lines())
+    status, output, error = run(
+        *("touch", "watch", "-", "--skin", folder / "skin.toml", "--gestures", model, "--output", tmp_path),
+        *("--rate", RATE),
+    )
+    assert (status, error) == (143 if number == signal.SIGTERM else 0, "")
+    assert "420 frames" in output
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "events.csv",
+        "paths.csv",
+        "report.json",
+        "timeline.png",
+    ]
+    assert json.loads((tmp_path / "report.json").read_text("utf-8"))["touches"] == len(events(tmp_path)) >= 2
 
 
 @pytest.mark.parametrize(

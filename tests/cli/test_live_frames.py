@@ -7,6 +7,7 @@ import pytest
 
 from jeit.cli import live_frames
 from jeit.cli.live_frames import LiveFrames
+from jeit.cli.stopping import Stopping
 
 
 @pytest.fixture
@@ -100,12 +101,12 @@ def test_ctrl_c_ends_it(clock):
         signal.raise_signal(signal.SIGINT)
         yield from frames(clock, 3)
 
-    handler = signal.getsignal(signal.SIGINT)
-    assert len(list(LiveFrames(lines(), 10.0, 10.0))) == 3
-    assert signal.getsignal(signal.SIGINT) is handler
+    with Stopping() as stopping:
+        assert len(list(stopping.until(LiveFrames(lines(), 10.0, 10.0)))) == 3
     seen = []
-    for second, _ in LiveFrames(frames(clock, 9), 10.0, 10.0):
-        seen.append(second)
-        if len(seen) == 4:
-            signal.raise_signal(signal.SIGINT)
+    with Stopping() as stopping:
+        for second, _ in stopping.until(LiveFrames(frames(clock, 9), 10.0, 10.0)):
+            seen.append(second)
+            if len(seen) == 4:
+                signal.raise_signal(signal.SIGINT)
     assert len(seen) == 4

@@ -8,6 +8,7 @@ import pytest
 from studies import SMALL
 
 from jeit.design.study import read_study
+from jeit.design.study.lock import locked
 from jeit.design.study.store import Store
 
 pytest.importorskip("xarray")
@@ -61,6 +62,15 @@ def test_run_stop_resume_and_report(file, run, monkeypatch):
     assert "something else already" in failed(run("study", "run", file, "--output", file))
     file.write_text(SMALL.replace("rows = 5", "rows = 6"), "utf-8")
     assert "another study, or of this one before it was changed" in failed(run("study", "resume", file))
+
+
+@pytest.mark.parametrize("command", ["run", "resume"])
+def test_a_study_that_another_process_writes(file, run, command):
+    store = Store(read_study(file), file.with_suffix(".zarr"))
+    with locked(store.path, "study"):
+        assert f"{store.path} is being written by this process since " in failed(run("study", command, file, "-q"))
+        assert "0 of 2 points finished" in run("study", "status", file)[1]
+        assert "no chunk of the study is finished" in failed(run("study", "report", file))
 
 
 @pytest.mark.parametrize("command", ["resume", "status", "report"])

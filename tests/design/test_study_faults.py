@@ -56,6 +56,36 @@ def test_killed_in_the_middle_of_a_chunk_and_resumed_the_store_is_the_same(
     assert contents(store_path) == contents(whole_store)
 
 
+KILLED_BY_ZARR = """
+import os, signal, sys
+from pathlib import Path
+from jeit.design.study import read_study, run_study
+
+replace, calls = Path.replace, []
+
+def dying(self, target):
+    calls.append(self.suffix == ".partial" and "/c/" in str(self))
+    if sum(calls) == {calls}:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return replace(self, target)
+
+Path.replace = dying
+run_study(read_study(sys.argv[1]), sys.argv[2])
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+@pytest.mark.parametrize("calls", [3, 2 * ARRAYS + 20])
+def test_killed_while_zarr_writes_a_file(study, study_file, whole_store, store_path, calls):
+    """As the store is made, and in the first chunk: what Zarr was writing lies under another name."""
+    ended = in_another_process(KILLED_BY_ZARR.format(calls=calls), study_file, store_path)
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    assert [name for name in contents(store_path.parent) if name.endswith(".partial")]
+    run_study(study, store_path)
+    assert contents(store_path) == contents(whole_store)
+    assert os.listdir(store_path.parent) == ["study.zarr"]
+
+
 @pytest.mark.parametrize("where", ["before the mark", "in the mark"])
 def test_stopped_about_the_mark(study, whole_store, store_path, monkeypatch, where):
     """Interrupted between a chunk's arrays and its mark, or before the mark takes the place of the old one."""
@@ -94,6 +124,55 @@ def test_a_full_disk_keeps_finished_chunks(study, whole_store, store_path, monke
     run_study(study, store_path)
     assert solved == [1, 2]
     assert contents(store_path) == contents(whole_store)
+
+
+def test_a_file_size_limit_keeps_finished_chunks(study, whole_store, store_path, watch_chunks):
+    """What the system does, not what it is made to: the last mark is too long by a little."""
+    resource = pytest.importorskip("resource")
+    earlier = resource.getrlimit(resource.RLIMIT_FSIZE)
+    Store(study, store_path)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((whole_store / "zarr.json").stat().st_size - 10, earlier[1]))
+    try:
+        with pytest.raises(OSError, match=r"File too large: a chunk could not be written; 2 of 3 chunks are finished"):
+            run_study(study, store_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, earlier)
+    assert os.listdir(store_path.parent) == ["study.zarr"]
+    assert study_progress(study, store_path).chunks == 2
+    solved = watch_chunks()
+    run_study(study, store_path)
+    assert solved == [2]
+    assert contents(store_path) == contents(whole_store)
+
+
+def test_no_room_for_a_store(study, store_path):
+    resource = pytest.importorskip("resource")
+    earlier = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for limit in (20, 400):  # not for the lock, not for all of the store
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, earlier[1]))
+        try:
+            with pytest.raises(OSError, match=r"the study's store cannot be made \(File too large\)"):
+                run_study(study, store_path)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, earlier)
+        assert os.listdir(store_path.parent) == []
+
+
+def test_a_store_that_can_only_be_read(study, whole_store, monkeypatch):
+    def refusing(path, flags, *rest, **options):
+        if flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT):
+            raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+        return opened(path, flags, *rest, **options)
+
+    opened = os.open
+    before = contents(whole_store.parent)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", refusing)
+        with pytest.raises(OSError, match=r"the study's store cannot be written \(Read-only file system\)"):
+            run_study(study, whole_store)
+        assert study_progress(study, whole_store).chunks == 3
+        assert open_results(study, whole_store).finished.all()
+    assert contents(whole_store.parent) == before
 
 
 @pytest.mark.parametrize("damage", ["cut short", "changed", "lost"])

@@ -204,7 +204,22 @@ def half_gone(frame):
     return frame
 
 
+def clipped(frame):
+    """The amplifier gives no more than three fifths of the largest voltage."""
+    return np.clip(frame, -0.6 * np.abs(frame).max(), 0.6 * np.abs(frame).max())
+
+
+def at_both_rails(frame):
+    return np.copysign(2 * np.abs(frame).max(), frame)
+
+
+def amplified_and_clipped(frame):
+    return clipped(3 * frame)
+
+
 REFUSED = {
+    "at the rails": (at_both_rails, "Saturated: 208 channels at the ends"),
+    "at the rails in part, and all wrong": (amplified_and_clipped, "channels, and the others are far off too"),
     "all zero": (np.zeros_like, "current source"),
     "another sensor, one electrode worse": (lambda frame: dead_electrode(3 * frame) - 20 * dead_part(frame), "another"),
     "all NaN": (lambda frame: frame * np.nan, "Only 0 of 208"),
@@ -238,7 +253,12 @@ def test_a_bad_frame_is_refused_and_the_stream_goes_on(name, method, frames, ima
 @pytest.mark.parametrize("method", ["gauss-newton", "one-step"])
 @pytest.mark.parametrize(
     ("fault", "left", "message"),
-    [(with_nan, 205, "3 channels"), (dead_electrode, 156, "Electrode 5"), (fading_electrode, 156, "Electrode 5")],
+    [
+        (with_nan, 205, "3 channels"),
+        (clipped, 176, "32 channels at the ends of the range"),
+        (dead_electrode, 156, "Electrode 5"),
+        (fading_electrode, 156, "Electrode 5"),
+    ],
 )
 def test_channels_without_a_reading_are_left_out(fault, left, message, method, model, frames, imager, linear):
     one = imager if method == "gauss-newton" else linear

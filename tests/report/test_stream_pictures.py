@@ -90,7 +90,7 @@ def test_a_film_has_every_frame_at_the_pace_of_the_stream(tmp_path):
 
 
 def test_long_streams_make_short_films(tmp_path, monkeypatch):
-    monkeypatch.setattr(film, "_MOST", 4)
+    monkeypatch.setattr(film, "FILM_FRAMES", 4)
     write_film(tmp_path / "a.gif", MESH, changes(40), rate=1000.0)
     with Image.open(tmp_path / "a.gif") as shown:
         assert (shown.n_frames, shown.info["duration"]) == (4, 40)  # no faster than 25 a second

@@ -96,11 +96,13 @@ def stream(
 
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written, scaled
+    from jeit.cli.stopping import FramesTold, Stopping
     from jeit.data import read
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as images_of
     from jeit.report import write_stream
     from jeit.report.film import check_film
+    from jeit.report.stream import PICTURES
 
     given = {
         "solver": method,
@@ -116,30 +118,33 @@ def stream(
     wanted = None if film == "none" else film
     with naming_options({"film": "--film"}):
         films = () if wanted is None else (check_film(wanted),)
-    make_folder(output, ("frames.csv", "images.npz", "frames.png", *films))
     console = plain_console()
-    with Steps(console, quiet=quiet) as step:
-        step("read")
-        empty = read(reference, format, description)
-        measured = empty if data == "-" else read(Path(data), format, description, like=empty)
-        imager, calibration = prepare_imager(empty, settings, measurement=measured, progress=step)
+    with Stopping() as stopping:
+        make_folder(output, ("frames.csv", "images.npz", "frames.png", *films))
+        with Steps(console, quiet=quiet) as step:
+            step("read")
+            empty = read(reference, format, description)
+            measured = empty if data == "-" else read(Path(data), format, description, like=empty)
+            imager, calibration = prepare_imager(empty, settings, measurement=measured, progress=step)
+        if data == "-":
+            frames, number = parse_frames(sys.stdin), None
+        else:
+            frames, number = frames_of(measured), measured.num_frames
+        with naming_options({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
+            step("image")
+            come = FramesTold(step, number)
 
-    def show(one) -> None:
-        if one.reason and not quiet:
-            console.print(f"  frame {one.number}: {one.status}. {one.reason}", soft_wrap=True)
+            def show(one) -> None:
+                come.one_more()
+                if one.reason and not quiet:
+                    console.print(f"  frame {one.number}: {one.status}. {one.reason}", soft_wrap=True)
 
-    frames = parse_frames(sys.stdin) if data == "-" else frames_of(measured)
-    with naming_options({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
-
-        def draw(what: str) -> None:
-            if not step.under_way:
-                step("draw")
-            step.tell(what)
-
-        told = {"progress": show, "drawing": draw}
-        written = write_stream(
-            images_of(imager, frames), calibration, output, name=data, film=wanted, rate=rate, **told
-        )
+            drawing = stopping.before(PICTURES, step)
+            images = images_of(imager, stopping.until(frames))
+            with stopping.ending(come, "frames.csv", "images.npz"):
+                written = write_stream(
+                    images, calibration, output, name=data, film=wanted, rate=rate, progress=show, drawing=drawing
+                )
     if not written.latency.size:
         raise ValueError(
             f"'{data}': {counted(written.number, 'frame')}, and none could be imaged; the first: {written.first_reason}"

@@ -34,10 +34,14 @@ def run(
     file: File, output: Output = None, page: Page = None, scheduler: Scheduler = None, quiet: Quiet = False
 ) -> None:
     """Run a study from its beginning, and report."""
+    from jeit.design.study.lock import locked
+
     sweep, store = _read(file, output)
     if store.exists() and not (store / "zarr.json").is_file():
         raise ValueError(f"--output {store}: there is something else already; choose another name.")
     if store.exists():
+        with locked(store, "study"):  # or else a process that writes it is told of, before anybody deletes it
+            pass
         raise ValueError(f"{store} is there already: 'jeit study resume {file}' goes on with it; or delete it.")
     _run(sweep, file, store, page, scheduler, quiet)
 

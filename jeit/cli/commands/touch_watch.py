@@ -1,5 +1,6 @@
 """`jeit touch gestures` and `jeit touch watch`: gestures learnt from recordings, and named as they end."""
 
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -114,16 +115,14 @@ def watch(
     """Name touches as they end: when, where, which gesture, and how probable that is.
 
     Writes events.csv and paths.csv line by line, and at the end report.json and timeline.png. Of standard input a line
-    is printed with the first frame after a touch; where that goes on within 100 ms it is named anew. Ctrl-C ends it,
-    and all is written.
+    is printed with the first frame after a touch; where that goes on within 100 ms it is named anew. Ctrl-C and
+    SIGTERM end it, and all is written.
     """
     from dataclasses import replace
 
-    import numpy as np
-
-    from jeit.arguments import counted
-    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.console import Steps, plain_console
     from jeit.cli.live_frames import LiveFrames
+    from jeit.cli.stopping import Stopping
     from jeit.data import load_description, read_frame_recording
     from jeit.imaging import TouchImages, TouchWatch
     from jeit.imaging.stream_preparation import parse_frames
@@ -132,44 +131,56 @@ def watch(
     from jeit.touch import GestureModel
 
     check_positive({"--untouched": untouched, "--patience": patience} | ({} if rate is None else {"--rate": rate}))
-    make_folder(output, WATCH_FILES)
     console = plain_console()
-    with Steps(console, quiet=quiet) as step:
-        step("read")
-        with naming_options({"description": "--skin"}):
-            description = load_description(skin)
-        model = GestureModel.read(gestures)
-        still = None if reference is None else read_frame_recording(reference, description).frames
-        usual = 60.0 if model.reading is None else model.reading.rate
-        live = None
-        if stream == "-":
-            live = LiveFrames(parse_frames(sys.stdin), rate, usual)
-            if still is None:
-                step(f"untouched, for {untouched:g} s")
-                still = live.untouched(untouched)
-            frames, own = live, live.rate_seen
-        else:
-            frames, still, own = _recorded(Path(stream), description, still, untouched, rate or usual)
-        step("prepare")
-        images = TouchImages.prepare(description, still, replace(TOUCH_IMAGES, as_is=as_is), progress=step.tell)
-        watch = TouchWatch.create(images, model, still, rate=own, patience=patience)
-    for note in () if quiet else watch.notes:
-        console.print(f"  note: {note}", soft_wrap=True)
+    with Stopping() as stopping:
+        make_folder(output, WATCH_FILES)
+        with Steps(console, quiet=quiet) as step:
+            step("read")
+            with naming_options({"description": "--skin"}):
+                description = load_description(skin)
+            model = GestureModel.read(gestures)
+            still = None if reference is None else read_frame_recording(reference, description).frames
+            usual = 60.0 if model.reading is None else model.reading.rate
+            live = None
+            if stream == "-":
+                live = LiveFrames(parse_frames(sys.stdin), rate, usual)
+                if still is None:
+                    step(f"untouched, for {untouched:g} s")
+                    still = live.untouched(untouched)
+                frames, own = live, live.rate_seen
+            else:
+                frames, still, own = _recorded(Path(stream), description, still, untouched, rate or usual)
+            step("prepare")
+            images = TouchImages.prepare(description, still, replace(TOUCH_IMAGES, as_is=as_is), progress=step.tell)
+            watch = TouchWatch.create(images, model, still, rate=own, patience=patience)
+        for note in () if quiet else watch.notes:
+            console.print(f"  note: {note}", soft_wrap=True)
 
-    if live is not None and not quiet:
-        console.print("  ready: the skin may be touched")
+        if live is not None and not quiet:
+            console.print("  ready: the skin may be touched")
 
-    def show(one) -> None:
-        if one.note and not quiet:
-            console.print(f"  note: {one.note}", soft_wrap=True)
-        # Live, a touch is named with the first frame that has none; of a file it is told once, as it was in the end.
-        told = one.ended if stream != "-" else () if one.named is None else (one.named,)
-        for touch in () if quiet else told:
-            console.print(_line(touch))
+        def show(one) -> None:
+            if one.note and not quiet:
+                console.print(f"  note: {one.note}", soft_wrap=True)
+            # Live, a touch is named with the first frame that has none; of a file it is told once, as in the end.
+            told = one.ended if stream != "-" else () if one.named is None else (one.named,)
+            for touch in () if quiet else told:
+                console.print(_line(touch))
 
-    written = write_watch(watch.follow(frames), watch, output, name=stream, progress=show)
-    if quiet:
-        return
+        written = write_watch(watch.follow(stopping.until(frames)), watch, output, name=stream, progress=show)
+    if not quiet:
+        _say(console, written, live, output)
+    if stopping.signal == signal.SIGTERM:
+        raise typer.Exit(128 + signal.SIGTERM)
+
+
+def _say(console, written, live, output: Path) -> None:
+    """What was told, in sum."""
+    import numpy as np
+
+    from jeit.arguments import counted
+    from jeit.cli.console import say_written
+
     said = ", ".join(f"{number} {status}" for status, number in sorted(written.counts.items()))
     unlike = sum(one.unlike for one in written.touches)
     console.print(f"\n{counted(len(written.seconds), 'frame')}: {said}")

@@ -10,7 +10,7 @@ from jeit.design.study.batch import check_points, solve_chunk
 from jeit.design.study.cluster import over_cluster
 from jeit.design.study.progress import Progress, Teller
 from jeit.design.study.spec import Study
-from jeit.design.study.store import Store, open_results, require
+from jeit.design.study.store import Store, open_results, require, writing
 
 
 def run_study(
@@ -25,19 +25,20 @@ def run_study(
       solved again, and only this process writes. In this process unless given.
     - `progress`: called with a `Progress` at the start and after each chunk; in this process, after each exact map too.
 
-    Raises `ValueError` for meshes too coarse for their electrodes or touches, and for another study's store, before
+    One process at a time: others are told which, dead ones are seen through. Raises `ValueError` for meshes too coarse
+    for their electrodes or touches, for another study's store, and for one that another process writes, before
     anything runs, `ImportError` without the extra `cluster`, and `OSError` where the store cannot be written, such as
     on a full disk: finished chunks are kept.
     """
     require("xarray")
     check_points(study)
-    store = Store(study, path)
-    done = set(store.sound())
-    left = [number for number in range(len(study.chunks)) if number not in done]
-    tell = Teller(study.chunks, done, progress)
-    for number, results in _solved(study, left, client, tell.solved):
-        store.write(number, results)
-        tell.finished(number)
+    with writing(study, path) as store:
+        done = set(store.sound())
+        left = [number for number in range(len(study.chunks)) if number not in done]
+        tell = Teller(study.chunks, done, progress)
+        for number, results in _solved(study, left, client, tell.solved):
+            store.write(number, results)
+            tell.finished(number)
     return open_results(study, path)
 
 

@@ -4,12 +4,14 @@ No chunk touches another's files. Which chunks are finished stands, with a check
 of each, in one file that is replaced as a whole, after the chunk's own.
 """
 
+import contextlib
+import glob
 import hashlib
 import json
 import os
 import shutil
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
@@ -18,10 +20,12 @@ import numpy as np
 
 from jeit.arguments import check_kind
 from jeit.design.study.contents import Contents, study_contents
+from jeit.design.study.lock import locked
 from jeit.design.study.spec import Study
 from jeit.design.study.store_check import ArrayShape, damage, danger
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
+_A_PATH = "that of the store, such as 'results.zarr'"
 
 
 class OtherContents(ValueError):
@@ -29,7 +33,8 @@ class OtherContents(ValueError):
 
 
 class Store:
-    """The store of a study, or of other `Contents`, at `path`; made empty if there is none."""
+    """The store of a study, or of other `Contents`, at `path`; made empty if there is none, or only read where none is
+    to be made. See `writing`."""
 
     def __init__(self, work: Study | Contents, path: str | Path, *, create: bool = True):
         """Raises `FileNotFoundError` if there is no store and none is to be made, `ValueError` if there is something
@@ -37,7 +42,7 @@ class Store:
         extra `cluster`, and `OSError` if it cannot be written."""
         zarr = require("zarr")
         self.contents = work if isinstance(work, Contents) else study_contents(work)
-        check_kind("path", path, (str, os.PathLike), "that of the store, such as 'results.zarr'")
+        check_kind("path", path, (str, os.PathLike), _A_PATH)
         self.path, kind = Path(path), self.contents.kind
         if not self.path.exists():
             if not create:
@@ -61,7 +66,7 @@ class Store:
             )
         self._check(_shapes(zarr, self.contents))
         try:
-            self._group = zarr.open_group(str(self.path), mode="r+", zarr_format=3)
+            self._group = zarr.open_group(str(self.path), mode="r+" if create else "r", zarr_format=3)
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise self._damaged(error) from None
 
@@ -168,6 +173,24 @@ class Store:
         )
 
 
+@contextlib.contextmanager
+def writing(work: Study | Contents, path: str | Path) -> Iterator[Store]:
+    """The store of `work` at `path`, made empty if there is none, for this process alone to write.
+
+    What killed runs left half-written, under names of their own, is cleared. Raises as `Store` does, and `ValueError`
+    where another process writes it.
+    """
+    check_kind("path", path, (str, os.PathLike), _A_PATH)
+    contents = work if isinstance(work, Contents) else study_contents(work)
+    path = Path(path)
+    with locked(path, contents.kind):
+        _clear_beside(path)
+        store = Store(contents, path)
+        for left in path.rglob("*.partial"):  # of Zarr
+            left.unlink(missing_ok=True)
+        yield store
+
+
 def open_results(study: Study, path: str | Path):
     """The results as an `xarray.Dataset` with dimensions point and place; what is not finished is NaN.
 
@@ -237,6 +260,16 @@ def _create(zarr: ModuleType, contents: Contents, path: Path) -> None:
         os.rename(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _clear_beside(path: Path) -> None:
+    """Take away what runs that were killed have left beside the store."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*"):
+        pid, _, kind = left.name.removeprefix(f".{path.name}.").partition(".")
+        if pid.isdecimal() and kind == "new":
+            shutil.rmtree(left, ignore_errors=True)
+        elif pid.isdecimal() and kind == "tmp":
+            left.unlink(missing_ok=True)
 
 
 def _checksum(results: Mapping[str, np.ndarray]) -> str:

@@ -13,6 +13,8 @@ _LARGEST_DIFFERENCE = 0.5
 # Beyond this, an electrode is taken for dead whose channels have changed by half or more, and hold most of the change.
 _SUSPICIOUS, _EXPLAINED, _LOST = 0.15, 0.5, 0.5
 _LEAST_CHANNELS = 0.5
+# Beyond the same, so many channels that read exactly the same, and more or less than all others, are at a rail.
+_AT_RAIL, _ALIKE = 3, 1e-6
 # Reciprocal channels of nothing but noise are alike by chance: so many standard deviations of that, of so many pairs
 # at least, tell of a change; and a change of less than this, relative to an undisturbed frame, is none.
 _CHANCE, _FEWEST_PAIRS, _EQUAL = 3.0, 10, 1e-12
@@ -110,6 +112,8 @@ class FrameCheck:
             usable, reason = self._without_dead_electrode(difference, usable)
             if reason:
                 return values, usable, FrameStatus.PARTIAL, reason
+            if (rail := self._at_rail(values, usable)).any():
+                return self._without_saturated(values, difference, usable, rail)
             if relative > _LARGEST_DIFFERENCE:
                 reason = f"It differs by {relative:.0%} from an undisturbed frame: another sensor's, or a fault."
                 return values, none, FrameStatus.REFUSED, reason
@@ -134,3 +138,24 @@ class FrameCheck:
         if not (lost and explained):
             return usable, ""
         return rest, f"Electrode {electrode + 1} seems to be dead; its channels are left out."
+
+    def _at_rail(self, values, usable):
+        """Channels of an amplifier that can give no more."""
+        far = np.abs(values - self.expected) > _SUSPICIOUS * np.abs(self.expected)
+        rail = np.zeros_like(usable)
+        for end in (values[usable].max(), values[usable].min()):
+            same = usable & (values == end)
+            if np.count_nonzero(same) < _AT_RAIL or not end:
+                continue
+            # Channels that symmetry makes equal, in numbers that nobody measured, are so undisturbed too.
+            if far[same].all() and np.ptp(self.expected[same]) > _ALIKE * np.abs(self.expected[same]).max():
+                rail |= same
+        return rail
+
+    def _without_saturated(self, values, difference, usable, rail):
+        rest, told = usable & ~rail, counted(int(np.count_nonzero(rail)), "channel")
+        if np.count_nonzero(rest) < _LEAST_CHANNELS * np.count_nonzero(self.mask):
+            return values, rest, FrameStatus.REFUSED, f"Saturated: {told} at the ends of the range."
+        if np.linalg.norm(difference[rest]) > _LARGEST_DIFFERENCE * self.size:
+            return values, rest, FrameStatus.REFUSED, f"Saturated: {told}, and the others are far off too."
+        return values, rest, FrameStatus.PARTIAL, f"Left out: {told} at the ends of the range, saturated."

@@ -46,9 +46,9 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     compiled before the first frame is asked for. A frame is refused, and the stream goes on, when it has another number
     of channels or is not real, when fewer than half of the channels can be used, when all read zero (the current source
     has failed), or when it differs from an undisturbed frame by more than half of it. A dead electrode's channels are
-    left out, and named. A frame that nothing but noise tells from an undisturbed one is imaged, and said to be
-    "unchanged". Raises `ValueError` for what is no imager, for what are no frames, and for an array of frames that is
-    not (frames, channels).
+    left out, and named, and so are those that an amplifier cuts at the ends of its range. A frame that nothing but
+    noise tells from an undisturbed one is imaged, and said to be "unchanged". Raises `ValueError` for what is no
+    imager, for what are no frames, and for an array of frames that is not (frames, channels).
     """
     check_kind("imager", imager, Imager, "an Imager, as of Imager.create or prepare_imager(reference)[0]")
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")

@@ -4,6 +4,7 @@ A frame that was refused has no image: its body is grey, and says so.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +23,19 @@ from jeit_solvers.engines import as_array
 
 # Pixels along a side of a picture, and the grey of a body without an image.
 _PIXELS, _GREY = 160, "#dfe2e6"
+SHEET_FRAMES = 12
+"""Frames of a contact sheet at most, unless it is told."""
+# Refused frames that are named beneath it.
+_NAMED = 6
+
+
+class FrameCount(NamedTuple):
+    """How many frames a stream had, of which some are drawn: the `number`, how many were `refused`, and the `names` of
+    the first of those."""
+
+    number: int
+    refused: int
+    names: Sequence[str]
 
 
 def chosen_frames(number: int, most: int) -> list[int]:
@@ -91,14 +105,15 @@ def plot_frames(
     *,
     titles: Sequence[str] | None = None,
     scale: ColourScale = CHANGE,
-    most: int = 12,
+    most: int = SHEET_FRAMES,
+    count: FrameCount | None = None,
 ) -> Figure:
     """A contact sheet of a stream: some of its frames, evenly chosen, on one colour scale, each with its title.
 
     `changes` (F, m): of conductivity, S (3-D: S/m, drawn half way up), a row of NaN for a frame that was refused, shown
-    as such. `titles`: one a frame, their numbers unless given, from 0. `most`: frames on the sheet. The scale is that
-    of all frames, drawn or not. Raises `ValueError` for changes of another shape, another number of titles than of
-    frames, and where every frame was refused.
+    as such. `titles`: one a frame, their numbers unless given, from 0. `most`: frames on the sheet. `count`: of all
+    frames, where `changes` are only some. The scale is that of all frames, drawn or not. Raises `ValueError` for
+    changes of another shape, another number of titles than of frames, and where every frame was refused.
     """
     check_body(mesh, electrodes)
     values = np.asarray(changes)
@@ -120,19 +135,21 @@ def plot_frames(
     if scale.bar:
         where = figure.add_subplot(places[:, -1])
         draw_colour_bar(where, pictures[0].drawn, fitted.label, signed=scale.difference, place=where)
-    told = _told(values, said, len(chosen), mesh)
+    if count is None:
+        refused = [title for title, row in zip(said, values, strict=True) if not np.isfinite(row).all()]
+        count = FrameCount(len(values), len(refused), refused)
+    told = _told(count, len(chosen), mesh)
     if told:
         figure.supxlabel(told, fontsize=9, color=SOFT)
     return figure
 
 
-def _told(values: np.ndarray, titles: list[str], chosen: int, mesh: Mesh) -> str:
+def _told(count: FrameCount, chosen: int, mesh: Mesh) -> str:
     """What the sheet does not show: frames left out, and which were refused."""
-    parts = [] if chosen == len(values) else [f"{chosen} of {len(values)} frames"]
-    refused = [title for title, row in zip(titles, values, strict=True) if not np.isfinite(row).all()]
-    if refused:
-        some = ", ".join(refused[:6]) + (" …" if len(refused) > 6 else "")
-        parts.append(f"{len(refused)} of {len(values)} refused: {some}")
+    parts = [] if chosen == count.number else [f"{chosen} of {count.number} frames"]
+    if count.refused:
+        some = ", ".join(count.names[:_NAMED]) + (" …" if count.refused > _NAMED else "")
+        parts.append(f"{count.refused} of {count.number} refused: {some}")
     if mesh.dimension == 3:
         z = np.asarray(mesh.points)[:, 2]
         parts.append(f"slices at z = {500 * (z.min() + z.max()):.1f} mm")

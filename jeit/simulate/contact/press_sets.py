@@ -16,7 +16,7 @@ from jeit.arguments import check_kind, told
 from jeit.design.study.cluster import over_cluster
 from jeit.design.study.contents import Contents
 from jeit.design.study.progress import Progress, Teller
-from jeit.design.study.store import Store, require
+from jeit.design.study.store import Store, require, writing
 from jeit.simulate.contact.indent_sets import IndentSet
 from jeit.simulate.contact.press import Press
 from jeit.simulate.contact.press_draws import PressDraws
@@ -138,19 +138,19 @@ def simulate_presses(
     """Simulate what is not finished of a set, of presses or indents, and return it, as of `open_presses`.
 
     Killed at any moment, it goes on from the last finished chunk when run again, to the same store. `path`, `client`
-    and `progress` as in `jeit.design.run_study`. Raises `ValueError` for another set's store, and as
-    `PressedSkin.frames` does, `ImportError` without the extra `cluster`, and `OSError` where the store cannot be
-    written.
+    and `progress` as in `jeit.design.run_study`. Raises `ValueError` for another set's store, for one
+    that another process writes, and as `PressedSkin.frames` does, `ImportError` without the extra `cluster`, and
+    `OSError` where the store cannot be written.
     """
     require("xarray")
     check_kind("presses", presses, (PressSet, IndentSet), "a PressSet(skin, draws, number), or an IndentSet")
-    store = Store(presses.contents(), path)
-    done = set(store.sound())
-    left = [number for number in range(len(presses.chunks)) if number not in done]
-    tell = Teller(presses.chunks, done, progress)
-    for number, results in _solved(presses, left, client):
-        store.write(number, results)
-        tell.finished(number)
+    with writing(presses.contents(), path) as store:
+        done = set(store.sound())
+        left = [number for number in range(len(presses.chunks)) if number not in done]
+        tell = Teller(presses.chunks, done, progress)
+        for number, results in _solved(presses, left, client):
+            store.write(number, results)
+            tell.finished(number)
     return open_presses(presses, path)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from studies import contents, in_another_process
 
+from jeit.design.study.lock import locked
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.layout import ring
@@ -122,6 +123,18 @@ def test_a_finished_set_is_not_simulated_again(presses, whole, solved):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+def test_one_process_at_a_time_simulates_a_set(presses, whole):
+    with (
+        locked(whole, "press set"),
+        pytest.raises(ValueError, match=r"whole\.zarr is being written by this process .* resume the press set"),
+    ):
+        simulate_presses(presses, whole)
+    (whole / "voltages" / "c" / "0.abc.partial").write_bytes(b"half")
+    before = contents(whole)
+    simulate_presses(presses, whole)
+    assert set(before) - set(contents(whole)) == {"voltages/c/0.abc.partial"}
+
+
 def test_killed_within_a_chunk_and_resumed_the_store_is_the_same(presses, whole, tmp_path, solved):
     path = tmp_path / "killed.zarr"
     ended = in_another_process(KILLED, Path(__file__).parent, path, PYTHONPATH=os.pathsep.join(sys.path))

@@ -1,0 +1,119 @@
+"""Ctrl-C and SIGTERM while frames are streamed: what has come is written, and the exit status says what ended it."""
+
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+import typer
+
+from jeit.arguments import counted
+from jeit.cli.console import Steps
+from jeit.cli.options import remove_empty_folders
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_NO_MORE = object()
+# Seconds from one word of how many frames have come to the next.
+_EVERY = 0.25
+
+
+class StoppedError(Exception):
+    """A stream was stopped, and what is left to do is left out."""
+
+
+class Stopping:
+    """A context in which those signals end the frames of `until` after the one under way, or at once where the next is
+    waited for. A second signal ends the command at once, and so does the first where there are no frames yet."""
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+        self._streaming, self._waiting = False, False
+        self._earlier: dict[int, Any] = {}
+
+    def until(self, frames: Iterable) -> Iterator:
+        """The frames, until a signal comes."""
+        self._streaming = True
+        source = iter(frames)
+        try:
+            while True:
+                self._waiting = True
+                if self.signal is not None:
+                    return
+                frame = next(source, _NO_MORE)
+                self._waiting = False
+                if frame is _NO_MORE:
+                    return
+                yield frame
+        except KeyboardInterrupt:
+            return
+        finally:
+            self._waiting = False
+
+    def before(self, pictures: Sequence[str], step: Steps) -> Callable[[str], None]:
+        """Tells of what is written and drawn as steps; nothing is drawn where a signal has come."""
+
+        def tell(what: str) -> None:
+            part = "draw" if what.partition(":")[0] in pictures else "write"
+            if part == "draw" and self.signal is not None:
+                raise StoppedError
+            if step.under_way != part:
+                step(part)
+            step.tell(what)
+
+        return tell
+
+    @contextmanager
+    def ending(self, come: "FramesTold", *files: str) -> Iterator[None]:
+        """End the command after what is within, where a signal has come, and say after how many frames; `files` have
+        them."""
+        try:
+            yield
+            held = f"; {' and '.join(files)} have them"
+        except (StoppedError, ValueError) as error:
+            if self.signal is None:
+                raise
+            held = f"; {' and '.join(files)} have them" if isinstance(error, StoppedError) else ""
+        if self.signal is not None:
+            self._end(f" after {counted(come.number, 'frame')}{held}")
+
+    def _end(self, said: str) -> NoReturn:
+        remove_empty_folders()
+        print(f"jeit: stopped{said}.", file=sys.stderr)
+        raise typer.Exit(128 + (self.signal or 0))
+
+    def __enter__(self) -> "Stopping":
+        if threading.current_thread() is threading.main_thread():
+            heard = [one for one in _SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
+            self._earlier = {one: signal.signal(one, self._stop) for one in heard}
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_) -> None:
+        for one, handler in self._earlier.items():
+            signal.signal(one, handler)
+        if kind is KeyboardInterrupt and self.signal is not None:
+            self._end("")
+
+    def _stop(self, number: int, _) -> None:
+        at_once = self.signal is not None or self._waiting or not self._streaming
+        self.signal, self._waiting = number, False
+        if at_once:
+            raise KeyboardInterrupt
+
+
+class FramesTold:
+    """Says of the step under way how many frames have come, of `number` where that is known, a few times a second."""
+
+    def __init__(self, step: Steps, number: int | None = None):
+        self._step, self._of = step, "" if number is None else f" of {number:,}"
+        self.number, self._last = 0, 0.0
+
+    def one_more(self) -> None:
+        """A frame has come."""
+        self.number += 1
+        now = time.monotonic()
+        if now - self._last > _EVERY:
+            self._last = now
+            self._step.tell(f"frame {self.number:,}{self._of}")

@@ -1,0 +1,123 @@
+"""Commands killed with kill -9 where it hurts: what is left can be read, and the next run is as one undisturbed."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+from studies import in_another_process
+
+pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+
+KILLED = """
+import os, signal, sys
+from {module} import {owner}
+
+whole, calls = {owner}.{method}, []
+
+def dying(self, *given, **options):
+    calls.append(1)
+    if len(calls) == {calls}:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return whole(self, *given, **options)
+
+{owner}.{method} = dying
+from jeit.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+# What is called for the how-manieth time when it dies, and the files that there are then.
+STREAM = {
+    "its third line": ("jeit.report.growing", "GrowingTable", "write", 4, {"frames.csv"}),
+    "its images": ("zipfile", "_ZipWriteFile", "write", 3, {"frames.csv"}),
+    "its sheet": ("jeit.plot.imaging.frames", "FramePicture", "show", 3, {"frames.csv", "images.npz"}),
+    "its film": ("jeit.plot.imaging.frames", "FramePicture", "show", 9, {"frames.csv", "images.npz", "frames.png"}),
+}
+
+
+@pytest.mark.parametrize(
+    "moment", [pytest.param(one, marks=() if one == "its images" else pytest.mark.slow) for one in STREAM]
+)
+def test_a_stream(moment, tank, run, tmp_path):
+    module, owner, method, calls, left = STREAM[moment]
+    data = tank.write("many", np.stack([tank.touched, tank.rest, 1.02 * tank.touched, tank.touched]))
+    given = "stream", data, "--reference", tank.folder / "rest.csv", "--method", "one-step", "--num-points", 250
+    code = KILLED.format(module=module, owner=owner, method=method, calls=calls)
+    ended = in_another_process(code, *given, "--quiet", "--output", tmp_path / "out")
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    assert {path.name for path in (tmp_path / "out").iterdir() if path.name[0] != "."} == left
+    lines = (tmp_path / "out" / "frames.csv").read_text().splitlines(keepends=True)
+    assert len(lines) == (3 if moment == "its third line" else 5)
+    assert all(line.endswith("\n") for line in lines)
+    assert {len(row) for row in csv.reader(lines)} == {10}
+    if "images.npz" in left:
+        with np.load(tmp_path / "out" / "images.npz") as held:
+            assert held["conductivity"].shape[0] == 4
+    for folder in ("out", "undisturbed"):
+        assert run(*given, "--quiet", "--output", tmp_path / folder)[0] == 0
+    for name in ("images.npz", "frames.png", "film.gif"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes()
+    assert sorted(os.listdir(tmp_path / "out")) == sorted(os.listdir(tmp_path / "undisturbed"))
+
+
+@pytest.mark.slow
+def test_an_image(tank, run, tmp_path):
+    """The second of its files takes its place: one is new, the others are those of an earlier run."""
+    given = "--reference", tank.folder / "rest.csv", "--num-points", 250, "--quiet", "--output"
+    assert run("reconstruct", tank.write("less", 0.5 * (tank.rest + tank.touched)), *given, tmp_path / "out")[0] == 0
+    code = KILLED.format(module="pathlib", owner="Path", method="replace", calls=2)
+    ended = in_another_process(code, "reconstruct", tank.folder / "touched.csv", *given, tmp_path / "out")
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    with np.load(tmp_path / "out" / "image.npz") as held:
+        assert all(held[name].size for name in held.files)
+    with Image.open(tmp_path / "out" / "image.png") as picture:
+        picture.load()
+    for folder in ("out", "undisturbed"):
+        assert run("reconstruct", tank.folder / "touched.csv", *given, tmp_path / folder)[0] == 0
+    for name in ("image.npz", "image.png"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes()
+
+
+KILLED_IN_THE_CACHE = """
+import os, signal, sys
+from pathlib import Path
+
+whole = Path.write_bytes
+
+def dying(self, content):
+    if self.name.endswith("-cache") and len(content) > 2000:
+        whole(self, content[: len(content) // 2])
+        print(self, flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+    return whole(self, content)
+
+Path.write_bytes = dying
+from jeit.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.slow
+def test_while_compiled_code_is_kept(tank, tmp_path):
+    """Half a program is left; the next run says nothing of it, and keeps it whole."""
+    given = ["reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv", "--num-points", 250]
+    given = [*map(str, given), "--quiet", "--output"]
+    kept = ("JAX_COMPILATION_CACHE_DIR", "JEIT_COMPILATION_CACHE")
+    environment = {name: value for name, value in os.environ.items() if name not in kept}
+
+    def start(cache, *command):
+        home = {"XDG_CACHE_HOME": str(tmp_path / cache), "LOCALAPPDATA": str(tmp_path / cache), "HOME": str(tmp_path)}
+        return subprocess.run([sys.executable, *command], env=environment | home, capture_output=True, text=True)
+
+    ended = start("cache", "-c", KILLED_IN_THE_CACHE, *given, tmp_path / "out")
+    assert ended.returncode == -signal.SIGKILL, ended.stderr
+    torn = ended.stdout.strip()
+    size = os.path.getsize(torn)
+    for cache, folder in (("cache", "out"), ("another", "undisturbed")):
+        ended = start(cache, "-m", "jeit", *given, tmp_path / folder)
+        assert (ended.returncode, ended.stderr) == (0, "")
+    assert not os.path.exists(torn) or os.path.getsize(torn) > size
+    assert (tmp_path / "out" / "image.npz").read_bytes() == (tmp_path / "undisturbed" / "image.npz").read_bytes()

@@ -1,0 +1,166 @@
+"""One process at a time writes a store: owners are named, dead ones seen through, what they left is cleared."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from studies import contents
+
+from jeit.design.study import lock as lock_module
+from jeit.design.study import open_results, run_study, study_progress
+from jeit.design.study.lock import locked
+
+pytest.importorskip("xarray")
+pytest.importorskip("zarr")
+
+HOLDS = """
+import sys, time
+from pathlib import Path
+from jeit.design.study.lock import locked
+with locked(Path(sys.argv[1]), "study"):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def lock_file(store_path):
+    """Where the lock of the store is."""
+    return store_path.with_name(".study.zarr.lock")
+
+
+@pytest.fixture
+def other_process(store_path):
+    """Another process that holds the lock."""
+    process = subprocess.Popen([sys.executable, "-c", HOLDS, store_path], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def signed(lock_file, **owner):
+    """A lock that says this of its owner, as if left behind."""
+    said = {"pid": 4242, "host": "elsewhere", "boot": "another", "since": "2026-01-02 03:04:05+00:00"} | owner
+    lock_file.write_text(json.dumps(said))
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+def test_another_process_is_named_and_a_dead_one_seen_through(study, store_path, lock_file, other_process):
+    told = rf"^{re.escape(str(store_path))} is being written by process {other_process.pid} since \d{{4}}-\d\d-\d\d "
+    with pytest.raises(ValueError, match=told):
+        run_study(study, store_path)
+    assert not store_path.exists()
+    other_process.send_signal(signal.SIGKILL)
+    other_process.wait()
+    assert lock_file.exists()
+    with locked(store_path, "study"):
+        assert json.loads(lock_file.read_text())["pid"] == os.getpid()
+    assert not lock_file.exists()
+
+
+def test_reading_needs_no_lock_and_writing_twice_is_refused(study, whole_store, lock_file):
+    with locked(whole_store, "study"):
+        assert study_progress(study, whole_store).chunks == 3
+        assert open_results(study, whole_store).finished.all()
+        with pytest.raises(ValueError, match=r"being written by this process since .* then resume the study"):
+            run_study(study, whole_store)
+    run_study(study, whole_store)
+
+
+def test_another_machines_lock_says_how_to_be_rid_of_it(study, whole_store):
+    lock_file = whole_store.with_name(f".{whole_store.name}.lock")
+    signed(lock_file)
+    with pytest.raises(
+        ValueError, match=r"process 4242 on 'elsewhere' since 2026-01-02.* where it does not, delete "
+    ) as e:
+        run_study(study, whole_store)
+    assert str(lock_file) in str(e.value)
+    lock_file.unlink()
+    run_study(study, whole_store)
+
+
+@pytest.mark.parametrize(
+    "left", ["nothing", "no JSON", "a list", "before this machine started", "another name of this machine"]
+)
+def test_locks_left_behind_are_taken_over(store_path, lock_file, left):
+    if left == "before this machine started":
+        signed(lock_file, host=lock_module.platform.node())
+    elif left == "another name of this machine":
+        if not lock_module._boot():
+            pytest.skip("this system does not tell its runs apart")
+        signed(lock_file, boot=lock_module._boot())
+    else:
+        lock_file.write_text({"nothing": "", "no JSON": "{" * 5000, "a list": "[1]"}[left])
+    with locked(store_path, "study"):
+        assert json.loads(lock_file.read_text())["pid"] == os.getpid()
+
+
+def test_where_the_system_locks_no_files(store_path, lock_file, monkeypatch):
+    monkeypatch.setattr(lock_module, "fcntl", None)
+    signed(lock_file, host=lock_module.platform.node(), pid=os.getpid())
+    with (
+        pytest.raises(ValueError, match=f"process {os.getpid()} on this machine since .* delete "),
+        locked(store_path, "study"),
+    ):
+        pass
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    signed(lock_file, host=lock_module.platform.node(), pid=ended.pid)
+    with locked(store_path, "study"):
+        assert json.loads(lock_file.read_text())["pid"] == os.getpid()
+
+
+def test_a_link_is_not_written_through(store_path, lock_file, tmp_path):
+    (tmp_path / "letter.txt").write_text("dear")
+    lock_file.symlink_to(tmp_path / "letter.txt")
+    with pytest.raises(OSError, match="the study's store cannot be made"), locked(store_path, "study"):
+        pass
+    assert (tmp_path / "letter.txt").read_text() == "dear"
+
+
+def test_what_killed_runs_have_left_is_cleared(study, whole_store, store_path):
+    run_study(study, store_path)
+    beside, inside = store_path.parent, store_path / "sensitivity" / "c" / "0"
+    (beside / ".study.zarr.4242.tmp").write_text("{")
+    (beside / ".study.zarr.4242.new").mkdir()
+    (beside / ".study.zarr.4242.new" / "zarr.json").write_text("{")
+    (inside / "0.0123456789abcdef.partial").write_bytes(b"half")
+    for name in (".study.zarr.notes", "study.zarr.4242.tmp", ".other.zarr.4242.tmp"):
+        (beside / name).write_text("mine")
+    run_study(study, store_path)
+    assert contents(store_path) == contents(whole_store)
+    assert sorted(os.listdir(beside)) == [
+        ".other.zarr.4242.tmp",
+        ".study.zarr.notes",
+        "study.zarr",
+        "study.zarr.4242.tmp",
+    ]
+
+
+def test_nothing_is_cleared_of_what_is_no_store(study, store_path):
+    store_path.mkdir()
+    (store_path / "film.partial").write_text("mine")
+    with pytest.raises(ValueError, match="holds no study"):
+        run_study(study, store_path)
+    assert (store_path / "film.partial").read_text() == "mine"
+    assert os.listdir(store_path.parent) == ["study.zarr"]
+
+
+def test_a_clock_set_back_does_no_harm(study, whole_store, store_path, monkeypatch):
+    now = [2e9]
+
+    def backwards():
+        now[0] -= 1e6
+        return now[0]
+
+    monkeypatch.setattr(time, "time", backwards)
+    monkeypatch.setattr(time, "time_ns", lambda: int(1e9 * backwards()))
+    run_study(study, store_path)
+    assert contents(store_path) == contents(whole_store)

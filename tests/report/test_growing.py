@@ -1,0 +1,158 @@
+"""What a stream of any length leaves: whole lines, rows that grow on disk, memory that does not."""
+
+import csv
+import tracemalloc
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.inverse.streaming.frame_check import FrameStatus
+from jeit.inverse.streaming.stream import FrameImage
+from jeit.layout import ring
+from jeit.mesh import Disk
+from jeit.protocol import adjacent
+from jeit.report import write_stream
+from jeit.report.growing import GrowingRows, GrowingTable, Sample
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    """What `write_stream` asks of a calibration: a model, and its conductivity, 1 S."""
+    model = ForwardModel(Disk(0.05).mesh(num_points=200), BoundaryElectrodes(ring(0.05, 8), 0.01, 0.1), adjacent(8))
+    return SimpleNamespace(model=model, conductivity=np.asarray(1.0))
+
+
+def images(calibration, number, imaged=lambda one: True):
+    """Of a spot that grows stronger; the others are refused."""
+    cells, usable = calibration.model.mesh.num_cells, np.ones(40, bool)
+    for one in range(number):
+        if imaged(one):
+            change = np.where(np.arange(cells) == one % cells, 1e-3 * (one + 1) / number, 0.0)
+            yield FrameImage(one, 1 + change, FrameStatus.IMAGED, "", usable, 1.0, 2, 1e-3 * one)
+        else:
+            yield FrameImage(one, None, FrameStatus.REFUSED, "no good", usable, np.nan, 0, 1e-3)
+
+
+def test_a_stream_is_written_as_it_was_imaged(calibrated, tmp_path):
+    told = []
+    written = write_stream(
+        images(calibrated, 40, lambda one: one % 3 != 1), calibrated, tmp_path, film=None, drawing=told.append
+    )
+    with np.load(tmp_path / "images.npz") as held:
+        assert sorted(held.files) == ["background", "cells", "conductivity", "points"]
+        assert held["conductivity"].shape == (40, calibrated.model.mesh.num_cells)
+        assert held["conductivity"].dtype == np.float32
+        assert np.isnan(held["conductivity"][1::3]).all()
+        np.testing.assert_allclose(held["conductivity"][39].max(), 1 + 1e-3, rtol=1e-6)
+        np.testing.assert_array_equal(held["cells"], calibrated.model.mesh.cells)
+    assert (written.number, written.counts) == (40, {"imaged": 27, "refused": 13})
+    np.testing.assert_allclose(written.latency, 1e-3 * np.array([one for one in range(40) if one % 3 != 1]))
+    assert told == ["images", "contact sheet"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames.csv", "frames.png", "images.npz"]
+
+
+def test_one_frame_that_was_imaged_is_shown(calibrated, tmp_path, monkeypatch):
+    """Though none of those that would be drawn was."""
+    monkeypatch.setattr("jeit.report.stream.FILM_FRAMES", 4)
+    written = write_stream(images(calibrated, 500, lambda one: one == 3), calibrated, tmp_path, film="film.gif")
+    assert written.counts == {"refused": 499, "imaged": 1}
+    assert (tmp_path / "frames.png").stat().st_size > 10_000
+    assert (tmp_path / "film.gif").stat().st_size > 10_000
+
+
+def no_pictures(what):
+    if what == "contact sheet":
+        raise InterruptedError
+
+
+def test_memory_does_not_grow_with_a_stream(calibrated, tmp_path):
+    def peak(number):
+        tracemalloc.start()
+        with pytest.raises(InterruptedError):
+            write_stream(images(calibrated, number), calibrated, tmp_path, drawing=no_pictures)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return most
+
+    peak(10)
+    first, second = peak(1000), peak(4000)
+    assert second - first < 5e5  # their images are 5 MB
+    with np.load(tmp_path / "images.npz") as held:
+        assert held["conductivity"].nbytes > 5e6
+
+
+def test_what_is_not_drawn_any_more_leaves_the_rest(calibrated, tmp_path):
+    (tmp_path / ".images.npz.0123.part").write_bytes(b"left by a stream that was killed")
+    (tmp_path / ".film.gif.77.part.gif").write_bytes(b"so is this")
+    with pytest.raises(InterruptedError):
+        write_stream(images(calibrated, 5), calibrated, tmp_path, drawing=no_pictures)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames.csv", "images.npz"]
+
+
+def limited(size):
+    """A context in which no file may be larger than this many bytes."""
+    resource = pytest.importorskip("resource")
+
+    class Limited:
+        def __enter__(self):
+            self.earlier = resource.getrlimit(resource.RLIMIT_FSIZE)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, self.earlier[1]))
+
+        def __exit__(self, *_):
+            resource.setrlimit(resource.RLIMIT_FSIZE, self.earlier)
+
+    return Limited()
+
+
+def test_a_full_disk_leaves_whole_lines(tmp_path):
+    with GrowingTable(tmp_path / "a.csv", ("one", "two")) as table, limited(40):
+        table.write((1, "first"))
+        with pytest.raises(OSError, match="File too large"):
+            table.write((2, "more than there is room for, in two pieces"))
+    assert (tmp_path / "a.csv").read_bytes() == b"one,two\r\n1,first\r\n"
+
+
+def test_a_full_disk_says_what_is_left(calibrated, tmp_path):
+    with (
+        limited(20_000),
+        pytest.raises(OSError, match=r"File too large: what came .* frames\.csv tells of the \d+ frames until then"),
+    ):
+        write_stream(images(calibrated, 100), calibrated, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["frames.csv"]
+    with open(tmp_path / "frames.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) >= 10
+    assert all(None not in row.values() for row in rows)
+
+
+def test_a_link_is_not_written_through(tmp_path):
+    (tmp_path / "letter.txt").write_text("dear")
+    (tmp_path / "a.csv").symlink_to(tmp_path / "letter.txt")
+    with GrowingTable(tmp_path / "a.csv", ("one",)):
+        pass
+    assert (tmp_path / "letter.txt").read_text() == "dear"
+    assert (tmp_path / "a.csv").read_text() == "one\n"
+
+
+def test_rows_are_read_where_they_are_wanted(tmp_path):
+    with GrowingRows(tmp_path, (2, 3)) as rows:
+        for one in range(5000):
+            rows.append(np.full((2, 3), one))
+        assert rows.read([0, 4999, 17])[:, 1, 2].tolist() == [0, 4999, 17]
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sample_is_even_and_small():
+    sample = Sample()
+    for one in range(1000):
+        sample.append(one)
+    assert sample.values().tolist() == list(range(1000))
+    for one in range(1000, 1_000_000):
+        sample.append(one)
+    values = sample.values()
+    assert 30_000 < len(values) <= 2**16
+    assert set(np.diff(values)) == {16}
+    assert values[-1] > 999_980
