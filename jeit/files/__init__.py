@@ -8,7 +8,7 @@ from jeit.files.foreign import read_as, reason
 from jeit.files.limits import MOST_ELECTRODES, check_electrodes, check_memory
 from jeit.files.npz_file import check_archive, need, npy_array, npz_arrays
 from jeit.files.text import check_size, parsed_toml, read_json, read_text, read_toml
-from jeit.files.whole import whole_files, written_whole
+from jeit.files.whole import clear_unfinished, whole_files, written_whole
 
 __all__ = [
     "MOST_ELECTRODES",
@@ -16,6 +16,7 @@ __all__ = [
     "check_electrodes",
     "check_memory",
     "check_size",
+    "clear_unfinished",
     "need",
     "npy_array",
     "npz_arrays",

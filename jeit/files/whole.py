@@ -1,13 +1,18 @@
 """Files that are written whole or not at all: beside what was there, and put in its place when all is on the disk."""
 
 import os
+import re
 import secrets
 import shutil
-import tempfile
+import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
+
+from jeit.files.processes import boot, is_alive
+
+_UNFINISHED = re.compile(r"\.jeit-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.part")
 
 
 @contextmanager
@@ -17,7 +22,8 @@ def written_whole(path: str | Path) -> Iterator[BinaryIO]:
     A link at `path` is replaced, not followed. Raises `OSError` where it cannot be written.
     """
     path = Path(path)
-    other = path.with_name(f".{path.name[:80]}.{secrets.token_hex(4)}.part")
+    clear_unfinished(path.parent)
+    other = path.parent / _unfinished()
     try:
         with other.open("xb") as file:
             yield file
@@ -34,7 +40,9 @@ def whole_files(folder: Path) -> Iterator[Path]:
 
     Links at their places are replaced, not followed. Raises `OSError` where they cannot be written.
     """
-    beside = Path(tempfile.mkdtemp(prefix=".jeit-", suffix=".part", dir=folder))
+    clear_unfinished(folder)
+    beside = folder / _unfinished()
+    beside.mkdir()
     try:
         yield beside
         for one in sorted(beside.iterdir()):
@@ -44,3 +52,21 @@ def whole_files(folder: Path) -> Iterator[Path]:
             one.replace(folder / one.name)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
+
+
+def clear_unfinished(folder: Path) -> None:
+    """Take away what processes of this machine that were killed have left unfinished in a folder."""
+    with suppress(OSError):
+        for one in folder.iterdir():
+            made = _UNFINISHED.fullmatch(one.name)
+            if made and made[1] == _machine() and not is_alive(int(made[2])):
+                shutil.rmtree(one, ignore_errors=True) if one.is_dir() and not one.is_symlink() else one.unlink()
+
+
+def _unfinished() -> str:
+    return f".jeit-{_machine()}-{os.getpid()}-{secrets.token_hex(4)}.part"
+
+
+def _machine() -> str:
+    """This run of this machine, in eight letters; no process of another can be asked after."""
+    return f"{zlib.crc32(boot().encode()):08x}"

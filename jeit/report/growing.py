@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import glob
 import io
 import os
 import tempfile
@@ -135,10 +134,3 @@ class Sample:
     def values(self) -> Float[np.ndarray, " k"]:
         """Those that are kept."""
         return np.array(self._values)
-
-
-def clear_parts(folder: Path, *names: str) -> None:
-    """Take away what an earlier stream that was killed has left half-written of files of these names."""
-    for name in names:
-        for left in folder.glob(f".{glob.escape(name)}.*.part*"):
-            left.unlink(missing_ok=True)

@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jeit.arguments import counted
-from jeit.files import written_whole
+from jeit.files import clear_unfinished, written_whole
 from jeit.report.describe import plain, version_of
 from jeit.report.folder import results, results_folder, write_json
-from jeit.report.growing import GrowingRows, GrowingTable, Sample, clear_parts, saying_what_is_left
+from jeit.report.growing import GrowingRows, GrowingTable, Sample, saying_what_is_left
 from jeit.report.stream import PICTURES
 from jeit.simulate.contact.indent_sets import pixel_places
 from jeit.touch.networks import ImageNetwork, LearntImages
@@ -131,7 +131,7 @@ def write_depths(
     where = results_folder(folder, DEPTH_FILES)
     for earlier in DEPTH_FILES[1:]:
         (where / earlier).unlink(missing_ok=True)  # would not go with these frames
-    clear_parts(where, *DEPTH_FILES)
+    clear_unfinished(where)
     tell = drawing or (lambda said: None)
     with GrowingRows(where, network.shape) as rows:
         told = _Told(network)

@@ -1,8 +1,6 @@
 """What is left of a stream on disk: a line and an image for every frame as it comes, and at the end pictures."""
 
-import contextlib
-import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,14 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.arguments import is_number, told
-from jeit.files import written_whole
+from jeit.files import clear_unfinished, whole_files, written_whole
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.streaming.frame_check import FrameStatus
 from jeit.inverse.streaming.stream import FrameImage
 from jeit.mesh import centroids
 from jeit.report.film import FILM_FRAMES, check_film, write_film
 from jeit.report.folder import results_folder
-from jeit.report.growing import GrowingRows, GrowingTable, Sample, clear_parts, saying_what_is_left
+from jeit.report.growing import GrowingRows, GrowingTable, Sample, saying_what_is_left
 
 PICTURES = ("contact sheet", "film")
 """What is drawn of a stream, by the names that are told."""
@@ -76,7 +74,7 @@ def write_stream(
     folder = results_folder(folder, made)
     for earlier in made[1:]:
         (folder / earlier).unlink(missing_ok=True)  # would not go with these frames
-    clear_parts(folder, *made[1:])
+    clear_unfinished(folder)
     tell = drawing or (lambda said: None)
     mesh, seen = calibration.model.mesh, _Seen(calibration)
     with GrowingRows(folder, (mesh.num_cells,)) as rows:
@@ -157,9 +155,9 @@ class _Pictures:
             return
         changes, titles = self._some(rows, seen, FILM_FRAMES)
         pace = None if self.rate is None else self.rate * len(changes) / rows.number
-        with _named_part(self.folder / self.film) as path:
+        with whole_files(self.folder) as made:
             write_film(
-                path,
+                made / self.film,
                 model.mesh,
                 changes,
                 model.electrodes,
@@ -181,17 +179,6 @@ class _Pictures:
 
     def _titles(self, numbers: Iterable[int]) -> list[str]:
         return [f"frame {one}" if self.rate is None else f"{one / self.rate:.2f} s" for one in numbers]
-
-
-@contextlib.contextmanager
-def _named_part(path: Path) -> Iterator[Path]:
-    """Another name, of the same ending, for a file that takes its place at `path` when it is whole."""
-    other = path.with_name(f".{path.name}.{os.getpid()}.part{path.suffix}")
-    try:
-        yield other
-        other.replace(path)
-    finally:
-        other.unlink(missing_ok=True)
 
 
 def _row(one: FrameImage, centre, background: float) -> list[object]:

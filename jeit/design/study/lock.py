@@ -9,6 +9,7 @@ from datetime import datetime
 from pathlib import Path
 
 from jeit.arguments import told
+from jeit.files.processes import boot, is_alive
 
 try:
     import fcntl
@@ -88,7 +89,7 @@ def _is_at(handle: int, place: Path) -> bool:
 
 
 def _sign(handle: int) -> None:
-    owner = {"pid": os.getpid(), "host": platform.node(), "boot": _boot()}
+    owner = {"pid": os.getpid(), "host": platform.node(), "boot": boot()}
     owner["since"] = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
     os.ftruncate(handle, 0)
     os.pwrite(handle, json.dumps(owner).encode(), 0)
@@ -106,31 +107,11 @@ def _owner(handle: int) -> dict:
 
 def _gone(owner: dict, *, certain: bool) -> bool:
     """Whether the owner is dead: `certain` where it no longer holds the file, which tells of this machine only."""
-    return _is_here(owner) and (certain or not _alive(owner.get("pid")))
+    return _is_here(owner) and (certain or not is_alive(owner.get("pid")))
 
 
 def _is_here(owner: dict) -> bool:
-    return owner.get("host") == platform.node() or (bool(_boot()) and owner.get("boot") == _boot())
-
-
-def _alive(pid: object) -> bool:
-    if os.name != "posix" or not isinstance(pid, int) or isinstance(pid, bool) or pid <= 0:
-        return True  # not known
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-def _boot() -> str:
-    """Which run of the system this is: containers with names of their own share it."""
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    except OSError:
-        return ""
+    return owner.get("host") == platform.node() or (bool(boot()) and owner.get("boot") == boot())
 
 
 def _refusal(owner: dict, place: Path, path: Path, kind: str) -> str:

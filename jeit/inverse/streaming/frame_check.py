@@ -133,7 +133,8 @@ class FrameCheck:
         if not np.isfinite(left[electrode]):
             return usable, ""
         own, rest = usable & self.touching[electrode], usable & ~self.touching[electrode]
-        lost = np.median(np.abs(difference[own]) / np.abs(self.expected[own])) > _LOST
+        read = own & (self.expected != 0)
+        lost = read.any() and np.median(np.abs(difference[read]) / np.abs(self.expected[read])) > _LOST
         explained = left[electrode] <= min(_EXPLAINED * total, _LARGEST_DIFFERENCE * self.size)
         if not (lost and explained):
             return usable, ""

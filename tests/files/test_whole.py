@@ -1,0 +1,42 @@
+"""Files that are whole or not there, and what is left of processes that were killed."""
+
+import os
+import subprocess
+import sys
+
+from jeit.files import whole_files, written_whole
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from jeit.files import whole_files, written_whole
+with whole_files(Path(sys.argv[1])) as made, written_whole(Path(sys.argv[1]) / "one") as file:
+    (made / "two").write_text("half")
+    file.write(b"half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_process_left_is_cleared_by_the_next(tmp_path):
+    (tmp_path / "one").write_text("before")
+    subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
+    assert (tmp_path / "one").read_text() == "before"
+    left = [one.name for one in tmp_path.iterdir() if one.name != "one"]
+    assert len(left) == 2
+    living = left[0].split("-")
+    other = tmp_path / f".jeit-{living[1]}-{os.getppid()}-{'0' * 8}.part"
+    elsewhere = tmp_path / f".jeit-00000000-{living[2]}-{'0' * 8}.part"
+    for one in (other, elsewhere):
+        one.write_text("of a process that lives, or of another machine")
+    with written_whole(tmp_path / "one") as file:
+        file.write(b"after")
+    assert {one.name for one in tmp_path.iterdir()} == {"one", other.name, elsewhere.name}
+    assert (tmp_path / "one").read_text() == "after"
+
+
+def test_a_file_in_the_making_is_not_cleared_by_another(tmp_path):
+    with whole_files(tmp_path) as made:
+        (made / "two").write_text("two")
+        with written_whole(tmp_path / "one") as file:
+            file.write(b"one")
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["one", "two"]
