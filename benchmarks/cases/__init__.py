@@ -31,6 +31,8 @@ NAMES = (
     "ktc2023",
     "real_skins",
     "crash",
+    "fuzz",
+    "threads",
     "discriminants",
     "gestures",
     "modality",

@@ -15,7 +15,7 @@ from random import Random
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path += [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
-from commands import READERS
+from commands import COMMANDS, READERS
 from mutators import mutated
 from oracle import Outcome, outcome
 from readers import Reader
@@ -52,9 +52,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--inputs", type=int, default=2000, help="of all readers together")
     parser.add_argument("--reader", choices=[*READERS], action="append")
+    parser.add_argument("--files", action="store_true", help="readers of files alone")
+    parser.add_argument("--commands", action="store_true", help="commands alone")
     parser.add_argument("--first", type=int, default=0, help="number of the first input")
     given = parser.parse_args()
-    chosen = [READERS[name] for name in given.reader or READERS]
+    left_out = {"": {}, "files": COMMANDS, "commands": {name for name in READERS if name not in COMMANDS}}
+    without = left_out["files" if given.files else "commands" if given.commands else ""]
+    chosen = [READERS[name] for name in given.reader or READERS if name not in without]
     each, faults = -(-given.inputs // len(chosen)), []
     print(f"{'reader':26}{'tried':>8}{'refused':>9}{'accepted':>9}{'faults':>8}{'slowest':>9}")
     for reader in chosen:
@@ -67,7 +71,8 @@ def main() -> int:
         row = [each, counts["refused"], counts["accepted"], counts["faulty"]]
         print(f"{reader.name:26}" + "".join(f"{one:>{8 + (place in (1, 2))}}" for place, one in enumerate(row)), end="")
         print(f"{slowest:>7.1f} s", flush=True)
-    print(*faults, sep="\n")
+    for fault in faults:
+        print(fault)
     return 1 if faults else 0
 
 
