@@ -7,11 +7,11 @@ light: nothing of the library is imported here.
 
 from jeit.arguments.arrays import real_array
 from jeit.arguments.counts import counted, percent
+from jeit.arguments.instrument import readings
 from jeit.arguments.keys import check_key
 from jeit.arguments.kinds import check_kind, is_number, told
 from jeit.arguments.lengths import IN_MILLIMETRES, check_metres
 from jeit.arguments.names import check_name, did_you_mean, listed
-from jeit.arguments.readings import readings
 from jeit.arguments.traced import check_has_values
 
 __all__ = [

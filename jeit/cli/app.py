@@ -2,6 +2,7 @@
 
 import gc
 import io
+import logging
 import os
 import sys
 import warnings
@@ -22,7 +23,7 @@ from jeit.cli.commands.reconstruct import reconstruct
 from jeit.cli.commands.stream import stream
 from jeit.cli.commands.study import study
 from jeit.cli.commands.touch import touch
-from jeit.cli.options import naming_options, remove_empty_folders
+from jeit.cli.options import naming_options, remembering_files, remove_empty_folders
 from jeit.start import discarded_damaged
 
 # Commands that run one program again and again: a frame in a third of the time.
@@ -116,7 +117,7 @@ def _name_options(command) -> None:
         _name_options(one)
     options = {one.name: max(one.opts, key=len) for one in command.params if one.param_type_name == "option"}
     if command.callback is not None and options:
-        command.callback = naming_options(options)(command.callback)
+        command.callback = remembering_files(naming_options(options)(command.callback))
 
 
 def _explain(error: Exception) -> int:
@@ -165,5 +166,6 @@ def _start(*, quickly: bool) -> None:
     of the time to compile, which would be most of its time. A user who has set XLA_FLAGS has decided already."""
     if quickly:
         os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of folders that it cannot write to, and fonts
     # What is imported and traced are many small objects, which Python would look through for rubbish again and again.
     gc.set_threshold(100_000, 20, 50)

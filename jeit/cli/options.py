@@ -1,10 +1,11 @@
 """Options and arguments that several commands share."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -52,8 +53,24 @@ Hop = Annotated[
     float | None, typer.Option(help="From one window to the next, seconds (default 0.0125, or the calibration's).")
 ]
 
-# Folders that make_folder made, the innermost of each first.
+# Folders that make_folder made, the innermost of each first; files that the command under way was given.
 _MADE: list[Path] = []
+_GIVEN: list[Path] = []
+
+
+def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
+    """A command after whose call `make_folder` knows the files that it was given."""
+
+    @wraps(command)
+    def call(**values: Any) -> Any:
+        _GIVEN.clear()
+        for value in values.values():
+            with suppress(OSError, ValueError):
+                if isinstance(value, str | Path) and Path(value).is_file():
+                    _GIVEN.append(Path(value))
+        return command(**values)
+
+    return call
 
 
 @contextmanager
@@ -117,7 +134,12 @@ def intensity_settings(low: float | None, high: float | None, window: float | No
 
 def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json")) -> None:
     """Make the folder for results of these names before any work is done; `remove_empty_folders` undoes it. Raises
-    `ValueError` if it cannot be one."""
+    `ValueError` if it cannot be one, and where a file of that name in it is one that the command was given."""
+    for name in names:
+        if any((output / name).exists() and (output / name).samefile(one) for one in _GIVEN):
+            raise ValueError(
+                f"--output {output}: {name} in it was given, and would be written over; give another folder."
+            )
     from jeit.report.folder import results_folder
 
     missing = [one for one in (output, *output.parents) if not one.exists()]

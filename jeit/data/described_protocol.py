@@ -22,7 +22,7 @@ _CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
 _COMMON = {"kind", "number", "name", "current", "current_from_name", "current_unit"}
 # Keys that number electrodes, from 0.
 _NUMBERING = ("common", "reference", "pairs", "drive_pairs", "measurement_pairs")
-# Bytes that are taken for every channel, and copies of the patterns, while a protocol is made.
+# Bytes that are taken for every channel beside its pattern, and copies of the patterns, while a protocol is used.
 _CHANNEL, _COPIES = 64, 2
 
 
@@ -76,7 +76,8 @@ def _counts(kind: str, number: int, options: dict[str, Any]) -> tuple[int, int, 
 
 
 def _check_size(drives: int, measurements: int, number: int, channels: int, origin: str) -> None:
-    check_memory(f"{origin}: protocol", 8 * _COPIES * number * (drives + measurements) + _CHANNEL * channels)
+    patterns = number * (drives + measurements + channels)
+    check_memory(f"{origin}: protocol", 8 * _COPIES * patterns + _CHANNEL * channels)
 
 
 def _current(table: DrivenTable, path: Path) -> float:

@@ -41,6 +41,7 @@ def screen(
 
     Raises `ValueError` when the shape does not fit the protocol, or nothing usable is left.
     """
+    name = name.encode("utf-8", "backslashreplace").decode()  # of a file, whose name may be no text
     values = _as_frames(voltages, protocol, name)
     usable = np.ones(values.shape, dtype=bool)
     found = list(notes)

@@ -1,6 +1,7 @@
 """Reader of plain tables: CSV, text, NPY and NPZ with a TOML description."""
 
 import re
+from array import array
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -149,25 +150,27 @@ def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray
 def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
     delimiter = None if layout.delimiter.strip() == "" and layout.delimiter != "\t" else layout.delimiter
     check_memory(path.name, _IN_MEMORY * path.stat().st_size)
-    rows: list[np.ndarray] = []
+    numbers, length = array("d"), 0
     for number, line in enumerate(_lines(path), start=1):
         if number <= layout.skip_rows or not line.strip() or line.lstrip().startswith("#"):
             continue
         try:
-            rows.append(np.array([float(cell) for cell in line.split(delimiter)]))
+            row = [float(cell) for cell in line.split(delimiter)]
         except ValueError:
             raise ValueError(
                 f"{path.name}, line {number}: {line.strip()[:40]!r} is not numbers separated by "
                 f"{delimiter or 'spaces'!r}. Set [data] delimiter and skip_rows in the description (missing "
                 "values are written nan)."
             ) from None
-        if len(rows[-1]) != len(rows[0]):
+        length = length or len(row)
+        if len(row) != length:
             raise ValueError(
-                f"{path.name}, line {number} has length {len(rows[-1])}, the first {len(rows[0])}. Is the file cut off?"
+                f"{path.name}, line {number} has length {len(row)}, the first {length}. Is the file cut off?"
             )
-    if not rows:
+        numbers.extend(row)
+    if not numbers:
         raise ValueError(f"{path.name} holds no numbers.")
-    return np.array(rows)
+    return np.array(numbers).reshape(-1, length)
 
 
 def _lines(path: Path) -> Iterator[str]:

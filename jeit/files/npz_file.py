@@ -15,6 +15,9 @@ import numpy as np
 from jeit.files.foreign import reason
 from jeit.files.limits import check_memory
 
+_COPIES = 2
+# Bytes of a member that is no array, such as a head of JSON.
+_MOST_TEXT = 2**24
 _ARRAY, _ARCHIVE = b"\x93NUM", b"PK\x03\x04"
 # What NumPy, and zipfile beneath it, say of files that are broken, encrypted, or compressed in ways they do not know.
 FAULTS = (
@@ -55,7 +58,7 @@ def npz_arrays(
                 members = {one.filename.removesuffix(".npy"): one for one in archive.infolist()}
                 asked = {name: one for name, one in members.items() if every or name in keys}
                 headers = {name: _member_header(archive, name, one) for name, one in asked.items()}
-                check_memory(path.name, sum(one.size for one in headers.values()))
+                check_memory(path.name, sum(one.memory for one in headers.values()))
                 arrays = {}
                 for name, one in asked.items():
                     with archive.open(one) as member:
@@ -70,7 +73,7 @@ def npy_array(path: Path) -> np.ndarray:
     with path.open("rb") as file:
         try:
             header = _header(file)
-            check_memory(path.name, header.size)
+            check_memory(path.name, header.memory)
             left = path.stat().st_size - file.tell()
             if header.size > left:
                 raise ValueError(f"it says {header.size} bytes of numbers, and has {left}; is it cut off?")
@@ -90,6 +93,8 @@ def check_archive(path: Path) -> None:
             for one in members:
                 if one.filename.endswith(".npy"):
                     _member_header(archive, one.filename, one)
+                elif one.file_size > _MOST_TEXT:
+                    raise ValueError(f"'{one.filename[:40]}' in it has {one.file_size} bytes of text")
     except (*FAULTS, OSError) as error:
         if isinstance(error, OSError) and error.errno == errno.ENOENT:
             raise
@@ -112,6 +117,11 @@ class _Header(NamedTuple):
     def size(self) -> int:
         """Bytes of the numbers."""
         return math.prod(self.shape) * self.dtype.itemsize
+
+    @property
+    def memory(self) -> int:
+        """Bytes that they take when they are used: in double precision, and once more."""
+        return _COPIES * math.prod(self.shape) * max(self.dtype.itemsize, 8)
 
 
 def _header(file: IO[bytes]) -> _Header:

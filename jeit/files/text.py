@@ -10,6 +10,8 @@ from jeit.files.limits import check_memory
 
 # Bytes of a file that a person writes, at most; bytes of memory for each of a text's.
 _LONGEST, _TEXT = 2**22, 4
+# Parts of a key.
+_DEEPEST = 32
 
 
 def read_text(path: str | Path, *, encoding: str = "utf-8", most: int | None = None) -> str:
@@ -43,12 +45,22 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 def parsed_toml(text: str, name: str) -> dict[str, Any]:
     """The same of a `text` from the file `name`. Raises `ValueError` for what is none."""
+    if any(_dots(line) > _DEEPEST for line in text.splitlines()):
+        raise ValueError(f"{name} has a key of more than {_DEEPEST} parts; none is of so many.")
     try:
         return tomllib.loads(text)
     except RecursionError:
         raise ValueError(f"{name} is nested too deep.") from None
     except ValueError as error:  # TOMLDecodeError, and numbers of too many digits
         raise ValueError(f"{name} is no TOML file: {reason(error)}.") from None
+
+
+def _dots(line: str) -> int:
+    """Most dots in a key of a line of TOML: such make the parser slow, with their square."""
+    if "=" not in line:
+        return line.count(".") if line.lstrip().startswith("[") and "," not in line else 0
+    before = [part.rpartition("{")[2].rpartition(",")[2] for part in line.split("=")[:-1]]
+    return max(part.count(".") for part in before)
 
 
 def read_json(path: str | Path, *, most: int = 2**26) -> Any:

@@ -14,6 +14,7 @@ from jeit.files import check_electrodes, check_size, read_as
 from jeit.layout.csv_file import MOST_BYTES, millimetres
 from jeit.layout.layout import Layout
 from jeit.layout.svg_shapes import (
+    LARGEST,
     NUMBER,
     ROUND,
     composed,
@@ -130,6 +131,8 @@ def _shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, st
         role = next((name for name in _ROLES if name in {one.upper() for one in called}), role)
         if "transform" in element.attrib:
             to = composed(to, transform_of(element))
+            if not (np.abs(to) < LARGEST).all():
+                raise ValueError(f"transforms about {described(element)} are too large for a drawing.")
         if tag in _GROUPS:
             waiting += [(child, role, to) for child in reversed(element)]
         else:

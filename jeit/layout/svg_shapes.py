@@ -11,7 +11,7 @@ from jeit.arguments import told
 # Possessive: what is no number is found so in one pass, however long it is.
 NUMBER = r"[-+]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?+\d++)?+"
 # Of numbers in a drawing, whose squares are still of use when they have been moved and scaled.
-_LARGEST = 1e30
+LARGEST = 1e30
 ROUND = ("circle", "ellipse")
 
 
@@ -39,6 +39,8 @@ def transform_of(element: ElementTree.Element) -> np.ndarray:
                     "rotate."
                 )
         found = composed(found, one)
+    if not (np.abs(found) < LARGEST).all():
+        raise ValueError(f"transform of {described(element)} is too large for a drawing.")
     return found
 
 
@@ -71,7 +73,7 @@ def number_of(element: ElementTree.Element, name: str, text: str | None) -> floa
     if text is None or re.fullmatch(NUMBER, text.strip()) is None:
         raise ValueError(f"{name} of {described(element)} is {told(text)}, not a number.")
     value = float(text)
-    if not abs(value) < _LARGEST:
+    if not abs(value) < LARGEST:
         raise ValueError(f"{name} of {described(element)} is {told(text)}, too large for a drawing.")
     return value
 

@@ -1,6 +1,7 @@
 """Mesh files from anywhere, before meshio opens them: which lead to no other file, and do not grow beyond memory."""
 
 import lzma
+import math
 import re
 import threading
 import types
@@ -34,6 +35,11 @@ FORMATS = {
 # Times its size in the file that a mesh takes in memory.
 _GROWTH = 4
 _INCLUDE = re.compile(rb"^[ \t]*\*[ \t]*include", re.IGNORECASE | re.MULTILINE)
+# Sets of an Abaqus file told by their first and last number; what a VTK file counts, in a grid along each axis.
+_GENERATED = re.compile(rb"^[ \t]*\*.*generate", re.IGNORECASE | re.MULTILINE)
+_VTK_COUNTS = re.compile(
+    rb"^[ \t]*(DIMENSIONS|POINTS|CELLS|CELL_TYPES|\w+_COORDINATES)((?:[ \t]+\d+)+)", re.IGNORECASE | re.MULTILINE
+)
 # Counts, and whole numbers of so many digits, in a .msh file; and its nodes as bytes.
 _COUNTED = re.compile(rb"^\$(Nodes|Elements|PhysicalNames)\s*?\n\s*(\d+)\r?\n", re.MULTILINE)
 _LONG = re.compile(rb"(?<![\w.+-])\d{8,}(?![\d.eE])")
@@ -61,6 +67,10 @@ def check_foreign(path: Path) -> str:
         _check_numbers(path)
     if kind == "abaqus" and _INCLUDE.search(path.read_bytes()):
         raise ValueError(f"path: {path.name[:80]} includes another file; put all into one.")
+    if kind == "abaqus" and _GENERATED.search(path.read_bytes()):
+        raise ValueError(f"path: {path.name[:80]} tells a set by its ends (GENERATE); write its members out.")
+    if kind == "vtk":
+        _check_counts(path)
     return kind
 
 
@@ -88,6 +98,19 @@ def _check_numbers(path: Path) -> None:
             f"path: {path.name[:80]} does not work as a mesh file: it counts to {max(numbers)}, and a file of its size "
             f"has {most} nodes and cells at most."
         )
+
+
+def _check_counts(path: Path) -> None:
+    """Raise `ValueError` for a VTK file that counts more points or cells than a file of its size has."""
+    content = path.read_bytes()
+    for found in _VTK_COUNTS.finditer(content):
+        counts = [int(one[:20]) for one in found[2].split()]
+        number = math.prod(counts) if found[1].upper() == b"DIMENSIONS" else max(counts)
+        if number > max(len(content), 1000):
+            raise ValueError(
+                f"path: {path.name[:80]} does not work as a mesh file: it counts to {number} in {found[1].decode()}, "
+                f"and has {len(content)} bytes; grids that are told by their ends are not read."
+            )
 
 
 class _Begun(Exception):

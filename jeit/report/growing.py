@@ -24,11 +24,10 @@ _BLOCK, _MOST = 2**20, 2**16
 
 class GrowingTable:
     """A CSV file of whole lines: each is on the disk when it has been written, or, killed or on a full disk, not at
-    all. A link at its place is replaced, not followed. Raises `OSError` where it cannot be written."""
+    all. What is at its place, a link too, is replaced. Raises `OSError` where it cannot be written."""
 
     def __init__(self, path: Path, columns: Sequence[str]):
-        if path.is_symlink():
-            path.unlink()
+        path.unlink(missing_ok=True)
         self._file = path.open("wb", buffering=0)
         self.write(columns)
 

@@ -45,7 +45,7 @@ def test_progress_says_the_step_and_the_best_score(monkeypatch):
         step("optimise")
         monkeypatch.setattr(step._status, "update", said.append)
         step.tell("step 3 of at most 60, best score 1.234")
-    assert said == ["optimise … step 3 of at most 60, best score 1.234"]
+    assert [str(one) for one in said] == ["optimise … step 3 of at most 60, best score 1.234"]
 
 
 @pytest.mark.parametrize(

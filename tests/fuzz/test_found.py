@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import struct
 import time
 import zipfile
@@ -14,7 +15,10 @@ from readers import READERS
 
 from jeit.cli import main
 from jeit.data import _matlab
+from jeit.files import read_toml
+from jeit.mesh import read as read_mesh
 from jeit.report.folder import results
+from jeit.report.growing import GrowingTable
 
 ZEROS = 3000  # million, of a bomb
 
@@ -121,7 +125,7 @@ FOUND = {
             {name: one for name, one in sound_members("taps").items() if name != "intensity.npy"},
             {"intensity.npy": npy_head("(9, 43690666)")},
         ),
-        "JEIT_FILE_GB=4",
+        "JEIT_FILE_GB=7",
     ),
     "a bomb in a member that nobody needs": (
         "taps", lambda: zipped(sound_members("taps"), {"other.npy": npy_head("(393216000,)")}), None,
@@ -240,3 +244,68 @@ def test_all_files_or_none(tmp_path):
         fail_at_the_last()
     assert [one.name for one in tmp_path.iterdir()] == ["a"]
     assert (tmp_path / "a").read_text() == "before"
+
+
+def test_a_file_given_is_not_written_over(tmp_path, capsys):
+    """Where a stream's table has the name of its input."""
+    for other, content in READERS["table, csv"].files.items():
+        (tmp_path / other.replace("a.", "frames.")).write_bytes(content)
+    before = (tmp_path / "frames.csv").read_bytes()
+    given = str(tmp_path / "frames.csv")
+    assert main(["stream", given, "--reference", given, "--output", str(tmp_path)]) == 1
+    assert "would be written over" in capsys.readouterr().err
+    assert (tmp_path / "frames.csv").read_bytes() == before
+
+
+def test_a_table_replaces_what_is_at_its_place(tmp_path):
+    """A hard link, whose other name would be written through, and a pipe, which would be waited for."""
+    (tmp_path / "mine").write_text("precious")
+    (tmp_path / "link").hardlink_to(tmp_path / "mine")
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("link", "pipe"):
+        with GrowingTable(tmp_path / name, ["a"]) as table:
+            table.write([1])
+        assert (tmp_path / name).read_text().splitlines() == ["a", "1"]
+    assert (tmp_path / "mine").read_text() == "precious"
+
+
+def test_a_chunk_that_unpacks_to_gigabytes(tmp_path):
+    reader = READERS["store of a study"]
+    for other, content in reader.files.items():
+        (tmp_path / other).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / other).write_bytes(content)
+    chunks = (tmp_path / "a.zarr" / "minimum").rglob("*")
+    chunk = next(one for one in chunks if one.is_file() and one.name != "zarr.json")
+    chunk.write_bytes(b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 2 * 10**9) + bytes(40))
+    with pytest.raises(ValueError, match=r"has a chunk, .* of 2000000000 bytes"):
+        reader.use(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        (
+            "a.vtk",
+            b"# vtk DataFile Version 3.0\na\nASCII\nDATASET STRUCTURED_POINTS\nDIMENSIONS 400 400 400\n",
+            "64000000",
+        ),
+        ("a.inp", b"*NODE\n1,0,0,0\n*NSET,NSET=a,GENERATE\n1,2000000000,1\n", "GENERATE"),
+    ],
+)
+def test_meshes_of_a_few_letters(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=said):
+        read_mesh(tmp_path / name)
+
+
+def test_a_key_of_forty_thousand_parts(tmp_path):
+    (tmp_path / "a.toml").write_text("a" + ".a" * 40_000 + " = 1\n")
+    with pytest.raises(ValueError, match="key of more than 32 parts"):
+        read_toml(tmp_path / "a.toml")
+
+
+def test_a_name_that_is_no_text(tmp_path, capsys):
+    for other, content in READERS["table, csv"].files.items():
+        (tmp_path / other.replace("a.", "b\udcff.")).write_bytes(content)
+    assert main(["info", str(tmp_path / "b\udcff.csv")]) == 0
+    assert "\\udcff" in capsys.readouterr().out

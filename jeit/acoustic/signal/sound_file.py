@@ -10,7 +10,7 @@ import scipy.io.wavfile
 from jeit.files import check_memory, read_as, reason
 
 # Bytes of memory for each of a file of eight bits a sample.
-_IN_MEMORY = 8
+_IN_MEMORY = 16
 # What files of other formats begin with: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
 _OTHERS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
 # And those that soundfile does not read either: MP4 from its fifth byte on, WebM, WMA, AMR.
@@ -76,7 +76,7 @@ def _read_other(path: Path) -> tuple[np.ndarray, float, float | None]:
     with read_as(unread):
         file = soundfile.SoundFile(path)
     with file:
-        check_memory(path.name, 8.0 * file.frames * file.channels)
+        check_memory(path.name, 16.0 * file.frames * file.channels)
         with read_as(unread):
             data, rate, kind = file.read(file.frames, "float64", always_2d=True), file.samplerate, file.subtype
     # What is compressed may overshoot 1 a little; its full scale is 1 all the same.

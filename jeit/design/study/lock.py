@@ -28,6 +28,7 @@ def locked(path: Path, kind: str) -> Iterator[None]:
     whose processes cannot be asked after. Raises `ValueError` where another process, or another thread of this one,
     writes the store, and `OSError` where no file can be written beside it.
     """
+    path = path.resolve()  # one lock, by whatever link it is reached
     place = path.with_name(f".{path.name}.lock")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)

@@ -6,13 +6,16 @@ and text, through codecs that only pack bytes, and no links to other places.
 """
 
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 # Those that pack bytes and nothing else. One that holds further codecs (sharding) is not among them.
-CODECS = frozenset({"blosc", "bytes", "crc32c", "gzip", "transpose", "vlen-utf8", "zstd"})
+CODECS = frozenset({"blosc", "bytes", "crc32c", "transpose", "vlen-utf8", "zstd"})
+# Bytes of a chunk of texts at most, and of what a chunk of numbers may have beside them.
+_LARGEST, _BESIDE = 2**24, 2**12
 
 _NUMBERS = tuple(f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64))
 _TYPES = frozenset({"bool", "string", *_NUMBERS})
@@ -68,9 +71,37 @@ def damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
             return f"array '{name}' has not one {_METADATA}"
         own = _read(path / name / _METADATA)
         reason = _UNREADABLE if own is None else _node_damage(named[name], array) or _node_damage(own, array)
+        reason = reason or _chunk_damage(path / name, array)
         if reason:
             return f"array '{name}' {reason}"
     return None
+
+
+def _chunk_damage(folder: Path, array: ArrayShape) -> str | None:
+    """Whether a chunk says to be larger, unpacked, than its array's are."""
+    most = _LARGEST if array.data_type == "string" else 8 * math.prod(array.chunks) + _BESIDE
+    for file in folder.rglob("*"):
+        if file.is_file() and file.name != _METADATA:
+            with file.open("rb") as opened:
+                size = _unpacked(opened.read(18), file.stat().st_size)
+            if size is None or size > most:
+                return f"has a chunk, '{file.relative_to(folder)}', of {size or 'unknown'} bytes, more than {most}"
+    return None
+
+
+def _unpacked(beginning: bytes, size: int) -> int | None:
+    """Bytes of a chunk that begins so and has this `size`, unpacked: as a frame of zstd says (RFC 8878), or a header of
+    blosc; of none of these its size itself. None where a frame does not say it."""
+    if beginning.startswith(b"\x28\xb5\x2f\xfd") and len(beginning) > 5:
+        about = beginning[4]
+        single = about >> 5 & 1
+        start = 5 + (1 - single) + (0, 1, 2, 4)[about & 3]
+        length = (single, 2, 4, 8)[about >> 6]
+        told = int.from_bytes(beginning[start : start + length], "little")
+        return told + (256 if length == 2 else 0) if length else None
+    if beginning[:1] == b"\x02" and len(beginning) >= 16:
+        return max(size, int.from_bytes(beginning[4:8], "little"))
+    return size
 
 
 def _nodes(content: Any, where: str) -> Iterator[tuple[str, Any]]:

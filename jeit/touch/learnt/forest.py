@@ -27,6 +27,11 @@ class Forest:
     start: Float[np.ndarray, " d"]
     classes_: np.ndarray
 
+    def __post_init__(self):
+        """Raises `ValueError` for a depth that trees of so many nodes do not have."""
+        if not 0 <= self.depth <= self.value.shape[1]:
+            raise ValueError(f"depth is {self.depth}, of trees of {self.value.shape[1]} nodes.")
+
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """What the trees add up to."""
         trees, size, targets = self.value.shape
