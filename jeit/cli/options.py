@@ -56,6 +56,8 @@ Hop = Annotated[
 # Folders that make_folder made, the innermost of each first; files that the command under way was given.
 _MADE: list[Path] = []
 _GIVEN: list[Path] = []
+# Options whose files are written, not read.
+_WRITTEN = ("output", "page", "film")
 
 
 def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -64,9 +66,9 @@ def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(command)
     def call(**values: Any) -> Any:
         _GIVEN.clear()
-        for value in values.values():
+        for name, value in values.items():
             with suppress(OSError, ValueError):
-                if isinstance(value, str | Path) and Path(value).is_file():
+                if name not in _WRITTEN and isinstance(value, str | Path) and Path(value).is_file():
                     _GIVEN.append(Path(value))
         return command(**values)
 
