@@ -61,16 +61,19 @@ def placed(theta):
     return eqx.tree_at(lambda m: m.mesh.points, moved, theta["points"])
 
 
-def assert_gradient(function, theta, *, equal=1e-8, compiled=False, agree=1e-5):
+def assert_gradient(function, theta, *, equal=1e-8, compiled=False):
     """Reverse mode against central differences of fourth order of what is answered at once, or `compiled`; and
-    the value, which is to be `equal`. Large steps bend and small ones are rounded: one of six has to agree."""
+    the value, which is to be `equal`. Large steps bend and small ones are rounded: one of six has to agree to 1e-5.
+
+    Steps go up wherever they go, each number by a share of its own: along others the parts of a slope may all but
+    cancel, and differences are of rounding."""
     theta = {name: np.asarray(value, float) for name, value in theta.items()}
     value, gradient = jax.jit(jax.value_and_grad(function))(theta)
     np.testing.assert_allclose(value, function(theta), rtol=equal)
     answer = jax.jit(function) if compiled else function
     random = np.random.default_rng(11)
     for name, at in theta.items():
-        direction = random.normal(size=at.shape) * SIZE.get(name, at)
+        direction = np.abs(random.normal(size=at.shape) * SIZE.get(name, at)) * np.sign(gradient[name])
         found, errors = float(np.vdot(gradient[name], direction)), []
         for step in (1e-3, 1e-2, 3e-3, 3e-4, 1e-4, 1e-5):
 
@@ -79,9 +82,9 @@ def assert_gradient(function, theta, *, equal=1e-8, compiled=False, agree=1e-5):
 
             near, far = moved(1) - moved(-1), moved(2) - moved(-2)
             errors.append(abs(found / ((8 * near - far) / (12 * step)) - 1))
-            if errors[-1] <= agree:
+            if errors[-1] <= 1e-5:
                 break
-        assert min(errors) <= agree, (name, found, errors)
+        assert min(errors) <= 1e-5, (name, found, errors)
 
 
 @pytest.mark.parametrize("prior", [Noser(), Laplace(), Gaussian(0.03), Tikhonov()], ids=lambda p: type(p).__name__)
@@ -183,11 +186,7 @@ def test_uncertainties():
         return 1e3 * WEIGHT @ around.standard_deviation() + 1e3 * around.region(np.flatnonzero(INSIDE))[1]
 
     theta = THETA | {"hyperparameter": 10.0}
-    points = theta.pop("points")
-    # Along this direction of the data the deviations hardly change: iterations leave their differences less exact.
-    assert_gradient(lambda moved: deviation(moved | {"points": points}), theta, agree=5e-5)
-    # By themselves, along a direction of their own: along another the derivative all but cancels.
-    assert_gradient(lambda moved: deviation(theta | moved), {"points": points})
+    assert_gradient(deviation, theta)
 
 
 @pytest.mark.slow

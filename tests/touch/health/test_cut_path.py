@@ -85,25 +85,41 @@ def test_the_update_is_the_exact_solve(model, kind, tensor):
     np.testing.assert_allclose(untouched, model.transfer_impedance(base), atol=1e-9 * np.abs(exact).max())
 
 
-@pytest.mark.parametrize("depth", [1.0, 0.5])
-def test_a_path_is_found_in_a_change_that_another_mesh_made(depth):
-    sheet, thickness, cut = 2e-3, 4e-3, Cut([(0.0, 0.008), (0.016, 0.02)], depth)
+SHEET = 2e-3
+_HALF = "half of the sheet reads as a shorter cut through all of it: a third of the length"
+
+
+def line_of_a_cut(depth):
+    """A cut, the line and the spot that are fitted to what another mesh says of it."""
+    cut = Cut([(0.0, 0.008), (0.016, 0.02)], depth)
     electrodes = BoundaryElectrodes(ring(0.05, 16), 0.008, 3.0)
     fine = ForwardModel(Disk(0.05).mesh(num_points=1500, refine=cut.refine(7e-4)), electrodes, adjacent(16))
     coarse = ForwardModel(Disk(0.05).mesh(num_points=500), electrodes, adjacent(16))
-    rest = np.asarray(fine.voltages(sheet))
-    change = np.asarray(fine.voltages(cut.conductivity(fine.mesh, sheet, thickness))) - rest
+    rest = np.asarray(fine.voltages(SHEET))
+    change = np.asarray(fine.voltages(cut.conductivity(fine.mesh, SHEET, 4e-3))) - rest
     noise = np.full(len(rest), 2e-3 * np.sqrt(np.mean(change**2)))
     change += noise * np.random.default_rng(1).normal(size=len(rest)) + 1e-5 * rest
-    fit = LossFit(coarse, np.full(coarse.mesh.num_cells, sheet), change, np.arange(208), noise, np.array([0.01, 0.01]))
-    line, spot = fit.line([np.array([0.01, 0.01])]), fit.spot(np.array([0.01, 0.01]))
+    fit = LossFit(coarse, np.full(coarse.mesh.num_cells, SHEET), change, np.arange(208), noise, np.array([0.01, 0.01]))
+    return cut, fit.line([np.array([0.01, 0.01])]), fit.spot(np.array([0.01, 0.01]))
+
+
+@pytest.mark.parametrize("depth", [1.0, 0.5])
+def test_a_path_is_found_in_a_change_that_another_mesh_made(depth):
+    cut, line, spot = line_of_a_cut(depth)
     assert line.misfit < 0.25 * spot.misfit
     found = Cut(line.path).along(1e-3)
     apart = np.linalg.norm(cut.along(1e-3)[:, None] - found, axis=-1)
     assert 0.5 * (apart.min(axis=0).mean() + apart.min(axis=1).mean()) < 4e-3
-    length = np.linalg.norm(np.diff(line.path, axis=0), axis=1).sum()
-    # Of a cut through half of the sheet the place is told, and not how long it is: most of a third.
-    assert abs(length - cut.length) < (max(0.25 * cut.length, 2 * line.deviation) if depth == 1 else 0.8 * cut.length)
     assert line.through or depth < 1
-    assert (line.conductivity <= sheet * (1 + 1e-12)).all()
-    assert line.conductivity.min() < 0.8 * sheet
+    assert (line.conductivity <= SHEET * (1 + 1e-12)).all()
+    assert line.conductivity.min() < 0.8 * SHEET
+
+
+@pytest.mark.parametrize(
+    "depth",
+    [1.0, pytest.param(0.5, marks=pytest.mark.xfail(raises=AssertionError, reason=_HALF))],
+)
+def test_its_length_is_told_within_its_deviation(depth):
+    cut, line, _ = line_of_a_cut(depth)
+    length = np.linalg.norm(np.diff(line.path, axis=0), axis=1).sum()
+    assert abs(length - cut.length) < max(0.25 * cut.length, 2 * line.deviation)
