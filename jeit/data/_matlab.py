@@ -48,14 +48,10 @@ class _Variable(NamedTuple):
 
 def variable_names(path: Path) -> set[str]:
     """Names of the variables in a .mat file. Raises `ValueError` when it is not a readable .mat file."""
-    check_memory(path.name, path.stat().st_size)
-    with read_as(_unreadable(path)):
-        if _is_format_4(path):
+    if _is_format_4(path):
+        with read_as(_unreadable(path)):
             return {name for name, _, _ in scipy.io.whosmat(str(path))}
-        start = path.read_bytes()[:_HEADER]
-    _refuse_hdf(start, path)
-    with read_as(_unreadable(path)):
-        return {one.name for one in _variables(path.read_bytes())}
+    return {one.name for one in _variables(path)}
 
 
 def load(path: Path, *wanted: str) -> dict[str, np.ndarray]:
@@ -64,18 +60,16 @@ def load(path: Path, *wanted: str) -> dict[str, np.ndarray]:
 
     Raises `ValueError` when it cannot be read, and for what would not fit in memory (`check_memory`).
     """
-    names = variable_names(path)
-    held = {"": np.array(sorted(names), dtype=str)}
     if _is_format_4(path):
         with read_as(_unreadable(path)):  # never compressed: of no more numbers than bytes
-            return held | _plain(scipy.io.loadmat(str(path), variable_names=list(wanted)), wanted)
-    with read_as(_unreadable(path)):
-        asked = [
-            one for one in _variables(path.read_bytes()) if one.name in wanted and one.kind in (_SPARSE, *_NUMERIC)
-        ]
+            read = scipy.io.loadmat(str(path), variable_names=list(wanted))
+        return {"": np.array(sorted(variable_names(path)), dtype=str)} | _plain(read, wanted)
+    held = _variables(path)
+    asked = [one for one in held if one.name in wanted and one.kind in (_SPARSE, *_NUMERIC)]
     check_memory(path.name, sum(one.size for one in asked))
     with read_as(_unreadable(path)):
-        return held | {one.name: _values(one) for one in asked}
+        values = {one.name: _values(one) for one in asked}
+    return {"": np.array(sorted({one.name for one in held}), dtype=str)} | values
 
 
 def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
@@ -101,21 +95,25 @@ def _unreadable(path: Path) -> str:
 
 
 def _is_format_4(path: Path) -> bool:
-    """Format 4 begins with a number below 5,000; others with text."""
+    """Format 4 begins with a number below 5,000; others with text. Raises `TooLarge`."""
+    check_memory(path.name, path.stat().st_size)
     with path.open("rb") as file:
         return 0 in file.read(4)
 
 
-def _refuse_hdf(start: bytes, path: Path) -> None:
-    """Of MATLAB's version 7.3, whose files are HDF5."""
-    if len(start) == _HEADER and (start[:8] == b"\x89HDF\r\n\x1a\n" or 2 in start[124:126]):
+def _variables(path: Path) -> list[_Variable]:
+    """What a file of format 5 says that it holds. Raises `ValueError` for others."""
+    content = path.read_bytes()
+    if len(content) >= _HEADER and (content[:8] == b"\x89HDF\r\n\x1a\n" or 2 in content[124:126]):
         raise ValueError(
             f"{path.name} was saved in MATLAB's version 7.3 (HDF5). Save it again with `save(name, '-v7')`."
         )
+    with read_as(_unreadable(path)):
+        return [*_elements(content)]
 
 
-def _variables(content: bytes) -> Iterator[_Variable]:
-    """What a file of format 5 says that it holds."""
+def _elements(content: bytes) -> Iterator[_Variable]:
+    """Its arrays, one after the other; of packed ones the beginning is unpacked."""
     if len(content) < _HEADER or content[126:128] not in (b"IM", b"MI"):
         raise ValueError("it is of another kind")
     order = "<" if content[126:128] == b"IM" else ">"

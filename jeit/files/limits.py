@@ -8,14 +8,18 @@ MOST_ELECTRODES = 1024
 _VARIABLE, _USUAL = "JEIT_FILE_GB", 1.0
 
 
+class TooLarge(ValueError):
+    """What is in a file would take more memory than a file may."""
+
+
 def check_memory(name: str, size: float) -> None:
-    """Raise `ValueError` where what is in the file `name` would take more than a gigabyte of memory: `size` bytes.
+    """Raise `TooLarge`, a `ValueError`, where what is in the file `name` would take more than a gigabyte: `size` bytes.
 
     More is allowed by the environment variable JEIT_FILE_GB, in gigabytes.
     """
     most = _most()
     if size > 1e9 * most:
-        raise ValueError(
+        raise TooLarge(
             f"{name} would take {size / 1e9:.3g} GB in memory, more than the {most:g} GB that a file may. If that is "
             f"meant, allow it by setting the environment variable {_VARIABLE}={size / 1e9 + 0.5:.0f}."
         )

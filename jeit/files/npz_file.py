@@ -1,6 +1,5 @@
 """The arrays of NPZ and NPY files: plain numbers and text, nothing that would be executed, of no more than they say."""
 
-import errno
 import math
 import struct
 import sys
@@ -13,7 +12,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from jeit.files.foreign import reason
-from jeit.files.limits import check_memory
+from jeit.files.limits import TooLarge, check_memory
 
 _COPIES = 2
 # Bytes of a member that is no array, such as a head of JSON.
@@ -63,6 +62,8 @@ def npz_arrays(
                 for name, one in asked.items():
                     with archive.open(one) as member:
                         arrays[name] = _read(member)
+        except TooLarge:
+            raise
         except (*FAULTS, OSError) as error:  # members may say that they lie before the file's beginning
             raise _unreadable("NPZ file of plain arrays", error) from None
     return {"": np.array([*members], dtype=str), **arrays}
@@ -79,6 +80,8 @@ def npy_array(path: Path) -> np.ndarray:
                 raise ValueError(f"it says {header.size} bytes of numbers, and has {left}; is it cut off?")
             file.seek(0)
             return _read(file)
+        except TooLarge:
+            raise
         except FAULTS as error:
             raise _unreadable("NPY file of plain numbers", error) from None
 
@@ -95,9 +98,9 @@ def check_archive(path: Path) -> None:
                     _member_header(archive, one.filename, one)
                 elif one.file_size > _MOST_TEXT:
                     raise ValueError(f"'{one.filename[:40]}' in it has {one.file_size} bytes of text")
+    except (TooLarge, FileNotFoundError):
+        raise
     except (*FAULTS, OSError) as error:
-        if isinstance(error, OSError) and error.errno == errno.ENOENT:
-            raise
         raise _unreadable("archive", error) from None
 
 
@@ -162,8 +165,5 @@ def _read(file: IO[bytes]) -> np.ndarray:
 
 
 def _unreadable(kind: str, error: Exception) -> ValueError:
-    message = str(error)
-    if "GB in memory" in message:
-        return ValueError(message)
-    hint = "" if "object" not in message.lower() else " as numbers and text, not objects"
+    hint = "" if "object" not in str(error).lower() else " as numbers and text, not objects"
     return ValueError(f"not a readable {kind} ({reason(error)}); write it again{hint}.")

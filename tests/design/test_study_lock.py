@@ -74,6 +74,16 @@ def test_reading_needs_no_lock_and_writing_twice_is_refused(study, whole_store, 
     run_study(study, whole_store)
 
 
+def test_a_link_to_a_store_has_its_lock(store_path, whole_store):
+    store_path.symlink_to(whole_store)
+    with (
+        locked(whole_store, "study"),
+        pytest.raises(ValueError, match="being written by this process"),
+        locked(store_path, "study"),
+    ):
+        pass
+
+
 def test_another_machines_lock_says_how_to_be_rid_of_it(study, whole_store):
     lock_file = whole_store.with_name(f".{whole_store.name}.lock")
     signed(lock_file)

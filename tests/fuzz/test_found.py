@@ -14,8 +14,10 @@ from oracle import outcome
 from readers import READERS
 
 from jeit.cli import main
+from jeit.cli.options import make_folder, remembering_files
 from jeit.data import _matlab
-from jeit.files import read_toml
+from jeit.files import check_archive, read_toml
+from jeit.layout import read_layout
 from jeit.mesh import read as read_mesh
 from jeit.report.folder import results
 from jeit.report.growing import GrowingTable
@@ -134,6 +136,14 @@ FOUND = {
         "sound, npz",
         lambda: zipped({**sound_members("sound, npz"), "samples.npy": npy_head("(2, 99)")}, {}),
         "says 1584 bytes of numbers, and has 128",
+    ),
+    "bytes that become numbers of eight": (
+        "sound, npz",
+        lambda: zipped(
+            {name: one for name, one in sound_members("sound, npz").items() if name != "samples.npy"},
+            {"samples.npy": npy_head("(2, 1572864000)", "|i1")},
+        ),
+        "GB in memory",
     ),
     "an array of a hundred million million numbers": (
         "table, npy", lambda: npy_head("(100000000000000,)"), "GB in memory",
@@ -309,3 +319,26 @@ def test_a_name_that_is_no_text(tmp_path, capsys):
         (tmp_path / other.replace("a.", "b\udcff.")).write_bytes(content)
     assert main(["info", str(tmp_path / "b\udcff.csv")]) == 0
     assert "\\udcff" in capsys.readouterr().out
+
+
+def test_a_head_of_text_that_unpacks_to_many_times_its_size(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.skops", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("schema.json", b"[]," * 6_000_000)
+    with pytest.raises(ValueError, match="'schema.json' in it has 18000000 bytes of text"):
+        check_archive(tmp_path / "a.skops")
+
+
+def test_transforms_too_large(tmp_path):
+    scaled = svg('<g id="ELECTRODES"', '<g transform="scale(1e20)"><g transform="scale(1e20)"><g id="ELECTRODES"')
+    (tmp_path / "a.svg").write_bytes(scaled.replace(b"</svg>", b"</g></g></svg>"))
+    with pytest.raises(ValueError, match="too large for a drawing"):
+        read_layout(tmp_path / "a.svg")
+
+
+def test_an_output_of_an_earlier_run_is_no_input(tmp_path):
+    """Only what is read may not be written over."""
+    (tmp_path / "report.json").write_text("{}")
+    command = remembering_files(lambda **_: make_folder(tmp_path, ("report.json",)))
+    command(output=tmp_path / "report.json", data="elsewhere")
+    with pytest.raises(ValueError, match="would be written over"):
+        command(output=tmp_path, data=str(tmp_path / "report.json"))

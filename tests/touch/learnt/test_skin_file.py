@@ -7,6 +7,7 @@ import pytest
 from made_skins import record
 
 from jeit.touch import LearntSkin, Presses, read_skin, write_skin
+from jeit.touch.learnt.forest import Forest
 
 FRESH = record(30, seed=1)
 
@@ -100,3 +101,10 @@ def test_the_same_skin_is_the_same_bytes(quick, tmp_path):
     write_skin(quick, tmp_path / "one.skops")
     write_skin(read_skin(tmp_path / "one.skops"), tmp_path / "two.skops")
     assert (tmp_path / "one.skops").read_bytes() == (tmp_path / "two.skops").read_bytes()
+
+
+def test_a_forest_is_no_deeper_than_it_has_nodes():
+    """Else it would be walked down without end."""
+    nodes = np.zeros((1, 3), int)
+    with pytest.raises(ValueError, match="depth is 1000000000000, of trees of 3 nodes"):
+        Forest(nodes, np.zeros((1, 3)), nodes, nodes, np.zeros((1, 3, 1)), 10**12, np.zeros(1), np.zeros(0))
