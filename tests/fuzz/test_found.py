@@ -141,7 +141,7 @@ FOUND = {
         "sound, npz",
         lambda: zipped(
             {name: one for name, one in sound_members("sound, npz").items() if name != "samples.npy"},
-            {"samples.npy": npy_head("(2, 1572864000)", "|i1")},
+            {"samples.npy": npy_head("(2, 100000000)", "|i1")},
         ),
         "GB in memory",
     ),
@@ -324,7 +324,7 @@ def test_a_name_that_is_no_text(tmp_path, capsys):
 def test_a_head_of_text_that_unpacks_to_many_times_its_size(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.skops", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("schema.json", b"[]," * 6_000_000)
-    with pytest.raises(ValueError, match="'schema.json' in it has 18000000 bytes of text"):
+    with pytest.raises(ValueError, match=r"schema\.json. in it has 18000000 bytes of text"):
         check_archive(tmp_path / "a.skops")
 
 
