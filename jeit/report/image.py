@@ -11,6 +11,7 @@ from jeit.imaging.difference import ImagedDifference
 from jeit.imaging.method import METHODS
 from jeit.imaging.settings import ImagingSettings
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
+from jeit.inverse.shapes import Ellipsoid, Star
 from jeit.protocol import Protocol
 from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain, version_of
 from jeit.report.folder import results, write_json
@@ -69,7 +70,7 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         result.mesh,
         np.asarray(result.departure) / (math.log(10) if result.iterative else 1),
         result.calibration.model.electrodes,
-        inclusions=result.inclusions if result.labels is None and result.shapes is None else (),
+        inclusions=result.inclusions if result.labels is None and (result.shapes is None or height is not None) else (),
         title=result.measurement.name + ("" if height is None else f", slice at z = {1e3 * height:.1f} mm"),
         height=height,
         scale=ColourScale(quantity="log₁₀ of conductivity over background", unit="") if result.iterative else CHANGE,
@@ -80,8 +81,8 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         ax.plot(*truth, color="#157f3b", label="pressed here", **ring)
     if result.labels is not None:
         draw_labels(result.labels, result.extent, ax=ax)
-    elif result.shapes is not None:
-        draw_outlines(result.shapes.stars, ax=ax)
+    elif result.shapes is not None and height is None:
+        draw_outlines([one for one in result.shapes.bodies if isinstance(one, Star)], ax=ax)
     elif result.inclusions:
         found = "found: sign and area" if height is None else "found: sign, and a ball of its volume"
         ax.plot([], [], color="black", linewidth=1, linestyle=(0, (4, 3)), label=found)
@@ -210,16 +211,17 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
             {
                 "sign": one.sign,
                 "centroid": one.centroid,
-                "area": one.area,
-                "outline": one.outline,
+                **_form(one),
                 "conductivity_over_background": math.exp(one.sign * one.contrast),
                 "conductivity_is": "told by the data" if one.weak else "assumed, as of what is strong",
                 "rise": one.rise,
             }
-            for one in stars
+            for one in bodies
         ]
-        for stars in (result.shapes.stars, result.shapes.doubtful)
+        for bodies in (result.shapes.bodies, result.shapes.doubtful)
     )
+    for one, deviation in zip(kept, result.shapes.contrast_deviations, strict=True):
+        one["deviation_of_logarithm"] = deviation
     return {
         "bodies": kept,
         "left_out": left,
@@ -229,6 +231,13 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
         "misfit_unit": "standard deviations",
         "drift_of_background": result.shapes.drift,
     }
+
+
+def _form(body: Star | Ellipsoid) -> dict[str, Any]:
+    """What its kind has: the outline of a star, the half axes of an ellipsoid."""
+    if isinstance(body, Star):
+        return {"area": body.area, "outline": body.outline}
+    return {"volume": body.volume, "centre": body.centre, "half_axes": body.axes}
 
 
 def _prior(settings: ImagingSettings) -> str | None:

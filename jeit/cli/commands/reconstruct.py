@@ -176,9 +176,9 @@ def show(console, result: "ImagedDifference") -> None:
     if result.shapes is not None:
         left = f"; {counted(len(result.shapes.doubtful), 'ghost')} left out" if result.shapes.doubtful else ""
         drift = f"the background has drifted by {percent(result.shapes.drift)}"
-        strong = sum(not one.weak for one in result.shapes.stars)
+        strong = sum(not one.weak for one in result.shapes.bodies)
         assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""
-        rows.append(("bodies", f"{counted(len(result.shapes.stars), 'outline')} fitted{left}{assumed}; {drift}"))
+        rows.append(("bodies", f"{counted(len(result.shapes.bodies), 'outline')} fitted{left}{assumed}; {drift}"))
     if result.why:
         rows.append(("chosen, for", result.why))
     if unlike := result.unlike_electrodes:
