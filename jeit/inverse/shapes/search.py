@@ -18,6 +18,7 @@ from jeit.inverse.shapes.bodies import Bodies, BodyPrior
 from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior, Ellipsoids
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
+from jeit.mesh import check_flat
 from jeit_solvers.engines import as_array
 
 # How many times the objective must rise, at least, when a body is left out and the others fitted again.
@@ -105,6 +106,7 @@ def reconstruct_shapes(
     """
     measured, used = check_frame(model, voltages, mask)
     check_has_values("reconstruct_shapes", (model, measured), "bodies are chosen by comparison", "take reconstruct")
+    check_flat(model.mesh, "star shapes")
     background = np.asarray(check_background(model, background))
     deviation = check_noise(noise, measured, used)
     form, kind = (Stars, StarPrior) if model.mesh.dimension == 2 else (Ellipsoids, EllipsoidPrior)
