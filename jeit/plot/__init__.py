@@ -21,7 +21,10 @@ from jeit.plot.imaging.hyperparameter import plot_choice
 from jeit.plot.imaging.image import plot_image
 from jeit.plot.imaging.mesh import plot_mesh
 from jeit.plot.solid.camera import Camera
+from jeit.plot.solid.isosurfaces import plot_isosurfaces
+from jeit.plot.solid.overview import plot_solid
 from jeit.plot.solid.shaded_surface import plot_surface
+from jeit.plot.solid.slices import plot_slice, plot_slices
 from jeit.plot.touch.contact_stages import plot_contact_stages
 from jeit.plot.touch.contacts import plot_contacts
 from jeit.plot.touch.depth_map import plot_depth_map, plot_losses
@@ -61,6 +64,7 @@ __all__ = [
     "plot_health_course",
     "plot_heard",
     "plot_image",
+    "plot_isosurfaces",
     "plot_key_errors",
     "plot_loss_map",
     "plot_losses",
@@ -72,6 +76,9 @@ __all__ = [
     "plot_receptive_fields",
     "plot_sensitivity_histograms",
     "plot_sensitivity_map",
+    "plot_slice",
+    "plot_slices",
+    "plot_solid",
     "plot_surface",
     "plot_taxel_areas",
     "plot_taxels",

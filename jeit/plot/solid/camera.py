@@ -7,7 +7,7 @@ from jeit.arguments import is_number, told
 
 # Over the left shoulder of who looks: to the right and up on the page, and towards the viewer.
 _LIGHT = np.array([-0.35, 0.5, 0.79])
-_DARKEST = 0.55
+_DARKEST = 0.66
 
 
 class Camera:

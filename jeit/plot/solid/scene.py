@@ -97,14 +97,12 @@ class Scene:
         corners, face, edge, width = (
             np.concatenate(parts)[order] for parts in (self._corners, self._face, self._edge, self._width)
         )
-        # Smoothed borders of pieces without an edge would leave seams between them.
         ax.add_collection(
             PolyCollection(
                 corners,  # pyright: ignore[reportArgumentType]
                 facecolors=face,
                 edgecolors=edge,
                 linewidths=width,
-                antialiaseds=width > 0,
                 closed=True,
                 capstyle="round",
                 joinstyle="round",
@@ -121,10 +119,11 @@ def bare_in_space(ax: Axes, camera: Camera, points: Float[np.ndarray, "n 3"], *,
     room = (0.09 if numbered else 0.03) * size
     ax.set_aspect("equal")
     ax.set_xlim(left - max(room, 0.07 * size), right + max(room, 0.07 * size))
-    ax.set_ylim(low - 0.26 * size - room, high + room)
+    ax.set_ylim(low - 0.24 * size - 0.4 * room, high + room)
     ax.set_axis_off()
-    draw_scale_bar(ax, (left, right, low - room, high))
-    draw_axes_cross(ax, camera.on_page(np.eye(3)), (right - 0.05 * size, low - room - 0.16 * size), 0.09 * size)
+    draw_scale_bar(ax, (left, right, low - 0.4 * room, high))
+    place = (right - 0.05 * size, low - 0.4 * room - 0.14 * size)
+    draw_axes_cross(ax, camera.on_page(np.eye(3)), place, 0.09 * size)
 
 
 def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], place: tuple[float, float], length: float) -> None:
