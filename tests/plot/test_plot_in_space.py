@@ -14,11 +14,11 @@ from jeit.electrodes import (
     PointElectrodes,
     plates,
 )
+from jeit.electrodes.electrode_shapes import shapes_of
 from jeit.image import Inclusion, Plane
 from jeit.layout import ring
 from jeit.mesh import box, centroids, cylinder, disk
 from jeit.plot import Camera, ColourScale, plot_isosurfaces, plot_slice, plot_slices, plot_solid, plot_surface
-from jeit.plot.solid.electrode_shapes import shapes_of
 from jeit.plot.solid.isosurfaces import level_surfaces
 from jeit.plot.solid.scene import Scene
 

@@ -6,10 +6,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 
 from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrode_shapes import Draped, ElectrodeShapes, shapes_of, surface_triangles
 from jeit.mesh import Mesh
 from jeit.plot.axes import SOFT
 from jeit.plot.imaging.electrodes import METAL
-from jeit.plot.solid.electrode_shapes import Draped, ElectrodeShapes, shapes_of, surface_triangles
 from jeit.plot.solid.scene import Scene, draw_number
 from jeit.plot.solid.shaded_surface import BODY
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, is_number, told
 from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrode_shapes import ElectrodeShapes
 from jeit.image import Inclusion, Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
 from jeit.image.plane import check_solid
 from jeit.mesh import Mesh
@@ -17,7 +18,6 @@ from jeit.plot.axes import INK, axes_or_new
 from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale, check_scale
 from jeit.plot.solid.body import add_electrodes, add_hull, number_electrodes
 from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
-from jeit.plot.solid.electrode_shapes import ElectrodeShapes
 from jeit.plot.solid.scene import Scene, bare_in_space
 from jeit.plot.solid.shaded_surface import colours_of, mappable
 

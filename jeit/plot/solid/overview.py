@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane
 from jeit.image.plane import AXES
 from jeit.mesh import Mesh, centroids
@@ -15,12 +16,13 @@ from jeit.plot.axes import INK, draw_colour_bar
 from jeit.plot.colour_scale import CHANGE, ColourScale
 from jeit.plot.solid.body import size_of
 from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
-from jeit.plot.solid.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.plot.solid.isosurfaces import HALF, check_drawn, draw_in_space
 from jeit.plot.solid.shaded_surface import mappable
 from jeit.plot.solid.slices import cell_values, draw_slice, dress_slice
 
 _MOST_LISTED = 5
+LOGARITHM = ColourScale(quantity="log₁₀ of conductivity over background", unit="")
+"""Of iterative images."""
 
 
 def plot_solid(

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import told
 from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, cut_by_plane
 from jeit.image.marching import passed_edges
 from jeit.image.plane import AXES
@@ -21,7 +22,6 @@ from jeit.plot.axes import INK, axes_or_new, draw_colour_bar, draw_scale_bar
 from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import size_of
-from jeit.plot.solid.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.plot.solid.isosurfaces import check_drawn
 from jeit.plot.solid.scene import draw_axes_cross, draw_number
 

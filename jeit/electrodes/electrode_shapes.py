@@ -6,7 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from jeit.electrodes import AbstractElectrodes, CombinedElectrodes, FacetElectrodes
+from jeit.electrodes.combined import CombinedElectrodes
+from jeit.electrodes.electrodes import AbstractElectrodes
+from jeit.electrodes.facets import FacetElectrodes
 from jeit.mesh import Mesh
 
 _ROUND, _SIDE = 32, 8
