@@ -258,4 +258,4 @@ def _sampled(grid: Raster, change) -> Inexact[Array, "rows columns"]:
 def _with_change(inclusion: Inclusion, background) -> Inclusion:
     """An inclusion found in the logarithm of conductivity over `background`, its peak turned into a change."""
     peak = float(background * np.expm1(inclusion.peak))
-    return Inclusion(inclusion.sign, inclusion.centroid, inclusion.area, peak)
+    return replace(inclusion, peak=peak)

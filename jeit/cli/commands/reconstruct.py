@@ -27,7 +27,13 @@ if TYPE_CHECKING:
 def reconstruct(
     data: Data,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder for image.png, image.npz, report.json.", show_default=False)
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Folder for image.png, image.npz, report.json and, of a solid, image.vtu.",
+            show_default=False,
+        ),
     ],
     reference: Reference = None,
     format: Format = None,
@@ -69,7 +75,7 @@ def reconstruct(
     model: Model = None,
     quiet: Quiet = False,
 ) -> None:
-    """Image what changed between REFERENCE and DATA; writes image.png, image.npz and report.json.
+    """Image what changed between REFERENCE and DATA; writes image.png, image.npz, report.json; of solids image.vtu.
 
     With --method network, how deep a skin is indented: frames.csv, depth.npz, depth.png and report.json.
 
@@ -129,7 +135,8 @@ def reconstruct(
         write_image(result, output)
     if not quiet:
         show(console, result)
-        say_written(console, output / "image.png", "image.npz", "report.json")
+        solid = ("image.vtu",) if result.mesh.dimension == 3 else ()
+        say_written(console, output / "image.png", "image.npz", "report.json", *solid)
 
 
 def show(console, result: "ImagedDifference") -> None:
