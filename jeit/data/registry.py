@@ -78,7 +78,7 @@ def _recognise(file: Path, description: str | Path | None) -> str:
         if candidate.recognises(file):
             return name
     if file.suffix.lower() == ".mat":
-        if description is not None or file.with_suffix(".toml").is_file():
+        if description is not None or eidors.find_description(file) is not None:
             return "eidors"
         raise ValueError(
             f"{file.name} is a .mat file of no known kind; it holds "

@@ -51,11 +51,11 @@ def haar(
     reference: int | None = None,
     current: Current = 1e-3,
 ) -> Protocol:
-    """Haar wavelets over the electrodes' numbers: L - 1 orthogonal drives, coarse to fine, of `current` amperes at most.
+    """Haar wavelets over the electrodes' numbers: L - 1 orthogonal drives, coarse to fine, `current` amperes at most.
 
     The first drive sends current from the first half of the electrodes to the second, the next two do so within each
-    half, and so on (Haar 1910). Where L is no power of two, halves differ by one electrode, and each electrode of the
-    larger one carries less, so that the sum is zero (unbalanced wavelets: Girardi and Sweldens 1997). Every L from 2 on.
+    half, and so on (Haar 1910). Where L is no power of two, halves differ by one electrode, and each of the larger one
+    carries less, so that the sum is zero (unbalanced wavelets: Girardi and Sweldens 1997). Every L from 2 on.
 
     - `measurement`, `reference`: as in `measurement_patterns`.
 
@@ -110,7 +110,9 @@ def optimal(
     if other is not None:
         second = _checked("other", other)
         if second.shape != first.shape:
-            raise ValueError(f"other: its shape is {second.shape}, and that of transfer {first.shape}; give one body's.")
+            raise ValueError(
+                f"other: its shape is {second.shape}, and that of transfer {first.shape}; give one body's."
+            )
         change = dissipated - basis.T @ second @ basis
     if np.linalg.norm(change) <= _NOTHING * np.linalg.norm(dissipated):
         raise ValueError("other: it equals transfer, and no current tells them apart.")

@@ -26,7 +26,7 @@ def measurement_patterns(num_electrodes: int, measurement: Reading, reference: i
     count = check_count(num_electrodes, "measurement_patterns", 2)
     check_choice(measurement, READINGS, "measurement_patterns", "measurement")
     if measurement != "against" and reference is not None:
-        raise ValueError(f"reference has no use with measurement = {measurement!r}; leave it out, or read 'against' it.")
+        raise ValueError(f"reference has no use with measurement = {measurement!r}; leave it out, or read against it.")
     if measurement == "adjacent":
         return pair_patterns(ring_pairs(count, 1), count)
     if measurement == "mean-removed":

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jeit import protocol
-from jeit.forward import ForwardModel
 from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 
