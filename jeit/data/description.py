@@ -44,6 +44,7 @@ from jeit.protocol import Protocol
 
 if TYPE_CHECKING:
     from jeit.data.description_tables import DataTable, ProtocolTable
+    from jeit.protocol.potentials import Reading
 
 BUNDLED = ("tank6cm",)
 _VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
@@ -93,6 +94,15 @@ class Description:
     def patterns_measured(self) -> bool:
         """Whether the currents lie in the data file."""
         return self.protocol_section is not None and self.protocol_section.kind == "measured"
+
+    @property
+    def reading(self) -> tuple[Reading, int | None]:
+        """What is read of the potentials of all electrodes where the currents lie in the data file, and which electrode
+        they are read against."""
+        section = self.protocol_section
+        if section is None or section.kind != "measured":
+            return "mean-removed", None
+        return section.measurement, section.reference
 
     def model(self, path: str | Path, *, num_points: int) -> ForwardModel:
         """A model, on a new mesh of about `num_points` nodes, of what the file at `path` was measured on.
