@@ -16,7 +16,10 @@ Reference = Annotated[
 ]
 Format = Annotated[
     str | None,
-    typer.Option(help="kit4, ktc2023, eidors, table or tank6cm; found from the content unless given."),
+    typer.Option(
+        help="kit4, ktc2023, eidors, sciospec, draeger, carefusion, swisstom, goettingen, table or tank6cm; found from "
+        "the content unless given."
+    ),
 ]
 Description = Annotated[
     str | None,

@@ -64,7 +64,8 @@ class Linearisation(eqx.Module):
             whitened = root_weight[:, None] * host.asarray(jacobian)[channels]
             directions = _directions(model.protocol, channels, root_weight)
             product = prior.covariance_product(model.mesh, (directions.T @ whitened).conj()) @ directions.T
-            spectrum = Spectrum.create(whitened, product, prior.null_space(model.mesh))
+            repeated = model.protocol.repeated_facts(channels)
+            spectrum = Spectrum.create(whitened, product, prior.null_space(model.mesh), repeated)
         else:
             directions = _traced_directions(model.protocol, channels, root_weight)
             reduced = directions.T @ (root_weight[:, None] * jacobian[channels])

@@ -24,7 +24,8 @@ class Spectrum(eqx.Module):
     """Eigendecomposition of the data-space system, from which the reconstruction for any λ is cheap.
 
     **Fields**: `basis` (M, r) = QU; `eigenvalues` Λ (r,); `jacobian` J (M, m); `product` ΓJᵀ (m, M); `null_space` N
-    (m, p); `seen` B = JN (M, p); `outer` JΓJᵀ (M, M).
+    (m, p); `seen` B = JN (M, p); `outer` JΓJᵀ (M, M); `repeated`, how many of the components say nothing, whatever was
+    measured, see `Protocol.repeated_facts`.
     """
 
     basis: Float[Array, "M r"]
@@ -34,12 +35,24 @@ class Spectrum(eqx.Module):
     null_space: Float[Array, "m p"]
     seen: Float[Array, "M p"]
     outer: Float[Array, "M M"]
+    repeated: int = eqx.field(static=True, default=0)
 
     @classmethod
-    def create(cls, jacobian: Float[Array, "M m"], product: Float[Array, "m M"], null_space: Float[Array, "m p"]):
+    def create(
+        cls,
+        jacobian: Float[Array, "M m"],
+        product: Float[Array, "m M"],
+        null_space: Float[Array, "m p"],
+        repeated: int = 0,
+    ):
         """From the whitened Jacobian, its product with the prior covariance, and the prior's null space."""
         basis, eigenvalues, seen, outer = _decompose(jacobian, product, null_space)
-        return cls(basis, eigenvalues, jacobian, product, null_space, seen, outer)
+        return cls(basis, eigenvalues, jacobian, product, null_space, seen, outer, repeated)
+
+    @property
+    def freedom(self) -> int:
+        """How many components of the data may say something: all but those that are repeated."""
+        return self.eigenvalues.shape[0] - self.repeated
 
     def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
         """R_λ (m, M) for whitened data."""

@@ -12,8 +12,11 @@ import numpy as np
 import scipy.io
 import scipy.io.wavfile
 
-sys.path += [str(Path(__file__).parents[1] / room) for room in ("", "acoustic", "touch/gestures", "touch/listening")]
+sys.path += [
+    str(Path(__file__).parents[1] / room) for room in ("", "acoustic", "data", "touch/gestures", "touch/listening")
+]
 
+from instrument_files import write_carefusion, write_draeger, write_get, write_sciospec, write_swisstom
 from made_clips import MATERIALS, struck
 from made_skins import record
 from made_touches import touches
@@ -196,6 +199,36 @@ def _eidors(folder):
         "vi": rng.random(6),
     }
     scipy.io.savemat(folder / "a.mat", held)
+
+
+@_reader("measured patterns", "a.mat", data.read)
+def _patterns(folder):
+    rng = np.random.default_rng(0)
+    current, voltages = 1e-3 * rng.normal(size=(8, 7)), rng.normal(size=(8, 7, 3))
+    current -= current.mean(axis=0)
+    held = {"current_patterns": current, "frame_voltage": voltages - voltages.mean(axis=0)}
+    scipy.io.savemat(folder / "a.mat", held, do_compression=True)
+    driven = BODY.replace('kind = "adjacent"\ncurrent = 1e-3', 'kind = "measured"')
+    said = driven.replace('frame_names = ["a", "b"]', 'keys = ["frame_voltage"]\nframe_rate = 5.0')
+    (folder / "a.toml").write_text(said)
+
+
+def _instrument(name, suffix, number, make):
+    def made(folder):
+        make(folder / f"a{suffix}")
+        (folder / "a.toml").write_text(BODY.partition("[protocol]")[0].replace("number = 8", f"number = {number}"))
+
+    _reader(name, f"a{suffix}", data.read)(made)
+
+
+_ADJACENT = 1.0 + np.random.default_rng(0).random((2, 208))
+_instrument("draeger", ".eit", 16, lambda path: write_draeger(path, _ADJACENT))
+_instrument("goettingen", ".get", 16, lambda path: write_get(path, _ADJACENT, text=True))
+_instrument("carefusion", ".eit", 16, lambda path: write_carefusion(path, _ADJACENT))
+_instrument(
+    "swisstom", ".eit", 32, lambda path: write_swisstom(path, np.random.default_rng(0).random((2, 32, 32)), [0, 20_000])
+)
+_instrument("sciospec", ".eit", 8, lambda path: write_sciospec(path, np.array([np.eye(8)] * 2), [(1, 3), (2, 4)]))
 
 
 @_reader("frames", "a.npz", read_frame_recording)
