@@ -21,6 +21,7 @@ from jeit.plot.imaging.hyperparameter import plot_choice
 from jeit.plot.imaging.image import plot_image
 from jeit.plot.imaging.mesh import plot_mesh
 from jeit.plot.solid.camera import Camera
+from jeit.plot.solid.interactive import view_solid
 from jeit.plot.solid.isosurfaces import plot_isosurfaces
 from jeit.plot.solid.overview import plot_solid
 from jeit.plot.solid.shaded_surface import plot_surface
@@ -87,4 +88,5 @@ __all__ = [
     "plot_track",
     "plot_travel",
     "plot_tried",
+    "view_solid",
 ]

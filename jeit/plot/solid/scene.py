@@ -16,6 +16,8 @@ from jeit.plot.solid.camera import Camera
 
 _RIM = [withStroke(linewidth=2.2, foreground="white")]
 _LETTERS = ("x", "y", "z")
+# Of what has no values.
+BODY = "#b9bec6"
 
 
 class Scene:
