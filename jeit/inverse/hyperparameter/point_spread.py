@@ -61,7 +61,7 @@ def blur_radius(
     """
     area = np.asarray(measures(mesh))
     eigenvalues, modes = np.asarray(spectrum.eigenvalues), np.asarray(spectrum.modes())
-    signals = np.asarray(spectrum.jacobian)[:, targets]
+    signals = np.asarray(spectrum.directions) @ np.asarray(spectrum.reduced)[:, targets]
     size = np.linalg.norm(signals, axis=0)
     strength = signal_to_noise * np.sqrt(len(signals)) / np.maximum(size, np.finfo(float).tiny)
     components = adjoint(np.asarray(spectrum.basis)) @ signals
