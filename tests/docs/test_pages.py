@@ -115,7 +115,17 @@ def _readme(names: dict, folder: Path, printed: list[str]) -> None:
     assert names["sensitivity"].position.shape == (208, 16, 2)
 
 
+def _looking_inside(names: dict, folder: Path, printed: list[str]) -> None:
+    made = ("overview.png", "slices.png", "oblique.png", "image.vtu", "filling.pvd", "filling.xdmf")
+    assert all((folder / name).stat().st_size > 200 for name in made)
+    assert [line.split(",")[0] for line in printed[:2]] == ["conductive", "resistive"]
+    for one, middle in zip(names["found"], ((0.03, -0.05, 0.1), (-0.03, 0.06, 0.06)), strict=True):
+        assert np.linalg.norm(np.array(one.centroid) - middle) < 0.02
+    assert printed[2].endswith("cm²")
+
+
 HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
+    "looking-inside.md": _looking_inside,
     "README.md": _readme,
     "contacts.md": _contacts,
     "design.md": _design,

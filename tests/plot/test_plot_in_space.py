@@ -312,6 +312,13 @@ def test_electrodes_on_a_surface_are_numbered_and_those_behind_it_hidden():
     # Half of the pieces of metal come first, under the wall in front, and half last.
     assert (metal < 0.45 * number).sum() == (metal > 0.55 * number).sum() == len(metal) / 2
     assert {"1"} <= set(shown(ax))
-    assert "2" not in shown(ax)  # it would lie on the first
+    assert "2" not in shown(ax)
     with pytest.raises(ValueError, match="electrodes must be ElectrodeShapes"):
         plot_surface(sleeve.points, wall, None, FaceDiscs(places, 0.012, 1e-3))
+
+
+def test_a_group_of_facets_has_one_rim(tank, ax):
+    plot_isosurfaces(tank, np.zeros(tank.num_cells), plates(tank, ["top"], 1e-3), camera=Camera(0, 90), ax=ax)
+    lines = np.abs(np.array(pieces(ax).get_linewidths()) - 0.5) < 1e-9
+    edges = np.array([np.linalg.norm(np.ptp(one.vertices, axis=0)) for one in np.array(pieces(ax).get_paths())[lines]])
+    assert edges.sum() == pytest.approx(2 * (BOX[0] + BOX[1]))

@@ -1,5 +1,7 @@
 """What stands round an image in space: the body's hull, translucent, and electrodes on it, numbered."""
 
+from collections import Counter
+
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
@@ -15,7 +17,7 @@ _HULL = 0.1
 # Cosine of the angle between facets beyond which their edge is one of the body.
 _SHARP = 0.85
 # Over the size of the body: how much nearer electrodes count than the surface under them, and how far off numbers are.
-_BEFORE, _AWAY = 0.03, 0.045
+_BEFORE, _AWAY = 0.06, 0.045
 # And how far numbers are apart that can be read.
 _CLEAR = 0.03
 
@@ -56,17 +58,34 @@ def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarr
 def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes) -> None:
     """Electrodes on a surface: those on the side that is looked at over all behind it, others under it."""
     surface, size = Draped(points, triangles), float(np.ptp(points, axis=0).max())
-    for corners in shapes.polygons():
-        (outward,) = surface.normals(corners.mean(axis=0)[None])
+    polygons = shapes.polygons()
+    normals = surface.normals(np.array([corners.mean(axis=0) for corners in polygons]))
+    rims = _rims(polygons, shapes.electrode, 1e-6 * size)
+    for corners, outward, rim in zip(polygons, normals, rims, strict=True):
         if len(corners) == 1:
             angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
             _, across, up = surface.frames(corners)[0]
             corners = corners + 0.012 * size * (np.outer(np.cos(angle), across) + np.outer(np.sin(angle), up))
-        scene.add_polygon(corners, METAL, outward, _BEFORE * size)
+            rim = np.ones(12, bool)
+        before = _BEFORE * size * float(np.sign(outward @ scene.camera.toward))
+        scene.add_polygon(corners, METAL, before=before, rim=rim)
 
 
-def number_electrodes(ax: Axes, scene: Scene, points, triangles, shapes: ElectrodeShapes) -> None:
-    """Numbers from 1 beside electrodes, outward; faint on the side that is not looked at."""
+def _rims(polygons, electrode, near: float) -> list[np.ndarray]:
+    """Which edges of each polygon are on the rim of its electrode: those that no other of its polygons has."""
+    keys = []
+    for corners, number in zip(polygons, electrode.tolist(), strict=True):
+        places = [tuple(place) for place in np.round(corners / near).astype(np.int64).tolist()]
+        others = [*places[1:], places[0]]
+        keys.append([(number, *sorted(pair)) for pair in zip(places, others, strict=True)])
+    count = Counter(key for one in keys for key in one)
+    return [np.array([count[key] == 1 for key in one]) for one in keys]
+
+
+def number_electrodes(
+    ax: Axes, scene: Scene, points, triangles, shapes: ElectrodeShapes, *, behind: bool = True
+) -> None:
+    """Numbers from 1 beside electrodes, outward; faint ones on the side that is not looked at, if `behind` is shown."""
     middles = shapes.middles()
     normals = Draped(points, triangles).normals(middles)
     places = scene.camera.on_page(middles + _AWAY * float(np.ptp(points, axis=0).max()) * normals)
@@ -75,5 +94,7 @@ def number_electrodes(ax: Axes, scene: Scene, points, triangles, shapes: Electro
     near, clear = places[~faint], _CLEAR * float(np.ptp(points, axis=0).max())
     for k, place in enumerate(places):
         # What is behind has no number where one in front has its own.
+        if faint[k] and not behind:
+            continue
         if not faint[k] or not len(near) or np.linalg.norm(near - place, axis=1).min() > clear:
             draw_number(ax, place, str(k + 1), fontsize=fontsize, faint=bool(faint[k]))

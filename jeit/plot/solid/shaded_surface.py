@@ -54,7 +54,7 @@ def plot_surface(
     scene.draw(ax)
     bare_in_space(ax, camera, places, numbered=electrodes is not None)
     if electrodes is not None:
-        number_electrodes(ax, scene, places, faces, electrodes)
+        number_electrodes(ax, scene, places, faces, electrodes, behind=False)
     if title is not None:
         ax.set_title(title)
     if fitted is not None:
