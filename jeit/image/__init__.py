@@ -1,17 +1,27 @@
-"""Images: rasters of what lives on a mesh, and the inclusions found in them."""
+"""Images: rasters of what lives on a mesh, the inclusions found in them, and what regions and cells do over time."""
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
+from jeit.image.image_series import ImageSeries
 from jeit.image.inclusions import Inclusion, find_inclusions
 from jeit.image.merit import figures_of_merit
+from jeit.image.oscillations import Oscillation, amplitude_spectrum, oscillation
 from jeit.image.raster import Raster
+from jeit.image.regions import ball_region, box_region, half_region
 from jeit.image.segmentation import segment
 
 _tell_old_names(__name__)
 
 __all__ = [
+    "ImageSeries",
     "Inclusion",
+    "Oscillation",
     "Raster",
+    "amplitude_spectrum",
+    "ball_region",
+    "box_region",
     "figures_of_merit",
     "find_inclusions",
+    "half_region",
+    "oscillation",
     "segment",
 ]

@@ -13,6 +13,7 @@ from jeit.report.layout_improvement import draw_improved_layout, report_improved
 from jeit.report.learnt_skin import report_learnt_skin, write_learnt_skin, write_touches
 from jeit.report.listener import draw_heard, report_heard, report_listener, write_heard, write_listener
 from jeit.report.measurement import report_measurement
+from jeit.report.series import write_series
 from jeit.report.skin_health import draw_health, report_health, write_health
 from jeit.report.stream import write_stream
 from jeit.report.study import write_study_report
@@ -57,6 +58,7 @@ __all__ = [
     "write_learnt_images",
     "write_learnt_skin",
     "write_listener",
+    "write_series",
     "write_stream",
     "write_study_report",
     "write_touches",
