@@ -7,11 +7,18 @@ import numpy as np
 from jaxtyping import Bool
 
 from jeit.data import Measurement
+from jeit.data.imageable import check_same_setup
 from jeit.files import check_memory
 from jeit.image.image_series import ImageSeries
 from jeit.imaging.clock import Clock
 from jeit.imaging.method import METHODS
-from jeit.imaging.preparation import PreparedDifference, check_measurement, check_real, prepare_difference
+from jeit.imaging.preparation import (
+    PreparedDifference,
+    check_measurement,
+    check_real,
+    prepare_difference,
+    select_frames,
+)
 from jeit.imaging.settings import AUTO, ImagingSettings, as_settings
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit_solvers.engines import as_array
@@ -65,9 +72,10 @@ def image_sequence(
     voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     if reference is None and "reference" not in measurement.frame_names:
         reference = measurement.mean_frame()
-    base = reference if reference is not None else measurement.frame("reference")
-    expected = np.asarray(base.mean_frame().voltages)[0]
-    common = (mask.mean(axis=0) >= _MOST_FRAMES) & np.asarray(base.mean_frame().mask)[0]
+    _, base = select_frames(measurement, reference)
+    check_same_setup(measurement, base)
+    expected = np.asarray(base.voltages)[0]
+    common = (mask.mean(axis=0) >= _MOST_FRAMES) & np.asarray(base.mask)[0]
     refused = np.asarray(~mask[:, common].all(axis=1))
     if not common.any() or refused.all():
         raise ValueError(f"'{measurement.name}': no channel is usable in most frames, or none has all of them.")
