@@ -106,6 +106,8 @@ def test_a_mean_weighs_cells_by_their_size(mesh):
     mean = series.mean_change(right)
     assert mean[0] == pytest.approx(4 * 0.1 / (3 * np.pi), rel=0.02)  # of a half disk
     assert mean[1] == pytest.approx(1)
+    even = ImageSeries(mesh, 1 / size[None], np.zeros(1)).mean_change(right)
+    assert even[0] == pytest.approx(right.sum() / size[right].sum(), rel=1e-9)
     assert np.isnan(mean[2])
     assert series.imaged.tolist() == [True, True, False]
     np.testing.assert_allclose(series.functional(), np.abs(changes[0] - changes[1]) / 2)
