@@ -15,6 +15,7 @@ from jeit.report.listener import draw_heard, report_heard, report_listener, writ
 from jeit.report.measurement import report_measurement
 from jeit.report.saved_image import SavedImage, read_image
 from jeit.report.saved_image_views import write_views
+from jeit.report.series import write_series
 from jeit.report.skin_health import draw_health, report_health, write_health
 from jeit.report.stream import write_stream
 from jeit.report.study import write_study_report
@@ -62,6 +63,7 @@ __all__ = [
     "write_learnt_images",
     "write_learnt_skin",
     "write_listener",
+    "write_series",
     "write_stream",
     "write_study_report",
     "write_touches",

@@ -92,6 +92,13 @@ def _hearing(names: dict, folder: Path, printed: list[str]) -> None:
     assert (folder / "track.png").stat().st_size > 10_000
 
 
+def _instruments(names: dict, folder: Path, printed: list[str]) -> None:
+    assert names["told"] == sorted(names["told"], reverse=True)
+    assert abs(names["slow"].frequency - 0.3) < 0.01
+    phase = float(printed[0].split()[-1])
+    assert abs(phase - np.degrees(np.pi - 0.5)) < 5
+
+
 def _pressing(names: dict, folder: Path, printed: list[str]) -> None:
     assert names["frames"].shape == (4, 208)
     assert names["film"].shape == (60, 208)
@@ -132,6 +139,7 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "gestures.md": _gestures,
     "health.md": _health,
     "hearing.md": _hearing,
+    "instruments.md": _instruments,
     "pressing.md": _pressing,
     "reconstruction.md": _reconstruction,
     "surfaces.md": _surfaces,
