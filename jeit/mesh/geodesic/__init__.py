@@ -1,0 +1,6 @@
+"""Ways along triangulated surfaces in space: their lengths, the places that they join, and surfaces unrolled."""
+
+from jeit.mesh.geodesic.geodesics import Geodesics
+from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
+
+__all__ = ["Geodesics", "SurfacePlaces", "Triangles"]
