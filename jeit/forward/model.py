@@ -229,7 +229,7 @@ def voltages_and_jacobian_of(model: ForwardModel | IntegratedModel, conductivity
     gradient = field_gradients(mesh, fields)
     rows = patterns @ gradient.reshape(-1, gradient.shape[-1]).T
     # ∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, axis by axis.
-    for component in xp.split(rows, mesh.dimension, axis=1):
+    for component in xp.split(rows, mesh.space_dimension, axis=1):
         drive = gather(component, protocol.drive_index)
         measure = gather(component, protocol.num_drives + protocol.measurement_index)
         jacobian = jacobian + drive * measure

@@ -9,8 +9,9 @@ from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.mesh.body import Body
 from jeit.mesh.cell_quality import quality
 from jeit.mesh.files import read, write
+from jeit.mesh.flatness import check_flat
 from jeit.mesh.generate.refine import Refine
-from jeit.mesh.geometry import centroids, gradients, measures
+from jeit.mesh.geometry import centroids, gradients, measures, normals
 from jeit.mesh.gmsh import from_gmsh
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Disk, Domain, Polygon, Rectangle
@@ -32,12 +33,14 @@ __all__ = [
     "Solid",
     "box",
     "centroids",
+    "check_flat",
     "cylinder",
     "disk",
     "from_gmsh",
     "gradients",
     "layer",
     "measures",
+    "normals",
     "polygon",
     "quality",
     "read",

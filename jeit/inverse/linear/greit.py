@@ -17,7 +17,7 @@ from jeit.forward.model import check_model
 from jeit.inverse.hyperparameter.greit_noise_figure import greit_noise_figure
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.linearisation import used_channels
-from jeit.mesh import Mesh, centroids, measures
+from jeit.mesh import Mesh, centroids, check_flat, measures
 
 # Desired images fall from their height to zero over this much of their radius to either side of it.
 _EDGE = 0.25
@@ -62,6 +62,7 @@ def greit(
     )
     check_has_values("model, conductivity or noise", (model, conductivity, noise), "GREIT is trained on", instead)
     mesh = model.mesh
+    check_flat(mesh, "GREIT's targets")
     if mesh.dimension != 2:
         raise ValueError("GREIT is for plane bodies, and this mesh is 3-D; use one_step, which takes either.")
     radius = model.electrodes.num_electrodes**-0.5 if radius is None else radius

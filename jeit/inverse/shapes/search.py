@@ -16,6 +16,7 @@ from jeit.inverse.nonlinear.checks import check_background, check_frame, check_n
 from jeit.inverse.nonlinear.observed import independent_data
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
+from jeit.mesh import check_flat
 from jeit_solvers.engines import as_array
 
 # How many times the objective must rise, at least, when a body is left out and the others fitted again.
@@ -95,6 +96,7 @@ def reconstruct_shapes(
     """
     measured, used = check_frame(model, voltages, mask)
     check_has_values("reconstruct_shapes", (model, measured), "bodies are chosen by comparison", "take reconstruct")
+    check_flat(model.mesh, "star shapes")
     if model.mesh.dimension != 2:
         raise ValueError(
             "reconstruct_shapes: star shapes are for sheets and tanks in two dimensions; take reconstruct."
