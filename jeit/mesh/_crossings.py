@@ -15,8 +15,9 @@ _PAIRS = 500_000
 _NEXT = np.array([1, 2, 0])
 
 
-def check_crossings(points: np.ndarray, cells: np.ndarray) -> None:
-    """Raise `ValueError` if two triangles (m, 3) cross, touch, or lie on each other, but in what they share."""
+def first_crossing(points: np.ndarray, cells: np.ndarray) -> tuple[int, int] | None:
+    """The first found of the pairs of triangles (m, 3) that cross, touch, or lie on each other, but in what they share;
+    None where there is none."""
     tolerance = _TOUCHING * float(np.ptp(points, axis=0).max())
     for pairs in _near(points[cells], tolerance):
         shared = (cells[pairs[:, 0], :, None] == cells[pairs[:, 1], None, :]).sum(axis=(1, 2))
@@ -26,12 +27,9 @@ def check_crossings(points: np.ndarray, cells: np.ndarray) -> None:
         meet[one] = _cross_opposite(points, cells, pairs[one], tolerance)
         meet[two] = _folded(points, cells, pairs[two])
         if meet.any():
-            number, found = int(meet.sum()), np.sort(pairs[meet][0]).tolist()
-            middle = points[cells[found[0]]].mean(axis=0).round(6).tolist()
-            raise ValueError(
-                f"cells: the surface crosses or touches itself: {number} pair(s) of triangles meet, first {found}, at "
-                f"{middle} m. Move the nodes apart, or unite what overlaps where the surface was made."
-            )
+            first, second = np.sort(pairs[meet][0]).tolist()
+            return first, second
+    return None
 
 
 def _near(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
@@ -118,11 +116,14 @@ def _overlap_in_plane(first: np.ndarray, second: np.ndarray, tolerance: float) -
     unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     height = np.einsum("pki,pi->pk", second - first[:, :1], unit)
     overlap = np.abs(height).max(axis=1) <= tolerance
+    first, second, unit = first[overlap], second[overlap], unit[overlap]
+    apart = np.zeros(len(first), bool)
     for one in (first, second):
         for k in range(3):
             outward = np.cross(one[:, _NEXT[k]] - one[:, k], unit)
             outward = outward / np.linalg.norm(outward, axis=1, keepdims=True)
             spans = [np.einsum("pki,pi->pk", corners, outward) for corners in (first, second)]
             gap = np.maximum(spans[0].min(axis=1) - spans[1].max(axis=1), spans[1].min(axis=1) - spans[0].max(axis=1))
-            overlap &= gap <= tolerance
+            apart |= gap > tolerance
+    overlap[overlap] = ~apart
     return overlap

@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from jeit.mesh import _topology
-from jeit.mesh._crossings import check_crossings
+from jeit.mesh._crossings import first_crossing
 
 
 def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
@@ -33,7 +33,12 @@ def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
     swapped = np.where(turned[:, None], cells[:, [0, 2, 1]], cells)
     if points is None:
         return swapped
-    check_crossings(points, cells)
+    if (pair := first_crossing(points, cells)) is not None:
+        middle = points[cells[pair[0]]].mean(axis=0).round(6).tolist()
+        raise ValueError(
+            f"cells: the surface crosses or touches itself: triangles {pair[0]} and {pair[1]} meet, at {middle} m. "
+            "Move the nodes apart, or unite what overlaps where the surface was made."
+        )
     if closed and enclosed_volume(points, swapped) < 0:
         if not turned.any():
             warnings.warn(
