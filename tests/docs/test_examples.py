@@ -20,6 +20,7 @@ MOST = {
     "hear_a_stroke": 3e-3,
     "learn_a_prior": 0.97,
     "localisation_error": 2.5e-3,
+    "prosthesis": 6e-3,
 }
 
 

@@ -2,5 +2,6 @@
 
 from jeit.mesh.geodesic.geodesics import Geodesics
 from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
+from jeit.mesh.geodesic.unrolled import Unrolled, unroll
 
-__all__ = ["Geodesics", "SurfacePlaces", "Triangles"]
+__all__ = ["Geodesics", "SurfacePlaces", "Triangles", "Unrolled", "unroll"]

@@ -10,11 +10,12 @@ that curvature does. Each length only ever falls, and lengths too large give len
 worked on in any order: those that changed, of all sources together, until none does.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 
 from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
 from jeit.mesh.mesh import Mesh
@@ -141,26 +142,45 @@ class Geodesics(eqx.Module):
         inside = np.arange(total[-1]) - np.repeat(total - number, number)
         return np.repeat(carried, number), self.touching[np.repeat(self.first[nodes], number) + inside]
 
-    def _at(self, sources: SurfacePlaces, lengths: Float[np.ndarray, "s n"], bent, targets: SurfacePlaces):
-        """Lengths (s, p) inside the triangles."""
+    def near(self, sources, targets: SurfacePlaces, limit: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Of each of some `sources` (s, 3) the targets no farther than `limit` metres by the way along the surface, as
+        their numbers, and how far they are: what is far away is not looked at."""
+        begun = self.surface.nearest(sources)
+        tree, found = KDTree(targets.points), []
+        for low in range(0, len(begun.triangle), _TOGETHER):
+            some = SurfacePlaces(*(getattr(begun, one)[low : low + _TOGETHER] for one in _FIELDS))
+            lengths, bent = self._from(some, limit)
+            close = [np.asarray(one, int) for one in tree.query_ball_point(some.points, limit, return_sorted=True)]
+            source = np.repeat(np.arange(len(close)), [len(one) for one in close])
+            every = np.concatenate(close) if close else np.zeros(0, int)
+            at = SurfacePlaces(*(getattr(targets, one)[every] for one in _FIELDS))
+            length = self._at(some, lengths, bent, at, source)
+            ends = np.cumsum([len(one) for one in close])[:-1]
+            for index, own in zip(np.split(every, ends), np.split(length, ends), strict=True):
+                found.append((index[own < limit], own[own < limit]))
+        return found
+
+    def _at(self, sources: SurfacePlaces, lengths: Float[np.ndarray, "s n"], bent, targets: SurfacePlaces, source=None):
+        """Lengths (s, p) inside the triangles; or (p,), of each target from a source with that number."""
         cells = self.surface.cells[targets.triangle]
         corners = self.surface.points[cells]
-        found = np.full((len(lengths), len(cells)), np.inf)
+        of = np.arange(len(lengths))[:, None] if source is None else source
+        found = np.inf
         for first, second, third in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            start, end = lengths[:, cells[:, first]], lengths[:, cells[:, second]]
-            mean = (bent[:, cells[:, first]] + bent[:, cells[:, second]]) / 2
+            ends = (of, cells[:, first]), (of, cells[:, second])
+            start, end = (lengths[one] for one in ends)
             side, x, y = _in_plane(corners[:, first], corners[:, second], targets.points)
-            through, _ = _laid(start, end, side, x, y, curvature=mean)
+            through, _ = _laid(start, end, side, x, y, curvature=(bent[ends[0]] + bent[ends[1]]) / 2)
             # Where ways from two sides meet, the ends' lengths are of different waves, and the third corner is not as
             # far from what they seem to come from as it is.
-            seen, behind, _ = _origin(start, end, side)
-            _, across, off = _in_plane(corners[:, first], corners[:, second], corners[:, third])
-            apart = np.hypot(across - seen, off + behind) - lengths[:, cells[:, third]]
-            one_wave = np.abs(apart) < _APART * side
+            with np.errstate(invalid="ignore", over="ignore"):
+                seen, behind, _ = _origin(start, end, side)
+                _, across, off = _in_plane(corners[:, first], corners[:, second], corners[:, third])
+                apart = np.hypot(across - seen, off + behind) - lengths[of, cells[:, third]]
             by_corner = start + np.sqrt(x**2 + y**2)
-            found = np.minimum(found, np.where(one_wave, through, by_corner))
-        straight = np.linalg.norm(sources.points[:, None] - targets.points, axis=-1)
-        return np.where(sources.triangle[:, None] == targets.triangle, straight, found)
+            found = np.minimum(found, np.where(np.abs(apart) < _APART * side, through, by_corner))
+        straight = np.linalg.norm(sources.points[of] - targets.points, axis=-1)
+        return np.where(sources.triangle[of] == targets.triangle, straight, found)
 
 
 _FIELDS = "triangle", "weights", "points", "away"
@@ -174,7 +194,7 @@ def _in_plane(start, end, corner):
     return side, x, np.sqrt(np.maximum(((corner - start) ** 2).sum(axis=-1) - x**2, 0.0))
 
 
-def _laid(start, end, side, x, y, *, joined=True, curvature=0.0):
+def _laid(start, end, side, x, y, *, joined: Any = True, curvature: Any = 0.0):
     """Lengths at corners from those at the `start` and `end` of their sides, and whether the way comes by the start; in
     a straight line only where both ends' are `joined`. `curvature`: mean of the way, 1/m²."""
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
@@ -186,7 +206,8 @@ def _laid(start, end, side, x, y, *, joined=True, curvature=0.0):
         length = np.sqrt((x - seen) ** 2 + (y + behind) ** 2)
         # The wave's sagitta at the crossing, off that of a plane's.
         square = (crossing - seen) ** 2 + off
-        length += 0.5 * _flatter(curvature, np.sqrt(square)) * off / square * crossing * (side - crossing)
+        across = np.where(square > 0, off / np.where(square > 0, square, 1.0), 0.0)
+        length += 0.5 * _flatter(curvature, np.sqrt(square)) * across * crossing * (side - crossing)
     return np.where(straight, length, np.minimum(along, back)), along <= back
 
 
@@ -204,7 +225,7 @@ def _flatter(curvature, length):
     angle = np.sqrt(np.abs(curvature)) * length
     small, round_, saddle = angle < 1e-3, np.clip(angle, 1e-3, _FARTHEST), np.clip(angle, 1e-3, 10.0)
     share = np.where(curvature > 0, 1 - round_ / np.tan(round_), 1 - saddle / np.tanh(saddle))
-    return np.where(small, curvature * length / 3, share / length)
+    return np.where(small, curvature * length / 3, share / np.where(small, 1.0, length))
 
 
 def _curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarray, " n"]:
@@ -218,7 +239,9 @@ def _curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarray, " n"]
     lacking[border], area[border] = 0.0, 0.0
     for _ in range(2):
         lacking, area = (
-            one + np.bincount(corners.start, one[corners.end], count) + np.bincount(corners.end, one[corners.start], count)
+            one
+            + np.bincount(corners.start, one[corners.end], count)
+            + np.bincount(corners.end, one[corners.start], count)
             for one in (lacking, area)
         )
     return np.where(area > 0, lacking / np.where(area > 0, area, 1.0), 0.0)

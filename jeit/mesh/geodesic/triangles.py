@@ -104,6 +104,11 @@ class Triangles(eqx.Module):
         row = np.arange(len(places))
         return SurfacePlaces(near[row, best], weights[row, best], points[row, best], away[row, best])
 
+    def normals_at(self, places: SurfacePlaces) -> Float[np.ndarray, "p 3"]:
+        """Outward unit normals at places, between those of the nodes."""
+        between = places.of_nodes(self, self.node_normals)
+        return between / np.linalg.norm(between, axis=1, keepdims=True)
+
     def distance_to_border(self, places) -> Float[np.ndarray, " p"]:
         """How far places (p, 3) are from the edge, straight through space, metres; infinite where there is none."""
         border = self.border

@@ -2,6 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial import KDTree
 
 from jeit.layout.arrangements import check_count
 from jeit.mesh import Mesh
@@ -11,8 +12,9 @@ from jeit.mesh.geodesic import Geodesics, Triangles
 _NODES = 30
 # Halved no further than this many nodes.
 _MOST = 60_000
-# Places up to which each next one is where the ways are longest; more begin at random.
-_FARTHEST = 128
+# More places than this lie so near each other that ways between them are as good as straight: what is nearest is told
+# by space, and by the side that it faces.
+_BY_WAYS = 128
 
 
 def spread(
@@ -41,7 +43,7 @@ def spread(
     ways = Geodesics.create(triangles)
     position = triangles.points[_begin(ways, usable, weight, number)]
     for _ in range(iterations):
-        owner = ways.owners(position)[0][usable]
+        owner = (ways.owners(position)[0] if number <= _BY_WAYS else _nearest(triangles, position))[usable]
         own = np.bincount(owner, weight[usable], number)
         middle = np.stack([np.bincount(owner, weight[usable] * x, number) for x in triangles.points[usable].T], axis=1)
         moved = np.where(own[:, None] > 0, middle / np.maximum(own, 1e-300)[:, None], position)
@@ -53,9 +55,17 @@ def spread(
     return position
 
 
+def _nearest(triangles: Triangles, position: Float[np.ndarray, "L 3"]) -> np.ndarray:
+    """Of each node the nearest position: as far away again, half a pitch, where they face opposite sides."""
+    half = 0.5 * np.sqrt(triangles.areas.sum() / len(position))
+    facing = half * triangles.normals[triangles.nearest(position).triangle]
+    tree = KDTree(np.hstack([position, facing]))
+    return np.asarray(tree.query(np.hstack([triangles.points, half * triangles.node_normals]))[1])
+
+
 def _begin(ways: Geodesics, usable: np.ndarray, weight: np.ndarray, number: int) -> np.ndarray:
     """Nodes to begin with."""
-    if number > _FARTHEST:
+    if number > _BY_WAYS:
         share = weight[usable] / weight.sum()
         return np.random.default_rng(0).choice(usable, number, replace=False, p=share)
     points = ways.surface.points
