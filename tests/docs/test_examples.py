@@ -9,6 +9,7 @@ import pytest
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples"
 MOST = {
+    "bent_sheet": 0.05,
     "press_on_a_skin": 3e-3,
     "press_with_a_load": 1e-8,
     "contacts_from_images": 4e-3,

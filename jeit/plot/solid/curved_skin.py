@@ -9,10 +9,13 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
 from jeit.layout import SurfaceLayout
+from jeit.mesh import measures
 from jeit.plot.axes import INK, SERIES_COLOURS, axes_or_new
 from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
-from jeit.plot.solid.body import add_electrodes, size_of
+from jeit.plot.imaging.electrodes import METAL
+from jeit.plot.solid.body import size_of
 from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
+from jeit.plot.solid.electrode_shapes import Draped, shapes_of
 from jeit.plot.solid.scene import Scene, bare_in_space
 from jeit.plot.solid.shaded_surface import BODY, checked_values, colours_of, mappable
 
@@ -49,7 +52,12 @@ def plot_curved_skin(
         fitted = scale.of(image, "S")
         colours = colours_of(fitted, image if len(image) == len(cells) else image[cells].mean(axis=1))
     scene.add_triangles(points, cells, colours, smooth=True)
-    add_electrodes(scene, mesh, layout.discs(1.0))
+    surface = Draped(points, cells)
+    # Pieces are sorted by their middles: a disc counts as nearer than the triangles that it lies on.
+    before = float(np.sqrt(np.asarray(measures(mesh)).max()))
+    for corners in shapes_of(mesh, layout.discs(1.0)).polygons():
+        (outward,) = surface.normals(corners.mean(axis=0)[None])
+        scene.add_polygon(corners, METAL, outward, before)
     scene.draw(ax)
     for (name, places), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
         seen = _on_this_side(mesh, np.atleast_2d(np.asarray(places, float)), camera)
