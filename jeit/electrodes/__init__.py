@@ -4,6 +4,7 @@
 |---|---|---|
 | edge of a sheet (2-D) | `BoundaryElectrodes` | `PointElectrodes` |
 | inside a sheet (2-D) | `SheetDiscs` | `PointElectrodes` |
+| inside a curved sheet | `SurfaceDiscs` | `PointElectrodes` |
 | faces of a 3-D body | `FaceDiscs`, `FacePatches` | `PointElectrodes` |
 | whole facets of a mesh, nodes of a mesh | `FacetElectrodes`, `plates`, `electrodes_from_nodes` | `NodeElectrodes` |
 | several of these at once | `CombinedElectrodes` | |
@@ -20,6 +21,7 @@ from jeit.electrodes.electrodes import AbstractElectrodes
 from jeit.electrodes.facets import FacetElectrodes, electrodes_from_nodes, plates
 from jeit.electrodes.patches import FacePatches
 from jeit.electrodes.point import NodeElectrodes, PointElectrodes
+from jeit.electrodes.surface_discs import SurfaceDiscs
 
 _tell_old_names(__name__)
 
@@ -34,6 +36,7 @@ __all__ = [
     "NodeElectrodes",
     "PointElectrodes",
     "SheetDiscs",
+    "SurfaceDiscs",
     "electrodes_from_nodes",
     "plates",
     "shapes_of",

@@ -55,7 +55,7 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
 
     def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
-        self.position, self.radius, self.contact_impedance = _as_discs(position, 2, radius, contact_impedance)
+        self.position, self.radius, self.contact_impedance = as_discs(position, 2, radius, contact_impedance)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Cells of 0.7 of the smallest radius on them."""
@@ -103,7 +103,7 @@ class FaceDiscs(AbstractDiscs):
 
     def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
         """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
-        self.position, self.radius, self.contact_impedance = _as_discs(position, 3, radius, contact_impedance)
+        self.position, self.radius, self.contact_impedance = as_discs(position, 3, radius, contact_impedance)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
         """None: they are not of a plane mesh."""
@@ -133,7 +133,7 @@ class FaceDiscs(AbstractDiscs):
         check_discs(self, mesh, facet_measures(mesh))
 
 
-def _as_discs(position, dimension: int, radius, contact_impedance):
+def as_discs(position, dimension: int, radius, contact_impedance):
     """Positions (L, d) and radii (L,) in metres and contact impedances (L,) in ohm·m², checked."""
     position = as_positions(position, (dimension,))
     radius = as_electrode_values("radius", radius, len(position), unit="metres")
