@@ -322,3 +322,13 @@ def test_a_group_of_facets_has_one_rim(tank, ax):
     lines = np.abs(np.array(pieces(ax).get_linewidths()) - 0.5) < 1e-9
     edges = np.array([np.linalg.norm(np.ptp(one.vertices, axis=0)) for one in np.array(pieces(ax).get_paths())[lines]])
     assert edges.sum() == pytest.approx(2 * (BOX[0] + BOX[1]))
+    faces = pieces(ax).get_facecolor()
+    hull = np.flatnonzero((faces[:, 3] > 0) & (faces[:, 3] < 0.2))
+    assert np.flatnonzero(is_metal(faces)).min() > hull.max()  # over the wall that it is on
+
+
+def test_electrodes_on_the_far_side_are_under_the_wall_that_they_are_on(tank, ax):
+    plot_isosurfaces(tank, np.zeros(tank.num_cells), plates(tank, ["bottom"], 1e-3), camera=Camera(0, 90), ax=ax)
+    faces = pieces(ax).get_facecolor()
+    hull = np.flatnonzero((faces[:, 3] > 0) & (faces[:, 3] < 0.2))
+    assert np.flatnonzero(is_metal(faces)).max() < hull.min()
