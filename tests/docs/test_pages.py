@@ -104,6 +104,12 @@ def _reconstruction(names: dict, folder: Path, printed: list[str]) -> None:
     assert 1.8e-3 < float(names["result"].conductivity.max()) < 5e-3  # S; the inclusion has 3 mS
 
 
+def _surfaces(names: dict, folder: Path, printed: list[str]) -> None:
+    assert names["arm"].is_surface
+    assert names["skin"].dimension == 3
+    assert len(printed) == 2
+
+
 def _readme(names: dict, folder: Path, printed: list[str]) -> None:
     assert (folder / "press.png").stat().st_size > 10_000
     assert names["sensitivity"].position.shape == (208, 16, 2)
@@ -118,6 +124,7 @@ HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
     "hearing.md": _hearing,
     "pressing.md": _pressing,
     "reconstruction.md": _reconstruction,
+    "surfaces.md": _surfaces,
 }
 
 
