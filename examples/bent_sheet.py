@@ -1,7 +1,7 @@
 """A square of skin with 14 places to press, after Russo et al. 2017, flat and bent to a radius of 3 cm.
 
-Bending a sheet without thickness changes no voltage; of a layer 5 mm thick it stretches the touched side by a sixth. The
-same presses are classified on the bent skin by what was learnt bent, and by what was learnt flat. See `bent_sheet.png`.
+Bending a sheet without thickness changes no voltage; of a layer 5 mm thick it stretches the touched side by a sixth.
+The same presses are told on the bent skin by what was learnt bent, and by what was learnt flat. See `bent_sheet.png`.
 """
 
 import matplotlib.pyplot as plt

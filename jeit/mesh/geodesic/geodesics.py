@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
@@ -65,7 +66,13 @@ class Geodesics(eqx.Module):
         corners = _Corners(node, start, end, *local)
         return cls(triangles, corners, _curvature(triangles, corners), first, order % len(node))
 
-    def distances(self, sources, targets=None, *, limit: float = np.inf) -> Float[np.ndarray, "s p"]:
+    def distances(
+        self,
+        sources: ArrayLike | SurfacePlaces,
+        targets: ArrayLike | SurfacePlaces | None = None,
+        *,
+        limit: float = np.inf,
+    ) -> Float[np.ndarray, "s p"]:
         """Lengths (s, p), metres, of the shortest ways from `sources` (s, 3) to `targets` (p, 3), places on the
         surface, or near it, for the nearest of it is taken; to all nodes (s, n) unless targets are given.
 
@@ -82,7 +89,7 @@ class Geodesics(eqx.Module):
         found[found > limit] = np.inf
         return found
 
-    def between(self, places) -> Float[np.ndarray, "p p"]:
+    def between(self, places: ArrayLike) -> Float[np.ndarray, "p p"]:
         """Lengths between all of some places (p, 3), metres: symmetric, zero on the diagonal."""
         at = self.surface.nearest(places)
         lengths = self.distances(at, at)
@@ -90,7 +97,7 @@ class Geodesics(eqx.Module):
         np.fill_diagonal(lengths, 0)
         return lengths
 
-    def owners(self, sources) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    def owners(self, sources: ArrayLike | SurfacePlaces) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Of each node the nearest of the `sources` (s, 3), as its number, and the length of the way to it, metres."""
         at = sources if isinstance(sources, SurfacePlaces) else self.surface.nearest(sources)
         nodes = self.surface.cells[at.triangle]
@@ -142,7 +149,7 @@ class Geodesics(eqx.Module):
         inside = np.arange(total[-1]) - np.repeat(total - number, number)
         return np.repeat(carried, number), self.touching[np.repeat(self.first[nodes], number) + inside]
 
-    def near(self, sources, targets: SurfacePlaces, limit: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    def near(self, sources: ArrayLike, targets: SurfacePlaces, limit: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """Of each of some `sources` (s, 3) the targets no farther than `limit` metres by the way along the surface, as
         their numbers, and how far they are: what is far away is not looked at."""
         begun = self.surface.nearest(sources)

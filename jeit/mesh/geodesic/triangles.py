@@ -3,6 +3,7 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jeit.mesh.mesh import Mesh
@@ -20,7 +21,7 @@ class SurfacePlaces(eqx.Module):
     points: Float[np.ndarray, "p 3"]
     away: Float[np.ndarray, " p"]
 
-    def of_nodes(self, triangles: "Triangles", values) -> np.ndarray:
+    def of_nodes(self, triangles: "Triangles", values: ArrayLike) -> np.ndarray:
         """Values of the nodes (n, …) between them, at the places (p, …)."""
         corners = np.asarray(values)[triangles.cells[self.triangle]]
         return np.einsum("pk,pk...->p...", self.weights, corners)
@@ -91,17 +92,17 @@ class Triangles(eqx.Module):
         corners = self.corners
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
-    def nearest(self, places) -> SurfacePlaces:
+    def nearest(self, places: ArrayLike) -> SurfacePlaces:
         """The points of the surface that are nearest to `places` (p, 3), metres."""
-        places = np.asarray(places, float)
+        asked = np.asarray(places, float)
         number = min(_CANDIDATES, len(self.cells))
         corners = self.corners
-        near = KDTree(corners.mean(axis=1)).query(places, number)[1].reshape(len(places), number)
-        weights = _nearest_in_triangles(corners[near], places[:, None])
+        near = KDTree(corners.mean(axis=1)).query(asked, number)[1].reshape(len(asked), number)
+        weights = _nearest_in_triangles(corners[near], asked[:, None])
         points = np.einsum("pqk,pqkd->pqd", weights, corners[near])
-        away = np.linalg.norm(points - places[:, None], axis=-1)
+        away = np.linalg.norm(points - asked[:, None], axis=-1)
         best = away.argmin(axis=1)
-        row = np.arange(len(places))
+        row = np.arange(len(asked))
         return SurfacePlaces(near[row, best], weights[row, best], points[row, best], away[row, best])
 
     def normals_at(self, places: SurfacePlaces) -> Float[np.ndarray, "p 3"]:
@@ -109,15 +110,15 @@ class Triangles(eqx.Module):
         between = places.of_nodes(self, self.node_normals)
         return between / np.linalg.norm(between, axis=1, keepdims=True)
 
-    def distance_to_border(self, places) -> Float[np.ndarray, " p"]:
+    def distance_to_border(self, places: ArrayLike) -> Float[np.ndarray, " p"]:
         """How far places (p, 3) are from the edge, straight through space, metres; infinite where there is none."""
-        border = self.border
+        border, asked = self.border, np.asarray(places, float)
         if not len(border):
-            return np.full(len(places), np.inf)
+            return np.full(len(asked), np.inf)
         start, end = self.points[border[:, 0]], self.points[border[:, 1]]
         part = (np.arange(16) / 16)[:, None, None]
         along = ((1 - part) * start + part * end).reshape(-1, 3)
-        return KDTree(along).query(np.asarray(places, float))[0]
+        return KDTree(along).query(asked)[0]
 
     def finer(self) -> "Triangles":
         """Each triangle as four, halved along its sides."""

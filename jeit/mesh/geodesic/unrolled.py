@@ -13,6 +13,7 @@ import equinox as eqx
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.sparse.linalg import factorized
 
@@ -65,13 +66,13 @@ class Unrolled(eqx.Module):
         ends = _border_of(self.cells)
         return ends, ~_among(np.sort(self.nodes[ends], axis=1), np.sort(self.surface.border, axis=1))
 
-    def flat(self, places) -> Float[np.ndarray, "p 2"]:
+    def flat(self, places: ArrayLike | SurfacePlaces) -> Float[np.ndarray, "p 2"]:
         """Where places on the surface, (p, 3) metres, come to lie: (p, 2) metres."""
         at = places if isinstance(places, SurfacePlaces) else self.surface.nearest(places)
         return np.einsum("pk,pkd->pd", at.weights, self.points[self.cells[at.triangle]])
 
 
-def unroll(surface: Triangles | Mesh, face: str | None = None, *, cut=None) -> Unrolled:
+def unroll(surface: Triangles | Mesh, face: str | None = None, *, cut: ArrayLike | None = None) -> Unrolled:
     """Lay a surface flat, or a `face` of a shell, as it is seen from outside. `cut`: a place (3,), metres, that the cut
     of a closed sleeve is to pass by; the side of the least x unless given. Raises `ValueError` as `Triangles.of` does,
     and for surfaces with handles or of which parts do not hang together."""

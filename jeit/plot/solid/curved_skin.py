@@ -57,7 +57,8 @@ def plot_curved_skin(
     before = float(np.sqrt(np.asarray(measures(mesh)).max()))
     for corners in shapes_of(mesh, layout.discs(1.0)).polygons():
         (outward,) = surface.normals(corners.mean(axis=0)[None])
-        scene.add_polygon(corners, METAL, outward, before)
+        facing = abs(float(outward @ camera.toward))
+        scene.add_polygon(corners, METAL, outward, before / max(facing, 0.1))
     scene.draw(ax)
     for (name, places), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
         seen = _on_this_side(mesh, np.atleast_2d(np.asarray(places, float)), camera)
