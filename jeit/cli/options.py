@@ -16,7 +16,10 @@ Reference = Annotated[
 ]
 Format = Annotated[
     str | None,
-    typer.Option(help="kit4, ktc2023, eidors, table or tank6cm; found from the content unless given."),
+    typer.Option(
+        help="kit4, ktc2023, eidors, sciospec, draeger, carefusion, swisstom, goettingen, table or tank6cm; found from "
+        "the content unless given."
+    ),
 ]
 Description = Annotated[
     str | None,
@@ -27,7 +30,7 @@ Contact = Annotated[
     str | None,
     typer.Option(help="Contact impedance in the calibration: each, common or fixed; found from the protocol."),
 ]
-Nodes = Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000).")]
+Nodes = Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000; of a solid body 10000).")]
 AsIs = Annotated[
     bool,
     typer.Option("--as-is", help="Go on though electrodes, channels or signs look wired otherwise than described."),
@@ -134,7 +137,7 @@ def intensity_settings(low: float | None, high: float | None, window: float | No
     return IntensitySettings(**given)
 
 
-def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json")) -> None:
+def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json", "image.vtu")) -> None:
     """Make the folder for results of these names before any work is done; `remove_empty_folders` undoes it. Raises
     `ValueError` if it cannot be one, and where a file of that name in it is one that the command was given."""
     for name in names:

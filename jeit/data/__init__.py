@@ -14,6 +14,8 @@ from jeit.data.measurement import Measurement
 from jeit.data.quality import estimate_noise, impossible_signs, reciprocity_error
 from jeit.data.registry import read
 from jeit.data.screening import screen
+from jeit.data.series import join
+from jeit.data.transfer import driven_by, transfer_impedance
 
 _tell_old_names(__name__)
 
@@ -22,12 +24,15 @@ __all__ = [
     "GestureSet",
     "Measurement",
     "check_imageable",
+    "driven_by",
     "estimate_noise",
     "impossible_signs",
+    "join",
     "load_description",
     "read",
     "read_frame_recording",
     "reciprocity_error",
     "screen",
+    "transfer_impedance",
     "write_table",
 ]

@@ -10,11 +10,12 @@ import numpy as np
 
 from jeit import protocol as protocols
 from jeit.data.described_body import located
+from jeit.data.measured_patterns import protocol_of_file
 from jeit.files import check_memory
 from jeit.protocol import Protocol
 
 if TYPE_CHECKING:
-    from jeit.data.description_tables import ConstructedTable, DrivenTable, ProtocolTable
+    from jeit.data.description_tables import ConstructedTable, DrivenTable, OptimalTable, ProtocolTable
 
 PROTOCOL_ARRAYS = ("drive", "measurement", "drive_index", "measurement_index")
 _CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
@@ -38,6 +39,10 @@ def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: P
             return protocols.from_matrices(table.drive, table.measurement, table.select, name=table.name)
         if table.kind == "channels":
             return Protocol(**{part: getattr(table, part) for part in PROTOCOL_ARRAYS}, name=table.name)
+        if table.kind == "measured":
+            return protocol_of_file(table, path)
+        if table.kind == "optimal":
+            return _optimal(table, origin)
         return _constructed(table, num_electrodes, path, origin)
     except ValueError as error:
         raise located(error, origin, "protocol") from None
@@ -61,6 +66,22 @@ def _constructed(table: ConstructedTable, num_electrodes: int | None, path: Path
             )
     _check_size(*_counts(table.kind, number, options), origin)
     made = getattr(protocols, table.kind)(number, current=_current(table, path), **options)
+    return made if table.name is None else replace(made, name=table.name)
+
+
+def _optimal(table: OptimalTable, origin: str) -> Protocol:
+    count = len(table.transfer)
+    _check_size(count, count, count, count**2, origin)
+    current = 1e-3 if table.current is None else table.current * _CURRENT_UNITS[table.current_unit]
+    made = protocols.optimal(
+        table.transfer,
+        table.other,
+        number=table.drives,
+        power=table.power,
+        measurement=table.measurement,
+        reference=table.reference,
+        current=current,
+    )
     return made if table.name is None else replace(made, name=table.name)
 
 

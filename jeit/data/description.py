@@ -14,9 +14,15 @@ Sections (`tank6cm.toml` in this folder is an example; only `[protocol]` must be
 - `[protocol]`: `kind` = name of a constructor in `jeit.protocol` with its arguments, or "matrices" with
   `drive` (S, L) in amperes and `measurement` (K, L), or "channels" with those and `drive_index` (M,) and
   `measurement_index` (M,), from 0. `current` in amperes, or `current_unit`; or `current_from_name`, the name of
-  the file with {current} in place of the number and * for anything, such as "*_{current}uA_*".
+  the file with {current} in place of the number and * for anything, such as "*_{current}uA_*". Or "optimal" with
+  `transfer`, and `other`, (L, L) ohm, and `current` or `power`; or "measured", of a .mat or .npz file that holds its
+  currents in `drive_key` ("current_patterns" unless given, a column a pattern; `patterns_in` = "rows" otherwise), and
+  `measurement`, what is read of all potentials: "mean-removed" (less their mean), "mean", "adjacent" or "against" an
+  electrode `reference`; or `measurement_key`, a matrix of the file.
 - `[data]`: `frames_in` = "columns" or "rows"; `delimiter`, `skip_rows`; `complex_pairs`, `component`; `gain`,
-  `polarity`, `unit`, `saturation`; `frame_names`; `keys`, the variables to read from a .mat or .npz file.
+  `polarity`, `unit`, `saturation`; `frame_names`; `keys`, the variables to read from a .mat or .npz file, of three
+  axes if they are as `axes` says (electrodes, patterns, frames unless given); `frames` = "all", or "mean" of them;
+  `frame_rate`, in a second.
 - `[notes]`: `text`, a list of sentences to carry along.
 """
 
@@ -39,6 +45,7 @@ from jeit.protocol import Protocol
 
 if TYPE_CHECKING:
     from jeit.data.description_tables import DataTable, ProtocolTable
+    from jeit.protocol.potentials import Reading
 
 BUNDLED = ("tank6cm",)
 _VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
@@ -57,6 +64,9 @@ class TableLayout:
     saturation: float | None = None
     frame_names: tuple[str, ...] = ()
     keys: tuple[str, ...] = ()
+    axes: tuple[str, ...] = ()
+    averaged: bool = False
+    frame_rate: float | None = None
 
 
 @dataclass(frozen=True)
@@ -80,6 +90,20 @@ class Description:
             return None
         number = None if self.electrodes is None else self.electrodes.num_electrodes
         return described_protocol(self.protocol_section, number, Path(path), self.origin)
+
+    @property
+    def patterns_measured(self) -> bool:
+        """Whether the currents lie in the data file."""
+        return self.protocol_section is not None and self.protocol_section.kind == "measured"
+
+    @property
+    def reading(self) -> tuple[Reading, int | None]:
+        """What is read of the potentials of all electrodes where the currents lie in the data file, and which electrode
+        they are read against."""
+        section = self.protocol_section
+        if section is None or section.kind != "measured":
+            return "mean-removed", None
+        return section.measurement, section.reference
 
     def model(self, path: str | Path, *, num_points: int) -> ForwardModel:
         """A model, on a new mesh of about `num_points` nodes, of what the file at `path` was measured on.
@@ -148,4 +172,7 @@ def _layout(data: DataTable) -> TableLayout:
         saturation=None if data.saturation is None else data.saturation * abs(scale),
         frame_names=tuple(data.frame_names),
         keys=tuple(data.keys),
+        axes=tuple(data.axes),
+        averaged=data.frames == "mean",
+        frame_rate=data.frame_rate,
     )

@@ -25,6 +25,7 @@ Impedances = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-15, 1e12,
 Patterns = Annotated[np.ndarray, Numbers(((1, math.inf), (2, MOST_ELECTRODES)), -1e12, 1e12)]
 Pairs = Annotated[np.ndarray, Numbers(((1, math.inf), (2, 2)), 0, MOST_ELECTRODES, kind=int)]
 Indices = Annotated[np.ndarray, Numbers(((1, math.inf),), 0, 2**31 - 1, kind=int)]
+Reading = Literal["adjacent", "mean", "mean-removed", "against"]
 Choices = Annotated[np.ndarray, Numbers(((1, math.inf), (1, math.inf)), kind=bool)]
 
 
@@ -253,12 +254,62 @@ class TwoTerminalTable(DrivenTable):
     pairs: Pairs | None = None
 
 
-class TrigonometricTable(DrivenTable):
+class AllAtOnceTable(DrivenTable):
+    """What protocols that drive all electrodes have: what is read of their potentials."""
+
+    measurement: Reading = "mean-removed"
+    reference: Annotated[int, _INDEX] | None = None
+
+
+class TrigonometricTable(AllAtOnceTable):
     """Of `jeit.protocol.trigonometric`."""
 
     what = "the protocol 'trigonometric'"
     kind: Literal["trigonometric"]
-    measurement: Literal["adjacent", "mean"] = "adjacent"
+    measurement: Reading = "adjacent"
+
+
+class HaarTable(AllAtOnceTable):
+    """Of `jeit.protocol.haar`."""
+
+    what = "the protocol 'haar'"
+    kind: Literal["haar"]
+
+
+class OptimalTable(Table):
+    """Of `jeit.protocol.optimal`. `transfer`, `other`: ohm; `drives`: how many; `power`: watts."""
+
+    what = "the protocol 'optimal'"
+    kind: Literal["optimal"]
+    name: Word | None = None
+    transfer: Patterns
+    other: Patterns | None = None
+    drives: Annotated[int, Number(1, MOST_ELECTRODES)] | None = None
+    power: Annotated[float, Number(1e-15, 1e3, "W")] | None = None
+    measurement: Reading = "mean-removed"
+    reference: Annotated[int, _INDEX] | None = None
+    current: Annotated[float, Number(1e-15, 1e12, "in current_unit")] | None = None
+    current_unit: Literal["A", "mA", "uA", "µA"] = "A"
+
+    @model_validator(mode="after")
+    def _bounded(self) -> "OptimalTable":
+        if (self.current is None) == (self.power is None):
+            raise fault("or power: give one of them, the most of an electrode or of a pattern.", "current")
+        return self
+
+
+class MeasuredTable(Table):
+    """Of currents that lie in the data file. `drive_key`, `measurement_key`: the names of its matrices."""
+
+    what = "a protocol of measured currents"
+    kind: Literal["measured"]
+    name: Word | None = None
+    drive_key: Word = "current_patterns"
+    measurement_key: Word | None = None
+    patterns_in: Literal["columns", "rows"] = "columns"
+    measurement: Reading = "mean-removed"
+    reference: Annotated[int, _INDEX] | None = None
+    current_unit: Literal["A", "mA", "uA", "µA"] = "A"
 
 
 class BipolarTable(DrivenTable):
@@ -310,6 +361,18 @@ class DataTable(Table):
     saturation: Annotated[float, Number(1e-12, 1e12, "in the file's unit")] | None = None
     frame_names: Words = Field(default=[])
     keys: Words = Field(default=[])
+    axes: Annotated[list[Literal["electrodes", "patterns", "frames"]], Field(max_length=3)] = Field(default=[])
+    frames: Literal["all", "mean"] = "all"
+    frame_rate: Annotated[float, Number(1e-9, 1e9, "frames in a second")] | None = None
+
+    @model_validator(mode="after")
+    def _every_axis(self) -> "DataTable":
+        if self.axes and sorted(self.axes) != ["electrodes", "frames", "patterns"]:
+            raise fault("must be electrodes, patterns and frames, each once, in the order of the array.", "axes")
+        if self.frames == "mean" and (self.frame_names or self.frame_rate is not None):
+            idle = "frame_names" if self.frame_names else "frame_rate"
+            raise fault("has no use where the frames are averaged; leave it out.", idle)
+        return self
 
 
 class NotesTable(Table):
@@ -323,9 +386,9 @@ GeometryTable = DiskTable | RectangleTable | PolygonTable | BoxTable | CylinderT
 ElectrodesTable = BoundaryTable | DiscTable | PatchTable | PointTable | FacetsTable
 ConstructedTable = (
     AdjacentTable | SkipTable | OppositeTable | AgainstOneTable | ReferenceTable | TwoTerminalTable | TrigonometricTable
-    | BipolarTable
+    | HaarTable | BipolarTable
 )  # fmt: skip
-ProtocolTable = ConstructedTable | MatricesTable | ChannelsTable
+ProtocolTable = ConstructedTable | OptimalTable | MatricesTable | ChannelsTable | MeasuredTable
 
 _SHAPE = OneOf(
     "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable, mark="mesh", other=MeshTable
@@ -333,7 +396,7 @@ _SHAPE = OneOf(
 _ELECTRODES = OneOf("kind", BoundaryTable, DiscTable, PatchTable, PointTable, FacetsTable)
 _PROTOCOL = OneOf(
     "kind", AdjacentTable, SkipTable, OppositeTable, AgainstOneTable, ReferenceTable, TwoTerminalTable,
-    TrigonometricTable, BipolarTable, MatricesTable, ChannelsTable,
+    TrigonometricTable, HaarTable, OptimalTable, BipolarTable, MatricesTable, ChannelsTable, MeasuredTable,
 )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ for the latter: EIDORS drives -I at the first electrode of a pair and +I at the 
 minus second, so that adjacent data come out positive; say `polarity = "reversed"`.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,12 @@ import numpy as np
 from jeit.arguments import listed
 from jeit.data import _matlab
 from jeit.data.description import Description, load_description, parse_description
+from jeit.data.measured_patterns import frames_of
 from jeit.data.measurement import Measurement
 from jeit.data.table import frames_from, measurement_from
 from jeit.protocol import Protocol, from_channels
 
-DESCRIPTION = "EIDORS-style vectors (.mat with stim, meas, meas_stim, or with a TOML description)"
+DESCRIPTION = "EIDORS-style vectors (.mat with stim, meas, meas_stim, or any with a TOML description)"
 PATTERN = ("stim", "meas", "meas_stim")
 # Names under which homogeneous (reference) and inhomogeneous vectors are usually saved.
 REFERENCE_NAMES = ("v_h", "vh")
@@ -28,6 +30,15 @@ def recognises(path: Path) -> bool:
     return path.suffix.lower() == ".mat" and set(PATTERN) <= _matlab.variable_names(path)
 
 
+def find_description(path: Path) -> Path | None:
+    """The description beside a file: of its name, or `description.toml` in its folder unless the file describes itself;
+    None where there is none."""
+    beside, common = path.with_suffix(".toml"), path.parent / "description.toml"
+    if beside.is_file():
+        return beside
+    return common if common.is_file() and not recognises(path) else None
+
+
 def read(path: Path, description: str | Path | None = None) -> Measurement:
     """Read the vectors named by the description's `[data] keys`, or else those named vh, vi, v_h, v_i.
 
@@ -37,13 +48,16 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
     Raises `ValueError` when neither file nor description says what was driven and measured, or no vector is
     found.
     """
-    beside = path.with_suffix(".toml")
-    which = beside if description is None and beside.is_file() else description
+    which = description if description is not None else find_description(path)
     described = parse_description({}, path.name) if which is None else load_description(which)
     keys, names = _keys(_matlab.variable_names(path), described, path)
     content = _matlab.load(path, *keys, *PATTERN)
     vectors = [_matlab.numbers(content, key, path) for key in keys]
-    if len(vectors) == 1:
+    if vectors[0].ndim == 3 or described.patterns_measured:
+        if len(vectors) > 1:
+            raise ValueError(f"{path.name}: [data] keys names {len(vectors)} arrays; give one, of all frames.")
+        table = frames_of(vectors[0], described.layout.axes, path.name)
+    elif len(vectors) == 1:
         # A vector is one frame however it lies; a matrix holds a frame per column, as EIDORS stores them.
         table = vectors[0].reshape(1, -1) if 1 in vectors[0].shape else vectors[0].T
     else:
@@ -56,7 +70,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
         protocol = _own_protocol(content, path)
     frames = frames_from(table, described.layout, path.name)
     measurement = measurement_from(path, described, frames, protocol, None)
-    return measurement if measurement.frame_names or not names else _named(measurement, names)
+    return measurement if measurement.frame_names or not names else replace(measurement, frame_names=names)
 
 
 def _keys(content: set[str], described: Description, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -90,17 +104,3 @@ def _own_protocol(content: dict, path: Path) -> Protocol:
         return from_channels(stim.T, meas, index.astype(int) - 1, name=f"{path.stem}, {len(index)} channels")
     except ValueError as error:
         raise ValueError(f"{path.name}: {error}") from None
-
-
-def _named(measurement: Measurement, names: tuple[str, ...]) -> Measurement:
-    return Measurement(
-        measurement.voltages,
-        measurement.mask,
-        measurement.protocol,
-        electrodes=measurement.electrodes,
-        domain=measurement.domain,
-        name=measurement.name,
-        source=measurement.source,
-        frame_names=names,
-        notes=measurement.notes,
-    )

@@ -19,10 +19,10 @@ from jeit.protocol import Protocol
 def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]:
     """Write `path` (.npz) and a description of the same name (.toml); return both paths.
 
-    The NPZ holds `voltages` (F, M) volts, `mask` (F, M), `frame_names` and `notes`; and the protocol's `drive` (S, L)
-    amperes, `measurement` (K, L), `drive_index` (M,), `measurement_index` (M,), `protocol_name`. The TOML holds
-    geometry, electrodes and protocol, and so describes any table of the same sensor. `read` gives the same measurement
-    back.
+    The NPZ holds `voltages` (F, M) volts, `mask` (F, M), `frame_names`, `notes`, and if known `times` (F,) seconds; and
+    the protocol's `drive` (S, L) amperes, `measurement` (K, L), `drive_index` (M,), `measurement_index` (M,),
+    `protocol_name`. The TOML holds geometry, electrodes and protocol, and so describes any table of the same sensor.
+    `read` gives the same measurement back.
 
     Raises `ValueError` for another suffix, and for electrodes or bodies that cannot be written into a description (a
     mesh or an outline of your own, and what lies on its facets).
@@ -40,6 +40,8 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
     component = "complex" if np.iscomplexobj(measurement.voltages) else "real"
     lines += ["", "[data]", *_assignments({"frames_in": "rows", "component": component})]
     arrays: dict[str, Any] = {part: np.asarray(getattr(protocol, part)) for part in PROTOCOL_ARRAYS}
+    if measurement.times is not None:
+        arrays["times"] = np.asarray(measurement.times)
     description = file.with_suffix(".toml")
     with whole_files(file.parent) as made:
         np.savez_compressed(

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Inexact
+from jaxtyping import Array, Bool, Float, Inexact
 from numpy.typing import ArrayLike
 
 from jeit.arguments import counted, did_you_mean
@@ -33,6 +33,7 @@ class Measurement(eqx.Module):
       plain `Mesh`, which is made one); None when the file does not say.
     - `name`, `source`: what and where it comes from; `frame_names`: one for each frame, or empty.
     - `notes`: what was assumed, and what was masked and why; one sentence each.
+    - `times`: (F,) seconds at which the frames were measured, rising; None when nothing says.
     """
 
     voltages: Inexact[Array, "F M"]
@@ -44,6 +45,7 @@ class Measurement(eqx.Module):
     source: str = eqx.field(static=True)
     frame_names: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
+    times: Float[Array, " F"] | None
 
     def __init__(
         self,
@@ -57,9 +59,10 @@ class Measurement(eqx.Module):
         source: str = "",
         frame_names: tuple[str, ...] = (),
         notes: tuple[str, ...] = (),
+        times: ArrayLike | None = None,
     ):
-        """`voltages` and `mask` (F, M), or (M,) for one frame. Raises `ValueError` where shapes disagree, and for what
-        is no body."""
+        """`voltages` and `mask` (F, M), or (M,) for one frame; `times` (F,). Raises `ValueError` where shapes disagree,
+        for times that do not rise, and for what is no body."""
         self.voltages = as_array(_frames(voltages))
         self.mask = as_array(_frames(mask))
         self.protocol = protocol
@@ -69,6 +72,7 @@ class Measurement(eqx.Module):
         self.source = source
         self.frame_names = tuple(frame_names)
         self.notes = tuple(notes)
+        self.times = None if times is None else as_array(np.asarray(times, float))
         if not jnp.issubdtype(self.voltages.dtype, jnp.inexact):
             raise ValueError(f"voltages are {self.voltages.dtype}; give real or complex volts.")
         if self.voltages.ndim != 2 or self.voltages.shape[1] != protocol.num_measurements:
@@ -90,6 +94,8 @@ class Measurement(eqx.Module):
             raise ValueError(
                 f"frame_names are {len(self.frame_names)} and the frames {self.voltages.shape[0]}; give one each."
             )
+        if self.times is not None:
+            _check_times(np.asarray(self.times), self.voltages.shape[0])
 
     @property
     def num_frames(self) -> int:
@@ -100,6 +106,31 @@ class Measurement(eqx.Module):
     def num_channels(self) -> int:
         """Number of channels M in a frame."""
         return self.voltages.shape[1]
+
+    @property
+    def frame_rate(self) -> float | None:
+        """Frames in a second, over all of them; None where there are no times, or one frame."""
+        if self.times is None or self.num_frames < 2:
+            return None
+        times = np.asarray(self.times)
+        return float((len(times) - 1) / (times[-1] - times[0]))
+
+    def frames(self, which: slice | ArrayLike) -> "Measurement":
+        """Some frames, in the order of time: a slice, numbers from 0 that rise, or a mask (F,).
+
+        Raises `ValueError` for frames that do not exist, and for none.
+        """
+        chosen = np.arange(self.num_frames)[which] if isinstance(which, slice) else np.atleast_1d(np.asarray(which))
+        if chosen.dtype == bool and chosen.shape == (self.num_frames,):
+            chosen = np.flatnonzero(chosen)
+        if chosen.ndim != 1 or not chosen.size or chosen.dtype.kind not in "iu":
+            raise ValueError(
+                f"which: give a slice, whole numbers or a mask of {self.num_frames} frames that leaves some; got "
+                f"{chosen.dtype} of shape {chosen.shape}."
+            )
+        if chosen.min() < 0 or chosen.max() >= self.num_frames or (np.diff(chosen) <= 0).any():
+            raise ValueError(f"which: frames run from 0 to {self.num_frames - 1}; give numbers in rising order.")
+        return self._frames(chosen)
 
     def frame(self, which: int | str) -> "Measurement":
         """One frame, by number from 0 (negative from the end) or by name, as a measurement of its own.
@@ -134,7 +165,7 @@ class Measurement(eqx.Module):
     def mean_frame(self) -> "Measurement":
         """The mean over frames of the usable voltages; a channel that no frame has stays masked."""
         mean, usable = _mean(self.voltages, self.mask)
-        return self._replace(mean, usable, frame_names=())
+        return self._replace(mean, usable, frame_names=(), times=None)
 
     def filled(self, value: float = 0.0) -> Inexact[Array, "F M"]:
         """(F, M) voltages with `value` in place of what is masked."""
@@ -173,9 +204,11 @@ class Measurement(eqx.Module):
 
     def _frames(self, index: np.ndarray) -> "Measurement":
         names = tuple(self.frame_names[k] for k in index) if self.frame_names else ()
-        return self._replace(*_rows(self.voltages, self.mask, index), frame_names=names)
+        times = None if self.times is None else np.asarray(self.times)[index]
+        return self._replace(*_rows(self.voltages, self.mask, index), frame_names=names, times=times)
 
-    def _replace(self, voltages, mask, *, frame_names=None, notes=None) -> "Measurement":
+    def _replace(self, voltages, mask, **others) -> "Measurement":
+        kept = {"frame_names": self.frame_names, "notes": self.notes, "times": self.times, **others}
         return Measurement(
             voltages,
             mask,
@@ -184,9 +217,15 @@ class Measurement(eqx.Module):
             domain=self.domain,
             name=self.name,
             source=self.source,
-            frame_names=self.frame_names if frame_names is None else frame_names,
-            notes=self.notes if notes is None else notes,
+            **kept,
         )
+
+
+def _check_times(times: np.ndarray, number: int) -> None:
+    if times.shape != (number,):
+        raise ValueError(f"times have shape {times.shape}; give seconds for each of {number} frames.")
+    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise ValueError("times must be finite and rise from frame to frame, in seconds; sort the frames by time.")
 
 
 def _frames(values):

@@ -1,13 +1,19 @@
 """One door for all files: `read` finds the format from the content, or takes it from you."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from jeit.arguments import check_name, listed
 from jeit.data import _matlab, eidors, kit4, ktc2023, table
+from jeit.data.instruments import carefusion, draeger, goettingen, sciospec, swisstom
 from jeit.data.measurement import Measurement
+from jeit.data.series import join
+from jeit.files import check_memory
+
+# Bytes in memory for one of text, at most.
+_IN_MEMORY = 4
 
 
 @dataclass(frozen=True)
@@ -27,6 +33,11 @@ FORMATS: dict[str, Format] = {
     "kit4": Format(kit4.DESCRIPTION, kit4.recognises, kit4.read),
     "ktc2023": Format(ktc2023.DESCRIPTION, ktc2023.recognises, ktc2023.read),
     "eidors": Format(eidors.DESCRIPTION, eidors.recognises, eidors.read, described=True),
+    "sciospec": Format(sciospec.DESCRIPTION, sciospec.recognises, sciospec.read, described=True),
+    "draeger": Format(draeger.DESCRIPTION, draeger.recognises, draeger.read, described=True),
+    "carefusion": Format(carefusion.DESCRIPTION, carefusion.recognises, carefusion.read, described=True),
+    "swisstom": Format(swisstom.DESCRIPTION, swisstom.recognises, swisstom.read, described=True),
+    "goettingen": Format(goettingen.DESCRIPTION, goettingen.recognises, goettingen.read, described=True),
     "table": Format(table.DESCRIPTION, table.recognises, table.read, described=True, borrows=True),
     "tank6cm": Format(
         "6 cm tank (.csv, 208 rows of real and imaginary pairs): a table with the bundled description",
@@ -45,18 +56,23 @@ def read(
 ) -> Measurement:
     """Read a measurement from a file.
 
-    - `path`: the data file.
-    - `format`: a name in `FORMATS` ("kit4", "ktc2023", "eidors", "table", "tank6cm"); found from the content
-      if not given.
-    - `description`: a TOML file (or the name of a bundled one) that says what the numbers mean, for formats
-      "table" and "eidors"; looked for beside the data if not given.
+    - `path`: the data file; or a folder of Sciospec's, which writes a file for every frame: all, in the order of
+      their names.
+    - `format`: a name in `FORMATS` ("kit4", "ktc2023", "eidors", "sciospec", "draeger", "carefusion", "swisstom",
+      "goettingen", "table", "tank6cm"); found from the content if not given.
+    - `description`: a TOML file (or the name of a bundled one) that says what the numbers mean, for a table or an
+      EIDORS file, and what body was measured, for those of instruments; looked for beside the data if not given.
     - `like`: a measurement of the same sensor, its reference say, which describes a table that nothing else describes.
 
     Raises `ValueError` when the file is not there, of no known format, or not what its format demands.
     """
     file = Path(path)
     if file.is_dir():
-        raise ValueError(f"{file} is a folder. Give one data file in it.")
+        members = sorted(one for one in file.iterdir() if one.is_file() and sciospec.recognises(one))
+        if not members or format not in (None, "sciospec"):
+            raise ValueError(f"{file} is a folder. Give one data file in it.")
+        check_memory(file.name, _IN_MEMORY * sum(one.stat().st_size for one in members))
+        return replace(join([sciospec.read(one, description) for one in members]), name=file.name, source=str(file))
     if not file.is_file():
         raise ValueError(f"There is no file {file}. Check the path.")
     if file.stat().st_size == 0:
@@ -69,7 +85,7 @@ def read(
     if chosen.described:
         return chosen.read(file, description=description)
     if description is not None:
-        raise ValueError(f"Format '{name}' describes itself; only table and eidors take a description.")
+        raise ValueError(f"Format '{name}' describes itself; tables and files of instruments take a description.")
     return chosen.read(file)
 
 
@@ -78,7 +94,7 @@ def _recognise(file: Path, description: str | Path | None) -> str:
         if candidate.recognises(file):
             return name
     if file.suffix.lower() == ".mat":
-        if description is not None or file.with_suffix(".toml").is_file():
+        if description is not None or eidors.find_description(file) is not None:
             return "eidors"
         raise ValueError(
             f"{file.name} is a .mat file of no known kind; it holds "
@@ -86,7 +102,5 @@ def _recognise(file: Path, description: str | Path | None) -> str:
             f"{eidors.DESCRIPTION}."
         )
     raise ValueError(
-        f"{file.name}: files ending in '{file.suffix}' are of no known format. Known: "
-        + "; ".join(f"{name}: {candidate.summary}" for name, candidate in FORMATS.items())
-        + "."
+        f"{file.name}: files ending in '{file.suffix}' are of no known format. Known: " + f"{', '.join(FORMATS)}."
     )

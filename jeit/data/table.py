@@ -11,6 +11,7 @@ import numpy as np
 from jeit.arguments import listed
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.description import Description, TableLayout, load_description
+from jeit.data.measured_patterns import frames_of
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.files import check_memory, npy_array, npz_arrays
@@ -19,7 +20,7 @@ from jeit.protocol import Protocol
 DESCRIPTION = "table (.csv, .txt, .npy, .npz) with a TOML description beside it"
 SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
 # What `write_table` puts beside the voltages and the protocol.
-_WORDS = ("mask", "protocol_name", "frame_names", "notes")
+_WORDS = ("mask", "protocol_name", "frame_names", "notes", "times")
 # Bytes in memory of a number of two letters, twice: as rows, and as the table that they make.
 _IN_MEMORY = 8
 
@@ -63,14 +64,20 @@ def read(path: Path, description: str | Path | None = None, like: Measurement | 
     if path.suffix.lower() in (".npz", ".npy"):
         arrays = _from_numpy(path, described.layout.keys)
         table, mask, protocol = _voltages(arrays, described.layout, path), arrays.get("mask"), None
+        if table.ndim == 3 or described.patterns_measured:
+            table = frames_of(table, described.layout.axes, path.name)
         if described.protocol_section is None:
             protocol = _own_protocol(arrays)
-        described = _with_words(described, arrays)
+        described, times = _with_words(described, arrays), _times(arrays, path.name)
     else:
-        table, mask, protocol = _from_text(path, described.layout), None, None
+        table, mask, protocol, times = _from_text(path, described.layout), None, None, None
     if which is None and like is not None:
         protocol = protocol or like.protocol
-    return measurement_from(path, described, frames_from(table, described.layout, path.name), protocol, mask)
+    frames = frames_from(table, described.layout, path.name)
+    measurement = measurement_from(path, described, frames, protocol, mask)
+    if times is None or described.layout.averaged or described.layout.frame_rate is not None:
+        return measurement
+    return replace(measurement, times=times)
 
 
 def _borrowed(like: Measurement) -> Description:
@@ -106,7 +113,7 @@ def measurement_from(
             f"{described.origin}: [data] frame_names must be as many as the frames of {path.name}, {number}; they are "
             f"{len(names)}."
         )
-    return screen(
+    measurement = screen(
         frames * described.layout.scale,
         protocol,
         electrodes=described.electrodes,
@@ -118,6 +125,11 @@ def measurement_from(
         frame_names=names,
         notes=described.notes,
     )
+    if described.layout.averaged:
+        note = f"the mean of {measurement.num_frames} frames."
+        return replace(measurement.mean_frame(), notes=(*measurement.notes, note))
+    rate = described.layout.frame_rate
+    return measurement if rate is None else replace(measurement, times=np.arange(number) / rate)
 
 
 def numbers(path: Path, layout: TableLayout) -> np.ndarray:
@@ -220,6 +232,14 @@ def _with_words(described: Description, arrays: dict[str, np.ndarray]) -> Descri
     names = described.layout.frame_names or _texts(arrays, "frame_names")
     notes = (*described.notes, *_texts(arrays, "notes"))
     return replace(described, layout=replace(described.layout, frame_names=names), notes=notes)
+
+
+def _times(arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
+    """Of a file of `write_table`, if it has them."""
+    times = arrays.get("times")
+    if times is not None and times.dtype.kind not in "iuf":
+        raise ValueError(f"{name}: 'times' holds {times.dtype}; give seconds.")
+    return times
 
 
 def _texts(arrays: dict[str, np.ndarray], name: str) -> tuple[str, ...]:

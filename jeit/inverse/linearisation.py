@@ -65,7 +65,8 @@ class Linearisation(eqx.Module):
             directions = data_directions(model.protocol, channels, root_weight)
             reduced: Any = combined_jacobian(model, conductivity, channels, (root_weight[:, None] * directions).T)
             product = prior.covariance_product(model.mesh, reduced.conj())
-            spectrum = Spectrum.create(reduced, product, prior.null_space(model.mesh), as_array(directions))
+            repeated, free = model.protocol.repeated_facts(channels), prior.null_space(model.mesh)
+            spectrum = Spectrum.create(reduced, product, free, repeated, as_array(directions))
         else:
             jacobian = model.jacobian(conductivity)
             directions = _traced_directions(model.protocol, channels, root_weight)

@@ -9,6 +9,7 @@ from jeit.mesh.generate import unstructured
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import check_length
+from jeit.mesh.prisms import stacked_cells, stacked_wall
 from jeit.mesh.shapes import disk, rectangle
 
 # In a solid 'bottom' and 'top' are the faces across z, so the sides of a rectangle across y get new names.
@@ -27,6 +28,10 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
     neighbours agree. Raises `ValueError` on a solid mesh, a thickness that is not positive, no layers, or
     heights that do not rise from 0 to the thickness.
     """
+    if mesh.is_surface:
+        raise ValueError(
+            "mesh: this one is a surface in space; what has a thickness above it is a shell, jeit.mesh.shell."
+        )
     if mesh.dimension != 2:
         raise ValueError("mesh: a layer is made from a plane (2-D) mesh, this one is 3-D.")
     thickness = check_length("thickness", thickness)
@@ -37,23 +42,10 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
     unstructured.check_total(count * (num_layers + 1), "num_layers")
     points = np.column_stack([np.tile(plane, (num_layers + 1, 1)), np.repeat(levels, count)])
 
-    a, b, c = np.sort(cells.astype(np.int64), axis=1).T
-    up = count
-    prism = np.stack(
-        [
-            np.stack([a, b, c, c + up], axis=1),
-            np.stack([a, b, b + up, c + up], axis=1),
-            np.stack([a, a + up, b + up, c + up], axis=1),
-        ],
-        axis=1,
-    ).reshape(-1, 4)
-    solid = np.concatenate([prism + k * count for k in range(num_layers)])
+    solid = stacked_cells(cells, count, num_layers)
 
     def side(edges: np.ndarray) -> np.ndarray:
-        low, high = np.sort(edges.astype(np.int64), axis=1).T
-        lower = np.stack([low, high, high + up], axis=1)
-        upper = np.stack([low, low + up, high + up], axis=1)
-        return np.concatenate([face + k * count for k in range(num_layers) for face in (lower, upper)])
+        return stacked_wall(edges, count, num_layers)
 
     tags: dict[str, ArrayLike] = {"bottom": cells, "top": cells + num_layers * count, "side": side(facets)}
     for name, index in mesh.tags.items():

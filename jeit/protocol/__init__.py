@@ -1,6 +1,7 @@
 """Protocols: which currents are driven and which voltages are read, as matrices with names and units."""
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
+from jeit.protocol.all_at_once import haar, optimal, trigonometric
 from jeit.protocol.matrices import from_channels, from_matrices
 from jeit.protocol.patterns import (
     adjacent,
@@ -9,9 +10,9 @@ from jeit.protocol.patterns import (
     opposite,
     reference_electrode,
     skip,
-    trigonometric,
     two_terminal,
 )
+from jeit.protocol.potentials import measurement_patterns
 from jeit.protocol.protocol import Protocol
 
 _tell_old_names(__name__)
@@ -23,7 +24,10 @@ __all__ = [
     "bipolar",
     "from_channels",
     "from_matrices",
+    "haar",
+    "measurement_patterns",
     "opposite",
+    "optimal",
     "reference_electrode",
     "skip",
     "trigonometric",

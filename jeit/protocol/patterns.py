@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jeit.protocol._check import check_choice, check_count, check_current, check_pairs, electrode_indices
-from jeit.protocol.matrices import from_matrices
 from jeit.protocol.pairs import CrossedPairs, Current, Order, Reciprocal, pair_patterns, ring_pairs
 from jeit.protocol.protocol import Protocol
 
@@ -216,36 +215,6 @@ def two_terminal(
         measurement_index=channels,
         name=f"two-terminal, {len(chosen)} pairs, {count} electrodes",
     )
-
-
-def trigonometric(
-    num_electrodes: int,
-    *,
-    measurement: Literal["adjacent", "mean"] = "adjacent",
-    current: Current = 1e-3,
-) -> Protocol:
-    """Sinusoidal currents in all electrodes at once: L - 1 drives, L(L - 1) channels.
-
-    Drives are cos(θ), sin(θ), cos(2θ), sin(2θ), ... with θ = 2πl/L and amplitude `current` in amperes: the
-    patterns that best tell a centred inclusion in a disk (Isaacson 1986; Gisser, Isaacson and Newell 1988).
-    16 electrodes: 240.
-
-    - `measurement`: "adjacent" reads each electrode against the next; "mean" against the mean of all others.
-
-    Raises `ValueError` for a bad count, current or option.
-    """
-    count = check_count(num_electrodes, "trigonometric", 3)
-    check_current(current, "trigonometric")
-    check_choice(measurement, ("adjacent", "mean"), "trigonometric", "measurement")
-    angle = 2 * np.pi * np.arange(count) / count
-    waves = [wave(k * angle) for k in range(1, count // 2 + 1) for wave in (np.cos, np.sin)]
-    drive = np.array(waves[: count - 1])
-    drive -= drive.mean(axis=1, keepdims=True)  # the last rounding errors of Kirchhoff's law
-    if measurement == "adjacent":
-        rows = pair_patterns(ring_pairs(count, 1), count)
-    else:
-        rows = np.eye(count) - (1 - np.eye(count)) / (count - 1)
-    return from_matrices(current * drive, rows, name=f"trigonometric, {measurement} measurement, {count} electrodes")
 
 
 def bipolar(

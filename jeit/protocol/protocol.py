@@ -155,6 +155,28 @@ class Protocol(eqx.Module):
             name=f"{self.name}, {channels.size} of {self.num_measurements} channels",
         )
 
+    def repeated_facts(self, channels: ArrayLike | None = None) -> int:
+        """How many channels, of all or of these (K,) indices, say nothing that others of their drive do not say.
+
+        Where readings are computed from the potentials of many electrodes, less their mean say, L of them hold L - 1
+        facts, and their noise as many. Where a drive is read by differences of two electrodes alone, these are taken
+        for measured one by one, each with noise of its own, though they may close a ring.
+        """
+        rows = np.asarray(self.measurement)
+        kept = np.arange(self.num_measurements) if channels is None else np.asarray(channels)
+        drive, reading = np.asarray(self.drive_index)[kept], np.asarray(self.measurement_index)[kept]
+        if not (np.count_nonzero(rows, axis=1) > 2).any():
+            return 0
+        repeated, known = 0, {}
+        for one in np.unique(drive):
+            read = np.sort(reading[drive == one])
+            key = read.tobytes()
+            if key not in known:
+                several = (np.count_nonzero(rows[read], axis=1) > 2).any()
+                known[key] = len(read) - int(np.linalg.matrix_rank(rows[read], tol=1e-9)) if several else 0
+            repeated += known[key]
+        return repeated
+
     def reciprocal_pairs(self) -> tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
         """Pairs of channels that reciprocity ties together, and the ratio of their voltages.
 

@@ -151,7 +151,10 @@ def test_the_file_that_the_bad_ones_were_made_from_is_good(tmp_path):
 @pytest.mark.parametrize(
     ("options", "lesson"),
     [
-        ({"format": "xlsx"}, "kit4, ktc2023, eidors, table, tank6cm"),
+        (
+            {"format": "xlsx"},
+            "kit4, ktc2023, eidors, sciospec, draeger, carefusion, swisstom, goettingen, table, tank6cm",
+        ),
         ({"format": "kit4"}, "not a readable .mat"),
         ({"format": "tank6cm", "description": "other.toml"}, "describes itself"),
         ({"description": "absent.toml"}, "no such file"),

@@ -1,6 +1,7 @@
 """The readers on files written here, so that they are tested where no measured data are."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -141,6 +142,8 @@ KINDS = {
     "reference_electrode": {"current": 1e-3},
     "two_terminal": {"pairs": [[0, 1], [3, 4]], "current": 1e-3},
     "trigonometric": {"measurement": "mean", "current": 1e-3},
+    "haar": {"measurement": "against", "reference": 2, "current": 1e-3},
+    "optimal": {"transfer": [[2, -1, -1], [-1, 2, -1], [-1, -1, 2]], "drives": 1, "current": 1, "current_unit": "mA"},
     "bipolar": {"drive_pairs": [[0, 1]], "measurement_pairs": [[2, 3], [4, 5]], "current": 1e-3},
     "matrices": {"drive": [[1e-3, -1e-3, 0]], "measurement": [[0, 1, -1], [1, 0, -1]]},
     "channels": {
@@ -155,11 +158,11 @@ KINDS = {
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_protocol_can_be_described(tmp_path, kind):
     lines = [f'kind = "{kind}"', *(f"{key} = {json.dumps(value)}" for key, value in KINDS[kind].items())]
-    number = [] if kind in ("matrices", "channels") else ["number = 8"]
+    number = [] if kind in ("matrices", "channels", "optimal") else ["number = 8"]
     (tmp_path / "p.toml").write_text("\n".join(["[protocol]", *lines, *number]), "utf-8")
     made = data.load_description(tmp_path / "p.toml").protocol(tmp_path / "p.csv")
     assert made is not None
-    assert made.num_electrodes == {"matrices": 3, "channels": 3, "reference_electrode": 9}.get(kind, 8)
+    assert made.num_electrodes == {"matrices": 3, "channels": 3, "optimal": 3, "reference_electrode": 9}.get(kind, 8)
 
 
 def test_round_trip(tmp_path, tank, setup):
@@ -241,3 +244,38 @@ def test_round_trip_of_other_shapes(tmp_path, tank, shape):
         np.testing.assert_array_equal(loop, wanted)
     assert type(again.electrodes) is type(electrodes)
     np.testing.assert_array_equal(again.electrodes.position, position)
+
+
+def test_times_are_kept(tmp_path, tank, setup):
+    """By selections, and by what is written; an average has none."""
+    chosen = protocol.adjacent(8)
+    times = np.array([0.0, 0.02, 0.04, 0.07])
+    made = replace(data.screen(np.stack([k * tank(chosen) for k in range(1, 5)]), chosen, **setup(8)), times=times)
+    assert made.frame_rate == pytest.approx(3 / 0.07)
+    data.write_table(made, tmp_path / "out.npz")
+    again = data.read(tmp_path / "out.npz")
+    np.testing.assert_array_equal(again.times, times)
+    np.testing.assert_array_equal(again.frames([1, 3]).times, times[[1, 3]])
+    np.testing.assert_array_equal(again.frames(slice(2, None)).voltages, made.voltages[2:])
+    np.testing.assert_array_equal(again.frames(times > 0.03).times, times[2:])
+    np.testing.assert_array_equal(again.frame(-1).times, times[-1:])
+    np.testing.assert_array_equal(again.masked(np.ones(40, bool), "no reason.").times, times)
+    assert again.frame(0).frame_rate is None
+    assert again.mean_frame().times is None
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [([0, 1], "each of 3 frames"), ([0, 1, 1], "rise from frame to frame"), ([0, 1, np.nan], "must be finite")],
+)
+def test_bad_times(tank, times, message):
+    chosen = protocol.adjacent(8)
+    with pytest.raises(ValueError, match=message):
+        replace(data.screen(np.stack([tank(chosen)] * 3), chosen), times=times)
+
+
+@pytest.mark.parametrize("which", [[], [2, 1], [0, 3], [0.5], np.ones(4, bool), slice(3, None)])
+def test_frames_that_are_not_there(tank, which):
+    chosen = protocol.adjacent(8)
+    with pytest.raises(ValueError, match="which: "):
+        data.screen(np.stack([tank(chosen)] * 3), chosen).frames(which)

@@ -12,8 +12,11 @@ import numpy as np
 import scipy.io
 import scipy.io.wavfile
 
-sys.path += [str(Path(__file__).parents[1] / room) for room in ("", "acoustic", "touch/gestures", "touch/listening")]
+sys.path += [
+    str(Path(__file__).parents[1] / room) for room in ("", "acoustic", "data", "touch/gestures", "touch/listening")
+]
 
+from instrument_files import write_carefusion, write_draeger, write_get, write_sciospec, write_swisstom
 from made_clips import MATERIALS, struck
 from made_skins import record
 from made_touches import touches
@@ -198,6 +201,36 @@ def _eidors(folder):
     scipy.io.savemat(folder / "a.mat", held)
 
 
+@_reader("measured patterns", "a.mat", data.read)
+def _patterns(folder):
+    rng = np.random.default_rng(0)
+    current, voltages = 1e-3 * rng.normal(size=(8, 7)), rng.normal(size=(8, 7, 3))
+    current -= current.mean(axis=0)
+    held = {"current_patterns": current, "frame_voltage": voltages - voltages.mean(axis=0)}
+    scipy.io.savemat(folder / "a.mat", held, do_compression=True)
+    driven = BODY.replace('kind = "adjacent"\ncurrent = 1e-3', 'kind = "measured"')
+    said = driven.replace('frame_names = ["a", "b"]', 'keys = ["frame_voltage"]\nframe_rate = 5.0')
+    (folder / "a.toml").write_text(said)
+
+
+def _instrument(name, suffix, number, make):
+    def made(folder):
+        make(folder / f"a{suffix}")
+        (folder / "a.toml").write_text(BODY.partition("[protocol]")[0].replace("number = 8", f"number = {number}"))
+
+    _reader(name, f"a{suffix}", data.read)(made)
+
+
+_ADJACENT = 1.0 + np.random.default_rng(0).random((2, 208))
+_instrument("draeger", ".eit", 16, lambda path: write_draeger(path, _ADJACENT))
+_instrument("goettingen", ".get", 16, lambda path: write_get(path, _ADJACENT, text=True))
+_instrument("carefusion", ".eit", 16, lambda path: write_carefusion(path, _ADJACENT))
+_instrument(
+    "swisstom", ".eit", 32, lambda path: write_swisstom(path, np.random.default_rng(0).random((2, 32, 32)), [0, 20_000])
+)
+_instrument("sciospec", ".eit", 8, lambda path: write_sciospec(path, np.array([np.eye(8)] * 2), [(1, 3), (2, 4)]))
+
+
 @_reader("frames", "a.npz", read_frame_recording)
 def _frames(folder):
     rng = np.random.default_rng(0)
@@ -330,6 +363,31 @@ def _mesh():
 @_reader("mesh, msh", "a.msh", read_mesh)
 def _msh(folder):
     write_mesh(_mesh(), folder / "a.msh")
+
+
+def _tetrahedron() -> tuple[np.ndarray, np.ndarray]:
+    return np.eye(4)[:, :3] * 0.1, np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]])
+
+
+@_reader("mesh, stl", "a.stl", read_mesh)
+def _stl(folder: Path) -> None:
+    points, cells = _tetrahedron()
+    records = [bytes(12) + one.astype("<f4").tobytes() + bytes(2) for one in points[cells]]
+    (folder / "a.stl").write_bytes(bytes(80) + len(records).to_bytes(4, "little") + b"".join(records))
+
+
+@_reader("mesh, stl text", "a.stl", read_mesh)
+def _stl_text(folder: Path) -> None:
+    points, cells = _tetrahedron()
+    lines = [f"vertex {x} {y} {z}" for x, y, z in points[cells].reshape(-1, 3)]
+    (folder / "a.stl").write_text("\n".join(["solid a", *lines, "endsolid a"]))
+
+
+@_reader("mesh, obj", "a.obj", read_mesh)
+def _obj(folder: Path) -> None:
+    points, cells = _tetrahedron()
+    lines = [f"v {x} {y} {z}" for x, y, z in points] + [f"f {a}//1 {b}//1 {c}//1" for a, b, c in cells + 1]
+    (folder / "a.obj").write_text("\n".join(lines))
 
 
 @_reader("mesh, vtu", "a.vtu", read_mesh)

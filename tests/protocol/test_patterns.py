@@ -26,6 +26,9 @@ PROTOCOLS = {
     "two-terminal, chosen": (protocol.two_terminal(32, [(k, (k + 5) % 32) for k in range(32)]), 32),
     "trigonometric 16": (protocol.trigonometric(16), 240),
     "trigonometric 7, mean": (protocol.trigonometric(7, measurement="mean"), 42),
+    "trigonometric 7, mean removed": (protocol.trigonometric(7, measurement="mean-removed"), 42),
+    "haar 32": (protocol.haar(32), 31 * 32),  # ACT 5's: 31 patterns, 32 potentials
+    "haar 11, against the last": (protocol.haar(11, measurement="against"), 10 * 10),
     "bipolar": (protocol.bipolar(4, [(0, 1), (2, 3)], [(0, 1), (2, 3), (1, 2)]), 2),
 }
 

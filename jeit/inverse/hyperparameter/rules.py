@@ -31,7 +31,9 @@ def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mes
     """
     candidates, data = spectrum.candidates(), _needed(data, "gcv")
     residual, penalty = spectrum.curves(data, candidates)
-    score = len(data) * residual**2 / _filters(spectrum, candidates).sum(axis=1) ** 2
+    # What is repeated is left in no residual, and would be counted among what is: its filter is 1.
+    number = len(data) - spectrum.repeated
+    score = number * residual**2 / (_filters(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
     return Choice.among("gcv", candidates, int(np.argmin(score)), score, (residual, penalty))
 
 
@@ -44,7 +46,7 @@ def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = 
     """
     candidates, data = spectrum.candidates(), _needed(data, "discrepancy")
     components = abs(adjoint(np.asarray(spectrum.basis)) @ data)
-    freedom = len(components) * (2 if np.iscomplexobj(data) else 1)
+    freedom = spectrum.freedom * (2 if np.iscomplexobj(data) else 1)
     residual, penalty = spectrum.curves(data, candidates)
     criterion = residual / np.sqrt(freedom)
     inside = np.flatnonzero(criterion <= noise)
@@ -87,7 +89,7 @@ def noise_figure(
     gain = spectrum.squared_modes()
     passed = gain / (eigenvalues + candidates[:, None] ** 2) ** 2
     image = passed @ eigenvalues / passed.sum(axis=1)
-    figure = np.sqrt(eigenvalues.mean() / image)
+    figure = np.sqrt(eigenvalues.sum() / spectrum.freedom / image)
     return Choice.among(
         "noise-figure",
         candidates,

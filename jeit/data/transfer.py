@@ -1,0 +1,78 @@
+"""The transfer impedance behind a measurement, and what the same body would read under other patterns.
+
+L electrodes have a symmetric Z (L, L) with rows that sum to zero: L (L - 1) / 2 numbers. Any set of patterns that
+determines it, L - 1 independent currents on all electrodes say, tells what every other set would read.
+"""
+
+import numpy as np
+import scipy.linalg
+from jaxtyping import Inexact
+
+from jeit.data.measurement import Measurement
+from jeit.files import check_memory
+from jeit.protocol import Protocol
+
+# Of the largest singular value: what is smaller is not measured.
+_UNKNOWN = 1e-9
+# Copies of the equations while they are solved.
+_COPIES = 4
+
+
+def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]:
+    """The transfer impedance of every frame, (F, L, L) ohm: potentials of all electrodes, less their mean, for a unit
+    current in each.
+
+    The symmetric one that fits the usable voltages best by least squares. Raises `ValueError` where they leave some of
+    it open: with too few patterns, or without the voltages of driven electrodes.
+    """
+    protocol, count = measurement.protocol, measurement.protocol.num_electrodes
+    basis = scipy.linalg.null_space(np.ones((1, count)))
+    rows, columns = np.triu_indices(count - 1)
+    check_memory(f"the transfer impedance of '{measurement.name}'", 8 * _COPIES * len(rows) * measurement.num_channels)
+    drive, reading = np.asarray(protocol.channel_drive) @ basis, np.asarray(protocol.channel_measurement) @ basis
+    forms = drive[:, rows] * reading[:, columns] + np.where(rows == columns, 0, drive[:, columns] * reading[:, rows])
+    size = np.abs(drive).max()
+    voltages, masks = np.asarray(measurement.filled()), np.asarray(measurement.mask)
+    found = np.empty((measurement.num_frames, count, count), voltages.dtype)
+    for mask in np.unique(masks, axis=0):
+        inverse = np.linalg.pinv(forms[mask] / size, rcond=_UNKNOWN) / size
+        if np.linalg.norm(inverse @ forms[mask] - np.eye(len(rows))) > 1e-6 * len(rows):
+            raise ValueError(
+                f"'{measurement.name}': its {int(mask.sum())} usable channels leave the transfer impedance open, "
+                f"{len(rows)} numbers. It takes {count - 1} independent currents, read on all electrodes."
+            )
+        for frame in np.flatnonzero((masks == mask).all(axis=1)):
+            upper = np.zeros((count - 1, count - 1), voltages.dtype)
+            upper[rows, columns] = inverse @ voltages[frame, mask]
+            found[frame] = basis @ (upper + np.triu(upper, 1).T) @ basis.T
+    return found
+
+
+def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
+    """The same frames as another `protocol` on the same electrodes would have read them.
+
+    For a reference that was measured with other currents than the frames. Noise is carried along: where the patterns
+    measured hardly tell what the others read, it grows. Raises `ValueError` for another number of electrodes, and as
+    `transfer_impedance`.
+    """
+    if protocol.num_electrodes != measurement.protocol.num_electrodes:
+        raise ValueError(
+            f"protocol has {protocol.num_electrodes} electrodes, and '{measurement.name}' "
+            f"{measurement.protocol.num_electrodes}; both must be of the same body."
+        )
+    drive, reading = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
+    impedance = transfer_impedance(measurement)
+    voltages = np.stack([np.einsum("km,km->k", reading @ one, drive) for one in impedance])
+    note = f"measured with '{measurement.protocol.name}', and turned into what '{protocol.name}' reads."
+    return Measurement(
+        voltages,
+        np.ones(voltages.shape, bool),
+        protocol,
+        electrodes=measurement.electrodes,
+        domain=measurement.domain,
+        name=measurement.name,
+        source=measurement.source,
+        frame_names=measurement.frame_names,
+        notes=(*measurement.notes, note),
+        times=measurement.times,
+    )

@@ -1,0 +1,49 @@
+"""Where a picture in space is seen from, and the light on what is seen."""
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.arguments import is_number, told
+
+# Over the left shoulder of who looks: to the right and up on the page, and towards the viewer.
+_LIGHT = np.array([-0.35, 0.5, 0.79])
+_DARKEST = 0.66
+
+
+class Camera:
+    """A direction to look from, far away, so that lengths across it are true and one scale bar is right everywhere.
+
+    **Fields**: `toward`, `right`, `up` (3,): unit vectors to the viewer, and to the right and up on the page.
+    """
+
+    def __init__(self, azimuth: float = -60.0, elevation: float = 25.0):
+        """`azimuth`: degrees round z from the x axis towards y, where the viewer stands; `elevation`: degrees above the
+        plane z = 0. −90 and 0 look at the front, along y; elevation 90 looks down. Raises `ValueError`."""
+        for name, value in (("azimuth", azimuth), ("elevation", elevation)):
+            if not is_number(value):
+                raise ValueError(f"{name} must be an angle in degrees; it is {told(value)}.")
+        if not -90 <= elevation <= 90:
+            raise ValueError(f"elevation must lie between −90 (from below) and 90 degrees; it is {elevation:g}.")
+        round_z, above = np.radians(azimuth), np.radians(elevation)
+        self.toward = np.array([np.cos(above) * np.cos(round_z), np.cos(above) * np.sin(round_z), np.sin(above)])
+        self.right = np.array([-np.sin(round_z), np.cos(round_z), 0.0])
+        self.up = np.cross(self.toward, self.right)
+
+    def on_page(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
+        """Places (…, 3) as seen, metres to the right and up."""
+        return np.stack([points @ self.right, points @ self.up], axis=-1)
+
+    def nearness(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+        """How far places (…, 3) are towards the viewer, metres."""
+        return points @ self.toward
+
+    def light(self, normals: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
+        """Brightness (m,), from dark to 1, of surfaces with these normals (any length), lit from both sides alike."""
+        length = np.maximum(np.linalg.norm(normals, axis=-1), 1e-300)
+        direction = normals / length[:, None]
+        direction = direction * np.where(direction @ self.toward < 0, -1.0, 1.0)[:, None]
+        lamp = _LIGHT[0] * self.right + _LIGHT[1] * self.up + _LIGHT[2] * self.toward
+        return _DARKEST + (1 - _DARKEST) * np.clip(direction @ lamp / np.linalg.norm(lamp), 0, 1)
+
+
+FROM_THE_CORNER = Camera()

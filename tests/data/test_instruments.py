@@ -1,0 +1,231 @@
+"""Files of instruments: what is written by the published description comes back, in order, and nothing breaks."""
+
+import numpy as np
+import pytest
+from instrument_files import (
+    adjacent_channels,
+    adjacent_voltages,
+    write_carefusion,
+    write_draeger,
+    write_get,
+    write_sciospec,
+    write_swisstom,
+)
+
+from jeit import data, protocol
+from jeit.data.quality import impossible_signs
+from jeit.data.registry import FORMATS
+
+RING = (
+    '[geometry]\nshape = "disk"\nradius = 0.1\n[electrodes]\nlayout = "ring"\nwidth = 0.01\ncontact_impedance = 0.01\n'
+)
+
+
+def impedance(number, seed=0):
+    """Of a disk with small electrodes and something in it, symmetric, rows summing to zero."""
+    angle = 2 * np.pi * np.arange(number) / number
+    place = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    distance = np.linalg.norm(place[:, None] - place, axis=-1) + np.eye(number) * 0.05
+    made = -30 * np.log(distance)
+    bump = np.exp(-((place - [0.3, 0.9]) ** 2).sum(axis=1)) * (1 + 0.1 * seed)
+    made = made + 2 * np.outer(bump, bump)
+    keep = np.eye(number) - 1 / number
+    return keep @ made @ keep
+
+
+def frames(count=3):
+    return np.array([adjacent_voltages(impedance(16, seed)) for seed in range(count)])
+
+
+ADJACENT = {
+    "draeger": ("a.eit", write_draeger, 20.0),
+    "draeger, 32": ("a.eit", lambda path, made: write_draeger(path, made, version=0x20, rate="50"), 50.0),
+    "goettingen": ("a.get", write_get, None),
+    "goettingen, with text": ("a.get", lambda path, made: write_get(path, made, text=True), None),
+    "carefusion": ("a.eit", write_carefusion, None),
+}
+
+
+@pytest.mark.parametrize("kind", ADJACENT)
+def test_adjacent_voltages_come_back_in_order(kind, tmp_path):
+    name, write, rate = ADJACENT[kind]
+    made = frames()
+    write(tmp_path / name, made)
+    (tmp_path / "a.toml").write_text(RING + "number = 16\n")
+    found = data.read(tmp_path / name)
+    exact = 1e-6 if name.endswith(".get") or kind == "carefusion" else 1e-12  # numbers of four bytes
+    np.testing.assert_allclose(found.voltages, -made, rtol=exact)
+    drives, reads = np.asarray(found.protocol.channel_drive), np.asarray(found.protocol.channel_measurement)
+    for channel, (p, q, r, s) in enumerate(adjacent_channels()):
+        assert [drives[channel].argmax(), drives[channel].argmin()] == [p, q]
+        assert [reads[channel].argmax(), reads[channel].argmin()] == [r, s]
+    assert data.reciprocity_error(found) < 10 * exact
+    assert impossible_signs(found).max() == 0
+    assert found.frame_rate == (None if rate is None else pytest.approx(rate))
+    assert any("not" in note for note in found.notes)
+
+
+def test_channels_that_reciprocity_repeats_may_be_left_out(tmp_path):
+    made = frames()
+    later = [(p, r) for p, _, r, _ in adjacent_channels()]
+    made[:, [r < p for p, r in later]] = 0
+    write_get(tmp_path / "a.get", made)
+    found = data.read(tmp_path / "a.get")
+    assert np.asarray(found.mask).sum(axis=1).tolist() == [104] * 3
+    assert any("104 of 208 channels were not measured" in note for note in found.notes)
+
+
+def test_swisstom(tmp_path):
+    made = np.array([1e-3 * impedance(32, seed) * (1 + 0.1j) for seed in range(3)])
+    times = np.array([2**32 - 30_000, 2**32 - 10_000, 2**32 + 10_000])  # the counter goes round
+    write_swisstom(tmp_path / "a.eit", made, times)
+    (tmp_path / "a.toml").write_text(RING + 'number = 32\n[data]\ncomponent = "complex"\n')
+    found = data.read(tmp_path / "a.eit")
+    expected = protocol.skip(32, 4, current=5e-3, driven_electrodes=True, order="fixed")
+    assert found.protocol.same_patterns(expected)
+    drives, reads = np.asarray(expected.channel_drive), np.asarray(expected.channel_measurement)
+    voltages = np.array([np.einsum("kl,lm,km->k", reads, one, drives) for one in made])
+    mask = np.asarray(found.mask)
+    np.testing.assert_array_equal(mask[0], ~expected.channels_on_driven_electrodes())
+    np.testing.assert_allclose(found.voltages[mask], voltages[mask], atol=1e-11)
+    assert found.frame_rate == pytest.approx(50)
+    assert data.reciprocity_error(found) < 1e-6
+
+
+PAIRS = [(k + 1, (k + 3) % 8 + 1) for k in range(8)]
+
+
+@pytest.mark.parametrize("header", [9, 11, 18])
+def test_sciospec(tmp_path, header):
+    made = np.array([impedance(8) * (1 - 0.2j), impedance(8, 1) * (1 - 0.1j)])
+    write_sciospec(tmp_path / "a.eit", made, PAIRS, header=header, spare=24 if header == 18 else 0)
+    (tmp_path / "a.toml").write_text(RING + 'number = 8\n[data]\ncomponent = "complex"\n')
+    found = data.read(tmp_path / "a.eit")
+    assert found.frame_names == ("1000 Hz", "10000 Hz")
+    assert found.protocol.num_electrodes == 8
+    expected = 1e-3 * made[1] @ (np.eye(8)[2] - np.eye(8)[5])
+    np.testing.assert_allclose(found.voltages[1].reshape(8, 8)[2], expected, atol=1e-10)
+    assert data.reciprocity_error(found) < 1e-7
+
+
+def test_sciospec_differences_and_polarity(tmp_path):
+    """The current enters where the potential is higher, whatever the order of the pair."""
+    made = impedance(8)[None]
+    write_sciospec(tmp_path / "a.eit", made, PAIRS)
+    write_sciospec(tmp_path / "b.eit", -made, PAIRS)
+    (tmp_path / "description.toml").write_text(
+        RING + 'number = 8\n[protocol]\nkind = "measured"\nmeasurement = "adjacent"\n'
+    )
+    one, two = data.read(tmp_path / "a.eit"), data.read(tmp_path / "b.eit")
+    assert not any("second electrode" in note for note in one.notes)
+    assert any("second electrode" in note for note in two.notes)
+    np.testing.assert_array_equal(one.protocol.drive, -np.asarray(two.protocol.drive))
+    expected = 1e-3 * (made[0] - np.roll(made[0], -1, axis=0)) @ (np.eye(8)[0] - np.eye(8)[3])
+    np.testing.assert_allclose(one.voltages[0, :8], expected, atol=1e-10)
+    assert impossible_signs(one.without_driven_channels()).max() == 0
+
+
+def test_a_folder_of_sciospec_files_is_a_series(tmp_path):
+    for number in range(4):
+        write_sciospec(
+            tmp_path / f"setup_{number:05d}.eit",
+            impedance(8, number)[None],
+            PAIRS,
+            date=f"2020.01.02. 10:00:00.{50 * number:03d}",
+        )
+    found = data.read(tmp_path)
+    assert found.num_frames == 4
+    assert found.frame_rate == pytest.approx(20, rel=1e-4)
+    np.testing.assert_allclose(
+        found.voltages[3].reshape(8, 8)[0], 1e-3 * impedance(8, 3) @ (np.eye(8)[0] - np.eye(8)[3]), atol=1e-10
+    )
+
+
+def test_join_takes_one_set_up_only(tank):
+    one, two = (data.screen(tank(made), made) for made in (protocol.adjacent(8), protocol.opposite(8)))
+    with pytest.raises(ValueError, match="is read otherwise"):
+        data.join([one, two])
+    with pytest.raises(ValueError, match="there is none"):
+        data.join([])
+    assert data.join([one, one]).num_frames == 2
+
+
+def test_each_is_known_by_its_content(tmp_path):
+    made, small = frames(), impedance(8)[None]
+    writers = {
+        "draeger": lambda path: write_draeger(path, made),
+        "carefusion": lambda path: write_carefusion(path, made),
+        "swisstom": lambda path: write_swisstom(path, [1e-3 * impedance(32)], [0]),
+        "sciospec": lambda path: write_sciospec(path, small, PAIRS),
+    }
+    for name, write in writers.items():
+        write(tmp_path / "a.eit")
+        assert [one for one in FORMATS if FORMATS[one].recognises(tmp_path / "a.eit")] == [name]
+
+
+def test_a_last_frame_that_is_cut_off_is_left_out_and_said(tmp_path):
+    write_draeger(tmp_path / "a.eit", frames(), cut=100)
+    found = data.read(tmp_path / "a.eit")
+    assert found.num_frames == 2
+    assert any("cut off, and left out (5395 bytes)" in note for note in found.notes)
+
+
+def changed(write, at, new):
+    def make(path):
+        write(path)
+        content = bytearray(path.read_bytes())
+        content[at : at + len(new)] = new
+        path.write_bytes(content)
+
+    return make
+
+
+def dragged(path):
+    write_draeger(path, frames(1))
+
+
+def swiss(path):
+    write_swisstom(path, [1e-3 * impedance(32)], [0])
+
+
+def text(old, new):
+    def make(path):
+        write_sciospec(path, impedance(8)[None], PAIRS)
+        content = path.read_text()
+        assert old in content
+        path.write_text(content.replace(old, new, 1))
+
+    return make
+
+
+FAULTS = {
+    "dräger, another version": (changed(dragged, 0, b"\x1f"), "format 31"),
+    "dräger, header beyond the end": (changed(dragged, 4, b"\xff\xff\xff\x7f"), "beyond its end"),
+    "dräger, negative header": (changed(dragged, 4, b"\x00\x00\x00\x80"), "beyond its end"),
+    "dräger, no rate": (lambda path: write_draeger(path, frames(1), rate="none"), "no 'Framerate"),
+    "dräger, no frame": (lambda path: write_draeger(path, frames(1), cut=5000), "no whole frame"),
+    "swisstom, another version": (changed(swiss, 0, b"\0\0\0\3"), "not known; format 4 is"),
+    "swisstom, header beyond the end": (changed(swiss, 4, b"\xff\xff\xff\x7f"), "beyond its end"),
+    "swisstom, a frame of negative length": (changed(swiss, 64 + 12, b"\xff\xff\xff\xff"), "damaged"),
+    "carefusion, no header": (
+        lambda path: path.write_bytes(b"\xff\xfe" + '<?xml version="1.0" ?><EIT_File>'.encode("utf-16-le")),
+        "does not say where",
+    ),
+    "sciospec, a long header": (text("18\n", "60\n"), "60 lines"),
+    "sciospec, no number": (text("1000\n", "fast\n"), "must be a number; it is 'fast'"),
+    "sciospec, a million frequencies": (text("0\n1\n", "0\n1000000\n"), "frequencies"),
+    "sciospec, ragged": (text("1 4\n", "1 4\n1.0\t2.0\t3.0\t4.0\n"), "two electrodes"),
+    "sciospec, an electrode that is none": (text("1 4\n", "1 9\n"), "electrode 9"),
+    "sciospec, words": (text("1 4\n", "one four\n"), "is not numbers"),
+    "sciospec, no current": (text("0.001\n", "0\n"), "positive"),
+    "sciospec, a pair of one": (text("1 4\n", "1 1\n"), "sums to"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_what_is_wrong_is_told(name, tmp_path):
+    make, message = FAULTS[name]
+    make(tmp_path / "a.eit")
+    with pytest.raises(ValueError, match=message) as caught:
+        data.read(tmp_path / "a.eit")
+    assert len(str(caught.value)) < 400

@@ -1,0 +1,192 @@
+"""Files that hold their currents beside electrodes × patterns × frames, and what their transfer impedance tells."""
+
+import re
+
+import numpy as np
+import pytest
+import scipy.io
+
+from jeit import data, protocol
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.inverse import Noser, one_step
+from jeit.layout import ring
+from jeit.mesh import Disk
+
+COUNT, FRAMES = 8, 5
+DESCRIBED = """
+[geometry]
+shape = "disk"
+radius = 0.1
+[electrodes]
+layout = "ring"
+number = 8
+clockwise = true
+width = 0.01
+contact_impedance = 0.01
+[protocol]
+kind = "measured"
+[data]
+keys = ["frame_voltage"]
+"""
+
+
+@pytest.fixture
+def published(tank):
+    """What a university's system writes: currents (L, S) A, voltages (L, S, F) V less their mean."""
+    chosen = protocol.haar(COUNT, current=2.4e-4)
+    voltages = tank(chosen).reshape(COUNT - 1, COUNT).T
+    drift = 1 + 1e-3 * np.arange(FRAMES)
+    return {"current_patterns": np.asarray(chosen.drive).T, "frame_voltage": voltages[:, :, None] * drift}
+
+
+def read(folder, arrays, description=DESCRIBED, suffix=".mat"):
+    file = folder / f"tank{suffix}"
+    scipy.io.savemat(file, arrays) if suffix == ".mat" else np.savez(file, **arrays)
+    (folder / "description.toml").write_text(description, "utf-8")
+    return data.read(file)
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".npz"])
+def test_read_with_a_short_description(published, tank, tmp_path, suffix):
+    found = read(tmp_path, published, suffix=suffix)
+    assert found.protocol.same_patterns(protocol.haar(COUNT, current=2.4e-4))
+    assert found.voltages.shape == (FRAMES, (COUNT - 1) * COUNT)
+    np.testing.assert_allclose(found.voltages[2], 1.002 * tank(found.protocol), rtol=1e-12)
+    assert found.electrodes.num_electrodes == COUNT
+    assert data.reciprocity_error(found) < 1e-12
+
+
+def test_the_mean_of_the_frames(published, tank, tmp_path):
+    found = read(tmp_path, published, DESCRIBED + 'frames = "mean"\n')
+    np.testing.assert_allclose(found.voltages, [1.002 * tank(found.protocol)], rtol=1e-12)
+    assert found.notes[-1] == "the mean of 5 frames."
+    assert found.times is None
+
+
+def test_other_axes_names_and_units(published, tank, tmp_path):
+    turned = {"i": 1e3 * published["current_patterns"].T, "u": np.transpose(published["frame_voltage"], (2, 0, 1))}
+    said = DESCRIBED.replace("frame_voltage", "u") + 'axes = ["frames", "electrodes", "patterns"]\nframe_rate = 20.0\n'
+    said = said.replace('"measured"\n', '"measured"\ndrive_key = "i"\npatterns_in = "rows"\ncurrent_unit = "mA"\n')
+    found = read(tmp_path, turned, said)
+    np.testing.assert_allclose(found.voltages[0], tank(found.protocol), rtol=1e-12)
+    np.testing.assert_allclose(found.times, np.arange(FRAMES) / 20)
+    assert found.frame_rate == pytest.approx(20)
+
+
+def test_a_matrix_of_what_was_measured(published, tmp_path):
+    rows = np.eye(COUNT)[:3] - np.eye(COUNT)[3:6]
+    arrays = {**published, "meas": rows.T, "frame_voltage": np.einsum("kl,lsf->ksf", rows, published["frame_voltage"])}
+    found = read(tmp_path, arrays, DESCRIBED.replace('"measured"\n', '"measured"\nmeasurement_key = "meas"\n'))
+    np.testing.assert_array_equal(found.protocol.measurement, rows)
+
+
+def test_one_frame_of_two_axes(published, tmp_path):
+    one = {**published, "frame_voltage": published["frame_voltage"][:, :, 0]}
+    assert read(tmp_path, one).num_frames == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said", "message"),
+    [
+        ({"current_patterns": np.ones((8, 7))}, None, "sums to 8"),
+        ({"current_patterns": np.eye(8)[None]}, None, "must be a matrix"),
+        ({"current_patterns": np.full((8, 7), np.nan)}, None, "without NaN"),
+        ({"frame_voltage": np.ones((8, 6, 5))}, None, "channels"),
+        ({"frame_voltage": np.ones((8, 7, 5, 2))}, None, "are 3 axes"),
+        ({}, ("kind =", 'drive_key = "other"\nkind ='), "no variable 'other'"),
+        ({}, ("[data]", '[data]\naxes = ["frames", "frames", "patterns"]'), "each once"),
+        ({}, ("[data]", '[data]\nframes = "mean"\nframe_rate = 5.0'), "no use where the frames are averaged"),
+        ({}, ("number = 8", "number = 9"), "9 electrodes were placed"),
+        ({}, ("kind =", 'measurement = "against"\nreference = 8\nkind ='), "0 to 7"),
+        ({}, ("kind =", "reference = 1\nkind ="), "no use"),
+    ],
+)
+def test_what_does_not_fit(published, tmp_path, change, said, message):
+    description = DESCRIBED if said is None else DESCRIBED.replace(*said, 1)
+    with pytest.raises(ValueError, match=message):
+        read(tmp_path, {**published, **change}, description)
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ('kind = "optimal"\ntransfer = [[1, -1], [-1, 1]]', "give one of them"),
+        ('kind = "optimal"\ntransfer = [[1, -1], [-1, 1]]\npower = 1e-6', "power needs other"),
+        ('kind = "measured"', "takes the currents from"),
+        ('kind = "haar"\nnumber = 8', "current"),
+    ],
+)
+def test_protocols_that_cannot_be(tmp_path, said, message):
+    (tmp_path / "p.toml").write_text(f"[protocol]\n{said}\n", "utf-8")
+    with pytest.raises(ValueError, match=re.escape(message)):
+        data.load_description(tmp_path / "p.toml").protocol(tmp_path / "p.csv")
+
+
+def measured(tank, chosen, noise=0.0, seed=0):
+    voltages = tank(chosen, 0.3)
+    return data.screen(voltages + noise * np.random.default_rng(seed).normal(size=voltages.shape), chosen)
+
+
+@pytest.mark.parametrize("measurement", ["adjacent", "mean", "mean-removed", "against"])
+def test_other_currents_are_told_by_the_transfer_impedance(tank, measurement):
+    made = measured(tank, protocol.trigonometric(COUNT, measurement=measurement))
+    for other in (protocol.haar(COUNT), protocol.adjacent(COUNT, driven_electrodes=True), protocol.opposite(COUNT)):
+        told = data.driven_by(made, other)
+        np.testing.assert_allclose(told.voltages[0], tank(other, 0.3), rtol=0, atol=1e-10 * np.abs(told.voltages).max())
+        assert told.protocol is other
+
+
+def test_what_is_not_measured_is_not_told(tank):
+    with pytest.raises(ValueError, match="leave the transfer impedance open"):
+        data.transfer_impedance(measured(tank, protocol.adjacent(COUNT)))
+    with pytest.raises(ValueError, match="both must be of the same body"):
+        data.driven_by(measured(tank, protocol.haar(COUNT)), protocol.haar(9))
+
+
+def test_noise_by_reciprocity_of_patterns_on_all_electrodes(tank):
+    """Potentials that each carry noise, less their mean: 15 % for 28 independent differences."""
+    chosen, noise = protocol.haar(16), 1e-4
+    clean = tank(chosen).reshape(-1, 16)
+    found = []
+    for seed in range(8):
+        rough = clean + noise * np.random.default_rng(seed).normal(size=clean.shape)
+        rough -= rough.mean(axis=1, keepdims=True)
+        estimate = data.estimate_noise(data.screen(rough.ravel(), chosen))
+        assert estimate is not None
+        assert estimate.method == "reciprocity"
+        found.append(estimate.standard_deviation)
+    assert np.mean(found) == pytest.approx(noise, rel=0.1)
+
+
+def test_gains_that_differ_break_reciprocity(tank):
+    chosen = protocol.haar(16)
+    gains = 1 + 0.02 * np.random.default_rng(3).normal(size=16)
+    spoilt = (tank(chosen).reshape(-1, 16) * gains).ravel()
+    assert data.reciprocity_error(data.screen(tank(chosen), chosen)) < 1e-12
+    assert data.reciprocity_error(data.screen(spoilt, chosen)) > 5e-3
+
+
+@pytest.mark.parametrize("rule", ["noise-figure", "gcv", "discrepancy", "l-curve"])
+def test_potentials_less_their_mean_are_not_counted_twice(rule):
+    """L of them are L - 1 facts: the image, and the hyperparameter, are those of L - 1 orthonormal combinations."""
+    electrodes = BoundaryElectrodes(ring(0.1, COUNT), 0.02, 0.01)
+    redundant = ForwardModel(Disk(0.1).mesh(num_points=300), electrodes, protocol.haar(COUNT))
+    rows = np.linalg.svd(protocol.measurement_patterns(COUNT, "mean-removed"))[2][:-1]
+    rows -= rows.mean(axis=1, keepdims=True)
+    facts = redundant.with_protocol(protocol.from_matrices(redundant.protocol.drive, rows))
+    noise = np.random.default_rng(5).normal(size=(COUNT - 1, COUNT))
+    noise -= noise.mean(axis=1, keepdims=True)
+    conductivity = np.ones(redundant.mesh.num_cells)
+    conductivity[:40] = 1.3
+    change = np.asarray(redundant.voltages(conductivity) - redundant.voltages(1.0)).reshape(COUNT - 1, COUNT)
+    change = change + 1e-2 * np.abs(change).max() * noise
+    found = [
+        one_step(
+            model, 1.0, prior=Noser(), hyperparameter=rule, noise=0.01 * np.abs(change).max(), difference=one.ravel()
+        )
+        for model, one in ((redundant, change), (facts, change @ rows.T))
+    ]
+    images = [np.asarray(one.image(given.ravel())) for one, given in zip(found, (change, change @ rows.T), strict=True)]
+    assert float(found[0].hyperparameter) == pytest.approx(float(found[1].hyperparameter), rel=1e-6)
+    np.testing.assert_allclose(images[0], images[1], rtol=0, atol=1e-6 * np.abs(images[1]).max())
