@@ -129,7 +129,7 @@ def measurement_from(
         note = f"the mean of {measurement.num_frames} frames."
         return replace(measurement.mean_frame(), notes=(*measurement.notes, note))
     rate = described.layout.frame_rate
-    return measurement if rate is None else replace(measurement, times=np.arange(number) / rate)
+    return measurement if rate is None else measurement.at_rate(rate)
 
 
 def numbers(path: Path, layout: TableLayout) -> np.ndarray:

@@ -48,6 +48,29 @@ def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]
     return found
 
 
+def as_driven(reference: Measurement, measurement: Measurement) -> Measurement:
+    """A reference, as the protocol of a measurement on the same electrodes would have read it, if it was measured with
+    other patterns and they tell that; as it is where they do not, or differ by nothing but how large currents are."""
+    ours, theirs = measurement.protocol, reference.protocol
+    if ours.num_electrodes != theirs.num_electrodes or ours.same_patterns(theirs) or _proportional(ours, theirs):
+        return reference
+    try:
+        return driven_by(reference, ours)
+    except ValueError:
+        return reference
+
+
+def _proportional(ours: Protocol, theirs: Protocol) -> bool:
+    """Whether both read the same, and every current of one is the same number of times that of the other."""
+    if ours.num_measurements != theirs.num_measurements:
+        return False
+    first, second = np.asarray(ours.channel_drive), np.asarray(theirs.channel_drive)
+    ratio = np.linalg.norm(first) / np.linalg.norm(second)
+    return np.allclose(first, ratio * second, rtol=1e-6, atol=1e-6 * np.abs(first).max()) and np.allclose(
+        ours.channel_measurement, theirs.channel_measurement, rtol=1e-6
+    )
+
+
 def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
     """The same frames as another `protocol` on the same electrodes would have read them.
 

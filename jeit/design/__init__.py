@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from jeit.design.optimisation.design_space import DesignSpace as DesignSpace
     from jeit.design.optimisation.objective import Objective as Objective
     from jeit.design.optimisation.optimise import optimise_layout as optimise_layout
+    from jeit.design.optimisation.surface_optimise import optimise_surface_layout as optimise_surface_layout
     from jeit.design.response import skin_response as skin_response
     from jeit.design.scores import TouchPrior as TouchPrior
     from jeit.design.scores import layout_scores as layout_scores
@@ -51,6 +52,7 @@ _HOMES = {
     "layout_scores": "scores",
     "open_results": "study",
     "optimise_layout": "optimisation.optimise",
+    "optimise_surface_layout": "optimisation.surface_optimise",
     "describes_skin": "skin.skin_file",
     "read_described_skin": "skin.skin_file",
     "read_study": "study",

@@ -10,7 +10,8 @@ from jeit.design.defaults import CONTRAST, MARGIN, PLACES
 from jeit.design.response import SkinResponse, number_of_taxels, skin_response
 from jeit.design.skin.skin import Skin, check_skin
 from jeit.design.skin.touch_grid import touches_away_from_the_edge
-from jeit.layout import Layout
+from jeit.layout import Layout, SurfaceLayout
+from jeit.mesh.geodesic import Triangles
 
 # By so much less than the other's least a place must feel to be blind: rounding of coordinates is not.
 _ROUNDING = 1e-6
@@ -78,8 +79,16 @@ def compare_layouts(
     return LayoutComparison((first, second), (responses[0], responses[1]), margin, places, contrast, seed)
 
 
-def check_same_outline(first: Layout, second: Layout) -> None:
+def check_same_outline(first: Layout | SurfaceLayout, second: Layout | SurfaceLayout) -> None:
     """Raise `ValueError` unless both are on the same skin, but for where its drawing has its origin."""
+    if isinstance(first, SurfaceLayout) or isinstance(second, SurfaceLayout):
+        areas = [_area(layout) for layout in (first, second)]
+        if type(first) is not type(second) or abs(areas[0] - areas[1]) > 1e-2 * areas[0]:
+            raise ValueError(
+                f"the layouts are on different skins, '{first.name}' of {1e4 * areas[0]:.4g} and '{second.name}' of "
+                f"{1e4 * areas[1]:.4g} cm²; compare layouts on the same surface."
+            )
+        return
     sizes = []
     for layout in (first, second):
         low_x, high_x, low_y, high_y = layout.known_outline.extent
@@ -92,6 +101,12 @@ def check_same_outline(first: Layout, second: Layout) -> None:
         raise ValueError(
             f"the layouts are on different skins, {said}; a file that does not say its skin is read with outline=."
         )
+
+
+def _area(layout: Layout | SurfaceLayout) -> float:
+    if isinstance(layout, SurfaceLayout):
+        return float(Triangles.of(layout.surface).areas.sum())
+    return float(layout.known_outline.area)
 
 
 def comparison(one: SkinResponse, other: SkinResponse) -> list[dict]:

@@ -15,7 +15,7 @@ from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin
 from jeit.design.skin.touch_grid import touch_grid
 from jeit.layout import Layout
-from jeit.layout.layout import check_layout
+from jeit.layout.surface_layout import check_layout, flat_layout
 from jeit.protocol import two_terminal
 
 # Of the mesh that results are confirmed on, times those of the one optimised on; and of places along a side.
@@ -43,7 +43,7 @@ class ImprovedLayout(eqx.Module):
     @property
     def layout(self) -> Layout:
         """The better one, or that given if there is none."""
-        return self.optimisation.layout
+        return flat_layout(self.optimisation.layout)
 
 
 def improve_layout(

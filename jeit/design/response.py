@@ -10,13 +10,13 @@ from jeit.design.skin.skin import Skin, check_skin
 from jeit.design.skin.touch_grid import TouchGrid, check_grid
 from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.taxels import Taxels, find_taxels
-from jeit.layout import Layout
+from jeit.layout import Layout, SurfaceLayout
 
 
 class SkinResponse(eqx.Module):
     """What a skin of one `layout` feels: its `sensitivity`, and its `taxels`."""
 
-    layout: Layout
+    layout: Layout | SurfaceLayout
     sensitivity: SensitivityMap
     taxels: Taxels
 

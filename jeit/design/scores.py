@@ -27,7 +27,6 @@ from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.design.skin.touch_grid import check_places
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity
-from jeit.mesh import check_flat
 from jeit_solvers.dense.cholesky import inverse_cholesky
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, undifferentiated
 
@@ -44,8 +43,11 @@ class TouchPrior(eqx.Module):
     factor: Float[Array, "n r"]
 
     @classmethod
-    def create(cls, places: ArrayLike, *, correlation: float, deviation: float = 1.0) -> "TouchPrior":
-        """deviation² exp(-d² / 2 correlation²) between places (n, 2) at a distance d, metres.
+    def create(
+        cls, places: ArrayLike, *, correlation: float, deviation: float = 1.0, lengths: ArrayLike | None = None
+    ) -> "TouchPrior":
+        """deviation² exp(-d² / 2 correlation²) between places (n, 2) at a distance d, metres; places on a curved skin,
+        (n, 3), at `lengths` (n, n) from each other, `Geodesics.between`, straight through space unless given.
 
         What holds less than a millionth of the largest variance is left out. Raises `ValueError` for a correlation or
         deviation that is not positive, and for what are no places.
@@ -54,8 +56,11 @@ class TouchPrior(eqx.Module):
             raise ValueError(
                 f"correlation (metres) and deviation must be positive; they are {correlation!r} and {deviation!r}."
             )
-        place = check_places(places)
-        squared = np.sum((place[:, None] - place) ** 2, axis=-1)
+        place = check_places(places, 3 if np.shape(places)[-1:] == (3,) else 2)
+        straight = np.sum((place[:, None] - place) ** 2, axis=-1)
+        squared = straight if lengths is None else np.asarray(lengths, float) ** 2
+        if squared.shape != straight.shape:
+            raise ValueError(f"lengths has shape {squared.shape}; give one between any two of {len(place)} places.")
         values, vectors = np.linalg.eigh(deviation**2 * np.exp(-squared / (2 * correlation**2)))
         kept = values > 1e-6 * values[-1]
         return cls(as_array(vectors[:, kept] * np.sqrt(values[kept])))
@@ -140,7 +145,6 @@ def layout_scores(
 
 def _check(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> None:
     channels = model.protocol.num_measurements
-    check_flat(model.mesh, "scores")
     if model.mesh.dimension != 2:
         raise ValueError(f"model is of a {model.mesh.dimension}-D body; scores are of the equivalent sheet.")
     if len(prior.factor) != len(touches.slope):

@@ -17,13 +17,14 @@ from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 class Taxels(eqx.Module):
     """The k virtual taxels of a layout, from touches at n places; make them with `find_taxels`.
 
-    **Fields**: `places` (n, 2) metres; `cell_area` (n,), the part of the skin that each place stands for, m²;
-    `clusters`, of the voltage changes of the touches, with their means; `similarity` (k, n), cosine of the angle
-    between the mean change of each taxel and the change of each place; `threshold`, from which on a place belongs to a
-    taxel. After `jax.vmap` all arrays, and what is worked out from them, lead with the axis of the layouts.
+    **Fields**: `places` (n, 2) metres, on a curved skin (n, 3); `cell_area` (n,), the part of the skin that each place
+    stands for, m²; `clusters`, of the voltage changes of the touches, with their means; `similarity` (k, n), cosine of
+    the angle between the mean change of each taxel and the change of each place; `threshold`, from which on a place
+    belongs to a taxel. After `jax.vmap` all arrays, and what is worked out from them, lead with the axis of the
+    layouts.
     """
 
-    places: Float[Array, "*layouts n 2"]
+    places: Float[Array, "*layouts n d"]
     cell_area: Float[Array, "*layouts n"]
     clusters: KMeans
     similarity: Float[Array, "*layouts k n"]
@@ -42,8 +43,8 @@ class Taxels(eqx.Module):
 
     @property
     @either_engine
-    def positions(self) -> Float[Array, "*layouts k 2"]:
-        """The centroid of each cluster's places, metres."""
+    def positions(self) -> Float[Array, "*layouts k d"]:
+        """The centroid of each cluster's places, metres; on a curved skin in space, somewhat below its surface."""
         count = self.similarity.shape[-2]
         weight = (self.labels[..., None, :] == np.arange(count)[:, None]) * self.cell_area[..., None, :]
         return weight @ self.places / weight.sum(axis=-1, keepdims=True)
@@ -112,7 +113,8 @@ def find_taxels(
     directions: bool = False,
     restarts: int = 10,
 ) -> Taxels:
-    """Virtual taxels from the voltage `changes` (n, m) of one and the same touch at `places` (n, 2), metres.
+    """Virtual taxels from the voltage `changes` (n, m) of one and the same touch at `places` (n, 2), on a curved skin
+    (n, 3), metres.
 
     The changes are parted into clusters by k-means; a taxel is where the cosine of the angle between its cluster's mean
     and a place's change is at least `threshold`. Park et al. 2022, text S4: 48 × 48 places, 90 clusters, 0.7. Places
@@ -159,10 +161,12 @@ def _unit(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
 def _check(changes, places, cell_area, num_taxels, threshold) -> None:
     """Raise `ValueError`; what is traced is judged by its shape alone."""
     shape = np.shape(changes)
-    if len(shape) != 2 or 0 in shape or np.shape(places) != (shape[0], 2) or np.shape(cell_area) not in ((), shape[:1]):
+    in_space = np.shape(places) == (*shape[:1], 3) and not (has_values(places) and not np.ptp(places, axis=0).any())
+    fits = np.shape(places) == (*shape[:1], 2) or in_space
+    if len(shape) != 2 or 0 in shape or not fits or np.shape(cell_area) not in ((), shape[:1]):
         raise ValueError(
             f"changes has shape {shape}, places {np.shape(places)} and cell_area {np.shape(cell_area)}; give (n, m), "
-            "(n, 2) and a number or (n,): one touch for each of n places, m voltages each."
+            "(n, 2), on a curved skin (n, 3), and a number or (n,): one touch for each of n places, m voltages each."
         )
     if jnp.iscomplexobj(changes):
         raise ValueError("changes are complex; give their real part or the changes of the magnitudes.")
@@ -185,7 +189,7 @@ def _check_lengths(places: np.ndarray, cell_area: np.ndarray) -> None:
         raise ValueError("places must be finite, in metres.")
     if not (np.isfinite(cell_area) & (cell_area > 0)).all():
         raise ValueError("cell_area must be positive and finite, in m².")
-    box = float(np.prod(np.ptp(places, axis=0)))
+    box = float(np.prod(np.sort(np.ptp(places, axis=0))[-2:]))
     # Cells fill about the box round the places; of a factor of 100 the units are to blame.
     if box > 0 and not 0.01 < cell_area.sum() / box < 100:
         raise ValueError(

@@ -149,7 +149,8 @@ class _PlanePen:
         self.drawn: list[list[np.ndarray]] = []
 
     def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
-        self.drawn.append([np.asarray(one) for one in pieces])
+        ends = [np.asarray(one) for one in pieces]
+        self.drawn.append([one[k : k + 2] for one in ends for k in range(len(one) - 1)])
 
     def disc(self, middle: np.ndarray, radius: float) -> None:
         angle = 2 * np.pi * np.arange(_ROUND) / _ROUND

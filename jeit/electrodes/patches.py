@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.electrodes.clipping import covered_moments
-from jeit.electrodes.discs import facet_normals, seen_flat
+from jeit.electrodes.discs import facet_normals, nearest_facets, seen_flat
 from jeit.electrodes.electrodes import (
     AbstractPlacedElectrodes,
     Contact,
@@ -31,7 +31,8 @@ class FacePatches(AbstractPlacedElectrodes):
     """Complete electrodes that are rectangles on the surface of a 3-D mesh, free of its nodes.
 
     A patch lies in the tangent plane at its position: its width runs horizontally (perpendicular to z) and its
-    height up the surface; on a horizontal face width runs along x and height along y.
+    height up the surface; on a horizontal face width runs along x and height along y. On a curved face it covers what
+    lies beneath that rectangle: round a cylinder of radius R a plate of arc length a has the width 2 R sin(a / 2 R).
 
     **Fields**: `position` (L, 3) metres, on the surface; `width`, `height` (L,) metres; `contact_impedance` (L,)
     ohm·m².
@@ -146,11 +147,7 @@ def _reached(mesh: Mesh, position, half_size, frames):
 def _frames(mesh: Mesh, position):
     """Unit vectors (L, 3) at each electrode: normal of the nearest facet, across, and up. Not differentiated."""
     xp = namespace(mesh, position)
-    centres = mesh.points[mesh.facets].mean(axis=1)
-    apart = xp.sum((position[:, None] - centres) ** 2, axis=-1)
-    # The first of those that are equally near, whatever the unit of length rounds to.
-    nearest = xp.argmax(apart <= (1 + 1e-9) * apart.min(axis=1, keepdims=True), axis=1)
-    normal = facet_normals(mesh)[nearest]
+    normal = facet_normals(mesh)[nearest_facets(mesh, position)]
     horizontal = abs(normal[:, 2:]) > 0.9
     upward = xp.where(horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(normal.dtype)
     across = xp.cross(upward, normal)

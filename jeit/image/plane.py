@@ -134,4 +134,6 @@ def _page(toward) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _millimetres(value: float) -> str:
-    return f"{1e3 * value:.4g}".replace("-", "−") if abs(value) > 5e-7 else "0"
+    # A tenth of a millimetre, or in a small body three digits.
+    text = f"{1e3 * value:.1f}".removesuffix(".0") if abs(value) >= 0.0095 else f"{1e3 * value:.3g}"
+    return text.replace("-", "−") if abs(value) > 5e-10 else "0"

@@ -1,9 +1,9 @@
 """From two frames to a picture in one call, `image_difference`, and what every rule for λ would choose on the way.
 
 `settings` says how to image, `preparation` checks, meshes and calibrates, `wiring` finds what is not wired as told,
-`method` images, `automatic` decides how, `difference` looks for inclusions; `stream_preparation` makes ready for frame
-after frame. And from a stream of a touched skin to what it means: `touch_images`, `gesture_learning`, `touch_watch`;
-`health_learning`, what it is like while it is healthy.
+`method` images, `automatic` decides how, `difference` looks for inclusions, `sequence` images many frames at once;
+`stream_preparation` makes ready for frame after frame. And from a stream of a touched skin to what it means:
+`touch_images`, `gesture_learning`, `touch_watch`; `health_learning`, what it is like while it is healthy.
 """
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
@@ -20,6 +20,7 @@ from jeit.imaging.preparation import (
     prepare_difference,
     select_frames,
 )
+from jeit.imaging.sequence import ImagedSequence, image_sequence
 from jeit.imaging.settings import CONTACTS, ImagingSettings
 from jeit.imaging.stream_preparation import StreamSettings, frames_of, prepare_imager
 from jeit.imaging.touch_images import TouchImages, untouched_frames
@@ -33,6 +34,7 @@ __all__ = [
     "ComparedRules",
     "ImagedDifference",
     "ImagedFrequencies",
+    "ImagedSequence",
     "ImagingSettings",
     "LearntGestures",
     "NamedTouch",
@@ -49,6 +51,7 @@ __all__ = [
     "frequency_weight",
     "image_difference",
     "image_frequencies",
+    "image_sequence",
     "imaging_mesh",
     "learn_gestures",
     "learn_health",

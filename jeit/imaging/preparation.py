@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from jeit.arguments import check_kind
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality, assess
+from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
@@ -193,7 +194,9 @@ def select_frames(
     """The frame to image and the reference to image it against, one frame each.
 
     A frame named "reference" in `measurement` is never imaged unless asked for, and is what the others are compared
-    with when no `reference` is given. Raises `ValueError` when there is no reference, no such frame, or no measurement.
+    with when no `reference` is given. A reference that was measured with other currents, which tell what those of the
+    measurement would have read, is turned into that (`jeit.data.driven_by`), and its notes say so. Raises `ValueError`
+    when there is no reference, no such frame, or no measurement.
     """
     check_measurement("measurement", measurement)
     if reference is not None:
@@ -207,7 +210,7 @@ def select_frames(
     if "reference" in reference.frame_names and reference.num_frames > 1:
         _, reference = reference.split_reference()
     one = objects.frame(0) if frame is None else measurement.frame(frame)
-    return one, reference.mean_frame()
+    return one, as_driven(reference.mean_frame(), one)
 
 
 def check_measurement(name: str, given: Measurement) -> None:

@@ -65,8 +65,9 @@ class Linearisation(eqx.Module):
             directions = data_directions(model.protocol, channels, root_weight)
             reduced: Any = combined_jacobian(model, conductivity, channels, (root_weight[:, None] * directions).T)
             product = prior.covariance_product(model.mesh, reduced.conj())
-            repeated, free = model.protocol.repeated_facts(channels), prior.null_space(model.mesh)
-            spectrum = Spectrum.create(reduced, product, free, repeated, as_array(directions))
+            repeated = model.protocol.repeated_facts(channels)
+            null_space = prior.null_space(model.mesh)
+            spectrum = Spectrum.create(reduced, product, null_space, as_array(directions), repeated)
         else:
             jacobian = model.jacobian(conductivity)
             directions = _traced_directions(model.protocol, channels, root_weight)

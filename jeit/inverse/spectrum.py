@@ -30,8 +30,8 @@ class Spectrum(eqx.Module):
     """Eigendecomposition of the data-space system, from which the reconstruction for any λ is cheap.
 
     **Fields**: `basis` (M, k) = QU; `eigenvalues` Λ (k,); `directions` D (M, r); `reduced` G (r, m); `images` ΓGᵀ
-    (m, r); `null_space` N (m, p); `seen` B = JN (M, p); `outer` JΓJᵀ (M, M); `repeated`, how many of the
-    components say nothing, whatever was measured, see `Protocol.repeated_facts`.
+    (m, r); `null_space` N (m, p); `seen` B = JN (M, p); `outer` JΓJᵀ (M, M); `repeated`, how many of the components say
+    nothing, whatever was measured, see `Protocol.repeated_facts`.
     """
 
     basis: Float[Array, "M k"]
@@ -50,14 +50,19 @@ class Spectrum(eqx.Module):
         jacobian: Float[Array, "r m"],
         product: Float[Array, "m r"],
         null_space: Float[Array, "m p"],
-        repeated: int = 0,
         directions: Float[Array, "M r"] | None = None,
+        repeated: int = 0,
     ):
         """From the whitened Jacobian, its product with the prior covariance, and the prior's null space; of all
         channels, or in orthonormal `directions` of theirs."""
         given = host.asarray(np.eye(len(jacobian))) if directions is None else directions
         basis, eigenvalues, seen, outer = _decompose(jacobian, product, null_space, given)
         return cls(basis, eigenvalues, given, jacobian, product, null_space, seen, outer, repeated)
+
+    @property
+    def freedom(self) -> int:
+        """How many components of the data may say something: all but those that are repeated."""
+        return self.eigenvalues.shape[0] - self.repeated
 
     @property
     def jacobian(self) -> Float[Array, "M m"]:
@@ -68,11 +73,6 @@ class Spectrum(eqx.Module):
     def product(self) -> Float[Array, "m M"]:
         """ΓJᵀ (m, M)."""
         return self.images @ self.directions.T
-
-    @property
-    def freedom(self) -> int:
-        """How many components of the data may say something: all but those that are repeated."""
-        return self.eigenvalues.shape[0] - self.repeated
 
     def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
         """R_λ (m, M) for whitened data."""

@@ -23,7 +23,7 @@ def ring(
     `start_angle`: of the first electrode, radians counter-clockwise from +x (default: 12 o'clock). Raises
     `ValueError` for a radius that is not positive or fewer than two electrodes.
     """
-    _check_count(num_electrodes, 2)
+    check_count(num_electrodes, 2)
     if not radius > 0:
         raise ValueError(f"radius must be positive, in metres; it is {radius}.")
     step = (-1 if clockwise else 1) * 2 * np.pi / num_electrodes
@@ -48,7 +48,7 @@ def perimeter(domain: Domain, num_electrodes: int, *, start: float = 0.0) -> np.
     lower left corner; half a pitch keeps electrodes off the corners when L is a multiple of four).
     Raises `ValueError` for fewer than two.
     """
-    _check_count(num_electrodes, 2)
+    check_count(num_electrodes, 2)
     arc_length = start + domain.perimeter * np.arange(num_electrodes) / num_electrodes
     return np.asarray(domain.boundary(arc_length % domain.perimeter))
 
@@ -60,8 +60,8 @@ def grid(
 
     (L, 2) metres. Raises `ValueError` for sides that are not positive and for no rows or columns.
     """
-    _check_count(columns, 1)
-    _check_count(rows, 1)
+    check_count(columns, 1)
+    check_count(rows, 1)
     if not (width > 0 or columns == 1) or not (height > 0 or rows == 1):
         raise ValueError(f"width and height must be positive, in metres; they are {width} and {height}.")
     x = centre[0] + (np.linspace(-width / 2, width / 2, columns) if columns > 1 else np.zeros(1))
@@ -76,7 +76,7 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
     farthest points), so every electrode serves about the same area. `margin`: least distance to the outline,
     metres. Deterministic. Raises `ValueError` if the margin leaves no room.
     """
-    _check_count(num_electrodes, 1)
+    check_count(num_electrodes, 1)
     x_min, x_max, y_min, y_max = domain.extent
     spacing = np.sqrt((x_max - x_min) * (y_max - y_min) / max(20_000, 200 * num_electrodes))
     x, y = np.arange(x_min + spacing / 2, x_max, spacing), np.arange(y_min + spacing / 2, y_max, spacing)
@@ -103,6 +103,7 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
     return position
 
 
-def _check_count(number: int, least: int) -> None:
+def check_count(number: int, least: int) -> None:
+    """Raise `ValueError` for what is no whole number of electrodes, or fewer than `least`."""
     if not is_number(number) or int(number) != number or number < least:
         raise ValueError(f"Give a whole number of electrodes, at least {least}; got {told(number)}.")

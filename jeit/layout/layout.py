@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind
 from jeit.electrodes.discs import SheetDiscs
 from jeit.electrodes.electrodes import as_electrode_values, as_positions
+from jeit.layout.labels import check_labels
 from jeit.mesh import Domain
 from jeit_solvers.engines import has_values
 
@@ -63,7 +63,7 @@ class Layout(eqx.Module):
             else as_electrode_values("contact_impedance", contact_impedance, number, unit="ohm·m²")
         )
         self.outline = outline
-        self.labels = _check_labels(labels, number)
+        self.labels = check_labels(labels, number)
         self.name = name
         if has_values(self.centres, self.diameters, outline):
             called = [f"electrode {index + 1} ('{label}')" for index, label in enumerate(self.labels)]
@@ -90,6 +90,11 @@ class Layout(eqx.Module):
             return self.outline.extent
         return bounds(np.asarray(self.centres), np.asarray(self.diameters))
 
+    def lengths(self) -> Float[np.ndarray, "L L"]:
+        """Distances between the electrodes' centres, metres."""
+        centres = np.asarray(self.centres)
+        return np.linalg.norm(centres[:, None] - centres, axis=-1)
+
     def sheet_discs(self, contact_impedance: ArrayLike | None = None) -> SheetDiscs:
         """The electrodes for a forward model on a sheet; `contact_impedance` in ohm·m² replaces the layout's.
 
@@ -105,11 +110,7 @@ def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain 
     """Raise `ValueError` unless discs lie apart and inside `outline`, all in metres; `called` (L,) names them."""
     x_min, x_max, y_min, y_max = bounds(centres, diameters) if outline is None else outline.extent
     size = max(x_max - x_min, y_max - y_min)
-    if not SMALLEST - _ROUNDING <= size <= LARGEST + _ROUNDING:
-        raise ValueError(
-            f"centres: the skin would be {_told(size)} across; are millimetres taken for metres, or metres for "
-            "millimetres? Lengths differ by a factor of 1000."
-        )
+    check_size(size)
     gap = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
     np.fill_diagonal(gap, np.inf)
     if gap.min() < -_ROUNDING:
@@ -135,6 +136,15 @@ def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain 
         )
 
 
+def check_size(size: float) -> None:
+    """Raise `ValueError` for a skin of a `size`, metres, that is not known to exist."""
+    if not SMALLEST - _ROUNDING <= size <= LARGEST + _ROUNDING:
+        raise ValueError(
+            f"centres: the skin would be {_told(size)} across; are millimetres taken for metres, or metres for "
+            "millimetres? Lengths differ by a factor of 1000."
+        )
+
+
 def _told(length: float) -> str:
     return f"{length:.3g} m" if length > LARGEST else f"{1e3 * length:.3g} mm"
 
@@ -144,25 +154,3 @@ def bounds(centres: np.ndarray, diameters: np.ndarray) -> tuple[float, float, fl
     low = (centres - diameters[:, None] / 2).min(axis=0)
     high = (centres + diameters[:, None] / 2).max(axis=0)
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])
-
-
-def _check_labels(labels: Sequence[str] | None, number: int) -> tuple[str, ...]:
-    if labels is None:
-        return tuple(str(index + 1) for index in range(number))
-    labels = list(labels)
-    if len(labels) != number:
-        raise ValueError(f"labels: there are {len(labels)}; give one for each of the {number} electrodes.")
-    for label in labels:
-        if not isinstance(label, str) or not label or label != label.strip() or not label.isprintable():
-            raise ValueError(
-                f"labels: {label!r} is no label; give text on one line, without blanks before or after it."
-            )
-    repeated = sorted({label for label in labels if labels.count(label) > 1})
-    if repeated:
-        raise ValueError(f"labels: {repeated[0]!r} is the label of several electrodes; give each its own.")
-    return tuple(labels)
-
-
-def check_layout(name: str, given: Layout) -> None:
-    """Raise `ValueError`, about the argument `name`, for what is no `Layout`, such as the name of one."""
-    check_kind(name, given, Layout, "a Layout, as of named_layout('park-inner') or read_layout(path)")

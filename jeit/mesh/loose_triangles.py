@@ -17,8 +17,9 @@ _HEADER = 84
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 # Nodes that are nearer, relative to the largest coordinate, are one: such files keep six digits of them.
 _SEAM = 2e-6
-# Times its size in the file that what is read of one takes in memory.
-_GROWTH = 20
+# Times its size in the file that what is read of one takes in memory, at most: faces of an .obj file are told in few
+# letters.
+_GROWTH = {".stl": 8, ".obj": 16}
 
 
 def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -27,10 +28,11 @@ def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     Polygons are cut into triangles from their first corner on; triangles without an area are left out. Raises
     `ValueError`, about `name`, for a file that holds none.
     """
+    ending = path.suffix.lower()
+    check_memory(name, _GROWTH[ending] * path.stat().st_size)
     content = path.read_bytes()
-    check_memory(name, _GROWTH * len(content))
     try:
-        points, cells = _stl(content) if path.suffix.lower() == ".stl" else _obj(content)
+        points, cells = _stl(content) if ending == ".stl" else _obj(content)
     except (ValueError, IndexError, OverflowError) as error:
         said = " ".join(str(error).split())[:80]
         raise ValueError(f"path: {name} does not work as a mesh file: {said}.") from None

@@ -14,6 +14,7 @@ from jeit.plot.colour_scale import ColourScale
 from jeit.plot.design.sensitivity_map import plot_sensitivity_histograms, plot_sensitivity_map
 from jeit.plot.design.taxels import plot_taxel_areas, plot_taxels
 from jeit.plot.design.travel import plot_travel
+from jeit.plot.design.unrolled_skin import plot_unrolled
 from jeit.plot.imaging.admittivity import plot_admittivity
 from jeit.plot.imaging.figures_of_merit import plot_figures_of_merit
 from jeit.plot.imaging.frames import plot_frames
@@ -21,6 +22,8 @@ from jeit.plot.imaging.hyperparameter import plot_choice
 from jeit.plot.imaging.image import plot_image
 from jeit.plot.imaging.mesh import plot_mesh
 from jeit.plot.solid.camera import Camera
+from jeit.plot.solid.curved_skin import plot_curved_skin
+from jeit.plot.solid.interactive import view_solid
 from jeit.plot.solid.isosurfaces import plot_isosurfaces
 from jeit.plot.solid.overview import plot_solid
 from jeit.plot.solid.shaded_surface import plot_surface
@@ -55,6 +58,7 @@ __all__ = [
     "plot_confusion",
     "plot_contact_stages",
     "plot_contacts",
+    "plot_curved_skin",
     "plot_depth_map",
     "plot_error_curve",
     "plot_figures_of_merit",
@@ -87,4 +91,6 @@ __all__ = [
     "plot_track",
     "plot_travel",
     "plot_tried",
+    "plot_unrolled",
+    "view_solid",
 ]

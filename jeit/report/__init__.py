@@ -14,6 +14,8 @@ from jeit.report.learnt_skin import report_learnt_skin, write_learnt_skin, write
 from jeit.report.listener import draw_heard, report_heard, report_listener, write_heard, write_listener
 from jeit.report.measurement import report_measurement
 from jeit.report.saved_image import SavedImage, read_image
+from jeit.report.saved_image_views import write_views
+from jeit.report.series import write_series
 from jeit.report.skin_health import draw_health, report_health, write_health
 from jeit.report.stream import write_stream
 from jeit.report.study import write_study_report
@@ -61,10 +63,12 @@ __all__ = [
     "write_learnt_images",
     "write_learnt_skin",
     "write_listener",
+    "write_series",
     "write_stream",
     "write_study_report",
     "write_touches",
     "write_track",
+    "write_views",
     "write_vtk_series",
     "write_vtu",
     "write_watch",

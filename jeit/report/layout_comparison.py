@@ -45,6 +45,7 @@ def draw_layout_comparison(result: LayoutComparison):
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch, PathPatch
 
+    from jeit.layout.surface_layout import flat_layout
     from jeit.plot import plot_sensitivity_histograms, plot_sensitivity_map, plot_taxel_areas, plot_taxels
     from jeit.plot.axes import INK, bare, draw_scale_bar
     from jeit.plot.design.travel import outline_path
@@ -57,7 +58,7 @@ def draw_layout_comparison(result: LayoutComparison):
     largest = max(float(one.taxels.max_area) for one in both)
     names = told_apart([_shortened(one.layout.name) for one in both])
     for row, name, one in zip(axes, names, both, strict=True):
-        centres, outline = one.layout.centres, one.layout.known_outline
+        centres, outline = one.layout.centres, flat_layout(one.layout).known_outline
         plot_sensitivity_map(
             one.sensitivity, electrodes=centres, limit=highest, title=f"{name}: sensitivity", ax=row[0]
         )

@@ -24,6 +24,7 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
         **describe_measurement(measurement),
         "frames": measurement.num_frames,
         "frame_names": list(measurement.frame_names),
+        "frame_rate": measurement.frame_rate,
         "voltages": int(np.asarray(measurement.mask).size),
         "protocol": protocol.name,
         "drives": protocol.num_drives,

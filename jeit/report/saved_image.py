@@ -82,6 +82,8 @@ def read_image(path: str | Path) -> SavedImage:
         arrays = npz_arrays(path, *_KEPT, otherwise=_OTHERWISE)
         _check_kind(arrays)
         need(arrays, *_NEEDED)
+        if arrays["points"].dtype.kind not in "fiu":
+            raise ValueError(f"'points' is {told(arrays['points'])}; real numbers are wanted, metres.")
         mesh = Mesh.create(arrays["points"], arrays["cells"])
         return _image(mesh, arrays)
     except ValueError as error:
@@ -126,11 +128,13 @@ def _electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShapes | 
         return None
     need(arrays, "electrode_sizes", "electrode_numbers")
     corners, sizes, numbers = (arrays[f"electrode_{name}"] for name in ("corners", "sizes", "numbers"))
+    if corners.ndim != 2 or corners.shape[1] != mesh.points.shape[1] or corners.dtype.kind not in "fiu":
+        raise ValueError("'electrode_corners' are no places in the mesh's space; write it again.")
+    if not np.isfinite(corners).all():
+        raise ValueError("'electrode_corners' are no places: some are not finite; write it again.")
     whole = all(one.dtype.kind in "iu" and one.ndim == 1 for one in (sizes, numbers))
     if not (whole and len(sizes) == len(numbers) > 0 and sizes.min() > 0 and sizes.sum() == len(corners)):
         raise ValueError("'electrode_sizes' does not tell whose corners 'electrode_corners' are; write it again.")
-    if corners.ndim != 2 or corners.shape[1] != mesh.points.shape[1] or not np.isfinite(corners).all():
-        raise ValueError("'electrode_corners' are no places in the mesh's space; write it again.")
     # Every electrode has a polygon, or there would be one without a place.
     if not np.array_equal(np.unique(numbers), np.arange(numbers.max() + 1)):
         raise ValueError("'electrode_numbers' leave electrodes out; write it again.")
@@ -142,7 +146,7 @@ def _inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusion, .
         return ()
     need(arrays, "inclusion_sizes", "inclusion_peaks")
     centroids, sizes, peaks = (arrays[f"inclusion_{name}"] for name in ("centroids", "sizes", "peaks"))
-    number = len(centroids)
+    number = peaks.size
     if centroids.shape != (number, mesh.points.shape[1]) or not sizes.shape == peaks.shape == (number,):
         raise ValueError("'inclusion_centroids', '_sizes' and '_peaks' do not belong together; write it again.")
     if not all(one.dtype.kind == "f" and np.isfinite(one).all() for one in (centroids, sizes, peaks)):

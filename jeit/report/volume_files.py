@@ -85,7 +85,8 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
 
 
 def write_xdmf(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
-    """Write a series in time as one XDMF file of text, with no other beside it; arguments as of `write_vtk_series`."""
+    """Write a series in time as one XDMF file of text, with no other beside it; arguments as of `write_vtk_series`.
+    Raises `ValueError` as that does, for an ending other than .xdmf."""
     from meshio.xdmf import TimeSeriesWriter
 
     path = Path(path)
@@ -123,7 +124,7 @@ def _real(data: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
     """Values with complex ones by their parts."""
     found = {}
     for name, values in data.items():
-        array = np.asarray(values)
+        array: Any = np.asarray(values)
         if np.iscomplexobj(array):
             found[f"{name}, real"], found[f"{name}, imaginary"] = array.real, array.imag
         else:

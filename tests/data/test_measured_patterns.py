@@ -7,8 +7,10 @@ import pytest
 import scipy.io
 
 from jeit import data, protocol
+from jeit.data.imageable import assess
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
+from jeit.imaging import select_frames
 from jeit.inverse import Noser, one_step
 from jeit.layout import ring
 from jeit.mesh import Disk
@@ -190,3 +192,17 @@ def test_potentials_less_their_mean_are_not_counted_twice(rule):
     images = [np.asarray(one.image(given.ravel())) for one, given in zip(found, (change, change @ rows.T), strict=True)]
     assert float(found[0].hyperparameter) == pytest.approx(float(found[1].hyperparameter), rel=1e-6)
     np.testing.assert_allclose(images[0], images[1], rtol=0, atol=1e-6 * np.abs(images[1]).max())
+
+
+def test_a_reference_of_other_currents_is_turned_into_those_of_the_frames(tank):
+    frame = measured(tank, protocol.haar(COUNT), noise=1e-7)
+    other = data.screen(tank(protocol.trigonometric(COUNT)), protocol.trigonometric(COUNT))
+    _, base = select_frames(frame, other)
+    np.testing.assert_allclose(base.voltages[0], tank(frame.protocol), rtol=0, atol=1e-10 * np.abs(base.voltages).max())
+    assert any("turned into what" in note for note in base.notes)
+    # Not where they do not tell, or only how large they are differs.
+    for made in (protocol.adjacent(COUNT), protocol.haar(COUNT, current=2e-3)):
+        _, base = select_frames(frame, data.screen(tank(made), made))
+        assert base.protocol is made
+        with pytest.raises(ValueError, match=r"drive or read different|times the current|channels"):
+            assess(frame, base)

@@ -9,6 +9,7 @@ import pytest
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples"
 MOST = {
+    "bent_sheet": 0.05,
     "press_on_a_skin": 3e-3,
     "press_with_a_load": 1e-8,
     "contacts_from_images": 4e-3,
@@ -20,6 +21,7 @@ MOST = {
     "hear_a_stroke": 3e-3,
     "learn_a_prior": 0.97,
     "localisation_error": 2.5e-3,
+    "prosthesis": 6e-3,
 }
 
 

@@ -92,6 +92,13 @@ def _hearing(names: dict, folder: Path, printed: list[str]) -> None:
     assert (folder / "track.png").stat().st_size > 10_000
 
 
+def _instruments(names: dict, folder: Path, printed: list[str]) -> None:
+    assert names["told"] == sorted(names["told"], reverse=True)
+    assert abs(names["slow"].frequency - 0.3) < 0.01
+    phase = float(printed[0].split()[-1])
+    assert abs(phase - np.degrees(np.pi - 0.5)) < 5
+
+
 def _pressing(names: dict, folder: Path, printed: list[str]) -> None:
     assert names["frames"].shape == (4, 208)
     assert names["film"].shape == (60, 208)
@@ -104,20 +111,38 @@ def _reconstruction(names: dict, folder: Path, printed: list[str]) -> None:
     assert 1.8e-3 < float(names["result"].conductivity.max()) < 5e-3  # S; the inclusion has 3 mS
 
 
+def _surfaces(names: dict, folder: Path, printed: list[str]) -> None:
+    assert names["arm"].is_surface
+    assert names["skin"].dimension == 3
+    assert len(printed) == 2
+
+
 def _readme(names: dict, folder: Path, printed: list[str]) -> None:
     assert (folder / "press.png").stat().st_size > 10_000
     assert names["sensitivity"].position.shape == (208, 16, 2)
 
 
+def _looking_inside(names: dict, folder: Path, printed: list[str]) -> None:
+    made = ("overview.png", "slices.png", "oblique.png", "image.vtu", "filling.pvd", "filling.xdmf")
+    assert all((folder / name).stat().st_size > 200 for name in made)
+    assert [line.split(",")[0] for line in printed[:2]] == ["conductive", "resistive"]
+    for one, middle in zip(names["found"], ((0.03, -0.05, 0.1), (-0.03, 0.06, 0.06)), strict=True):
+        assert np.linalg.norm(np.array(one.centroid) - middle) < 0.02
+    assert printed[2].endswith("cm²")
+
+
 HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
+    "looking-inside.md": _looking_inside,
     "README.md": _readme,
     "contacts.md": _contacts,
     "design.md": _design,
     "gestures.md": _gestures,
     "health.md": _health,
     "hearing.md": _hearing,
+    "instruments.md": _instruments,
     "pressing.md": _pressing,
     "reconstruction.md": _reconstruction,
+    "surfaces.md": _surfaces,
 }
 
 

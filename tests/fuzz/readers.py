@@ -33,10 +33,14 @@ from jeit.data.frame_recording import read_frame_recording
 from jeit.design import Skin
 from jeit.design.skin.skin_file import read_described_skin
 from jeit.design.study import read_study, run_study, study_progress
+from jeit.electrodes import FaceDiscs
+from jeit.image import Inclusion
 from jeit.layout import named_layout, read_layout, write_layout
-from jeit.mesh import Disk, Rectangle
+from jeit.mesh import Disk, Rectangle, box
 from jeit.mesh import read as read_mesh
 from jeit.mesh import write as write_mesh
+from jeit.report import read_image
+from jeit.report.saved_image import saved_extras
 from jeit.touch import LearntSkin, PlacedMap, Presses, SelfOrganisingMap, read_presses, read_skin, write_skin
 from jeit.touch.gestures import GestureModel
 from jeit.touch.kohonen import Schedule, read_map, write_map
@@ -229,6 +233,15 @@ _instrument(
     "swisstom", ".eit", 32, lambda path: write_swisstom(path, np.random.default_rng(0).random((2, 32, 32)), [0, 20_000])
 )
 _instrument("sciospec", ".eit", 8, lambda path: write_sciospec(path, np.array([np.eye(8)] * 2), [(1, 3), (2, 4)]))
+
+
+@_reader("image", "a.npz", read_image)
+def _image(folder):
+    tank = box(0.1, 0.08, 0.06, num_points=30)
+    found = (Inclusion(1, (0.0, 0.0, 0.03), 1e-6, 1e-3),)
+    extras = saved_extras(tank, FaceDiscs([[0.05, 0.0, 0.03], [-0.05, 0.0, 0.03]], 0.01, 1e-3), found)
+    values = np.linspace(-1, 1, tank.num_cells)
+    np.savez(folder / "a.npz", conductivity=values, background=0.3, points=tank.points, cells=tank.cells, **extras)
 
 
 @_reader("frames", "a.npz", read_frame_recording)

@@ -77,8 +77,8 @@ def test_a_ball_at_the_wall_has_what_is_inside_of_it():
     np.testing.assert_allclose(found.centroid, [0.085 - 0.015, 0, 0.085], atol=2e-3)
 
 
-def test_the_least_size_is_as_wide_in_a_solid_as_in_a_sheet():
-    """A ball of an eighth of the tank's width is 0.0017 of its volume: no artefact."""
+def test_the_least_size_in_a_solid_is_a_ball_of_an_eighth_of_its_width():
+    """A ball of a seventh of the tank's width is 0.0018 of its volume: no artefact."""
     tank = box(0.1, 0.1, 0.1, cell_size=0.005)
     image = 1e-3 * ball(tank, [0, 0, 0.05], 0.0075)
     assert len(find_inclusions(tank, image)) == 1

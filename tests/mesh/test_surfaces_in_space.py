@@ -187,6 +187,13 @@ FAULTS = {
     ),
     "a wall through a wall": (lambda: Mesh.create(*_crossing(0.01)), "crosses or touches itself: triangles"),
     "a wall that touches a wall": (lambda: Mesh.create(*_crossing(0.0)), "crosses or touches itself"),
+    "a fan that goes through itself": (
+        lambda: Mesh.create(
+            0.1 * np.array([[0, 0, 0], [1, -1, 0], [1, 1, 0], [0.5, 0.2, 0.5], [0.5, 0, -0.5]]),
+            [[0, 1, 2], [0, 2, 3], [0, 3, 4]],
+        ),
+        "triangles 0 and 2 meet",
+    ),
     "folded flat": (
         lambda: Mesh.create([*SQUARE[:3], [0.08, 0.02, 0]], [[0, 1, 2], [0, 2, 3]]),
         "crosses or touches itself",

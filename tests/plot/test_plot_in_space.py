@@ -266,9 +266,7 @@ def test_the_overview_cuts_through_what_is_strongest(tank, image, patches):
     figure = plot_solid(tank, image, patches)
     titles = {one.get_title() for one in figure.axes} - {""}
     strongest = np.asarray(centroids(tank))[np.abs(image).argmax()]
-    assert titles == {
-        f"{axis} = {1e3 * one:.4g} mm".replace("-", "−") for axis, one in zip("xyz", strongest, strict=True)
-    }
+    assert titles == {Plane.at(axis, float(one)).name for axis, one in zip("xyz", strongest, strict=True)}
     inclusions = [Inclusion(-1, (-0.03, 0.06, 0.06), 1e-4, -1e-3)]
     figure = plot_solid(tank, image, patches, inclusions=inclusions)
     assert {one.get_title() for one in figure.axes} - {""} == {"x = −30 mm", "y = 60 mm", "z = 60 mm"}
@@ -300,3 +298,27 @@ def test_a_constant_image_is_drawn(tank):
 def test_solids_that_cannot_be_drawn(tank, draw, said):
     with pytest.raises(ValueError, match=said):
         draw(tank)
+
+
+def test_electrodes_on_a_surface_are_numbered_and_those_behind_it_hidden():
+    sleeve = cylinder(0.05, 0.2, num_points=3000)
+    wall = np.asarray(sleeve.facets)[np.asarray(sleeve.tags["side"])]
+    places = [[0.05, 0.0, 0.1], [-0.05, 0.0, 0.1]]
+    shapes = shapes_of(sleeve, FaceDiscs(places, 0.012, 1e-3))
+    ax = Figure().subplots()
+    plot_surface(sleeve.points, wall, None, shapes, camera=Camera(0, 0), ax=ax)
+    metal = np.flatnonzero(is_metal(pieces(ax).get_facecolor()))
+    number = len(pieces(ax).get_facecolor())
+    # Half of the pieces of metal come first, under the wall in front, and half last.
+    assert (metal < 0.45 * number).sum() == (metal > 0.55 * number).sum() == len(metal) / 2
+    assert {"1"} <= set(shown(ax))
+    assert "2" not in shown(ax)
+    with pytest.raises(ValueError, match="electrodes must be ElectrodeShapes"):
+        plot_surface(sleeve.points, wall, None, FaceDiscs(places, 0.012, 1e-3))
+
+
+def test_a_group_of_facets_has_one_rim(tank, ax):
+    plot_isosurfaces(tank, np.zeros(tank.num_cells), plates(tank, ["top"], 1e-3), camera=Camera(0, 90), ax=ax)
+    lines = np.abs(np.array(pieces(ax).get_linewidths()) - 0.5) < 1e-9
+    edges = np.array([np.linalg.norm(np.ptp(one.vertices, axis=0)) for one in np.array(pieces(ax).get_paths())[lines]])
+    assert edges.sum() == pytest.approx(2 * (BOX[0] + BOX[1]))

@@ -73,6 +73,8 @@ def test_files_of_before_have_neither_electrodes_nor_inclusions(tmp_path):
         ({"electrode_numbers": np.array([0, 7])}, "leave electrodes out"),
         ({"electrode_corners": np.full((64, 3), np.inf)}, "no places"),
         ({"inclusion_peaks": np.zeros(1)}, "do not belong together"),
+        ({"inclusion_centroids": np.array(1.0)}, "do not belong together"),
+        ({"points": np.asarray(TANK.points) + 0j}, "'points' is an array of complex128"),
         ({"inclusion_centroids": np.full((2, 3), np.nan)}, "not finite"),
         ({"departure": np.zeros(2)}, "'departure' is an array"),
         ({"images": np.zeros(2), "conductivity": None}, "many frames"),

@@ -23,6 +23,7 @@ def info(
     found = report_measurement(measurement)
     body, noise = found["body"], found["noise"]
     names = f" ({', '.join(found['frame_names'])})" if found["frame_names"] else ""
+    rate = f", {found['frame_rate']:.4g} a second" if found["frame_rate"] else ""
     size = ", ".join(
         f"{key} {1e3 * body[key]:g} mm" for key in ("radius", "width", "height", "thickness") if key in body
     )
@@ -30,7 +31,7 @@ def info(
         size = f"{body['dimension']}-D, {counted(body['points'], 'node')}"
     known = noise and f"{scaled(noise['standard_deviation'], 'V')}, from {noise['method']}"
     rows = [
-        ("frames", f"{found['frames']}{names}"),
+        ("frames", f"{found['frames']}{names}{rate}"),
         ("protocol", found["protocol"]),
         ("channels", f"{found['channels']}, of {counted(found['drives'], 'drive')}"),
         ("masked", f"{found['masked']} of {found['voltages']} voltages"),

@@ -64,7 +64,9 @@ def stream(
     ] = "film.gif",
     rate: Annotated[
         float | None,
-        typer.Option(help="Frames in a second: times in place of numbers, and the film's pace (default 10)."),
+        typer.Option(
+            help="Frames in a second: times in place of numbers, and the film's pace (default: what DATA says, or 10)."
+        ),
     ] = None,
     model: Model = None,
     quiet: Quiet = False,
@@ -130,6 +132,7 @@ def stream(
             frames, number = parse_frames(sys.stdin), None
         else:
             frames, number = frames_of(measured), measured.num_frames
+            rate = measured.frame_rate if rate is None else rate
         with naming_options({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
             step("image")
             come = FramesTold(step, number)

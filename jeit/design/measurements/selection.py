@@ -121,24 +121,25 @@ def random_selections(key: Array, num_candidates: int, number: int, count: int) 
     return orders[:, :number]
 
 
-def nearest_pairs(centres, number: int) -> Int[np.ndarray, " N"]:
+def nearest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"]:
     """The `number` shortest of all pairs of electrodes at `centres` (L, d): channels of `two_terminal(L)`.
 
-    The obvious pattern that measures every place from close by. Of pairs of the same length the first are taken.
+    `lengths` (L, L) between them, metres, in place of distances straight through space: `SurfaceLayout.lengths`. The
+    obvious pattern that measures every place from close by. Of pairs of the same length the first are taken.
     Raises `ValueError` for a number that is not from 1 to L(L - 1)/2.
     """
-    return _by_length(centres, number, 1)
+    return _by_length(centres, number, 1, lengths)
 
 
-def farthest_pairs(centres, number: int) -> Int[np.ndarray, " N"]:
+def farthest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"]:
     """The `number` longest pairs, as in `nearest_pairs`: a pattern that drives current through the whole skin.
 
     Raises `ValueError` for a number that is not from 1 to L(L - 1)/2.
     """
-    return _by_length(centres, number, -1)
+    return _by_length(centres, number, -1, lengths)
 
 
-def _by_length(centres, number: int, sign: int) -> np.ndarray:
+def _by_length(centres, number: int, sign: int, lengths) -> np.ndarray:
     centres = np.asarray(centres, float)
     first, second = np.triu_indices(len(centres), 1)
     if not 1 <= number <= len(first):
@@ -146,7 +147,13 @@ def _by_length(centres, number: int, sign: int) -> np.ndarray:
             f"number must be from 1 to the {len(first)} pairs of {len(centres)} electrodes; it is {number}."
         )
     # Rounded to a nanometre, so that pairs as long as each other are taken in their order.
-    length = np.linalg.norm(centres[first] - centres[second], axis=1).round(9)
+    if lengths is None:
+        lengths = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    elif np.shape(lengths) != (len(centres), len(centres)):
+        raise ValueError(
+            f"lengths has shape {np.shape(lengths)}; give one between any two of {len(centres)} electrodes."
+        )
+    length = np.asarray(lengths, float)[first, second].round(9)
     return np.argsort(sign * length, kind="stable")[:number]
 
 

@@ -10,6 +10,7 @@ from jeit.arguments import check_kind, check_metres, is_number, told
 from jeit.design.optimisation.constraints import Constraints
 from jeit.design.optimisation.variables import Symmetry, Variables, Varied
 from jeit.design.skin.skin import Skin, longer_side
+from jeit.layout import SurfaceLayout
 from jeit.mesh import Domain
 
 
@@ -63,6 +64,8 @@ class DesignSpace(eqx.Module):
     def constraints(self, skin: Skin) -> Constraints:
         """What its layouts satisfy on a `skin`. Raises `ValueError` where neither says the outline, and for a spacing
         that is none."""
+        if isinstance(skin.layout, SurfaceLayout):
+            raise ValueError("skin is curved; move its electrodes with jeit.design.optimise_surface_layout.")
         outline = skin.layout.outline if self.outline is None else self.outline
         if outline is None:
             raise ValueError(

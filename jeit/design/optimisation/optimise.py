@@ -23,7 +23,7 @@ from jeit.design.optimisation.search import Record, descend
 from jeit.design.optimisation.variables import Variables, Varied
 from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin, check_skin
-from jeit.layout import Layout
+from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh import Domain
 
 # Weights of the penalty, and the share of the steps after which each ends.
@@ -54,7 +54,7 @@ class Optimisation(eqx.Module):
     - `status`: "converged", "step limit", "stalled" (no shorter step improved) or "infeasible", and the `reason`.
     """
 
-    layout: Layout
+    layout: Layout | SurfaceLayout
     scores: Scores
     value: float
     start_value: float

@@ -7,8 +7,8 @@ import numpy as np
 from jeit.arguments import check_name
 from jeit.design.defaults import CURRENT, NUM_PAIRS, PROTOCOL
 from jeit.design.measurements.selection import nearest_pairs
-from jeit.layout import Layout
-from jeit.layout.layout import check_layout
+from jeit.layout import Layout, SurfaceLayout
+from jeit.layout.surface_layout import check_layout
 from jeit.protocol import Protocol, adjacent, opposite, two_terminal
 
 ProtocolName = Literal["adjacent", "opposite", "two-terminal"]
@@ -16,13 +16,17 @@ PROTOCOLS: tuple[ProtocolName, ...] = ("adjacent", "opposite", "two-terminal")
 
 
 def skin_protocol(
-    layout: Layout, name: ProtocolName = PROTOCOL, *, num_pairs: int | None = None, current: float = CURRENT
+    layout: Layout | SurfaceLayout,
+    name: ProtocolName = PROTOCOL,
+    *,
+    num_pairs: int | None = None,
+    current: float = CURRENT,
 ) -> Protocol:
     """The measurements of a skin with electrodes of `layout`, at `current` amperes.
 
-    `num_pairs`, of "two-terminal" only: between so many of the electrodes nearest to each other, 0 for all pairs; 94
-    unless given, as in Park et al. 2022, or all if there are fewer. Raises `ValueError` for another name, more pairs
-    than there are, pairs of another protocol, and as the protocols do.
+    `num_pairs`, of "two-terminal" only: between so many of the electrodes nearest to each other, on a curved skin by
+    the way along it, 0 for all pairs; 94 unless given, as in Park et al. 2022, or all if there are fewer. Raises
+    `ValueError` for another name, more pairs than there are, pairs of another protocol, and as the protocols do.
     """
     check_layout("layout", layout)
     check_name("protocol", name, PROTOCOLS)
@@ -33,11 +37,11 @@ def skin_protocol(
     number = number_of_pairs(layout, num_pairs)
     pairs = np.column_stack(np.triu_indices(layout.num_electrodes, 1))
     if number < len(pairs):
-        pairs = pairs[np.sort(nearest_pairs(layout.centres, number))]
+        pairs = pairs[np.sort(nearest_pairs(layout.centres, number, lengths=layout.lengths()))]
     return two_terminal(layout.num_electrodes, pairs, current=current)
 
 
-def number_of_pairs(layout: Layout, num_pairs: int | None) -> int:
+def number_of_pairs(layout: Layout | SurfaceLayout, num_pairs: int | None) -> int:
     """How many pairs are measured, as in `skin_protocol`. Raises `ValueError` for more than there are."""
     pairs = layout.num_electrodes * (layout.num_electrodes - 1) // 2
     if num_pairs is None:

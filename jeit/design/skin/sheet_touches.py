@@ -10,14 +10,16 @@ from jeit.design.defaults import CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
 from jeit.design.skin.touched_cells import TouchedCells, touched_cells
 from jeit.mesh import Mesh, centroids
+from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit_solvers.engines import gather, host, namespace, sum_into
 
 
 class SheetTouches(eqx.Module):
     """Touches of a sheet at n places, and how they change as the places move; make them with `sheet_touches`.
 
-    **Fields**: `touched`; `slope` (n, c, 2), the derivative of `touched.change` in the place, per metre; `thickness` of
-    the layer that the sheet stands for and `depth` of the touches, metres.
+    **Fields**: `touched`; `slope` (n, c, 2), the derivative of `touched.change` in the place, per metre, on a curved
+    sheet in two directions at right angles along it; `thickness` of the layer that the sheet stands for and `depth` of
+    the touches, metres.
     """
 
     touched: TouchedCells
@@ -60,7 +62,28 @@ def sheet_touches(
         distance = jnp.sqrt(jnp.sum((place - middle) ** 2) + 1e-18)
         return (contrast - 1) * indentation.depth_at(distance) / thickness
 
-    middles = centroids(mesh)[touched.cells]
-    slope = jax.jit(jax.vmap(jax.vmap(jax.grad(change), (None, 0))))(touched.places, middles)
+    middles, origin = centroids(mesh)[touched.cells], touched.places
+    if mesh.is_surface:
+        middles, origin = _laid_out(mesh, touched, indentation.reach), jnp.zeros_like(origin[:, :2])
+    slope = jax.jit(jax.vmap(jax.vmap(jax.grad(change), (None, 0))))(origin, middles)
     slope = jnp.where(touched.change[..., None] != 0, slope, 0.0)
     return SheetTouches(touched, slope, jnp.asarray(thickness, float), float(indentation.depth_at(host.zeros(()))))
+
+
+def _laid_out(mesh: Mesh, touched: TouchedCells, reach: float) -> Float[np.ndarray, "n c 2"]:
+    """Middles of touched cells as seen from their touches' places along the surface: in the plane that touches it
+    there, as far as the way along the surface is long."""
+    surface, places, cells = Triangles.of(mesh), np.asarray(touched.places), np.asarray(touched.cells)
+    middles = np.asarray(centroids(mesh))
+    normal = surface.normals_at(surface.nearest(places))
+    aside = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    first = np.cross(aside, normal)
+    first = first / np.linalg.norm(first, axis=1, keepdims=True)
+    frame = np.stack([first, np.cross(normal, first)], axis=1)
+    flat = np.einsum("nid,ncd->nci", frame, middles[cells] - places[:, None])
+    length, known = np.zeros(cells.shape), np.zeros(mesh.num_cells)
+    for row, (index, own) in enumerate(Geodesics.create(surface).near(places, surface.nearest(middles), reach)):
+        known[index] = own
+        length[row] = known[cells[row]]
+    straight = np.linalg.norm(flat, axis=-1)
+    return flat * np.where(straight > 0, length / np.where(straight > 0, straight, 1.0), 1.0)[..., None]

@@ -1,4 +1,4 @@
-"""`Skin`: a layout of electrodes in a conducting sheet, or on the bottom of a layer; checked, meshed, and touched."""
+"""`Skin`: a layout of electrodes in a sheet, or on the bottom of a layer, flat or curved; checked, meshed, touched."""
 
 from collections.abc import Sequence
 
@@ -13,15 +13,17 @@ from jeit.design.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CON
 from jeit.design.skin.cell_size import check_cell_size, smallest_diameter
 from jeit.design.skin.indentation import AbstractIndentation, Bell
 from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.reached_cells import touched_surface
 from jeit.design.skin.sheet_touches import SheetTouches, sheet_touches
 from jeit.design.skin.touched_cells import TouchedCells, touched_cells
 from jeit.design.skin.voltage_changes import touch_changes
-from jeit.electrodes import FaceDiscs, SheetDiscs
+from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import check_conductivity
-from jeit.layout import Layout
-from jeit.layout.layout import check_layout
-from jeit.mesh import Domain, Mesh, Rectangle, layer
+from jeit.layout import Layout, SurfaceLayout
+from jeit.layout.surface_layout import check_layout, flat_layout
+from jeit.mesh import Domain, Mesh, Rectangle, layer, shell
+from jeit.mesh.geodesic import Triangles
 from jeit.protocol import Protocol
 from jeit_solvers.engines import host
 
@@ -30,21 +32,25 @@ _THICKEST = 3.0
 
 
 class Skin(eqx.Module):
-    """A flat skin of one layout: its electrodes' discs in a sheet, or on the bottom of a layer touched on its top.
+    """A skin of one layout: its electrodes' discs in a sheet, or on the bottom of a layer touched on its top.
+
+    Of a `SurfaceLayout` the sheet or the layer is curved; places touched are (n, 3), on its surface, and all else is
+    the same.
 
     **Fields**
 
-    - `layout`: of the electrodes, with the skin's outline.
+    - `layout`: of the electrodes, with the skin's outline, or its surface.
     - `model`: its forward model: mesh, electrodes and protocol.
     - `thickness`: metres, of a sheet that of the layer which it stands for.
     - `conductivity`: of the material, S/m, one number or one for each cell.
     - `num_layers`: of cells of a layer; 0 for a sheet.
     - `cell_size`: metres, of the plane mesh, if that was asked for.
 
-    Make it with `Skin.create`, which checks and meshes; or from a `model` of one's own, of `SheetDiscs` or `FaceDiscs`.
+    Make it with `Skin.create`, which checks and meshes; or from a `model` of one's own, of `SheetDiscs` (`SurfaceDiscs`
+    on a curved sheet) or `FaceDiscs`.
     """
 
-    layout: Layout
+    layout: Layout | SurfaceLayout
     model: ForwardModel
     thickness: float
     conductivity: Float[Array, "..."]
@@ -53,7 +59,7 @@ class Skin(eqx.Module):
 
     def __init__(
         self,
-        layout: Layout,
+        layout: Layout | SurfaceLayout,
         model: ForwardModel,
         *,
         thickness: float,
@@ -62,7 +68,8 @@ class Skin(eqx.Module):
         cell_size: float | None = None,
     ):
         """Raises `ValueError` for a model of other electrodes, or of another dimension."""
-        wanted = FaceDiscs if num_layers else SheetDiscs
+        sheet = SurfaceDiscs if isinstance(layout, SurfaceLayout) else SheetDiscs
+        wanted = FaceDiscs if num_layers else sheet
         if not isinstance(model.electrodes, wanted):
             raise ValueError(
                 f"model has {type(model.electrodes).__name__}; a {'layer' if num_layers else 'sheet'} has "
@@ -82,7 +89,7 @@ class Skin(eqx.Module):
     @classmethod
     def create(
         cls,
-        layout: Layout,
+        layout: Layout | SurfaceLayout,
         *,
         thickness: float = THICKNESS,
         conductivity: ArrayLike = CONDUCTIVITY,
@@ -96,12 +103,20 @@ class Skin(eqx.Module):
 
         `thickness` in metres, `conductivity` in S/m. `contact_impedance` of the electrodes, ohm·m²: the layout's unless
         given, and 1e-4 where it does not say. `num_layers` of cells, 0 for a sheet. `cell_size`, metres (4.5e-3), or
-        `num_points`, about, of the plane mesh. `protocol`: that of `skin_protocol(layout)` unless given.
+        `num_points`, about, of the plane mesh; a `SurfaceLayout` has its own. `protocol`: that of
+        `skin_protocol(layout)` unless given.
 
-        Raises `ValueError` for a layout without an outline, a skin thicker than wide, cells too small for any mesh, and
-        electrodes too small for them.
+        Raises `ValueError` for a layout without an outline, a skin thicker than wide, cells too small for any mesh,
+        electrodes too small for them, and as `jeit.mesh.shell` does, for a skin thicker than it is curved.
         """
         check_layout("layout", layout)
+        if isinstance(layout, SurfaceLayout):
+            if cell_size is not None or num_points is not None:
+                raise ValueError(
+                    "cell_size and num_points are of flat skins; a SurfaceLayout's surface is a mesh already."
+                )
+            model = curved_model(layout, thickness, num_layers, contact_impedance, protocol)
+            return cls(layout, model, thickness=thickness, conductivity=conductivity, num_layers=num_layers)
         outline = plain_outline(layout.known_outline)
         check_metres("thickness", thickness, longer_side(outline), "the skin is wide")
         if cell_size is None and num_points is None:
@@ -118,32 +133,47 @@ class Skin(eqx.Module):
         return cls(layout, model, thickness=thickness, conductivity=conductivity, **options)
 
     @property
-    def outline(self) -> Domain:
-        """Of the skin, metres."""
+    def outline(self) -> Domain | Triangles:
+        """Of the skin, metres; of a curved one the surface that is touched."""
+        if isinstance(self.layout, SurfaceLayout):
+            return touched_surface(self.model.mesh, self.touched_face)
         return self.layout.known_outline
+
+    @property
+    def flat_outline(self) -> Domain:
+        """Of a flat skin, metres. Raises `ValueError` for a curved one, which has none."""
+        return flat_layout(self.layout).known_outline
+
+    @property
+    def touched_face(self) -> str:
+        """Of a curved layer: "outer", or "inner" where its electrodes are on the outer one."""
+        inward = isinstance(self.layout, SurfaceLayout) and not self.layout.outward
+        return "inner" if inward else "outer"
 
     @property
     def model_conductivity(self) -> Float[Array, "..."]:
         """What the model takes: the material's in S/m for a layer, a sheet's in siemens."""
         return model_conductivity(self.conductivity, self.thickness, self.num_layers)
 
-    def with_layout(self, layout: Layout, contact_impedance: ArrayLike | None = None) -> "Skin":
+    def with_layout(self, layout: Layout | SurfaceLayout, contact_impedance: ArrayLike | None = None) -> "Skin":
         """The same skin, on the same mesh and with the same protocol, with as many electrodes of another layout.
 
         `contact_impedance` as in `create`. Raises `ValueError` for electrodes off the mesh or too small for it.
         """
         electrodes, mesh = skin_electrodes(layout, self.num_layers, contact_impedance), self.model.mesh
-        if self.cell_size is None:
+        if self.cell_size is None or isinstance(layout, SurfaceLayout):
             electrodes.check(mesh)
         else:
-            check_cell_size("cell_size", self.cell_size, layout, float(self.outline.area), self.num_layers)
+            outline = layout.known_outline
+            check_cell_size("cell_size", self.cell_size, layout, float(outline.area), self.num_layers)
             _check_electrodes(layout, electrodes, mesh, self.cell_size, None)
         return eqx.tree_at(lambda one: (one.layout, one.model), self, (layout, self.model.with_electrodes(electrodes)))
 
     def touched_cells(
         self, places: ArrayLike, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
     ) -> TouchedCells:
-        """What touches at `places` (n, 2), metres, change, one at a time; `Bell` unless given, as in `touched_cells`.
+        """What touches at `places` (n, 2), on a curved skin (n, 3), metres, change, one at a time; `Bell` unless
+        given, as in `touched_cells`.
 
         Raises `ValueError` for touches as deep as the skin, of which one changes no cell, as where a layer has too few
         layers of cells, and for a contrast that changes nothing.
@@ -162,7 +192,7 @@ class Skin(eqx.Module):
         if deepest >= self.thickness:
             raise ValueError(f"{said}.")
         try:
-            return touched_cells(self.model.mesh, indentation, places, contrast=contrast)
+            return touched_cells(self.model.mesh, indentation, places, contrast=contrast, face=self.touched_face)
         except ValueError as error:
             if self.thickness > most:
                 raise ValueError(f"{said}: {error}") from None
@@ -180,7 +210,7 @@ class Skin(eqx.Module):
         return touch_changes(self.model, self.model_conductivity, touched, linear=linear)
 
 
-def skins_of(layouts: Sequence[Layout], protocols: Sequence[Protocol], **options) -> list[Skin]:
+def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Protocol], **options) -> list[Skin]:
     """Skins of layouts and their protocols, with `options` of `Skin.create`, whose errors it raises; one mesh and its
     factorisation's plan serve all that follow each other on the same outline with as many electrodes."""
     made: list[Skin] = []
@@ -193,10 +223,21 @@ def skins_of(layouts: Sequence[Layout], protocols: Sequence[Protocol], **options
     return made
 
 
-def _serves(skin: Skin, layout: Layout) -> bool:
+def _serves(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
     """Whether the mesh of a skin is that of a layout too."""
+    if isinstance(layout, SurfaceLayout):
+        own = skin.layout
+        if not isinstance(own, SurfaceLayout) or own.outward != layout.outward or not _as_many(skin, layout):
+            return False
+        return bool(eqx.tree_equal(own.surface, layout.surface))
+    if isinstance(skin.layout, SurfaceLayout):
+        return False
     same = eqx.tree_equal(skin.outline, plain_outline(layout.known_outline))
-    return bool(same) and layout.num_electrodes == skin.layout.num_electrodes
+    return bool(same) and _as_many(skin, layout)
+
+
+def _as_many(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
+    return layout.num_electrodes == skin.layout.num_electrodes
 
 
 def check_skin(name: str, given) -> None:
@@ -204,8 +245,10 @@ def check_skin(name: str, given) -> None:
     check_kind(name, given, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
 
 
-def longer_side(outline: Domain) -> float:
+def longer_side(outline: Domain | Triangles) -> float:
     """Of the box of an outline, metres: how wide a skin is."""
+    if isinstance(outline, Triangles):
+        return float(np.ptp(outline.points, axis=0).max())
     low_x, high_x, low_y, high_y = outline.extent
     return float(max(high_x - low_x, high_y - low_y))
 
@@ -226,11 +269,26 @@ def plain_outline(outline: Domain) -> Domain:
     return Rectangle(width, height, ((low_x + high_x) / 2, (low_y + high_y) / 2))
 
 
-def skin_electrodes(layout: Layout, num_layers: int, contact_impedance=None) -> SheetDiscs | FaceDiscs:
+def curved_model(
+    layout: SurfaceLayout, thickness: float, num_layers: int, contact_impedance, protocol: Protocol | None
+) -> ForwardModel:
+    """Of a sheet that is the layout's surface, or of a shell of it. Raises `ValueError` as `Skin.create` does."""
+    surface = layout.surface
+    check_metres("thickness", thickness, longer_side(Triangles.of(surface)), "the skin is wide")
+    mesh = shell(surface, thickness, num_layers, outward=layout.outward) if num_layers else surface
+    electrodes = skin_electrodes(layout, num_layers, contact_impedance)
+    return ForwardModel(mesh, electrodes, skin_protocol(layout) if protocol is None else protocol)
+
+
+def skin_electrodes(
+    layout: Layout | SurfaceLayout, num_layers: int, contact_impedance=None
+) -> SheetDiscs | SurfaceDiscs | FaceDiscs:
     """Discs in a sheet (`num_layers` 0), or on the bottom of a layer. Contact impedance in ohm·m²: the layout's unless
     given, and 1e-4 where it does not say."""
     if contact_impedance is None and layout.contact_impedance is None:
         contact_impedance = CONTACT_IMPEDANCE
+    if isinstance(layout, SurfaceLayout):
+        return layout.discs(contact_impedance, sheet=not num_layers)
     discs = layout.sheet_discs(contact_impedance)
     if not num_layers:
         return discs

@@ -6,17 +6,20 @@ from jaxtyping import Float
 
 from jeit.arguments import check_kind, told
 from jeit.design.defaults import PLACES
+from jeit.layout import spread
 from jeit.mesh import Domain
+from jeit.mesh.geodesic import Triangles
 
 
 class TouchGrid(eqx.Module):
     """Where a skin is touched: the middles of equal rectangles that cover it.
 
-    - `places`: (n, 2) metres; `rows`, `columns`: (n,) of each in the raster, row 0 at the least y.
+    - `places`: (n, 2) metres, on a curved skin (n, 3); `rows`, `columns`: (n,) of each in the raster, row 0
+      at the least y.
     - `shape`: (rows, columns) of the raster; `pitch`: (width, height) of a rectangle, metres.
     """
 
-    places: Float[np.ndarray, "n 2"]
+    places: Float[np.ndarray, "n d"]
     rows: np.ndarray
     columns: np.ndarray
     shape: tuple[int, int] = eqx.field(static=True)
@@ -34,16 +37,43 @@ class TouchGrid(eqx.Module):
         return image
 
 
-def touch_grid(outline: Domain, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
+class SurfaceGrid(TouchGrid):
+    """Where a curved skin is touched: `places` (n, 3), metres, spread evenly over it by ways along its surface.
+
+    They are in no raster: one row. **Fields**: those of `TouchGrid`, and `areas` (n,) m², what each place stands for.
+    """
+
+    areas: Float[np.ndarray, " n"]
+
+    @classmethod
+    def spread(cls, surface: Triangles, number: int, margin: float = 0.0) -> "SurfaceGrid":
+        """So many places, `margin` metres from the edge. Raises `ValueError` where that leaves no room."""
+        places = spread(surface, number, margin=margin)
+        kept = surface.node_areas * (surface.distance_to_border(surface.points) >= margin)
+        each = float(kept.sum()) / number
+        flat = np.zeros(number, int), np.arange(number)
+        return cls(places, *flat, (1, number), (each**0.5, each**0.5), np.full(number, each))
+
+    def raster(self, values) -> Float[np.ndarray, "rows columns"]:
+        """Raises `ValueError`: places on a curved skin are in no rows and columns."""
+        raise ValueError(
+            "grid is of a curved skin, whose places are in no raster; draw it with jeit.plot.plot_unrolled."
+        )
+
+
+def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
     """Rectangles over the bounding box of `outline`, those whose middle lies inside; 48 × 48 as in Park et al. 2022.
 
-    Raises `ValueError` for fewer than one row or column, and for what is no outline.
+    Of a curved skin, whose outline is its surface, as many places spread evenly over it. Raises `ValueError` for fewer
+    than one row or column, and for what is no outline.
     """
-    check_kind("outline", outline, Domain, "an outline, such as skin.outline or Rectangle(0.2, 0.2)")
+    check_kind("outline", outline, (Domain, Triangles), "an outline, such as skin.outline or Rectangle(0.2, 0.2)")
     if columns < 1 or rows < 1:
         raise ValueError(
             f"a grid needs one column and one row at least; {columns} columns and {rows} rows were asked for."
         )
+    if isinstance(outline, Triangles):
+        return SurfaceGrid.spread(outline, columns * rows)
     low_x, high_x, low_y, high_y = outline.extent
     width, height = (high_x - low_x) / columns, (high_y - low_y) / rows
     x, y = low_x + width * (np.arange(columns) + 0.5), low_y + height * (np.arange(rows) + 0.5)
@@ -53,11 +83,15 @@ def touch_grid(outline: Domain, columns: int = PLACES, rows: int = PLACES) -> To
     return TouchGrid(places[inside], row, column, (rows, columns), (float(width), float(height)))
 
 
-def touches_away_from_the_edge(outline: Domain, margin: float, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
+def touches_away_from_the_edge(
+    outline: Domain | Triangles, margin: float, columns: int = PLACES, rows: int = PLACES
+) -> TouchGrid:
     """The places of `touch_grid` whose touches reach over no edge: farther than `margin` (metres) from the outline.
 
     Raises `ValueError` if no place is so far from the edge.
     """
+    if isinstance(outline, Triangles):
+        return SurfaceGrid.spread(outline, columns * rows, margin)
     grid = touch_grid(outline, columns, rows)
     offsets = margin * np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 16, endpoint=False)])
     kept = np.all([np.asarray(outline.contains(grid.places + offset)) for offset in offsets], axis=0)
@@ -71,14 +105,15 @@ def check_grid(grid: TouchGrid) -> None:
     check_kind("grid", grid, TouchGrid, "a TouchGrid, as of touch_grid(skin.outline)")
 
 
-def check_places(places) -> Float[np.ndarray, "n 2"]:
-    """Places (n, 2), metres, as an array. Raises `ValueError` for what are none, such as a whole `TouchGrid`."""
-    wanted = "places must be (n, 2), one or more, in metres, such as touch_grid(skin.outline).places"
+def check_places(places, dimension: int = 2) -> Float[np.ndarray, "n d"]:
+    """Places (n, 2), or (n, 3) on a curved skin, metres, as an array. Raises `ValueError` for what are none, such as a
+    whole `TouchGrid`."""
+    wanted = f"places must be (n, {dimension}), one or more, in metres, such as touch_grid(skin.outline).places"
     try:
         found = np.asarray(places, float)
     except (TypeError, ValueError):
         raise ValueError(f"{wanted}; it is {told(places)}.") from None
-    if found.ndim != 2 or found.shape[1] != 2 or not len(found):
+    if found.ndim != 2 or found.shape[1] != dimension or not len(found):
         raise ValueError(f"{wanted}; they have shape {found.shape}.")
     lost = np.flatnonzero(~np.isfinite(found).all(axis=1))
     if lost.size:

@@ -4,14 +4,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.spatial import KDTree
 
 from jeit.arguments import check_kind
 from jeit.design.defaults import CONTRAST, MOST_CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
+from jeit.design.skin.reached_cells import is_curved, reached_cells, said
 from jeit.design.skin.touch_grid import check_places
 from jeit.electrodes.window import smooth_step
-from jeit.mesh import Mesh, centroids, check_flat
+from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array, host
 
 
@@ -20,12 +20,12 @@ class TouchedCells(eqx.Module):
 
     **Fields**
 
-    - `places`: (n, 2) metres, middles of the touches.
+    - `places`: (n, 2) metres, on a curved skin (n, 3), middles of the touches.
     - `cells`: (n, c), and `change`: (n, c), −1 for a cell that conducts no more; 0 where a touch has fewer cells.
     - `num_cells`: of the mesh they are of.
     """
 
-    places: Float[Array, "n 2"]
+    places: Float[Array, "n d"]
     cells: Int[Array, "n c"]
     change: Float[Array, "n c"]
     num_cells: int = eqx.field(static=True)
@@ -39,8 +39,9 @@ def touched_cells(
     thickness: float | None = None,
     contrast: float = CONTRAST,
     edge: float = 0.0,
+    face: str = "outer",
 ) -> TouchedCells:
-    """Indent the top of a layer, or a sheet, at `places` (n, 2) in metres, one at a time.
+    """Indent the top of a layer, or a sheet, at `places` (n, 2) in metres, one at a time; on a curved skin (n, 3).
 
     **Layer** (3-D mesh, top at its greatest z): cells in the indented part, by their centroids, get `contrast` times
     their conductivity: 0, the default, for an insulating indenter (Park et al. 2022, text S4). With an `edge` in metres
@@ -49,33 +50,32 @@ def touched_cells(
     **Sheet** (2-D mesh) of a layer of `thickness` metres: a part depth / thickness of the current's way gets `contrast`
     times its conductivity.
 
+    **Curved skin** (a surface in space, or a shell of one): the same, with distances along the surface touched, the
+    `face` of a shell, and depths along its inward normal.
+
     A `contrast` above 1 is that of a conductor. Raises `ValueError` for places where no cell is touched, for an
     indentation as deep as the skin, and where `thickness` is missing or superfluous.
     """
-    check_flat(mesh, "these touches")
-    middle = np.asarray(centroids(mesh))
-    places = check_places(places)
+    places = check_places(places, 3 if is_curved(mesh) else 2)
     check_kind("indentation", indentation, AbstractIndentation, "an indentation, such as Bell() or Hemisphere()")
     _check_values(contrast, edge)
     layer = mesh.dimension == 3
     deepest = float(indentation.depth_at(host.zeros(())))
-    below = np.zeros(len(middle))
-    if layer:
-        if thickness is not None:
-            raise ValueError("thickness is for sheets; that of a layer is in its mesh.")
-        height = np.asarray(mesh.points)[:, 2]
-        below = height.max() - middle[:, 2]
-        thickness = float(np.ptp(height))
-    elif thickness is None or not 0 < thickness < np.inf:
+    if layer and thickness is not None:
+        raise ValueError("thickness is for sheets; that of a layer is in its mesh.")
+    if not layer and (thickness is None or not 0 < thickness < np.inf):
         raise ValueError(f"thickness must be given for a sheet, in metres, positive; it is {thickness!r}.")
+    reached = reached_cells(mesh, places, indentation.reach, deepest + edge if layer else np.inf, face)
+    thickness = reached.thickness if layer else thickness
+    assert thickness is not None
     if deepest >= thickness:
         raise ValueError(
             f"the indentation is {1e3 * deepest:.3g} mm deep, and the skin {1e3 * thickness:.3g} mm thick; press less."
         )
-    candidates = np.flatnonzero(below < deepest + edge)
-    near = KDTree(middle[candidates, :2]).query_ball_point(places, indentation.reach, return_sorted=True)
-    cells, there = padded([candidates[np.asarray(index, int)] for index in near])
-    depth = np.asarray(indentation.depth_at(np.linalg.norm(middle[cells, :2] - places[:, None], axis=-1)))
+    cells, there = padded(reached.near)
+    distance = np.full(cells.shape, np.inf)
+    distance[there] = np.concatenate(reached.distance)
+    depth, below = np.asarray(indentation.depth_at(as_array(distance))), reached.below
     if not layer:
         share = depth / thickness
     elif edge:
@@ -85,11 +85,10 @@ def touched_cells(
     changed = there & (share > 0)
     empty = np.flatnonzero(~changed.any(axis=1))
     if empty.size:
-        x, y = 1e3 * places[empty[0]]
         raise ValueError(
-            f"{empty.size} of {len(places)} touches change no cell, the first at ({x:.4g}, {y:.4g}) mm: they lie off "
-            "the skin (places are in metres), or its cells are too coarse for so shallow an indentation; refine the "
-            "mesh, in a layer upwards."
+            f"{empty.size} of {len(places)} touches change no cell, the first at {said(places[empty[0]])} mm: they lie "
+            "off the skin (places are in metres), or its cells are too coarse for so shallow an indentation; refine "
+            "the mesh, in a layer upwards."
         )
     kept, there = padded([one[used] for one, used in zip(cells, changed, strict=True)])
     change = np.zeros(kept.shape)

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind
+from jeit.design.skin.reached_cells import said
 from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.skin.touched_nodes import touched_nodes
 from jeit.forward import ForwardModel
@@ -96,14 +97,13 @@ def _exact(model: ForwardModel, conductivity, touched: TouchedCells):
     return found
 
 
-def check_found(changes, places: Float[np.ndarray, "n 2"]) -> None:
+def check_found(changes, places: Float[np.ndarray, "n d"]) -> None:
     """Raise `RuntimeError` where changes by touches at `places`, metres, were not found."""
     lost = np.flatnonzero(~np.isfinite(np.asarray(changes)).all(axis=1))
     if lost.size:
-        x, y = places[lost[0]]
         raise RuntimeError(
             f"the changes by {lost.size} of {len(places)} touches were not found in {_MOST_STEPS} steps, the first at "
-            f"({1e3 * x:.4g}, {1e3 * y:.4g}) mm; does it cut an electrode off, or are conductivities many orders of "
+            f"{said(places[lost[0]])} mm; does it cut an electrode off, or are conductivities many orders of "
             "magnitude apart?"
         )
 

@@ -23,7 +23,7 @@ from jeit.design.skin.voltage_changes import touch_changes
 from jeit.design.study.scores import OPTIMALITY
 from jeit.design.study.spec import Point, Shape, Study
 from jeit.design.taxels import find_taxels
-from jeit.electrodes import FaceDiscs, SheetDiscs
+from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.forward import ForwardModel
 from jeit.protocol import Protocol
 
@@ -47,7 +47,7 @@ class _Varied(eqx.Module):
     """Where points of one shape differ; `conductivity` of the mesh's cells, noise in volts. A batch of k of them is one
     whose every array leads with an axis of k."""
 
-    electrodes: SheetDiscs | FaceDiscs
+    electrodes: SheetDiscs | SurfaceDiscs | FaceDiscs
     protocol: Protocol
     thickness: Float[Array, ""]
     conductivity: Float[Array, ""]

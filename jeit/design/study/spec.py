@@ -19,7 +19,7 @@ from jeit.design.skin.protocol import ProtocolName, skin_protocol
 from jeit.design.skin.skin import longer_side, skin_electrodes
 from jeit.design.study.layouts import is_file, study_layout
 from jeit.design.study.scores import OPTIMALITY
-from jeit.electrodes import FaceDiscs, SheetDiscs
+from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.files import check_memory, read_text
 from jeit.files.text import parsed_toml
 from jeit.layout import Layout
@@ -73,7 +73,7 @@ class Point:
         return Shape(self.layout.num_electrodes, self.protocol, self.pairs, self.cell_size, self.layers, thickness)
 
     @property
-    def electrodes(self) -> SheetDiscs | FaceDiscs:
+    def electrodes(self) -> SheetDiscs | SurfaceDiscs | FaceDiscs:
         """In the sheet, or on the bottom of the layer."""
         return skin_electrodes(self.layout, self.layers)
 

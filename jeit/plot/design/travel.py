@@ -10,6 +10,7 @@ from matplotlib.path import Path
 
 from jeit.arguments import check_kind
 from jeit.design.optimisation.optimise import Optimisation
+from jeit.layout.surface_layout import flat_layout
 from jeit.mesh import Domain
 from jeit.plot.axes import INK, SOFT, axes_or_new, bare, draw_scale_bar
 from jeit.plot.imaging.electrodes import METAL
@@ -37,7 +38,7 @@ def plot_travel(
     ends, radii = optimisation.centres[start], optimisation.radii[start]
     ways = np.concatenate([optimisation.snapshots[start], ends[None]])
     ax = axes_or_new(ax)
-    outline = optimisation.layout.outline
+    outline = flat_layout(optimisation.layout).outline
     if outline is not None:
         ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9, zorder=2))
         extent = outline.extent

@@ -1,23 +1,25 @@
 """What stands round an image in space: the body's hull, translucent, and electrodes on it, numbered."""
 
+from collections import Counter
+
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 
-from jeit.electrodes import AbstractElectrodes
-from jeit.electrodes.electrode_shapes import Draped, ElectrodeShapes, shapes_of, surface_triangles
+from jeit.electrodes.electrode_shapes import Draped, ElectrodeShapes, surface_triangles
 from jeit.mesh import Mesh
 from jeit.plot.axes import SOFT
 from jeit.plot.imaging.electrodes import METAL
-from jeit.plot.solid.scene import Scene, draw_number
-from jeit.plot.solid.shaded_surface import BODY
+from jeit.plot.solid.scene import BODY, Scene, draw_number
 
 _HULL = 0.1
 # Cosine of the angle between facets beyond which their edge is one of the body.
 _SHARP = 0.85
 # Over the size of the body: how much nearer electrodes count than the surface under them, and how far off numbers are.
-_BEFORE, _AWAY = 0.03, 0.045
+_BEFORE, _AWAY = 0.06, 0.045
+# And how far numbers are apart that can be read.
+_CLEAR = 0.03
 
 
 def size_of(mesh: Mesh) -> float:
@@ -53,25 +55,46 @@ def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarr
     return np.concatenate([edges[pair[drawn]], edges[alone]])
 
 
-def add_electrodes(scene: Scene, mesh: Mesh, electrodes: AbstractElectrodes | ElectrodeShapes) -> ElectrodeShapes:
-    """Electrodes on the surface: those on the side that is looked at over all behind it, others under it."""
-    shapes = electrodes if isinstance(electrodes, ElectrodeShapes) else shapes_of(mesh, electrodes)
-    surface, size = Draped(np.asarray(mesh.points), surface_triangles(mesh)), size_of(mesh)
-    for corners in shapes.polygons():
-        (outward,) = surface.normals(corners.mean(axis=0)[None])
+def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes) -> None:
+    """Electrodes on a surface: those on the side that is looked at over all behind it, others under it."""
+    surface, size = Draped(points, triangles), float(np.ptp(points, axis=0).max())
+    polygons = shapes.polygons()
+    normals = surface.normals(np.array([corners.mean(axis=0) for corners in polygons]))
+    rims = _rims(polygons, shapes.electrode, 1e-6 * size)
+    for corners, outward, rim in zip(polygons, normals, rims, strict=True):
         if len(corners) == 1:
             angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
             _, across, up = surface.frames(corners)[0]
             corners = corners + 0.012 * size * (np.outer(np.cos(angle), across) + np.outer(np.sin(angle), up))
-        scene.add_polygon(corners, METAL, outward, _BEFORE * size)
-    return shapes
+            rim = np.ones(12, bool)
+        before = _BEFORE * size * float(np.sign(outward @ scene.camera.toward))
+        scene.add_polygon(corners, METAL, before=before, rim=rim)
 
 
-def number_electrodes(ax: Axes, scene: Scene, mesh: Mesh, shapes: ElectrodeShapes) -> None:
-    """Numbers from 1 beside electrodes, outward; faint on the side that is not looked at."""
+def _rims(polygons, electrode, near: float) -> list[np.ndarray]:
+    """Which edges of each polygon are on the rim of its electrode: those that no other of its polygons has."""
+    keys = []
+    for corners, number in zip(polygons, electrode.tolist(), strict=True):
+        places = [tuple(place) for place in np.round(corners / near).astype(np.int64).tolist()]
+        others = [*places[1:], places[0]]
+        keys.append([(number, *sorted(pair)) for pair in zip(places, others, strict=True)])
+    count = Counter(key for one in keys for key in one)
+    return [np.array([count[key] == 1 for key in one]) for one in keys]
+
+
+def number_electrodes(
+    ax: Axes, scene: Scene, points, triangles, shapes: ElectrodeShapes, *, behind: bool = True
+) -> None:
+    """Numbers from 1 beside electrodes, outward; faint ones on the side that is not looked at, if `behind` is shown."""
     middles = shapes.middles()
-    normals = Draped(np.asarray(mesh.points), surface_triangles(mesh)).normals(middles)
-    places = scene.camera.on_page(middles + _AWAY * size_of(mesh) * normals)
+    normals = Draped(points, triangles).normals(middles)
+    places = scene.camera.on_page(middles + _AWAY * float(np.ptp(points, axis=0).max()) * normals)
     fontsize = 8 if len(places) <= 20 else 6.5
-    for k, (place, normal) in enumerate(zip(places, normals, strict=True)):
-        draw_number(ax, place, str(k + 1), fontsize=fontsize, faint=bool(normal @ scene.camera.toward < -0.05))
+    faint = normals @ scene.camera.toward < -0.05
+    near, clear = places[~faint], _CLEAR * float(np.ptp(points, axis=0).max())
+    for k, place in enumerate(places):
+        # What is behind has no number where one in front has its own.
+        if faint[k] and not behind:
+            continue
+        if not faint[k] or not len(near) or np.linalg.norm(near - place, axis=1).min() > clear:
+            draw_number(ax, place, str(k + 1), fontsize=fontsize, faint=bool(faint[k]))

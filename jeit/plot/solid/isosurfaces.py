@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, is_number, told
 from jeit.electrodes import AbstractElectrodes
-from jeit.electrodes.electrode_shapes import ElectrodeShapes
+from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
 from jeit.image.plane import check_solid
 from jeit.mesh import Mesh
@@ -22,7 +22,7 @@ from jeit.plot.solid.scene import Scene, bare_in_space
 from jeit.plot.solid.shaded_surface import colours_of, mappable
 
 HALF = (0.5,)
-_OUTER = 0.3
+OUTER = 0.3
 # Over the strongest change of either sign: as inclusions are looked for.
 _LEAST_PEAK = 0.3
 _DASHED = (0, (4, 3))
@@ -76,7 +76,7 @@ def draw_in_space(
     surfaces = level_surfaces(mesh, values, levels, both=fitted.scale.difference)
     for value, share, surface in surfaces:
         colour = np.array(colours_of(fitted, np.array([value]))[0])
-        colour[3] = 1.0 if share == max(levels) else _OUTER
+        colour[3] = 1.0 if share == max(levels) else OUTER
         scene.add_triangles(surface.points, surface.triangles, colour, smooth=True)
     for plane in planes:
         outline = cut_by_plane(mesh, plane).outline
@@ -84,11 +84,14 @@ def draw_in_space(
             outline[..., :1] * plane.right + outline[..., 1:] * plane.up + (plane.point @ plane.toward) * plane.toward
         )
         scene.add_lines(places, INK, 0.6)
-    shapes = None if electrodes is None else add_electrodes(scene, mesh, electrodes)
-    scene.draw(ax)
-    bare_in_space(ax, camera, np.asarray(mesh.points), numbered=shapes is not None)
+    shapes = shapes_of(mesh, electrodes) if isinstance(electrodes, AbstractElectrodes) else electrodes
+    points, wall = np.asarray(mesh.points), np.asarray(mesh.facets)
     if shapes is not None:
-        number_electrodes(ax, scene, mesh, shapes)
+        add_electrodes(scene, points, wall, shapes)
+    scene.draw(ax)
+    bare_in_space(ax, camera, points, numbered=shapes is not None)
+    if shapes is not None:
+        number_electrodes(ax, scene, points, wall, shapes)
     for one in inclusions:
         # A ball is seen as a disc of its radius from every side.
         x, y = camera.on_page(np.array(one.centroid))

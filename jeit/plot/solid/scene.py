@@ -5,7 +5,7 @@ among all others, and seen along parallel rays, so that the picture has a true s
 """
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgba
@@ -16,6 +16,8 @@ from jeit.plot.solid.camera import Camera
 
 _RIM = [withStroke(linewidth=2.2, foreground="white")]
 _LETTERS = ("x", "y", "z")
+# Of what has no values.
+BODY = "#b9bec6"
 
 
 class Scene:
@@ -57,9 +59,10 @@ class Scene:
         self._add(corners[:, [0, 1, 2, 2]], nearness, face, np.where(solid[:, None], face, 0), 0.7 * solid)
 
     def add_polygon(
-        self, corners: Float[np.ndarray, "k 3"], colour, outward: Float[np.ndarray, "3"], before: float
+        self, corners: Float[np.ndarray, "k 3"], colour, *, before: float, rim: Bool[np.ndarray, " k"]
     ) -> None:
-        """A convex patch of a surface, in pieces that are sorted each for itself; and its rim."""
+        """A convex patch of a surface, in pieces that are sorted each for itself, `before` metres nearer than they are;
+        its edges that are on the `rim` as lines."""
         middle = corners.mean(axis=0)
         ring = np.arange(len(corners))
         points = np.concatenate([corners, (corners + middle) / 2, middle[None]])
@@ -71,10 +74,9 @@ class Scene:
                 np.stack([inner, other + count, np.full(count, 2 * count)], axis=1),
             ]
         )
-        nearer = before * float(outward @ self.camera.toward)
-        self.add_triangles(points, triangles, np.array(to_rgba(colour)), before=nearer)
-        rim = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
-        self.add_lines(rim, INK, 0.5, before=nearer + abs(nearer) * 0.05)
+        self.add_triangles(points, triangles, np.array(to_rgba(colour)), before=before)
+        edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)[rim]
+        self.add_lines(edges, INK, 0.5, before=before + abs(before) * 0.05)
 
     def add_lines(self, ends: Float[np.ndarray, "s 2 3"], colour, width: float, *, before: float = 0.0) -> None:
         """Lines from one end to the other, `width` in points."""

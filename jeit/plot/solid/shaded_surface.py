@@ -9,18 +9,19 @@ from matplotlib.colors import Normalize, to_rgba
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
+from jeit.electrodes.electrode_shapes import ElectrodeShapes
 from jeit.plot.axes import axes_or_new
 from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale, check_scale
+from jeit.plot.solid.body import add_electrodes, number_electrodes
 from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
-from jeit.plot.solid.scene import Scene, bare_in_space
-
-BODY = "#b9bec6"
+from jeit.plot.solid.scene import BODY, Scene, bare_in_space
 
 
 def plot_surface(
     points: ArrayLike,
     triangles: ArrayLike,
     values: ArrayLike | None = None,
+    electrodes: ElectrodeShapes | None = None,
     *,
     camera: Camera = FROM_THE_CORNER,
     scale: ColourScale = CHANGE,
@@ -29,13 +30,16 @@ def plot_surface(
 ) -> Axes:
     """Draw a surface in space: `points` (n, 3) metres, `triangles` (m, 3) into them.
 
-    `values`: one for each triangle, flat, or for each point, smooth; grey without. `camera`: from where it is seen.
+    `values`: one for each triangle, flat, or for each point, smooth; grey without. `electrodes`: what
+    `jeit.electrodes.shapes_of` makes of them, drawn on it and numbered. `camera`: from where it is seen.
     `scale`: how values become colours; changes of sheet conductivity in S unless it says otherwise. Raises `ValueError`
     for arrays of other shapes, values that are not finite and things of another kind.
     """
     places, faces = checked_surface(points, triangles)
     check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")
     check_scale(scale)
+    if electrodes is not None:
+        check_kind("electrodes", electrodes, ElectrodeShapes, "ElectrodeShapes, of shapes_of(mesh, electrodes)")
     ax = axes_or_new(ax)
     scene, fitted = Scene(camera), None
     if values is None:
@@ -45,8 +49,12 @@ def plot_surface(
         fitted = scale.of(image, "S")
         colours = colours_of(fitted, image if len(image) == len(faces) else image[faces].mean(axis=1))
     scene.add_triangles(places, faces, colours, smooth=True)
+    if electrodes is not None:
+        add_electrodes(scene, places, faces, electrodes)
     scene.draw(ax)
-    bare_in_space(ax, camera, places, numbered=False)
+    bare_in_space(ax, camera, places, numbered=electrodes is not None)
+    if electrodes is not None:
+        number_electrodes(ax, scene, places, faces, electrodes, behind=False)
     if title is not None:
         ax.set_title(title)
     if fitted is not None:

@@ -194,7 +194,8 @@ def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, away: 
         ring = np.arange(1, len(corners) - 1)
         fan = np.stack([np.zeros_like(ring), ring, ring + 1], axis=1)
         lines = plane.on_page(passed_edges(fan, height).at_corners(corners))
-        found.setdefault(int(number), []).extend(lines)
+        if len(lines):
+            found.setdefault(int(number), []).extend(lines)
     for number, lines in found.items():
         ax.add_collection(LineCollection(lines, colors=METAL, linewidths=4, capstyle="butt", zorder=3))
         ends = np.concatenate(lines)

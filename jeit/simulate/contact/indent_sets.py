@@ -43,7 +43,7 @@ class IndentSet:
     ):
         """Raises `ValueError` for what is no skin, draws or seed, numbers below 1, and depths that the skin has not."""
         check_kind("skin", skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
-        check_kind("draws", draws, IndentDraws, "IndentDraws([ball(0.015)], skin.outline, (1e-3, 8e-3))")
+        check_kind("draws", draws, IndentDraws, "IndentDraws([ball(0.015)], skin.flat_outline, (1e-3, 8e-3))")
         for name, given in (("number", number), ("chunk", chunk)):
             if not (isinstance(given, int) and given >= 1):
                 raise ValueError(f"{name} must be a whole number, 1 or more; it is {given!r}.")
@@ -139,7 +139,7 @@ def _digest(parts: Any, text: str) -> str:
 
 def image_places(skin: Skin, columns: int, rows: int) -> np.ndarray:
     """Middles (rows, columns, 2) of pixels over the box of a skin, metres, row 0 at the least y."""
-    low_x, high_x, low_y, high_y = map(float, skin.outline.extent)
+    low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
     return pixel_places((low_x, high_x, low_y, high_y), (rows, columns))
 
 

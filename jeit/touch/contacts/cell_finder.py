@@ -6,6 +6,7 @@ from scipy import sparse
 
 from jeit.image.watershed import basins, cell_neighbours
 from jeit.mesh import Mesh, centroids, measures
+from jeit.mesh.geodesic import Triangles
 from jeit.touch.contacts.cell_outline import outline_of_cells
 from jeit.touch.contacts.contact import Contact
 from jeit.touch.contacts.finder import AbstractFinder, check_finder, check_share
@@ -22,16 +23,19 @@ class CellFinder(AbstractFinder):
 
     Its defaults err least on simulated skins (`python -m benchmarks contacts`).
 
-    **Fields**: those; `smoothing` (m, m), applied first; and of the mesh `cells` (m, 3), `points` (n, 2), `centres`
-    (m, 2), `areas` (m,) and `neighbours` (m, 3).
+    The mesh is a flat sheet or a surface in space; contacts of the latter are (3,), on it.
+
+    **Fields**: those; `smoothing` (m, m), applied first; of the mesh `cells` (m, 3), `points` (n, d), `centres` (m, d),
+    `areas` (m,) and `neighbours` (m, 3); and its `surface`, of a mesh in space.
     """
 
     smoothing: sparse.csr_array
     cells: Int[np.ndarray, "m 3"]
-    points: Float[np.ndarray, "n 2"]
-    centres: Float[np.ndarray, "m 2"]
+    points: Float[np.ndarray, "n d"]
+    centres: Float[np.ndarray, "m d"]
     areas: Float[np.ndarray, " m"]
     neighbours: Int[np.ndarray, "m 3"]
+    surface: Triangles | None
     level: float
     least_peak: float
     least_prominence: float
@@ -54,11 +58,12 @@ class CellFinder(AbstractFinder):
 
         Raises `ValueError` for a mesh of three dimensions, a smoothing that is no length, and shares that are none.
         """
-        check_finder(mesh, sign, floor)
+        check_finder(mesh, sign, floor, flat=False)
         for name, value in (("level", level), ("least_peak", least_peak), ("least_prominence", least_prominence)):
             check_share(name, value)
         self.cells, self.points = np.asarray(mesh.cells), np.asarray(mesh.points)
         self.centres, self.areas = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
+        self.surface = Triangles.of(mesh) if mesh.is_surface else None
         self.smoothing = gaussian_means(mesh, smoothing)
         self.neighbours = cell_neighbours(mesh)
         self.level, self.least_peak, self.least_prominence = float(level), float(least_peak), float(least_prominence)
@@ -79,9 +84,11 @@ class CellFinder(AbstractFinder):
         weight = area * (change[region] - level)
         centroid = weight @ centre / weight.sum()
         # Of Σ a (v − level v_peak) x / Σ a (v − level v_peak) by v.
-        slope = np.zeros((self.num_cells, 2))
+        slope = np.zeros(self.centres.shape)
         slope[region] = area[:, None] * (centre - centroid) / weight.sum()
         slope[peak] -= self.level * slope[region].sum(axis=0)
+        if self.surface is not None:
+            centroid = self.surface.nearest(centroid[None]).points[0]
         return Contact(
             centroid=centroid,
             area=float(area.sum()),

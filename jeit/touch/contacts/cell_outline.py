@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 
-def outline_of_cells(points: Float[np.ndarray, "n 2"], cells: Int[np.ndarray, "c 3"]) -> Float[np.ndarray, "k 2"]:
-    """Vertices (k, 2), in metres, of the longest loop of edges that belong to one of the `cells` (c, 3) only.
+def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c 3"]) -> Float[np.ndarray, "k d"]:
+    """Vertices (k, d), in metres, of the longest loop of edges that belong to one of the `cells` (c, 3) only.
 
     Cells turn one way, so their edges do too, and those that are left lead on from one to the next; where the set
     touches itself in a node, the loop takes either way.

@@ -8,16 +8,16 @@ from jaxtyping import Float
 class Contact(eqx.Module):
     """Where something touches.
 
-    **Fields**: `centroid` (x, y), metres; `area`, m², of the region; `peak`, the strongest change in it, in the unit of
-    the image and with its sign; `integral` of the change over the region, that unit times m²; `contour` (k, 2), metres,
-    the region's outline, open (the last point is not the first again); `deviation`, metres: the root mean square
-    distance by which noise of the image moves the centroid, to first order (`ImageNoise` says of what noise). It holds
-    neither what the image blurs nor where it errs without noise.
+    **Fields**: `centroid` (x, y), metres, on a surface in space (x, y, z); `area`, m², of the region; `peak`, the
+    strongest change in it, in the unit of the image and with its sign; `integral` of the change over the region, that
+    unit times m²; `contour` (k, d), metres, the region's outline, open (the last point is not the first again);
+    `deviation`, metres: the root mean square distance by which noise of the image moves the centroid, to first order
+    (`ImageNoise` says of what noise). It holds neither what the image blurs nor where it errs without noise.
     """
 
-    centroid: Float[np.ndarray, "2"]
+    centroid: Float[np.ndarray, " d"]
     area: float
     peak: float
     integral: float
-    contour: Float[np.ndarray, "k 2"]
+    contour: Float[np.ndarray, "k d"]
     deviation: float

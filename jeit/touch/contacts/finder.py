@@ -89,10 +89,12 @@ def checked_image(finder: AbstractFinder, image) -> Float[np.ndarray, " m"]:
     return finder.sign * values
 
 
-def check_finder(mesh: Mesh, sign: int, floor: float) -> None:
-    """Raises `ValueError` for what is no 2-D mesh, a sign that is none, and a floor that is negative."""
+def check_finder(mesh: Mesh, sign: int, floor: float, *, flat: bool = True) -> None:
+    """Raises `ValueError` for what is no 2-D mesh, and a surface in space where it must be flat, a sign that is none,
+    and a floor that is negative."""
     check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
-    check_flat(mesh, "contacts")
+    if flat:
+        check_flat(mesh, "contacts on a raster")
     if mesh.dimension != 2:
         raise ValueError("mesh has three dimensions; contacts are found on sheets: reconstruct on a 2-D mesh.")
     if not (is_number(sign) and sign in (1, -1)):

@@ -63,7 +63,7 @@ class ImageNetwork:
     def of_skin(cls, network: ThreeStages | Unrolled, skin: Skin, noise: float, shape: tuple[int, int]):
         """A network that was trained on this skin."""
         design = "unrolled" if isinstance(network, Unrolled) else "three-stages"
-        low_x, high_x, low_y, high_y = map(float, skin.outline.extent)
+        low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
         extent = low_x, high_x, low_y, high_y
         made_for = described(skin.model.protocol, skin.layout.centres, extent)
         return cls(network, design, float(skin.thickness), shape, extent, float(noise), made_for)
@@ -231,7 +231,7 @@ def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
         head["made_for"],
     )
     if skin is not None:
-        here = described(skin.model.protocol, skin.layout.centres, (*map(float, skin.outline.extent),))
+        here = described(skin.model.protocol, skin.layout.centres, (*map(float, skin.flat_outline.extent),))
         check_same(path, found.made_for, here)
     return found
 

@@ -38,10 +38,10 @@ def bodies() -> list[AbstractIndenter]:
 def touch_draws(skin: Skin) -> IndentDraws:
     """Touches of one to three of these bodies, anywhere on a skin, turned by any angle."""
     thickness = float(skin.thickness)
-    low_x, high_x, low_y, high_y = map(float, skin.outline.extent)
+    low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
     depth = (DEPTHS[0] * thickness, DEPTHS[1] * thickness)
     margin = _MARGIN * min(high_x - low_x, high_y - low_y)
-    return IndentDraws(bodies(), skin.outline, depth, margin=margin, at_once=_AT_ONCE)
+    return IndentDraws(bodies(), skin.flat_outline, depth, margin=margin, at_once=_AT_ONCE)
 
 
 def detection_noise(skin: Skin, limit: float = _LIMIT) -> float:
@@ -52,7 +52,7 @@ def detection_noise(skin: Skin, limit: float = _LIMIT) -> float:
     """
     tip = ball(0.015)
     depth = material("hydrogel").support.pressure(tip, limit).approach
-    grid = touches_away_from_the_edge(skin.outline, 0.0075, _PLACES, _PLACES)
+    grid = touches_away_from_the_edge(skin.flat_outline, 0.0075, _PLACES, _PLACES)
     change = relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places])
     # To four digits, which no order of sums decides.
     return float(f"{np.median(np.abs(change).max(axis=1)) / _DEVIATIONS:.4g}")

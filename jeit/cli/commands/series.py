@@ -1,0 +1,142 @@
+"""`jeit series`: every frame of a recording at once; what regions do over time, and what oscillates where."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jeit.cli.options import AsIs, Contact, Data, Description, Format, Nodes, Quiet, make_folder, naming_options
+
+if TYPE_CHECKING:
+    from jeit.mesh import Mesh
+
+
+def series(
+    data: Data,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", help="Folder for series.png, series.npz, regions.csv, report.json.", show_default=False
+        ),
+    ],
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            help="Measured file of the undisturbed body; DATA's frame 'reference', or its mean, unless given."
+        ),
+    ] = None,
+    frequency: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Map amplitude and phase at so many hertz, or at the strongest in a band: 0.3, or 0.1-0.6; may be "
+            "given repeatedly.",
+            metavar="HZ|LOW-HIGH",
+        ),
+    ] = None,
+    region: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Region of interest, metres: ball:X,Y[,Z],RADIUS or box:X,Y[,Z],X,Y[,Z] (two corners) or "
+            "half:DX,DY[,DZ] (from the middle that way); may be given repeatedly. The whole body unless given.",
+            metavar="SHAPE:NUMBERS",
+        ),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Frames in a second, where neither DATA nor its description says so.")
+    ] = None,
+    format: Format = None,
+    description: Description = None,
+    hyperparameter: Annotated[
+        str | None, typer.Option(help="A number, or the rule that chooses it (default noise-figure).")
+    ] = None,
+    contact: Contact = None,
+    num_points: Nodes = None,
+    film: Annotated[
+        str, typer.Option(help="Film's name: .gif, or .mp4 where ffmpeg is installed; none for none (default).")
+    ] = "none",
+    as_is: AsIs = False,
+    quiet: Quiet = False,
+) -> None:
+    """Image all frames of DATA against one reference, linearly and in one go, and tell what happens over time.
+
+    Writes series.png (the functional image, maps of amplitude and phase, curves and spectra of regions), series.npz,
+    regions.csv and report.json. Frame after frame as they come: jeit stream.
+
+    In Python: `jeit.imaging.image_sequence`, `jeit.image.oscillation`, `jeit.report.write_series`.
+    """
+    from jeit.arguments import counted
+    from jeit.cli.console import Steps, plain_console, say_written, scaled
+    from jeit.cli.options import number_or_name
+    from jeit.data import read
+    from jeit.image import oscillation
+    from jeit.imaging import ImagingSettings, image_sequence
+    from jeit.report import write_series
+    from jeit.report.film import check_film
+    from jeit.report.series import SERIES_FILES
+
+    given = {
+        "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
+        "contact": contact,
+        "num_points": num_points,
+        "as_is": as_is,
+    }
+    settings = ImagingSettings("one-step", **{name: value for name, value in given.items() if value is not None})
+    wanted = None if film == "none" else film
+    with naming_options({"film": "--film"}):
+        films = () if wanted is None else (check_film(wanted),)
+    bands = [_band(one) for one in frequency or ()]
+    make_folder(output, (*SERIES_FILES, *films))
+    console = plain_console()
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        base = None if reference is None else read(reference, format, description)
+        measured = read(data, format, description, like=base)
+        with naming_options({"rate": "--rate"}):
+            measured = measured if rate is None else measured.at_rate(rate)
+        found = image_sequence(measured, base, settings, progress=step)
+        with naming_options({"region": "--region", "frequency": "--frequency"}):
+            regions = {one: _region(one, found.series.mesh) for one in region or ()}
+            told = [oscillation(found.series.changes, found.series.times, one) for one in bands]
+        step("write")
+        report = write_series(found, output, regions=regions, oscillations=told, film=wanted)
+    if quiet:
+        return
+    frames, unit = counted(report["frames"], "frame"), report["unit"]
+    console.print(f"\n{frames}, {report['frame_rate']:.4g} a second, {report['refused']} refused")
+    for one in report["oscillations"]:
+        console.print(f"{one['frequency']:.4g} Hz (resolution {one['resolution']:.2g} Hz):")
+        for name, part in one["regions"].items():
+            sizes = f"{scaled(part['amplitude'], unit)} ± {scaled(part['noise'], unit)}"
+            console.print(f"  {name}: amplitude {sizes}, phase {part['phase_degrees']:.0f}°", markup=False)
+    say_written(console, output / "series.png", "series.npz", "regions.csv", "report.json", *films)
+
+
+def _band(text: str) -> "float | tuple[float, float]":
+    """A frequency, or a band of them. Raises `ValueError`."""
+    parts = text.split("-")
+    try:
+        numbers = [float(one) for one in parts]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (1, 2):
+        raise ValueError(f"--frequency: give hertz such as 0.3, or a band such as 0.1-0.6; it is {text[:40]!r}.")
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
+def _region(text: str, mesh: "Mesh"):
+    """Cells of a region. Raises `ValueError`."""
+    from jeit.image import ball_region, box_region, half_region
+
+    name, _, rest = text.partition(":")
+    try:
+        numbers = [float(one) for one in rest.split(",")]
+    except ValueError:
+        numbers = []
+    d = mesh.dimension
+    wanted = {"ball": d + 1, "box": 2 * d, "half": d}
+    if wanted.get(name) != len(numbers):
+        example = "ball:0.02,0,0.01" if d == 2 else "ball:0.02,0,0.05,0.01"
+        raise ValueError(f"--region: {text[:40]!r} is none of a body of {d} dimensions; give {example}, box: or half:.")
+    if name == "ball":
+        return ball_region(mesh, numbers[:d], numbers[d])
+    return box_region(mesh, numbers[:d], numbers[d:]) if name == "box" else half_region(mesh, numbers)

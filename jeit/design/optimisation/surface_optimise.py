@@ -1,0 +1,122 @@
+"""Better layouts of curved sheets: electrodes moved along the surface by gradients through the forward model.
+
+Gradient ascent with a line search: every step is in the tangent planes of the electrodes, its end is moved to the
+nearest point of the surface, which is where the way along it leads, to second order; a step that lowers the score, or
+brings electrodes too close to each other or to the edge, is halved.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from jeit.arguments import check_kind, is_number, told
+from jeit.design.optimisation.objective import Objective
+from jeit.design.scores import Scores
+from jeit.design.skin.skin import Skin, check_skin
+from jeit.electrodes import SurfaceDiscs
+from jeit.layout import SurfaceLayout
+from jeit.mesh.geodesic import Triangles
+from jeit_solvers.engines import as_array
+
+# Of the pitch: the longest first step, and the shortest that is tried.
+_LONGEST, _SHORTEST = 0.3, 1e-3
+
+
+class SurfaceOptimisation(eqx.Module):
+    """What `optimise_surface_layout` found.
+
+    **Fields**: `layout`, the best; its `value` and `start_value`, that of the layout given; `history` (T,) of the score
+    after every step, which never falls, and `snapshots` (T, L, 3), metres.
+    """
+
+    layout: SurfaceLayout
+    value: float
+    start_value: float
+    history: Float[np.ndarray, " T"]
+    snapshots: Float[np.ndarray, "T L 3"]
+
+
+def optimise_surface_layout(
+    skin: Skin,
+    objective: Objective,
+    *,
+    steps: int = 30,
+    minimum_spacing: float = 0.0,
+    margin: float = 0.0,
+    callback: Callable[[int, float], None] | None = None,
+) -> SurfaceOptimisation:
+    """Move the electrodes of a curved sheet along it until its `objective` is as large as gradients make it.
+
+    `objective`: of touches of the sheet, as for `optimise_layout`. `minimum_spacing` between centres, metres, and
+    electrodes never overlap; `margin` from the edge, metres, besides their own radius. `callback`: called with each
+    step's number and score. Raises `ValueError` for flat skins and layers, and for numbers that make no sense.
+    """
+    check_skin("skin", skin)
+    check_kind("objective", objective, Objective, "an Objective, as of Objective.create(skin, places)")
+    layout = skin.layout
+    if not isinstance(layout, SurfaceLayout) or skin.num_layers:
+        raise ValueError("skin must be a curved sheet: Skin.create(surface_layout, num_layers=0); see optimise_layout.")
+    if not isinstance(steps, int) or steps < 1:
+        raise ValueError(f"steps must be a whole number from 1; it is {told(steps)}.")
+    for name, length in (("minimum_spacing", minimum_spacing), ("margin", margin)):
+        if not is_number(length) or length < 0:
+            raise ValueError(f"{name} must be in metres, not negative; it is {told(length)}.")
+    surface, radii = Triangles.of(layout.surface), np.asarray(layout.diameters) / 2
+    apart = np.maximum(minimum_spacing, radii[:, None] + radii)
+    np.fill_diagonal(apart, 0.0)
+    value_and_slope = _cost(skin, objective)
+    position = np.asarray(layout.centres)
+    value, slope = value_and_slope(position)
+    pitch = float(np.sqrt(surface.areas.sum() / len(position)))
+    length, history, snapshots = _LONGEST * pitch, [value], [position]
+    for step in range(steps):
+        normal = surface.normals_at(surface.nearest(position))
+        along = slope - (slope * normal).sum(axis=1, keepdims=True) * normal
+        steepest = np.linalg.norm(along, axis=1).max()
+        moved = None
+        while steepest > 0 and length > _SHORTEST * pitch:
+            tried = surface.nearest(position + length / steepest * along).points
+            if _fits(tried, apart, surface, radii + margin):
+                new, new_slope = value_and_slope(tried)
+                if new > value:
+                    moved = tried, new, new_slope
+                    break
+            length /= 2
+        if moved is None:
+            break
+        position, value, slope = moved
+        length = min(1.5 * length, _LONGEST * pitch)
+        history.append(value)
+        snapshots.append(position)
+        if callback is not None:
+            callback(step, value)
+    options = {"contact_impedance": layout.contact_impedance, "outward": layout.outward, "labels": layout.labels}
+    found = SurfaceLayout(position, layout.diameters, layout.surface, name=layout.name, **options)
+    return SurfaceOptimisation(found, value, history[0], np.array(history), np.array(snapshots))
+
+
+def surface_scores(skin: Skin, objective: Objective, position: Float[Array, "L 3"]) -> Scores:
+    """All scores of a curved sheet with electrodes at other positions; differentiable in them."""
+    discs = skin.model.electrodes
+    assert isinstance(discs, SurfaceDiscs)
+    model = skin.model.with_electrodes(SurfaceDiscs(position, discs.radius, discs.contact_impedance))
+    return objective.scores(eqx.tree_at(lambda one: one.model, skin, model))
+
+
+def _cost(skin: Skin, objective: Objective):
+    compiled = jax.jit(jax.value_and_grad(lambda place: objective.score(surface_scores(skin, objective, place))))
+
+    def value_and_slope(position):
+        value, slope = compiled(as_array(position))
+        return float(value), np.asarray(slope)
+
+    return value_and_slope
+
+
+def _fits(position, apart, surface: Triangles, room) -> bool:
+    """Whether electrodes are as far apart, straight through space, and from the edge as they must be."""
+    distance = np.linalg.norm(position[:, None] - position, axis=-1)
+    return bool((distance >= apart).all() and (surface.distance_to_border(position) >= room).all())

@@ -1,0 +1,87 @@
+"""Which cells of a skin a touch may reach: how far along its surface, and how deep below it (NumPy)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from jeit.mesh import Mesh, centroids
+from jeit.mesh.geodesic import Geodesics, Triangles
+
+# Of a curved skin's thickness, or its cells, that places may be off its surface.
+_OFF = 0.5
+
+
+class ReachedCells(NamedTuple):
+    """Of n touches: `near`, the numbers of each one's cells, and `distance`, metres from its place along the surface;
+    `below` (m,), metres from the surface to every cell's middle, infinite for those deeper than asked for; and
+    `thickness` of a layer, metres, None of a sheet."""
+
+    near: list[Int[np.ndarray, " c"]]
+    distance: list[Float[np.ndarray, " c"]]
+    below: Float[np.ndarray, " m"]
+    thickness: float | None
+
+
+def is_curved(mesh: Mesh) -> bool:
+    """Whether it is a surface in space, or a shell of one."""
+    return mesh.is_surface or {"inner", "outer"} <= set(mesh.tags)
+
+
+def touched_surface(mesh: Mesh, face: str = "outer") -> Triangles:
+    """Of a curved skin: itself, or the `face` of a shell."""
+    return Triangles.of(mesh, None if mesh.is_surface else face)
+
+
+def reached_cells(
+    mesh: Mesh, places: Float[np.ndarray, "n d"], reach: float, deepest: float, face: str = "outer"
+) -> ReachedCells:
+    """Cells whose middles lie within `reach` of `places` along the surface, and less than `deepest` below it, metres.
+
+    Of a flat layer below its top, at its greatest z; of a shell below its `face`, along the inward normal. Raises
+    `ValueError` for places off a curved surface.
+    """
+    middle = np.asarray(centroids(mesh))
+    if is_curved(mesh):
+        return _on_surface(mesh, middle, places, reach, deepest, face)
+    below, thickness = np.zeros(len(middle)), None
+    if mesh.dimension == 3:
+        height = np.asarray(mesh.points)[:, 2]
+        below, thickness = height.max() - middle[:, 2], float(np.ptp(height))
+    candidates = np.flatnonzero(below < deepest)
+    found = KDTree(middle[candidates, :2]).query_ball_point(places, reach, return_sorted=True)
+    near = [candidates[np.asarray(index, int)] for index in found]
+    distance = [np.linalg.norm(middle[own, :2] - place, axis=-1) for own, place in zip(near, places, strict=True)]
+    return ReachedCells(near, distance, below, thickness)
+
+
+def _on_surface(mesh: Mesh, middle, places, reach: float, deepest: float, face: str) -> ReachedCells:
+    surface = touched_surface(mesh, face)
+    thickness = None if mesh.is_surface else shell_thickness(mesh)
+    allowed = _OFF * (np.sqrt(surface.areas.max()) if thickness is None else thickness)
+    off = surface.nearest(places).away
+    lost = np.flatnonzero(off > allowed)
+    if lost.size:
+        raise ValueError(
+            f"places: {lost.size} of {len(places)} lie off the skin's surface, the first, at {said(places[lost[0]])} "
+            f"mm, by {1e3 * off[lost[0]]:.3g} mm; give places on the touched face, in metres, such as "
+            "touch_grid(skin.outline).places."
+        )
+    at = surface.nearest(middle)
+    below = np.zeros(len(middle)) if mesh.is_surface else at.away
+    candidates = np.flatnonzero(below < deepest)
+    feet = type(at)(at.triangle[candidates], at.weights[candidates], at.points[candidates], at.away[candidates])
+    found = Geodesics.create(surface).near(places, feet, reach)
+    return ReachedCells([candidates[index] for index, _ in found], [length for _, length in found], below, thickness)
+
+
+def shell_thickness(mesh: Mesh) -> float:
+    """Of a shell, metres: the median of how far the nodes of its inner face are from the outer one."""
+    inner = Triangles.of(mesh, "inner").points
+    return float(np.median(Triangles.of(mesh, "outer").nearest(inner).away))
+
+
+def said(place) -> str:
+    """A place in millimetres: "(12, 3.5)"."""
+    return "(" + ", ".join(f"{1e3 * value:.4g}" for value in place) + ")"

@@ -1,0 +1,98 @@
+"""Round electrodes in a sheet that is curved: discs on a surface of triangles in space."""
+
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
+
+from jeit.electrodes.discs import AbstractDiscs, as_discs, check_discs, disc_window
+from jeit.electrodes.electrodes import Contact
+from jeit.electrodes.window import EDGE, nearest_electrodes, triangle_quadrature, window_contact
+from jeit.mesh import Body, Mesh, Refine, measures, normals
+from jeit.mesh.geodesic import Triangles
+from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated
+
+# Cosine of the angle between normals: a disc as large as the surface's radius of curvature turns by one radian.
+_FACING = float(np.cos(1.0))
+
+
+class SurfaceDiscs(AbstractDiscs):
+    """Complete electrodes that are discs in a curved sheet, a surface of triangles in space, free of its nodes.
+
+    `SheetDiscs` of curved sheets. A disc is what of the surface lies within its radius, straight through space, and
+    faces as its middle does: on a surface of radius of curvature R that is longer along the surface by a part
+    radius² / 24 R², and nothing of what lies opposite. Differentiable in position, of which only moves along the
+    surface count: a move off it changes nothing to first order.
+
+    **Fields**: `position` (L, 3) metres, on the surface; `radius` (L,) metres; `contact_impedance` (L,) ohm·m².
+    """
+
+    position: Float[Array, "L 3"]
+    radius: Float[Array, " L"]
+    contact_impedance: Float[Array, " L"]
+
+    def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
+        """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
+        self.position, self.radius, self.contact_impedance = as_discs(position, 3, radius, contact_impedance)
+
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
+        """None: they are not of a plane mesh."""
+        return ()
+
+    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
+        """The triangles of `mesh`."""
+        return (mesh.cells,)
+
+    def contact(self, mesh: Mesh) -> Contact:
+        """Contact integrals over the triangles, by quadrature of the windows."""
+        xp = namespace(self, mesh)
+        area = measures(mesh)
+        barycentric, _ = triangle_quadrature()
+        points = xp.einsum("pi,mid->mpd", barycentric, mesh.points[mesh.cells])
+        edge = EDGE * xp.sqrt(area)
+        middle = points.mean(axis=1)
+        near = nearest_electrodes(middle, self.position, self.radius)
+        window = disc_window(points, self.position[near], self.radius[near], edge)
+        normal = undifferentiated(normals(mesh))
+        at = xp.argmin(undifferentiated(((self.position[:, None] - middle) ** 2).sum(axis=-1)), axis=1)
+        faces = xp.take_along_axis(normal @ normal[at].T, near, axis=1) > 0
+        window = window * faces[..., None]
+        return window_contact(mesh.cells, area, window, near, self.contact_impedance, mesh.num_points)
+
+    def check(self, mesh: Mesh) -> None:
+        """Raise `ValueError` for discs off the surface, over its edge, as large as its radius of curvature,
+        overlapping, or too small for the mesh."""
+        if not mesh.is_surface:
+            raise ValueError("SurfaceDiscs live on a surface in space, and this mesh is none; see jeit.mesh.tube.")
+        if not has_values(self, mesh):
+            return
+        discs, mesh = on_host((self, mesh))
+        check_on_surface(discs.position, discs.radius, Triangles.of(mesh))
+        check_discs(discs, mesh, measures(mesh))
+
+
+def check_on_surface(position, radius, surface: Triangles) -> None:
+    """Raise `ValueError` for discs at `position` (L, 3) of `radius` (L,), metres, farther off the surface than they are
+    large, over its edge, and as large as its radius of curvature."""
+    position, radius = np.asarray(position), np.asarray(radius)
+    at = surface.nearest(position)
+    border = surface.distance_to_border(at.points)
+    middles, normal = surface.corners.mean(axis=1), surface.normals
+    for number, (place, size) in enumerate(zip(position, radius, strict=True)):
+        x, y, z = 1e3 * place
+        where = f"electrode {number + 1}, {2e3 * size:.3g} mm across at ({x:.4g}, {y:.4g}, {z:.4g}) mm,"
+        if at.away[number] > size:
+            raise ValueError(
+                f"position: {where} is {1e3 * at.away[number]:.3g} mm off the surface, farther than its radius; move "
+                "it onto the surface. Are both in metres?"
+            )
+        if border[number] < 0.9 * size:
+            raise ValueError(
+                f"position: {where} lies on the surface's edge, {1e3 * border[number]:.3g} mm from it; move it inside."
+            )
+        within = np.linalg.norm(middles - at.points[number], axis=1) < size
+        turned = normal[within] @ normal[at.triangle[number]]
+        if (np.abs(turned) < _FACING).any():
+            raise ValueError(
+                f"radius: {where} is larger than the surface's radius of curvature there; a disc so large is no disc, "
+                "give less."
+            )

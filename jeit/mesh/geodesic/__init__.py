@@ -1,0 +1,7 @@
+"""Ways along triangulated surfaces in space: their lengths, the places that they join, and surfaces unrolled."""
+
+from jeit.mesh.geodesic.geodesics import Geodesics
+from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
+from jeit.mesh.geodesic.unrolled import Unrolled, unroll
+
+__all__ = ["Geodesics", "SurfacePlaces", "Triangles", "Unrolled", "unroll"]

@@ -1,0 +1,151 @@
+"""`Triangles`: a triangulated surface in space as arrays, with the point of it that is nearest to any other (NumPy)."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from jeit.mesh.mesh import Mesh
+
+# Triangles near a place, by their middles, among which the nearest is.
+_CANDIDATES = 16
+
+
+class SurfacePlaces(eqx.Module):
+    """p places on a surface: `triangle` (p,), `weights` (p, 3) of its corners, `points` (p, 3) and `away` (p,), how far
+    what was asked for is from the surface; metres."""
+
+    triangle: Int[np.ndarray, " p"]
+    weights: Float[np.ndarray, "p 3"]
+    points: Float[np.ndarray, "p 3"]
+    away: Float[np.ndarray, " p"]
+
+    def of_nodes(self, triangles: "Triangles", values) -> np.ndarray:
+        """Values of the nodes (n, …) between them, at the places (p, …)."""
+        corners = np.asarray(values)[triangles.cells[self.triangle]]
+        return np.einsum("pk,pk...->p...", self.weights, corners)
+
+
+class Triangles(eqx.Module):
+    """Triangles in space.
+
+    **Fields**: `points` (n, 3) metres; `cells` (m, 3), counter-clockwise as seen from outside.
+    """
+
+    points: Float[np.ndarray, "n 3"]
+    cells: Int[np.ndarray, "m 3"]
+
+    @classmethod
+    def of(cls, mesh: Mesh, face: str | None = None) -> "Triangles":
+        """Those of a surface, or those facets of a solid mesh that have the tag `face`, "inner" or "outer" of a shell.
+
+        Nodes that are none of theirs are left out. Raises `ValueError` for a plane mesh, and a tag that there is not.
+        """
+        points = np.asarray(mesh.points, float)
+        if points.shape[1] != 3:
+            raise ValueError("mesh is plane; a surface in space is needed, with points (n, 3).")
+        cells = np.asarray(mesh.cells)
+        if cells.shape[1] == 4:
+            if face not in mesh.tags:
+                raise ValueError(f"face: the mesh has the tags {sorted(mesh.tags)}, and '{face}' is none of them.")
+            cells = np.asarray(mesh.facets)[np.asarray(mesh.tags[face])]
+        used, renumbered = np.unique(cells, return_inverse=True)
+        return cls(points[used], renumbered.reshape(cells.shape))
+
+    @property
+    def corners(self) -> Float[np.ndarray, "m 3 3"]:
+        """Of every triangle, metres."""
+        return self.points[self.cells]
+
+    @property
+    def areas(self) -> Float[np.ndarray, " m"]:
+        """Of the triangles, m²."""
+        return np.linalg.norm(self._crossed, axis=1) / 2
+
+    @property
+    def normals(self) -> Float[np.ndarray, "m 3"]:
+        """Outward unit normals of the triangles."""
+        return self._crossed / np.linalg.norm(self._crossed, axis=1, keepdims=True)
+
+    @property
+    def node_areas(self) -> Float[np.ndarray, " n"]:
+        """A third of each node's triangles, m²."""
+        return np.bincount(self.cells.ravel(), np.repeat(self.areas / 3, 3), len(self.points))
+
+    @property
+    def node_normals(self) -> Float[np.ndarray, "n 3"]:
+        """Outward unit normals of the nodes, means of the triangles' by area."""
+        summed = np.zeros_like(self.points)
+        np.add.at(summed, self.cells, self._crossed[:, None])
+        return summed / np.linalg.norm(summed, axis=1, keepdims=True)
+
+    @property
+    def border(self) -> Int[np.ndarray, "b 2"]:
+        """Edges of one triangle only: none of a closed surface."""
+        edges = self.cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        _, first, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+        return edges[first[counts == 1]]
+
+    @property
+    def _crossed(self) -> Float[np.ndarray, "m 3"]:
+        corners = self.corners
+        return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+    def nearest(self, places) -> SurfacePlaces:
+        """The points of the surface that are nearest to `places` (p, 3), metres."""
+        places = np.asarray(places, float)
+        number = min(_CANDIDATES, len(self.cells))
+        corners = self.corners
+        near = KDTree(corners.mean(axis=1)).query(places, number)[1].reshape(len(places), number)
+        weights = _nearest_in_triangles(corners[near], places[:, None])
+        points = np.einsum("pqk,pqkd->pqd", weights, corners[near])
+        away = np.linalg.norm(points - places[:, None], axis=-1)
+        best = away.argmin(axis=1)
+        row = np.arange(len(places))
+        return SurfacePlaces(near[row, best], weights[row, best], points[row, best], away[row, best])
+
+    def normals_at(self, places: SurfacePlaces) -> Float[np.ndarray, "p 3"]:
+        """Outward unit normals at places, between those of the nodes."""
+        between = places.of_nodes(self, self.node_normals)
+        return between / np.linalg.norm(between, axis=1, keepdims=True)
+
+    def distance_to_border(self, places) -> Float[np.ndarray, " p"]:
+        """How far places (p, 3) are from the edge, straight through space, metres; infinite where there is none."""
+        border = self.border
+        if not len(border):
+            return np.full(len(places), np.inf)
+        start, end = self.points[border[:, 0]], self.points[border[:, 1]]
+        part = (np.arange(16) / 16)[:, None, None]
+        along = ((1 - part) * start + part * end).reshape(-1, 3)
+        return KDTree(along).query(np.asarray(places, float))[0]
+
+    def finer(self) -> "Triangles":
+        """Each triangle as four, halved along its sides."""
+        edges = np.sort(self.cells[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
+        distinct, number = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+        a, b, c = self.cells.T
+        p, q, r = (number.reshape(-1, 3) + len(self.points)).T
+        cells = np.concatenate([np.stack(one, axis=1) for one in ((a, r, q), (r, b, p), (q, p, c), (p, q, r))])
+        return Triangles(np.concatenate([self.points, self.points[distinct].mean(axis=1)]), cells)
+
+
+def _nearest_in_triangles(corners: Float[np.ndarray, "... 3 3"], place: Float[np.ndarray, "... 3"]) -> np.ndarray:
+    """Weights (…, 3) of the corners at the point of each triangle that is nearest to a place."""
+    first, second = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
+    offset = place - corners[..., 0, :]
+    aa, bb, ab = (first**2).sum(-1), (second**2).sum(-1), (first * second).sum(-1)
+    a, b = (offset * first).sum(-1), (offset * second).sum(-1)
+    area = aa * bb - ab**2
+    u, v = (bb * a - ab * b) / area, (aa * b - ab * a) / area
+    inside = np.stack([1 - u - v, u, v], axis=-1)
+    found = np.where((inside >= 0).all(axis=-1, keepdims=True), inside, np.nan)
+    least = np.where(np.isnan(found[..., 0]), np.inf, 0.0)
+    for start, end in ((0, 1), (1, 2), (2, 0)):
+        side = corners[..., end, :] - corners[..., start, :]
+        reached = np.clip(((place - corners[..., start, :]) * side).sum(-1) / (side**2).sum(-1), 0, 1)
+        left = np.linalg.norm(corners[..., start, :] + reached[..., None] * side - place, axis=-1)
+        weights = np.zeros_like(inside)
+        weights[..., start], weights[..., end] = 1 - reached, reached
+        better = left < least
+        least, found = np.where(better, left, least), np.where(better[..., None], weights, found)
+    return found

@@ -1,0 +1,296 @@
+"""`Unrolled`: a curved surface laid flat, in metres, with how much that stretches it (NumPy).
+
+What can be laid flat without stretching, cylinders, cones and bent sheets, is, but for what their triangles are not;
+all else as rigidly as possible: each triangle turned only, and these brought together in the least-squares sense, again
+and again (Liu, Zhang, Xu, Gotsman and Gortler, SGP 2008, from a conformal start: Lévy, Petitjean, Ray and Maillot,
+SIGGRAPH 2002). A closed sleeve is cut along a shortest way from edge to edge, a closed surface from one end to the
+other.
+"""
+
+import itertools
+
+import equinox as eqx
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float, Int
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.linalg import factorized
+
+from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
+from jeit.mesh.mesh import Mesh
+
+_ROUNDS = 60
+# Height in space for a metre on the flat surface, from which on it tells which way is up.
+_UP = 0.3
+
+
+class Unrolled(eqx.Module):
+    """A surface laid flat; make it with `unroll`.
+
+    **Fields**: `surface`; `cells` (m, 3), its triangles in nodes of the flat one, where the cut is two lines; `points`
+    (k, 2), the flat nodes, metres; `nodes` (k,), which of the surface's each is; `stretch` (m, 2), the least and the
+    greatest factor by which each triangle is stretched.
+    """
+
+    surface: Triangles
+    cells: Int[np.ndarray, "m 3"]
+    points: Float[np.ndarray, "k 2"]
+    nodes: Int[np.ndarray, " k"]
+    stretch: Float[np.ndarray, "m 2"]
+
+    @property
+    def distortion(self) -> float:
+        """Most that lengths are stretched or shrunk, a share: 0 for what can be laid flat."""
+        return float(np.maximum(self.stretch[:, 1] - 1, 1 - self.stretch[:, 0]).max())
+
+    @property
+    def mean_distortion(self) -> float:
+        """Mean of the same over the surface's area."""
+        return float(np.average(np.abs(self.stretch - 1).max(axis=1), weights=self.surface.areas))
+
+    @property
+    def seam(self) -> Float[np.ndarray, "s 2 2"]:
+        """Edges of the flat surface that were cut: none of an open one."""
+        ends, cut = self._edges
+        return self.points[ends[cut]]
+
+    @property
+    def edge(self) -> Float[np.ndarray, "s 2 2"]:
+        """Edges of the flat surface that are the surface's own."""
+        ends, cut = self._edges
+        return self.points[ends[~cut]]
+
+    @property
+    def _edges(self):
+        ends = _border_of(self.cells)
+        return ends, ~_among(np.sort(self.nodes[ends], axis=1), np.sort(self.surface.border, axis=1))
+
+    def flat(self, places) -> Float[np.ndarray, "p 2"]:
+        """Where places on the surface, (p, 3) metres, come to lie: (p, 2) metres."""
+        at = places if isinstance(places, SurfacePlaces) else self.surface.nearest(places)
+        return np.einsum("pk,pkd->pd", at.weights, self.points[self.cells[at.triangle]])
+
+
+def unroll(surface: Triangles | Mesh, face: str | None = None, *, cut=None) -> Unrolled:
+    """Lay a surface flat, or a `face` of a shell, as it is seen from outside. `cut`: a place (3,), metres, that the cut
+    of a closed sleeve is to pass by; the side of the least x unless given. Raises `ValueError` as `Triangles.of` does,
+    and for surfaces with handles or of which parts do not hang together."""
+    triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
+    cells, nodes = _cut_open(triangles, cut)
+    corners = triangles.corners
+    local = _laid(corners)
+    points = _conformal(cells, local, len(nodes))
+    points = _rigid(cells, local, points)
+    points = _upright(points, triangles.points[nodes])
+    flat = _edges(points[cells]) @ np.linalg.inv(_edges(local))
+    return Unrolled(triangles, cells, points, nodes, np.linalg.svd(flat, compute_uv=False)[:, ::-1])
+
+
+def _laid(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3 2"]:
+    """Each triangle in a plane of its own."""
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    length = np.linalg.norm(a, axis=1)
+    along = (a * b).sum(axis=1) / length
+    up = np.linalg.norm(np.cross(a, b), axis=1) / length
+    zero = np.zeros_like(length)
+    return np.stack([np.stack([zero, zero], 1), np.stack([length, zero], 1), np.stack([along, up], 1)], axis=1)
+
+
+def _edges(triangles: Float[np.ndarray, "m 3 2"]) -> Float[np.ndarray, "m 2 2"]:
+    return np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=2)
+
+
+def _conformal(cells, local, count: int) -> np.ndarray:
+    """Least-squares conformal map, its two farthest nodes held: angles are kept as far as they can be."""
+    held = _far_apart(cells, local, count)
+    w = np.stack([local[:, 2] - local[:, 1], local[:, 0] - local[:, 2], local[:, 1] - local[:, 0]], axis=1)
+    w = w / np.sqrt(np.abs(np.linalg.det(_edges(local))))[:, None, None]
+    row = np.repeat(np.arange(len(cells)), 3)
+    real, imaginary = (
+        scipy.sparse.csr_array((part.ravel(), (row, cells.ravel())), shape=(len(cells), count))
+        for part in (w[..., 0], w[..., 1])
+    )
+    matrix = scipy.sparse.block_array([[real, -imaginary], [imaginary, real]]).tocsc()
+    fixed = np.array([held[0], held[1], held[0] + count, held[1] + count])
+    values = np.array([0.0, held[2], 0.0, 0.0])
+    free = np.setdiff1d(np.arange(2 * count), fixed)
+    left, right = matrix[:, free], -(matrix[:, fixed] @ values)
+    found = np.zeros(2 * count)
+    found[fixed] = values
+    found[free] = scipy.sparse.linalg.spsolve((left.T @ left).tocsc(), left.T @ right)
+    return found.reshape(2, -1).T
+
+
+def _far_apart(cells, local, count: int):
+    """Two nodes far from each other, and how far, along edges."""
+    length = np.linalg.norm(local[:, [1, 2, 0]] - local, axis=2)
+    start, end = cells.ravel(), cells[:, [1, 2, 0]].ravel()
+    graph = scipy.sparse.csr_array((length.ravel(), (start, end)), shape=(count, count))
+    first = int(np.argmax(dijkstra(graph, directed=False, indices=0)))
+    lengths = dijkstra(graph, directed=False, indices=first)
+    return first, int(np.argmax(lengths)), float(lengths.max())
+
+
+def _rigid(cells, local, points: np.ndarray) -> np.ndarray:
+    """As rigid as possible: each triangle turned as the map turns it, then all points moved to suit them best."""
+    count = len(points)
+    next_, after = [1, 2, 0], [2, 0, 1]
+    edge = local[:, next_] - local  # side k from corner k to the next
+    one, other = local - local[:, after], local[:, next_] - local[:, after]
+    cross = one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
+    weight = (one * other).sum(-1) / cross / 2  # half the cotangent of the angle opposite to side k
+    start, end = cells, cells[:, next_]
+    rows = np.concatenate([start.ravel(), end.ravel(), start.ravel(), end.ravel()])
+    columns = np.concatenate([start.ravel(), end.ravel(), end.ravel(), start.ravel()])
+    w = weight.ravel()
+    matrix = scipy.sparse.csc_array((np.concatenate([w, w, -w, -w]), (rows, columns)), shape=(count, count))
+    solve = factorized(matrix[1:, 1:].tocsc())
+    for _ in range(_ROUNDS):
+        drawn = points[end] - points[start]
+        moment = np.einsum("mk,mki,mkj->mij", weight, drawn, edge)
+        u, _, v = np.linalg.svd(moment)
+        u[:, :, 1] *= np.sign(np.linalg.det(u @ v))[:, None]
+        turned = weight[..., None] * np.einsum("mij,mkj->mki", u @ v, edge)
+        right = np.zeros_like(points)
+        np.add.at(right, end, turned)
+        np.subtract.at(right, start, turned)
+        moved = np.zeros_like(points)
+        moved[1:] = np.column_stack([solve(right[1:, axis]) for axis in range(2)])
+        settled = np.abs((moved - points) - (moved - points).mean(axis=0)).max() < 1e-7 * np.ptp(points)
+        points = moved
+        if settled:
+            break
+    return points
+
+
+def _upright(points: np.ndarray, space: np.ndarray) -> np.ndarray:
+    """Turned so that z is up, or y where z goes neither way, and the middle at the origin; never mirrored: it is seen
+    from outside."""
+    points = points - points.mean(axis=0)
+    for axis in (2, 1, 0):
+        height = space[:, axis] - space[:, axis].mean()
+        (a, b), *_ = np.linalg.lstsq(points, height, rcond=None)
+        if np.hypot(a, b) > _UP:
+            c, s = np.array([b, a]) / np.hypot(a, b)
+            return points @ np.array([[c, s], [-s, c]])
+    return points
+
+
+def _border_of(cells) -> np.ndarray:
+    edges = cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, first, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+    return edges[first[counts == 1]]
+
+
+def _among(edges, others) -> np.ndarray:
+    size = 1 + max(edges.max(initial=0), others.max(initial=0))
+    return np.isin(edges[:, 0] * size + edges[:, 1], others[:, 0] * size + others[:, 1])
+
+
+def _cut_open(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of a surface that is a disk once cut, and the surface's node of each of theirs."""
+    cells, count = surface.cells, len(surface.points)
+    border = surface.border
+    loops, label = _loops(border, count)
+    edges = np.unique(np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+    euler = count - len(edges) + len(cells)
+    graph = scipy.sparse.csr_array((np.ones(len(edges)), edges.T), shape=(count, count))
+    if connected_components(graph, directed=False)[0] > 1:
+        raise ValueError("surface: parts of it do not hang together; unroll each on its own.")
+    if loops == 1 and euler == 1:
+        return cells, np.arange(count)
+    if (loops, euler) not in ((2, 0), (0, 2)):
+        raise ValueError(
+            f"surface: it has {loops} edges and Euler characteristic {euler}; what can be unrolled is a sheet, a "
+            "sleeve of two open ends, or closed without handles."
+        )
+    points = surface.points
+    if loops == 2:
+        ends = np.unique(border[label == 0]), np.unique(border[label == 1])
+    else:
+        axis = int(np.argmax(np.ptp(points, axis=0)))
+        ends = np.array([points[:, axis].argmin()]), np.array([points[:, axis].argmax()])
+    path = _way(points, edges, ends, cut, border)
+    return _split(cells, path, count, closed=loops == 0)
+
+
+def _loops(border, count: int):
+    """How many loops the border is, and of which each of its edges is."""
+    if not len(border):
+        return 0, np.zeros(0, int)
+    graph = scipy.sparse.csr_array((np.ones(len(border)), border.T), shape=(count, count))
+    label = connected_components(graph, directed=False)[1][border[:, 0]]
+    kinds, label = np.unique(label, return_inverse=True)
+    return len(kinds), label
+
+
+def _way(points, edges, ends, cut, border) -> list[int]:
+    """Nodes of a way along edges from one end to the other, by the side asked for, and off the border between."""
+    middle = points.mean(axis=0)
+    goal = np.asarray(cut, float) if cut is not None else None
+    spread = np.ptp(points, axis=0).max()
+    between = points[edges].mean(axis=1)
+    if goal is None:
+        # What is off the side of the least x costs more: a straight line along that side.
+        off = (between[:, 0] - points[:, 0].min()) / spread
+        aside = np.abs(between[:, 1] - middle[1]) / spread
+        cost = 1 + 20 * (off + aside)
+    else:
+        way = points[ends[1]].mean(axis=0) - points[ends[0]].mean(axis=0)
+        way = way / np.linalg.norm(way)
+        away = between - goal
+        cost = 1 + 20 * np.linalg.norm(away - (away @ way)[:, None] * way, axis=1) / spread
+    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) * cost
+    if len(border):
+        length = np.where(_among(edges, np.sort(border, axis=1)), 1e3 * length, length)
+    graph = scipy.sparse.csr_array((length, edges.T), shape=(len(points), len(points)))
+    lengths, before, _ = dijkstra(graph, directed=False, indices=ends[0], return_predecessors=True, min_only=True)
+    path = [int(ends[1][np.argmin(lengths[ends[1]])])]
+    while before[path[-1]] >= 0:
+        path.append(int(before[path[-1]]))
+    return path
+
+
+def _split(cells, path: list[int], count: int, *, closed: bool):
+    """Triangles on one side of a way of edges get new nodes along it; ends of the way stay one node where they are
+    inside a closed surface."""
+    doubled = path[1:-1] if closed else path
+    ahead = set(itertools.pairwise(path))
+    onto = set(path)
+    new = {node: count + k for k, node in enumerate(doubled)}
+    touching: dict[int, list[int]] = {node: [] for node in doubled}
+    for number in np.flatnonzero(np.isin(cells, doubled).any(axis=1)):
+        for node in cells[number]:
+            if node in touching:
+                touching[int(node)].append(int(number))
+    cells = cells.copy()
+    original = cells.copy()
+    for node in doubled:
+        # Triangles round the node, joined across edges that are not of the way, fall into two parts: one side's is the
+        # part with a triangle that runs along the way.
+        around = touching[node]
+        side = set()
+        for number in around:
+            corners = original[number].tolist()
+            sides = zip(corners, corners[1:] + corners[:1], strict=True)
+            if any(one in ahead and node in one for one in sides):
+                side.add(number)
+        grown = True
+        while grown:
+            grown = False
+            for number in around:
+                if number in side:
+                    continue
+                for other in tuple(side):
+                    shared = set(original[number].tolist()) & set(original[other].tolist()) - {node}
+                    if any(not _on_way(node, far, onto, ahead) for far in shared):
+                        side.add(number)
+                        grown = True
+                        break
+        for number in side:
+            cells[number][original[number] == node] = new[node]
+    return cells, np.concatenate([np.arange(count), np.array(doubled, int)])
+
+
+def _on_way(node: int, far: int, onto: set, ahead: set) -> bool:
+    return far in onto and ((node, far) in ahead or (far, node) in ahead)

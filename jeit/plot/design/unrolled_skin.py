@@ -1,0 +1,104 @@
+"""Images of curved skins, unrolled: laid flat, as seen from outside, true to scale."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.patches import Circle
+from matplotlib.tri import Triangulation
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind
+from jeit.electrodes import FaceDiscs, SurfaceDiscs
+from jeit.layout import SurfaceLayout
+from jeit.mesh.geodesic import Unrolled
+from jeit.plot.axes import INK, SERIES_COLOURS, SOFT, axes_or_new, bare, draw_scale_bar, extent_of
+from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
+
+# Shares of lengths from which on a picture says that it is distorted.
+_TOLD = 0.005
+
+
+def plot_unrolled(
+    unrolled: Unrolled,
+    values: ArrayLike | None = None,
+    electrodes: SurfaceLayout | SurfaceDiscs | FaceDiscs | None = None,
+    *,
+    marks: Mapping[str, ArrayLike] | None = None,
+    scale: ColourScale = CHANGE,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw a surface laid flat, as of `jeit.mesh.geodesic.unroll(skin.model.mesh)`, dashed where it was cut open.
+
+    `values`: one for each triangle of the surface, flat, or for each node, shaded. `electrodes` are discs, numbered.
+    `marks`: places (p, 3), metres, on the surface, by what the legend calls them. `scale`: how values become colours;
+    changes of sheet conductivity in S unless it says otherwise. Where laying it flat stretches or shrinks the surface
+    by half a per cent or more, the picture says by how much. Raises `ValueError` for values of another shape, complex
+    or not finite, and things of another kind.
+    """
+    check_kind("unrolled", unrolled, Unrolled, "a surface laid flat, as of unroll(skin.model.mesh)")
+    check_scale(scale)
+    ax = axes_or_new(ax, (7.4, 5.2))
+    points = unrolled.points
+    flat = Triangulation(points[:, 0], points[:, 1], unrolled.cells)
+    if values is not None:
+        image = _checked(unrolled, values)
+        colours = scale.of(image, "S")
+        per_cell = len(image) == len(unrolled.cells)
+        style: dict[str, Any] = {"shading": "gouraud"}
+        if per_cell:
+            style = {"shading": "flat", "edgecolors": "face", "linewidth": 0.5}
+        drawn = ax.tripcolor(
+            flat, colours.factor * (image if per_cell else image[unrolled.nodes]), **style, **colours.keywords
+        )
+        colours.draw_bar(ax, drawn)
+    _draw_edges(ax, unrolled)
+    if electrodes is not None:
+        _draw_electrodes(ax, unrolled, electrodes)
+    for (name, places), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
+        at = unrolled.flat(np.atleast_2d(np.asarray(places, float)))
+        ax.plot(at[:, 0], at[:, 1], "o", color=colour, markersize=5, markeredgecolor="white", label=name, zorder=5)
+    extent = extent_of(points)
+    bare(ax, extent, numbered=False)
+    draw_scale_bar(ax, extent)
+    if marks:
+        ax.legend(loc="lower right", frameon=False, labelcolor=INK, ncols=len(marks), borderaxespad=0)
+    if unrolled.mean_distortion > _TOLD:
+        mean, most = 100 * unrolled.mean_distortion, 100 * unrolled.distortion
+        told = f"lengths off by {mean:.2g} % on average, {most:.2g} % at most"
+        ax.text(0.5, 0.02, told, transform=ax.transAxes, ha="center", color=SOFT, fontsize=8)
+    if title:
+        ax.set_title(title)
+    return ax
+
+
+def _checked(unrolled: Unrolled, values: ArrayLike) -> np.ndarray:
+    image, sizes = np.asarray(values), (len(unrolled.cells), len(unrolled.surface.points))
+    if image.shape not in ((sizes[0],), (sizes[1],)):
+        raise ValueError(
+            f"values has shape {image.shape}; give one for each of the {sizes[0]} triangles or the {sizes[1]} nodes."
+        )
+    if np.iscomplexobj(image):
+        raise ValueError("values are complex; draw their real or imaginary part.")
+    return image
+
+
+def _draw_edges(ax: Axes, unrolled: Unrolled) -> None:
+    for edges, style in ((unrolled.edge, "solid"), (unrolled.seam, (0, (3, 2)))):
+        ax.add_collection(LineCollection(list(edges), colors=SOFT, linewidths=1.0, linestyles=[style]))
+
+
+def _draw_electrodes(ax: Axes, unrolled: Unrolled, electrodes) -> None:
+    kinds = (SurfaceLayout, SurfaceDiscs, FaceDiscs)
+    check_kind("electrodes", electrodes, kinds, "those of a curved skin: its layout, or skin.model.electrodes")
+    if isinstance(electrodes, SurfaceLayout):
+        centres, radii, names = electrodes.centres, electrodes.diameters / 2, electrodes.labels
+    else:
+        centres, radii = electrodes.position, electrodes.radius
+        names = [str(k + 1) for k in range(electrodes.num_electrodes)]
+    for place, radius, name in zip(unrolled.flat(centres), np.asarray(radii), names, strict=True):
+        ax.add_patch(Circle(tuple(place), float(radius), facecolor="#ffffffa0", edgecolor=INK, linewidth=0.8, zorder=3))
+        ax.annotate(name, tuple(place), ha="center", va="center", fontsize=6, color=INK, zorder=4)

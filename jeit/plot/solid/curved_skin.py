@@ -1,0 +1,91 @@
+"""Curved skins as they are in space, with values on them and electrodes as discs."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgba
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind
+from jeit.layout import SurfaceLayout
+from jeit.mesh import measures
+from jeit.plot.axes import INK, SERIES_COLOURS, axes_or_new
+from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
+from jeit.plot.imaging.electrodes import METAL
+from jeit.plot.solid.body import size_of
+from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
+from jeit.plot.solid.electrode_shapes import Draped, shapes_of
+from jeit.plot.solid.scene import Scene, bare_in_space
+from jeit.plot.solid.shaded_surface import BODY, checked_values, colours_of, mappable
+
+# Of the skin's size: how far marks count as nearer than the surface that they are on.
+_BEFORE = 0.02
+
+
+def plot_curved_skin(
+    layout: SurfaceLayout,
+    values: ArrayLike | None = None,
+    *,
+    marks: Mapping[str, ArrayLike] | None = None,
+    camera: Camera = FROM_THE_CORNER,
+    scale: ColourScale = CHANGE,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the surface of a curved skin in space, with its electrodes as discs on it.
+
+    `values`: one for each triangle of `layout.surface`, flat, or for each of its nodes; grey without. `marks`: places
+    (p, 3), metres, by what the legend calls them; those on the far side are left out. `camera`: from where it is seen.
+    `scale`: how values become colours; changes of sheet conductivity in S unless it says otherwise. Raises `ValueError`
+    for values of another shape or not finite, and things of another kind.
+    """
+    check_kind("layout", layout, SurfaceLayout, "a SurfaceLayout, skin.layout of a curved skin")
+    check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")
+    check_scale(scale)
+    mesh = layout.surface
+    points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
+    ax = axes_or_new(ax)
+    scene, fitted, colours = Scene(camera), None, np.array(to_rgba(BODY))
+    if values is not None:
+        image = checked_values(values, len(points), len(cells))
+        fitted = scale.of(image, "S")
+        colours = colours_of(fitted, image if len(image) == len(cells) else image[cells].mean(axis=1))
+    scene.add_triangles(points, cells, colours, smooth=True)
+    surface = Draped(points, cells)
+    # Pieces are sorted by their middles: a disc counts as nearer than the triangles that it lies on.
+    before = float(np.sqrt(np.asarray(measures(mesh)).max()))
+    for corners in shapes_of(mesh, layout.discs(1.0)).polygons():
+        (outward,) = surface.normals(corners.mean(axis=0)[None])
+        scene.add_polygon(corners, METAL, outward, before)
+    scene.draw(ax)
+    for (name, places), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
+        seen = _on_this_side(mesh, np.atleast_2d(np.asarray(places, float)), camera)
+        ax.plot(*camera.on_page(seen).T, "o", color=colour, markersize=5, markeredgecolor="white", label=name, zorder=5)
+    bare_in_space(ax, camera, points, numbered=False)
+    if marks:
+        ax.legend(loc="lower center", ncols=len(marks), frameon=False, labelcolor=INK, borderaxespad=0)
+    if title is not None:
+        ax.set_title(title)
+    if fitted is not None:
+        fitted.draw_bar(ax, mappable(fitted))
+    return ax
+
+
+def _on_this_side(mesh, places, camera: Camera):
+    """Places that nothing of the surface hides: none of it lies nearer to the viewer on the same ray."""
+    corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
+    flat, deep = camera.on_page(corners), camera.nearness(corners)
+    seen = []
+    for place in places:
+        at, depth = camera.on_page(place[None])[0], float(camera.nearness(place[None])[0])
+        a, b, c = (flat[:, k] - at for k in range(3))
+        areas = np.stack([b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0], c[:, 0] * a[:, 1] - c[:, 1] * a[:, 0],
+                          a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]], axis=1)  # fmt: skip
+        total = areas.sum(axis=1)
+        share = areas / np.where(total == 0, 1.0, total)[:, None]
+        over = (share >= 0).all(axis=1) & (total != 0)
+        nearer = (share * deep).sum(axis=1)[over]
+        if not (nearer > depth + _BEFORE * size_of(mesh)).any():
+            seen.append(place)
+    return np.array(seen).reshape(-1, 3)

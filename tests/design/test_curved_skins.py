@@ -1,0 +1,282 @@
+"""Curved skins: the same calls as flat ones, and the same answers where they are the same skin."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.design import (
+    Bell,
+    Objective,
+    Skin,
+    optimise_surface_layout,
+    sensitivity_map,
+    skin_response,
+    touch_grid,
+    touches_away_from_the_edge,
+)
+from jeit.design.optimisation.surface_optimise import surface_scores
+from jeit.design.skin.protocol import skin_protocol
+from jeit.electrodes import FaceDiscs, SurfaceDiscs
+from jeit.forward import ForwardModel
+from jeit.inverse import one_step
+from jeit.layout import Layout, SurfaceLayout, grid, spread
+from jeit.mesh import Mesh, Rectangle, bend, forearm, layer, shell, tube
+from jeit.mesh.geodesic import Geodesics, Triangles
+from jeit.touch.contacts import CellFinder, find_contacts
+
+SHEET = Rectangle(0.12, 0.12)
+
+
+def raised(points) -> np.ndarray:
+    return np.column_stack([points, np.zeros(len(points))])
+
+
+def test_places_are_spread_by_ways_along_the_surface():
+    mesh = forearm(0.2, 0.025, 0.045, num_points=1500)
+    places = spread(mesh, 32, margin=0.01)
+    ways = Geodesics.create(mesh)
+    apart = ways.between(places)
+    np.fill_diagonal(apart, np.inf)
+    area = float(Triangles.of(mesh).areas.sum())
+    pitch = np.sqrt(2 / np.sqrt(3) * area / 32)
+    assert apart.min() > 0.65 * pitch
+    assert ways.surface.distance_to_border(places).min() >= 0.0099
+    np.testing.assert_array_equal(places, spread(mesh, 32, margin=0.01))
+    with pytest.raises(ValueError, match="leaves no room"):
+        spread(mesh, 32, margin=0.15)
+
+
+def test_94_nearest_pairs_are_nearest_along_the_surface():
+    layout = SurfaceLayout.spread(tube(0.015, 0.15, num_points=900), 32, 5e-3)
+    protocol = skin_protocol(layout)
+    assert protocol.num_measurements == 94
+    lengths = layout.lengths()
+    drive = np.asarray(protocol.drive)[np.asarray(protocol.drive_index)]
+    chosen = [lengths[tuple(np.flatnonzero(row))] for row in drive]
+    every = np.sort(lengths[np.triu_indices(32, 1)])
+    np.testing.assert_allclose(np.sort(chosen), every[:94], rtol=1e-6)
+    straight = np.linalg.norm(np.asarray(layout.centres)[:, None] - layout.centres, axis=-1)
+    by_chord, by_way = (set(np.argsort(one[np.triu_indices(32, 1)])[:94]) for one in (straight, lengths))
+    assert by_chord != by_way
+
+
+@pytest.mark.parametrize("num_layers", [0, 3])
+def test_a_skin_in_a_plane_in_space_is_the_flat_skin(num_layers):
+    """And R → ∞ of a bent one."""
+    flat = Layout(grid(0.08, 0.08, 3, 3), 8e-3, outline=SHEET, contact_impedance=1e-4)
+    plane = Skin.create(flat, num_layers=num_layers, num_points=700)
+    places = np.array([[0.01, 0.02], [-0.03, 0.0], [0.02, -0.03]])
+    changes = np.asarray(plane.voltage_changes(plane.touched_cells(places)))
+    mesh = SHEET.mesh(num_points=700)
+    in_space = Mesh.create(raised(np.asarray(mesh.points)), mesh.cells)
+    curved = Skin.create(
+        SurfaceLayout(raised(flat.centres), 8e-3, in_space, contact_impedance=1e-4), num_layers=num_layers
+    )
+    assert isinstance(curved.model.electrodes, FaceDiscs if num_layers else SurfaceDiscs)
+    above = raised(places) + np.array([0, 0, plane.thickness if num_layers else 0.0])
+    same = np.asarray(curved.voltage_changes(curved.touched_cells(above)))
+    np.testing.assert_allclose(same, changes, rtol=1e-6, atol=1e-9 * np.abs(changes).max())
+
+
+@pytest.mark.slow
+def test_bends_towards_the_flat_skin():
+    flat = Layout(grid(0.08, 0.08, 3, 3), 8e-3, outline=SHEET, contact_impedance=1e-4)
+    fine = SHEET.mesh(num_points=700)
+    places = np.array([[0.01, 0.02], [-0.03, 0.0]])
+    errors = []
+    for radius in (0.1, 0.4, 1.6):
+        surface = bend(fine, radius, axis="y")
+
+        def rolled(points, radius=radius, up=0.0):
+            angle = points[:, 0] / radius
+            low = (radius + up) * np.cos(angle) - radius
+            return np.column_stack([(radius + up) * np.sin(angle), points[:, 1], low])
+
+        curved = Skin.create(SurfaceLayout(rolled(np.asarray(flat.centres)), 8e-3, surface, contact_impedance=1e-4),
+                             num_layers=2, thickness=5e-3)  # fmt: skip
+        found = np.asarray(curved.model.voltages(1.0))
+        cells = Mesh.create(np.column_stack([unbent(surface, radius), np.zeros(surface.num_points)]), surface.cells)
+        plane = Skin.create(SurfaceLayout(raised(np.asarray(flat.centres)), 8e-3, cells, contact_impedance=1e-4),
+                            num_layers=2, thickness=5e-3)  # fmt: skip
+        exact = np.asarray(plane.model.voltages(1.0))
+        errors.append(np.abs(found / exact - 1).max())
+        touched = curved.touched_cells(rolled(places, up=5e-3), Bell(2.5e-3, 7.5e-3))
+        assert np.isfinite(np.asarray(curved.voltage_changes(touched))).all()
+    assert errors[2] < errors[1] < errors[0]
+    assert errors[2] < 0.005
+
+
+def unbent(surface: Mesh, radius: float) -> np.ndarray:
+    points = np.asarray(surface.points)
+    return np.column_stack([radius * np.arctan2(points[:, 0], radius + points[:, 2]), points[:, 1]])
+
+
+def test_a_bent_sheet_without_thickness_is_the_flat_sheet():
+    """`bend` keeps all lengths on the sheet: voltages differ by the chords of discs that follow."""
+    fine = SHEET.mesh(num_points=900)
+    surface = bend(fine, 0.03)
+    flat = Mesh.create(np.column_stack([_flat(surface), np.zeros(surface.num_points)]), surface.cells)
+    centres = grid(0.08, 0.08, 3, 3)
+    at = Triangles.of(flat).nearest(raised(centres))
+    bent = np.einsum("pk,pkd->pd", at.weights, np.asarray(surface.points)[np.asarray(surface.cells)[at.triangle]])
+    voltages = [
+        np.asarray(Skin.create(SurfaceLayout(one, 8e-3, mesh), num_layers=0).model.voltages(0.01))
+        for one, mesh in ((raised(centres), flat), (bent, surface))
+    ]
+    np.testing.assert_allclose(voltages[1], voltages[0], rtol=5e-3)
+
+
+def _flat(surface: Mesh) -> np.ndarray:
+    from jeit.mesh.geodesic import unroll
+
+    return unroll(surface).points
+
+
+def test_the_same_calls_as_on_flat_skins():
+    layout = SurfaceLayout.spread(tube(0.03, 0.1, num_points=700), 12, 7e-3, contact_impedance=1e-4)
+    skin = Skin.create(layout, num_layers=0)
+    places = touches_away_from_the_edge(skin.outline, 0.012, 6, 6)
+    assert places.places.shape == (36, 3)
+    mapped = sensitivity_map(skin.model, skin.model_conductivity, places, thickness=skin.thickness)
+    assert float(mapped.minimum) > 0
+    assert float(mapped.uniformity) > 0.5
+    with pytest.raises(ValueError, match="no raster"):
+        mapped.image()
+    response = skin_response(skin, places, key=jax.random.key(0), num_taxels=8)
+    assert response.taxels.positions.shape == (8, 3)
+    assert float(response.taxels.areas.sum()) > 0
+    with pytest.raises(ValueError, match="lie off the skin's surface"):
+        skin.touched_cells([[0.0, 0.0, 0.05]])
+    with pytest.raises(ValueError, match=r"places must be \(n, 3\)"):
+        skin.touched_cells([[0.0, 0.0]])
+
+
+def test_touches_are_where_ways_along_the_surface_say_and_below_it():
+    core = tube(0.03, 0.1, num_points=1500)
+    skin = Skin.create(SurfaceLayout.spread(core, 8, 8e-3), thickness=8e-3, num_layers=6)
+    place = np.array([[0.038, 0.0, 0.05]])
+    touched = skin.touched_cells(place, Bell(4e-3, 8e-3))
+    changed = np.unique(np.asarray(touched.cells)[np.asarray(touched.change) != 0])
+    mesh = skin.model.mesh
+    middle = np.asarray(mesh.points)[np.asarray(mesh.cells)].mean(axis=1)
+    radius, angle = np.hypot(middle[:, 0], middle[:, 1]), np.arctan2(middle[:, 1], middle[:, 0])
+    depth = 4e-3 * np.exp(-((0.038 * angle) ** 2 + (middle[:, 2] - 0.05) ** 2) / (2 * 8e-3**2))
+    inside = np.flatnonzero(0.038 - radius < depth)
+    assert len(set(changed) ^ set(inside)) < 0.1 * len(inside)
+
+
+def test_positions_along_the_surface_have_gradients():
+    surface = tube(0.03, 0.08, num_points=900)
+    layout = SurfaceLayout.spread(surface, 8, 9e-3, contact_impedance=1e-4)
+    skin = Skin.create(layout, num_layers=0, protocol=None)
+    shelled = Skin.create(layout, num_layers=2, thickness=6e-3)
+    triangles = Triangles.of(surface)
+    normal = triangles.normals_at(triangles.nearest(layout.centres))
+    step = np.random.default_rng(0).normal(size=normal.shape)
+    step -= (step * normal).sum(axis=1, keepdims=True) * normal
+    for one in (skin, shelled):
+
+        def voltages(position, one=one):
+            electrodes = eqx.tree_at(lambda each: each.position, one.model.electrodes, position)
+            return one.model.with_electrodes(electrodes).voltages(1.0)
+
+        at = one.model.electrodes.position
+        value, slope = jax.jvp(voltages, (at,), (jnp.asarray(step),))
+        for size in (1e-6, 1e-7):
+            change = (voltages(at + size * step) - voltages(at - size * step)) / (2 * size)
+            assert np.abs(change - slope).max() < 1e-4 * np.abs(slope).max()
+        back = jax.vjp(voltages, at)[1](jnp.ones_like(value))[0]
+        assert float(jnp.sum(back * step)) == pytest.approx(float(slope.sum()), rel=1e-8)
+
+
+@pytest.mark.slow
+def test_optimises_electrodes_along_the_surface():
+    surface = tube(0.03, 0.08, num_points=500)
+    crowded = spread(surface, 8, margin=0.02)
+    skin = Skin.create(SurfaceLayout(crowded, 8e-3, surface, contact_impedance=1e-4), num_layers=0)
+    places = touch_grid(skin.outline, 5, 5).places
+    objective = Objective.create(skin, places, correlation=0.02)
+    slope = jax.grad(lambda one: objective.score(surface_scores(skin, objective, one)))(skin.layout.centres)
+    assert np.isfinite(np.asarray(slope)).all()
+    found = optimise_surface_layout(skin, objective, steps=6, minimum_spacing=0.012)
+    assert found.value > found.start_value + 0.02
+    assert (np.diff(found.history) > 0).all()
+    assert Triangles.of(surface).nearest(found.layout.centres).away.max() < 1e-9
+    with pytest.raises(ValueError, match="must be a curved sheet"):
+        optimise_surface_layout(Skin.create(Layout(grid(0.08, 0.08, 3, 3), 8e-3, outline=SHEET)), objective)
+
+
+def mean_error(fine: Skin, coarse: Skin, places, far) -> float:
+    changes = np.asarray(fine.voltage_changes(fine.touched_cells(places, Bell(4e-3, 6e-3))))
+    changes = changes + np.random.default_rng(7).normal(scale=2e-5, size=changes.shape)
+    images = np.asarray(one_step(coarse.model, coarse.model_conductivity, noise=2e-5).image(jnp.asarray(changes)))
+    finder = CellFinder(coarse.model.mesh, sign=-1)
+    return float(np.mean([far(place, find_contacts(finder, one)[0].centroid)
+                          for place, one in zip(places, images, strict=True)]))  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("radius", [0.03, 0.04])
+def test_touches_are_found_as_well_as_on_the_flat_skin(radius):
+    """`TOUCH` H: geodesic error no more than 1.5 times that of the flat skin of the same sides."""
+    height = 0.14
+    sides = Rectangle(2 * np.pi * radius, height)
+    even = Layout(grid(0.75 * 2 * np.pi * radius, 0.75 * height, 4, 4), 6e-3, outline=sides)
+    flat = [Skin.create(even, num_layers=0, cell_size=size) for size in (3.5e-3, 5e-3)]
+    inside = touches_away_from_the_edge(sides, 0.015, 8, 8).places
+    plane = mean_error(*flat, inside, lambda one, other: np.linalg.norm(one - other))
+    centres = SurfaceLayout.spread(tube(radius, height, cell_size=5e-3), 16, 6e-3, margin=5e-3).centres
+    curved = [
+        Skin.create(SurfaceLayout(centres, 6e-3, tube(radius, height, cell_size=size)), num_layers=0)
+        for size in (3.5e-3, 5e-3)
+    ]
+    on = touches_away_from_the_edge(curved[0].outline, 0.015, 6, 8).places
+    ways = Geodesics.create(curved[1].model.mesh)
+    error = mean_error(*curved, on, lambda one, other: ways.distances(one[None], other[None])[0, 0])
+    assert error < 1.5 * plane
+    assert error < 0.008
+
+
+def test_a_touch_across_the_seam_is_one():
+    surface = tube(0.03, 0.1, cell_size=5e-3)
+    skin = Skin.create(SurfaceLayout.spread(surface, 12, 7e-3), num_layers=0)
+    changes = skin.voltage_changes(skin.touched_cells([[-0.03, 0.0, 0.05]], Bell(4e-3, 7e-3)))
+    image = np.asarray(one_step(skin.model, skin.model_conductivity).image(changes))[0]
+    (contact, *_) = find_contacts(CellFinder(surface, sign=-1), image)
+    assert np.linalg.norm(contact.centroid - [-0.03, 0, 0.05]) < 0.008
+
+
+@pytest.mark.parametrize(
+    ("match", "centres", "diameter"),
+    [
+        ("off the surface, farther than its radius", [[0.05, 0, 0.05]], 6e-3),
+        ("lies on the surface's edge", [[0.03, 0, 0.0005]], 6e-3),
+        ("overlap by", [[0.03, 0, 0.05], [0.03, 0, 0.053]], 6e-3),
+        ("larger than the surface's radius of curvature", [[0.03, 0, 0.05]], 8e-2),
+    ],
+)
+def test_refuses_electrodes_that_cannot_be(match, centres, diameter):
+    with pytest.raises(ValueError, match=match):
+        SurfaceLayout(centres, diameter, tube(0.03, 0.1, num_points=1500))
+
+
+def test_refuses_skins_that_cannot_be():
+    layout = SurfaceLayout.spread(tube(0.03, 0.1, num_points=700), 8, 7e-3, outward=False)
+    with pytest.raises(ValueError, match="cell_size and num_points are of flat skins"):
+        Skin.create(layout, cell_size=0.005)
+    with pytest.raises(ValueError, match="thick"):
+        Skin.create(layout, thickness=0.035, num_layers=3)
+    with pytest.raises(ValueError, match="surface is flat or a solid"):
+        SurfaceLayout([[0.03, 0, 0.05]], 6e-3, layer(SHEET.mesh(num_points=200), 5e-3, 1))
+    discs, protocol, solid = (
+        SurfaceDiscs(layout.centres, 3.5e-3, 1e-4),
+        skin_protocol(layout),
+        shell(layout.surface, 5e-3),
+    )
+    with pytest.raises(ValueError, match="SurfaceDiscs live on a surface in space"):
+        ForwardModel(solid, discs, protocol)
+    inward = Skin.create(layout, thickness=6e-3, num_layers=3)
+    assert inward.touched_face == "inner"
+    assert float(np.hypot(*inward.outline.points[:, :2].T).max()) < 0.0245

@@ -1,0 +1,130 @@
+"""Breathing lungs in a chest, and a sphere that oscillates ten times a second, and what images tell of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jeit import data, protocol
+from jeit.electrodes import BoundaryElectrodes, FaceDiscs
+from jeit.forward import ForwardModel
+from jeit.image import ball_region, half_region, oscillation
+from jeit.imaging import ImagingSettings, image_sequence
+from jeit.layout import ring
+from jeit.mesh import Disk, Solid, centroids, measures
+
+NOISE = 1e-4
+
+
+def measured(model, conductivity, domain, times, seed):
+    """Frames of conductivities (F, m), with noise."""
+    clean = np.stack([np.asarray(model.voltages(one)) for one in conductivity])
+    noisy = clean + NOISE * np.abs(clean) * np.random.default_rng(seed).normal(size=clean.shape)
+    screened = data.screen(noisy, model.protocol, electrodes=model.electrodes, domain=domain, name="simulated")
+    return replace(screened, times=times)
+
+
+def degrees(phase, expected):
+    """How far a phase is off."""
+    return np.degrees(np.abs(np.angle(np.exp(1j * (phase - expected)))))
+
+
+@pytest.fixture(scope="module")
+def chest():
+    """Two lungs at 0.3 Hz, the right one an eighth of a period late, and a heart at 1.25 Hz; 20 frames a second."""
+    domain, times = Disk(0.15), np.arange(300) / 20.0
+    model = ForwardModel(
+        domain.mesh(num_points=700), BoundaryElectrodes(ring(0.15, 16), 0.02, 0.01), protocol.adjacent(16)
+    )
+    place = np.asarray(centroids(model.mesh))
+    left, right, heart = (np.linalg.norm(place - at, axis=1) < size for at, size in
+                          (([-0.07, 0.0], 0.035), ([0.07, 0.0], 0.035), ([0.0, 0.08], 0.03)))  # fmt: skip
+    turn = 2 * np.pi * times[:, None]
+    changes = -0.15 * np.cos(0.3 * turn) * left - 0.15 * np.cos(0.3 * turn - np.pi / 4) * right
+    changes = changes + 0.05 * np.cos(1.25 * turn + 1.0) * heart
+    return measured(model, 0.3 * (1 + changes), domain, times, 1)
+
+
+def test_breathing_is_told_by_frequency_amplitude_and_phase(chest):
+    found = image_sequence(chest, settings=ImagingSettings(num_points=900))
+    series, mesh = found.series, found.series.mesh
+    left, right, heart = (
+        ball_region(mesh, at, size) for at, size in (([-0.07, 0], 0.03), ([0.07, 0], 0.03), ([0, 0.08], 0.025))
+    )
+    slow = oscillation(series.changes, series.times, (0.1, 0.6))
+    assert slow.frequency == pytest.approx(0.3, abs=0.005)
+    curves = np.stack([series.mean_change(one) for one in (left, right, heart)], axis=1)
+    breath = oscillation(curves, series.times, slow.frequency)
+    # cos(turn - π/4) with a minus: π - π/4. The other lung's image reaches over by a few per cent.
+    assert degrees(breath.phase[:2], [np.pi, np.pi - np.pi / 4]).max() < 5
+    # A smooth image of a change of 0.045 S is lower, in both lungs alike.
+    assert breath.amplitude[0] == pytest.approx(breath.amplitude[1], rel=0.1)
+    assert 0.4 * 0.045 < breath.amplitude[0] < 1.1 * 0.045
+    beat = oscillation(curves[:, 2], series.times, (0.8, 2.5))
+    assert beat.frequency == pytest.approx(1.25, abs=0.01)
+    assert degrees(beat.phase, 1.0) < 5
+    functional = series.functional()
+    assert functional[left].mean() > 4 * functional[~(left | right)].mean()
+    assert not found.refused.any()
+    # Lungs differ in phase by an eighth of a period everywhere in them.
+    assert degrees(slow.phase[left], np.pi).max() < 10
+    assert np.median(degrees(slow.phase[right], 0.75 * np.pi)) < 5
+
+
+def test_images_are_those_of_one_frame_after_the_other(chest):
+    few = chest.frames(slice(0, 40))
+    found = image_sequence(few, chest.mean_frame(), ImagingSettings(num_points=500, hyperparameter=0.1))
+    change = np.asarray(few.voltages) - np.asarray(chest.mean_frame().voltages)
+    for frame in (0, 17, 39):
+        np.testing.assert_allclose(
+            found.series.changes[frame], found.reconstruction.image(change[frame]), rtol=1e-4, atol=1e-7
+        )
+
+
+def test_frames_that_lack_channels_are_refused_and_channels_that_most_lack_left_out(chest):
+    few = chest.frames(slice(0, 30))
+    mask = np.ones(few.mask.shape, bool)
+    mask[5, 17], mask[:20, 40] = False, False
+    found = image_sequence(replace(few, mask=mask), chest.mean_frame(), ImagingSettings(num_points=500))
+    assert np.flatnonzero(found.refused).tolist() == [5]
+    assert np.isnan(found.series.changes[5]).all()
+    assert not np.asarray(found.reconstruction.matrix)[:, 40].any()
+
+
+def test_what_makes_no_series(chest):
+    with pytest.raises(ValueError, match="without times"):
+        image_sequence(replace(chest, times=None))
+    with pytest.raises(ValueError, match="take a linear one"):
+        image_sequence(chest.frames(slice(0, 9)), settings=ImagingSettings(method="gauss-newton", num_points=300))
+
+
+@pytest.mark.slow
+def test_a_sphere_that_oscillates_ten_times_a_second():
+    """In a cylinder with two rings of eight electrodes, at 100 frames a second: frequency, phase and place."""
+    domain, times = Solid(Disk(0.1), 0.12), np.arange(100) / 100.0
+    position = np.concatenate([np.column_stack([ring(0.1, 8), np.full(8, height)]) for height in (0.04, 0.08)])
+    electrodes = FaceDiscs(position, 0.012, 1e-3)
+    model = ForwardModel(
+        domain.mesh(num_points=2500, refine=electrodes.refinement(domain)), electrodes, protocol.haar(16)
+    )
+    centre = np.array([0.04, 0.02, 0.06])
+    inside = np.linalg.norm(np.asarray(centroids(model.mesh)) - centre, axis=1) < 0.025
+    conductivity = 0.2 * (1 + 0.5 * np.cos(2 * np.pi * 10 * times[:, None] - 0.6) * inside)
+    made = measured(model, conductivity, domain, times, 2)
+    found = image_sequence(made, settings=ImagingSettings(num_points=2000, contact="common"))
+    series = found.series
+    ball = ball_region(series.mesh, centre, 0.025)
+    told = oscillation(series.changes, series.times, (5, 20))
+    assert told.frequency == pytest.approx(10, abs=0.05)
+    curve = oscillation(series.mean_change(ball), series.times, told.frequency)
+    assert degrees(curve.phase, -0.6) < 5
+    # A smooth image of it is weak: the oscillation has half of what lies between images of both ends, at rest.
+    ends = model.voltages(0.2 * (1 + 0.5 * inside)) - model.voltages(0.2 * (1 - 0.5 * inside))
+    still = np.asarray(found.reconstruction.image(ends)) / 2
+    size = np.asarray(measures(series.mesh))[ball]
+    assert curve.amplitude == pytest.approx(still[ball] @ size / size.sum(), rel=0.05)
+    peak = np.asarray(centroids(series.mesh))[np.argmax(told.amplitude)]
+    assert np.linalg.norm(peak - centre) < 0.025
+    assert series.unit == "S/m"
+    upper = half_region(series.mesh, (0, 0, 1))
+    assert told.amplitude[upper].mean() == pytest.approx(told.amplitude[~upper].mean(), rel=0.3)  # it is half way up
