@@ -30,7 +30,7 @@ Contact = Annotated[
     str | None,
     typer.Option(help="Contact impedance in the calibration: each, common or fixed; found from the protocol."),
 ]
-Nodes = Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000).")]
+Nodes = Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 2000; of a solid body 10000).")]
 AsIs = Annotated[
     bool,
     typer.Option("--as-is", help="Go on though electrodes, channels or signs look wired otherwise than described."),

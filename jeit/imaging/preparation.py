@@ -19,9 +19,11 @@ from jeit.imaging.wiring import Wiring, find_wiring
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channel_weights import electrode_misfits
-from jeit.mesh import Body, Mesh
+from jeit.mesh import Body, Mesh, Solid
 from jeit_solvers.engines import as_array
 
+# Nodes unless asked for, of a solid body and of a sheet.
+_SOLID, _SHEET = 10_000, 2000
 # Of a difference, what no model is taken to explain better than.
 _LEAST_MISFIT = 0.03
 # How many times as much of it sharp outlines may miss.
@@ -123,7 +125,7 @@ def prepare_difference(
     *,
     frame: int | str | None = None,
     contact: str | None = None,
-    num_points: int = 2000,
+    num_points: int | None = None,
     as_is: bool = False,
     clock: Clock | None = None,
 ) -> PreparedDifference:
@@ -216,9 +218,11 @@ def check_measurement(name: str, given: Measurement) -> None:
     check_kind(name, given, Measurement, "a Measurement, as of jeit.read(path)")
 
 
-def imaging_mesh(domain: Body, electrodes: AbstractElectrodes, num_points: int) -> Mesh:
-    """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep."""
-    return body_mesh(domain, electrodes, num_points)
+def imaging_mesh(domain: Body, electrodes: AbstractElectrodes, num_points: int | None) -> Mesh:
+    """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep; None for
+    2,000 of a sheet, and 10,000 of a solid body."""
+    usual = _SOLID if isinstance(domain, Solid) else _SHEET
+    return body_mesh(domain, electrodes, usual if num_points is None else num_points)
 
 
 def default_contact(measurement: Measurement) -> str:

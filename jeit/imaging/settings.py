@@ -28,7 +28,7 @@ class ImagingSettings:
       served on measured tanks.
     - `contact`: how the contact impedance is calibrated ("each", "common", "fixed"); None decides by the protocol: each
       electrode's own where voltages are read on driven electrodes, else fixed, for then nothing shows it.
-    - `num_points`: nodes of the mesh, about.
+    - `num_points`: nodes of the mesh, about; None for 2,000 of a sheet, and of a solid body 10,000.
     - `raster_shape`: (rows, columns) of the raster.
     - `level`, `least_peak`: see `jeit.image.find_inclusions`.
     - `as_is`: image even where the wiring is found to be another than described, see `jeit.imaging.wiring`.
@@ -42,7 +42,7 @@ class ImagingSettings:
     prior: str | AbstractPrior = MEASURED
     hyperparameter: float | str | None = None
     contact: str | None = None
-    num_points: int = 2000
+    num_points: int | None = None
     raster_shape: tuple[int, int] = (256, 256)
     level: float = 0.65
     least_peak: float = 0.3
@@ -80,11 +80,11 @@ def check_prior(prior) -> None:
         check_name("prior", prior, PRIORS, "" if isinstance(prior, str) else ", or an object such as Noser()")
 
 
-def check_body(contact: str | None, num_points: int) -> None:
+def check_body(contact: str | None, num_points: int | None) -> None:
     """Raises `ValueError` for a calibration that there is not, and for meshes too coarse or too fine."""
     if contact is not None:
         check_name("contact", contact, CONTACTS)
-    if not (isinstance(num_points, Integral) and 50 <= num_points <= 100_000):
+    if num_points is not None and not (isinstance(num_points, Integral) and 50 <= num_points <= 100_000):
         raise ValueError(f"num_points: give 50 to 100,000 nodes of the mesh; it is {told(num_points)}.")
 
 

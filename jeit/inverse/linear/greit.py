@@ -48,16 +48,17 @@ def greit(
 
     Trained on about `num_targets` small discs (3-D: balls) spread evenly over the body, on a hexagonal grid (3-D:
     cubic). Y holds their responses to a change of one siemens, taken **from the Jacobian**: exact for small changes;
-    the contrast of large ones is underestimated, as in any linear image. X holds the images desired: discs of one radius with a smooth edge, cut
-    off at the outline, each with as much change (its integral) as its target. Both are divided by √(number of targets).
+    the contrast of large ones is underestimated, as in any linear image. X holds the images desired: discs of one
+    radius with a smooth edge, cut off at the outline, each with as much change (its integral) as its target. Both are
+    divided by √(number of targets).
 
     `radius` of the desired images and `target_radius` of the targets: fractions of the body's radius, that of the disc
     with its area (3-D: of the ball with its volume). `radius` is 1/√L unless given, 0.25 for 16 electrodes; smaller
     buys resolution with ringing and noise. `hyperparameter`: λ itself, or "noise-figure": the λ at which the
     signal-to-noise ratio of the data is `noise_figure` times that of the image, for a target in the middle of the body;
-    0.5 is what GREIT's authors agreed on. Signal is the mean absolute value, over channels in units of their noise and over the body; noise is the root
-    mean square standard deviation. `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in
-    volts (or relative to each other). `mask`: True for the channels to use.
+    0.5 is what GREIT's authors agreed on. Signal is the mean absolute value, over channels in units of their noise and
+    over the body; noise is the root mean square standard deviation. `noise`: standard deviation of the channels, W =
+    noise⁻²; one number or (M,), in volts (or relative to each other). `mask`: True for the channels to use.
 
     Raises `ValueError` for arguments that do not fit, and for a noise figure that no λ reaches.
     """
@@ -76,12 +77,12 @@ def greit(
     if np.shape(conductivity) not in ((), (mesh.num_cells,)):
         raise ValueError("conductivity: give one number, or one value per cell: the image has a value per cell.")
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
-    body_radius, middle = _radius(measure.sum(), mesh.dimension), measure @ centre / measure.sum()
+    body_radius, middle = _radius(float(measure.sum()), mesh.dimension), measure @ centre / measure.sum()
     position, covered = _targets(mesh, middle, target_radius * body_radius, num_targets)
     desired = _desired_images(mesh, position, covered.T @ measure, radius * body_radius)
     # In the directions that a body can move data in, of which there are fewer than channels.
     directions = data_directions(model.protocol, channels, root_weight)
-    weighted = (np.asarray(root_weight)[:, None] * directions).T
+    weighted = directions.T * np.asarray(root_weight)  # (r, K)
     response, shares = np.zeros((len(weighted), len(position))), covered.tocsr()
     for cells, block in combined_blocks(model, conductivity, channels, weighted):
         response += (shares[cells].T @ block.T).T / np.sqrt(len(position))

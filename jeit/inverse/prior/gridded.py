@@ -16,7 +16,8 @@ _MOST = 500_000
 
 
 class GriddedGaussian:
-    """Γ_ij = exp(-|x_i - x_j|² / 2 length²) between `places` (m, d), metres; `length` in metres."""
+    """Γ_ij = exp(-|x_i - x_j|² / 2 length²) between `places` (m, d), metres; `length` in metres.
+    `variance` (m,): its diagonal, one but for what interpolation takes off."""
 
     def __init__(self, places: Float[np.ndarray, "m d"], length: float):
         spacing = length / _PER_LENGTH
@@ -24,7 +25,11 @@ class GriddedGaussian:
         self._shape = tuple(int(count) for count in np.ceil((places.max(axis=0) - low) / spacing) + 2)
         steps = [np.arange(count) for count in self._shape]
         self._along = [np.exp(-((one[:, None] - one) ** 2) / (2 * _PER_LENGTH**2)) for one in steps]
-        self._interpolation = _cubic((places - low) / spacing, self._shape)
+        place = (places - low) / spacing
+        self._interpolation = _cubic(place, self._shape)
+        weights, nodes = _weights(place), np.arange(_CUBIC)
+        between = np.exp(-((nodes[:, None] - nodes) ** 2) / (2 * _PER_LENGTH**2))
+        self.variance = np.prod(np.einsum("mdi,ij,mdj->md", weights, between, weights), axis=1)
 
     @staticmethod
     def suits(places: Float[np.ndarray, "m d"], length: float) -> bool:
@@ -40,14 +45,16 @@ class GriddedGaussian:
         return self._interpolation @ grid.reshape(-1, columns.shape[1])
 
 
+def _weights(place: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
+    """Of Lagrange's cubics through the two grid points on either side, along every axis."""
+    t = place - np.floor(place) + 1
+    nodes = np.arange(_CUBIC)
+    return np.stack([np.prod([(t - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1)
+
+
 def _cubic(place: Float[np.ndarray, "m d"], shape: tuple[int, ...]) -> scipy.sparse.csr_array:
     """Weights (m, grid points) of Lagrange's cubics at places in units of the grid."""
-    first = np.floor(place).astype(int) - 1
-    t = place - first  # from 1 to 2
-    nodes = np.arange(_CUBIC)
-    along = np.stack(
-        [np.prod([(t - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1
-    )  # (m, d, 4)
+    first, nodes, along = np.floor(place).astype(int) - 1, np.arange(_CUBIC), _weights(place)
     weight, index = np.ones((len(place), 1)), np.zeros((len(place), 1), int)
     for axis, count in enumerate(shape):
         weight = (weight[:, :, None] * along[:, axis, None, :]).reshape(len(place), -1)

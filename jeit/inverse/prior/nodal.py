@@ -46,7 +46,8 @@ class NodalSystem(NamedTuple):
         self, elements: Float[np.ndarray, "..."], diagonal: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " e"]:
         """Entries, in the pattern's order, of a matrix of the cells' `elements` (m, k, k) and a `diagonal` (n,)."""
-        values = np.array(self.pattern.assemble(elements))
+        given: Any = elements
+        values = np.array(self.pattern.assemble(given))
         values[: self.pattern.size] += diagonal
         return values
 

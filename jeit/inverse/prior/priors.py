@@ -103,13 +103,8 @@ class AbstractPrior(eqx.Module):
         """S with Γ = S Sᵀ, for nonlinear reconstructions; where Q has a null space, a wide prior stands for none."""
 
     def informed_basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
-        """The part of S that data tell of at the background, for bodies of many cells."""
-        rows: Any = np.asarray(jacobian)
-        return informed_shapes(rows, lambda columns: self.covariance_product(mesh, columns.T), self.variance(mesh))
-
-    def variance(self, mesh: Mesh) -> Float[np.ndarray, " m"] | None:
-        """Of every cell, the diagonal of Γ, where that is known."""
-        return None
+        """What stands for S where there are many cells, if that is too large: see `informed_shapes`."""
+        return self.basis(mesh, jacobian)
 
     def null_space(self, mesh: Mesh) -> Float[Array, "m p"]:
         """Basis of the images that cost nothing; none unless a prior says otherwise."""
@@ -130,10 +125,6 @@ class Tikhonov(AbstractPrior):
     def basis(self, mesh, jacobian):
         """Every cell on its own."""
         return DiagonalBasis(host.ones(mesh.num_cells))
-
-    def informed_basis(self, mesh, jacobian):
-        """The same: it takes no room."""
-        return self.basis(mesh, jacobian)
 
 
 class Noser(AbstractPrior):
@@ -161,10 +152,6 @@ class Noser(AbstractPrior):
     def basis(self, mesh, jacobian):
         """Every cell on its own."""
         return DiagonalBasis((abs(jacobian) ** 2).sum(axis=0) ** (-self.exponent / 2))
-
-    def informed_basis(self, mesh, jacobian):
-        """The same: it takes no room."""
-        return self.basis(mesh, jacobian)
 
 
 class Laplace(AbstractPrior):
@@ -258,9 +245,13 @@ class Gaussian(AbstractPrior):
         ones = np.ones(len(centres))
         return DenseBasis(host.asarray(pivoted_cholesky(ones, column, tolerance=_LEFT_OUT, max_rank=_MOST_SHAPES)))
 
-    def variance(self, mesh):
-        """One."""
-        return np.ones(mesh.num_cells)
+    def informed_basis(self, mesh, jacobian):
+        """As of any prior, by way of a grid, or where that would be too large, of all shapes."""
+        places = np.asarray(centroids(mesh))
+        if not GriddedGaussian.suits(places, float(self.length)):
+            return self.basis(mesh, jacobian)
+        grid = GriddedGaussian(places, float(self.length))
+        return informed_shapes(np.asarray(jacobian), grid.product, grid.variance)
 
     def precision(self, mesh, jacobian):
         """Not to be had: the inverse of a Gaussian covariance is dense and ill-conditioned. Raises `ValueError`."""

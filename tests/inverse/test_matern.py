@@ -1,0 +1,140 @@
+"""Matérn fields: their correlation against the closed form, even variances, and images by them."""
+
+import numpy as np
+import pytest
+from scipy.special import kv
+
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.inverse import one_step, posterior, reconstruct
+from jeit.inverse.prior import priors
+from jeit.inverse.prior.gridded import GriddedGaussian
+from jeit.inverse.prior.matern import Matern
+from jeit.inverse.prior.priors import Gaussian, Laplace
+from jeit.layout import ring
+from jeit.mesh import box, centroids, disk
+from jeit.mesh.geometry import interior_facets
+from jeit.protocol import adjacent
+
+
+def covariance(mesh, length):
+    """Of the cell nearest to the middle with all, and the distances to it."""
+    centre = np.asarray(centroids(mesh))
+    distance = np.linalg.norm(centre - centre.mean(axis=0), axis=1)
+    middle = distance.argmin()
+    one = np.zeros((1, mesh.num_cells))
+    one[0, middle] = 1
+    found = np.asarray(Matern(length).covariance_product(mesh, one))[:, 0]
+    return found, np.linalg.norm(centre - centre[middle], axis=1)
+
+
+def test_correlation_in_a_sheet_is_the_closed_form():
+    """κr K₁(κr) from a third of the length to twice of it, within 3 %; with cells half as large, half of that."""
+    worst = []
+    for number in (700, 2800):
+        found, distance = covariance(disk(1.0, num_points=number), 0.25)
+        scaled = np.sqrt(2) * distance / 0.25
+        there = (scaled > 0.4) & (scaled < 3)
+        worst.append(np.abs(found[there] - scaled[there] * kv(1, scaled[there])).max())
+    assert worst[1] < 0.03
+    assert worst[1] < 0.6 * worst[0]
+
+
+def test_correlation_in_a_solid_is_the_closed_form():
+    """exp(-κr), from half the length to twice of it, on average within 2 %."""
+    found, distance = covariance(box(1.0, 1.0, 1.0, num_points=2800), 0.25)
+    scaled = distance / 0.25
+    there = (scaled > 0.5) & (scaled < 2)
+    assert np.abs(found[there] - np.exp(-scaled[there])).mean() < 0.02
+
+
+def test_variance_is_even_up_to_the_wall():
+    mesh = disk(1.0, num_points=1500)
+    variance = np.sum(np.asarray(Matern(0.25).basis(mesh, np.zeros((0, 0))).shapes) ** 2, axis=1)
+    assert 0.9 < variance.min() < variance.max() < 1.0
+
+
+def test_estimated_variances_are_near_the_exact_ones(monkeypatch):
+    mesh = disk(1.0, num_points=600)
+    exact = Matern(0.25)._field(mesh, 0.0)
+    monkeypatch.setattr("jeit.inverse.prior.matern._FEW", 10)
+    assert np.asarray(Matern(0.25)._field(mesh, 0.0).scale) == pytest.approx(exact.scale, rel=0.15)
+
+
+def test_basis_and_product_are_of_one_covariance():
+    mesh = disk(1.0, num_points=300)
+    rows = np.random.default_rng(0).normal(size=(3, mesh.num_cells))
+    shapes = np.asarray(Matern(0.3).basis(mesh, rows).shapes)
+    product = np.asarray(Matern(0.3).covariance_product(mesh, rows))
+    np.testing.assert_allclose(product, shapes @ (shapes.T @ rows.T), rtol=1e-10)
+
+
+@pytest.fixture(scope="module")
+def model():
+    electrodes = BoundaryElectrodes(ring(0.1, 16), 0.012, 1e-3)
+    return ForwardModel(disk(0.1, num_points=400), electrodes, adjacent(16))
+
+
+def imaged(model):
+    centre = np.asarray(centroids(model.mesh))
+    target = np.array([0.04, 0.01])
+    body = np.where(np.linalg.norm(centre - target, axis=1) < 0.02, 1.5, 1.0)
+    return centre, target, np.asarray(model.voltages(body)), np.asarray(model.voltages(1.0))
+
+
+def test_images_show_a_body_where_it_is(model):
+    centre, target, after, before = imaged(model)
+    change = np.asarray(one_step(model, 1.0, prior=Matern(0.02)).image(after - before))
+    assert np.linalg.norm(centre[change.argmax()] - target) < 0.015
+    found = reconstruct(model, after, 1.0, prior=Matern(0.02), hyperparameter=1.0, noise=1e-3 * np.abs(before).max())
+    assert np.linalg.norm(centre[np.asarray(found.conductivity).argmax()] - target) < 0.015
+
+
+# All shapes of a Gaussian leave a thousandth of its variance out, which is a fifth of the narrowest bars.
+@pytest.mark.parametrize(("prior", "least"), [(Gaussian(0.02), 0.25), (Matern(0.02), 0.05)])
+def test_of_many_cells_fewer_shapes_make_the_same_image(model, prior, least, monkeypatch):
+    """Images within 3 % of those of all shapes, and error bars: what data do not tell of keeps its variance."""
+    _, _, after, before = imaged(model)
+
+    def found():
+        noise = 1e-3 * np.abs(before).max()
+        one = reconstruct(model, after, 1.0, prior=prior, hyperparameter=1.0, noise=noise)
+        return np.asarray(one.conductivity) - 1, np.asarray(posterior(one).standard_deviation())
+
+    image, deviation = found()
+    monkeypatch.setattr(priors, "_MANY", 10)
+    monkeypatch.setattr(GriddedGaussian, "suits", staticmethod(lambda places, length: True))
+    few, bars = found()
+    assert np.abs(few - image).max() < 0.03 * np.abs(image).max()
+    assert np.abs(bars / deviation - 1).max() < least
+
+
+def test_gaussian_by_way_of_a_grid():
+    mesh = box(1.0, 1.0, 1.0, num_points=1500)
+    centre = np.asarray(centroids(mesh))
+    rows = np.random.default_rng(0).normal(size=(4, mesh.num_cells))
+    exact = np.asarray(Gaussian(0.3).covariance_product(mesh, rows))
+    about = GriddedGaussian(centre, 0.3).product(rows.T)
+    assert np.abs(about - exact).max() < 5e-3 * np.abs(exact).max()
+
+
+def test_laplace_of_many_cells_is_of_their_nodes(monkeypatch):
+    """Γ is symmetric and positive, and smooth: of white rows it keeps a small share of the steps between cells."""
+    mesh = box(1.0, 1.0, 1.0, num_points=300)
+    rows = np.random.default_rng(1).normal(size=(2, mesh.num_cells))
+    monkeypatch.setattr(priors, "_MANY", 10)
+    product = np.asarray(Laplace().covariance_product(mesh, rows))
+    inner = rows @ product
+    assert inner[0, 1] == pytest.approx(inner[1, 0], rel=1e-9)
+    assert (np.linalg.eigvalsh((inner + inner.T) / 2) > 0).all()
+    first, second = interior_facets(mesh)[0].T
+    steps = (product[first] - product[second]).std() / product.std()
+    assert steps < 0.3
+
+
+def test_bad_lengths_are_refused():
+    for length in (0.0, -1.0, np.nan):
+        with pytest.raises(ValueError, match="length"):
+            Matern(length)
+    with pytest.raises(ValueError, match="precision"):
+        Matern(0.1).precision(disk(1.0, num_points=60), np.zeros((0, 0)))
