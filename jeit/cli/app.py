@@ -24,6 +24,7 @@ from jeit.cli.commands.series import series
 from jeit.cli.commands.stream import stream
 from jeit.cli.commands.study import study
 from jeit.cli.commands.touch import touch
+from jeit.cli.commands.view import view
 from jeit.cli.options import naming_options, remembering_files, remove_empty_folders
 from jeit.start import discarded_damaged
 
@@ -52,6 +53,7 @@ app = typer.Typer(
 )
 app.command()(demo)
 app.command()(reconstruct)
+app.command()(view)
 app.command()(stream)
 app.command()(series)
 app.command()(choose)

@@ -106,9 +106,10 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str) -> Table:
     `unit` is that of conductivity."""
     unit, peaks = in_one_unit([one.peak for one in inclusions], unit)
     dimension = max((len(one.centroid) for one in inclusions), default=2)
+    solid = any(one.is_solid for one in inclusions)
     places = [f"{axis} / mm" for axis in "xyz"[:dimension]]
     # A million times either: square metres in mm², cubic metres in cm³.
-    size, digits = ("area / mm²", 0) if dimension == 2 else ("volume / cm³", 2)
+    size, digits = ("volume / cm³", 2) if solid else ("area / mm²", 0)
     table = Table("inclusion", *places, size, f"peak / {unit}", box=None, padding=(0, 2))
     for column in table.columns[1:]:
         column.justify = "right"

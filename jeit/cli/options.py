@@ -137,7 +137,7 @@ def intensity_settings(low: float | None, high: float | None, window: float | No
     return IntensitySettings(**given)
 
 
-def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json")) -> None:
+def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json", "image.vtu")) -> None:
     """Make the folder for results of these names before any work is done; `remove_empty_folders` undoes it. Raises
     `ValueError` if it cannot be one, and where a file of that name in it is one that the command was given."""
     for name in names:

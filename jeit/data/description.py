@@ -37,6 +37,7 @@ from typing import TYPE_CHECKING, Any
 from jeit.data.described_body import described_body, described_electrodes
 from jeit.data.described_protocol import described_protocol
 from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.body_mesh import body_mesh
 from jeit.files import read_toml
 from jeit.forward import ForwardModel
 from jeit.mesh import Body
@@ -114,7 +115,7 @@ class Description:
             said = {"geometry": domain, "electrodes": electrodes, "protocol": protocol}
             missing = ", ".join(f"[{section}]" for section, one in said.items() if one is None)
             raise ValueError(f"{self.origin}: a model needs {missing} too; describe it.")
-        mesh = domain.mesh(num_points=num_points, refine=electrodes.refinement(domain) or None)
+        mesh = body_mesh(domain, electrodes, num_points)
         return ForwardModel(mesh, electrodes, protocol)
 
 

@@ -27,6 +27,7 @@ from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.design.skin.touch_grid import check_places
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import cell_conductivity, check_conductivity
+from jeit.mesh import check_flat
 from jeit_solvers.dense.cholesky import inverse_cholesky
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, undifferentiated
 
@@ -139,6 +140,7 @@ def layout_scores(
 
 def _check(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> None:
     channels = model.protocol.num_measurements
+    check_flat(model.mesh, "scores")
     if model.mesh.dimension != 2:
         raise ValueError(f"model is of a {model.mesh.dimension}-D body; scores are of the equivalent sheet.")
     if len(prior.factor) != len(touches.slope):

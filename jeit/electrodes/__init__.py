@@ -15,6 +15,7 @@ from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.electrodes.boundary import BoundaryElectrodes
 from jeit.electrodes.combined import CombinedElectrodes
 from jeit.electrodes.discs import FaceDiscs, SheetDiscs
+from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.electrodes.electrodes import AbstractElectrodes
 from jeit.electrodes.facets import FacetElectrodes, electrodes_from_nodes, plates
 from jeit.electrodes.patches import FacePatches
@@ -26,6 +27,7 @@ __all__ = [
     "AbstractElectrodes",
     "BoundaryElectrodes",
     "CombinedElectrodes",
+    "ElectrodeShapes",
     "FaceDiscs",
     "FacePatches",
     "FacetElectrodes",
@@ -34,4 +36,5 @@ __all__ = [
     "SheetDiscs",
     "electrodes_from_nodes",
     "plates",
+    "shapes_of",
 ]

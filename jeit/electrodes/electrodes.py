@@ -200,7 +200,12 @@ def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
 
 
 def check_dimension(electrodes: str, mesh: Mesh, dimension: int) -> None:
-    """Raise unless the mesh has the space dimension that this kind of electrode lives in."""
+    """Raise unless the mesh is of the kind that these electrodes live on, in as many coordinates as `dimension`."""
+    if mesh.is_surface:
+        raise ValueError(
+            f"{electrodes} do not live on a surface in space; PointElectrodes and NodeElectrodes do, plates along its "
+            "edges, and FaceDiscs and FacePatches on a shell of it (jeit.mesh.shell)."
+        )
     if mesh.dimension != dimension:
         raise ValueError(
             f"{electrodes} live on a {dimension}-D mesh, and this mesh is {mesh.dimension}-D; "

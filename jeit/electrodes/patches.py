@@ -1,10 +1,14 @@
 """Rectangular electrodes on the surface of a 3-D body, such as the plates round a tank."""
 
+from typing import Any
+
+import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.electrodes.discs import facet_normals, seen_flat
+from jeit.electrodes.clipping import covered_moments
+from jeit.electrodes.discs import facet_normals, nearest_facets, seen_flat
 from jeit.electrodes.electrodes import (
     AbstractPlacedElectrodes,
     Contact,
@@ -13,17 +17,22 @@ from jeit.electrodes.electrodes import (
     as_positions,
     check_dimension,
 )
-from jeit.electrodes.window import EDGE, smooth_step, triangle_quadrature, window_contact
 from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import facet_measures
-from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated
+from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undifferentiated
+
+# Patches that do not overlap and can reach one triangle that is not larger than they are.
+_MOST_AT_ONCE = 8
+# A triangle in place of those that a patch does not reach.
+_UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 
 
 class FacePatches(AbstractPlacedElectrodes):
     """Complete electrodes that are rectangles on the surface of a 3-D mesh, free of its nodes.
 
     A patch lies in the tangent plane at its position: its width runs horizontally (perpendicular to z) and its
-    height up the surface; on a horizontal face width runs along x and height along y.
+    height up the surface; on a horizontal face width runs along x and height along y. On a curved face it covers what
+    lies beneath that rectangle: round a cylinder of radius R a plate of arc length a has the width 2 R sin(a / 2 R).
 
     **Fields**: `position` (L, 3) metres, on the surface; `width`, `height` (L,) metres; `contact_impedance` (L,)
     ohm·m².
@@ -66,24 +75,29 @@ class FacePatches(AbstractPlacedElectrodes):
         return (mesh.facets,)
 
     def contact(self, mesh: Mesh) -> Contact:
-        """Contact integrals over the boundary triangles, by quadrature of the windows."""
+        """Contact integrals over what the patches cover of boundary triangles, seen along their normals: exact."""
         xp = namespace(self, mesh)
-        area = facet_measures(mesh)
-        barycentric, _ = triangle_quadrature()
-        points = xp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
+        area, half_size = facet_measures(mesh), xp.stack([self.width, self.height], axis=-1) / 2
         normal, across, up = _frames(mesh, self.position)
-        offset = points[:, :, None, :] - self.position  # (b, p, L, 3)
-        edge = EDGE * xp.sqrt(area)[:, None, None]
-        window = smooth_step((self.width / 2 - abs((offset * across).sum(axis=-1))) / edge)
-        window = window * smooth_step((self.height / 2 - abs((offset * up).sum(axis=-1))) / edge)
-        # The same side of the body: facing as the electrode does, and no deeper than the patch is large.
-        facing = facet_normals(mesh) @ normal.T > 0.5
-        depth = abs((offset.mean(axis=1) * normal).sum(axis=-1))
-        near = depth < xp.maximum(self.width, self.height) / 2
-        window = window * undifferentiated(facing & near)[:, None, :]
-        every = xp.broadcast_to(xp.arange(self.num_electrodes), (len(area), self.num_electrodes))
-        window = xp.swapaxes(window, 1, 2)
-        return window_contact(mesh.facets, area, window, every, self.contact_impedance, mesh.num_points)
+        corners = mesh.points[mesh.facets]
+        near, reached = _reached(mesh, self.position, half_size, (normal, across, up))
+        some = reached.any(axis=1).nonzero()[0] if xp is np else np.arange(len(area))
+        near, reached = near[some], reached[some]
+        offset = corners[some][:, None] - self.position[near][:, :, None]  # (q, k, 3, 3)
+        place = xp.stack([(offset * axis[near][:, :, None]).sum(axis=-1) for axis in (across, up)], axis=-1)
+        # A triangle seen from its edge covers nothing, and has nothing to divide by.
+        place = xp.where(reached[..., None, None], place, _UNIT)
+        once, twice = covered_moments(place, half_size[near])
+        current = xp.where(reached, area[some][:, None] / self.contact_impedance[near], 0)
+        mass = (current[..., None, None] * twice).sum(axis=1)
+        nodes = mesh.facets[some]
+        shape = mesh.num_points, self.num_electrodes
+        load = sum_into(shape, (nodes[:, None], near[..., None]), current[..., None] * once)
+        if xp is np:
+            every: Any = np.zeros((len(area), 3, 3), mass.dtype)
+            every[some] = mass
+            mass = every
+        return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for patches off the surface, overlapping, or too small for the mesh."""
@@ -107,14 +121,33 @@ class FacePatches(AbstractPlacedElectrodes):
             raise ValueError(f"Electrodes {first + 1} and {second + 1} overlap; move them apart.")
 
 
+def _reached(mesh: Mesh, position, half_size, frames):
+    """Which patches (b, k) may cover something of each boundary triangle, the nearest first, and whether they do.
+
+    On the same side of the body: facing as the patch does, and no deeper than it is large. Not differentiated.
+    """
+    xp = namespace(mesh, position)
+    corners = mesh.points[mesh.facets]
+    middle = corners.mean(axis=1)
+    radius = xp.sqrt(((corners - middle[:, None]) ** 2).sum(axis=-1).max(axis=1))
+    away = [middle @ axis.T - (position * axis).sum(axis=1) for axis in frames]
+    beyond = [xp.maximum(abs(away[1 + i]) - half_size[:, i], 0) for i in range(2)]
+    facing = (facet_normals(mesh) @ frames[0].T > 0.5) & (abs(away[0]) < half_size.max(axis=1))
+    distance = undifferentiated(xp.where(facing, beyond[0] ** 2 + beyond[1] ** 2, xp.inf))
+    reaches = distance <= undifferentiated(radius**2)[:, None]
+    count = min(_MOST_AT_ONCE, len(position))
+    if xp is np:
+        count = max(1, min(count, int(reaches.sum(axis=1).max(initial=0))))
+        near = np.argsort(distance, axis=1, kind="stable")[:, :count]
+    else:
+        near = jax.lax.top_k(-distance, count)[1]
+    return near, xp.take_along_axis(reaches, near, axis=1)
+
+
 def _frames(mesh: Mesh, position):
     """Unit vectors (L, 3) at each electrode: normal of the nearest facet, across, and up. Not differentiated."""
     xp = namespace(mesh, position)
-    centres = mesh.points[mesh.facets].mean(axis=1)
-    apart = xp.sum((position[:, None] - centres) ** 2, axis=-1)
-    # The first of those that are equally near, whatever the unit of length rounds to.
-    nearest = xp.argmax(apart <= (1 + 1e-9) * apart.min(axis=1, keepdims=True), axis=1)
-    normal = facet_normals(mesh)[nearest]
+    normal = facet_normals(mesh)[nearest_facets(mesh, position)]
     horizontal = abs(normal[:, 2:]) > 0.9
     upward = xp.where(horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(normal.dtype)
     across = xp.cross(upward, normal)

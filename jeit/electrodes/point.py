@@ -6,12 +6,12 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.electrodes.electrodes import AbstractPointElectrodes, Contact, ElectrodePen, as_positions
-from jeit.mesh import Body, Mesh, Refine, gradients
+from jeit.mesh import Body, Mesh, Refine, gradients, measures, normals
 from jeit_solvers.engines import either_engine, has_values, namespace, sum_into, undifferentiated
 
 
 class PointElectrodes(AbstractPointElectrodes):
-    """Point electrodes at any position in or on the boundary of a mesh.
+    """Point electrodes at any position in a mesh, on its boundary, or on a surface in space.
 
     Current enters and voltage is read by P1 interpolation in the cell that holds the position. The potential of
     a point source is singular, so voltages at driven electrodes depend on the mesh.
@@ -52,14 +52,22 @@ class PointElectrodes(AbstractPointElectrodes):
 
     def check(self, mesh: Mesh) -> None:
         """Raise `ValueError` for electrodes outside the mesh, or two at one place."""
-        if self.position.shape[1] != mesh.dimension:
-            raise ValueError(f"position has {self.position.shape[1]} coordinates and the mesh is {mesh.dimension}-D.")
+        if self.position.shape[1] != mesh.space_dimension:
+            raise ValueError(
+                f"position has {self.position.shape[1]} coordinates and the mesh is in {mesh.space_dimension}-D."
+            )
         if not has_values(self.position, mesh.points, mesh.cells):
             return
         position, points = np.asarray(self.position), np.asarray(mesh.points)
         outside = np.asarray(_locate(self.position, mesh)[2])
         # A point on a curved boundary lies slightly outside the polygon: allow a third of a cell.
         far = np.flatnonzero(outside < -1 / 3)
+        if far.size and mesh.is_surface:
+            raise ValueError(
+                f"position: electrode {far[0] + 1} at {position[far[0]].tolist()} m lies off the surface, by more than "
+                f"a third of the nearest triangle; the surface spans {points.min(axis=0).tolist()} to "
+                f"{points.max(axis=0).tolist()} m. Move it onto the surface."
+            )
         if far.size:
             raise ValueError(
                 f"position: electrode {far[0] + 1} at {position[far[0]].tolist()} m lies outside the mesh, which spans "
@@ -134,6 +142,9 @@ def _locate(position, mesh: Mesh):
     local = xp.einsum("mij,lmj->lmi", gradients(mesh)[:, 1:], position[:, None] - corners[:, 0])
     barycentric = xp.concatenate([1 - local.sum(axis=-1, keepdims=True), local], axis=-1)
     inside = undifferentiated(barycentric).min(axis=-1)
+    if mesh.is_surface:  # a position may lie above or below many triangles: that next to it counts
+        off = xp.einsum("mi,lmi->lm", normals(mesh), position[:, None] - corners[:, 0])
+        inside = xp.minimum(inside, 0) - abs(undifferentiated(off)) / xp.sqrt(2 * undifferentiated(measures(mesh)))
     cell = xp.argmax(inside, axis=1)
     weights = xp.take_along_axis(barycentric, cell[:, None, None], 1)[:, 0]
     return cell, weights, inside.max(axis=1)

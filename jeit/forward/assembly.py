@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Inexact
 
-from jeit.mesh import Mesh, gradients, measures
+from jeit.mesh import Mesh, gradients, measures, normals
 from jeit_solvers.engines import gather, has_values, namespace
 
 
@@ -27,21 +27,22 @@ def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
 def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
     """Convert `conductivity` to an array and raise `ValueError` if it has the wrong shape or is not positive.
 
-    Accepts a scalar, which comes back as (m,), (m,) per cell, (n,) per node or (m, d, d) symmetric tensors; siemens per
-    metre (in a 2-D sheet, siemens). A complex admittivity needs a positive real part. Values of tracers are not looked
-    at.
+    Accepts a scalar, which comes back as (m,), (m,) per cell, (n,) per node or (m, s, s) symmetric tensors, s being the
+    dimension of space; siemens per metre (in a 2-D sheet, siemens). Of tensors (m, 3, 3) on a surface in space only the
+    part in each triangle's plane counts. A complex admittivity needs a positive real part. Values of tracers are not
+    looked at.
     """
     conductivity = np.asarray(conductivity) if has_values(conductivity) else jnp.asarray(conductivity)
     # One type and shape for all that mean the same, or JAX compiles again: Python's numbers are "weakly" typed.
     conductivity = namespace(conductivity).asarray(conductivity, dtype=_floating(conductivity.dtype))
-    m, n, d = mesh.num_cells, mesh.num_points, mesh.dimension
+    m, n, d = mesh.num_cells, mesh.num_points, mesh.space_dimension
     if conductivity.shape not in [(), (m,), (n,), (m, d, d)]:
         raise ValueError(
             f"conductivity has shape {conductivity.shape}; give a scalar, one value per cell ({m},), one per node "
             f"({n},), or tensors ({m}, {d}, {d}). For a batch, use jax.vmap."
         )
     if has_values(conductivity):
-        _check_values(conductivity)
+        _check_values(conductivity, np.asarray(normals(mesh)) if mesh.is_surface and has_values(mesh.points) else None)
     return namespace(conductivity).broadcast_to(conductivity, conductivity.shape or (m,))
 
 
@@ -54,13 +55,18 @@ def _floating(kind: Any) -> Any:
     return jax.dtypes.canonicalize_dtype(kind.newbyteorder("="))
 
 
-def _check_values(conductivity: Any) -> None:
+def _check_values(conductivity: Any, normal: Any) -> None:
     if not np.isfinite(conductivity).all():
         raise ValueError("conductivity has NaN or infinite values.")
     if conductivity.ndim == 3:
         if not np.allclose(conductivity, np.swapaxes(conductivity, 1, 2), rtol=1e-12, atol=0):
             raise ValueError("conductivity tensors must be symmetric.")
-        least = np.linalg.eigvalsh(conductivity.real).min()
+        real = conductivity.real
+        if normal is not None:  # only across it must they be positive: put a large value along it
+            along = normal[:, :, None] * normal[:, None]
+            across = np.eye(3) - along
+            real = across @ real @ across + np.abs(real).max() * along
+        least = np.linalg.eigvalsh(real).min()
     else:
         least = conductivity.real.min()
     if least <= 0:
@@ -79,7 +85,7 @@ def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Arra
     rows, columns = np.tril_indices(mesh.dimension + 1)
     return xp.stack(
         [
-            weight * sum(gradient[:, row, axis] * flux[:, column, axis] for axis in range(mesh.dimension))
+            weight * sum(gradient[:, row, axis] * flux[:, column, axis] for axis in range(mesh.space_dimension))
             for row, column in zip(rows, columns, strict=True)
         ]
     )
@@ -96,6 +102,6 @@ def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array,
     return xp.stack(
         [
             functools.reduce(operator.add, [weighted[:, k, axis, None] * corner for k, corner in enumerate(corners)])
-            for axis in range(mesh.dimension)
+            for axis in range(mesh.space_dimension)
         ]
     )

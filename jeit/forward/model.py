@@ -2,7 +2,7 @@
 
 import functools
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -22,6 +22,9 @@ from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 from jeit_solvers import SparseCholesky, in_turn
 from jeit_solvers.engines import gather, has_values, host, namespace, on_device, on_host, sum_into
+
+# Numbers of a Jacobian at a time, where it is made in pieces.
+_BLOCK = 4_000_000
 
 
 class ForwardModel(eqx.Module):
@@ -138,7 +141,8 @@ def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) ->
         return _COMPILED[quantity](model, conductivity)
     parts = model.mesh, model.electrodes, model.protocol, model.system
     if not (model.at_once and has_values(conductivity)):
-        return _COMPILED[quantity](integrated_model(*parts), conductivity)
+        found = _COMPILED[quantity](integrated_model(*parts), conductivity)
+        return on_host(found) if namespace(parts[:3], conductivity) is np else found
     with np.errstate(all="ignore"):
         found = quantity(host_model(*parts), on_host(conductivity))
     return found if namespace(parts[:3]) is np else on_device(found)
@@ -221,24 +225,45 @@ def potentials_of(model: ForwardModel | IntegratedModel, conductivity):
 
 def voltages_and_jacobian_of(model: ForwardModel | IntegratedModel, conductivity):
     """Voltages (M,) and their Jacobian (M, m), of a `conductivity` in S/m (2-D: S); for `evaluate`."""
-    mesh, protocol, jacobian = model.mesh, model.protocol, host.zeros(())
-    xp = namespace(conductivity, mesh)
+    mesh, protocol = model.mesh, model.protocol
     fields, impedance = fields_and_impedance_of(model, conductivity)
-    # One product for all patterns and axes: it also keeps XLA from computing the gradients anew for every channel.
-    patterns = xp.concatenate([-protocol.drive, protocol.measurement])
-    gradient = field_gradients(mesh, fields)
-    rows = patterns @ gradient.reshape(-1, gradient.shape[-1]).T
-    # ∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, axis by axis.
-    for component in xp.split(rows, mesh.dimension, axis=1):
-        drive = gather(component, protocol.drive_index)
-        measure = gather(component, protocol.num_drives + protocol.measurement_index)
-        jacobian = jacobian + drive * measure
+    if namespace(conductivity, mesh) is np:
+        jacobian: Any = np.empty((protocol.num_measurements, mesh.num_cells), fields.dtype)
+        for cells, block in jacobian_blocks(mesh, protocol, fields):
+            jacobian[:, cells] = block
+    else:
+        jacobian = _of_cells(protocol, field_gradients(mesh, fields))
     if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
         per_corner = jacobian.T / mesh.cells.shape[1]
         shape = mesh.num_points, protocol.num_measurements
         corners = [sum_into(shape, mesh.cells[:, k], per_corner) for k in range(mesh.cells.shape[1])]
         jacobian = functools.reduce(operator.add, corners).T
     return channel_voltages(protocol, impedance), jacobian
+
+
+def jacobian_blocks(
+    mesh: Mesh, protocol: Protocol, fields: Inexact[Array, "n L"]
+) -> Iterator[tuple[slice, Inexact[Array, "M b"]]]:
+    """The Jacobian of the channels in the conductivity of cells, V m/S (2-D: V/S), some cells after others: of a solid
+    body it is too large to be held, and what is made of it is not. In NumPy; `fields` as of `fields_of`, ohms."""
+    gradient = field_gradients(mesh, fields)
+    size = max(1, _BLOCK // protocol.num_measurements)
+    for start in range(0, mesh.num_cells, size):
+        cells = slice(start, min(start + size, mesh.num_cells))
+        yield cells, _of_cells(protocol, gradient[:, cells])
+
+
+def _of_cells(protocol: Protocol, gradient: Inexact[Array, "d b L"]) -> Inexact[Array, "M b"]:
+    """∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, axis by axis, from the fields' gradients in cells."""
+    xp, jacobian = namespace(gradient), host.zeros(())
+    # One product for all patterns and axes: it also keeps XLA from computing the gradients anew for every channel.
+    patterns = xp.concatenate([-protocol.drive, protocol.measurement])
+    rows = patterns @ gradient.reshape(-1, gradient.shape[-1]).T
+    for component in xp.split(rows, len(gradient), axis=1):
+        drive = gather(component, protocol.drive_index)
+        measure = gather(component, protocol.num_drives + protocol.measurement_index)
+        jacobian = jacobian + drive * measure
+    return jacobian
 
 
 _COMPILED = {

@@ -1,10 +1,13 @@
-"""Images: rasters of what lives on a mesh, the inclusions found in them, and what regions and cells do over time."""
+"""Images: rasters of what lives on a mesh, planes and surfaces through a solid, the inclusions found in them, and what
+regions and cells do over time."""
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.image.image_series import ImageSeries
 from jeit.image.inclusions import Inclusion, find_inclusions
+from jeit.image.isosurface import TriangleSurface, isosurface_of, node_values
 from jeit.image.merit import figures_of_merit
 from jeit.image.oscillations import Oscillation, amplitude_spectrum, oscillation
+from jeit.image.plane import Plane, cut_by_plane
 from jeit.image.raster import Raster
 from jeit.image.regions import ball_region, box_region, half_region
 from jeit.image.segmentation import segment
@@ -15,13 +18,18 @@ __all__ = [
     "ImageSeries",
     "Inclusion",
     "Oscillation",
+    "Plane",
     "Raster",
+    "TriangleSurface",
     "amplitude_spectrum",
     "ball_region",
     "box_region",
+    "cut_by_plane",
     "figures_of_merit",
     "find_inclusions",
     "half_region",
+    "isosurface_of",
+    "node_values",
     "oscillation",
     "segment",
 ]

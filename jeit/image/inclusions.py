@@ -1,4 +1,4 @@
-"""Inclusions: where an image departs from its background, as regions with sign, centroid and area."""
+"""Inclusions: where an image departs from its background, as regions with sign, centroid, and area or volume."""
 
 import equinox as eqx
 import numpy as np
@@ -7,18 +7,28 @@ from jaxtyping import Array, Bool, Float
 from jeit.image.watershed import basins, cell_neighbours
 from jeit.mesh import Mesh, centroids, measures
 
+# Of a sheet: about a sixteenth of its width either way.
+_LEAST_AREA = 0.004
+
 
 class Inclusion(eqx.Module):
     """One region of raised or lowered conductivity.
 
-    **Fields**: `sign`, +1 conductive or -1 resistive; `centroid` in metres, weighted by the change; `area` in m² (3-D:
-    volume in m³); `peak`, the strongest change in it, in the image's unit.
+    **Fields**: `sign`, +1 conductive or -1 resistive; `centroid` in metres, weighted by the change; `area` in m² (of
+    solids volume in m³); `peak`, the strongest change in it, in the image's unit; `on_surface`, whether it lies on a
+    surface in space, which has an area though its centroid has three coordinates.
     """
 
     sign: int
     centroid: tuple[float, ...]
     area: float
     peak: float
+    on_surface: bool = False
+
+    @property
+    def is_solid(self) -> bool:
+        """Whether `area` is a volume."""
+        return len(self.centroid) == 3 and not self.on_surface
 
     @property
     def kind(self) -> str:
@@ -28,7 +38,7 @@ class Inclusion(eqx.Module):
     @property
     def radius(self) -> float:
         """Of the disk of the same area, or in 3-D of the ball of the same volume, metres."""
-        if len(self.centroid) == 3:
+        if self.is_solid:
             return float(np.cbrt(3 * self.area / (4 * np.pi)))
         return float(np.sqrt(self.area / np.pi))
 
@@ -40,7 +50,7 @@ def find_inclusions(
     level: float = 0.5,
     least_peak: float = 0.3,
     least_prominence: float = 0.1,
-    least_area: float = 0.004,
+    least_area: float | None = None,
     noise: Float[Array, " m"] | None = None,
     least_significance: float = 5.5,
 ) -> list[Inclusion]:
@@ -48,9 +58,10 @@ def find_inclusions(
 
     `image` (m,): change of conductivity in every cell. A peak counts if it is at least `least_peak` times the
     strongest change of either sign, stands at least `least_prominence` times its own height above the saddle to a
-    higher one, and its region covers at least `least_area` of the mesh; the rest are artefacts. So are, where `noise`
-    (m,) is given, the standard deviation of the image, peaks of less than `least_significance` times that. Strongest
-    first. Raises `ValueError` for an image of another size or with NaN.
+    higher one, and its region covers at least `least_area` of the mesh; the rest are artefacts. Unless given that is
+    0.004 of a sheet, and of a solid 0.004 to the power of 3/2, which is as wide in every direction. Artefacts are also
+    peaks of less than `least_significance` times `noise` (m,), the standard deviation of the image, where given.
+    Strongest first. Raises `ValueError` for an image of another size or with NaN.
     """
     regions = inclusion_regions(
         mesh,
@@ -72,7 +83,7 @@ def inclusion_regions(
     level: float,
     least_peak: float,
     least_prominence: float = 0.1,
-    least_area: float = 0.004,
+    least_area: float | None = None,
     noise: Float[Array, " m"] | None = None,
     least_significance: float = 5.5,
 ) -> list[tuple[Inclusion, Bool[np.ndarray, " m"]]]:
@@ -93,6 +104,8 @@ def inclusion_regions(
         return []
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
     neighbours = cell_neighbours(mesh)
+    if least_area is None:
+        least_area = _LEAST_AREA ** (mesh.dimension / 2)
     found = []
     for sign in (1, -1):
         change = sign * values
@@ -106,5 +119,7 @@ def inclusion_regions(
                 continue
             weight = (measure * change)[region]
             centroid = tuple(float(value) for value in weight @ centre[region] / weight.sum())
-            found.append((Inclusion(sign, centroid, float(measure[region].sum()), float(sign * peak)), region))
+            found.append(
+                (Inclusion(sign, centroid, float(measure[region].sum()), float(sign * peak), mesh.is_surface), region)
+            )
     return sorted(found, key=lambda one: -abs(one[0].peak))

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float, Inexact, Int
 from scipy.spatial import KDTree
 
-from jeit.mesh import Mesh
+from jeit.mesh import Mesh, check_flat
 from jeit_solvers.engines import as_array, either_engine, namespace
 
 
@@ -30,8 +30,10 @@ class Raster(eqx.Module):
         height: float | None = None,
     ) -> "Raster":
         """`shape`: (rows, columns). `extent`: metres; the smallest square round the mesh unless given. `height`: z of
-        the slice through a 3-D mesh, metres (half way up unless given). Raises `ValueError` for an empty extent.
+        the slice through a 3-D mesh, metres (half way up unless given). Raises `ValueError` for an empty extent,
+        and for a surface in space.
         """
+        check_flat(mesh, "rasters")
         points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
         low, high = points.min(axis=0), points.max(axis=0)
         if extent is None:

@@ -62,11 +62,9 @@ def image_automatically(prepared: PreparedDifference, prior: NamedPrior, segment
 def _shapes(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReconstruction | None:
     """The bodies of a smooth image as shapes, if there are any and they explain the voltages within what sharp outlines
     may miss, or as well as the image does."""
-    if prepared.mesh.dimension != 2:
-        return None
     found = shapes_in(prepared, smooth)
     explains = float(found.misfit) <= max(1.0, float(smooth.misfit))
-    return found if found.stars and explains else None
+    return found if found.bodies and explains else None
 
 
 def unsound(prepared: PreparedDifference, change: Float[Array, " m"]) -> str:

@@ -25,7 +25,7 @@ from jeit.inverse.calibration import Calibration
 from jeit.inverse.image_noise import image_noise
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
-from jeit.inverse.shapes import ShapeReconstruction, Star
+from jeit.inverse.shapes import Ellipsoid, ShapeReconstruction, Star
 from jeit.mesh import Mesh
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array
@@ -212,9 +212,11 @@ def _inclusions(
     """What an image shows as inclusions, with changes of conductivity for peaks; and labels, if they are asked for."""
     settings, reconstruction, background = found.settings, found.reconstruction, found.calibration.conductivity
     if found.shapes is not None:
-        stars = found.shapes.stars
-        labels = _labels(stars, grid) if settings.segment else None
-        listed = [Inclusion(one.sign, tuple(one.centroid.tolist()), one.area, one.sign * one.contrast) for one in stars]
+        bodies = found.shapes.bodies
+        labels = _labels(found.mesh, bodies, grid) if settings.segment else None
+        listed = [
+            Inclusion(one.sign, tuple(one.centroid.tolist()), one.measure, one.sign * one.contrast) for one in bodies
+        ]
         return [_with_change(one, background) for one in listed], labels
     departure, noise = as_array(np.real(found.departure)), None
     if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
@@ -233,11 +235,14 @@ def _covered(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
     return labels
 
 
-def _labels(stars: Sequence[Star], grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
-    """Which pixels lie in a star of either sign, of the strongest where two meet."""
+def _labels(mesh: Mesh, bodies: Sequence[Star | Ellipsoid], grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
+    """Which pixels lie in a body of either sign, of the strongest where two meet; of a solid half way up."""
     centres, inside = grid.pixel_centres(), np.asarray(grid.cell) >= 0
+    if mesh.dimension == 3:
+        z = np.asarray(mesh.points)[:, 2]
+        centres = np.concatenate([centres, np.full((*inside.shape, 1), (z.min() + z.max()) / 2)], axis=-1)
     labels = np.zeros(inside.shape, np.uint8)
-    for one in reversed(stars):
+    for one in reversed(bodies):
         labels[inside & one.holds(centres)] = CONDUCTIVE if one.sign > 0 else RESISTIVE
     return labels
 
@@ -253,4 +258,4 @@ def _sampled(grid: Raster, change) -> Inexact[Array, "rows columns"]:
 def _with_change(inclusion: Inclusion, background) -> Inclusion:
     """An inclusion found in the logarithm of conductivity over `background`, its peak turned into a change."""
     peak = float(background * np.expm1(inclusion.peak))
-    return Inclusion(inclusion.sign, inclusion.centroid, inclusion.area, peak)
+    return replace(inclusion, peak=peak)

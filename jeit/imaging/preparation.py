@@ -12,6 +12,7 @@ from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality, assess
 from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
 from jeit.imaging.clock import Clock
 from jeit.imaging.wiring import Wiring, find_wiring
@@ -217,7 +218,7 @@ def check_measurement(name: str, given: Measurement) -> None:
 
 def imaging_mesh(domain: Body, electrodes: AbstractElectrodes, num_points: int) -> Mesh:
     """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep."""
-    return domain.mesh(num_points=num_points, refine=electrodes.refinement(domain) or None)
+    return body_mesh(domain, electrodes, num_points)
 
 
 def default_contact(measurement: Measurement) -> str:

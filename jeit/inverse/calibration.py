@@ -29,8 +29,10 @@ _TRACED = "It was fitted inside a transformation of JAX; the status says how tha
 _MUCH = 0.12
 # Volts that no frame has; nor one over them.
 _SMALLEST = 1e-30
-# Relative change of misfit, or of the parameters, that ends a fit.
-_TOLERANCE = 1e-8
+# Relative change of misfit, or of the parameters, that ends a fit; and of a fit on a large mesh.
+_TOLERANCE, _SOLID = 1e-8, 1e-4
+# Cells from which a step takes seconds.
+_MANY = 30_000
 
 
 class Calibration(eqx.Module):
@@ -155,9 +157,10 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     def jacobian(parameters):
         return parts(np.where(used[:, None], problem.jacobian(parameters), 0) / size)
 
+    tolerance = _SOLID if model.mesh.num_cells > _MANY else _TOLERANCE
     ends: dict[str, Any] = {
-        "ftol": _TOLERANCE,
-        "xtol": _TOLERANCE,
+        "ftol": tolerance,
+        "xtol": tolerance,
         "gtol": None,
         "max_nfev": max_steps,
         "jac": jacobian,

@@ -6,6 +6,9 @@ from jaxtyping import Float
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit_solvers.engines import on_host
 
+# Rows of an image's size at a time.
+_ROWS = 32
+
 
 def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
     """Standard deviation (m,), from the noise alone, of what an image shows in every cell, on the link's scale.
@@ -18,8 +21,10 @@ def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
         raise ValueError("reconstruction: only images with smooth priors and unbounded solvers have such a noise.")
     inversion, coefficients = on_host((reconstruction.inversion, reconstruction.coefficients))
     _, jacobian = inversion.linearise(coefficients)
-    covariance = inversion.data.covariance
-    gain = np.linalg.solve(jacobian @ jacobian.T + covariance, jacobian)[:, : inversion.basis.num_coefficients]
-    shown = np.stack([inversion.basis.expand(row) for row in gain])
-    variance = np.einsum("rm,rm->m", shown, covariance @ shown)
+    covariance, count = inversion.data.covariance, inversion.basis.num_coefficients
+    root = np.linalg.cholesky(covariance).T @ np.linalg.inv(jacobian @ jacobian.T + covariance)
+    variance = np.zeros(len(inversion.reference))
+    for start in range(0, len(root), _ROWS):
+        gain = root[start : start + _ROWS] @ jacobian
+        variance += np.sum([inversion.basis.expand(row[:count]) ** 2 for row in gain], axis=0)
     return max(1.0, float(reconstruction.misfit)) * np.sqrt(variance)

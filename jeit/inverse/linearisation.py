@@ -1,23 +1,25 @@
 """The linearised problem of difference imaging: checked, whitened and decomposed, ready for any hyperparameter."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
-from jeit.forward.model import check_model
+from jeit.forward.assembly import check_conductivity
+from jeit.forward.model import check_model, evaluate, fields_and_impedance_of, jacobian_blocks
 from jeit.inverse.direct_problem import DirectProblem
 from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.defaults import PRIOR
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.spectrum import Spectrum
-from jeit.protocol import Protocol
-from jeit_solvers.engines import as_array, has_values, host, namespace
+from jeit.protocol import Protocol, two_terminal
+from jeit_solvers.engines import as_array, has_values, namespace, on_host
 
 # Singular values so small, beside the largest, are rounding.
 _NOTHING = 1e-12
@@ -59,14 +61,15 @@ class Linearisation(eqx.Module):
         if np.shape(conductivity) not in ((), (model.mesh.num_cells,)):
             raise ValueError("conductivity: give one number, or one value per cell: the image has a value per cell.")
         channels, root_weight = used_channels(model, noise, mask)
-        jacobian = model.jacobian(conductivity)
-        if has_values(jacobian, root_weight, prior):
-            whitened = root_weight[:, None] * host.asarray(jacobian)[channels]
-            directions = _directions(model.protocol, channels, root_weight)
-            product = prior.covariance_product(model.mesh, (directions.T @ whitened).conj()) @ directions.T
+        if has_values(model, conductivity, root_weight, prior):
+            directions = data_directions(model.protocol, channels, root_weight)
+            reduced: Any = combined_jacobian(model, conductivity, channels, (root_weight[:, None] * directions).T)
+            product = prior.covariance_product(model.mesh, reduced.conj())
             repeated = model.protocol.repeated_facts(channels)
-            spectrum = Spectrum.create(whitened, product, prior.null_space(model.mesh), repeated)
+            null_space = prior.null_space(model.mesh)
+            spectrum = Spectrum.create(reduced, product, null_space, as_array(directions), repeated)
         else:
+            jacobian = model.jacobian(conductivity)
             directions = _traced_directions(model.protocol, channels, root_weight)
             reduced = directions.T @ (root_weight[:, None] * jacobian[channels])
             product = prior.covariance_product(model.mesh, reduced.conj())
@@ -94,10 +97,47 @@ class Linearisation(eqx.Module):
         if not has_values(self.spectrum, self.root_weight, hyperparameter):
             used = jnp.asarray(self.spectrum.reconstruction(hyperparameter)) * self.root_weight
             return jnp.zeros((used.shape[0], self.num_channels), used.dtype).at[:, self.channels].set(used)
-        whitened = np.asarray(self.spectrum.reconstruction(hyperparameter))
-        matrix: Any = np.zeros((whitened.shape[0], self.num_channels), whitened.dtype)
-        matrix[:, self.channels] = whitened * self.root_weight
-        return matrix
+        images, weights = self.factors(hyperparameter)
+        return as_array(images @ weights)
+
+    def factors(self, hyperparameter) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "k M"]]:
+        """The same as images (m, k) and their weights (k, M), 1 / volts, of which it is the product: the smaller of two
+        things to keep. Of a problem that has values."""
+        assert isinstance(self.spectrum, Spectrum)
+        images, whitened = (np.asarray(part) for part in self.spectrum.factors(hyperparameter))
+        weights: Any = np.zeros((whitened.shape[0], self.num_channels), whitened.dtype)
+        weights[:, self.channels] = whitened * self.root_weight
+        return images, weights
+
+
+def combined_blocks(
+    model: ForwardModel, conductivity, channels: Int[np.ndarray, " K"], weights: Float[Any, "r K"]
+) -> Iterator[tuple[slice, Any]]:
+    """Weighted sums (r, b) of channels' Jacobians in some cells after others: more of these than memory likes are never
+    there at a time; in NumPy.
+
+    `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
+    """
+    fields = evaluate(model, fields_and_impedance_of, check_conductivity(model.mesh, conductivity))[0]
+    mesh, protocol = on_host((model.mesh, model.protocol.subset(channels)))
+    pairs = np.stack(np.triu_indices(protocol.num_electrodes, 1), axis=1)
+    if len(pairs) < len(channels):
+        # A channel is -1/2 of what it sees of every pair of electrodes, driven and read: ∂v = Σ_ab d_a m_b ∂G_ab.
+        weights = -0.5 * weights @ _seen(model.protocol, channels)
+        protocol = on_host(two_terminal(protocol.num_electrodes, pairs, current=1.0))
+    for cells, block in jacobian_blocks(mesh, protocol, on_host(fields)):
+        yield cells, weights @ np.asarray(block)
+
+
+def combined_jacobian(
+    model: ForwardModel, conductivity, channels: Int[np.ndarray, " K"], weights: Float[Any, "r K"]
+) -> Inexact[Any, "r m"]:
+    """The same in every cell, (r, m)."""
+    kind = complex if np.iscomplexobj(conductivity) else float
+    found = np.empty((len(weights), model.mesh.num_cells), kind)
+    for cells, block in combined_blocks(model, conductivity, channels, weights):
+        found[:, cells] = block
+    return found
 
 
 def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[Array, " K"]]:
@@ -125,7 +165,7 @@ def check_mask(mask) -> None:
     check_has_values("mask", mask, "which channels are used depends on", instead)
 
 
-def _directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarray, "K r"]:
+def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarray, "K r"]:
     """An orthonormal basis of all that changes of conductivity can do to whitened data: L electrodes have L(L - 1)/2
     transfer impedances, of which all channels are combinations, however many.
 

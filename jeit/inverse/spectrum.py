@@ -9,6 +9,9 @@ Q being an orthonormal basis of the complement of B (all of the data where N is 
 residual is v - JR_λv = λ²P_λv = QU diag(λ²/(Λ + λ²)) UᵀQᵀv, whatever λ, and
 
     R_λ = (I - NB⁺J) ΓJᵀQU diag(1/(Λ + λ²)) UᵀQᵀ + NB⁺.
+
+What data can show of a body is often of far fewer dimensions than there are channels: J = DG with orthonormal columns
+in D (M, r), and G (r, m) and its product ΓGᵀ are all that is kept of the size of the image.
 """
 
 import equinox as eqx
@@ -17,21 +20,25 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jeit_solvers import symmetric_eigen
-from jeit_solvers.engines import adjoint, either_engine, has_values, namespace
+from jeit_solvers.engines import adjoint, either_engine, has_values, host, namespace
+
+# Cells of which a mean over cells is taken, about.
+_ENOUGH = 10_000
 
 
 class Spectrum(eqx.Module):
     """Eigendecomposition of the data-space system, from which the reconstruction for any λ is cheap.
 
-    **Fields**: `basis` (M, r) = QU; `eigenvalues` Λ (r,); `jacobian` J (M, m); `product` ΓJᵀ (m, M); `null_space` N
-    (m, p); `seen` B = JN (M, p); `outer` JΓJᵀ (M, M); `repeated`, how many of the components say nothing, whatever was
-    measured, see `Protocol.repeated_facts`.
+    **Fields**: `basis` (M, k) = QU; `eigenvalues` Λ (k,); `directions` D (M, r); `reduced` G (r, m); `images` ΓGᵀ
+    (m, r); `null_space` N (m, p); `seen` B = JN (M, p); `outer` JΓJᵀ (M, M); `repeated`, how many of the components say
+    nothing, whatever was measured, see `Protocol.repeated_facts`.
     """
 
-    basis: Float[Array, "M r"]
-    eigenvalues: Float[Array, " r"]
-    jacobian: Float[Array, "M m"]
-    product: Float[Array, "m M"]
+    basis: Float[Array, "M k"]
+    eigenvalues: Float[Array, " k"]
+    directions: Float[Array, "M r"]
+    reduced: Float[Array, "r m"]
+    images: Float[Array, "m r"]
     null_space: Float[Array, "m p"]
     seen: Float[Array, "M p"]
     outer: Float[Array, "M M"]
@@ -40,23 +47,41 @@ class Spectrum(eqx.Module):
     @classmethod
     def create(
         cls,
-        jacobian: Float[Array, "M m"],
-        product: Float[Array, "m M"],
+        jacobian: Float[Array, "r m"],
+        product: Float[Array, "m r"],
         null_space: Float[Array, "m p"],
+        directions: Float[Array, "M r"] | None = None,
         repeated: int = 0,
     ):
-        """From the whitened Jacobian, its product with the prior covariance, and the prior's null space."""
-        basis, eigenvalues, seen, outer = _decompose(jacobian, product, null_space)
-        return cls(basis, eigenvalues, jacobian, product, null_space, seen, outer, repeated)
+        """From the whitened Jacobian, its product with the prior covariance, and the prior's null space; of all
+        channels, or in orthonormal `directions` of theirs."""
+        given = host.asarray(np.eye(len(jacobian))) if directions is None else directions
+        basis, eigenvalues, seen, outer = _decompose(jacobian, product, null_space, given)
+        return cls(basis, eigenvalues, given, jacobian, product, null_space, seen, outer, repeated)
 
     @property
     def freedom(self) -> int:
         """How many components of the data may say something: all but those that are repeated."""
         return self.eigenvalues.shape[0] - self.repeated
 
+    @property
+    def jacobian(self) -> Float[Array, "M m"]:
+        """The whitened Jacobian J (M, m)."""
+        return self.directions @ self.reduced
+
+    @property
+    def product(self) -> Float[Array, "m M"]:
+        """ΓJᵀ (m, M)."""
+        return self.images @ self.directions.T
+
     def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
         """R_λ (m, M) for whitened data."""
-        return _reconstruction(self, hyperparameter)
+        images, weights = self.factors(hyperparameter)
+        return images @ weights
+
+    def factors(self, hyperparameter) -> tuple[Float[Array, "m k"], Float[Array, "k M"]]:
+        """Images (m, k), no more than data can tell apart, and their weights: R_λ = images · weights."""
+        return _factors(self, hyperparameter)
 
     def image(self, data: ArrayLike, hyperparameter) -> Float[Array, " m"]:
         """R_λ v (m,) for whitened data v, without R_λ."""
@@ -66,9 +91,15 @@ class Spectrum(eqx.Module):
         """λ²/(Λ + λ²): the share of each data component that stays in the residual."""
         return hyperparameter**2 / (self.eigenvalues + hyperparameter**2)
 
-    def modes(self) -> Float[Array, "m r"]:
+    def modes(self) -> Float[Array, "m k"]:
         """(I - NB⁺J) ΓJᵀQU: what each data component adds to the image, but for the factor 1/(Λ + λ²)."""
         return _modes(self)
+
+    def squared_modes(self) -> Float[np.ndarray, " k"]:
+        """The mean over cells of the square of each of the `modes`; over some thousands, where there are more."""
+        images, weights = (np.asarray(part) for part in _mode_factors(self))
+        some = images[:: max(1, len(images) // _ENOUGH)]
+        return np.mean(np.abs(some @ weights) ** 2, axis=0)
 
     def candidates(self, size: int = 200) -> Float[np.ndarray, " K"]:
         """Candidate λ (K,), logarithmic over the range where any component is neither kept nor dropped."""
@@ -87,9 +118,10 @@ class Spectrum(eqx.Module):
 
 
 @either_engine
-def _decompose(jacobian, product, null_space):
+def _decompose(jacobian, product, null_space, directions):
     xp = namespace(jacobian, product, null_space)
-    outer, seen = jacobian @ product, jacobian @ null_space
+    outer = directions @ (jacobian @ product) @ directions.T
+    seen = directions @ (jacobian @ null_space)
     if null_space.shape[1] == 0:
         eigenvalues, vectors = symmetric_eigen((outer + adjoint(outer)) / 2)
         return vectors, xp.maximum(eigenvalues, 0), seen, outer
@@ -100,22 +132,23 @@ def _decompose(jacobian, product, null_space):
 
 
 @either_engine
-def _reconstruction(spectrum: Spectrum, hyperparameter):
-    basis = spectrum.basis
+def _factors(spectrum: Spectrum, hyperparameter):
+    basis, xp = spectrum.basis, namespace(spectrum)
     inverse = (basis / (spectrum.eigenvalues + hyperparameter**2)) @ adjoint(basis)
-    matrix = spectrum.product @ inverse
+    weights = spectrum.directions.T @ inverse
     if spectrum.null_space.shape[1] == 0:
-        return matrix
+        return spectrum.images, weights
     # What the penalised part leaves of the data, seen by the null space: its least-squares coefficients.
-    coefficients = namespace(spectrum).linalg.pinv(spectrum.seen)
+    coefficients = xp.linalg.pinv(spectrum.seen)
     rest = np.eye(basis.shape[0]) - spectrum.outer @ inverse
-    return matrix + spectrum.null_space @ (coefficients @ rest)
+    images = xp.concatenate([spectrum.images, spectrum.null_space], axis=1)
+    return images, xp.concatenate([weights, coefficients @ rest])
 
 
 @either_engine
 def _image(spectrum: Spectrum, data, hyperparameter):
     inner = spectrum.basis @ ((adjoint(spectrum.basis) @ data) / (spectrum.eigenvalues + hyperparameter**2))
-    image = spectrum.product @ inner
+    image = spectrum.images @ (spectrum.directions.T @ inner)
     if spectrum.null_space.shape[1] == 0:
         return image
     free = namespace(spectrum).linalg.pinv(spectrum.seen)
@@ -124,8 +157,13 @@ def _image(spectrum: Spectrum, data, hyperparameter):
 
 @either_engine
 def _modes(spectrum: Spectrum):
-    modes = spectrum.product @ spectrum.basis
+    images, weights = _mode_factors(spectrum)
+    return images @ weights
+
+
+def _mode_factors(spectrum: Spectrum):
+    weights, xp = spectrum.directions.T @ spectrum.basis, namespace(spectrum)
     if spectrum.null_space.shape[1] == 0:
-        return modes
-    free = namespace(spectrum).linalg.pinv(spectrum.seen)
-    return modes - spectrum.null_space @ (free @ (spectrum.outer @ spectrum.basis))
+        return spectrum.images, weights
+    free = xp.linalg.pinv(spectrum.seen) @ (spectrum.outer @ spectrum.basis)
+    return xp.concatenate([spectrum.images, -spectrum.null_space], axis=1), xp.concatenate([weights, free])

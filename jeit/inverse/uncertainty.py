@@ -20,7 +20,10 @@ from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.mesh import measures
 from jeit_solvers import Status
-from jeit_solvers.engines import has_values, on_host
+from jeit_solvers.engines import either_engine, has_values, namespace, on_host
+
+# Rows of an image's size at a time.
+_ROWS = 32
 
 
 class Posterior(eqx.Module):
@@ -109,7 +112,15 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
         )
     if has_values(reconstruction.outcome) and Status.FAILED.number in np.ravel(reconstruction.outcome):
         raise ValueError(f"posterior: the reconstruction failed. {reconstruction.reason}")
-    return _posterior(reconstruction.inversion, reconstruction.coefficients)
+    inversion, coefficients = reconstruction.inversion, reconstruction.coefficients
+    if not (has_values(inversion, coefficients) and inversion.model.mesh.dimension == 3):
+        return _posterior(inversion, coefficients)
+    # Of a solid body compiled programs would hold the Jacobian several times over.
+    with np.errstate(all="ignore"):
+        known, ended = on_host((inversion, coefficients))
+        _, jacobian = known.linearise(ended)
+        root = scipy.linalg.inv(np.linalg.cholesky(jacobian @ jacobian.T + known.data.covariance))
+    return Posterior(known, ended, jacobian, root)
 
 
 @eqx.filter_jit
@@ -120,18 +131,28 @@ def _posterior(inversion: Inversion, coefficients) -> Posterior:
     return Posterior(inversion, coefficients, jacobian, root)
 
 
-@eqx.filter_jit
+@either_engine
 def _estimate(posterior: Posterior):
-    """x at the solution, background unknowns included, and its standard deviation, per cell, on the link's scale."""
-    inversion = posterior.inversion
+    """x at the solution, background unknowns included, and its standard deviation, per cell, on the link's scale.
 
-    def row(one):
-        gradient = jax.vjp(inversion.estimate, posterior.coefficients)[1](one)[0]
-        return gradient @ gradient - jnp.sum((posterior.root @ (posterior.jacobian @ gradient)) ** 2)
-
-    cells = inversion.reference.shape[0]
-    variance = jax.lax.map(lambda cell: row(jax.nn.one_hot(cell, cells)), jnp.arange(cells), batch_size=256)
-    return inversion.estimate(posterior.coefficients), jnp.sqrt(variance)
+    With S the shapes and what unknowns add to the image, the variance is diag(S Sᵀ) - diag(S Jᵀ WᵀW J Sᵀ), of which the
+    rows W J Sᵀ are made some at a time.
+    """
+    inversion, coefficients = posterior.inversion, posterior.coefficients
+    basis, xp = inversion.basis, namespace(posterior)
+    estimate, count = inversion.estimate(coefficients), basis.num_coefficients
+    # Unknowns change the image linearly, if at all.
+    further = [np.arange(len(coefficients)) == number for number in range(count, len(coefficients))]
+    added = [inversion.estimate(coefficients + one) - estimate for one in further]
+    variance = basis.variance() + sum(one**2 for one in added)
+    rows = len(posterior.root)
+    for start in range(0, rows, _ROWS):
+        gain = posterior.root[start : start + _ROWS] @ posterior.jacobian
+        seen = xp.stack([basis.expand(row[:count]) for row in gain])
+        for number, one in enumerate(added):
+            seen = seen + gain[:, count + number, None] * one
+        variance = variance - (seen**2).sum(axis=0)
+    return estimate, xp.sqrt(xp.maximum(variance, 0))
 
 
 @eqx.filter_jit

@@ -49,20 +49,20 @@ def warn_large(extent: float, name: str) -> None:
     if extent > _LARGE:
         warnings.warn(
             f"{name}: {extent:g} m is large for what electrodes are put on. If the lengths are millimetres, multiply "
-            "them by 1e-3: jeit computes in metres.",
+            "them by 1e-3, if inches, by 0.0254 (a file is read with scale=1e-3): jeit computes in metres.",
             UserWarning,
             stacklevel=4,
         )
 
 
 def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray:
-    """Node indices as integers (m, d + 1); raises `ValueError` on bad, duplicated or unused ones."""
+    """Node indices as integers (m, k) of cells among points in `dimension` coordinates, k being `dimension` + 1, or 3
+    for a surface in space; raises `ValueError` on bad, duplicated or unused ones."""
     array = np.asarray(cells)
-    if array.ndim != 2 or array.shape[1] != dimension + 1 or not len(array):
-        kind = "triangles" if dimension == 2 else "tetrahedra"
-        raise ValueError(
-            f"cells: points in {dimension}-D need {kind} of shape (m, {dimension + 1}) with m > 0, got {array.shape}."
-        )
+    widths = (3,) if dimension == 2 else (4, 3)
+    if array.ndim != 2 or array.shape[1] not in widths or not len(array):
+        kind = "triangles of shape (m, 3)" if dimension == 2 else "tetrahedra of shape (m, 4), or triangles (m, 3),"
+        raise ValueError(f"cells: points in {dimension}-D need {kind} with m > 0, got {array.shape}.")
     if not np.issubdtype(array.dtype, np.integer):
         raise ValueError(f"cells: node indices must be integers, got {array.dtype}. Convert with .astype(int).")
     array = array.astype(np.int64)
@@ -113,15 +113,17 @@ def check_coinciding(points: np.ndarray) -> None:
 
 
 def signed_measures(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Signed areas or volumes (m,) of the cells."""
+    """Signed areas or volumes (m,) of the cells; areas of triangles in space have no sign."""
     edges = points[cells[:, 1:]] - points[cells[:, :1]]
+    if cells.shape[1] == points.shape[1]:
+        return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
     return np.linalg.det(edges) / (2.0 if cells.shape[1] == 3 else 6.0)
 
 
 def orient(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Cells with positive measure; raises `ValueError` on cells without any."""
     measure = signed_measures(points, cells)
-    dimension = points.shape[1]
+    dimension = cells.shape[1] - 1
     corners = points[cells]
     size = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     flat = np.flatnonzero(np.abs(measure) <= _FLAT * size**dimension)

@@ -25,12 +25,25 @@ def facet_keys(facets: np.ndarray, num_points: int) -> np.ndarray:
     return key
 
 
-def _odd_permutation(facets: np.ndarray) -> np.ndarray:
+def odd_permutation(facets: np.ndarray) -> np.ndarray:
     """True where sorting the nodes of a facet reverses its orientation."""
     if facets.shape[1] == 2:
         return facets[:, 0] > facets[:, 1]
     a, b, c = facets.T
     return ((a > b).astype(int) + (b > c) + (a > c)) % 2 == 1
+
+
+def match_facets(facets: np.ndarray, num_points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of `facets` with the same nodes, in pairs (first, second), and three of one facet if any occurs so often."""
+    key = facet_keys(facets, num_points)
+    order = np.argsort(key, kind="stable")
+    ordered = key[order]
+    same = ordered[1:] == ordered[:-1]
+    triple = np.flatnonzero(same[1:] & same[:-1])
+    if triple.size:
+        return order[:0], order[:0], order[triple[0] : triple[0] + 3]
+    position = np.flatnonzero(same)
+    return order[position], order[position + 1], order[:0]
 
 
 def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -40,21 +53,14 @@ def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     the two cells of a facet lie on the same side of it.
     """
     facets = cell_facets(cells)
-    key = facet_keys(facets, int(cells.max()) + 1)
-    order = np.argsort(key, kind="stable")
-    ordered = key[order]
-    same = ordered[1:] == ordered[:-1]
     width = cells.shape[1]
-    triple = np.flatnonzero(same[1:] & same[:-1])
-    if triple.size:
-        rows = order[triple[0] : triple[0] + 3]
+    first, second, crowded = match_facets(facets, int(cells.max()) + 1)
+    if crowded.size:
         raise ValueError(
-            f"cells: the facet with nodes {np.sort(facets[rows[0]]).tolist()} belongs to more than two cells "
-            f"(among them {(rows // width).tolist()}), so the mesh is not manifold. Remove the surplus cells."
+            f"cells: the facet with nodes {np.sort(facets[crowded[0]]).tolist()} belongs to more than two cells "
+            f"(among them {(crowded // width).tolist()}), so the mesh is not manifold. Remove the surplus cells."
         )
-    position = np.flatnonzero(same)
-    first, second = order[position], order[position + 1]
-    odd = _odd_permutation(facets)
+    odd = odd_permutation(facets)
     folded = np.flatnonzero(odd[first] == odd[second])
     if folded.size:
         pair = np.sort([first[folded[0]] // width, second[folded[0]] // width]).tolist()
@@ -69,10 +75,11 @@ def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def order_loops(facets: np.ndarray, points: np.ndarray | None) -> np.ndarray:
-    """Boundary edges of a 2-D mesh sorted head to tail, loop after loop, the outer loop first.
+    """Boundary edges of triangles sorted head to tail, loop after loop, the outer loop first.
 
-    Each loop starts at its lowest-numbered node. The outer loop is the one that encloses a positive area;
-    where `points` are not known, the longest one. Raises `ValueError` where loops meet in a node.
+    Each loop starts at its lowest-numbered node. The outer loop is the one that encloses a positive area; where
+    `points` are not known, that of most edges, and of a surface in space, the longest one. Raises `ValueError` where
+    loops meet in a node.
     """
     start, counts = np.unique(facets[:, 0], return_counts=True)
     if np.any(counts > 1):
@@ -91,6 +98,8 @@ def order_loops(facets: np.ndarray, points: np.ndarray | None) -> np.ndarray:
         loops.append(np.array(loop))
     if points is None:
         loops.sort(key=len, reverse=True)
+    elif points.shape[1] == 3:
+        loops.sort(key=lambda loop: -np.linalg.norm(points[loop] - points[np.roll(loop, -1)], axis=1).sum())
     else:
         loops.sort(key=lambda loop: -signed_area(points[loop]))
     return np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])

@@ -52,7 +52,10 @@ def quality(mesh: Mesh) -> Quality:
 def _triangles(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     edges = np.roll(corners, -1, axis=1) - corners
     length = np.linalg.norm(edges, axis=2)
-    doubled = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
+    if corners.shape[2] == 2:
+        doubled = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
+    else:
+        doubled = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     before = -np.roll(edges, 1, axis=1)
     angle = np.degrees(np.arctan2(doubled[:, None], (edges * before).sum(axis=2))).min(axis=1)
     # r = 2 A / (a + b + c) and R = a b c / (4 A).

@@ -1,4 +1,4 @@
-"""Meshes from and to files, through meshio (vtu, msh, xdmf, inp, …)."""
+"""Meshes from and to files, through meshio (vtu, msh, stl, obj, xdmf, inp, …)."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from jeit.mesh import _topology
 from jeit.mesh._foreign import bounded_inflation, check_foreign
+from jeit.mesh.loose_triangles import read_loose
 from jeit.mesh.mesh import Mesh
 
 if TYPE_CHECKING:
@@ -22,18 +23,22 @@ if TYPE_CHECKING:
 
 _CELLS = {2: "triangle", 3: "tetra"}
 _FACETS = {2: "line", 3: "triangle"}
+# Files of triangles whose neighbours are to be found.
+_LOOSE = (".stl", ".obj")
 # Of what a file holds that meshio did not look at; and letters of what is said of it.
 _FAULTS = (LookupError, TypeError, AttributeError, ArithmeticError, MemoryError)
 _SAID = 80
 
 
 def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh:
-    """Read a mesh of triangles (2-D) or tetrahedra (3-D) from a .vtu, .vtk, .msh (Gmsh), .inp, .xdmf or other file.
+    """Read a mesh of triangles (2-D) or tetrahedra (3-D) from a .vtu, .vtk, .msh (Gmsh), .inp, .xdmf or other file, or
+    a surface in space from one of these, from a scan or from CAD (.stl, .obj; for .step see `jeit.mesh.from_gmsh`).
 
-    `scale` is the length of the file's unit in metres: 1e-3 for millimetres. Groups of boundary facets (Gmsh's physical
-    groups, or meshio's cell sets) become tags; groups that hold no boundary facet are left out, and so are
-    nodes that no cell uses. A flat mesh in the plane z = constant becomes 2-D. Nothing but the file itself is read, and
-    no more of it than memory may hold (the environment variable JEIT_FILE_GB), unless it is `trusted`: then whatever
+    `scale` is the length of the file's unit in metres: 1e-3 for millimetres, 0.0254 for inches. Groups of boundary
+    facets (Gmsh's physical groups, or meshio's cell sets) become tags; groups that hold no boundary facet are left out,
+    and so are nodes that no cell uses. A flat mesh in the plane z = constant becomes 2-D; other triangles are a surface
+    in space, and in .stl and .obj files nodes at one place are made one. Nothing but the file itself is read, and no
+    more of it than memory may hold (the environment variable JEIT_FILE_GB), unless it is `trusted`: then whatever
     meshio knows is read as meshio reads it, with the files that it leads to.
 
     Raises `FileNotFoundError` if there is no such file and `ValueError` if it is not a mesh file, leads to others,
@@ -45,6 +50,9 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
     if not isinstance(scale, Real) or not 0 < scale < np.inf:
         raise ValueError(f"scale: expected the file's unit in metres, such as 1e-3 for millimetres, got {scale!r}.")
     kind = None if trusted else check_foreign(path)
+    if path.suffix.lower() in _LOOSE:
+        points, cells = read_loose(path, path.name[:80])
+        return _created(points * float(scale), cells, {})
     with bounded_inflation(path) if kind == "vtu" else nullcontext():
         content = _quietly(path, lambda meshio: meshio.read(path, file_format=kind))
     try:
@@ -68,7 +76,7 @@ def write(
     """
     path = Path(path)
     points = np.asarray(mesh.points, dtype=float)
-    if mesh.dimension == 2:
+    if mesh.space_dimension == 2:
         points = np.column_stack([points, np.zeros(len(points))])
     cells = {name: _data("cell_data", name, value, mesh.num_cells) for name, value in (cell_data or {}).items()}
     nodes: dict[str, ArrayLike] = {
@@ -152,13 +160,6 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
     used, inverse = np.unique(cells, return_inverse=True)
     cells = inverse.reshape(cells.shape)
     points = points[used]
-    if dimension == 2 and points.shape[1] == 3:
-        if np.ptp(points[:, 2]) > 1e-9 * np.ptp(points, axis=0).max():
-            raise ValueError(
-                f"path: {source} is a surface in space: its nodes differ in z. A 2-D mesh must lie in a "
-                "plane z = constant; a solid needs tetrahedra."
-            )
-        points = points[:, :2]
     number = np.full(len(content.points), -1)
     number[used] = np.arange(len(used))
     # The cells may still be turned either way: a boundary facet is one that occurs once.
@@ -171,6 +172,13 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
         nodes = nodes[np.isin(_topology.facet_keys(nodes, len(used)), boundary)]
         if len(nodes):
             tags[name] = nodes
+    return _created(points, cells, tags)
+
+
+def _created(points: np.ndarray, cells: np.ndarray, tags: Mapping[str, ArrayLike]) -> Mesh:
+    """A mesh, in two dimensions if its triangles lie in a plane z = constant."""
+    if cells.shape[1] == 3 and points.shape[1] == 3 and np.ptp(points[:, 2]) <= 1e-9 * np.ptp(points, axis=0).max():
+        points = points[:, :2]
     return Mesh.create(points, cells, tags=tags)
 
 

@@ -18,24 +18,32 @@ def measures(mesh: Mesh) -> Float[Array, " m"]:
     """Area in m² (2-D) or volume in m³ (3-D) of every cell, (m,), positive for a valid mesh."""
     corners = mesh.points[mesh.cells]
     edges = corners[:, 1:] - corners[:, :1]
+    xp = namespace(mesh.points)
+    if mesh.is_surface:
+        return 0.5 * _length(xp.cross(edges[:, 0], edges[:, 1]))
     if mesh.dimension == 2:
         return 0.5 * _cross(edges[:, 0], edges[:, 1])
-    xp = namespace(mesh.points)
     return xp.sum(xp.cross(edges[:, 0], edges[:, 1]) * edges[:, 2], axis=-1) / 6.0
 
 
 @either_engine
-def gradients(mesh: Mesh) -> Float[Array, "m k d"]:
-    """Gradients in 1/m of the d + 1 linear basis functions on every cell, (m, d + 1, d).
+def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
+    """Gradients in 1/m of the d + 1 linear basis functions on every cell, (m, d + 1, s), s being the space dimension.
 
     φ_i is 1 at node i of the cell and 0 at the others, so with E the matrix of edges x_i − x_0 the
     gradients of φ_1 … φ_d are the columns of E⁻¹, and that of φ_0 is minus their sum. E⁻¹ is written out:
-    cross products of edges over the determinant.
+    cross products of edges over the determinant. On a triangle in space, with normal n = a × b of its edges, they lie
+    in its plane: ∇φ_1 = b × n / |n|² and ∇φ_2 = n × a / |n|².
     """
     xp = namespace(mesh.points)
     corners = mesh.points[mesh.cells]
     edges = corners[:, 1:] - corners[:, :1]
-    if mesh.dimension == 2:
+    if mesh.is_surface:
+        a, b = edges[:, 0], edges[:, 1]
+        normal = xp.cross(a, b)
+        determinant = xp.sum(normal**2, axis=-1)[:, None]
+        others = xp.stack([xp.cross(b, normal), xp.cross(normal, a)], axis=1)
+    elif mesh.dimension == 2:
         a, b = edges[:, 0], edges[:, 1]
         determinant = _cross(a, b)[:, None]
         others = xp.stack([xp.stack([b[:, 1], -b[:, 0]], -1), xp.stack([-a[:, 1], a[:, 0]], -1)], axis=1)
@@ -51,9 +59,29 @@ def gradients(mesh: Mesh) -> Float[Array, "m k d"]:
 
 
 @either_engine
-def centroids(mesh: Mesh) -> Float[Array, "m d"]:
-    """Centre of gravity in metres of every cell, (m, d)."""
+def centroids(mesh: Mesh) -> Float[Array, "m s"]:
+    """Centre of gravity in metres of every cell, (m, s)."""
     return mesh.points[mesh.cells].mean(axis=1)
+
+
+def normals(mesh: Mesh) -> Float[Array, "m 3"]:
+    """Unit normals of the triangles of a surface in space, (m, 3): outward where it is closed.
+
+    Of a plane mesh they are (0, 0, 1). Raises `ValueError` for a solid, whose facets have normals, not its cells.
+    """
+    if mesh.dimension != 2:
+        raise ValueError("mesh: a solid's cells have no normals; take those of its surface, surface_of(mesh).")
+    return _normals(mesh)
+
+
+@either_engine
+def _normals(mesh: Mesh):
+    xp = namespace(mesh.points)
+    if not mesh.is_surface:
+        return xp.broadcast_to(np.array([0.0, 0.0, 1.0], mesh.points.dtype), (mesh.num_cells, 3))
+    corners = mesh.points[mesh.cells]
+    normal = xp.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normal / _length(normal)[:, None]
 
 
 @either_engine
@@ -62,13 +90,15 @@ def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
     corners = mesh.points[mesh.facets]
     edges = corners[:, 1:] - corners[:, :1]
     xp = namespace(mesh.points)
+    if mesh.is_surface:
+        return _length(edges[:, 0])
     if mesh.dimension == 2:
         return xp.sqrt(edges[:, 0, 0] ** 2 + edges[:, 0, 1] ** 2)
     return 0.5 * xp.sqrt(xp.sum(xp.cross(edges[:, 0], edges[:, 1]) ** 2, axis=-1))
 
 
 def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
-    """For each boundary facet of a 2-D mesh: the number of its loop, and the arc length in metres where it starts.
+    """For each boundary edge of a 2-D mesh: the number of its loop, and the arc length in metres where it starts.
 
     Both (b,). Arc length counts along `mesh.facets` from the first node of each loop, counter-clockwise on the outer
     one; the perimeter of a loop is the sum of its `facet_measures`. Raises `ValueError` in 3-D.
@@ -94,6 +124,11 @@ def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     cells = np.asarray(mesh.cells)
     first, second, _ = pair_facets(cells)
     return np.stack([first, second], axis=1) // cells.shape[1], cell_facets(cells)[first]
+
+
+def _length(vectors):
+    """Lengths (m,) of vectors (m, 3), written out for XLA."""
+    return namespace(vectors).sqrt(vectors[:, 0] ** 2 + vectors[:, 1] ** 2 + vectors[:, 2] ** 2)
 
 
 def _cross(a: Float[Array, "m 2"], b: Float[Array, "m 2"]) -> Float[Array, " m"]:

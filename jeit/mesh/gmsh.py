@@ -28,11 +28,11 @@ def from_gmsh(
 ) -> Mesh:
     """Mesh a geometry with Gmsh.
 
-    **Arguments**: `source`, a geometry file (.step, .iges, .brep, .stl), an outline such as `Disk`, or None
-    for the model that is current in the `gmsh` module; `cell_size` in the geometry's own unit (metres for a domain),
-    the largest edge; `dimension` 2 or 3 (by default the geometry's own); `scale`, the geometry's unit in metres;
-    `scripts`, whether `source` may be of Gmsh's own kind (.geo and all others), which can run any command and open any
-    file: of your own only. Physical groups of the boundary become tags.
+    **Arguments**: `source`, a geometry file (.step, .iges, .brep, .stl), an outline such as `Disk`, or None for the
+    model that is current in the `gmsh` module; `cell_size` in the geometry's own unit (metres for a domain), the
+    largest edge; `dimension` 2 or 3 (by default the geometry's own): 2 of a solid is its surface, in space; `scale`,
+    the geometry's unit in metres; `scripts`, whether `source` may be of Gmsh's own kind (.geo and all others), which
+    can run any command and open any file: of your own only. Physical groups of the boundary become tags.
 
     Raises `ImportError` if the gmsh package or a system library it needs is missing, and `ValueError`
     if Gmsh refuses the geometry, and for scripts unless they are allowed.

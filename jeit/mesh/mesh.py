@@ -9,32 +9,43 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.mesh import _checks, _topology
+from jeit.mesh import _checks, _surface, _topology
 from jeit_solvers.engines import as_array, has_values
 
 
 class Mesh(eqx.Module):
-    """A conforming mesh of triangles (2-D) or tetrahedra (3-D).
+    """A conforming mesh of triangles in the plane or in space (2-D), or of tetrahedra (3-D).
 
     Build one with `jeit.mesh.disk` and its siblings, `jeit.mesh.read`, or from raw arrays with
     `Mesh.create`, which checks and orients them. All array fields are pytree leaves, so a mesh can be
     traced, batched over its points, and differentiated with respect to them.
 
-    **Fields**: `points` (n, d) in metres; `cells` (m, d + 1) node indices, positively oriented;
+    **Fields**: `points` (n, s) in metres, s = 2 or 3; `cells` (m, d + 1) node indices, positively oriented;
     `facets` (b, d) boundary edges or triangles, oriented with the domain on the left (2-D) or the normal
     outward (3-D), and in 2-D ordered head to tail, loop after loop, the outer loop first; `tags` maps a
-    name to indices into `facets`.
+    name to indices into `facets`. Triangles in space are a surface: counter-clockwise as seen from outside, with edges
+    (0, 2) where it is closed.
     """
 
-    points: Float[Array, "n d"]
+    points: Float[Array, "n s"]
     cells: Int[Array, "m k"]
     facets: Int[Array, "b d"]
     tags: dict[str, Int[Array, " t"]]
 
     @property
     def dimension(self) -> int:
-        """Space dimension, 2 or 3."""
+        """Dimension of the cells: 2 of triangles, 3 of tetrahedra."""
+        return self.cells.shape[1] - 1
+
+    @property
+    def space_dimension(self) -> int:
+        """Number of coordinates of a point, 2 or 3."""
         return self.points.shape[1]
+
+    @property
+    def is_surface(self) -> bool:
+        """Whether these are triangles in space."""
+        return self.space_dimension > self.dimension
 
     @property
     def num_points(self) -> int:
@@ -55,17 +66,20 @@ class Mesh(eqx.Module):
     def create(points: ArrayLike, cells: ArrayLike, *, tags: Mapping[str, ArrayLike] | None = None) -> Mesh:
         """Check raw arrays, orient the cells, find the boundary, and make a `Mesh`.
 
-        **Arguments**: `points` (n, 2) or (n, 3) in metres; `cells` (m, d + 1) zero-based node indices in
-        either orientation (clockwise cells are turned round); `tags` maps a name to boundary facets, given
-        either as their nodes, (t, d) integers in any order, or as indices (t,) into the resulting `facets`.
+        **Arguments**: `points` (n, 2) or (n, 3) in metres; `cells` (m, 3) triangles, in the plane or in space, or
+        (m, 4) tetrahedra: zero-based node indices in either orientation (clockwise cells are turned round); `tags` maps
+        a name to boundary facets, given either as their nodes, (t, d) integers in any order, or as indices (t,) into
+        the resulting `facets`.
 
         In 2-D each loop of `facets` starts at its lowest-numbered node; the outer loop runs
-        counter-clockwise, holes clockwise. `points` may be traced by JAX: the checks on values are then
-        skipped and the cells are taken to be positively oriented already.
+        counter-clockwise, holes clockwise; of a surface in space the longest loop comes first. A closed surface faces
+        outward, an open one to the side that most of its triangles gave. `points` may be traced by JAX: the checks on
+        values are then skipped and the cells are taken to be positively oriented already.
 
         Raises `ValueError` if the arrays have the wrong shape or type, hold NaN or indices out of range,
         or describe a mesh with degenerate, duplicated or overlapping cells, unused or coinciding nodes,
-        facets shared by three cells, or several separate parts; warns if the extent exceeds 10 m, which
+        facets shared by three cells, or several separate parts; a surface with one side only, or one that touches or
+        crosses itself. Warns of a closed surface that came inside out, and if the extent exceeds 10 m, which
         almost always means millimetres.
         """
         if not has_values(cells):
@@ -74,16 +88,19 @@ class Mesh(eqx.Module):
                 "transformed function and pass it in, or replace its points with equinox.tree_at."
             )
         coordinates = _checks.check_points(points) if has_values(points) else None
-        num_points, dimension = np.shape(points if coordinates is None else coordinates)
-        indices = _checks.check_cells(cells, num_points, dimension)
+        num_points, space = np.shape(points if coordinates is None else coordinates)
+        indices = _checks.check_cells(cells, num_points, space)
+        dimension = indices.shape[1] - 1
         if coordinates is not None:
             _checks.check_coinciding(coordinates)
             indices = _checks.orient(coordinates, indices)
+        if space > dimension:
+            indices = _surface.orient_surface(indices, coordinates)
         first, second, single = _topology.pair_facets(indices)
         _checks.check_connected(first // (dimension + 1), second // (dimension + 1), len(indices))
         facets = _topology.cell_facets(indices)[single]
         if dimension == 2:
-            facets = _topology.order_loops(facets, coordinates)
+            facets = _topology.order_loops(facets, coordinates) if len(facets) else facets
         located = _checks.locate_tags(tags or {}, facets)
         return Mesh(
             points=as_array(points if coordinates is None else coordinates),

@@ -71,8 +71,8 @@ class OwnMesh(Body):
         return float(x_min), float(x_max), float(y_min), float(y_max)
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
-        """The edges of a plane mesh; none of a solid one."""
-        if self.given.dimension == 3:
+        """The edges of a plane mesh; none of a solid one, or of a surface in space."""
+        if self.given.space_dimension == 3:
             return ()
         points, facets = np.asarray(self.given.points), np.asarray(self.given.facets)
         begins = np.flatnonzero(facets[1:, 0] != facets[:-1, 1]) + 1  # facets follow each other, loop after loop
@@ -83,6 +83,7 @@ class OwnMesh(Body):
         return {
             "shape": "mesh",
             "dimension": self.given.dimension,
+            **({"space_dimension": 3} if self.given.is_surface else {}),
             "points": self.given.num_points,
             "cells": self.given.num_cells,
         }

@@ -9,49 +9,43 @@ from jeit.mesh.generate import unstructured
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import check_length
+from jeit.mesh.prisms import stacked_cells, stacked_wall
 from jeit.mesh.shapes import disk, rectangle
 
 # In a solid 'bottom' and 'top' are the faces across z, so the sides of a rectangle across y get new names.
 _RENAMED = {"bottom": "front", "top": "back"}
 
 
-def layer(mesh: Mesh, thickness: float, num_layers: int = 1) -> Mesh:
+def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLike | None = None) -> Mesh:
     """A plate: a plane mesh times [0, thickness], its prisms cut into three tetrahedra each.
 
-    Node k · n + i is node i of the plane mesh at height z = k · thickness / num_layers. Tags: 'bottom' (z = 0),
+    Node k · n + i is node i of the plane mesh at height z = k · thickness / num_layers, or at the k-th of `heights` if
+    those are given, from 0 to the thickness. Tags: 'bottom' (z = 0),
     'top' (z = thickness), 'side', and those of the plane mesh as parts of the side; its 'bottom' and 'top'
     (across y) are then called 'front' and 'back'.
 
     Every prism is cut along the diagonals that rise from its lower-numbered to its higher-numbered node, so that
-    neighbours agree. Raises `ValueError` on a solid mesh, a thickness that is not positive, or no layers.
+    neighbours agree. Raises `ValueError` on a solid mesh, a thickness that is not positive, no layers, or
+    heights that do not rise from 0 to the thickness.
     """
+    if mesh.is_surface:
+        raise ValueError(
+            "mesh: this one is a surface in space; what has a thickness above it is a shell, jeit.mesh.shell."
+        )
     if mesh.dimension != 2:
         raise ValueError("mesh: a layer is made from a plane (2-D) mesh, this one is 3-D.")
     thickness = check_length("thickness", thickness)
-    num_layers = unstructured.check_count("num_layers", num_layers, 1)
+    levels = _levels(thickness, num_layers, heights)
+    num_layers = len(levels) - 1
     plane, cells, facets = np.asarray(mesh.points), np.asarray(mesh.cells), np.asarray(mesh.facets)
     count = len(plane)
     unstructured.check_total(count * (num_layers + 1), "num_layers")
-    heights = np.repeat(np.linspace(0.0, thickness, num_layers + 1), count)
-    points = np.column_stack([np.tile(plane, (num_layers + 1, 1)), heights])
+    points = np.column_stack([np.tile(plane, (num_layers + 1, 1)), np.repeat(levels, count)])
 
-    a, b, c = np.sort(cells.astype(np.int64), axis=1).T
-    up = count
-    prism = np.stack(
-        [
-            np.stack([a, b, c, c + up], axis=1),
-            np.stack([a, b, b + up, c + up], axis=1),
-            np.stack([a, a + up, b + up, c + up], axis=1),
-        ],
-        axis=1,
-    ).reshape(-1, 4)
-    solid = np.concatenate([prism + k * count for k in range(num_layers)])
+    solid = stacked_cells(cells, count, num_layers)
 
     def side(edges: np.ndarray) -> np.ndarray:
-        low, high = np.sort(edges.astype(np.int64), axis=1).T
-        lower = np.stack([low, high, high + up], axis=1)
-        upper = np.stack([low, low + up, high + up], axis=1)
-        return np.concatenate([face + k * count for k in range(num_layers) for face in (lower, upper)])
+        return stacked_wall(edges, count, num_layers)
 
     tags: dict[str, ArrayLike] = {"bottom": cells, "top": cells + num_layers * count, "side": side(facets)}
     for name, index in mesh.tags.items():
@@ -60,6 +54,22 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1) -> Mesh:
             raise ValueError(f"mesh: its tag {name!r} would be called {new!r} in the layer, which is taken. Rename it.")
         tags[new] = side(facets[np.asarray(index)])
     return Mesh.create(points, solid, tags=tags)
+
+
+def _levels(thickness: float, num_layers: int, heights: ArrayLike | None) -> np.ndarray:
+    """Heights of the nodes, lowest first."""
+    if heights is None:
+        return np.linspace(0.0, thickness, unstructured.check_count("num_layers", num_layers, 1) + 1)
+    levels = np.asarray(heights, float)
+    if (
+        levels.ndim != 1
+        or len(levels) < 2
+        or levels[0] != 0
+        or levels[-1] != thickness
+        or not (np.diff(levels) > 0).all()
+    ):
+        raise ValueError(f"heights must rise from 0 to the thickness, {thickness:g} m.")
+    return levels
 
 
 def box(

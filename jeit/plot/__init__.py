@@ -1,5 +1,5 @@
-"""Pictures, with matplotlib: meshes, images, electrodes, sensitivity, taxels, layouts, voltages, microphones, touches,
-contacts, self-organising maps, damage, gestures in time, depths.
+"""Pictures, with matplotlib: meshes, images, solids and surfaces in space, electrodes, sensitivity, taxels, layouts,
+voltages, microphones, touches, contacts, self-organising maps, damage, gestures in time, depths.
 
 Every function takes `ax`, makes a figure of its own where none is given, and returns the axes it drew on. Lengths are
 in metres in the arguments and in millimetres in the pictures.
@@ -20,6 +20,12 @@ from jeit.plot.imaging.frames import plot_frames
 from jeit.plot.imaging.hyperparameter import plot_choice
 from jeit.plot.imaging.image import plot_image
 from jeit.plot.imaging.mesh import plot_mesh
+from jeit.plot.solid.camera import Camera
+from jeit.plot.solid.interactive import view_solid
+from jeit.plot.solid.isosurfaces import plot_isosurfaces
+from jeit.plot.solid.overview import plot_solid
+from jeit.plot.solid.shaded_surface import plot_surface
+from jeit.plot.solid.slices import plot_slice, plot_slices
 from jeit.plot.touch.contact_stages import plot_contact_stages
 from jeit.plot.touch.contacts import plot_contacts
 from jeit.plot.touch.depth_map import plot_depth_map, plot_losses
@@ -40,6 +46,7 @@ from jeit.plot.touch.touches import plot_answers, plot_places
 _tell_old_names(__name__)
 
 __all__ = [
+    "Camera",
     "ColourScale",
     "Marks",
     "plot_admittivity",
@@ -58,6 +65,7 @@ __all__ = [
     "plot_health_course",
     "plot_heard",
     "plot_image",
+    "plot_isosurfaces",
     "plot_key_errors",
     "plot_loss_map",
     "plot_losses",
@@ -69,6 +77,10 @@ __all__ = [
     "plot_receptive_fields",
     "plot_sensitivity_histograms",
     "plot_sensitivity_map",
+    "plot_slice",
+    "plot_slices",
+    "plot_solid",
+    "plot_surface",
     "plot_taxel_areas",
     "plot_taxels",
     "plot_timeline",
@@ -76,4 +88,5 @@ __all__ = [
     "plot_track",
     "plot_travel",
     "plot_tried",
+    "view_solid",
 ]

@@ -13,16 +13,20 @@ from jeit.report.layout_improvement import draw_improved_layout, report_improved
 from jeit.report.learnt_skin import report_learnt_skin, write_learnt_skin, write_touches
 from jeit.report.listener import draw_heard, report_heard, report_listener, write_heard, write_listener
 from jeit.report.measurement import report_measurement
+from jeit.report.saved_image import SavedImage, read_image
+from jeit.report.saved_image_views import write_views
 from jeit.report.series import write_series
 from jeit.report.skin_health import draw_health, report_health, write_health
 from jeit.report.stream import write_stream
 from jeit.report.study import write_study_report
 from jeit.report.touch_watch import draw_watch, report_watch, write_watch
 from jeit.report.track import draw_track, report_track, write_track
+from jeit.report.volume_files import write_vtk_series, write_vtu, write_xdmf
 
 _tell_old_names(__name__)
 
 __all__ = [
+    "SavedImage",
     "draw_calibration",
     "draw_choice",
     "draw_health",
@@ -32,6 +36,7 @@ __all__ = [
     "draw_layout_comparison",
     "draw_track",
     "draw_watch",
+    "read_image",
     "report_choice",
     "report_gestures",
     "report_health",
@@ -63,5 +68,9 @@ __all__ = [
     "write_study_report",
     "write_touches",
     "write_track",
+    "write_views",
+    "write_vtk_series",
+    "write_vtu",
     "write_watch",
+    "write_xdmf",
 ]

@@ -11,26 +11,37 @@ from jeit.imaging.difference import ImagedDifference
 from jeit.imaging.method import METHODS
 from jeit.imaging.settings import ImagingSettings
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
+from jeit.inverse.shapes import Ellipsoid, Star
 from jeit.protocol import Protocol
 from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain, version_of
 from jeit.report.folder import results, write_json
+from jeit.report.saved_image import saved_extras
+from jeit.report.volume_files import draft_vtu
 
+IMAGE_FILES = ("image.png", "image.npz", "report.json", "image.vtu")
+"""What `write_image` writes; the last of solids only."""
 _PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix", "matplotlib")
 
 
 def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[float, float] | None = None) -> None:
-    """Write `image.png`, `image.npz` and `report.json` into `folder`, made if need be.
+    """Write `image.png`, `image.npz`, `report.json`, and of a solid `image.vtu`, into `folder`, made if need be.
 
     The NPZ holds `raster` (rows, columns), the change of conductivity (S; 3-D: S/m, half way up), NaN outside the body,
     row 0 at the top, column 0 at the left; `extent` (x_min, x_max, y_min, y_max) in metres; `conductivity` (m,), the
     same change per cell; `background`, the conductivity it is a change of; `points` (n, d) and `cells` (m, d + 1); and
-    `labels` (rows, columns), if the image was segmented: 0 background, 1 resistive, 2 conductive. `truth`: a known
-    position (x, y) in metres, marked in the picture. Raises `ValueError` for what cannot be a folder.
+    `labels` (rows, columns), if the image was segmented: 0 background, 1 resistive, 2 conductive; and electrodes and
+    inclusions as `jeit.report.saved_image` says, for `jeit view`. The VTU has the same values per cell, and under which
+    electrode nodes lie. `truth`: a known position (x, y) in metres, marked in the picture of a sheet. Raises
+    `ValueError` for what cannot be a folder.
     """
-    with results(folder, ("image.png", "image.npz", "report.json")) as made:
+    with results(folder, IMAGE_FILES) as made:
         draw_image(result, truth=truth).savefig(made / "image.png", dpi=150)
         np.savez_compressed(made / "image.npz", **_arrays(result))
         write_json(report_image(result), made / "report.json")
+        if result.mesh.dimension == 3:
+            background, change = np.asarray(result.calibration.conductivity), np.asarray(result.change)
+            values = {"change of conductivity": change, "conductivity": background + change}
+            draft_vtu(made / "image.vtu", result.mesh, values, electrodes=result.calibration.model.electrodes)
 
 
 def _arrays(result: ImagedDifference) -> dict[str, Any]:
@@ -45,17 +56,26 @@ def _arrays(result: ImagedDifference) -> dict[str, Any]:
     }
     if result.labels is not None:
         arrays["labels"] = result.labels
-    return arrays
+    if result.iterative and not result.is_complex:
+        arrays["departure"] = _drawn(result)
+    return {**arrays, **saved_extras(result.mesh, result.calibration.model.electrodes, result.inclusions)}
+
+
+def _drawn(result: ImagedDifference) -> np.ndarray:
+    """What the picture shows in every cell: iterative images reach from a hundredth to a hundred times the background,
+    and on the scale of the logarithm both show."""
+    return np.asarray(result.departure) / (math.log(10) if result.iterative else 1)
 
 
 def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = None):
     """The picture of a result, as a matplotlib `Figure` that needs no display; both parts of one of admittivity."""
     from matplotlib.figure import Figure
 
-    from jeit.plot.colour_scale import CHANGE, ColourScale
+    from jeit.plot.colour_scale import CHANGE
     from jeit.plot.imaging.admittivity import plot_admittivity
     from jeit.plot.imaging.image import plot_image
     from jeit.plot.imaging.labels import draw_labels, draw_outlines
+    from jeit.plot.solid.overview import LOGARITHM, plot_solid
 
     if result.is_complex:
         figure = Figure(figsize=(11.5, 5.2), layout="constrained")
@@ -63,16 +83,20 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
         electrodes = result.calibration.model.electrodes
         plot_admittivity(result.mesh, np.asarray(result.change), electrodes, figure=figure)
         return figure
-    figure, height = Figure(figsize=(6.4, 5.6), layout="constrained"), picture_height(result)
-    # Iterative images reach from a hundredth to a hundred times the background: on the logarithm's scale both show.
+    scale = LOGARITHM if result.iterative else CHANGE
+    electrodes = result.calibration.model.electrodes
+    if result.mesh.dimension == 3:
+        figure = plot_solid(result.mesh, _drawn(result), electrodes, inclusions=result.inclusions, scale=scale)
+        figure.suptitle(result.measurement.name)
+        return figure
+    figure = Figure(figsize=(6.4, 5.6), layout="constrained")
     ax = plot_image(
         result.mesh,
-        np.asarray(result.departure) / (math.log(10) if result.iterative else 1),
-        result.calibration.model.electrodes,
+        _drawn(result),
+        electrodes,
         inclusions=result.inclusions if result.labels is None and result.shapes is None else (),
-        title=result.measurement.name + ("" if height is None else f", slice at z = {1e3 * height:.1f} mm"),
-        height=height,
-        scale=ColourScale(quantity="log₁₀ of conductivity over background", unit="") if result.iterative else CHANGE,
+        title=result.measurement.name,
+        scale=scale,
         ax=figure.subplots(),
     )
     if truth is not None:
@@ -81,24 +105,12 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     if result.labels is not None:
         draw_labels(result.labels, result.extent, ax=ax)
     elif result.shapes is not None:
-        draw_outlines(result.shapes.stars, ax=ax)
+        draw_outlines([one for one in result.shapes.bodies if isinstance(one, Star)], ax=ax)
     elif result.inclusions:
-        found = "found: sign and area" if height is None else "found: sign, and a ball of its volume"
-        ax.plot([], [], color="black", linewidth=1, linestyle=(0, (4, 3)), label=found)
+        ax.plot([], [], color="black", linewidth=1, linestyle=(0, (4, 3)), label="found: sign and area")
     if ax.get_legend_handles_labels()[1]:
         ax.legend(loc="upper left", bbox_to_anchor=(0, 0), frameon=False, borderaxespad=0)
     return figure
-
-
-def picture_height(result: ImagedDifference) -> float | None:
-    """Height z in metres of the slice that the picture of a solid shows: through the strongest inclusion, or half way
-    up where there is none, or labels are shown; None for a sheet."""
-    if result.mesh.dimension == 2:
-        return None
-    if result.inclusions and result.labels is None:
-        return result.inclusions[0].centroid[2]
-    z = np.asarray(result.mesh.points)[:, 2]
-    return float(z.min() + z.max()) / 2
 
 
 def report_image(result: ImagedDifference) -> dict[str, Any]:
@@ -193,12 +205,18 @@ def _inclusion(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]
         "kind": inclusion.kind,
         "centroid": list(inclusion.centroid),
         "centroid_unit": "m",
-        "area": inclusion.area,
-        "area_unit": "m²" if len(inclusion.centroid) == 2 else "m³",
+        **_size(inclusion),
         "peak": inclusion.peak,
         "peak_unit": _unit(result),
         "peak_relative_to_background": inclusion.peak / float(np.real(result.calibration.conductivity)),
     }
+
+
+def _size(inclusion: Inclusion) -> dict[str, Any]:
+    """The volume of an inclusion of a solid, or the area of one of a sheet."""
+    if inclusion.is_solid:
+        return {"volume": inclusion.area, "volume_unit": "m³"}
+    return {"area": inclusion.area, "area_unit": "m²"}
 
 
 def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
@@ -210,16 +228,17 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
             {
                 "sign": one.sign,
                 "centroid": one.centroid,
-                "area": one.area,
-                "outline": one.outline,
+                **_form(one),
                 "conductivity_over_background": math.exp(one.sign * one.contrast),
                 "conductivity_is": "told by the data" if one.weak else "assumed, as of what is strong",
                 "rise": one.rise,
             }
-            for one in stars
+            for one in bodies
         ]
-        for stars in (result.shapes.stars, result.shapes.doubtful)
+        for bodies in (result.shapes.bodies, result.shapes.doubtful)
     )
+    for one, deviation in zip(kept, result.shapes.contrast_deviations, strict=True):
+        one["deviation_of_logarithm"] = deviation
     return {
         "bodies": kept,
         "left_out": left,
@@ -229,6 +248,13 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
         "misfit_unit": "standard deviations",
         "drift_of_background": result.shapes.drift,
     }
+
+
+def _form(body: Star | Ellipsoid) -> dict[str, Any]:
+    """What its kind has: the outline of a star, the half axes of an ellipsoid."""
+    if isinstance(body, Star):
+        return {"area": body.area, "outline": body.outline}
+    return {"volume": body.volume, "centre": body.centre, "half_axes": body.axes}
 
 
 def _prior(settings: ImagingSettings) -> str | None:

@@ -57,7 +57,11 @@ def test_from_description_to_picture(body, run, tmp_path):
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     (found,) = report["inclusions"]
     assert found["kind"] == "conductive"
-    assert found["area_unit"] == ("m³" if body == "solid" else "m²")
+    size = {"volume", "volume_unit"} if body == "solid" else {"area", "area_unit"}
+    assert {key for key in found if key.startswith(("area", "volume"))} == size
+    assert found.get("volume_unit", found.get("area_unit")) == ("m³" if body == "solid" else "m²")
+    assert (tmp_path / "out" / "image.vtu").is_file() == (body == "solid")
+    assert ("image.vtu" in told) == (body == "solid")
     np.testing.assert_allclose(found["centroid"], [0.02, 0.0, 0.02][: model.mesh.dimension], atol=0.005)
     if body == "solid":
         assert report["geometry"]["thickness"] == 0.04

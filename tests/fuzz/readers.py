@@ -365,6 +365,31 @@ def _msh(folder):
     write_mesh(_mesh(), folder / "a.msh")
 
 
+def _tetrahedron() -> tuple[np.ndarray, np.ndarray]:
+    return np.eye(4)[:, :3] * 0.1, np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [0, 2, 3]])
+
+
+@_reader("mesh, stl", "a.stl", read_mesh)
+def _stl(folder: Path) -> None:
+    points, cells = _tetrahedron()
+    records = [bytes(12) + one.astype("<f4").tobytes() + bytes(2) for one in points[cells]]
+    (folder / "a.stl").write_bytes(bytes(80) + len(records).to_bytes(4, "little") + b"".join(records))
+
+
+@_reader("mesh, stl text", "a.stl", read_mesh)
+def _stl_text(folder: Path) -> None:
+    points, cells = _tetrahedron()
+    lines = [f"vertex {x} {y} {z}" for x, y, z in points[cells].reshape(-1, 3)]
+    (folder / "a.stl").write_text("\n".join(["solid a", *lines, "endsolid a"]))
+
+
+@_reader("mesh, obj", "a.obj", read_mesh)
+def _obj(folder: Path) -> None:
+    points, cells = _tetrahedron()
+    lines = [f"v {x} {y} {z}" for x, y, z in points] + [f"f {a}//1 {b}//1 {c}//1" for a, b, c in cells + 1]
+    (folder / "a.obj").write_text("\n".join(lines))
+
+
 @_reader("mesh, vtu", "a.vtu", read_mesh)
 def _vtu(folder):
     mesh = _mesh()

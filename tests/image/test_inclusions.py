@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.image import Inclusion, find_inclusions
-from jeit.mesh import box, centroids, disk
+from jeit.mesh import Mesh, Refine, box, centroids, disk, rectangle
 
 MESH = disk(0.1, num_points=1500)
 CENTRE = np.asarray(centroids(MESH))
@@ -47,3 +47,53 @@ def test_weak_peaks_and_specks_are_artefacts():
 
 def test_no_change_has_no_inclusions():
     assert find_inclusions(MESH, np.zeros(MESH.num_cells)) == []
+
+
+def ball(mesh, middle, radius):
+    return np.linalg.norm(np.asarray(centroids(mesh)) - middle, axis=1) < radius
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_balls_of_a_solid_have_their_volume_wherever_the_mesh_is_fine(refined):
+    """Cells of other sizes in one half change neither the volume nor the centre: both are weighted by volume."""
+    refine = [Refine([[0.05, 0.0]], cell_size=0.006, distance=0.04)] if refined else None
+    tank = box(0.17, 0.255, 0.17, cell_size=0.012, refine=refine)
+    middles, radius = np.array([[0.03, -0.05, 0.1], [-0.03, 0.06, 0.06]]), 0.03
+    image = 2e-3 * ball(tank, middles[0], radius) - 1e-3 * ball(tank, middles[1], radius)
+    found = find_inclusions(tank, image)
+    assert [one.sign for one in found] == [1, -1]
+    for one, middle in zip(found, middles, strict=True):
+        assert one.is_solid
+        assert one.area == pytest.approx(4 / 3 * np.pi * radius**3, rel=0.1)
+        assert one.radius == pytest.approx(radius, rel=0.035)
+        np.testing.assert_allclose(one.centroid, middle, atol=2e-3)
+
+
+def test_a_ball_at_the_wall_has_what_is_inside_of_it():
+    tank = box(0.17, 0.255, 0.17, cell_size=0.01)
+    (found,) = find_inclusions(tank, 1e-3 * ball(tank, [0.085, 0, 0.085], 0.04))
+    assert found.area == pytest.approx(2 / 3 * np.pi * 0.04**3, rel=0.1)
+    # The centre of gravity of half a ball is 3/8 of its radius off the flat side.
+    np.testing.assert_allclose(found.centroid, [0.085 - 0.015, 0, 0.085], atol=2e-3)
+
+
+def test_the_least_size_is_as_wide_in_a_solid_as_in_a_sheet():
+    """A ball of an eighth of the tank's width is 0.0017 of its volume: no artefact."""
+    tank = box(0.1, 0.1, 0.1, cell_size=0.005)
+    image = 1e-3 * ball(tank, [0, 0, 0.05], 0.0075)
+    assert len(find_inclusions(tank, image)) == 1
+    assert find_inclusions(tank, image, least_area=0.004) == []
+    assert find_inclusions(tank, 1e-3 * ball(tank, [0, 0, 0.05], 0.003)) == []
+
+
+def test_on_a_surface_in_space_what_is_found_has_an_area():
+    mesh = rectangle(0.1, 0.1, num_points=900)
+    points, bend = np.asarray(mesh.points), 0.06
+    rolled = np.stack([bend * np.sin(points[:, 0] / bend), points[:, 1], bend * np.cos(points[:, 0] / bend)], axis=1)
+    skin = Mesh.create(rolled, mesh.cells)
+    image = (np.hypot(*np.asarray(centroids(mesh)).T) < 0.02).astype(float)
+    (found,) = find_inclusions(skin, image)
+    (flat,) = find_inclusions(mesh, image)
+    assert not found.is_solid
+    assert len(found.centroid) == 3
+    assert found.radius == pytest.approx(flat.radius, rel=1e-3)

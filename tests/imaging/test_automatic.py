@@ -63,7 +63,7 @@ def test_a_strong_change_is_solved_for(factor, why):
 def test_strong_bodies_are_outlined():
     result = image(20.0)
     assert result.shapes is not None
-    (star,) = result.shapes.stars
+    (star,) = result.shapes.bodies
     np.testing.assert_allclose(star.area, np.pi * RADIUS**2 / 9, rtol=0.15)
     assert result.inclusions[0].area == star.area
     reported = report_image(result)["shapes"]

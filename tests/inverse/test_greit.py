@@ -229,13 +229,25 @@ def test_bad_input(model, changed, message):
         greit(model, **arguments)
 
 
-def test_solids_and_thin_bodies_are_refused():
-    corners = PointElectrodes([[-0.05, -0.05, 0], [0.05, -0.05, 0], [0.05, 0.05, 0], [-0.05, 0.05, 0]])
-    solid = ForwardModel(box(0.1, 0.1, 0.1, num_points=60), corners, adjacent(4))
-    with pytest.raises(ValueError, match="3-D"):
-        greit(solid, 1.0)
+def test_thin_bodies_are_refused():
     strip = Rectangle(1.0, 0.01)
     ends = PointElectrodes(perimeter(strip, 4, start=0.01))
     thin = ForwardModel(strip.mesh(num_points=300), ends, adjacent(4))
     with pytest.raises(ValueError, match="fits into this body"):
         greit(thin, 1.0, target_radius=0.2)
+
+
+def test_a_ball_in_a_solid_is_imaged_where_it_is():
+    """Within a tenth of the box's side, and with its integral within a fifth: the response is the model's own."""
+    sides = np.concatenate([np.eye(3), -np.eye(3)]) * 0.05
+    middle = np.array([0, 0, 0.05])
+    corners = np.stack(np.meshgrid(*3 * [[-0.05, 0.05]], indexing="ij"), axis=-1).reshape(-1, 3)
+    electrodes = PointElectrodes(np.concatenate([sides, corners]) + middle)
+    body = ForwardModel(box(0.1, 0.1, 0.1, num_points=1500), electrodes, adjacent(14))
+    centre, volume = np.asarray(centroids(body.mesh)), np.asarray(measures(body.mesh))
+    target = np.array([0.015, -0.01, 0.06])
+    ball = np.linalg.norm(centre - target, axis=1) < 0.018
+    found = greit(body, 1.0, radius=0.5, target_radius=0.2, hyperparameter=1e-3, noise=1e-3)
+    image = np.asarray(found.image(np.asarray(body.jacobian(1.0)) @ ball))
+    assert np.linalg.norm((volume * image) @ centre / (volume @ image) - target) < 0.01
+    assert volume @ image == pytest.approx(volume @ ball, rel=0.2)

@@ -60,11 +60,11 @@ def test_derivatives_are_those_of_finite_differences(model):
 
 def test_a_star_knows_its_area_its_middle_and_what_it_holds(model):
     stars = Stars.create(model.mesh, StarPrior(), [[0.03, 0.01]], [-1])
-    round_one = stars.star(0, stars.of_radii([0.02]))
+    round_one = stars.body(0, stars.of_radii([0.02]))
     assert round_one.sign == -1
     np.testing.assert_allclose(round_one.area, np.pi * 0.02**2, rtol=1e-3)
     np.testing.assert_allclose(round_one.centroid, [0.03, 0.01], atol=1e-6)
-    rough = stars.star(0, stars.of_radii([0.02]) + np.random.default_rng(1).normal(size=1 + stars.prior.size))
+    rough = stars.body(0, stars.of_radii([0.02]) + np.random.default_rng(1).normal(size=1 + stars.prior.size))
     axis = np.linspace(-0.15, 0.15, 601)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1)
     inside = rough.holds(grid)
@@ -76,7 +76,7 @@ def test_a_star_knows_its_area_its_middle_and_what_it_holds(model):
 def test_a_star_ends_where_the_body_does(model, reach):
     """A disk over the edge of the tank, its middle inside or outside: the area of two circles' lens."""
     stars = Stars.create(model.mesh, StarPrior(), [[reach, 0.0]], [1])
-    star, radius = stars.star(0, stars.of_radii([0.03])), 0.03
+    star, radius = stars.body(0, stars.of_radii([0.03])), 0.03
     assert np.linalg.norm(star.outline, axis=1).max() < 1.001 * RADIUS
     angle = [
         np.arccos((reach**2 + one**2 - other**2) / (2 * reach * one))
@@ -89,14 +89,14 @@ def test_a_star_ends_where_the_body_does(model, reach):
 
 
 def test_bodies_are_found_and_ghosts_left_out(found):
-    assert [one.sign for one in sorted(found.stars, key=lambda one: one.sign)] == [-1, 1]
-    plastic, metal = sorted(found.stars, key=lambda one: one.sign)
+    assert [one.sign for one in sorted(found.bodies, key=lambda one: one.sign)] == [-1, 1]
+    plastic, metal = sorted(found.bodies, key=lambda one: one.sign)
     assert np.linalg.norm(metal.centroid - SQUARE) < 0.02 * RADIUS
     assert np.linalg.norm(plastic.centroid - DISK) < 0.02 * RADIUS
     np.testing.assert_allclose(metal.area, 0.036**2, rtol=0.05)
     np.testing.assert_allclose(plastic.area, np.pi * 0.025**2, rtol=0.1)
     assert len(found.doubtful) == 2
-    assert max(one.rise for one in found.doubtful) < 2 < 100 < min(one.rise for one in found.stars)
+    assert max(one.rise for one in found.doubtful) < 2 < 100 < min(one.rise for one in found.bodies)
     np.testing.assert_allclose(found.drift, 0.05, atol=0.01)
     assert float(found.misfit) < 1
 
@@ -105,8 +105,8 @@ def test_neighbours_that_merge_are_told_apart(model):
     """Two disks of plastic, from one start between them."""
     places = np.array([[0.03, 0.03], [0.03, -0.02]])
     result = reconstruct_shapes(model, _solved(places, 0.02, 1e-2), BATH, start=[(-1, (0.03, 0.0), 0.03)])
-    assert [one.sign for one in result.stars] == [-1, -1]
-    found = sorted((one.centroid for one in result.stars), key=lambda place: -place[1])
+    assert [one.sign for one in result.bodies] == [-1, -1]
+    found = sorted((one.centroid for one in result.bodies), key=lambda place: -place[1])
     np.testing.assert_allclose(found, places, atol=0.02 * RADIUS)
 
 
@@ -115,7 +115,7 @@ def test_weak_bodies_are_told_from_small_strong_ones(model, factor):
     sign = 1 if factor > 1 else -1
     voltages = _solved([[0.03, 0.03]], 0.03, factor)
     noise = 0.01 * jnp.abs(voltages)
-    (body,) = reconstruct_shapes(model, voltages, BATH, start=[(sign, (0.03, 0.02), 0.02)], noise=noise).stars
+    (body,) = reconstruct_shapes(model, voltages, BATH, start=[(sign, (0.03, 0.02), 0.02)], noise=noise).bodies
     assert body.weak == (factor < 10)
     np.testing.assert_allclose(body.area, np.pi * 0.03**2, rtol=0.25)
     if body.weak:
@@ -131,7 +131,7 @@ def _solved(places, radius, factor):
 
 def test_conductivity_is_that_of_the_stars(found, model):
     relative = np.asarray(found.conductivity) / BATH
-    metal = next(one for one in found.stars if one.sign > 0)
+    metal = next(one for one in found.bodies if one.sign > 0)
     inside = metal.holds(np.asarray(centroids(model.mesh)))
     assert np.median(relative[inside]) > 10
     np.testing.assert_allclose(np.median(relative[~inside]), 1 + found.drift, rtol=1e-6)
@@ -145,15 +145,15 @@ def test_bodies_that_lie_on_each_other_do_not_cancel(model, frame, apart, ghosts
     result = reconstruct_shapes(
         model, frame, BATH, start=[*STARTS[:2], *pair], noise=0.03 * np.abs(frame), prior=StarPrior(apart=apart)
     )
-    assert (len(result.stars), len(result.doubtful)) == (4 - ghosts, ghosts)
+    assert (len(result.bodies), len(result.doubtful)) == (4 - ghosts, ghosts)
     grid = np.stack(np.meshgrid(*2 * [np.linspace(-RADIUS, RADIUS, 200)]), axis=-1)
-    covered = np.sum([one.holds(grid) for one in result.stars], axis=0)
+    covered = np.sum([one.holds(grid) for one in result.bodies], axis=0)
     assert ((covered > 1).mean() < 1e-3) == (ghosts == 2)
 
 
 def test_nothing_to_start_from_is_a_bath_that_drifted(model):
     result = reconstruct_shapes(model, model.voltages(1.1 * BATH), BATH, start=[])
-    assert result.stars == result.doubtful == ()
+    assert result.bodies == result.doubtful == ()
     np.testing.assert_allclose(result.drift, 0.1, atol=1e-3)
 
 
@@ -165,7 +165,7 @@ def test_nothing_to_start_from_is_a_bath_that_drifted(model):
         ({"start": [(1, (np.nan, 0), 0.01)]}, "centres finite"),
         ({"start": [(1, 0.01)]}, "start: give"),
         ({"start": 3}, "start: give"),
-        ({"prior": "smooth"}, "a StarPrior"),
+        ({"prior": "smooth"}, "such as StarPrior"),
         ({"least_rise": 0.5}, "least_rise"),
         ({"noise": -1.0}, "noise"),
         ({"background": -1.0}, "positive"),

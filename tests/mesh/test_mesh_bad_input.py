@@ -18,7 +18,7 @@ MESHES = {
     "no points": (lambda: Mesh.create(np.zeros((0, 2)), TWO), "empty"),
     "NaN": (lambda: Mesh.create([[0, 0], [1, np.nan], [1, 1], [0, 1]], TWO), "NaN or infinity, first node 1"),
     "tetrahedra in the plane": (lambda: Mesh.create(SQUARE, [[0, 1, 2, 3]]), "triangles of shape"),
-    "triangles in space": (lambda: Mesh.create(CUBE, [[0, 1, 2]]), "tetrahedra of shape"),
+    "edges in space": (lambda: Mesh.create(CUBE, [[0, 1]]), "tetrahedra of shape"),
     "no cells": (lambda: Mesh.create(SQUARE, np.zeros((0, 3), int)), "m > 0"),
     "indices that are floats": (lambda: Mesh.create(SQUARE, np.array(TWO, float)), "integers"),
     "one-based indices": (lambda: Mesh.create(SQUARE, np.array(TWO) + 1), "one-based"),

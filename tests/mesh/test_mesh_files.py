@@ -63,10 +63,10 @@ def test_unreadable_files(tmp_path, capfd):
         (tmp_path / name).write_text("this is not a mesh")
         with pytest.raises(ValueError, match=r"does not work as a mesh file.*\.vtu"):
             read(tmp_path / name)
-    points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.5]])
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.5], [0, -1, 0]])
     for cells, message in (
         ([("quad", [[0, 1, 2, 3]])], "linear triangles or tetrahedra"),
-        ([("triangle", [[0, 1, 2], [0, 2, 3]])], "surface in space"),
+        ([("triangle", [[0, 1, 2], [0, 1, 3], [0, 1, 4]])], "not manifold"),
         ([("triangle", [[0, 1, 2]]), ("quad", [[0, 1, 2, 3]])], "mixes in"),
     ):
         meshio.Mesh(points, cells).write(tmp_path / "other.vtk")

@@ -27,7 +27,13 @@ if TYPE_CHECKING:
 def reconstruct(
     data: Data,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Folder for image.png, image.npz, report.json.", show_default=False)
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Folder for image.png, image.npz, report.json and, of a solid, image.vtu.",
+            show_default=False,
+        ),
     ],
     reference: Reference = None,
     format: Format = None,
@@ -69,7 +75,7 @@ def reconstruct(
     model: Model = None,
     quiet: Quiet = False,
 ) -> None:
-    """Image what changed between REFERENCE and DATA; writes image.png, image.npz and report.json.
+    """Image what changed between REFERENCE and DATA; writes image.png, image.npz, report.json; of solids image.vtu.
 
     With --method network, how deep a skin is indented: frames.csv, depth.npz, depth.png and report.json.
 
@@ -129,7 +135,8 @@ def reconstruct(
         write_image(result, output)
     if not quiet:
         show(console, result)
-        say_written(console, output / "image.png", "image.npz", "report.json")
+        solid = ("image.vtu",) if result.mesh.dimension == 3 else ()
+        say_written(console, output / "image.png", "image.npz", "report.json", *solid)
 
 
 def show(console, result: "ImagedDifference") -> None:
@@ -176,9 +183,9 @@ def show(console, result: "ImagedDifference") -> None:
     if result.shapes is not None:
         left = f"; {counted(len(result.shapes.doubtful), 'ghost')} left out" if result.shapes.doubtful else ""
         drift = f"the background has drifted by {percent(result.shapes.drift)}"
-        strong = sum(not one.weak for one in result.shapes.stars)
+        strong = sum(not one.weak for one in result.shapes.bodies)
         assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""
-        rows.append(("bodies", f"{counted(len(result.shapes.stars), 'outline')} fitted{left}{assumed}; {drift}"))
+        rows.append(("bodies", f"{counted(len(result.shapes.bodies), 'outline')} fitted{left}{assumed}; {drift}"))
     if result.why:
         rows.append(("chosen, for", result.why))
     if unlike := result.unlike_electrodes:

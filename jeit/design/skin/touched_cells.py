@@ -11,7 +11,7 @@ from jeit.design.defaults import CONTRAST, MOST_CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
 from jeit.design.skin.touch_grid import check_places
 from jeit.electrodes.window import smooth_step
-from jeit.mesh import Mesh, centroids
+from jeit.mesh import Mesh, centroids, check_flat
 from jeit_solvers.engines import as_array, host
 
 
@@ -52,6 +52,7 @@ def touched_cells(
     A `contrast` above 1 is that of a conductor. Raises `ValueError` for places where no cell is touched, for an
     indentation as deep as the skin, and where `thickness` is missing or superfluous.
     """
+    check_flat(mesh, "these touches")
     middle = np.asarray(centroids(mesh))
     places = check_places(places)
     check_kind("indentation", indentation, AbstractIndentation, "an indentation, such as Bell() or Hemisphere()")

@@ -61,7 +61,7 @@ def blur_radius(
     """
     area = np.asarray(measures(mesh))
     eigenvalues, modes = np.asarray(spectrum.eigenvalues), np.asarray(spectrum.modes())
-    signals = np.asarray(spectrum.jacobian)[:, targets]
+    signals = np.asarray(spectrum.directions) @ np.asarray(spectrum.reduced)[:, targets]
     size = np.linalg.norm(signals, axis=0)
     strength = signal_to_noise * np.sqrt(len(signals)) / np.maximum(size, np.finfo(float).tiny)
     components = adjoint(np.asarray(spectrum.basis)) @ signals
@@ -85,7 +85,8 @@ def spread_cells(mesh: Mesh, number: int) -> Int[np.ndarray, " T"]:
     spacing = (size.sum() / number) ** (1 / mesh.dimension)
     counts = np.maximum(np.round((high - low) / spacing).astype(int), 1)
     steps = [a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, counts, strict=True)]
-    lattice = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, mesh.dimension)
+    lattice = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
     distance, nearest = (np.asarray(found) for found in KDTree(centre).query(lattice))
-    inside = distance <= size[nearest] ** (1 / mesh.dimension)
+    # A surface in space passes between the points of a lattice.
+    inside = distance <= (spacing / 2 if mesh.is_surface else size[nearest] ** (1 / mesh.dimension))
     return np.unique(nearest[inside] if inside.any() else nearest)

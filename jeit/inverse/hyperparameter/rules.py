@@ -86,7 +86,7 @@ def noise_figure(
     """
     candidates = spectrum.candidates()
     eigenvalues = np.asarray(spectrum.eigenvalues)
-    gain = np.sum(abs(np.asarray(spectrum.modes())) ** 2, axis=0)
+    gain = spectrum.squared_modes()
     passed = gain / (eigenvalues + candidates[:, None] ** 2) ** 2
     image = passed @ eigenvalues / passed.sum(axis=1)
     figure = np.sqrt(eigenvalues.sum() / spectrum.freedom / image)

@@ -1,8 +1,11 @@
 """GREIT: a reconstruction matrix trained on small targets, so that each is imaged as a smooth disc of one size.
 
 Adler et al., "GREIT: a unified approach to 2D linear EIT reconstruction of lung images", Physiol. Meas. 30 (2009)
-S35-S55. There the body is a disk; here the targets and their images follow the mesh, whatever its outline.
+S35-S55. There the body is a disk; here the targets and their images follow the mesh, whatever its outline; in a solid
+body they are balls.
 """
+
+from itertools import combinations
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,13 +19,15 @@ from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit.inverse.hyperparameter.greit_noise_figure import greit_noise_figure
 from jeit.inverse.linear.one_step import LinearReconstruction
-from jeit.inverse.linearisation import used_channels
-from jeit.mesh import Mesh, centroids, measures
+from jeit.inverse.linearisation import combined_blocks, data_directions, used_channels
+from jeit.mesh import Mesh, centroids, check_flat, measures
 
 # Desired images fall from their height to zero over this much of their radius to either side of it.
 _EDGE = 0.25
 # A training target counts if this share of it lies in the body.
 _INSIDE = 0.9
+# Cells of which a mean is taken, about.
+_ENOUGH = 10_000
 # Smaller targets are alike in a linear model, and cost points to sample them with.
 _LEAST = 0.01
 
@@ -39,22 +44,22 @@ def greit(
     target_radius: float = 0.05,
     num_targets: int = 1000,
 ) -> LinearReconstruction:
-    """GREIT reconstruction matrix R = XYᵀ(YYᵀ + λ²W⁻¹)⁻¹ of a plane body of any outline, at a background conductivity.
+    """GREIT reconstruction matrix R = XYᵀ(YYᵀ + λ²W⁻¹)⁻¹ of a body of any shape, at a background conductivity.
 
-    Trained on about `num_targets` small discs spread evenly over the body, on a hexagonal grid. Y holds their responses
-    to a change of one siemens, taken **from the Jacobian**: exact for small changes; the contrast of large ones is
-    underestimated, as in any linear image. X holds the images desired: discs of one radius with a smooth edge, cut
+    Trained on about `num_targets` small discs (3-D: balls) spread evenly over the body, on a hexagonal grid (3-D:
+    cubic). Y holds their responses to a change of one siemens, taken **from the Jacobian**: exact for small changes;
+    the contrast of large ones is underestimated, as in any linear image. X holds the images desired: discs of one radius with a smooth edge, cut
     off at the outline, each with as much change (its integral) as its target. Both are divided by √(number of targets).
 
     `radius` of the desired images and `target_radius` of the targets: fractions of the body's radius, that of the disc
-    with its area. `radius` is 1/√L unless given, 0.25 for 16 electrodes; smaller buys resolution with ringing and
-    noise. `hyperparameter`: λ itself, or "noise-figure": the λ at which the signal-to-noise ratio of the data is
-    `noise_figure` times that of the image, for a target in the middle of the body; 0.5 is what GREIT's authors agreed
-    on. Signal is the mean absolute value, over channels in units of their noise and over the body; noise is the root
+    with its area (3-D: of the ball with its volume). `radius` is 1/√L unless given, 0.25 for 16 electrodes; smaller
+    buys resolution with ringing and noise. `hyperparameter`: λ itself, or "noise-figure": the λ at which the
+    signal-to-noise ratio of the data is `noise_figure` times that of the image, for a target in the middle of the body;
+    0.5 is what GREIT's authors agreed on. Signal is the mean absolute value, over channels in units of their noise and over the body; noise is the root
     mean square standard deviation. `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in
     volts (or relative to each other). `mask`: True for the channels to use.
 
-    Raises `ValueError` for solids, for arguments that do not fit, and for a noise figure that no λ reaches.
+    Raises `ValueError` for arguments that do not fit, and for a noise figure that no λ reaches.
     """
     check_model(model)
     instead = (
@@ -62,8 +67,7 @@ def greit(
     )
     check_has_values("model, conductivity or noise", (model, conductivity, noise), "GREIT is trained on", instead)
     mesh = model.mesh
-    if mesh.dimension != 2:
-        raise ValueError("GREIT is for plane bodies, and this mesh is 3-D; use one_step, which takes either.")
+    check_flat(mesh, "GREIT's targets")
     radius = model.electrodes.num_electrodes**-0.5 if radius is None else radius
     _check(radius, target_radius, num_targets, hyperparameter, noise_figure)
     channels, root_weight = used_channels(model, noise, mask)
@@ -72,41 +76,60 @@ def greit(
     if np.shape(conductivity) not in ((), (mesh.num_cells,)):
         raise ValueError("conductivity: give one number, or one value per cell: the image has a value per cell.")
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
-    body_radius, middle = np.sqrt(measure.sum() / np.pi), measure @ centre / measure.sum()
+    body_radius, middle = _radius(measure.sum(), mesh.dimension), measure @ centre / measure.sum()
     position, covered = _targets(mesh, middle, target_radius * body_radius, num_targets)
     desired = _desired_images(mesh, position, covered.T @ measure, radius * body_radius)
-    jacobian = root_weight[:, None] * np.asarray(model.jacobian(conductivity))[channels]
-    response = jacobian @ covered / np.sqrt(len(position))
+    # In the directions that a body can move data in, of which there are fewer than channels.
+    directions = data_directions(model.protocol, channels, root_weight)
+    weighted = (np.asarray(root_weight)[:, None] * directions).T
+    response, shares = np.zeros((len(weighted), len(position))), covered.tocsr()
+    for cells, block in combined_blocks(model, conductivity, channels, weighted):
+        response += (shares[cells].T @ block.T).T / np.sqrt(len(position))
     eigenvalues, vectors = np.linalg.eigh(response @ response.T)
     eigenvalues = np.maximum(eigenvalues, 0)
     painted = desired @ (response.T @ vectors) / np.sqrt(len(position))
     if isinstance(hyperparameter, str):
         central = response[:, np.argmin(np.linalg.norm(position - middle, axis=1))]
-        level = float(np.abs(central).mean())
-        chosen = greit_noise_figure(noise_figure, eigenvalues, vectors.T @ central, level, painted, measure)
+        level = float(np.abs(directions @ central).mean())
+        some = slice(None, None, max(1, len(measure) // _ENOUGH))
+        signal = vectors.T @ central
+        chosen = greit_noise_figure(noise_figure, eigenvalues, signal, level, painted[some], measure[some])
     else:
         chosen = float(hyperparameter)
-    matrix = np.zeros((mesh.num_cells, model.protocol.num_measurements))
-    matrix[:, channels] = (painted / (eigenvalues + chosen**2)) @ vectors.T * root_weight
+    weights = np.zeros((len(eigenvalues), model.protocol.num_measurements))
+    weights[:, channels] = (vectors / (eigenvalues + chosen**2)).T @ directions.T * root_weight
     rule = "noise-figure" if isinstance(hyperparameter, str) else "given"
-    return LinearReconstruction.create(model, matrix, chosen, rule, "GREIT")
+    return LinearReconstruction.of_factors(model, (painted, weights), chosen, rule, "GREIT")
+
+
+def _radius(measure: float, dimension: int) -> float:
+    """Of the disc of an area, or the ball of a volume."""
+    return float(np.sqrt(measure / np.pi) if dimension == 2 else np.cbrt(3 * measure / (4 * np.pi)))
+
+
+def _ball(radius: float, dimension: int) -> float:
+    """Area of a disc, volume of a ball."""
+    return np.pi * radius**2 if dimension == 2 else 4 / 3 * np.pi * radius**3
 
 
 def _targets(mesh: Mesh, middle, radius: float, number: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
     """Centres (K, 2) of the targets that lie in the body, and the share of every cell that each covers (m, K)."""
     measure, points = np.asarray(measures(mesh)), np.asarray(mesh.points)
-    spacing = np.sqrt(2 / np.sqrt(3) * measure.sum() / number)
-    grid = _hexagonal(points.min(axis=0), points.max(axis=0), middle, spacing)
+    if mesh.dimension == 2:
+        spacing = np.sqrt(2 / np.sqrt(3) * measure.sum() / number)
+        grid = _hexagonal(points.min(axis=0), points.max(axis=0), middle, spacing)
+    else:
+        grid = _cubic(points.min(axis=0), points.max(axis=0), middle, np.cbrt(measure.sum() / number))
     samples, cell, share = _samples(mesh, radius / 4)
     pairs = KDTree(grid).sparse_distance_matrix(KDTree(samples), radius, output_type="ndarray")
     covered = scipy.sparse.coo_array(
         (share[pairs["j"]], (cell[pairs["j"]], pairs["i"])), shape=(mesh.num_cells, len(grid))
     ).tocsc()
-    inside = np.flatnonzero(covered.T @ measure > _INSIDE * np.pi * radius**2)
+    inside = np.flatnonzero(covered.T @ measure > _INSIDE * _ball(radius, mesh.dimension))
     if inside.size == 0:
         raise ValueError(
-            f"target_radius: no disc of {1e3 * radius:.3g} mm radius fits into this body; give a smaller one, or more "
-            "targets."
+            f"target_radius: no {'disc' if mesh.dimension == 2 else 'ball'} of {1e3 * radius:.3g} mm radius fits into "
+            "this body; give a smaller one, or more targets."
         )
     return grid[inside], covered[:, inside]
 
@@ -119,22 +142,32 @@ def _hexagonal(low, high, middle, spacing: float) -> np.ndarray:
     return middle + step * np.stack([column + row % 2 / 2, row], axis=-1).reshape(-1, 2)
 
 
+def _cubic(low, high, middle, spacing: float) -> np.ndarray:
+    """Points (k, 3) of a cubic grid about `middle` that covers the box from `low` to `high`."""
+    first, last = np.floor((low - middle) / spacing) - 1, np.ceil((high - middle) / spacing) + 1
+    steps = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
+    return middle + spacing * np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
 def _samples(mesh: Mesh, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (q, 2) spread evenly over every cell, about `spacing` apart, with their cells and their shares of these.
 
     The centres of the upright triangles that n cuts along each side leave: barycentric (i + 1/3, j + 1/3, k + 1/3) / n
-    with i + j + k = n - 1.
+    with i + j + k = n - 1; of tetrahedra likewise.
     """
     corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)
+    count = corners.shape[1]
+    longest = np.max(
+        [np.linalg.norm(corners[:, i] - corners[:, j], axis=1) for i, j in combinations(range(count), 2)], 0
+    )
     cuts = np.maximum(np.ceil(longest / spacing), 1).astype(int)
     points, owner, share = [], [], []
     for number in np.unique(cuts):
         cells = np.flatnonzero(cuts == number)
-        first, second = np.meshgrid(np.arange(number), np.arange(number))
-        first, second = (index[first + second < number] for index in (first, second))
-        barycentric = (np.stack([first, second, number - 1 - first - second], axis=1) + 1 / 3) / number
-        points.append((barycentric @ corners[cells]).reshape(-1, 2))
+        steps = np.stack(np.meshgrid(*[np.arange(number)] * (count - 1)), axis=-1).reshape(-1, count - 1)
+        steps = steps[steps.sum(axis=1) < number]
+        barycentric = (np.column_stack([steps, number - 1 - steps.sum(axis=1)]) + 1 / count) / number
+        points.append((barycentric @ corners[cells]).reshape(-1, corners.shape[2]))
         owner.append(np.repeat(cells, len(barycentric)))
         share.append(np.full(len(owner[-1]), 1 / len(barycentric)))
     return np.concatenate(points), np.concatenate(owner), np.concatenate(share)
@@ -148,7 +181,7 @@ def _desired_images(mesh: Mesh, position, area, radius: float) -> scipy.sparse.c
     height = (1 - np.sin(0.5 * np.pi * ramp)) / 2
     disc = scipy.sparse.coo_array((height, (pairs["i"], pairs["j"])), shape=(len(centre), len(position))).tocsc()
     total = disc.T @ measure
-    if not (total > 0.01 * np.pi * radius**2).all():
+    if not (total > 0.01 * _ball(radius, mesh.dimension)).all():
         raise ValueError(
             f"radius: a desired image of {1e3 * radius:.3g} mm radius is lost between the cells of this mesh; give a "
             "larger radius, or a finer mesh."

@@ -16,13 +16,17 @@ from jeit.inverse.hyperparameter.defaults import RULE
 from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.prior.priors import AbstractPrior
+from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array, has_values, is_forked, on_device, on_host
+
+# Cells that show which channels are tied, about.
+_ENOUGH = 4000
 
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["mesh", "first", "second", "ratio", "weights", "hyperparameter", "choice"],
+    data_fields=["mesh", "first", "second", "ratio", "weights", "hyperparameter", "choice", "mixing"],
     meta_fields=["num_measurements", "rule", "method"],
 )
 @dataclass(frozen=True, eq=False)
@@ -30,10 +34,12 @@ class LinearReconstruction:
     """A linear image reconstruction: change of conductivity = matrix · change of voltages.
 
     Two channels that reciprocity ties together (v_b = r v_a) have proportional columns in the matrix, so they are
-    added first and multiplied once: half the arithmetic, the same image.
+    added first and multiplied once: half the arithmetic, the same image. Where what is left is of fewer dimensions
+    than channels, these are mixed first.
 
     **Fields**: `mesh`; `first`, `second` (K,) the channels added to make each combined channel, and `ratio` (K,) the
-    weight of the second; `weights` (K, m), siemens per metre (2-D: siemens) per volt of combined channel;
+    weight of the second; `weights` (K, m), siemens per metre (2-D: siemens) per volt of combined channel, or, with a
+    `mixing` (K, r), (r, m) of its combinations;
     `hyperparameter` λ, and `rule`, how it was chosen; `method`, the name of the reconstruction; `choice`, all that was
     looked at in choosing λ and whether to trust it (`choice.note`), where λ came from `jeit.inverse.RULES` or a number.
     """
@@ -48,6 +54,29 @@ class LinearReconstruction:
     rule: str
     method: str
     choice: Choice | None = None
+    mixing: Inexact[Array, "K r"] | None = None
+
+    @classmethod
+    def of_factors(
+        cls,
+        model: ForwardModel,
+        factors: tuple[Inexact[np.ndarray, "m r"], Inexact[np.ndarray, "r M"]],
+        hyperparameter,
+        rule: str,
+        method: str,
+        choice: Choice | None = None,
+    ):
+        """From images and their weights, whose product is the reconstruction matrix, without it where it is larger."""
+        images, weights = factors
+        some = images[:: max(1, len(images) // _ENOUGH)]  # what ties channels ties them in every cell
+        first, second, ratio = _combine(model, some @ weights)
+        tied = (weights.T[first] + ratio[:, None] * weights.T[second]) / (1 + ratio**2)[:, None]
+        rows, mixing = (images.T, tied) if len(first) > images.shape[1] else (tied @ images.T, None)
+        places = as_array(first), as_array(second), as_array(ratio)
+        number = weights.shape[1]
+        mixed = None if mixing is None else as_array(mixing)
+        given = as_array(rows), as_array(hyperparameter, float), number, rule, method, choice, mixed
+        return cls(model.mesh, *places, *given)
 
     @classmethod
     def create(cls, model: ForwardModel, matrix, hyperparameter, rule: str, method: str, choice: Choice | None = None):
@@ -78,9 +107,10 @@ class LinearReconstruction:
     @property
     def matrix(self) -> Inexact[Array, "m M"]:
         """The full reconstruction matrix (m, M), zero in the columns of masked channels."""
-        full = jnp.zeros((self.num_measurements, self.weights.shape[1]), self.weights.dtype)
-        full = full.at[self.second].add(self.ratio[:, None] * self.weights)
-        return full.at[self.first].add(self.weights).T
+        weights = self.weights if self.mixing is None else self.mixing @ self.weights
+        full = jnp.zeros((self.num_measurements, weights.shape[1]), weights.dtype)
+        full = full.at[self.second].add(self.ratio[:, None] * weights)
+        return full.at[self.first].add(weights).T
 
     def image(self, difference: Inexact[Array, "*frames M"]) -> Inexact[Array, "*frames m"]:
         """Change of conductivity in every cell, for one difference of frames (M,) in volts or many (F, M).
@@ -106,13 +136,14 @@ class LinearReconstruction:
     @functools.cached_property
     def _parts(self) -> tuple[Any, ...]:
         """What an image takes, once and for all in NumPy: to ask for it frame by frame costs as much as a product."""
-        parts = (self.first, self.second, self.ratio, self.weights)
+        parts = (self.first, self.second, self.ratio, self.mixing, self.weights)
         return on_host(parts) if has_values(parts) else parts
 
 
 def _product(parts, difference) -> Any:
-    first, second, ratio, weights = parts
-    return (difference[..., first] + ratio * difference[..., second]) @ weights
+    first, second, ratio, mixing, weights = parts
+    combined = difference[..., first] + ratio * difference[..., second]
+    return (combined if mixing is None else combined @ mixing) @ weights
 
 
 @jax.jit
@@ -178,6 +209,10 @@ def one_step(
             f"hyperparameter: the rule '{choice.rule}' finds none, for numbers overflow; are noise and conductivity in "
             "volts and S/m (2-D: S)?"
         )
-    matrix = linear.matrix(choice.hyperparameter)
     method = f"one-step, {type(linear.prior).__name__} prior"
-    return LinearReconstruction.create(model, matrix, choice.hyperparameter, choice.rule, method, choice)
+    found = choice.hyperparameter, choice.rule, method, choice
+    if isinstance(linear.spectrum, Spectrum) and has_values(choice.hyperparameter):
+        factors = linear.factors(choice.hyperparameter)
+        del linear  # of a large body there is no room for both
+        return LinearReconstruction.of_factors(model, factors, *found)
+    return LinearReconstruction.create(model, linear.matrix(choice.hyperparameter), *found)

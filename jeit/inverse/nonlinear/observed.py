@@ -26,6 +26,7 @@ def independent_data(
     small = observed
     if has_values(observed.protocol):
         small = observed.with_protocol(observed.protocol.subset(np.asarray(channels.index)))
-    if at_once and model.at_once and has_values(small):
+    # Of a solid body compiled programs would hold the Jacobian several times over.
+    if at_once and (model.at_once or model.mesh.dimension == 3) and has_values(small):
         small, channels = on_host((small, channels))  # and so is all that is made of them
     return small, channels.weigh(deviation[kept]).combine(measured[kept])

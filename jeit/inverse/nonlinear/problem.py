@@ -2,10 +2,18 @@
 
 import equinox as eqx
 import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.forward import ForwardModel
-from jeit.forward.model import evaluate, voltages_and_jacobian_of, voltages_of
+from jeit.forward.model import (
+    channel_voltages,
+    evaluate,
+    fields_and_impedance_of,
+    jacobian_blocks,
+    voltages_and_jacobian_of,
+    voltages_of,
+)
 from jeit.inverse.channels import Data
 from jeit.inverse.nonlinear.links import AbstractLink
 from jeit.inverse.nonlinear.unknowns import AbstractUnknown
@@ -34,7 +42,8 @@ class Inversion(eqx.Module):
     @property
     def runs_at_once(self) -> bool:
         """Whether it can be solved in NumPy, for all of its values are at hand and nothing needs a derivative."""
-        return self.model.at_once and not self.unknowns and has_values(self)
+        in_pieces = self.model.at_once or namespace(self.model) is np
+        return in_pieces and not self.unknowns and has_values(self)
 
     @property
     def num_coefficients(self) -> int:
@@ -72,15 +81,26 @@ class Inversion(eqx.Module):
         shapes, values = self._parts(coefficients)
         model, estimate = self._situation(shapes, values)
         conductivity = self.link.conductivity(estimate)
-        voltages, jacobian = evaluate(model, voltages_and_jacobian_of, conductivity)
-        columns = [self.basis.restrict(jacobian * self.link.slope(estimate))]
+        if namespace(model, conductivity, self.basis) is np:
+            fields, impedance = evaluate(model, fields_and_impedance_of, conductivity)
+            voltages, slope = channel_voltages(model.protocol, impedance), self.link.slope(estimate)
+            blocks = jacobian_blocks(model.mesh, model.protocol, fields)
+            jacobian = self.basis.restrict_blocks((cells, block * slope[cells]) for cells, block in blocks)
+        else:
+            voltages, jacobian = evaluate(model, voltages_and_jacobian_of, conductivity)
+            jacobian = self.basis.restrict(jacobian * self.link.slope(estimate))
+        columns = [jacobian]
         if self.unknowns:
             along = jax.jacfwd(lambda values: self._predict(shapes, values))(values)
             columns += [block * unknown.deviation for block, unknown in zip(along, self.unknowns, strict=True)]
         weight, xp = self.data.weight, namespace(voltages, jacobian)
         # A factorisation may go well though some conductivities are below zero; no descent is to end there.
         residual = xp.where((conductivity > 0).all(), weight * (voltages - self.data.voltages), xp.nan)
-        return residual, weight[:, None] * xp.concatenate(columns, axis=1)
+        jacobian = xp.concatenate(columns, axis=1) if self.unknowns else jacobian
+        if xp is np:
+            jacobian *= weight[:, None]  # where it is: it may be all that there is room for
+            return residual, jacobian
+        return residual, weight[:, None] * jacobian
 
     def cost(self, coefficients: Float[Array, " n"]) -> Float[Array, ""]:
         """½ rᵀ G r + penalty."""

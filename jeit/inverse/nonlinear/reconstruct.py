@@ -1,5 +1,7 @@
 """`reconstruct`: the conductivity that explains a frame of voltages, by nonlinear least squares."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
-from jeit.forward.model import evaluate, voltages_of
+from jeit.forward.assembly import check_conductivity
+from jeit.forward.model import channel_voltages, evaluate, fields_and_impedance_of, jacobian_blocks, voltages_of
 from jeit.inverse.channels import Data
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
@@ -219,10 +222,7 @@ def pose(
     asked = prior.default_hyperparameter if hyperparameter is None else hyperparameter
     is_rule = isinstance(asked, str) or callable(asked)
     if prior.is_quadratic:
-        predicted, jacobian, known, slope = on_host(
-            (*model.voltages_and_jacobian(background), data, link.slope(reference))
-        )
-        seen = known.whiten(known.weight[:, None] * jacobian * slope)
+        predicted, seen, known = _whitened(model, data, background, link.slope(reference))
         spectrum = difference = None
         if is_rule:
             spectrum = Spectrum.create(seen, prior.covariance_product(mesh, seen), prior.null_space(mesh))
@@ -236,6 +236,21 @@ def pose(
     basis, penalty = prior.penalty(mesh, reference, weight, jacobian=seen, regions=regions, per_cell=per_cell)
     inversion = Inversion(model, data, link, reference, basis, penalty, parametrisation.unknowns)
     return inversion if namespace(model) is np else on_device(inversion), choice
+
+
+def _whitened(model: ForwardModel, data: Data, background, slope):
+    """Voltages of the background, the whitened Jacobian there on the link's scale, and the data, in NumPy if known."""
+    if not has_values(model, data, background, slope):
+        voltages, jacobian = model.voltages_and_jacobian(background)
+        return voltages, data.whiten(data.weight[:, None] * jacobian * slope), data
+    known, slope = on_host((data, slope))
+    fields, impedance = on_host(evaluate(model, fields_and_impedance_of, check_conductivity(model.mesh, background)))
+    mesh, protocol = on_host((model.mesh, model.protocol))
+    weights = known.whiten(np.diag(known.weight))
+    seen: Any = np.empty((len(weights), mesh.num_cells))
+    for cells, block in jacobian_blocks(mesh, protocol, fields):
+        seen[:, cells] = weights @ (block * slope[cells])
+    return channel_voltages(protocol, impedance), seen, known
 
 
 def _continued(start, inversion: Inversion, choice: Choice) -> Float[Array, " n"]:

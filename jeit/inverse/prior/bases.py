@@ -5,13 +5,18 @@ narrow one (a covariance of low rank) keeps what the prior holds possible and le
 """
 
 import abc
+import functools
+import operator
+from collections.abc import Iterable
+from typing import Any
 
 import equinox as eqx
 import numpy as np
+import scipy.sparse
 from jaxtyping import Array, Float, Int
 
 from jeit.mesh import Mesh, centroids, measures
-from jeit_solvers.engines import host, namespace, sum_into
+from jeit_solvers.engines import gather, host, namespace, sum_into
 
 
 class AbstractBasis(eqx.Module):
@@ -29,6 +34,18 @@ class AbstractBasis(eqx.Module):
     @abc.abstractmethod
     def restrict(self, rows: Float[Array, "M m"]) -> Float[Array, "M n"]:
         """Rows times S."""
+
+    def restrict_blocks(self, blocks: Iterable[tuple[slice, Any]]) -> Any:
+        """Rows (M, m) times S, given some cells after others, in NumPy: an array (M, n) of its own."""
+        cells, columns = zip(*blocks, strict=True)
+        whole: Any = np.empty((len(columns[0]), cells[-1].stop), columns[0].dtype)
+        for where, block in zip(cells, columns, strict=True):
+            whole[:, where] = block
+        return np.array(self.restrict(whole))
+
+    @abc.abstractmethod
+    def variance(self) -> Float[Array, " m"]:
+        """Of every cell before the data are seen, the diagonal of S Sᵀ, and of what the shapes leave out."""
 
     @abc.abstractmethod
     def scaled(self, factor) -> "AbstractBasis":
@@ -57,6 +74,19 @@ class DiagonalBasis(AbstractBasis):
         """Columns times the deviations."""
         return rows * self.deviation
 
+    def restrict_blocks(self, blocks):
+        """Columns times the deviations."""
+        found: list[np.ndarray] = []
+        for cells, block in blocks:
+            if not found:
+                found.append(np.empty((len(block), len(self.deviation)), block.dtype))
+            np.multiply(block, self.deviation[cells], out=found[0][:, cells])
+        return found[0]
+
+    def variance(self):
+        """Squares of the deviations."""
+        return self.deviation**2
+
     def scaled(self, factor):
         """Deviations times a number."""
         return DiagonalBasis(self.deviation * factor)
@@ -70,9 +100,11 @@ class DenseBasis(AbstractBasis):
     """Shapes in the columns of a matrix: S = `shapes` (m, n).
 
     Products are taken in the shapes' own precision: single, where a millionth does not matter and time does.
+    `left_out` (m,): variance of cells that the shapes are known to leave out; none unless given.
     """
 
     shapes: Float[Array, "m n"]
+    left_out: Float[Array, " m"] | None = None
 
     @property
     def num_coefficients(self) -> int:
@@ -87,13 +119,75 @@ class DenseBasis(AbstractBasis):
         """Rows times the matrix."""
         return (rows.astype(self.shapes.dtype) @ self.shapes).astype(rows.dtype)
 
+    def restrict_blocks(self, blocks):
+        """Rows times the matrix, added up."""
+        total = sum(block.astype(self.shapes.dtype) @ self.shapes[cells] for cells, block in blocks)
+        return np.asarray(total, float)
+
+    def variance(self):
+        """Sums of the shapes' squares, and what they leave out."""
+        xp = namespace(self)
+        within = xp.einsum("mn,mn->m", self.shapes, self.shapes)
+        return within if self.left_out is None else within + self.left_out
+
     def scaled(self, factor):
         """The matrix times a number."""
-        return DenseBasis(self.shapes * factor)
+        kind = self.shapes.dtype
+        left_out = None if self.left_out is None else self.left_out * factor**2
+        return DenseBasis((self.shapes * factor).astype(kind), left_out)
 
     def pooled(self, regions):
         """Shapes that are constant in every region."""
         return DenseBasis(regions.spread(regions.mean(self.shapes)))
+
+
+class NodalBasis(AbstractBasis):
+    """One coefficient for each node, of which a cell has the mean: S c of P1 functions c at the cells' centres.
+
+    **Fields**: `cells` (m, k) of the mesh; `number` of its nodes.
+    """
+
+    cells: Int[Array, "m k"]
+    number: int = eqx.field(static=True)
+
+    @property
+    def num_coefficients(self) -> int:
+        """One for each node."""
+        return self.number
+
+    def expand(self, coefficients):
+        """Means over the cells' nodes."""
+        return gather(coefficients, self.cells).mean(axis=1)
+
+    def restrict(self, rows):
+        """Columns, in equal parts, to the cells' nodes."""
+        parts = rows.T / self.cells.shape[1]
+        shape = self.number, len(rows)
+        corners = [sum_into(shape, self.cells[:, k], parts) for k in range(self.cells.shape[1])]
+        return functools.reduce(operator.add, corners).T
+
+    def restrict_blocks(self, blocks):
+        """The same, some cells after others."""
+        total: Any = 0.0
+        count = self.cells.shape[1]
+        for cells, block in blocks:
+            nodes = np.asarray(self.cells[cells])
+            to = np.arange(0, nodes.size + 1, count), (len(nodes), self.number)
+            means = scipy.sparse.csr_array((np.full(nodes.size, 1 / count), nodes.ravel(), to[0]), shape=to[1])
+            total = total + means.T @ block.T
+        return np.ascontiguousarray(np.asarray(total).T)
+
+    def variance(self):
+        """Of means of independent nodes."""
+        return namespace(self).full(len(self.cells), 1 / self.cells.shape[1])
+
+    def scaled(self, factor):
+        """Not to be had: nodes have no scale of their own. Raises `ValueError`."""
+        raise ValueError("A basis of nodes has no scale; weigh the penalty.")
+
+    def pooled(self, regions):
+        """Not to be had. Raises `ValueError`."""
+        raise ValueError("regions: images of nodes have none; leave them out.")
 
 
 class Regions(eqx.Module):
@@ -176,6 +270,10 @@ class RegionBasis(AbstractBasis):
     def restrict(self, rows):
         """Columns added up over every region."""
         return self.regions.total(rows.T).T * self.deviation
+
+    def variance(self):
+        """Squares of the regions' deviations."""
+        return self.regions.spread(self.deviation**2)
 
     def scaled(self, factor):
         """Deviations times a number."""

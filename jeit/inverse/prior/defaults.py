@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from jeit.inverse.prior.matern import Matern
 from jeit.inverse.prior.priors import AbstractPrior, Gaussian, Laplace, Noser, Tikhonov
 
 PRIOR = Noser()
@@ -20,5 +21,6 @@ PRIORS: dict[str, Callable[[float], AbstractPrior]] = {
     "laplace": lambda size: Laplace(),
     "noser": lambda size: Noser(),
     "gaussian": smooth_prior,
+    "matern": lambda size: Matern(smooth_prior(size).length),
 }
 """Quadratic priors by name, made for a body of a given size: its longer side, metres."""

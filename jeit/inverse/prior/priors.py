@@ -6,6 +6,8 @@ any generalised inverse and the null space is estimated from the data without pe
 """
 
 import abc
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +22,9 @@ from scipy.spatial.distance import cdist
 from jeit.arguments import check_has_values
 from jeit.inverse.hyperparameter.defaults import RULE
 from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, Regions
+from jeit.inverse.prior.gridded import GriddedGaussian
 from jeit.inverse.prior.low_rank import pivoted_cholesky, traced_pivoted_cholesky
+from jeit.inverse.prior.nodal import NodalSystem
 from jeit.inverse.prior.penalty import AbstractPenalty, QuadraticForm, Ridge
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geometry import interior_facets
@@ -31,6 +35,9 @@ from jeit_solvers.engines import has_values, host, on_host
 _BLOCK = 512
 # Of a Gaussian prior's variance, the share that its shapes may leave out, and their greatest number.
 _LEFT_OUT, _MOST_SHAPES = 1e-3, 2000
+# Cells beyond which images are made of no more shapes than data tell of, and neighbours are those of nodes; what of a
+# shape's variance, relative to the largest, data tell nothing of.
+_MANY, _NOTHING = 30_000, 1e-12
 # Precision given to the constant image where it would have none, relative to a step between neighbouring cells.
 _FREEDOM = 1e-6
 
@@ -70,7 +77,8 @@ class AbstractPrior(eqx.Module):
         """
         assert jacobian is not None  # a quadratic prior may look at it
         if not per_cell:
-            basis = self.basis(mesh, jacobian).scaled(1 / hyperparameter)
+            many = mesh.num_cells > _MANY and has_values(mesh, jacobian, self)
+            basis = (self.informed_basis if many else self.basis)(mesh, jacobian).scaled(1 / hyperparameter)
             return basis if regions is None else basis.pooled(regions), Ridge()
         if regions is not None:
             raise ValueError("regions: bounded solvers take every cell; use link=Bounded(lower, upper) instead.")
@@ -94,6 +102,15 @@ class AbstractPrior(eqx.Module):
     def basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
         """S with Γ = S Sᵀ, for nonlinear reconstructions; where Q has a null space, a wide prior stands for none."""
 
+    def informed_basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
+        """The part of S that data tell of at the background, for bodies of many cells."""
+        rows: Any = np.asarray(jacobian)
+        return informed_shapes(rows, lambda columns: self.covariance_product(mesh, columns.T), self.variance(mesh))
+
+    def variance(self, mesh: Mesh) -> Float[np.ndarray, " m"] | None:
+        """Of every cell, the diagonal of Γ, where that is known."""
+        return None
+
     def null_space(self, mesh: Mesh) -> Float[Array, "m p"]:
         """Basis of the images that cost nothing; none unless a prior says otherwise."""
         return host.zeros((mesh.num_cells, 0))
@@ -113,6 +130,10 @@ class Tikhonov(AbstractPrior):
     def basis(self, mesh, jacobian):
         """Every cell on its own."""
         return DiagonalBasis(host.ones(mesh.num_cells))
+
+    def informed_basis(self, mesh, jacobian):
+        """The same: it takes no room."""
+        return self.basis(mesh, jacobian)
 
 
 class Noser(AbstractPrior):
@@ -141,16 +162,24 @@ class Noser(AbstractPrior):
         """Every cell on its own."""
         return DiagonalBasis((abs(jacobian) ** 2).sum(axis=0) ** (-self.exponent / 2))
 
+    def informed_basis(self, mesh, jacobian):
+        """The same: it takes no room."""
+        return self.basis(mesh, jacobian)
+
 
 class Laplace(AbstractPrior):
     """Laplace smoothness: Q = 2 × graph Laplacian of face-neighbouring cells, xᵀQx = 2 Σ (x_i - x_j)².
 
-    Unweighted by geometry, as the field has it; a constant image costs nothing.
+    Unweighted by geometry, as the field has it; a constant image costs nothing. Of a solid body of more than 30,000
+    cells, whose graph has no factor of a size to keep, neighbours are nodes that share an edge, and a cell has their
+    mean.
     """
 
     def covariance_product(self, mesh, jacobian):
-        """Γ Jᵀ with the generalised inverse that grounds cell 0."""
+        """Γ Jᵀ with the generalised inverse that grounds cell 0, or node 0."""
         check_cells(mesh)
+        if mesh.dimension == 3 and mesh.num_cells > _MANY and has_values(mesh, jacobian):
+            return host.asarray(_between_nodes(mesh, np.asarray(jacobian).T, 0.0))
         pairs, _ = interior_facets(mesh)
         pattern, plan = on_host(cell_factorisation(mesh, [pairs, np.zeros((1, 1), int)]))
         link = host.broadcast_to(np.array([[2.0, -2.0], [-2.0, 2.0]]), (len(pairs), 2, 2))
@@ -176,6 +205,13 @@ class Laplace(AbstractPrior):
         lower = scipy.linalg.cholesky(precision, lower=True)
         return DenseBasis(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
 
+    def informed_basis(self, mesh, jacobian):
+        """As of any prior, the constant image nearly free."""
+        if mesh.dimension != 3:
+            return self.basis(mesh, jacobian)
+        free = partial(_between_nodes, mesh, freedom=_FREEDOM)
+        return informed_shapes(np.asarray(jacobian), free, None)
+
     def null_space(self, mesh):
         """The constant image."""
         return host.ones((mesh.num_cells, 1))
@@ -195,10 +231,12 @@ class Gaussian(AbstractPrior):
             raise ValueError(f"length must be positive, in metres; it is {self.length}.")
 
     def covariance_product(self, mesh, jacobian):
-        """Γ Jᵀ, a block of rows at a time: Γ is dense and is not kept."""
+        """Γ Jᵀ, a block of rows at a time, for Γ is dense and is not kept; of many cells by way of a grid."""
         scaled = centroids(mesh) / (np.sqrt(2) * self.length)
         if not has_values(scaled, jacobian):
             return _traced_product(jnp.asarray(scaled), jnp.asarray(jacobian))
+        if mesh.num_cells > _MANY and GriddedGaussian.suits(places := np.asarray(centroids(mesh)), float(self.length)):
+            return host.asarray(GriddedGaussian(places, float(self.length)).product(np.asarray(jacobian).T))
         scaled = np.asarray(scaled)
         rows = np.split(scaled, np.arange(_BLOCK, len(scaled), _BLOCK))
         return host.concatenate([np.exp(-cdist(row, scaled, "sqeuclidean")) @ np.asarray(jacobian).T for row in rows])
@@ -220,12 +258,47 @@ class Gaussian(AbstractPrior):
         ones = np.ones(len(centres))
         return DenseBasis(host.asarray(pivoted_cholesky(ones, column, tolerance=_LEFT_OUT, max_rank=_MOST_SHAPES)))
 
+    def variance(self, mesh):
+        """One."""
+        return np.ones(mesh.num_cells)
+
     def precision(self, mesh, jacobian):
         """Not to be had: the inverse of a Gaussian covariance is dense and ill-conditioned. Raises `ValueError`."""
         raise ValueError(
             "prior: Gaussian has no usable precision matrix, which bounds need; take Noser, Tikhonov, Laplace or "
             "TotalVariation, or link=Bounded(lower, upper) in place of bounds."
         )
+
+
+def informed_shapes(
+    jacobian: Float[np.ndarray, "M m"],
+    covariance: Callable[[Float[np.ndarray, "m M"]], Any],
+    variance: Float[np.ndarray, " m"] | None,
+) -> DenseBasis:
+    """ΓJᵀ(JΓJᵀ)^-½, no more shapes than data, from a function that multiplies with Γ; `variance`: its diagonal, where
+    that is known. In single precision, which alters an image by a millionth."""
+    product = np.asarray(covariance(jacobian.T))
+    inner = jacobian @ product
+    size, vectors = np.linalg.eigh((inner + inner.T) / 2)
+    kept = size > _NOTHING * size[-1]
+    shapes = (product @ (vectors[:, kept] / np.sqrt(size[kept]))).astype(np.float32)
+    if variance is None:
+        return DenseBasis(host.asarray(shapes))
+    seen = np.einsum("mn,mn->m", shapes, shapes)
+    return DenseBasis(host.asarray(shapes), host.asarray(np.maximum(variance - seen, 0)))
+
+
+def _between_nodes(mesh: Mesh, columns: Float[np.ndarray, "m k"], freedom: float) -> Float[np.ndarray, "m k"]:
+    """Γ times columns for twice the graph Laplacian of nodes that share an edge, node 0 grounded, or with a little
+    `freedom` for all."""
+    system = NodalSystem.create(mesh)
+    neighbours = system.pattern.to_scipy(np.ones(system.pattern.num_entries))
+    diagonal = 2 * (np.asarray(neighbours.sum(axis=1)).ravel() - 1) + freedom
+    if not freedom:
+        diagonal[0] += 2
+    values = np.full(system.pattern.num_entries, -2.0)
+    values[: len(diagonal)] = diagonal
+    return system.means @ system.inverse(values)(system.means.T @ columns)
 
 
 @jax.jit

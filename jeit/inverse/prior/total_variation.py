@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from jeit.inverse.hyperparameter.defaults import EDGE_PRICE
 from jeit.inverse.prior.bases import DiagonalBasis
+from jeit.inverse.prior.nodal_total_variation import NodalTotalVariation
 from jeit.inverse.prior.penalty import AbstractPenalty
 from jeit.inverse.prior.priors import AbstractPrior, cell_factorisation, check_cells
 from jeit.mesh import measures
@@ -29,6 +30,7 @@ _LEVEL = 1e-3
 class TotalVariation(AbstractPrior):
     """The prior of `reconstruct` for images of few pieces.
 
+    In a solid body the image is linear between its nodes, and a cell has their mean; in a sheet every cell has its own.
     `smoothing` β: jumps below it, on the link's scale (`Log()`: relative), cost by their square. Its energy is not
     quadratic, so linear images and the rules that choose λ have no use for it: λ is a number, 300 unless given. Raises
     `ValueError` for a smoothing that is not positive.
@@ -68,6 +70,8 @@ class TotalVariation(AbstractPrior):
         if regions is not None:
             raise ValueError("regions: total variation finds its own; leave them out, or take another prior.")
         check_cells(mesh)
+        if mesh.dimension == 3 and not per_cell and has_values(mesh):
+            return NodalTotalVariation.create(mesh, reference, hyperparameter, self.smoothing, _LEVEL)
         pairs, nodes = interior_facets(mesh)
         points = on_host(mesh.points)
         xp = namespace(points, hyperparameter, self.smoothing)

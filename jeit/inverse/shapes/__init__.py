@@ -1,6 +1,15 @@
 """Bodies as shapes with few parameters: what is told of a body where voltages tell too little for an image."""
 
+from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior
 from jeit.inverse.shapes.search import LEAST_RISE, ShapeReconstruction, reconstruct_shapes
 from jeit.inverse.shapes.star import Star, StarPrior
 
-__all__ = ["LEAST_RISE", "ShapeReconstruction", "Star", "StarPrior", "reconstruct_shapes"]
+__all__ = [
+    "LEAST_RISE",
+    "Ellipsoid",
+    "EllipsoidPrior",
+    "ShapeReconstruction",
+    "Star",
+    "StarPrior",
+    "reconstruct_shapes",
+]

@@ -1,6 +1,6 @@
-"""Least squares for the coefficients of stars: ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², r = w (v(σ(c)) - ŷ).
+"""Least squares for the coefficients of bodies: ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², r = w (v(σ(c)) - ŷ).
 
-How well some stars explain the data, number and kind open, is told by the evidence, the probability of the data
+How well some bodies explain the data, number and kind open, is told by the evidence, the probability of the data
 whatever the coefficients. By Laplace's approximation at the least cost, -log evidence = cost + ½ log det H + const,
 with H = 1 + JᵀC⁻¹J the Hessian in units of the prior: every coefficient costs as much as it has to be told precisely.
 MacKay, Neural Computation 4 (1992) 415, section 2.
@@ -18,14 +18,14 @@ from jaxtyping import Float
 from jeit.forward import ForwardModel
 from jeit.forward.changes import Change, solved_fields
 from jeit.inverse.channels import Data
-from jeit.inverse.shapes.star import Stars
+from jeit.inverse.shapes.bodies import Bodies
 from jeit_solvers import Descent, QuadraticModel, ridge_model
 
 
 class Fit(NamedTuple):
-    """Stars and their `coefficients` (n,) of least `cost`."""
+    """Bodies and their `coefficients` (n,) of least `cost`."""
 
-    stars: Stars
+    bodies: Bodies
     coefficients: Float[np.ndarray, " n"]
     cost: float
 
@@ -38,14 +38,14 @@ class ShapeProblem:
     data: Data
     background: Float[np.ndarray, " m"]
 
-    def linearise(self, coefficients: Float[np.ndarray, " n"], stars: Stars) -> tuple[Any, Any, Any, Any]:
+    def linearise(self, coefficients: Float[np.ndarray, " n"], bodies: Bodies) -> tuple[Any, Any, Any, Any]:
         """Residual (r + p,), a function that gives its Jacobian (r + p, n), covariance and precision (r + p, r + p)."""
-        image, slopes, overlap, overlap_slope = stars.image(coefficients)
+        image, slopes, overlap, overlap_slope = bodies.image(coefficients)
         conductivity = self.background * np.exp(image)
         fields = solved_fields(self.model, conductivity)
         weight = np.asarray(self.data.weight)
-        # That stars keep apart is one more datum of unit variance for every two of them.
-        apart, more = stars.prior.apart, np.eye(len(overlap))
+        # That bodies keep apart is one more datum of unit variance for every two of them.
+        apart, more = bodies.prior.apart, np.eye(len(overlap))
 
         def jacobian():
             changes = [Change(cells, conductivity[cells, None] * slope) for cells, slope in slopes]
@@ -58,9 +58,9 @@ class ShapeProblem:
             scipy.linalg.block_diag(self.data.precision, more),
         )
 
-    def quadratic_model(self, coefficients: Float[np.ndarray, " n"], stars: Stars) -> QuadraticModel:
+    def quadratic_model(self, coefficients: Float[np.ndarray, " n"], bodies: Bodies) -> QuadraticModel:
         """Cost and step, for `jeit_solvers.Descent`; points that are refused need no Jacobian."""
-        residual, jacobian, covariance, precision = self.linearise(coefficients, stars)
+        residual, jacobian, covariance, precision = self.linearise(coefficients, bodies)
         cost = 0.5 * (residual @ precision @ residual + coefficients @ coefficients)
 
         def step(damping):
@@ -68,16 +68,22 @@ class ShapeProblem:
 
         return cost, step
 
-    def fit(self, stars: Stars, start: Float[np.ndarray, " n"], max_steps: int, rtol: float = 3e-3) -> Fit:
+    def fit(self, bodies: Bodies, start: Float[np.ndarray, " n"], max_steps: int, rtol: float = 3e-3) -> Fit:
         """The least cost near `start`, by Levenberg-Marquardt."""
         descent = Descent(rtol=rtol, damping=1.0, history=max_steps + 1)
-        coefficients, state = descent.at_once(self.quadratic_model, start, stars, max_steps)
-        return Fit(stars, coefficients, float(state.cost))
+        coefficients, state = descent.at_once(self.quadratic_model, start, bodies, max_steps)
+        return Fit(bodies, coefficients, float(state.cost))
 
     def surprise(self, fit: Fit) -> float:
-        """-log evidence of some stars, up to a constant, with the odds against weak ones."""
-        _, jacobian, _, precision = self.linearise(fit.coefficients, fit.stars)
+        """-log evidence of some bodies, up to a constant, with the odds against their kinds."""
+        return fit.cost + 0.5 * float(np.linalg.slogdet(self._hessian(fit))[1]) + fit.bodies.odds
+
+    def deviations(self, fit: Fit) -> Float[np.ndarray, " n"]:
+        """Standard deviations of the coefficients after the data, by Laplace's approximation."""
+        return np.sqrt(np.diag(np.linalg.inv(self._hessian(fit))))
+
+    def _hessian(self, fit: Fit) -> Float[np.ndarray, "n n"]:
+        """H at the least cost."""
+        _, jacobian, _, precision = self.linearise(fit.coefficients, fit.bodies)
         rows = jacobian()
-        hessian = np.eye(len(fit.coefficients)) + rows.T @ (precision @ rows)
-        odds = fit.stars.weak.sum() * np.log(fit.stars.prior.odds_against_weak)
-        return fit.cost + 0.5 * float(np.linalg.slogdet(hessian)[1]) + float(odds)
+        return np.eye(len(fit.coefficients)) + rows.T @ (precision @ rows)

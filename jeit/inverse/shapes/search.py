@@ -14,8 +14,11 @@ from jeit.arguments import check_has_values, check_kind, is_number, told
 from jeit.forward import ForwardModel
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
 from jeit.inverse.nonlinear.observed import independent_data
+from jeit.inverse.shapes.bodies import Bodies, BodyPrior
+from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior, Ellipsoids
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
+from jeit.mesh import check_flat
 from jeit_solvers.engines import as_array
 
 # How many times the objective must rise, at least, when a body is left out and the others fitted again.
@@ -24,27 +27,33 @@ _FIRST_STEPS, _STEPS, _STEPS_WITHOUT, _STEPS_TRIED = 15, 40, 8, 6
 _ROUGHLY = 1e-2
 # How many times the objective rises at least without a body that is one beyond doubt.
 _SURELY = 10.0
-# Directions, from its longer axis, along which a star is split in two; and how many changes are made at most.
-_ACROSS, _MOST_CHANGES = (0.0, np.pi / 2), 10
+# How many changes of their number or kind are made at most.
+_MOST_CHANGES = 10
 # How much likelier (of the logarithm) more has to make the data than less, to be told.
 _MARGIN = 2.0
+
+
+Body = Star | Ellipsoid
 
 
 class ShapeReconstruction(eqx.Module):
     """What `reconstruct_shapes` found.
 
-    **Fields**: `stars`, the bodies, those that explain most first; `conductivity` (m,), S/m (2-D: S); `voltages` (M,),
-    what the model predicts for it; `misfit`, root mean square of predicted - measured over the channels used, in
-    standard deviations; `drift`, how many times as conductive as its `background` the bath is, less one; `doubtful`,
-    bodies that were started from and left out again, their `rise` too small.
+    **Fields**: `bodies`, `Star`s of a sheet and `Ellipsoid`s of a solid, those that explain most first; `conductivity`
+    (m,), S/m (2-D: S); `voltages` (M,), what the model predicts for it; `misfit`, root mean square of predicted -
+    measured over the channels used, in standard deviations; `drift`, how many times as conductive as its `background`
+    the bath is, less one; `doubtful`, bodies that were started from and left out again, their `rise` too small;
+    `contrast_deviations`, standard deviation of each body's contrast, after the data and as far as noise is all that is
+    wrong.
     """
 
-    stars: tuple[Star, ...]
+    bodies: tuple[Body, ...]
     conductivity: Float[Array, " m"]
     voltages: Float[Array, " M"]
     misfit: Float[Array, ""]
     drift: float
-    doubtful: tuple[Star, ...]
+    doubtful: tuple[Body, ...]
+    contrast_deviations: tuple[float, ...]
 
     @property
     def hyperparameter(self) -> float:
@@ -70,136 +79,140 @@ def reconstruct_shapes(
     start: Sequence[tuple[int, Sequence[float], float]],
     noise: Float[Array, " M"] | float | None = None,
     mask: Bool[Array, " M"] | None = None,
-    prior: StarPrior | None = None,
+    prior: BodyPrior | None = None,
     least_rise: float = LEAST_RISE,
 ) -> ShapeReconstruction:
-    """The bodies, as star shapes, that explain measured `voltages` (M,), in volts, of a sheet or tank.
+    """The bodies, star shapes in a sheet and ellipsoids in a solid, that explain measured `voltages` (M,), in volts.
 
     - `background`: conductivity without them, one number or (m,), S/m (2-D: S); what it has drifted is estimated.
-    - `start`: sign, centre (x, y) and radius, metres, of every body that may be there, such as of all the inclusions
-      of an image; too many do no harm, and two that are one there are told apart; where none is, none is added.
-    - `noise`, `mask`: as in `jeit.inverse.reconstruct`. `prior`: `StarPrior()` unless given.
+    - `start`: sign, centre (x, y) or (x, y, z) and radius, metres, of every body that may be there, such as of all the
+      inclusions of an image; too many do no harm, and two that are one there are told apart; where none is, none is
+      added.
+    - `noise`, `mask`: as in `jeit.inverse.reconstruct`.
+    - `prior`: `StarPrior()` of sheets, `EllipsoidPrior()` of solids, unless given.
     - `least_rise`: bodies whose loss raises the objective less than so many times are taken for ghosts; and those whose
       evidence is not for them.
 
-    All are fitted together, as strong disks first. Then one after the other is left out and the rest fitted again, and
-    that which is missed least goes, for as long as it is missed so little. What errors of the model and electrodes gone
-    missing make of themselves is missed little, for other bodies can take its place. Of what is left, each is split in
-    two, or taken for weak, where the evidence is for it (`ShapeProblem.surprise`): once splits first, once weak ones
-    first, and the better of the two is kept.
+    All are fitted together, as strong disks or balls first. Then one after the other is left out and the rest fitted
+    again, and that which is missed least goes, for as long as it is missed so little. What errors of the model and
+    electrodes gone missing make of themselves is missed little, for other bodies can take its place. Of what is left,
+    each is split in two, or taken for weak, where the evidence is for it (`ShapeProblem.surprise`): once splits first,
+    once weak ones first, and the better of the two is kept.
 
-    Raises `ValueError` for arguments that do not fit, and for solids.
+    Raises `ValueError` for arguments that do not fit.
 
     Kolehmainen, Arridge, Lionheart, Vauhkonen and Kaipio, Inverse Problems 15 (1999) 1375, boundaries by Fourier
     coefficients; the choice by evidence is jeit's own.
     """
     measured, used = check_frame(model, voltages, mask)
     check_has_values("reconstruct_shapes", (model, measured), "bodies are chosen by comparison", "take reconstruct")
-    if model.mesh.dimension != 2:
-        raise ValueError(
-            "reconstruct_shapes: star shapes are for sheets and tanks in two dimensions; take reconstruct."
-        )
+    check_flat(model.mesh, "star shapes")
     background = np.asarray(check_background(model, background))
     deviation = check_noise(noise, measured, used)
-    prior = StarPrior() if prior is None else prior
-    check_kind("prior", prior, StarPrior, "a StarPrior, such as StarPrior(modes=4)")
+    form, kind = (Stars, StarPrior) if model.mesh.dimension == 2 else (Ellipsoids, EllipsoidPrior)
+    prior = kind() if prior is None else prior
+    check_kind("prior", prior, kind, f"one of bodies of that dimension, such as {kind.__name__}(modes=2)")
     if not (is_number(least_rise) and least_rise >= 1):
         raise ValueError(f"least_rise must be a number from 1; it is {told(least_rise)}.")
-    sign, centre, radius = _checked_start(start)
+    sign, centre, radius = _checked_start(start, model.mesh.dimension)
     small, data = independent_data(model, measured, used, deviation, at_once=True)
     problem = ShapeProblem(small, data, background)
-    stars = Stars.create(model.mesh, prior, centre, sign)
-    fitted = problem.fit(*_grown(problem, stars, stars.of_radii(radius), _FIRST_STEPS), _STEPS)
+    bodies = form.create(model.mesh, prior, centre, sign)
+    fitted = problem.fit(*_grown(problem, bodies, bodies.of_radii(radius), _FIRST_STEPS), _STEPS)
     found = _without_ghosts(problem, fitted, (), least_rise)
     changes = [_in_two(problem, found.fit, least_rise), _as_weak(problem, found.fit)]
     ways = [_searched(problem, found, one, least_rise) for one in changes if one is not None] or [found]
     fitted, rises, doubtful = min(ways, key=lambda one: problem.surprise(one.fit))
-    stars, coefficients = fitted.stars, fitted.coefficients
-    conductivity = background * np.exp(stars.image(coefficients).image)
+    bodies, coefficients = fitted.bodies, fitted.coefficients
+    conductivity = background * np.exp(bodies.image(coefficients).image)
     predicted = np.asarray(model.voltages(conductivity))
+    spread = bodies.rows(problem.deviations(fitted))[:, bodies.dimension + 1]
+    slopes = [bodies.contrast(k, row)[1] for k, row in enumerate(bodies.rows(coefficients))]
     excess = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
     order = np.argsort(-np.asarray(rises), kind="stable")
     return ShapeReconstruction(
-        stars=tuple(stars.star(int(k), coefficients, rises[k]) for k in order),
+        bodies=tuple(bodies.body(int(k), coefficients, rises[k]) for k in order),
         conductivity=as_array(conductivity),
         voltages=as_array(predicted),
         misfit=as_array(np.sqrt(np.mean(excess**2))),
         drift=float(np.expm1(prior.drift * coefficients[0])),
         doubtful=doubtful,
+        contrast_deviations=tuple(float(spread[k] * slopes[k]) for k in order),
     )
 
 
-def _checked_start(start):
-    """Signs (k,), centres (k, 2) and radii (k,). Raises `ValueError`."""
+def _checked_start(start, dimension: int):
+    """Signs (k,), centres (k, d) and radii (k,). Raises `ValueError`."""
     try:
         sign = np.array([one[0] for one in start], float)
-        centre = np.array([one[1] for one in start], float).reshape(-1, 2)
+        centre = np.array([one[1] for one in start], float).reshape(-1, dimension)
         radius = np.array([one[2] for one in start], float)
     except (TypeError, ValueError, IndexError) as error:
-        raise ValueError("start: give (sign, (x, y), radius), metres, for every body.") from error
+        place = "x, y, z"[: 3 * dimension - 2]
+        raise ValueError(f"start: give (sign, ({place}), radius), metres, for every body.") from error
     if not (np.isin(sign, (-1, 1)).all() and np.isfinite(centre).all() and (radius > 0).all()):
         raise ValueError("start: signs are +1 or -1, centres finite and radii positive, metres.")
     return sign, centre, radius
 
 
-def _grown(problem: ShapeProblem, stars: Stars, coefficients, steps: int):
-    """Stars with all their modes, fitted to the data as disks; and their coefficients."""
-    disks, _, _ = found = problem.fit(*stars.with_modes(1, coefficients), steps, _ROUGHLY)
-    return disks.with_modes(stars.prior.modes, found.coefficients)
+def _grown(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
+    """Bodies with all their modes, fitted to the data as round ones; and their coefficients."""
+    rounded, _, _ = found = problem.fit(*bodies.with_modes(1, coefficients), steps, _ROUGHLY)
+    return rounded.with_modes(bodies.prior.modes, found.coefficients)
 
 
 class _Found(NamedTuple):
-    """Stars that data tell of, and their rises; and those left out."""
+    """Bodies that data tell of, and their rises; and those left out."""
 
     fit: Fit
     rises: list[float]
-    doubtful: tuple[Star, ...]
+    doubtful: tuple[Body, ...]
 
 
-def _without_ghosts(problem: ShapeProblem, fitted: Fit, doubtful: Sequence[Star], least_rise: float) -> _Found:
-    """The stars that are missed when they are left out and the rest fitted again; the least missed goes first."""
-    doubtful, missed = list(doubtful), np.zeros(len(fitted.stars.sign))  # cost without each star, at least
+def _without_ghosts(problem: ShapeProblem, fitted: Fit, doubtful: Sequence[Body], least_rise: float) -> _Found:
+    """The bodies that are missed when they are left out and the rest fitted again; the least missed goes first."""
+    doubtful, missed = list(doubtful), np.zeros(len(fitted.bodies.sign))  # cost without each star, at least
     while True:
-        stars, coefficients, cost = fitted
+        bodies, coefficients, cost = fitted
         # With one ghost fewer in whose place others can step, what was missed is missed as much.
         beyond_doubt = max(_SURELY * cost, problem.surprise(fitted) + _MARGIN)
         unsure, others = np.flatnonzero(missed <= beyond_doubt).tolist(), {}
         for k in unsure:
-            others[k] = problem.fit(*stars.without(k, coefficients), _STEPS_WITHOUT, 2 * _ROUGHLY)
+            others[k] = problem.fit(*bodies.without(k, coefficients), _STEPS_WITHOUT, 2 * _ROUGHLY)
             missed[k] = others[k].cost
         least = min(others, key=lambda k: missed[k], default=None)
         if least is None or (missed[least] >= least_rise * cost and _is_told(problem, others[least], fitted)):
             return _Found(fitted, list(missed / cost), tuple(doubtful))
-        doubtful.append(stars.star(least, coefficients, float(missed[least]) / cost))
+        doubtful.append(bodies.body(least, coefficients, float(missed[least]) / cost))
         missed = np.delete(missed, least)
-        fitted = problem.fit(others[least].stars, others[least].coefficients, _STEPS)
+        fitted = problem.fit(others[least].bodies, others[least].coefficients, _STEPS)
 
 
 def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
-    """The stars with one of them split in two; None if the data do not tell of it."""
-    stars, coefficients, cost = fitted
+    """The bodies with one of them split in two; None if the data do not tell of it."""
+    bodies, coefficients, cost = fitted
     tried = [
-        _grown(problem, *stars.split(k, coefficients, across), _STEPS_TRIED)
-        for k in range(len(stars.sign))
-        for across in _ACROSS
+        _grown(problem, *bodies.split(k, coefficients, number), _STEPS_TRIED)
+        for k in range(len(bodies.sign))
+        for number in range(bodies.dimension)
     ]
     found = _best(problem, tried)
     return found if found and cost >= least_rise * found.cost and _is_told(problem, fitted, found) else None
 
 
 def _as_weak(problem: ShapeProblem, fitted: Fit) -> Fit | None:
-    """The stars with one or all of the strong ones taken for weak; None if the data do not tell of it."""
-    strong = np.flatnonzero(~fitted.stars.weak)
+    """The bodies with one or all of the strong ones taken for weak; None if the data do not tell of it."""
+    strong = np.flatnonzero(~fitted.bodies.weak)
     some = [[k] for k in strong] + [strong] * (len(strong) > 1)
-    found = _best(problem, [fitted.stars.weakened(one, fitted.coefficients) for one in some])
+    found = _best(problem, [fitted.bodies.weakened(one, fitted.coefficients) for one in some])
     return found if found and _is_told(problem, fitted, found) else None
 
 
-def _best(problem: ShapeProblem, starts: Sequence[tuple[Stars, Float[np.ndarray, " n"]]]) -> Fit | None:
+def _best(problem: ShapeProblem, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]) -> Fit | None:
     """The least cost from several starts, by which a few steps are best."""
     tried = [problem.fit(*one, _STEPS_TRIED, _ROUGHLY) for one in starts]
     best = min(tried, key=lambda one: one.cost, default=None)
-    return best and problem.fit(best.stars, best.coefficients, _STEPS)
+    return best and problem.fit(best.bodies, best.coefficients, _STEPS)
 
 
 def _is_told(problem: ShapeProblem, simple: Fit, other: Fit) -> bool:
@@ -208,7 +221,7 @@ def _is_told(problem: ShapeProblem, simple: Fit, other: Fit) -> bool:
 
 
 def _searched(problem: ShapeProblem, found: _Found, changed: Fit, least_rise: float) -> _Found:
-    """The stars that explain the data once they are `changed`: split one after the other, and then taken for weak."""
+    """The bodies that explain the data once they are `changed`: split one after the other, and then taken for weak."""
     for _ in range(_MOST_CHANGES):
         found = _without_ghosts(problem, changed, found.doubtful, least_rise)
         change = _in_two(problem, found.fit, least_rise) or _as_weak(problem, found.fit)

@@ -104,6 +104,10 @@ class Rectangle(Domain):
         else:
             curve = closed_line(np.asarray(self.vertices))
             mesh = mesh_within([curve], self.area, target, refine, boundary_points, interior_points)
+        return self.tagged(mesh)
+
+    def tagged(self, mesh: Mesh) -> Mesh:
+        """A mesh of the rectangle, with tags for its sides."""
         return Mesh(mesh.points, mesh.cells, mesh.facets, self._sides(mesh))
 
     def _rows(self, target: Target) -> Mesh:

@@ -3,9 +3,10 @@
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PatchCollection
-from matplotlib.patches import Circle, Patch, Rectangle
+from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 
 from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrode_shapes import ElectrodeShapes
 from jeit.mesh import Mesh
 from jeit.plot.axes import axes_or_new
 from jeit.plot.imaging.electrode_numbers import draw_numbers
@@ -36,6 +37,20 @@ def draw_electrodes(
     if numbers:
         draw_numbers(ax, mesh, np.array(pen.places), np.array(pen.beside), first)
     return ax
+
+
+def draw_shapes(mesh: Mesh, shapes: ElectrodeShapes, *, ax: Axes) -> None:
+    """Draw electrodes of a plane mesh that are known as polygons, and their numbers from 1: lines of two corners along
+    its edge, dots, and what has a size."""
+    for corners in shapes.polygons():
+        if len(corners) == 2:
+            ax.plot(*corners.T, color=METAL, linewidth=5, solid_capstyle="butt", zorder=3)
+        elif len(corners) == 1:
+            ax.scatter(*corners[0], s=28, color=METAL, zorder=3)
+        else:
+            ax.add_patch(Polygon(corners, facecolor="none", edgecolor=METAL, linewidth=1.6, zorder=3))
+    first = np.unique(shapes.electrode, return_index=True)[1]
+    draw_numbers(ax, mesh, shapes.middles(), shapes.sizes[first] < 3, 1)
 
 
 class _Pen:

@@ -35,7 +35,7 @@ def draw_labels(labels: ArrayLike, extent: tuple[float, float, float, float], *,
 
 
 def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
-    """Outlines of bodies, see `jeit.inverse.shapes`: of resistive ones dashed. Metres."""
+    """Outlines of bodies in a sheet, see `jeit.inverse.shapes`: of resistive ones dashed. Metres."""
     ax = axes_or_new(ax)
     for sign, _, style, name in _STYLES:
         for number, one in enumerate(one for one in stars if one.sign == sign):

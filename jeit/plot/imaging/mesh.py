@@ -7,7 +7,7 @@ from matplotlib.collections import LineCollection
 
 from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
-from jeit.mesh import Mesh
+from jeit.mesh import Mesh, check_flat
 from jeit.plot.axes import INK, SOFT, axes_or_new, bare, draw_scale_bar, extent_of
 from jeit.plot.imaging.electrodes import draw_electrodes
 
@@ -36,8 +36,9 @@ def plot_mesh(
 
 
 def check_body(mesh: Mesh, electrodes: AbstractElectrodes | None) -> None:
-    """Raises `ValueError` for what is no mesh, and for what are no electrodes, if any are given."""
+    """Raises `ValueError` for what is no mesh, a surface in space, and what are no electrodes, if any are given."""
     check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
+    check_flat(mesh, "pictures seen from above")
     if electrodes is not None:
         check_kind("electrodes", electrodes, AbstractElectrodes, "those of jeit.electrodes, such as BoundaryElectrodes")
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from jeit.design.skin.touched_cells import padded
-from jeit.mesh import Mesh, measures
+from jeit.mesh import Mesh, check_flat, measures
 from jeit.simulate.contact.indenters import Disc
 from jeit.simulate.contact.press import Press
 from jeit.simulate.contact.pressure import AbstractSupport
@@ -38,6 +38,7 @@ class Samples(NamedTuple):
     @classmethod
     def of(cls, mesh: Mesh) -> "Samples":
         """Of a sheet, or of a layer, whose cells are all pressed as the skin above them is."""
+        check_flat(mesh, "these presses")
         corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
         thickness = np.ptp(corners[..., 2]) if mesh.dimension == 3 else 1.0
         corners = corners[..., :2]

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_key, check_kind, check_metres, is_number, real_array, told
 from jeit.forward.assembly import check_conductivity
-from jeit.mesh import Domain, Mesh, Refine, centroids, measures
+from jeit.mesh import Domain, Mesh, Refine, centroids, check_flat, measures
 
 # Directions tried for a cut before another place is; and how far a bent one turns, radians.
 _TRIES, _LEAST_BEND, _MOST_BEND = 400, 0.35, 1.2
@@ -65,6 +65,7 @@ class Cut(eqx.Module):
         Raises `ValueError` for what is no mesh, and for a cut that misses it.
         """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the skin")
+        check_flat(mesh, "cuts")
         points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
         there = np.zeros(len(cells), bool)
         for start, end in itertools.pairwise(self.path):

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy import sparse
 
 from jeit.arguments import check_kind, is_number, told
-from jeit.mesh import Mesh
+from jeit.mesh import Mesh, check_flat
 from jeit.touch.contacts.contact import Contact
 from jeit.touch.contacts.image_noise import ImageNoise
 
@@ -92,6 +92,7 @@ def checked_image(finder: AbstractFinder, image) -> Float[np.ndarray, " m"]:
 def check_finder(mesh: Mesh, sign: int, floor: float) -> None:
     """Raises `ValueError` for what is no 2-D mesh, a sign that is none, and a floor that is negative."""
     check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
+    check_flat(mesh, "contacts")
     if mesh.dimension != 2:
         raise ValueError("mesh has three dimensions; contacts are found on sheets: reconstruct on a 2-D mesh.")
     if not (is_number(sign) and sign in (1, -1)):

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.arguments import check_kind, is_number, real_array, told
-from jeit.mesh import Mesh, centroids, measures
+from jeit.mesh import Mesh, centroids, check_flat, measures
 
 # Fewer frames do not say how far the next one may stray.
 _LEAST_FRAMES = 10
@@ -60,6 +60,7 @@ class TouchLevel(eqx.Module):
     def __init__(self, mesh: Mesh, level: float):
         """Raises `ValueError` for a mesh that is no sheet's, and a level that is not positive."""
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
+        check_flat(mesh, "gestures")
         if mesh.dimension != 2:
             raise ValueError("mesh must be of two dimensions, a sheet's.")
         if not (is_number(level) and level > 0):

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int
 
 from jeit.electrodes import BoundaryElectrodes, NodeElectrodes, PointElectrodes, SheetDiscs
 from jeit.forward import ForwardModel
-from jeit.mesh import Mesh, centroids, measures
+from jeit.mesh import Mesh, centroids, check_flat, measures
 
 # Halvings of a cell at most.
 _ROUNDS = 12
@@ -26,6 +26,7 @@ def finer_model(
     A layer, and a skin whose electrodes are facets of its mesh, stays as it is.
     """
     mesh = model.mesh
+    check_flat(mesh, "cuts")
     if mesh.dimension == 2 and isinstance(model.electrodes, _FREE):
         finer, parent = finer_mesh(mesh, centre, radius, 0.5 * edge**2)
         return ForwardModel(finer, model.electrodes, model.protocol), parent, edge

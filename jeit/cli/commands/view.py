@@ -1,0 +1,81 @@
+"""`jeit view`: look at an image that jeit wrote, turned and cut with the mouse, or in pictures from several sides."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jeit.cli.options import Quiet, make_folder
+
+
+def view(
+    image: Annotated[Path, typer.Argument(help="An image.npz, as jeit reconstruct writes it.", show_default=False)],
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Folder for pictures; without it a window opens where one can."),
+    ] = None,
+    level: Annotated[
+        list[float] | None,
+        typer.Option(help="Isosurface at this share of the strongest change (default 0.5); may be given again."),
+    ] = None,
+    azimuth: Annotated[float, typer.Option(help="Degrees from the x axis towards y, where one looks from.")] = -60.0,
+    elevation: Annotated[float, typer.Option(help="Degrees above the horizontal.")] = 25.0,
+    plane_mm: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--plane-mm",
+            help="A slice of its own: z=20, or a point and the direction looked from, 0,0,85/1,1,0; again for more.",
+            metavar="AXIS=MM|X,Y,Z/NX,NY,NZ",
+        ),
+    ] = None,
+    axis: Annotated[str, typer.Option(help="Axis that the grid of slices is across: x, y or z.")] = "z",
+    slices: Annotated[int, typer.Option(help="Slices in the grid.")] = 9,
+    quiet: Quiet = False,
+) -> None:
+    """Look into IMAGE: a window where PyVista and a display are there, else pictures in a folder 'view' beside it.
+
+    Of a solid: overview.png, isosurfaces.png from four sides, slices.png, and planes.png of slices of your own; of a
+    skin in space surface.png; of a sheet image.png.
+
+    In Python: `jeit.report.read_image` and `jeit.report.write_views`; `jeit.plot.view_solid` makes the window.
+    """
+    from jeit.cli.console import plain_console, say_written
+    from jeit.plot.solid import interactive
+    from jeit.plot.solid.camera import Camera
+    from jeit.report import read_image, write_views
+    from jeit.report.saved_image_views import VIEW_FILES, drawn_values
+
+    camera, levels = Camera(azimuth, elevation), tuple(level or (0.5,))
+    planes = [_plane(text) for text in plane_mm or ()]
+    console, saved = plain_console(), read_image(image)
+    if output is None and saved.mesh.dimension == 3 and not planes:
+        if not (missing := interactive.can_view()):
+            values, scale = drawn_values(saved)
+            marked = {"inclusions": saved.inclusions, "levels": levels, "scale": scale}
+            interactive.view_solid(saved.mesh, values, saved.electrodes, **marked).show()
+            return
+        if not quiet:
+            console.print(f"  pictures, not a window: {missing}", highlight=False, markup=False)
+    folder = image.parent / "view" if output is None else output
+    make_folder(folder, VIEW_FILES)
+    names = write_views(saved, folder, camera=camera, levels=levels, planes=planes, axis=axis, slices=slices)
+    if not quiet:
+        say_written(console, folder / names[0], *names[1:])
+
+
+def _plane(text: str):
+    """The plane that `text` spells, in millimetres. Raises `ValueError`."""
+    from jeit.arguments import told
+    from jeit.image import Plane
+
+    try:
+        if "=" in text:
+            axis, _, value = text.partition("=")
+            return Plane.at(axis.strip(), float(value) / 1e3)
+        point, normal = ([float(one) for one in part.split(",")] for part in text.split("/"))
+        return Plane.through([one / 1e3 for one in point], normal)
+    except ValueError:
+        raise ValueError(
+            f"--plane-mm must be such as z=20, or a point and a direction, 0,0,85/1,1,0, in millimetres; it is "
+            f"{told(text)}."
+        ) from None

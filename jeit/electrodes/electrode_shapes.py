@@ -1,0 +1,163 @@
+"""Electrodes as what they are: discs, patches, facets and arcs as polygons on the surface, in their places."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from jeit.electrodes.combined import CombinedElectrodes
+from jeit.electrodes.electrodes import AbstractElectrodes
+from jeit.electrodes.facets import FacetElectrodes
+from jeit.mesh import Mesh
+
+_ROUND, _SIDE = 32, 8
+# Triangles of a surface near a corner among which it is laid on one.
+_NEAR = 24
+
+
+@dataclass(frozen=True)
+class ElectrodeShapes:
+    """Polygons that electrodes are drawn as, one or more each.
+
+    **Fields**: `corners` (q, d) metres, of all polygons one after the other, counter-clockwise seen from outside in
+    space; a dot has one; `sizes` (p,), how many are each polygon's; `electrode` (p,), whose it is, from 0.
+    """
+
+    corners: Float[np.ndarray, "q d"]
+    sizes: Int[np.ndarray, " p"]
+    electrode: Int[np.ndarray, " p"]
+
+    @property
+    def number(self) -> int:
+        """Of electrodes."""
+        return int(self.electrode.max()) + 1 if len(self.electrode) else 0
+
+    def polygons(self) -> list[Float[np.ndarray, "k d"]]:
+        """The corners of each."""
+        return np.split(self.corners, np.cumsum(self.sizes)[:-1])
+
+    def middles(self) -> Float[np.ndarray, "L d"]:
+        """Of every electrode, the mean of its corners."""
+        of_corner = np.repeat(self.electrode, self.sizes)
+        count = np.bincount(of_corner, minlength=self.number)
+        return np.stack([np.bincount(of_corner, one, self.number) / count for one in self.corners.T], axis=1)
+
+
+def shapes_of(mesh: Mesh, electrodes: AbstractElectrodes) -> ElectrodeShapes:
+    """The polygons of `electrodes` on `mesh`: a solid, a surface in space or a plane mesh."""
+    polygons: list[np.ndarray] = []
+    owner: list[int] = []
+    for number, of_one in enumerate(_all_polygons(mesh, electrodes)):
+        polygons += of_one
+        owner += [number] * len(of_one)
+    return ElectrodeShapes(np.concatenate(polygons), np.array([len(one) for one in polygons]), np.array(owner))
+
+
+def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.ndarray]]:
+    """The polygons of each electrode."""
+    points = np.asarray(mesh.points)
+    if points.shape[1] == 2:
+        pen = _PlanePen()
+        electrodes.draw(mesh, pen)
+        return pen.drawn
+    if isinstance(electrodes, CombinedElectrodes):
+        return [one for part in electrodes.parts for one in _all_polygons(mesh, part)]
+    triangles = surface_triangles(mesh)
+    if isinstance(electrodes, FacetElectrodes):
+        corners = points[np.asarray(mesh.facets)]
+        return [list(corners[covered > 0]) for covered in np.asarray(electrodes.covers).T]
+    said = {name: np.asarray(value) for name, value in electrodes.geometry().items() if name != "parts"}
+    if "position" not in said:
+        load = np.asarray(electrodes.contact(mesh).load)
+        return [[one[None]] for one in (load / load.sum(axis=0)).T @ points]
+    places = said["position"]
+    surface = Draped(points, triangles)
+    frames = surface.frames(places)
+    if "radius" in said:
+        angle = 2 * np.pi * np.arange(_ROUND) / _ROUND
+        sizes = np.broadcast_to(said["radius"], len(places))
+        flat = [size * np.stack([np.cos(angle), np.sin(angle)], axis=1) for size in sizes]
+    elif "width" in said and "height" in said:
+        side = np.arange(_SIDE) / _SIDE * 2 - 1
+        one = np.ones(_SIDE)
+        square = np.concatenate(
+            [np.stack(pair, axis=1) for pair in ((side, -one), (one, side), (-side, one), (-one, -side))]
+        )
+        sizes = np.broadcast_to(said["width"], len(places)), np.broadcast_to(said["height"], len(places))
+        flat = [square * [width / 2, height / 2] for width, height in zip(*sizes, strict=True)]
+    else:
+        return [[place[None]] for place in places]
+    return [
+        [surface.laid_on(place + shape @ frame[1:], frame[0])]
+        for place, shape, frame in zip(places, flat, frames, strict=True)
+    ]
+
+
+def surface_triangles(mesh: Mesh) -> Int[np.ndarray, "m 3"]:
+    """The boundary of a solid, or the cells of a surface in space."""
+    return np.asarray(mesh.facets if mesh.cells.shape[1] == 4 else mesh.cells)
+
+
+class Draped:
+    """A surface of triangles that flat shapes are laid on: `points` (n, 3), `triangles` (m, 3)."""
+
+    def __init__(self, points: Float[np.ndarray, "n 3"], triangles: Int[np.ndarray, "m 3"]):
+        self._corners = points[triangles]
+        normal = np.cross(self._corners[:, 1] - self._corners[:, 0], self._corners[:, 2] - self._corners[:, 0])
+        self._normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        self._tree = KDTree(self._corners.mean(axis=1))
+
+    def normals(self, places: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3"]:
+        """Of the nearest triangle, outward."""
+        return self._normal[self._tree.query(places)[1]]
+
+    def frames(self, places: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3 3"]:
+        """Unit vectors at each place: outward, across (horizontal) and up, as `FacePatches` have them."""
+        normal = self.normals(places)
+        upward = np.where(np.abs(normal[:, 2:]) > 0.9, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
+        across = np.cross(upward, normal)
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        return np.stack([normal, across, np.cross(normal, across)], axis=1)
+
+    def laid_on(self, places: Float[np.ndarray, "k 3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
+        """Places moved along the normal onto the triangle that they meet first, as far as they meet one."""
+        near = self._tree.query(places, k=min(_NEAR, len(self._corners)))[1].reshape(len(places), -1)
+        corners = self._corners[near]
+        edge, other = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
+        # Möller and Trumbore: place + t normal = corner + a edge + b other.
+        across = np.cross(normal, other)
+        volume = np.sum(edge * across, axis=-1)
+        flat = np.abs(volume) < 1e-12 * np.linalg.norm(edge, axis=-1) * np.linalg.norm(other, axis=-1)
+        volume = np.where(flat, 1.0, volume)
+        offset = places[:, None] - corners[:, :, 0]
+        a = np.sum(offset * across, axis=-1) / volume
+        turned = np.cross(offset, edge)
+        b = turned @ normal / volume
+        t = np.sum(other * turned, axis=-1) / volume
+        met = ~flat & (a > -1e-6) & (b > -1e-6) & (a + b < 1 + 1e-6)
+        far = np.where(met, np.abs(t), np.inf)
+        nearest, row = far.argmin(axis=1), np.arange(len(places))
+        moved = np.where(np.isfinite(far[row, nearest]), t[row, nearest], 0.0)
+        return places + moved[:, None] * normal
+
+
+class _PlanePen:
+    """Draws electrodes of a plane mesh as polygons: arcs as lines of two corners."""
+
+    def __init__(self):
+        self.drawn: list[list[np.ndarray]] = []
+
+    def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
+        ends = [np.asarray(one) for one in pieces]
+        self.drawn.append([one[k : k + 2] for one in ends for k in range(len(one) - 1)])
+
+    def disc(self, middle: np.ndarray, radius: float) -> None:
+        angle = 2 * np.pi * np.arange(_ROUND) / _ROUND
+        self.drawn.append([middle[:2] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
+
+    def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:
+        self.drawn.append([middle[:2] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, height / 2]])
+
+    def dot(self, middle: np.ndarray) -> None:
+        self.drawn.append([np.asarray(middle[:2])[None]])

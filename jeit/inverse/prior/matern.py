@@ -1,0 +1,121 @@
+"""Matérn fields: smooth images whose length scale comes from solving a differential equation on the mesh.
+
+(κ² - Δ) x = white noise has, in all of space, the Matérn correlation of smoothness ν = 2 - d / 2,
+
+    d = 2:  κr K₁(κr),    d = 3:  exp(-κr),
+
+so that the covariance of the nodes is A⁻¹ M A⁻¹, with A = κ²M + K of mass M and stiffness K: sparse systems, where the
+covariance itself would be a matrix of all pairs of cells. Lindgren, Rue and Lindström, J. R. Stat. Soc. B 73 (2011)
+423-498. The wall reflects the field, which raises its variance there; a Robin condition, ∂x/∂n = -κx / 1.42, takes most
+of that off (Roininen, Huttunen and Lasanen, Inverse Probl. Imaging 8 (2014) 561-586), and what is left is divided out.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float
+
+from jeit.arguments import check_has_values
+from jeit.inverse.prior.bases import DenseBasis
+from jeit.inverse.prior.nodal import NodalSystem, Solve
+from jeit.inverse.prior.priors import AbstractPrior, informed_shapes
+from jeit.mesh import Mesh, gradients, measures
+from jeit.mesh.geometry import facet_measures
+from jeit_solvers.engines import has_values, host, on_host
+
+# How far beyond the wall the field is taken to go on falling, in units of 1/κ.
+_ROBIN = 1.42
+# Nodes up to which variances are worked out; of more they are estimated, from this many fields.
+_FEW, _FIELDS = 3000, 400
+
+
+class Matern(AbstractPrior):
+    """Matérn smoothness: a random field of unit variance that a differential equation correlates over `length` metres.
+
+    The correlation falls to 0.14 at twice the `length`, as that of `Gaussian(length)` does, but from the first: its
+    images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. Cells much larger than the
+    length do not resolve it. Takes memory and time in proportion to the nodes, about. Raises `ValueError` for a length
+    that is not positive.
+    """
+
+    length: float
+
+    def __check_init__(self):
+        if has_values(self.length) and not (np.isfinite(self.length) and self.length > 0):
+            raise ValueError(f"length must be positive, in metres; it is {self.length}.")
+
+    def covariance_product(self, mesh, jacobian):
+        """Γ Jᵀ, by two sparse solves."""
+        field = self._field(mesh, jacobian)
+        columns: Any = np.asarray(on_host(jacobian)).T
+        if np.iscomplexobj(columns):
+            return host.asarray(field.product(columns.real) + 1j * field.product(columns.imag))
+        return host.asarray(field.product(columns))
+
+    def precision(self, mesh, jacobian):
+        """Not to be had of cells. Raises `ValueError`."""
+        raise ValueError(
+            "prior: Matern is a field of the nodes and has no precision matrix of cells, which bounds need; take "
+            "Noser, Tikhonov, Laplace or TotalVariation, or link=Bounded(lower, upper) in place of bounds."
+        )
+
+    def basis(self, mesh, jacobian):
+        """A shape for each node: what white noise there makes of the cells."""
+        return DenseBasis(host.asarray(self._field(mesh, jacobian).shapes()))
+
+    def informed_basis(self, mesh, jacobian):
+        """As of any prior, of one field."""
+        field = self._field(mesh, jacobian)
+        return informed_shapes(np.asarray(jacobian), field.product, field.variance)
+
+    def _field(self, mesh: Mesh, jacobian) -> "_Field":
+        instead = "take Gaussian(length), which can be differentiated"
+        check_has_values(
+            "model, or the prior's length", (mesh, jacobian, self.length), "a Matérn field is made", instead
+        )
+        return _Field.create(mesh, float(self.length))
+
+
+class _Field(NamedTuple):
+    """**Fields**: `means` of cells over their nodes (m, n); `solve`, with A; `mass` of the nodes (n,); `scale` (n,)
+    that makes their variances one; `variance` (m,) of the means."""
+
+    means: scipy.sparse.csr_array
+    solve: Solve
+    mass: Float[np.ndarray, " n"]
+    scale: Float[np.ndarray, " n"]
+    variance: Float[np.ndarray, " m"]
+
+    @classmethod
+    def create(cls, mesh: Mesh, length: float) -> "_Field":
+        system = NodalSystem.create(mesh)
+        mesh = system.mesh
+        count, size = mesh.cells.shape[1], mesh.num_points
+        decay = (1.0 if mesh.dimension == 3 else np.sqrt(2)) / length
+        slope, measure = np.asarray(gradients(mesh)), np.asarray(measures(mesh))
+        stiffness = np.einsum("mid,mjd,m->mij", slope, slope, measure)
+        mass = np.bincount(mesh.cells.ravel(), np.repeat(measure / count, count), size)
+        wall = np.asarray(facet_measures(mesh)) / mesh.dimension
+        rim = np.bincount(mesh.facets.ravel(), np.repeat(wall, mesh.dimension), size)
+        solve = system.inverse(system.assemble(stiffness, decay**2 * mass + decay / _ROBIN * rim))
+        fields = _fields(solve, mass)
+        scale = 1 / np.sqrt(np.sum(fields**2, axis=1))
+        return cls(system.means, solve, mass, scale, np.sum((system.means @ (scale[:, None] * fields)) ** 2, axis=1))
+
+    def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
+        """Γ times columns."""
+        within = self.scale[:, None] * (self.means.T @ columns)
+        return self.means @ (self.scale[:, None] * self.solve(self.mass[:, None] * self.solve(within)))
+
+    def shapes(self) -> Float[np.ndarray, "m n"]:
+        """S with Γ = S Sᵀ."""
+        return self.means @ (self.scale[:, None] * self.solve(np.diag(np.sqrt(self.mass))))
+
+
+def _fields(solve: Solve, mass: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
+    """F with F Fᵀ = A⁻¹ M A⁻¹: of a large mesh about, and on its diagonal, from random fields of that covariance."""
+    if len(mass) <= _FEW:
+        return solve(np.diag(np.sqrt(mass)))
+    noise = np.random.default_rng(0).standard_normal((len(mass), _FIELDS)) / np.sqrt(_FIELDS)
+    return solve(np.sqrt(mass)[:, None] * noise)

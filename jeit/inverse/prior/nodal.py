@@ -1,0 +1,65 @@
+"""Matrices between the nodes of a mesh, solved by the direct solver, and images of cells as means over their nodes."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse
+from jaxtyping import Float
+
+from jeit.mesh import Mesh
+from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, solve
+from jeit_solvers.engines import on_host
+
+# Columns solved for at a time: of more, fronts leave the caches, and of all they take the memory of several images.
+_AT_ONCE = 32
+
+Solve = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, "n k"]]
+"""What solves a system for columns."""
+
+
+class NodalSystem(NamedTuple):
+    """Where the entries of a matrix between neighbouring nodes go, and how to factorise it.
+
+    **Fields**: `mesh`, in NumPy; `pattern`; `plan`; `means` (m, n), of cells over their nodes.
+    """
+
+    mesh: Mesh
+    pattern: SparsityPattern
+    plan: FactorisationPlan
+    means: scipy.sparse.csr_array
+
+    @classmethod
+    def create(cls, mesh: Mesh) -> "NodalSystem":
+        """Of a mesh that has values."""
+        mesh = on_host(mesh)
+        cells, count = np.asarray(mesh.cells), mesh.cells.shape[1]
+        pattern = SparsityPattern.from_elements([cells], size=mesh.num_points)
+        plan = analyse(pattern, np.asarray(mesh.points))
+        ends = np.arange(0, cells.size + 1, count)
+        shape = mesh.num_cells, mesh.num_points
+        means = scipy.sparse.csr_array((np.full(cells.size, 1 / count), cells.ravel(), ends), shape=shape)
+        pattern, plan = on_host((pattern, plan))
+        return cls(mesh, pattern, plan, means)
+
+    def assemble(
+        self, elements: Float[np.ndarray, "..."], diagonal: Float[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " e"]:
+        """Entries, in the pattern's order, of a matrix of the cells' `elements` (m, k, k) and a `diagonal` (n,)."""
+        values = np.array(self.pattern.assemble(elements))
+        values[: self.pattern.size] += diagonal
+        return values
+
+    def inverse(self, values: Any) -> Solve:
+        """What solves A X = B for columns (n, k), A being of these entries, in the pattern's order."""
+        factor = factorise(self.plan, values)
+
+        def solved(columns: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+            found = np.empty_like(columns)
+            for start in range(0, columns.shape[1], _AT_ONCE):
+                some = slice(start, start + _AT_ONCE)
+                part: Any = np.ascontiguousarray(columns[:, some])
+                found[:, some] = solve(self.plan, factor, part)
+            return found
+
+        return solved

@@ -1,0 +1,210 @@
+"""Some bodies on a mesh: what they have in common whatever their form, from coefficients to conductivity.
+
+    log σ/σ₀ = drift + Σ_bodies mixture(share of a cell that a body covers, ± contrast),
+
+± contrast where it covers all. Everything is estimated in units of its prior's standard deviation, so that the penalty
+is ½‖coefficients‖².
+"""
+
+from __future__ import annotations
+
+import abc
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jeit.arguments import is_number, told
+
+
+@dataclass(frozen=True)
+class BodyPrior(abc.ABC):
+    """What bodies are expected to be; standard deviations, lengths in units of the longer side of the whole body.
+
+    - `modes`: of a form, how fine; 1 makes disks and balls.
+    - `place`: of the centre about where the search starts. `radius` with the spread of its logarithm.
+    - `roughness`: how far from round.
+    - `drift`: of the logarithm of the bath's conductivity between the two frames.
+    - `apart`: over the share of the whole body by which two bodies overlap, its standard deviation. Without it two of
+      opposite sign may lie on each other and cancel.
+
+    Raises `ValueError` for what is not positive.
+    """
+
+    modes: int
+    place: float = 0.15
+    radius: float = 0.12
+    radius_spread: float = 0.5
+    roughness: float = 0.25
+    drift: float = 0.1
+    apart: float = 1e3
+
+    def __post_init__(self):
+        for name, value in vars(self).items():
+            if not (is_number(value) and value > 0):
+                raise ValueError(f"{name} must be a positive number; it is {told(value)}.")
+        if self.modes != int(self.modes):
+            raise ValueError(f"modes must be a whole number from 1; it is {told(self.modes)}.")
+
+    @property
+    @abc.abstractmethod
+    def size(self) -> int:
+        """Coefficients of a body: centre, log radius, contrast, and those of its form."""
+
+    @abc.abstractmethod
+    def deviation(self, span: float) -> Float[np.ndarray, " q"]:
+        """Standard deviations of a body's values, 1 of its contrast; `span` of the whole body, metres."""
+
+    @abc.abstractmethod
+    def contrast_of(self, coefficient: float, weak: bool) -> tuple[float, float]:
+        """Contrast of log σ of a body, positive, and its derivative."""
+
+
+class BodyImage(NamedTuple):
+    """**Fields**: `image` (m,), log σ/σ₀; its derivatives `slopes`, by the drift in all cells, then by every body's
+    coefficients in the cells that it reaches; `overlap` of every two bodies, in units of the whole measure, and its
+    derivative `overlap_slope`."""
+
+    image: Float[np.ndarray, " m"]
+    slopes: Sequence[tuple[Any, Float[np.ndarray, "k q"]]]
+    overlap: Float[np.ndarray, " p"]
+    overlap_slope: Float[np.ndarray, "p n"]
+
+
+class Covered(NamedTuple):
+    """The `cells` (c,) that a body reaches, the `share` (c,) of each that it covers, and the derivative of that by the
+    body's coefficients, `slope` (c, q)."""
+
+    cells: Any
+    share: Float[np.ndarray, " c"]
+    slope: Float[np.ndarray, "c q"]
+
+
+@dataclass(frozen=True)
+class Bodies(abc.ABC):
+    """Bodies of one form. Coefficients: the drift, then body by body: centre, log radius, contrast, and the form's own.
+
+    **Fields**: `prior` of every body; `weight` (m,), every cell's share of the whole measure; `span`, the longest side
+    of the whole body; `start` (k, d), metres, and `sign` (k,) of every body; `weak` (k,), whether it is taken for weak,
+    not strong.
+    """
+
+    prior: Any
+    weight: Float[np.ndarray, " m"]
+    span: float
+    start: Float[np.ndarray, "k d"]
+    sign: Float[np.ndarray, " k"]
+    weak: Bool[np.ndarray, " k"]
+
+    @property
+    @abc.abstractmethod
+    def odds(self) -> float:
+        """Logarithm of the odds against bodies of their kinds, beforehand."""
+
+    @abc.abstractmethod
+    def weakened(self, some: Any, coefficients: Float[np.ndarray, " n"]) -> tuple[Self, Float[np.ndarray, " n"]]:
+        """The same with `some` bodies taken for weak."""
+
+    @abc.abstractmethod
+    def mixture(self, share: Float[np.ndarray, " c"], contrast: float) -> tuple[Any, Any, Any]:
+        """log σ/σ₀ (c,) of cells of which a body covers a `share`, and its derivatives by that and by the contrast."""
+
+    @abc.abstractmethod
+    def covered(self, k: int, row: Float[np.ndarray, " q"]) -> Covered:
+        """What body k, of these coefficients, covers."""
+
+    @abc.abstractmethod
+    def axis(self, k: int, row: Float[np.ndarray, " q"], number: int) -> Float[np.ndarray, " d"]:
+        """Unit vector along an axis of body k, the longest first."""
+
+    @abc.abstractmethod
+    def body(self, k: int, coefficients: Float[np.ndarray, " n"], rise: float = np.nan) -> Any:
+        """Body k, as far as it lies in the whole one."""
+
+    @property
+    def dimension(self) -> int:
+        """d."""
+        return self.start.shape[1]
+
+    def rows(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "k q"]:
+        """Coefficients of every body."""
+        return coefficients[1:].reshape(len(self.sign), self.prior.size)
+
+    def of_radii(self, radii) -> Float[np.ndarray, " n"]:
+        """Coefficients of disks or balls, metres, at the start."""
+        rows = np.zeros((len(self.sign), self.prior.size))
+        relative = np.log(np.asarray(radii, float) / (self.prior.radius * self.span)) / self.prior.radius_spread
+        rows[:, self.dimension] = np.clip(relative, -2, 2)
+        return np.append(0, rows)
+
+    def centre(self, k: int, row: Float[np.ndarray, " q"]) -> Float[np.ndarray, " d"]:
+        """Of body k, metres."""
+        return self.start[k] + self.prior.place * self.span * row[: self.dimension]
+
+    def log_radius(self, row: Float[np.ndarray, " q"]) -> float:
+        """Of the mean radius of a body, metres."""
+        return np.log(self.prior.radius * self.span) + self.prior.radius_spread * row[self.dimension]
+
+    def contrast(self, k: int, row: Float[np.ndarray, " q"]) -> tuple[float, float]:
+        """Of log σ of body k, positive, and its derivative by the coefficient."""
+        return self.prior.contrast_of(row[self.dimension + 1], self.weak[k])
+
+    def without(self, k: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
+        """The others, and their coefficients."""
+        start, sign, weak = (np.delete(one, k, axis=0) for one in (self.start, self.sign, self.weak))
+        others = replace(self, start=start, sign=sign, weak=weak)
+        return others, np.append(coefficients[0], np.delete(self.rows(coefficients), k, axis=0))
+
+    def split(self, k: int, coefficients, number: int) -> tuple[Self, Float[np.ndarray, " n"]]:
+        """Two round ones in place of body k, last, of half its measure each, that lie side by side along an axis."""
+        others, remaining = self.without(k, coefficients)
+        row, d = self.rows(coefficients)[k], self.dimension
+        half = np.zeros(self.prior.size)
+        half[d : d + 2] = row[d : d + 2]
+        half[d] -= np.log(2) / d / self.prior.radius_spread
+        step = np.exp(self.log_radius(half)) * self.axis(k, row, number)
+        if d == 3:
+            step = step * 2 ** (-1 / 3)  # as far out as the middles of the two halves, and some more
+        middle = self.centre(k, row)
+        start = np.concatenate([others.start, [middle + step, middle - step]])
+        sign, weak = np.append(others.sign, [self.sign[k]] * 2), np.append(others.weak, [self.weak[k]] * 2)
+        return replace(self, start=start, sign=sign, weak=weak), np.concatenate([remaining, half, half])
+
+    def with_modes(self, modes: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
+        """The same bodies with more modes, or fewer."""
+        new = replace(self, prior=replace(self.prior, modes=modes))
+        rows = np.zeros((len(self.sign), new.prior.size))
+        kept = min(new.prior.size, self.prior.size)
+        rows[:, :kept] = self.rows(coefficients)[:, :kept]
+        return new, np.append(coefficients[0], rows)
+
+    def image(self, coefficients) -> BodyImage:
+        """log σ/σ₀ per cell, how far the bodies overlap, and the derivatives of both."""
+        size, d = len(self.weight), self.dimension
+        rows = self.rows(coefficients)
+        parts = [self.covered(k, row) for k, row in enumerate(rows)]
+        drift, everywhere = np.full((size, 1), self.prior.drift), slice(None)
+        image = coefficients[0] * drift[:, 0]
+        slopes: list[tuple[Any, Any]] = [(everywhere, drift)]
+        shares = np.zeros((len(parts), size))
+        for k, (cells, share, slope) in enumerate(parts):
+            contrast, contrast_slope = self.contrast(k, rows[k])
+            mixed, by_share, by_contrast = self.mixture(share, contrast)
+            image[cells] += self.sign[k] * mixed
+            change = (self.sign[k] * by_share)[:, None] * slope
+            change[:, d + 1] = self.sign[k] * by_contrast * contrast_slope
+            slopes.append((cells, change))
+            shares[k, cells] = share
+        overlap, overlap_slope = [], []
+        weighed = self.weight * shares
+        for j, k in itertools.combinations(range(len(parts)), 2):
+            by_row = np.zeros((len(parts), self.prior.size))
+            for one, other in ((j, k), (k, j)):
+                cells, _, slope = parts[one]
+                by_row[one] = weighed[other, cells] @ slope
+            overlap.append(weighed[j] @ shares[k])
+            overlap_slope.append(np.append(0, by_row))
+        return BodyImage(image, slopes, np.array(overlap), np.reshape(overlap_slope, (-1, len(coefficients))))

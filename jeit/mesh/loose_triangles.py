@@ -1,0 +1,83 @@
+"""Files of triangles that do not say which are neighbours: .stl (binary and text) and .obj, from scans and CAD."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from jeit.files import check_memory
+from jeit.mesh.merging import merged
+
+# The bytes of a triangle in a binary .stl file: a normal, three corners, and two that some give a meaning.
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_HEADER = 84
+_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+# Nodes that are nearer, relative to the largest coordinate, are one: such files keep six digits of them.
+_SEAM = 2e-6
+# Times its size in the file that what is read of one takes in memory.
+_GROWTH = 20
+
+
+def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3), those at one place made one, and triangles (m, 3) of an .stl or .obj file, in the file's unit.
+
+    Polygons are cut into triangles from their first corner on; triangles without an area are left out. Raises
+    `ValueError`, about `name`, for a file that holds none.
+    """
+    content = path.read_bytes()
+    check_memory(name, _GROWTH * len(content))
+    try:
+        points, cells = _stl(content) if path.suffix.lower() == ".stl" else _obj(content)
+    except (ValueError, IndexError, OverflowError) as error:
+        said = " ".join(str(error).split())[:80]
+        raise ValueError(f"path: {name} does not work as a mesh file: {said}.") from None
+    if not len(cells):
+        raise ValueError(f"path: {name} does not work as a mesh file: there are no triangles in it.")
+    if not np.isfinite(points[cells]).all():
+        raise ValueError(f"path: {name} does not work as a mesh file: a coordinate is no finite number.")
+    used, number = np.unique(cells, return_inverse=True)
+    points, cells = points[used], number.reshape(cells.shape)
+    return merged(points, cells, _SEAM * float(np.abs(points).max()))
+
+
+def _stl(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+    number = int.from_bytes(content[_HEADER - 4 : _HEADER], "little")
+    if len(content) == _HEADER + number * _TRIANGLE.itemsize:
+        corners = np.frombuffer(content, _TRIANGLE, offset=_HEADER)["corners"].astype(float)
+    elif content[:5].lower() != b"solid":
+        raise ValueError("it is neither a text that begins with 'solid' nor as long as its number of triangles asks")
+    else:
+        corners = np.array([[float(value) for value in found] for found in _VERTEX.findall(content)])
+        if corners.size % 9:
+            raise ValueError("a facet has not three vertices")
+    points = corners.reshape(-1, 3)
+    return points, np.arange(len(points)).reshape(-1, 3)
+
+
+def _obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+    points: list[list[float]] = []
+    cells: list[tuple[int, int, int]] = []
+    for line in content.replace(b"\\\n", b" ").splitlines():
+        word, *values = line.split() or [b""]
+        if word == b"v":
+            points.append([float(value) for value in values[:3]])  # colours may follow
+            if len(points[-1]) != 3:
+                raise ValueError("a vertex has not three coordinates")
+        elif word == b"f":
+            corners = [_index(value, len(points)) for value in values]
+            cells += [(corners[0], *pair) for pair in pairwise(corners[1:])]
+    array = np.array(cells, np.int64).reshape(-1, 3)
+    if array.size and array.max() >= len(points):
+        raise ValueError(f"a face names vertex {array.max() + 1}, and there are {len(points)}")
+    return np.array(points, float).reshape(-1, 3), array
+
+
+def _index(value: bytes, count: int) -> int:
+    """Of what a face says of a corner, vertex/texture/normal; negative numbers count back from the last vertex."""
+    number = int(value.split(b"/")[0])
+    if number == 0 or number < -count:
+        raise ValueError(f"a face names vertex {number}, and {count} came before it")
+    return number - 1 if number > 0 else count + number

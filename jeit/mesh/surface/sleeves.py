@@ -1,0 +1,134 @@
+"""Open sleeves round the z axis: `tube`, and `forearm`, which is tapered and may be oval."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from jeit.mesh.generate import unstructured
+from jeit.mesh.mesh import Mesh
+from jeit.mesh.outline.domain import check_length
+
+# Height of a row of equilateral triangles, per edge.
+_ROW = np.sqrt(3) / 2
+_FEWEST_AROUND = 6
+# Places along an ellipse that its arc length is worked out from.
+_SAMPLES = 4096
+
+
+def tube(
+    radius: float,
+    height: float,
+    *,
+    num_points: int | None = None,
+    cell_size: float | None = None,
+    num_around: int | None = None,
+) -> Mesh:
+    """Side of an upright cylinder of `radius` and `height` metres round the z axis, from z = 0 up: a sleeve, open at
+    both ends.
+
+    Give `num_points`, the number of nodes (1,200 if nothing is said; met within about 5 %), `cell_size` in metres, or
+    `num_around`, the number of nodes round it. Rows of nodes lie on the cylinder, each turned by half a node against
+    the last; node 0 lies at angle 0. Tags: 'bottom', 'top'. A part of a cylinder is a sheet that was bent: `bend`.
+    Raises `ValueError` on bad or contradicting arguments.
+    """
+    radius, height = check_length("radius", radius), check_length("height", height)
+    around, rows = _counts(2 * np.pi * radius, height, num_points, cell_size, num_around)
+    return _sleeve(height, np.full((rows + 1, 2), radius), around)
+
+
+def forearm(
+    length: float,
+    wrist: float | Sequence[float],
+    elbow: float | Sequence[float],
+    *,
+    num_points: int | None = None,
+    cell_size: float | None = None,
+    num_around: int | None = None,
+) -> Mesh:
+    """A tapered sleeve round the z axis, from the `wrist` at z = 0 to the `elbow` at z = `length` metres.
+
+    `wrist`, `elbow`: radius of a round section in metres, or half its widths (along x, along y) of an oval one; between
+    them they change evenly. The other arguments are those of `tube`; nodes are spread evenly round each section. Tags:
+    'bottom', 'top'. Raises `ValueError` on bad or contradicting arguments.
+    """
+    length = check_length("length", length)
+    ends = np.stack([_section("wrist", wrist), _section("elbow", elbow)])
+    girth = float(np.mean([_arc_lengths(*end)[-1] for end in ends]))
+    slant = float(np.hypot(length, np.abs(ends[1] - ends[0]).mean()))
+    around, rows = _counts(girth, slant, num_points, cell_size, num_around)
+    share = np.linspace(0, 1, rows + 1)[:, None]
+    return _sleeve(length, (1 - share) * ends[0] + share * ends[1], around)
+
+
+def _section(name: str, given: float | Sequence[float]) -> np.ndarray:
+    try:
+        half = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        half = np.zeros(3)
+    if half.shape not in ((), (2,)):
+        raise ValueError(f"{name}: give a radius in metres, or two, along x and along y.")
+    return np.array([check_length(name, float(value)) for value in np.broadcast_to(half, 2)])
+
+
+def _counts(
+    girth: float, height: float, num_points: int | None, cell_size: float | None, num_around: int | None
+) -> tuple[int, int]:
+    """Nodes round a sleeve, and rows of triangles along it."""
+    if num_around is not None:
+        if num_points is not None or cell_size is not None:
+            raise ValueError("num_around: give it, num_points or cell_size, not two of them.")
+        around = unstructured.check_count("num_around", num_around, _FEWEST_AROUND)
+        return around, max(1, round(height / (_ROW * girth / around)))
+    target = unstructured.Target.create(num_points, cell_size)
+    if target.cell_size is None:
+        # n = (g / h) (H / (0.87 h) + 1)
+        number = target.num_points
+        edge = np.sqrt(girth * height / (_ROW * number))
+        for _ in range(30):
+            edge = np.sqrt(girth * (height / _ROW + edge) / number)
+        rows = max(1, round(height / (_ROW * edge)))
+        around = max(_FEWEST_AROUND, round(number / (rows + 1)))
+    else:
+        around = max(_FEWEST_AROUND, round(girth / target.cell_size))
+        rows = max(1, round(height / (_ROW * girth / around)))
+    unstructured.check_total(around * (rows + 1), "num_points" if target.cell_size is None else "cell_size")
+    return around, rows
+
+
+def _arc_lengths(a: float, b: float) -> np.ndarray:
+    """Arc length along an ellipse of half-axes a and b, at evenly spaced angles of its parameter."""
+    angle = np.linspace(0, 2 * np.pi, _SAMPLES + 1)
+    corners = np.stack([a * np.cos(angle), b * np.sin(angle)], axis=1)
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+
+
+def _sleeve(height: float, halves: np.ndarray, around: int) -> Mesh:
+    """Rows of nodes on ellipses of half-axes `halves` (r + 1, 2), evenly along each, joined by triangles."""
+    rings = []
+    for row, (a, b) in enumerate(halves):
+        turn = (np.arange(around) + row % 2 / 2) / around
+        angle = 2 * np.pi * turn
+        if a != b:
+            length = _arc_lengths(a, b)
+            angle = np.interp(turn * length[-1], length, np.linspace(0, 2 * np.pi, _SAMPLES + 1))
+        rings.append(np.stack([a * np.cos(angle), b * np.sin(angle), np.full(around, height * row)], axis=1))
+    points = np.concatenate(rings)
+    points[:, 2] /= len(halves) - 1
+    numbers = np.arange(len(points)).reshape(len(halves), around)
+    cells = [_between(low, high, row % 2) for row, (low, high) in enumerate(pairwise(numbers))]
+
+    def loop(ring: np.ndarray) -> np.ndarray:
+        return np.stack([ring, np.roll(ring, -1)], axis=1)
+
+    return Mesh.create(points, np.concatenate(cells), tags={"bottom": loop(numbers[0]), "top": loop(numbers[-1])})
+
+
+def _between(low: np.ndarray, high: np.ndarray, ahead: int) -> np.ndarray:
+    """Triangles between two rings of as many nodes; the lower one is `ahead` by half a node, or the upper one."""
+    after_low, after_high = np.roll(low, -1), np.roll(high, -1)
+    if ahead:
+        return np.concatenate([np.stack([low, after_low, after_high], 1), np.stack([low, after_high, high], 1)])
+    return np.concatenate([np.stack([low, after_low, high], 1), np.stack([after_low, after_high, high], 1)])

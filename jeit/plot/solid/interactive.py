@@ -1,0 +1,120 @@
+"""A solid image, or one on a surface, to turn round and cut with the mouse: through PyVista, where it is installed."""
+
+import os
+import sys
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jeit.electrodes import AbstractElectrodes, ElectrodeShapes, shapes_of
+from jeit.image import Inclusion
+from jeit.mesh import Mesh
+from jeit.plot.axes import INK
+from jeit.plot.colour_scale import CHANGE, ColourScale
+from jeit.plot.imaging.electrodes import METAL
+from jeit.plot.solid.isosurfaces import HALF, OUTER, check_drawn, level_surfaces
+from jeit.plot.solid.scene import BODY
+from jeit.plot.solid.slices import cell_values
+
+if TYPE_CHECKING:
+    import pyvista  # pyright: ignore[reportMissingImports]
+
+_SIZE = (1280, 860)
+
+
+def view_solid(
+    mesh: Mesh,
+    values: ArrayLike,
+    electrodes: AbstractElectrodes | ElectrodeShapes | None = None,
+    *,
+    levels: Sequence[float] = HALF,
+    inclusions: Sequence[Inclusion] = (),
+    scale: ColourScale = CHANGE,
+    off_screen: bool = False,
+) -> "pyvista.Plotter":
+    """A scene of a solid image: hull, isosurfaces, electrodes with their numbers, a plane to drag through the body and
+    a colour bar; arguments as for `plot_isosurfaces`. Call `show()` of what is returned, or, made `off_screen`,
+    `screenshot("view.png")`.
+
+    Lengths are in millimetres. Raises `ImportError` where PyVista is not installed, `ValueError` as `plot_isosurfaces`.
+    """
+    check_drawn(mesh, electrodes, scale)
+    surfaces = level_surfaces(mesh, values, levels, both=scale.difference)
+    pv = _pyvista()
+    fitted = scale.of(np.asarray(values), "S/m")
+    look: dict[str, Any] = {
+        "cmap": fitted.keywords["cmap"],
+        "clim": (fitted.keywords["vmin"], fitted.keywords["vmax"]),
+    }
+    points = 1e3 * np.asarray(mesh.points)
+    plotter = pv.Plotter(off_screen=off_screen, window_size=list(_SIZE))
+    if not off_screen:
+        plotter.enable_depth_peeling()  # translucent things in their order; without a graphics card they vanish by it
+    hull = pv.PolyData.from_regular_faces(points, np.asarray(mesh.facets))
+    plotter.add_mesh(hull, color=BODY, opacity=0.12, name="hull")
+    plotter.add_mesh(hull.extract_feature_edges(30), color=INK, line_width=1.5, name="edges")
+    for k, (value, share, surface) in enumerate(surfaces):
+        if not len(surface.triangles):
+            continue
+        shell = pv.PolyData.from_regular_faces(1e3 * surface.points, surface.triangles)
+        shell["value"] = np.full(shell.n_points, fitted.factor * value)
+        opacity = 1.0 if share == max(levels) else OUTER
+        options = {"smooth_shading": True, "show_scalar_bar": False, "name": f"isosurface {k}"}
+        plotter.add_mesh(shell, scalars="value", opacity=opacity, **options, **look)
+    grid = pv.UnstructuredGrid({pv.CellType.TETRA: np.asarray(mesh.cells)}, points)
+    grid.cell_data["value"] = fitted.factor * cell_values(mesh, values)
+    # In two lines: VTK cuts off what is wider than the bar has room for, and with it the unit.
+    what, bracket, unit = fitted.label.rpartition(" (")
+    bar = {"title": f"{what}\n{bracket.strip()}{unit}", "color": INK, "vertical": True, "n_labels": 5, "fmt": "%.3g"}
+    bar |= {"title_font_size": 16, "label_font_size": 14, "position_x": 0.86, "position_y": 0.25, "height": 0.5}
+    plotter.add_mesh_slice(grid, normal="z", scalars="value", scalar_bar_args=bar, name="plane", **look)
+    if electrodes is not None:
+        shapes = shapes_of(mesh, electrodes) if isinstance(electrodes, AbstractElectrodes) else electrodes
+        _add_electrodes(plotter, pv, shapes)
+    for k, one in enumerate(inclusions):
+        ball = pv.Sphere(radius=1e3 * one.radius, center=1e3 * np.array(one.centroid))
+        plotter.add_mesh(ball, style="wireframe", color=INK, opacity=0.15, name=f"inclusion {k}")
+    plotter.add_axes()  # pyright: ignore[reportCallIssue]
+    plotter.camera_position = [(-1, -1.7, 1), (0, 0, 0), (0, 0, 1)]
+    plotter.reset_camera()  # pyright: ignore[reportCallIssue]
+    return plotter
+
+
+def can_view() -> str:
+    """Why an interactive view cannot be opened here; nothing where it can."""
+    if find_spec("pyvista") is None:
+        return 'PyVista is not installed: pip install "jeit[view]"'
+    window = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return "" if window else "there is no display"
+
+
+def _pyvista() -> Any:
+    try:
+        import pyvista  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError(
+            f'the interactive view needs PyVista, which cannot be imported ({error}): pip install "jeit[view]". '
+            "Pictures without it: jeit.plot.plot_solid."
+        ) from None
+    return pyvista
+
+
+def _add_electrodes(plotter: "pyvista.Plotter", pv: Any, shapes: ElectrodeShapes) -> None:
+    """Electrodes as polygons of metal, dots as balls, with their numbers."""
+    size = 1e3 * float(np.ptp(shapes.corners, axis=0).max())
+    pieces = []
+    for corners in shapes.polygons():
+        if len(corners) == 1:
+            pieces.append(pv.Sphere(radius=0.012 * size, center=1e3 * corners[0]))
+        else:
+            # Round the middle: a patch bent round a wall is no plane polygon.
+            ring = np.arange(len(corners))
+            fan = np.stack([ring, np.roll(ring, -1), np.full(len(ring), len(ring))], axis=1)
+            pieces.append(pv.PolyData.from_regular_faces(1e3 * np.vstack([corners, corners.mean(axis=0)]), fan))
+    plotter.add_mesh(pv.merge(pieces), color=METAL, name="electrodes", ambient=0.35)
+    numbers = [str(k + 1) for k in range(shapes.number)]
+    style: dict[str, Any] = {"font_size": 14, "text_color": INK, "shape_opacity": 0.6, "show_points": False}
+    plotter.add_point_labels(1e3 * shapes.middles(), numbers, always_visible=True, shape_color="white", **style)

@@ -1,0 +1,137 @@
+"""A solid image in space: surfaces of equal change inside the body, its electrodes on it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind, is_number, told
+from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
+from jeit.image import Inclusion, Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
+from jeit.image.plane import check_solid
+from jeit.mesh import Mesh
+from jeit.plot.axes import INK, axes_or_new
+from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale, check_scale
+from jeit.plot.solid.body import add_electrodes, add_hull, number_electrodes
+from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
+from jeit.plot.solid.scene import Scene, bare_in_space
+from jeit.plot.solid.shaded_surface import colours_of, mappable
+
+HALF = (0.5,)
+OUTER = 0.3
+# Over the strongest change of either sign: as inclusions are looked for.
+_LEAST_PEAK = 0.3
+_DASHED = (0, (4, 3))
+
+
+def plot_isosurfaces(
+    mesh: Mesh,
+    values: ArrayLike,
+    electrodes: AbstractElectrodes | ElectrodeShapes | None = None,
+    *,
+    levels: Sequence[float] = HALF,
+    inclusions: Sequence[Inclusion] = (),
+    camera: Camera = FROM_THE_CORNER,
+    scale: ColourScale = CHANGE,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the surfaces on which an image of a solid has given shares of the strongest change of either sign.
+
+    `values` per cell (m,) or per node (n,); changes of conductivity in S/m unless `scale` says otherwise. `levels`:
+    shares from 0 to 1; the greatest is drawn solid, others translucent round it; a sign that is nowhere 0.3 times as
+    strong as the other is left out. Of a scale that is not of differences they are shares of the way from the least to
+    the greatest value. `electrodes` are drawn on the body and numbered,
+    `inclusions` marked by the outlines of balls of their volume. Raises `ValueError` for values of another shape,
+    levels that are no shares, a mesh that is no solid, and things of another kind.
+    """
+    check_drawn(mesh, electrodes, scale)
+    fitted = scale.of(np.asarray(values), "S/m")
+    ax = draw_in_space(
+        axes_or_new(ax), mesh, values, electrodes, levels=levels, inclusions=inclusions, camera=camera, fitted=fitted
+    )
+    fitted.draw_bar(ax, mappable(fitted))
+    return ax
+
+
+def draw_in_space(
+    ax: Axes,
+    mesh: Mesh,
+    values: ArrayLike,
+    electrodes: AbstractElectrodes | ElectrodeShapes | None,
+    *,
+    levels: Sequence[float],
+    inclusions: Sequence[Inclusion],
+    camera: Camera,
+    fitted: FittedScale,
+    planes: Sequence[Plane] = (),
+) -> Axes:
+    """As `plot_isosurfaces` without a colour bar, in a scale that is fitted; with the outlines of cuts by `planes`."""
+    check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")
+    scene = Scene(camera)
+    add_hull(scene, mesh)
+    surfaces = level_surfaces(mesh, values, levels, both=fitted.scale.difference)
+    for value, share, surface in surfaces:
+        colour = np.array(colours_of(fitted, np.array([value]))[0])
+        colour[3] = 1.0 if share == max(levels) else OUTER
+        scene.add_triangles(surface.points, surface.triangles, colour, smooth=True)
+    for plane in planes:
+        outline = cut_by_plane(mesh, plane).outline
+        places = (
+            outline[..., :1] * plane.right + outline[..., 1:] * plane.up + (plane.point @ plane.toward) * plane.toward
+        )
+        scene.add_lines(places, INK, 0.6)
+    shapes = shapes_of(mesh, electrodes) if isinstance(electrodes, AbstractElectrodes) else electrodes
+    points, wall = np.asarray(mesh.points), np.asarray(mesh.facets)
+    if shapes is not None:
+        add_electrodes(scene, points, wall, shapes)
+    scene.draw(ax)
+    bare_in_space(ax, camera, points, numbered=shapes is not None)
+    if shapes is not None:
+        number_electrodes(ax, scene, points, wall, shapes)
+    for one in inclusions:
+        # A ball is seen as a disc of its radius from every side.
+        x, y = camera.on_page(np.array(one.centroid))
+        ax.add_patch(Circle((x, y), one.radius, fill=False, edgecolor=INK, linewidth=1, linestyle=_DASHED, zorder=3))
+    return ax
+
+
+def level_surfaces(
+    mesh: Mesh, values: ArrayLike, levels: Sequence[float], *, both: bool
+) -> list[tuple[float, float, TriangleSurface]]:
+    """The surfaces at shares of the strongest change of each sign, if `both` are asked for, or else of the way from the
+    least value to the greatest: the value on each, its share, and the surface. Raises `ValueError` for levels that are
+    no shares.
+    """
+    shares = check_levels(levels)
+    image = node_values(mesh, np.asarray(values))
+    base = 0.0 if both else float(image.min())
+    least = _LEAST_PEAK * float(np.abs(image - base).max())
+    found = []
+    for sign in (1.0, -1.0) if both else (1.0,):
+        peak = float((sign * (image - base)).max())
+        if peak > 0 and peak >= least:
+            for share in shares:
+                level = sign * share * peak
+                found.append((base + level, share, isosurface_of(mesh, image - base, level)))
+    return found
+
+
+def check_levels(levels: Sequence[float]) -> list[float]:
+    """Shares of the strongest change. Raises `ValueError` for others."""
+    shares: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
+    if len(shares) == 0 or not all(is_number(one) and 0 < one < 1 for one in shares):
+        raise ValueError(f"levels must be shares of the strongest change, such as (0.3, 0.6); they are {told(levels)}.")
+    return [float(one) for one in shares]
+
+
+def check_drawn(mesh: Mesh, electrodes, scale: ColourScale) -> None:
+    """Raises `ValueError` for what is no solid, no electrodes or no scale."""
+    check_solid(mesh)
+    check_scale(scale)
+    if electrodes is not None:
+        kinds = (AbstractElectrodes, ElectrodeShapes)
+        check_kind("electrodes", electrodes, kinds, "those of jeit.electrodes, such as FacePatches")

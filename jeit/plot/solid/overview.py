@@ -1,0 +1,97 @@
+"""What one wants to see of a solid image first: where things are in space, and cut through the strongest change."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
+from jeit.image import Inclusion, Plane
+from jeit.image.plane import AXES
+from jeit.mesh import Mesh, centroids
+from jeit.plot.axes import INK, draw_colour_bar
+from jeit.plot.colour_scale import CHANGE, ColourScale
+from jeit.plot.solid.body import size_of
+from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
+from jeit.plot.solid.isosurfaces import HALF, check_drawn, draw_in_space
+from jeit.plot.solid.shaded_surface import mappable
+from jeit.plot.solid.slices import cell_values, draw_slice, dress_slice
+
+_MOST_LISTED = 5
+LOGARITHM = ColourScale(quantity="log₁₀ of conductivity over background", unit="")
+"""Of iterative images."""
+
+
+def plot_solid(
+    mesh: Mesh,
+    values: ArrayLike,
+    electrodes: AbstractElectrodes | ElectrodeShapes | None = None,
+    *,
+    levels: Sequence[float] = HALF,
+    inclusions: Sequence[Inclusion] = (),
+    camera: Camera = FROM_THE_CORNER,
+    scale: ColourScale = CHANGE,
+    figure: Figure | None = None,
+) -> Figure:
+    """Draw a solid image as isosurfaces in space beside three slices at right angles through its strongest change: the
+    centre of the first of `inclusions`, or else the cell of the strongest value. Their outlines are drawn in space.
+
+    All arguments as for `plot_isosurfaces`, and errors too. A new figure is made unless one is given.
+    """
+    check_drawn(mesh, electrodes, scale)
+    image = cell_values(mesh, values)
+    fitted = scale.of(image, "S/m")
+    shapes = electrodes
+    if isinstance(electrodes, AbstractElectrodes):
+        shapes = shapes_of(mesh, electrodes)
+    place = strongest_place(mesh, image, inclusions)
+    planes = [Plane.at(axis, float(place[AXES.index(axis)])) for axis in ("z", "x", "y")]
+    figure = Figure(figsize=(12.6, 6.4), layout="constrained") if figure is None else figure
+    grid = figure.add_gridspec(2, 4, width_ratios=(1.75, 1, 1, 0.045))
+    space = figure.add_subplot(grid[:, 0])
+    draw_in_space(
+        space, mesh, values, shapes, levels=levels, inclusions=inclusions, camera=camera, fitted=fitted, planes=planes
+    )
+    half = size_of(mesh) / 2
+    for plane, cell in zip(planes, (grid[0, 1], grid[0, 2], grid[1, 1]), strict=True):
+        panel = figure.add_subplot(cell)
+        draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted)
+        seen = plane.on_page(np.asarray(mesh.points))
+        x, y = (seen.min(axis=0) + seen.max(axis=0)) / 2
+        # All slices to one scale of lengths, whichever side is longest.
+        dress_slice(panel, plane, (x - half, x + half, y - half, y + half), cross=True)
+    _tell(figure.add_subplot(grid[1, 2]), place, levels, inclusions, difference=scale.difference)
+    if scale.bar:
+        bar = figure.add_subplot(grid[:, 3])
+        draw_colour_bar(space, mappable(fitted), fitted.label, signed=scale.difference, place=bar)
+    return figure
+
+
+def strongest_place(mesh: Mesh, image: np.ndarray, inclusions: Sequence[Inclusion] = ()) -> np.ndarray:
+    """Where to cut (3,): the centre of the first inclusion, or of the cell of the strongest value."""
+    if inclusions:
+        return np.array(inclusions[0].centroid)
+    return np.asarray(centroids(mesh))[np.abs(image - (np.median(image))).argmax()]
+
+
+def _tell(ax: Axes, place, levels, inclusions: Sequence[Inclusion], *, difference: bool) -> None:
+    """What is drawn, and what was found, in words."""
+    ax.set_axis_off()
+    shares = ", ".join(f"{100 * share:g}" for share in sorted(levels))
+    of = "of the strongest change" if difference else "of the way from least to greatest"
+    lines = [f"slices through ({_millimetres(place)}) mm", f"surfaces at {shares} % {of}"]
+    if inclusions:
+        lines += ["", "found, drawn as balls of their volume:"]
+    for one in inclusions[:_MOST_LISTED]:
+        sign = "+" if one.sign > 0 else "−"
+        lines.append(f"{sign}  {1e6 * one.area:.3g} cm³ at ({_millimetres(one.centroid)}) mm")
+    if len(inclusions) > _MOST_LISTED:
+        lines.append(f"and {len(inclusions) - _MOST_LISTED} more")
+    ax.text(0, 0.9, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=8.5, color=INK, linespacing=1.6)
+
+
+def _millimetres(place) -> str:
+    return ", ".join(f"{1e3 * value:.0f}" for value in place).replace("-", "−")

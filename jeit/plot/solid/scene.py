@@ -1,0 +1,157 @@
+"""A picture of things in space: all of them in pieces, drawn from the farthest to the nearest.
+
+matplotlib's own axes in space sort whole objects, so that electrodes show through bodies. Here every piece is sorted
+among all others, and seen along parallel rays, so that the picture has a true scale.
+"""
+
+import numpy as np
+from jaxtyping import Float, Int
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgba
+from matplotlib.patheffects import withStroke
+
+from jeit.plot.axes import INK, draw_scale_bar
+from jeit.plot.solid.camera import Camera
+
+_RIM = [withStroke(linewidth=2.2, foreground="white")]
+_LETTERS = ("x", "y", "z")
+# Of what has no values.
+BODY = "#b9bec6"
+
+
+class Scene:
+    """Collects what is to be seen by a `camera`, and draws it on axes in one stroke."""
+
+    def __init__(self, camera: Camera):
+        self.camera = camera
+        self._corners: list[np.ndarray] = []
+        self._nearness: list[np.ndarray] = []
+        self._face: list[np.ndarray] = []
+        self._edge: list[np.ndarray] = []
+        self._width: list[np.ndarray] = []
+
+    def add_triangles(
+        self,
+        points: Float[np.ndarray, "n 3"],
+        triangles: Int[np.ndarray, "m 3"],
+        colours: Float[np.ndarray, "m 4"],
+        *,
+        smooth: bool = False,
+        lit: bool = True,
+        before: Float[np.ndarray, "m"] | float = 0.0,
+    ) -> None:
+        """Triangles in colours (m, 4) of their own, darker where they are turned from the light. `smooth`: lit as if
+        rounded where they meet. `before`: metres that they count as nearer than they are."""
+        corners = points[triangles]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        if smooth:
+            at_nodes = np.stack(
+                [np.bincount(triangles.ravel(), np.repeat(one, 3), len(points)) for one in normals.T], axis=1
+            )
+            normals = at_nodes[triangles].sum(axis=1)
+        face = np.array(np.broadcast_to(colours, (len(triangles), 4)), dtype=float)
+        if lit:
+            face[:, :3] *= self.camera.light(normals)[:, None]
+        nearness = self.camera.nearness(corners.mean(axis=1)) + before
+        # Edges in the colour of the face close the seams; of translucent ones they would show as a net.
+        solid = face[:, 3] > 0.99
+        self._add(corners[:, [0, 1, 2, 2]], nearness, face, np.where(solid[:, None], face, 0), 0.7 * solid)
+
+    def add_polygon(
+        self, corners: Float[np.ndarray, "k 3"], colour, outward: Float[np.ndarray, "3"], before: float
+    ) -> None:
+        """A convex patch of a surface, in pieces that are sorted each for itself; and its rim."""
+        middle = corners.mean(axis=0)
+        ring = np.arange(len(corners))
+        points = np.concatenate([corners, (corners + middle) / 2, middle[None]])
+        inner, other, count = ring + len(corners), (ring + 1) % len(corners), len(corners)
+        triangles = np.concatenate(
+            [
+                np.stack([ring, other, other + count], axis=1),
+                np.stack([ring, other + count, inner], axis=1),
+                np.stack([inner, other + count, np.full(count, 2 * count)], axis=1),
+            ]
+        )
+        nearer = before * float(outward @ self.camera.toward)
+        self.add_triangles(points, triangles, np.array(to_rgba(colour)), before=nearer)
+        rim = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+        self.add_lines(rim, INK, 0.5, before=nearer + abs(nearer) * 0.05)
+
+    def add_lines(self, ends: Float[np.ndarray, "s 2 3"], colour, width: float, *, before: float = 0.0) -> None:
+        """Lines from one end to the other, `width` in points."""
+        edge = np.broadcast_to(to_rgba(colour), (len(ends), 4))
+        nearness = self.camera.nearness(ends.mean(axis=1)) + before
+        self._add(ends[:, [0, 1, 1, 0]], nearness, np.zeros((len(ends), 4)), edge, np.full(len(ends), width))
+
+    def _add(self, corners, nearness, face, edge, width) -> None:
+        self._corners.append(self.camera.on_page(corners))
+        self._nearness.append(nearness)
+        self._face.append(face)
+        self._edge.append(edge)
+        self._width.append(width)
+
+    def draw(self, ax: Axes) -> None:
+        """Draw all that was collected, from the farthest to the nearest."""
+        if not self._corners:
+            return
+        order = np.argsort(np.concatenate(self._nearness), kind="stable")
+        corners, face, edge, width = (
+            np.concatenate(parts)[order] for parts in (self._corners, self._face, self._edge, self._width)
+        )
+        ax.add_collection(
+            PolyCollection(
+                corners,  # pyright: ignore[reportArgumentType]
+                facecolors=face,
+                edgecolors=edge,
+                linewidths=width,
+                closed=True,
+                capstyle="round",
+                joinstyle="round",
+            ),
+            autolim=False,
+        )
+
+
+def bare_in_space(ax: Axes, camera: Camera, points: Float[np.ndarray, "n 3"], *, numbered: bool) -> None:
+    """Equal scales and no frame round what is seen of `points`; below it a scale bar, and which way the axes point."""
+    seen = camera.on_page(points)
+    (left, low), (right, high) = seen.min(axis=0), seen.max(axis=0)
+    size = max(right - left, high - low)
+    room = (0.09 if numbered else 0.03) * size
+    ax.set_aspect("equal")
+    ax.set_xlim(left - max(room, 0.07 * size), right + max(room, 0.07 * size))
+    ax.set_ylim(low - 0.24 * size - 0.4 * room, high + room)
+    ax.set_axis_off()
+    draw_scale_bar(ax, (left, right, low - 0.4 * room, high))
+    place = (right - 0.05 * size, low - 0.4 * room - 0.14 * size)
+    draw_axes_cross(ax, camera.on_page(np.eye(3)), place, 0.09 * size)
+
+
+def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], place: tuple[float, float], length: float) -> None:
+    """Arrows with letters, which way x, y and z point on the page, each as long as it is seen; what points at the
+    viewer is left out. All in metres on the page."""
+    for letter, direction in zip(_LETTERS, directions, strict=True):
+        if np.hypot(*direction) < 0.15:
+            continue
+        tip = np.array(place) + length * direction
+        style = {
+            "arrowstyle": "-|>,head_width=0.14,head_length=0.28",
+            "color": INK,
+            "linewidth": 0.9,
+            "shrinkA": 0,
+            "shrinkB": 0,
+        }
+        ax.annotate("", xy=tuple(tip), xytext=place, arrowprops=style, annotation_clip=False)
+        # The letter stands beyond the tip, as far off however short the arrow is seen.
+        x, y = tip + 0.3 * length * direction / np.hypot(*direction)
+        ax.text(x, y, letter, ha="center", va="center", fontsize=8, color=INK)
+
+
+def draw_number(ax: Axes, place: Float[np.ndarray, "2"], told: str, *, fontsize: float, faint: bool) -> None:
+    """A number on the page, with a rim that parts it from what is behind."""
+    x, y = place
+    ax.text(
+        x, y, told, ha="center", va="center", fontsize=fontsize, color=INK, alpha=0.45 if faint else 1.0,
+        path_effects=_RIM, zorder=4,
+    )  # fmt: skip

@@ -1,0 +1,103 @@
+"""Surfaces of triangles in space, with values on them, in light and shade from any side."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize, to_rgba
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind
+from jeit.electrodes.electrode_shapes import ElectrodeShapes
+from jeit.plot.axes import axes_or_new
+from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale, check_scale
+from jeit.plot.solid.body import add_electrodes, number_electrodes
+from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
+from jeit.plot.solid.scene import BODY, Scene, bare_in_space
+
+
+def plot_surface(
+    points: ArrayLike,
+    triangles: ArrayLike,
+    values: ArrayLike | None = None,
+    electrodes: ElectrodeShapes | None = None,
+    *,
+    camera: Camera = FROM_THE_CORNER,
+    scale: ColourScale = CHANGE,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw a surface in space: `points` (n, 3) metres, `triangles` (m, 3) into them.
+
+    `values`: one for each triangle, flat, or for each point, smooth; grey without. `electrodes`: what
+    `jeit.electrodes.shapes_of` makes of them, drawn on it and numbered. `camera`: from where it is seen.
+    `scale`: how values become colours; changes of sheet conductivity in S unless it says otherwise. Raises `ValueError`
+    for arrays of other shapes, values that are not finite and things of another kind.
+    """
+    places, faces = checked_surface(points, triangles)
+    check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")
+    check_scale(scale)
+    if electrodes is not None:
+        check_kind("electrodes", electrodes, ElectrodeShapes, "ElectrodeShapes, of shapes_of(mesh, electrodes)")
+    ax = axes_or_new(ax)
+    scene, fitted = Scene(camera), None
+    if values is None:
+        colours = np.array(to_rgba(BODY))
+    else:
+        image = checked_values(values, len(places), len(faces))
+        fitted = scale.of(image, "S")
+        colours = colours_of(fitted, image if len(image) == len(faces) else image[faces].mean(axis=1))
+    scene.add_triangles(places, faces, colours, smooth=True)
+    if electrodes is not None:
+        add_electrodes(scene, places, faces, electrodes)
+    scene.draw(ax)
+    bare_in_space(ax, camera, places, numbered=electrodes is not None)
+    if electrodes is not None:
+        number_electrodes(ax, scene, places, faces, electrodes)
+    if title is not None:
+        ax.set_title(title)
+    if fitted is not None:
+        fitted.draw_bar(ax, mappable(fitted))
+    return ax
+
+
+def checked_surface(points: ArrayLike, triangles: ArrayLike) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
+    """Points and triangles of a surface as arrays. Raises `ValueError`."""
+    places, faces = np.asarray(points), np.asarray(triangles)
+    if places.ndim != 2 or places.shape[1] != 3 or not np.issubdtype(places.dtype, np.number):
+        raise ValueError(f"points has shape {places.shape}; give (n, 3), metres.")
+    if not np.isfinite(places).all():
+        raise ValueError("points must be finite, in metres.")
+    if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or not np.issubdtype(faces.dtype, np.integer):
+        raise ValueError(f"triangles has shape {faces.shape} of {faces.dtype}; give (m, 3) whole numbers of points.")
+    if faces.min() < 0 or faces.max() >= len(places):
+        raise ValueError(f"triangles names point {int(faces.max())}; there are {len(places)}, counted from 0.")
+    return places.astype(float), faces
+
+
+def checked_values(values: ArrayLike, num_points: int, num_triangles: int) -> Float[np.ndarray, " k"]:
+    """Values of a surface per triangle or per point, as an array. Raises `ValueError`."""
+    image = np.asarray(values)
+    if image.shape not in ((num_triangles,), (num_points,)):
+        raise ValueError(
+            f"values has shape {image.shape}; give one for each of the {num_triangles} triangles or the {num_points} "
+            "points."
+        )
+    if np.iscomplexobj(image):
+        raise ValueError("values are complex; draw their real or imaginary part.")
+    return image
+
+
+def colours_of(fitted: FittedScale, values: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 4"]:
+    """Colours (m, 4) of values in a scale."""
+    return colormaps[fitted.keywords["cmap"]](_normalised(fitted)(fitted.factor * np.asarray(values)))
+
+
+def mappable(fitted: FittedScale) -> ScalarMappable:
+    """What a colour bar is drawn of."""
+    return ScalarMappable(_normalised(fitted), fitted.keywords["cmap"])
+
+
+def _normalised(fitted: FittedScale) -> Normalize:
+    return Normalize(fitted.keywords["vmin"], fitted.keywords["vmax"])

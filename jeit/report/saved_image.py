@@ -1,0 +1,153 @@
+"""An image on disk, `image.npz`: what is kept of it, and how it is had back to be looked at."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Inexact
+
+from jeit.arguments import counted, told
+from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
+from jeit.files import need, npz_arrays
+from jeit.image import Inclusion
+from jeit.mesh import Mesh
+
+_OTHERWISE = "not an image that jeit wrote; give the image.npz of jeit reconstruct"
+_NEEDED = ("conductivity", "points", "cells")
+_KEPT = (
+    *_NEEDED,
+    "background",
+    "departure",
+    "electrode_corners",
+    "electrode_sizes",
+    "electrode_numbers",
+    "inclusion_centroids",
+    "inclusion_sizes",
+    "inclusion_peaks",
+)
+
+
+@dataclass(frozen=True)
+class SavedImage:
+    """What an `image.npz` holds of a body and the image of it.
+
+    **Fields**: `mesh`; `change` (m,) of conductivity in every cell, S/m (of a sheet S), complex of admittivity;
+    `background`, what it is a change of, None where the file does not say; `departure` (m,), the logarithm to the base
+    of ten of conductivity over background, of iterative images, else None; `electrodes`, as polygons, None where the
+    file has none; `inclusions` that were found.
+    """
+
+    mesh: Mesh
+    change: Inexact[np.ndarray, " m"]
+    background: complex | float | None = None
+    departure: Float[np.ndarray, " m"] | None = None
+    electrodes: ElectrodeShapes | None = None
+    inclusions: tuple[Inclusion, ...] = ()
+
+    @property
+    def unit(self) -> str:
+        """Of conductivity."""
+        return "S" if self.mesh.dimension == 2 else "S/m"
+
+
+def saved_extras(
+    mesh: Mesh, electrodes: AbstractElectrodes, inclusions: tuple[Inclusion, ...]
+) -> dict[str, np.ndarray]:
+    """Arrays of an `image.npz` beside the image itself: electrodes as polygons, `electrode_corners` (q, d) of all of
+    them, `electrode_sizes` (p,) how many are each one's, `electrode_numbers` (p,) whose, from 0; and of inclusions
+    `inclusion_centroids` (i, d), `inclusion_sizes` (i,) m² (of solids m³), `inclusion_peaks` (i,)."""
+    shapes, dimension = shapes_of(mesh, electrodes), np.shape(mesh.points)[1]
+    return {
+        "electrode_corners": shapes.corners,
+        "electrode_sizes": shapes.sizes,
+        "electrode_numbers": shapes.electrode,
+        "inclusion_centroids": np.array([one.centroid for one in inclusions]).reshape(-1, dimension),
+        "inclusion_sizes": np.array([one.area for one in inclusions], float),
+        "inclusion_peaks": np.array([one.peak for one in inclusions], float),
+    }
+
+
+def read_image(path: str | Path) -> SavedImage:
+    """The image in an `image.npz` that `jeit reconstruct` or `write_image` wrote.
+
+    Files of earlier versions have no electrodes and no inclusions. Raises `ValueError` for files of another kind, or of
+    arrays that do not belong together, `OSError` where there is none.
+    """
+    path = Path(path)
+    name = path.name[:80]
+    if path.is_dir():
+        raise ValueError(f"{name} is a folder; give the image.npz in it.")
+    try:
+        arrays = npz_arrays(path, *_KEPT, otherwise=_OTHERWISE)
+        _check_kind(arrays)
+        need(arrays, *_NEEDED)
+        mesh = Mesh.create(arrays["points"], arrays["cells"])
+        return _image(mesh, arrays)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}"[:400]) from None
+
+
+def _check_kind(arrays: dict[str, np.ndarray]) -> None:
+    """Other files of jeit's that hold arrays: which command is for them."""
+    held = set(arrays[""].tolist())
+    if "images" in held or "depth" in held:
+        raise ValueError("it holds many frames; give the image.npz of one, of jeit reconstruct.")
+
+
+def _image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
+    def per_cell(name: str, kinds: str) -> np.ndarray | None:
+        if name not in arrays:
+            return None
+        values = arrays[name]
+        if values.shape != (mesh.num_cells,) or values.dtype.kind not in kinds:
+            raise ValueError(f"'{name}' is {told(values)}; there are {counted(mesh.num_cells, 'cell')}.")
+        if not np.isfinite(values).all():
+            raise ValueError(f"'{name}' has values that are not finite.")
+        return values
+
+    change = per_cell("conductivity", "fiuc")
+    assert change is not None
+    background = arrays.get("background")
+    if background is not None and (background.shape != () or background.dtype.kind not in "fiuc"):
+        raise ValueError(f"'background' is {told(background)}; one number is wanted.")
+    return SavedImage(
+        mesh=mesh,
+        change=change,
+        background=None if background is None else background.item(),
+        departure=per_cell("departure", "f"),
+        electrodes=_electrodes(mesh, arrays),
+        inclusions=_inclusions(mesh, arrays),
+    )
+
+
+def _electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShapes | None:
+    if "electrode_corners" not in arrays:
+        return None
+    need(arrays, "electrode_sizes", "electrode_numbers")
+    corners, sizes, numbers = (arrays[f"electrode_{name}"] for name in ("corners", "sizes", "numbers"))
+    whole = all(one.dtype.kind in "iu" and one.ndim == 1 for one in (sizes, numbers))
+    if not (whole and len(sizes) == len(numbers) > 0 and sizes.min() > 0 and sizes.sum() == len(corners)):
+        raise ValueError("'electrode_sizes' does not tell whose corners 'electrode_corners' are; write it again.")
+    if corners.ndim != 2 or corners.shape[1] != mesh.points.shape[1] or not np.isfinite(corners).all():
+        raise ValueError("'electrode_corners' are no places in the mesh's space; write it again.")
+    # Every electrode has a polygon, or there would be one without a place.
+    if not np.array_equal(np.unique(numbers), np.arange(numbers.max() + 1)):
+        raise ValueError("'electrode_numbers' leave electrodes out; write it again.")
+    return ElectrodeShapes(corners.astype(float), sizes, numbers)
+
+
+def _inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusion, ...]:
+    if "inclusion_centroids" not in arrays:
+        return ()
+    need(arrays, "inclusion_sizes", "inclusion_peaks")
+    centroids, sizes, peaks = (arrays[f"inclusion_{name}"] for name in ("centroids", "sizes", "peaks"))
+    number = len(centroids)
+    if centroids.shape != (number, mesh.points.shape[1]) or not sizes.shape == peaks.shape == (number,):
+        raise ValueError("'inclusion_centroids', '_sizes' and '_peaks' do not belong together; write it again.")
+    if not all(one.dtype.kind == "f" and np.isfinite(one).all() for one in (centroids, sizes, peaks)):
+        raise ValueError("inclusions have values that are not finite; write it again.")
+    return tuple(
+        Inclusion(1 if peak > 0 else -1, tuple(centroid), size, peak, mesh.is_surface)
+        for centroid, size, peak in zip(centroids.tolist(), sizes.tolist(), peaks.tolist(), strict=True)
+    )

@@ -1,0 +1,153 @@
+"""Images for other programs to look into: VTU, a series of them in time (PVD), and XDMF."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from jaxtyping import Int
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind, is_number, told
+from jeit.electrodes import AbstractElectrodes
+from jeit.files import whole_files
+from jeit.mesh import Mesh, write
+from jeit.mesh.geometry import facet_measures
+from jeit.report.folder import results_folder
+
+# Share of the surface round a node that an electrode covers if the node is said to be under it.
+_UNDER = 0.1
+
+
+def write_vtu(
+    path: str | Path,
+    mesh: Mesh,
+    cell_data: Mapping[str, ArrayLike],
+    *,
+    point_data: Mapping[str, ArrayLike] | None = None,
+    electrodes: AbstractElectrodes | None = None,
+) -> None:
+    """Write one VTU file: a mesh with values per cell (m,) and per node (n,), complex ones by their parts.
+
+    With `electrodes`, values per node say under which each lies, "electrode": its number from 1, 0 elsewhere. Lengths
+    are in metres. Raises `ValueError` for another ending, values of another length and a folder that cannot be.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".vtu":
+        raise ValueError(f"path: {path.name[:80]} must end in .vtu.")
+    with whole_files(results_folder(path.parent, (path.name,))) as made:
+        draft_vtu(made / path.name, mesh, cell_data, point_data=point_data, electrodes=electrodes)
+
+
+def draft_vtu(
+    path: Path,
+    mesh: Mesh,
+    cell_data: Mapping[str, ArrayLike],
+    *,
+    point_data: Mapping[str, ArrayLike] | None = None,
+    electrodes: AbstractElectrodes | None = None,
+) -> None:
+    """As `write_vtu`, in a folder whose files take their places later."""
+    at_nodes = dict(point_data or {})
+    if electrodes is not None:
+        at_nodes["electrode"] = electrode_of_nodes(mesh, electrodes)
+    write(mesh, path, cell_data=_real(cell_data), point_data=_real(at_nodes))
+
+
+def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
+    """Write a series in time: `path`, a .pvd file that ParaView opens, beside one VTU for each frame.
+
+    `times` (F,) seconds; `cell_data`: names and values (F, m). The VTU files are named after the series,
+    `breath_0000.vtu`. All are written or none. Raises `ValueError` for another ending and arrays that do not fit.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".pvd":
+        raise ValueError(f"path: {path.name[:80]} must end in .pvd.")
+    seconds, values = _frames(mesh, times, cell_data)
+    names = [f"{path.stem}_{k:04d}.vtu" for k in range(len(seconds))]
+    entries = [
+        f'    <DataSet timestep="{time:.17g}" part="0" file={quoteattr(name)}/>'
+        for time, name in zip(seconds, names, strict=True)
+    ]
+    lines = [
+        '<?xml version="1.0"?>',
+        '<VTKFile type="Collection" version="0.1">',
+        "  <Collection>",
+        *entries,
+        "  </Collection>",
+        "</VTKFile>",
+    ]
+    with whole_files(results_folder(path.parent, (path.name, *names))) as made:
+        for k, name in enumerate(names):
+            draft_vtu(made / name, mesh, {key: one[k] for key, one in values.items()})
+        (made / path.name).write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def write_xdmf(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
+    """Write a series in time as one XDMF file of text, with no other beside it; arguments as of `write_vtk_series`.
+    Raises `ValueError` as that does, for an ending other than .xdmf."""
+    from meshio.xdmf import TimeSeriesWriter
+
+    path = Path(path)
+    if path.suffix.lower() != ".xdmf":
+        raise ValueError(f"path: {path.name[:80]} must end in .xdmf.")
+    seconds, values = _frames(mesh, times, cell_data)
+    points = np.asarray(mesh.points, float)
+    if points.shape[1] == 2:
+        points = np.column_stack([points, np.zeros(len(points))])
+    kind = {3: "triangle", 4: "tetra"}[mesh.cells.shape[1]]
+    folder = results_folder(path.parent, (path.name,))
+    with whole_files(folder) as made, TimeSeriesWriter(str(made / path.name), data_format="XML") as file:
+        file.write_points_cells(points, [(kind, np.asarray(mesh.cells))])
+        for k, time in enumerate(seconds):
+            file.write_data(float(time), cell_data={key: [one[k]] for key, one in values.items()})
+
+
+def electrode_of_nodes(mesh: Mesh, electrodes: AbstractElectrodes) -> Int[np.ndarray, " n"]:
+    """The number, from 1, of the electrode that each node of a mesh lies under; 0 for none."""
+    contact = electrodes.contact(mesh)
+    load = np.asarray(contact.load)
+    if not electrodes.is_point:
+        load = load * np.asarray(electrodes.contact_impedance)
+        onto = np.asarray(contact.nodes[0])
+        if len(contact.nodes) == 1 and onto.shape == np.shape(mesh.facets):
+            share = np.repeat(np.asarray(facet_measures(mesh)) / onto.shape[1], onto.shape[1])
+            round_it = np.bincount(onto.ravel(), share, mesh.num_points)
+            load = load / np.where(round_it > 0, round_it, np.inf)[:, None]
+        else:
+            load = load / load.max(axis=0)
+    return np.where(load.max(axis=1) > _UNDER, load.argmax(axis=1) + 1, 0)
+
+
+def _real(data: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
+    """Values with complex ones by their parts."""
+    found = {}
+    for name, values in data.items():
+        array: Any = np.asarray(values)
+        if np.iscomplexobj(array):
+            found[f"{name}, real"], found[f"{name}, imaginary"] = array.real, array.imag
+        else:
+            found[name] = array
+    return found
+
+
+def _frames(mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> tuple[np.ndarray, dict[str, Any]]:
+    """Times and values of the frames of a series, checked."""
+    check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
+    seconds: Sequence | np.ndarray = np.atleast_1d(np.asarray(times, dtype=object))
+    if len(seconds) == 0 or not all(is_number(one) for one in seconds):
+        raise ValueError(f"times must be a time for each frame, seconds; they are {told(times)}.")
+    seconds = np.asarray(seconds, float)
+    if not (np.diff(seconds) > 0).all():
+        raise ValueError("times must rise from frame to frame.")
+    values = _real(cell_data)
+    for name, one in values.items():
+        if one.shape != (len(seconds), mesh.num_cells):
+            raise ValueError(
+                f"cell_data: {str(name)[:40]!r} has shape {one.shape}; give one value for each of the {len(seconds)} "
+                f"times and {mesh.num_cells} cells."
+            )
+    if not values:
+        raise ValueError("cell_data is empty; give the values of the frames by name.")
+    return seconds, values

@@ -1,0 +1,100 @@
+"""Discs and patches on the curved faces of shells: areas, places, derivatives, and what is on the other side."""
+
+import jax
+import numpy as np
+import pytest
+
+from jeit.electrodes import FaceDiscs, FacePatches
+from jeit.mesh import shell, tube
+
+RADIUS, THICKNESS, HEIGHT = 0.05, 0.004, 0.08
+ANGLE = 0.37
+
+
+def skin(cell_size, height=HEIGHT):
+    return shell(tube(RADIUS - THICKNESS, height, cell_size=cell_size), THICKNESS, 1)
+
+
+def spot(radius=RADIUS, height=HEIGHT):
+    return np.array([radius * np.cos(ANGLE), radius * np.sin(ANGLE), 0.51 * height])
+
+
+def disc_area(radius):
+    """Of what a ball cuts out of the cylinder: |z| < √(r² − 4R² sin²(θ/2)), by Gauss's rule in θ = α sin(πx/2)."""
+    x, weight = np.polynomial.legendre.leggauss(200)
+    widest = 2 * np.arcsin(radius / (2 * RADIUS))
+    angle = widest * np.sin(np.pi * x / 2)
+    half = np.sqrt(np.maximum(radius**2 - 4 * RADIUS**2 * np.sin(angle / 2) ** 2, 0))
+    return RADIUS * np.sum(weight * widest * np.pi / 2 * np.cos(np.pi * x / 2) * 2 * half)
+
+
+@pytest.mark.parametrize("ratio", [0.2, 0.6])
+def test_areas_of_discs_converge(ratio):
+    """Small against the radius of the cylinder, and not so small."""
+    radius, errors = ratio * RADIUS, []
+    for cell_size in (0.008, 0.004, 0.002):
+        height = 2.4 * radius
+        contact = FaceDiscs([spot(height=height)], radius, 1.0).contact(skin(cell_size, height))
+        errors.append(abs(float(contact.load.sum()) / disc_area(radius) - 1))
+    assert errors[0] < 1e-3
+    assert errors[2] < errors[0] / 4  # of the order of the square of the cell size, or better
+    assert errors[2] < 5e-5
+    # Against a flat disc: how much larger it is across, (r / R)² / 24, and the half of that.
+    assert disc_area(radius) / (np.pi * radius**2) == pytest.approx(1 + ratio**2 / 32, abs=ratio**4 / 50)
+
+
+def test_areas_of_patches_converge():
+    """A plate 30 mm long round the cylinder, seen along its normal."""
+    arc, errors = 0.03, []
+    width = 2 * RADIUS * np.sin(arc / (2 * RADIUS))
+    for cell_size in (0.008, 0.004, 0.002):
+        contact = FacePatches([spot(height=0.03)], width, 0.02, 1.0).contact(skin(cell_size, 0.03))
+        errors.append(abs(float(contact.load.sum()) / (arc * 0.02) - 1))
+    assert errors[2] < 1e-3
+    assert errors[2] < errors[0] / 4
+
+
+@pytest.mark.parametrize("ratio", [0.2, 0.95])
+def test_none_reaches_through_to_the_other_face(ratio):
+    """Discs of up to twelve times the thickness."""
+    mesh = skin(0.005, 2.2 * RADIUS)
+    inner = np.unique(np.asarray(mesh.facets)[np.asarray(mesh.tags["inner"])])
+    electrodes = FaceDiscs([spot(height=2.2 * RADIUS)], ratio * RADIUS, 1.0)
+    electrodes.check(mesh)
+    load = np.asarray(electrodes.contact(mesh).load)[:, 0]
+    assert np.abs(load[inner]).max() == 0
+    assert load.sum() == pytest.approx(disc_area(ratio * RADIUS), rel=1e-3)
+    own = FaceDiscs([spot(RADIUS - THICKNESS, 2.2 * RADIUS)], 0.2 * RADIUS, 1.0)
+    load = np.asarray(own.contact(mesh).load)[:, 0]
+    assert np.abs(np.delete(load, inner)).max() == 0
+
+
+@pytest.mark.parametrize("kind", ["disc", "patch"])
+def test_places_along_the_surface_by_taylor(kind):
+    mesh = skin(0.005, 0.04)
+    along = np.array([-np.sin(ANGLE), np.cos(ANGLE), 0.6])
+
+    def moment(step):
+        place = (spot(height=0.04) + 1e-3 * step * along)[None]
+        made = FaceDiscs(place, 0.012, 1.0) if kind == "disc" else FacePatches(place, 0.02, 0.015, 1.0)
+        load = made.contact(mesh).load[:, 0]
+        return (load @ mesh.points) / load.sum()
+
+    base, slope = jax.jvp(moment, (0.0,), (1.0,))
+    rest = [float(np.abs(moment(step) - base - step * slope).max()) for step in (0.2, 0.1, 0.05)]
+    assert rest[0] / rest[1] == pytest.approx(4, rel=0.3)
+    assert rest[1] / rest[2] == pytest.approx(4, rel=0.3)
+    # What is moved follows: the middle of what it covers moves as it does, but for what the cells leave of it.
+    np.testing.assert_allclose(slope, 1e-3 * along, atol=1.5e-4)
+
+
+def test_batches_and_compiled_calls():
+    mesh = skin(0.008, 0.05)
+    radii = np.array([0.008, 0.012, 0.02])
+
+    def area(radius):
+        return FaceDiscs([spot(height=0.05)], radius, 2.0).contact(mesh).load.sum()
+
+    each = np.array([float(area(radius)) for radius in radii])
+    np.testing.assert_allclose(jax.vmap(area)(radii), each, rtol=1e-12)
+    np.testing.assert_allclose([float(jax.jit(area)(radius)) for radius in radii], each, rtol=1e-12)

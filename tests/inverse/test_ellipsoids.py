@@ -1,0 +1,101 @@
+"""Bodies in a solid as ellipsoids: derivatives, geometry, and what is found in a box solved on another mesh."""
+
+import numpy as np
+import pytest
+
+from jeit.electrodes import FaceDiscs
+from jeit.forward import ForwardModel
+from jeit.inverse.shapes import EllipsoidPrior, StarPrior, reconstruct_shapes
+from jeit.inverse.shapes.ellipsoid import Ellipsoids
+from jeit.mesh import box, centroids
+from jeit.protocol import opposite
+
+SIZE, BATH = (0.1, 0.14, 0.1), 0.02
+BALL, RADIUS = np.array([0.012, -0.025, 0.055]), 0.022
+
+
+def discs():
+    """Sixteen discs on the four upright walls of the box."""
+    x, y = np.array([-0.025, 0.025]), np.array([-0.035, 0.035])
+    along_x = [(a, side * 0.07, z) for side in (-1, 1) for z in (0.03, 0.07) for a in x]
+    along_y = [(side * 0.05, b, z) for side in (-1, 1) for z in (0.03, 0.07) for b in y]
+    return FaceDiscs(np.array(along_x + along_y), 0.012, 0.01)
+
+
+def model(num_points):
+    return ForwardModel(box(*SIZE, num_points=num_points), discs(), opposite(16, current=1e-3))
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    return model(2500)
+
+
+@pytest.fixture
+def ellipsoids(coarse):
+    start = [[0.01, 0.02, 0.05], [-0.01, 0.0, 0.06], [0.01, 0.01, 0.04]]
+    return Ellipsoids.create(coarse.mesh, EllipsoidPrior(), start, [1, -1, 1])
+
+
+def test_derivatives_are_those_of_finite_differences(ellipsoids, coarse):
+    rng = np.random.default_rng(0)
+    point = ellipsoids.of_radii([0.03, 0.02, 0.03]) + 0.3 * rng.normal(size=31)
+    along, step = rng.normal(size=31), 1e-6
+    here = ellipsoids.image(point)
+    ahead, behind = ellipsoids.image(point + step * along), ellipsoids.image(point - step * along)
+    change = np.zeros(coarse.mesh.num_cells)
+    for (cells, slope), part in zip(here.slopes, np.split(along, [1, 11, 21]), strict=True):
+        change[cells] += slope @ part
+    np.testing.assert_allclose(change, (ahead.image - behind.image) / (2 * step), rtol=1e-6, atol=1e-6)
+    assert here.overlap.min() > 1e-5
+    np.testing.assert_allclose(here.overlap_slope @ along, (ahead.overlap - behind.overlap) / (2 * step), rtol=1e-5)
+
+
+def test_an_ellipsoid_knows_its_volume_its_middle_and_what_it_holds(ellipsoids):
+    rng = np.random.default_rng(1)
+    point = ellipsoids.of_radii([0.02, 0.02, 0.02])
+    point[6:11] = 0.8 * rng.normal(size=5)  # the stretches of the first
+    body = ellipsoids.body(0, point)
+    length = np.linalg.norm(body.axes, axis=1)
+    assert np.all(np.diff(length) < 0)
+    np.testing.assert_allclose(body.axes @ body.axes.T, np.diag(length**2), atol=1e-12)
+    np.testing.assert_allclose(np.prod(length), 0.02**3, rtol=1e-9)
+    np.testing.assert_allclose(body.volume, 4 * np.pi / 3 * 0.02**3, rtol=0.03)  # sampled in cells a third as large
+    np.testing.assert_allclose(body.centroid, body.centre, atol=5e-4)
+    ends = np.concatenate([body.centre + 0.99 * body.axes, body.centre - 0.99 * body.axes])
+    assert body.holds(ends).all()
+    assert not body.holds(body.centre + 1.01 * body.axes).any()
+
+
+def test_a_ball_over_the_wall_ends_there(coarse):
+    """Its middle on the wall: half the volume, its centroid 3/8 of the radius inside."""
+    balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), [[0.05, 0.0, 0.05]], [1])
+    body = balls.body(0, balls.of_radii([0.03]))
+    np.testing.assert_allclose(body.volume, 2 * np.pi / 3 * 0.03**3, rtol=0.02)
+    np.testing.assert_allclose(body.centroid, [0.05 - 3 / 8 * 0.03, 0, 0.05], atol=5e-4)
+
+
+@pytest.mark.parametrize("ratio", [4.0, 0.2])
+def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, ratio):
+    fine = model(9000)
+    held = np.linalg.norm(np.asarray(centroids(fine.mesh)) - BALL, axis=1) < RADIUS
+    rest, there = np.asarray(fine.voltages(BATH)), np.asarray(fine.voltages(BATH * np.where(held, ratio, 1.0)))
+    change = there - rest
+    noise = 0.03 * np.sqrt(np.mean(change**2))
+    change = change + 0.1 * noise * np.random.default_rng(0).normal(size=change.shape)
+    sign = 1 if ratio > 1 else -1
+    start = [(sign, BALL + 0.008, 0.025), (-sign, (-0.03, 0.04, 0.03), 0.02)]
+    found = reconstruct_shapes(coarse, np.asarray(coarse.voltages(BATH)) + change, BATH, start=start, noise=noise)
+    (body,) = found.bodies
+    assert body.sign == sign
+    assert np.linalg.norm(body.centroid - BALL) < 0.003
+    # What it does to the field: volume times (ratio - 1) / (ratio + 2); which of the two is hardly told.
+    strength = body.volume * np.expm1(sign * body.contrast) / (np.exp(sign * body.contrast) + 2)
+    true = 4 * np.pi / 3 * RADIUS**3 * (ratio - 1) / (ratio + 2)
+    np.testing.assert_allclose(strength, true, rtol=0.15)
+    assert len(found.doubtful) == 1
+
+
+def test_a_prior_of_a_sheet_is_refused(coarse):
+    with pytest.raises(ValueError, match="such as EllipsoidPrior"):
+        reconstruct_shapes(coarse, coarse.voltages(BATH), BATH, start=[], prior=StarPrior())

@@ -1,0 +1,317 @@
+"""Surfaces and solids in space, judged by what was drawn: order, colours, places."""
+
+import numpy as np
+import pytest
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from jeit.electrodes import (
+    BoundaryElectrodes,
+    CombinedElectrodes,
+    FaceDiscs,
+    FacePatches,
+    PointElectrodes,
+    plates,
+)
+from jeit.electrodes.electrode_shapes import shapes_of
+from jeit.image import Inclusion, Plane
+from jeit.layout import ring
+from jeit.mesh import box, centroids, cylinder, disk
+from jeit.plot import Camera, ColourScale, plot_isosurfaces, plot_slice, plot_slices, plot_solid, plot_surface
+from jeit.plot.solid.isosurfaces import level_surfaces
+from jeit.plot.solid.scene import Scene
+
+
+@pytest.fixture
+def ax():
+    return Figure(layout="constrained").subplots()
+
+
+def pieces(ax) -> PolyCollection:
+    (drawn,) = [one for one in ax.collections if isinstance(one, PolyCollection)]
+    return drawn
+
+
+@pytest.mark.parametrize(
+    ("angles", "toward", "right", "up"),
+    [
+        ((-90, 0), (0, -1, 0), (1, 0, 0), (0, 0, 1)),
+        ((0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        ((-90, 90), (0, 0, 1), (1, 0, 0), (0, 1, 0)),
+    ],
+)
+def test_cameras_look_where_they_are_told(angles, toward, right, up):
+    camera = Camera(*angles)
+    for seen, wanted in ((camera.toward, toward), (camera.right, right), (camera.up, up)):
+        np.testing.assert_allclose(seen, wanted, atol=1e-15)
+
+
+def test_what_is_nearer_is_drawn_later(ax):
+    points = np.array([[0, 0, z] for z in (0.3, 0.1, 0.2)])[:, None] + [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    scene = Scene(Camera(0, 90))
+    for k, colour in enumerate(np.eye(3)):
+        scene.add_triangles(points[k], np.array([[0, 1, 2]]), np.array([[*colour, 1.0]]), lit=False)
+    scene.draw(ax)
+    np.testing.assert_allclose(pieces(ax).get_facecolor()[:, :3], np.eye(3)[[1, 2, 0]])
+
+
+def test_lengths_across_the_view_are_true(ax):
+    camera = Camera(33, 47)
+    ends = np.stack([np.zeros(3), 0.05 * camera.up])
+    np.testing.assert_allclose(camera.on_page(ends)[1], [0, 0.05], atol=1e-15)
+
+
+def test_values_become_colours_and_the_light_does_not_change_which(ax):
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.2]])
+    plot_surface(points, [[0, 1, 2], [1, 3, 2]], [2e-3, -2e-3], ax=ax)
+    red, blue = sorted(pieces(ax).get_facecolor(), key=lambda colour: colour[2])
+    assert red[0] > 2 * red[2]
+    assert blue[2] > 2 * blue[0]
+    assert ax.figure.axes[-1].get_ylabel() == "Change of sheet conductivity (mS)"
+
+
+def test_both_sides_are_lit_alike():
+    camera = Camera()
+    normals = np.random.default_rng(1).normal(size=(50, 3))
+    np.testing.assert_allclose(camera.light(normals), camera.light(-3 * normals))
+    assert camera.light(normals).max() <= 1
+
+
+def test_a_surface_without_values_has_no_colour_bar(ax):
+    plot_surface(np.eye(3), [[0, 1, 2]], title="shell", ax=ax)
+    assert len(ax.figure.axes) == 1
+    assert ax.get_title() == "shell"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((np.zeros((3, 2)), [[0, 1, 2]]), "points has shape"),
+        ((np.full((3, 3), np.nan), [[0, 1, 2]]), "points must be finite"),
+        ((np.eye(3), [[0, 1, 3]]), "names point 3"),
+        ((np.eye(3), np.zeros((0, 3), int)), "triangles has shape"),
+        ((np.eye(3), [[0, 1, 2]], [1.0, 2.0]), "values has shape"),
+        ((np.eye(3), [[0, 1, 2]], [1j]), "complex"),
+        ((np.eye(3), [[0, 1, 2]], [np.inf]), "finite"),
+    ],
+)
+def test_surfaces_that_cannot_be(arguments, said):
+    with pytest.raises(ValueError, match=said):
+        plot_surface(*arguments)
+
+
+@pytest.mark.parametrize("angles", [(np.nan, 0), ("left", 0), (0, 91)])
+def test_cameras_that_cannot_be(angles):
+    with pytest.raises(ValueError, match=r"azimuth|elevation"):
+        Camera(*angles)
+
+
+def test_scales_and_cameras_of_another_kind():
+    with pytest.raises(ValueError, match="camera must be a Camera"):
+        plot_surface(np.eye(3), [[0, 1, 2]], camera=30)
+    with pytest.raises(ValueError, match="scale must be"):
+        plot_surface(np.eye(3), [[0, 1, 2]], scale="viridis")
+
+
+BOX = (0.17, 0.255, 0.17)
+PLACES = np.array([[0.085, 0.03, 0.05], [0.085, -0.06, 0.12], [0.0, -0.1275, 0.085], [-0.085, 0.0, 0.085]])
+
+
+@pytest.fixture(scope="module")
+def tank():
+    return box(*BOX, num_points=2500)
+
+
+@pytest.fixture(scope="module")
+def image(tank):
+    """A conductive ball and a resistive one, half as strong."""
+    place = np.asarray(centroids(tank))
+    balls = [np.exp(-(np.linalg.norm(place - middle, axis=1) ** 2) / 0.03**2) for middle in MIDDLES]
+    return 2e-3 * balls[0] - 1e-3 * balls[1]
+
+
+@pytest.fixture(scope="module")
+def patches():
+    return FacePatches(PLACES, 0.04, 0.03, 1e-3)
+
+
+MIDDLES = np.array([[0.03, -0.05, 0.1], [-0.03, 0.06, 0.06]])
+
+
+def shown(ax) -> list[str]:
+    return [text.get_text() for text in ax.texts]
+
+
+def area(corners):
+    """Of a polygon in space."""
+    return 0.5 * np.linalg.norm(sum(np.cross(a, b) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)))
+
+
+def test_patches_and_discs_are_polygons_of_their_size_in_the_wall(tank, patches):
+    shapes = shapes_of(tank, patches)
+    assert shapes.number == 4
+    np.testing.assert_allclose(shapes.middles(), PLACES, atol=1e-12)
+    for corners, place in zip(shapes.polygons(), PLACES, strict=True):
+        assert area(corners - place) == pytest.approx(0.04 * 0.03, rel=1e-12)
+        across = int(np.abs(place[:2] / BOX[:2]).argmax())
+        np.testing.assert_allclose(corners[:, across], place[across], atol=1e-12)
+        assert np.ptp(corners[:, 2]) == pytest.approx(0.03)
+    discs = shapes_of(tank, FaceDiscs(PLACES, 0.01, 1e-3))
+    assert area(discs.polygons()[0] - PLACES[0]) == pytest.approx(np.pi * 1e-4, rel=0.01)
+
+
+def test_strips_are_bent_round_a_cylinder():
+    tank = cylinder(0.075, 0.1, num_points=4000)
+    (corners,) = shapes_of(tank, FacePatches([[0.075, 0.0, 0.05]], 0.05, 0.08, 1e-3)).polygons()
+    radius = np.hypot(corners[:, 0], corners[:, 1])
+    assert np.abs(radius - 0.075).max() < 1e-3
+    assert np.ptp(corners[:, 0]) > 0.003  # a flat one would leave the wall by 4.3 mm
+
+
+def test_facets_points_and_parts_are_drawn_as_what_they_are(tank):
+    faces = shapes_of(tank, plates(tank, ["left", "right"], 1e-3))
+    total = [sum(area(one) for one, k in zip(faces.polygons(), faces.electrode, strict=True) if k == e) for e in (0, 1)]
+    np.testing.assert_allclose(total, BOX[1] * BOX[2])
+    dots = shapes_of(tank, PointElectrodes(PLACES))
+    np.testing.assert_array_equal(dots.sizes, 1)
+    both = shapes_of(tank, CombinedElectrodes(FaceDiscs(PLACES[:2], 0.01, 1), FacePatches(PLACES[2:], 0.02, 0.02, 1)))
+    np.testing.assert_allclose(both.middles(), PLACES, atol=1e-12)
+
+
+def test_arcs_of_a_sheet_are_lines_along_its_edge():
+    sheet = disk(0.05, num_points=300)
+    shapes = shapes_of(sheet, BoundaryElectrodes(ring(0.05, 8), 0.01, 0.1))
+    assert shapes.number == 8
+    assert shapes.corners.shape[1] == 2
+    assert np.abs(np.hypot(*shapes.corners.T) - 0.05).max() < 1e-3
+
+
+def nearness_of(ax, colour) -> np.ndarray:
+    """Where in the order of drawing the pieces lie whose face is about a colour."""
+    faces = pieces(ax).get_facecolor()
+    return np.flatnonzero(colour(faces))
+
+
+def is_metal(faces):
+    return (faces[:, 0] > 1.3 * faces[:, 1]) & (faces[:, 1] > 3 * faces[:, 2]) & (faces[:, 3] == 1)
+
+
+def test_electrodes_in_front_are_over_what_is_inside_and_those_behind_under_it(tank, image, patches, ax):
+    camera = Camera(azimuth=0, elevation=0)
+    plot_isosurfaces(tank, image, patches, camera=camera, scale=ColourScale(bar=False), ax=ax)
+    metal = nearness_of(ax, is_metal)
+    inside = nearness_of(ax, lambda faces: (faces[:, 3] == 1) & ~is_metal(faces))
+    drawn, seen = pieces(ax).get_paths(), []
+    for k in metal:
+        seen.append((drawn[k].vertices[:, 0].mean(), k > inside.max(), k < inside.min()))
+    # Patches 1 and 2 are on the wall looked at, 4 on the one behind; 3 is seen edge on.
+    for place, wanted in ((0.04, (True, False)), (-0.01, (False, True))):
+        on_it = {one[1:] for one in seen if abs(one[0] - place) < 0.006}
+        assert on_it == {wanted}
+
+
+def test_each_sign_has_its_own_surface(tank, image):
+    found = level_surfaces(tank, image, (0.5,), both=True)
+    assert [np.sign(value) for value, _, _ in found] == [1, -1]
+    for (_, _, surface), middle in zip(found, MIDDLES, strict=True):
+        # A Gaussian falls to half at 0.83 of its length.
+        assert surface.enclosed == pytest.approx(4 / 3 * np.pi * (0.8326 * 0.03) ** 3, rel=0.3)
+        assert np.linalg.norm(surface.points.mean(axis=0) - middle) < 0.008
+    weak = np.where(image < 0, 0.1 * image, image)
+    assert len(level_surfaces(tank, weak, (0.3, 0.6), both=True)) == 2
+    assert level_surfaces(tank, np.zeros(tank.num_cells), (0.5,), both=True) == []
+    ((value, _, _),) = level_surfaces(tank, image + 5e-3, (0.5,), both=False)
+    assert 5e-3 < value < 6.5e-3
+
+
+def test_a_slice_has_the_colours_of_the_cells_it_passes(tank, image, patches, ax):
+    plot_slice(tank, image, Plane.at("x", 0.03), patches, ax=ax)
+    (cells,) = [one for one in ax.collections if isinstance(one, PolyCollection)]
+    values = np.asarray(cells.get_array())
+    assert values.max() == pytest.approx(1e3 * image.max(), rel=0.1)
+    assert cells.get_clim() == pytest.approx((-1e3 * image.max(), 1e3 * image.max()))
+    assert ax.get_title() == "x = 30 mm"
+    # Electrode 3 lies across x = 0, from -20 to 20 mm.
+    assert "3" not in shown(ax)
+    assert {"y", "z", "50 mm"} <= set(shown(ax))
+
+
+def test_a_slice_shows_electrodes_that_it_passes_and_cuts_balls(tank, image, patches, ax):
+    inclusions = [Inclusion(1, (0.03, -0.05, 0.1), 4 / 3 * np.pi * 0.03**3, 1e-3)]
+    plot_slice(tank, image, Plane.at("z", 0.1 + 0.018), patches, inclusions=inclusions, ax=ax)
+    assert "2" in shown(ax)
+    assert "1" not in shown(ax)
+    (circle,) = [one for one in ax.patches if isinstance(one, Circle)]
+    assert circle.radius == pytest.approx(0.024)  # 18 mm off the middle of a ball of 30 mm
+    assert circle.center == pytest.approx((0.03, -0.05))
+    other = Figure().subplots()
+    plot_slice(tank, image, Plane.at("z", 0.14), inclusions=inclusions, ax=other)
+    assert not other.patches
+
+
+def test_grids_have_one_scale(tank, image, patches):
+    figure = plot_slices(tank, image, patches, axis="y", at=5)
+    panels = [one for one in figure.axes if one.get_title()]
+    assert [panel.get_title()[:4] for panel in panels] == ["y = "] * 5
+    limits = {tuple(c.get_clim()) for panel in panels for c in panel.collections if isinstance(c, PolyCollection)}
+    assert len(limits) == 1
+    assert len({panel.get_xlim() for panel in panels}) == 1
+    assert figure.axes[-1].get_ylabel() == "Change of conductivity (mS/m)"
+    told = plot_slices(tank, image, axis="z", at=[0.02, 0.03])
+    assert [one.get_title() for one in told.axes if one.get_title()] == ["z = 20 mm", "z = 30 mm"]
+
+
+def test_the_overview_cuts_through_what_is_strongest(tank, image, patches):
+    figure = plot_solid(tank, image, patches)
+    titles = {one.get_title() for one in figure.axes} - {""}
+    strongest = np.asarray(centroids(tank))[np.abs(image).argmax()]
+    assert titles == {Plane.at(axis, float(one)).name for axis, one in zip("xyz", strongest, strict=True)}
+    inclusions = [Inclusion(-1, (-0.03, 0.06, 0.06), 1e-4, -1e-3)]
+    figure = plot_solid(tank, image, patches, inclusions=inclusions)
+    assert {one.get_title() for one in figure.axes} - {""} == {"x = −30 mm", "y = 60 mm", "z = 60 mm"}
+    (words,) = [text.get_text() for one in figure.axes for text in one.texts if "found" in text.get_text()]
+    assert "100 cm³ at (−30, 60, 60) mm" in words
+
+
+def test_a_constant_image_is_drawn(tank):
+    plot_solid(tank, np.zeros(tank.num_cells)).canvas.draw()
+    plot_solid(tank, np.full(tank.num_points, 0.3), scale=ColourScale(difference=False)).canvas.draw()
+
+
+@pytest.mark.parametrize(
+    ("draw", "said"),
+    [
+        (lambda tank: plot_isosurfaces(tank, np.zeros(tank.num_cells), levels=(1.5,)), "levels must be shares"),
+        (lambda tank: plot_isosurfaces(tank, np.zeros(tank.num_cells), levels=()), "levels must be shares"),
+        (lambda tank: plot_isosurfaces(tank, np.zeros(3)), "values has shape"),
+        (lambda tank: plot_isosurfaces(tank, np.zeros(tank.num_cells), camera=3), "camera must be"),
+        (lambda tank: plot_slice(tank, np.zeros(tank.num_cells), Plane.at("z", 1.0)), "misses the body"),
+        (lambda tank: plot_slice(tank, np.full(tank.num_cells, np.nan), Plane.at("z", 0.1)), "finite"),
+        (lambda tank: plot_slices(tank, np.zeros(tank.num_cells), at=0), "at must be"),
+        (lambda tank: plot_slices(tank, np.zeros(tank.num_cells), axis="w"), "axis must be"),
+        (lambda tank: plot_slices(tank, np.zeros(tank.num_cells), electrodes=PLACES), "electrodes must be"),
+        (lambda tank: plot_solid(tank, np.zeros(tank.num_cells), scale=1), "scale must be"),
+        (lambda tank: plot_solid(disk(0.1, num_points=50), np.zeros(70)), "plane mesh"),
+    ],
+)
+def test_solids_that_cannot_be_drawn(tank, draw, said):
+    with pytest.raises(ValueError, match=said):
+        draw(tank)
+
+
+def test_electrodes_on_a_surface_are_numbered_and_those_behind_it_hidden():
+    sleeve = cylinder(0.05, 0.2, num_points=3000)
+    wall = np.asarray(sleeve.facets)[np.asarray(sleeve.tags["side"])]
+    places = [[0.05, 0.0, 0.1], [-0.05, 0.0, 0.1]]
+    shapes = shapes_of(sleeve, FaceDiscs(places, 0.012, 1e-3))
+    ax = Figure().subplots()
+    plot_surface(sleeve.points, wall, None, shapes, camera=Camera(0, 0), ax=ax)
+    metal = np.flatnonzero(is_metal(pieces(ax).get_facecolor()))
+    number = len(pieces(ax).get_facecolor())
+    # Half of the pieces of metal come first, under the wall in front, and half last.
+    assert (metal < 0.45 * number).sum() == (metal > 0.55 * number).sum() == len(metal) / 2
+    assert {"1"} <= set(shown(ax))
+    assert "2" not in shown(ax)  # it would lie on the first
+    with pytest.raises(ValueError, match="electrodes must be ElectrodeShapes"):
+        plot_surface(sleeve.points, wall, None, FaceDiscs(places, 0.012, 1e-3))
