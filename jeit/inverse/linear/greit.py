@@ -69,7 +69,7 @@ def greit(
     check_has_values("model, conductivity or noise", (model, conductivity, noise), "GREIT is trained on", instead)
     mesh = model.mesh
     check_flat(mesh, "GREIT's targets")
-    radius = model.electrodes.num_electrodes**-0.5 if radius is None else radius
+    radius = float(model.electrodes.num_electrodes**-0.5) if radius is None else radius
     _check(radius, target_radius, num_targets, hyperparameter, noise_figure)
     channels, root_weight = used_channels(model, noise, mask)
     if jnp.iscomplexobj(conductivity):

@@ -8,6 +8,7 @@ from matplotlib.colors import to_rgba
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
+from jeit.electrodes.electrode_shapes import Draped, shapes_of
 from jeit.layout import SurfaceLayout
 from jeit.mesh import measures
 from jeit.plot.axes import INK, SERIES_COLOURS, axes_or_new
@@ -15,7 +16,6 @@ from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import size_of
 from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
-from jeit.plot.solid.electrode_shapes import Draped, shapes_of
 from jeit.plot.solid.scene import Scene, bare_in_space
 from jeit.plot.solid.shaded_surface import BODY, checked_values, colours_of, mappable
 
@@ -58,7 +58,8 @@ def plot_curved_skin(
     for corners in shapes_of(mesh, layout.discs(1.0)).polygons():
         (outward,) = surface.normals(corners.mean(axis=0)[None])
         facing = abs(float(outward @ camera.toward))
-        scene.add_polygon(corners, METAL, outward, before / max(facing, 0.1))
+        rim = np.ones(len(corners), bool)
+        scene.add_polygon(corners, METAL, before=before / max(facing, 0.1), rim=rim)
     scene.draw(ax)
     for (name, places), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
         seen = _on_this_side(mesh, np.atleast_2d(np.asarray(places, float)), camera)
