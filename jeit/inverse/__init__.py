@@ -14,6 +14,7 @@ from jeit.inverse.linear.greit import greit
 from jeit.inverse.linear.one_step import one_step
 from jeit.inverse.nonlinear.parametrisation import Parametrisation
 from jeit.inverse.nonlinear.reconstruct import reconstruct
+from jeit.inverse.prior.matern import Matern
 from jeit.inverse.prior.priors import Gaussian, Laplace, Noser, Tikhonov
 from jeit.inverse.prior.total_variation import TotalVariation
 from jeit.inverse.streaming.imager import Imager
@@ -27,6 +28,7 @@ __all__ = [
     "Gaussian",
     "Imager",
     "Laplace",
+    "Matern",
     "Noser",
     "Parametrisation",
     "Tikhonov",

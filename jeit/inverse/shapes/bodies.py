@@ -104,6 +104,11 @@ class Bodies(abc.ABC):
     def odds(self) -> float:
         """Logarithm of the odds against bodies of their kinds, beforehand."""
 
+    @property
+    @abc.abstractmethod
+    def num_splits(self) -> int:
+        """Along how many of its axes, from the longest, it is tried whether a body is two."""
+
     @abc.abstractmethod
     def weakened(self, some: Any, coefficients: Float[np.ndarray, " n"]) -> tuple[Self, Float[np.ndarray, " n"]]:
         """The same with `some` bodies taken for weak."""

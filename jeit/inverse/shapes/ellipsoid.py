@@ -116,6 +116,11 @@ class Ellipsoids(Bodies):
         """None: they are of one kind, of any contrast."""
         return 0.0
 
+    @property
+    def num_splits(self) -> int:
+        """The longest: neighbours that merge make a long one, and every try is some tens of solves of a solid."""
+        return 1
+
     def weakened(self, some, coefficients):
         """As they are: the data tell the contrast of all."""
         return self, coefficients

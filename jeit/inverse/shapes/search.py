@@ -194,7 +194,7 @@ def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None
     tried = [
         _grown(problem, *bodies.split(k, coefficients, number), _STEPS_TRIED)
         for k in range(len(bodies.sign))
-        for number in range(bodies.dimension)
+        for number in range(bodies.num_splits)
     ]
     found = _best(problem, tried)
     return found if found and cost >= least_rise * found.cost and _is_told(problem, fitted, found) else None

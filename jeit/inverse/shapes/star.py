@@ -149,6 +149,11 @@ class Stars(Bodies):
         """What weak ones are less likely by beforehand."""
         return float(self.weak.sum() * np.log(self.prior.odds_against_weak))
 
+    @property
+    def num_splits(self) -> int:
+        """Both."""
+        return 2
+
     def weakened(self, some, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
         """The same with `some` stars taken for weak, and so much larger that they do as much to the field."""
         rows, weak = self.rows(coefficients).copy(), self.weak.copy()
