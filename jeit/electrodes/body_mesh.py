@@ -3,7 +3,6 @@
 import numpy as np
 from jaxtyping import Float
 
-from jeit.electrodes.discs import FaceDiscs
 from jeit.electrodes.electrodes import AbstractElectrodes
 from jeit.electrodes.patches import FacePatches
 from jeit.mesh import Body, Mesh, Rectangle, Solid
@@ -11,21 +10,18 @@ from jeit.mesh.graded import graded_box, graded_layers
 
 # How far from a face a position may be and yet lie on it, relative to the body's size; as a check of electrodes has it.
 _ON = 1e-3
-# Places round a disc that say where it ends.
+# Places round a patch on a lid that say where it ends.
 _ROUND = 16
 
 
 def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int) -> Mesh:
     """A mesh of about `num_points` nodes, finer where electrodes are, their edges in faces of its cells where they are
     rectangles on a box, or on the wall of a cylinder."""
-    if not (isinstance(body, Solid) and isinstance(electrodes, FacePatches | FaceDiscs)):
+    if not (isinstance(body, Solid) and isinstance(electrodes, FacePatches)):
         return body.mesh(num_points=num_points, refine=electrodes.refinement(body) or None)
     outline, height = body.outline, float(body.thickness)
     place = np.asarray(electrodes.position)
-    if isinstance(electrodes, FaceDiscs):
-        half = np.stack([np.asarray(electrodes.radius)] * 2, axis=1)
-    else:
-        half = np.stack([np.asarray(electrodes.width), np.asarray(electrodes.height)], axis=1) / 2
+    half = np.stack([np.asarray(electrodes.width), np.asarray(electrodes.height)], axis=1) / 2
     x_min, x_max, y_min, y_max = outline.extent
     near = _ON * max(x_max - x_min, y_max - y_min, height)
     flat = (np.abs(place[:, 2]) < near) | (np.abs(place[:, 2] - height) < near)

@@ -23,7 +23,7 @@ from jeit.mesh import Body, Mesh, Solid
 from jeit_solvers.engines import as_array
 
 # Nodes unless asked for, of a solid body and of a sheet.
-_SOLID, _SHEET = 10_000, 2000
+SOLID_POINTS, SHEET_POINTS = 10_000, 2000
 # Of a difference, what no model is taken to explain better than.
 _LEAST_MISFIT = 0.03
 # How many times as much of it sharp outlines may miss.
@@ -221,7 +221,7 @@ def check_measurement(name: str, given: Measurement) -> None:
 def imaging_mesh(domain: Body, electrodes: AbstractElectrodes, num_points: int | None) -> Mesh:
     """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep; None for
     2,000 of a sheet, and 10,000 of a solid body."""
-    usual = _SOLID if isinstance(domain, Solid) else _SHEET
+    usual = SOLID_POINTS if isinstance(domain, Solid) else SHEET_POINTS
     return body_mesh(domain, electrodes, usual if num_points is None else num_points)
 
 

@@ -132,7 +132,7 @@ def combined_blocks(
 def combined_jacobian(
     model: ForwardModel, conductivity, channels: Int[np.ndarray, " K"], weights: Float[Any, "r K"]
 ) -> Inexact[Any, "r m"]:
-    """The same in every cell, (r, m)."""
+    """The same in every cell, (r, m); `conductivity` in S/m (2-D: S)."""
     kind = complex if np.iscomplexobj(conductivity) else float
     found = np.empty((len(weights), model.mesh.num_cells), kind)
     for cells, block in combined_blocks(model, conductivity, channels, weights):

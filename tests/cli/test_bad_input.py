@@ -305,7 +305,7 @@ COMMANDS = {
     ),
     "unknown prior": (
         lambda t: good(t, "--prior", "flat"),
-        "laplace, noser, gaussian; it is 'flat'",
+        "laplace, noser, gaussian, matern; it is 'flat'",
     ),
     "unknown method": (lambda t: good(t, "--method", "guess"), "one-step, back-projection"),
     "unknown rule": (lambda t: good(t, "--hyperparameter", "luck"), "gcv, l-curve"),

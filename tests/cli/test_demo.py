@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jeit
+from jeit.imaging.preparation import SHEET_POINTS, SOLID_POINTS
 
 
 @pytest.mark.slow
@@ -54,7 +55,8 @@ def test_help_tells_the_defaults(run):
     rule = jeit.imaging.ImagingSettings(method="one-step").hyperparameter
     for value in (settings.method, settings.prior, rule):
         assert f"{value} (default)" in told
-    assert f"(default {settings.num_points})" in told
+    assert settings.num_points is None
+    assert f"(default {SHEET_POINTS}; of a solid body {SOLID_POINTS})" in told
 
 
 def test_contents_page():

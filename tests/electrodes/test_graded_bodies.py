@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.electrodes import FaceDiscs, FacePatches
+from jeit.electrodes import FacePatches
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.electrodes.clipping import covered_moments
 from jeit.forward import ForwardModel
@@ -79,12 +79,6 @@ def test_strips_on_a_cylinder_end_at_nodes():
     assert np.abs(rim - ends).min() < 0.01
     areas = np.asarray(strips.contact(mesh).load).sum(axis=0) * 1e-3
     assert areas == pytest.approx(np.full(8, 0.03 * 0.15), rel=0.03)
-
-
-def test_discs_on_a_lid_have_small_cells_round_them():
-    body = Solid(Disk(0.1), 0.05)
-    mesh = body_mesh(body, FaceDiscs([[0.03, 0, 0.05], [-0.03, 0, 0.05]], 0.01, 1e-3), 3000)
-    assert 1500 < mesh.num_points < 5000
 
 
 def test_heights_that_do_not_rise_are_refused():

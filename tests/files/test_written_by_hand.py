@@ -326,7 +326,9 @@ def test_tables_know_all_that_there_is():
     assert {*kinds(description_tables.GeometryTable, "shape")} == {*SHAPES}
     assert {*kinds(description_tables.ElectrodesTable, "kind")} == {*ELECTRODES, "facets"}
     constructed = kinds(description_tables.ConstructedTable, "kind")
-    assert {*constructed} == {*protocol.__all__} - {"Protocol", "from_channels", "from_matrices"}
+    no_kinds = {"Protocol", "from_channels", "from_matrices", "measurement_patterns"}
+    assert {*constructed, "optimal"} == {*protocol.__all__} - no_kinds
+    assert "optimal" in kinds(description_tables.ProtocolTable, "kind")
     for kind, table in constructed.items():
         options = {*inspect.signature(getattr(protocol, kind)).parameters} - {"num_electrodes", "num_boundary"}
         assert options <= {*table.model_fields}, kind
