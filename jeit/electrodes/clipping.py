@@ -10,6 +10,9 @@ from jaxtyping import Array, Float
 
 from jeit_solvers.engines import namespace
 
+# Share of a triangle that is taken for none: its digits are few, which the best contacts would show.
+_TOUCHED = 1e-9
+
 
 def covered_moments(
     corners: Float[Array, "*q 3 2"], half_size: Float[Array, "*q 2"]
@@ -34,11 +37,15 @@ def covered_moments(
     weight = _cross(place, following)
     ends = [xp.concatenate([1 - one.sum(axis=-1, keepdims=True), one], axis=-1) for one in (place, following)]
     total = ends[0] + ends[1] + np.array([1.0, 0.0, 0.0]).astype(place.dtype)
-    once = (weight[..., None] * total).sum(axis=-2) / 3
     twice = sum(xp.einsum("...k,...ki,...kj->...ij", weight, one, one) for one in (total, *ends))
     corner = np.zeros((3, 3))
     corner[0, 0] = 1
-    return once, (twice + weight.sum(axis=-1)[..., None, None] * corner.astype(place.dtype)) / 12
+    twice = (twice + weight.sum(axis=-1)[..., None, None] * corner.astype(place.dtype)) / 12
+    # Of what is only touched, rounding is left, which good contacts would make much of; and each mass has to be the
+    # sum of its products to the last digit, for where contacts are good their difference drives currents.
+    twice = xp.where(xp.sum(twice, axis=(-1, -2), keepdims=True) > _TOUCHED, twice, 0)
+    twice = (twice + xp.swapaxes(twice, -1, -2)) / 2
+    return twice.sum(axis=-1), twice
 
 
 def _pushed_within(outline: Float[Array, "*q k 2"], axis: int, half: Float[Array, "*q"]) -> Float[Array, "*q l 2"]:
