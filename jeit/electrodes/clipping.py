@@ -8,10 +8,10 @@ every triangle becomes a polygon of as many corners, in one array, whose integra
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit_solvers.engines import namespace
+from jeit_solvers.engines import namespace, undifferentiated
 
 # Share of a triangle that is taken for none: its digits are few, which the best contacts would show.
-_TOUCHED = 1e-9
+_TOUCHED = 1e-12
 
 
 def covered_moments(
@@ -41,9 +41,10 @@ def covered_moments(
     corner = np.zeros((3, 3))
     corner[0, 0] = 1
     twice = (twice + weight.sum(axis=-1)[..., None, None] * corner.astype(place.dtype)) / 12
-    # Of what is only touched, rounding is left, which good contacts would make much of; and each mass has to be the
-    # sum of its products to the last digit, for where contacts are good their difference drives currents.
-    twice = xp.where(xp.sum(twice, axis=(-1, -2), keepdims=True) > _TOUCHED, twice, 0)
+    # Of what is only touched, rounding is left, which good contacts would make much of: it goes, but not what it grows
+    # by. And each mass has to be the sum of its products to the last digit, for where contacts are good their
+    # difference drives currents.
+    twice = twice - undifferentiated(xp.where(twice.sum(axis=(-1, -2), keepdims=True) > _TOUCHED, 0, twice))
     twice = (twice + xp.swapaxes(twice, -1, -2)) / 2
     return twice.sum(axis=-1), twice
 

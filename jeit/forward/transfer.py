@@ -184,7 +184,24 @@ def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
     pairs = kept * kept[:, None]
     scale = undifferentiated(1 / xp.sqrt(xp.where(kept, abs(diagonal), 1)))
     scale = scale * scale[:, None]
-    return symmetric_inverse((xp.diag(xp.where(kept, diagonal, 1)) - pairs * others) * scale) * scale * pairs
+    matrix = (xp.diag(xp.where(kept, diagonal, 1)) - pairs * others) * scale
+    impedance = symmetric_inverse(matrix) * scale * pairs
+    return impedance + undifferentiated(_correction(others, impedance, xp.diag(kept)))
+
+
+def _correction(others: Inexact[Array, "c c"], impedance: Inexact[Array, "c c"], current: Inexact[Array, "c c"]):
+    """What one step of refinement adds to the impedance of terminals, where pairs short-circuit each other.
+
+    What flows between two terminals goes with the difference of their potentials: rounded in whatever way, what leaves
+    the one enters the other, and `current`, less all that flows, keeps the digits by which the pair is tied to the rest.
+    """
+    xp = namespace(others)
+    if xp is np:
+        flow = np.stack([row @ (potential - impedance) for row, potential in zip(others, impedance, strict=True)])
+    else:
+        flow = (others[:, :, None] * (impedance[:, None] - impedance)).sum(axis=1)
+    correction = impedance @ (current - flow)
+    return (correction + correction.T) / 2
 
 
 def centred(matrix: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:

@@ -186,7 +186,7 @@ def test_uncertainties():
         return 1e3 * WEIGHT @ around.standard_deviation() + 1e3 * around.region(np.flatnonzero(INSIDE))[1]
 
     theta = THETA | {"hyperparameter": 10.0}
-    assert_gradient(deviation, theta, compiled=True)  # at once, what iterations leave is a hundred-thousandth
+    assert_gradient(deviation, theta)
 
 
 @pytest.mark.slow
