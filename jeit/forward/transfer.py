@@ -193,7 +193,7 @@ def _correction(others: Inexact[Array, "c c"], impedance: Inexact[Array, "c c"],
     """What one step of refinement adds to the impedance of terminals, where pairs short-circuit each other.
 
     What flows between two terminals goes with the difference of their potentials: rounded in whatever way, what leaves
-    the one enters the other, and `current`, less all that flows, keeps the digits by which the pair is tied to the rest.
+    the one enters the other; and `current`, less all that flows, keeps the digits that tie the pair to the rest.
     """
     xp = namespace(others)
     if xp is np:

@@ -142,6 +142,7 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReco
     How much a body has to be missed, beyond what the evidence asks, is for errors of the model, which no noise tells.
     """
     model, background = prepared.model, prepared.calibration.conductivity
+    solid = prepared.mesh.dimension == 3
     departure = as_array(np.log(np.asarray(smooth.conductivity) / float(background)))
     peaks = find_inclusions(prepared.mesh, departure, level=0.5, least_peak=_PEAK, least_area=_AREA)
     return reconstruct_shapes(
@@ -151,7 +152,9 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReco
         start=[(one.sign, one.centroid, one.radius) for one in peaks[:_MOST]],
         noise=prepared.sharp_noise,
         mask=prepared.mask,
-        least_rise=1 + (LEAST_RISE - 1) * prepared.modelled_share,
+        # Errors of the model are let stay in a solid, as a smooth field.
+        least_rise=1 if solid else 1 + (LEAST_RISE - 1) * prepared.modelled_share,
+        smooth=smooth if solid else None,
     )
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from jeit.electrodes import FaceDiscs
 from jeit.forward import ForwardModel
+from jeit.inverse import Gaussian, reconstruct
 from jeit.inverse.shapes import EllipsoidPrior, StarPrior, reconstruct_shapes
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
 from jeit.mesh import box, centroids
@@ -94,6 +95,35 @@ def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, ratio):
     true = 4 * np.pi / 3 * RADIUS**3 * (ratio - 1) / (ratio + 2)
     np.testing.assert_allclose(strength, true, rtol=0.15)
     assert len(found.doubtful) == 1
+
+
+def test_balls_keep_their_volume_on_any_mesh(coarse):
+    balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), [[0.0, 0.0, 0.05]], [1])
+    for radius in (0.012, 0.02, 0.03):
+        np.testing.assert_allclose(balls.body(0, balls.of_radii([radius])).volume, 4 / 3 * np.pi * radius**3, rtol=0.02)
+
+
+@pytest.mark.slow
+def test_what_a_smooth_field_explains_bends_no_body(coarse):
+    """Salt that has sunk to the floor, twice as conductive there as the bath, under a ball ten times as conductive."""
+    fine = model(9000)
+    place = np.asarray(centroids(fine.mesh))
+    sunk = np.exp(np.log(2) * np.exp(-place[:, 2] / 0.015))
+    held = np.linalg.norm(place - BALL, axis=1) < RADIUS
+    change = np.asarray(fine.voltages(BATH * np.where(held, 10.0, sunk))) - np.asarray(fine.voltages(BATH))
+    noise = 0.05 * np.sqrt(np.mean(change**2))
+    frame = np.asarray(coarse.voltages(BATH)) + change
+    smooth = reconstruct(coarse, frame, BATH, prior=Gaussian(0.025), hyperparameter=5.0, noise=noise)
+    start = [(1, BALL + 0.005, 0.025)]
+    alone = reconstruct_shapes(coarse, frame, BATH, start=start, noise=noise)
+    beside = reconstruct_shapes(coarse, frame, BATH, start=start, noise=noise, smooth=smooth)
+    assert max(np.linalg.norm(body.centroid - BALL) for body in alone.bodies) > 0.02
+    (body,) = beside.bodies
+    assert np.linalg.norm(body.centroid - BALL) < 0.005
+    strength = body.volume * np.expm1(body.contrast) / (np.exp(body.contrast) + 2)
+    np.testing.assert_allclose(strength, 4 * np.pi / 3 * RADIUS**3 * 9 / 12, rtol=0.15)
+    floor = np.asarray(centroids(coarse.mesh))[:, 2] < 0.015
+    assert 1.1 < np.median(np.asarray(beside.conductivity)[floor]) / BATH < 2.0
 
 
 def test_a_prior_of_a_sheet_is_refused(coarse):

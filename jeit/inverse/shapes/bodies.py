@@ -115,7 +115,7 @@ class Bodies(abc.ABC):
 
     @abc.abstractmethod
     def mixture(self, share: Float[np.ndarray, " c"], contrast: float) -> tuple[Any, Any, Any]:
-        """log σ/σ₀ (c,) of cells of which a body covers a `share`, and its derivatives by that and by the contrast."""
+        """log σ/σ₀ (c,) of cells of which a body of a `contrast`, + or -, covers a `share`; its derivatives by both."""
 
     @abc.abstractmethod
     def covered(self, k: int, row: Float[np.ndarray, " q"]) -> Covered:
@@ -157,10 +157,14 @@ class Bodies(abc.ABC):
         """Of log σ of body k, positive, and its derivative by the coefficient."""
         return self.prior.contrast_of(row[self.dimension + 1], self.weak[k])
 
+    def only(self, some) -> Self:
+        """Some of them."""
+        some = np.asarray(some, int)
+        return replace(self, start=self.start[some], sign=self.sign[some], weak=self.weak[some])
+
     def without(self, k: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
         """The others, and their coefficients."""
-        start, sign, weak = (np.delete(one, k, axis=0) for one in (self.start, self.sign, self.weak))
-        others = replace(self, start=start, sign=sign, weak=weak)
+        others = self.only(np.delete(np.arange(len(self.sign)), k))
         return others, np.append(coefficients[0], np.delete(self.rows(coefficients), k, axis=0))
 
     def split(self, k: int, coefficients, number: int) -> tuple[Self, Float[np.ndarray, " n"]]:
@@ -196,11 +200,11 @@ class Bodies(abc.ABC):
         slopes: list[tuple[Any, Any]] = [(everywhere, drift)]
         shares = np.zeros((len(parts), size))
         for k, (cells, share, slope) in enumerate(parts):
-            contrast, contrast_slope = self.contrast(k, rows[k])
+            contrast, contrast_slope = (self.sign[k] * one for one in self.contrast(k, rows[k]))
             mixed, by_share, by_contrast = self.mixture(share, contrast)
-            image[cells] += self.sign[k] * mixed
-            change = (self.sign[k] * by_share)[:, None] * slope
-            change[:, d + 1] = self.sign[k] * by_contrast * contrast_slope
+            image[cells] += mixed
+            change = by_share[:, None] * slope
+            change[:, d + 1] = by_contrast * contrast_slope
             slopes.append((cells, change))
             shares[k, cells] = share
         overlap, overlap_slope = [], []

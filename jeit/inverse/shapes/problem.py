@@ -74,6 +74,11 @@ class ShapeProblem:
         coefficients, state = descent.at_once(self.quadratic_model, start, bodies, max_steps)
         return Fit(bodies, coefficients, float(state.cost))
 
+    @property
+    def uncertainty(self) -> float:
+        """What the covariance of the data adds to the -log evidence: half the logarithm of its determinant."""
+        return 0.5 * float(np.linalg.slogdet(np.asarray(self.data.covariance))[1])
+
     def surprise(self, fit: Fit) -> float:
         """-log evidence of some bodies, up to a constant, with the odds against their kinds."""
         return fit.cost + 0.5 * float(np.linalg.slogdet(self._hessian(fit))[1]) + fit.bodies.odds

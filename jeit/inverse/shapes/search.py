@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -14,9 +14,11 @@ from jeit.arguments import check_has_values, check_kind, is_number, told
 from jeit.forward import ForwardModel
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
 from jeit.inverse.nonlinear.observed import independent_data
+from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior
 from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior, Ellipsoids
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
+from jeit.inverse.shapes.smooth_field import SmoothField
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
 from jeit.mesh import check_flat
 from jeit_solvers.engines import as_array
@@ -25,6 +27,8 @@ from jeit_solvers.engines import as_array
 LEAST_RISE = 1.4
 _FIRST_STEPS, _STEPS, _STEPS_WITHOUT, _STEPS_TRIED = 15, 40, 8, 6
 _ROUGHLY = 1e-2
+# After so many in a row that data do not ask for, weaker ones are not tried.
+_MOST_REFUSED = 2
 # How many times the objective rises at least without a body that is one beyond doubt.
 _SURELY = 10.0
 # How many changes of their number or kind are made at most.
@@ -81,6 +85,7 @@ def reconstruct_shapes(
     mask: Bool[Array, " M"] | None = None,
     prior: BodyPrior | None = None,
     least_rise: float = LEAST_RISE,
+    smooth: Reconstruction | None = None,
 ) -> ShapeReconstruction:
     """The bodies, star shapes in a sheet and ellipsoids in a solid, that explain measured `voltages` (M,), in volts.
 
@@ -92,6 +97,8 @@ def reconstruct_shapes(
     - `prior`: `StarPrior()` of sheets, `EllipsoidPrior()` of solids, unless given.
     - `least_rise`: bodies whose loss raises the objective less than so many times are taken for ghosts; and those whose
       evidence is not for them.
+    - `smooth`: an image of the same channels by a smooth prior and no bounds; what it shows beside bodies is let stay
+      as a `SmoothField`, of as much as the evidence is for, and only bodies that are told beside it are fitted.
 
     All are fitted together, as strong disks or balls first. Then one after the other is left out and the rest fitted
     again, and that which is missed least goes, for as long as it is missed so little. What errors of the model and
@@ -118,13 +125,21 @@ def reconstruct_shapes(
     small, data = independent_data(model, measured, used, deviation, at_once=True)
     problem = ShapeProblem(small, data, background)
     bodies = form.create(model.mesh, prior, centre, sign)
+    level, beside = 0.0, None
+    if smooth is not None:
+        beside = SmoothField.create(smooth, problem)
+        level, bodies, radius = _told_one_by_one(beside, bodies, radius)
+        problem = beside.beside(level)
     fitted = problem.fit(*_grown(problem, bodies, bodies.of_radii(radius), _FIRST_STEPS), _STEPS)
     found = _without_ghosts(problem, fitted, (), least_rise)
     changes = [_in_two(problem, found.fit, least_rise), _as_weak(problem, found.fit)]
     ways = [_searched(problem, found, one, least_rise) for one in changes if one is not None] or [found]
     fitted, rises, doubtful = min(ways, key=lambda one: problem.surprise(one.fit))
     bodies, coefficients = fitted.bodies, fitted.coefficients
-    conductivity = background * np.exp(bodies.image(coefficients).image)
+    image = bodies.image(coefficients).image
+    if beside is not None:
+        image = image + beside.estimate(level, fitted)
+    conductivity = background * np.exp(image)
     predicted = np.asarray(model.voltages(conductivity))
     spread = bodies.rows(problem.deviations(fitted))[:, bodies.dimension + 1]
     slopes = [bodies.contrast(k, row)[1] for k, row in enumerate(bodies.rows(coefficients))]
@@ -159,6 +174,33 @@ def _grown(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
     """Bodies with all their modes, fitted to the data as round ones; and their coefficients."""
     rounded, _, _ = found = problem.fit(*bodies.with_modes(1, coefficients), steps, _ROUGHLY)
     return rounded.with_modes(bodies.prior.modes, found.coefficients)
+
+
+def _told_one_by_one(beside: SmoothField, bodies: Bodies, radius) -> tuple[float, Bodies, Any]:
+    """The level of a smooth field, and the bodies that data ask for besides, as balls: of those to start from, each
+    after those before it; and their radii."""
+    chosen: list[int] = []
+    (level, least), refused = _balls(beside, bodies.only([]), radius[:0], 1.0), 0
+    for k in range(len(radius)):
+        some = [*chosen, k]
+        tried, surprise = _balls(beside, bodies.only(some), radius[some], level)
+        if surprise + _MARGIN <= least:
+            chosen, level, least, refused = some, tried, surprise, 0
+        elif (refused := refused + 1) == _MOST_REFUSED:
+            break
+    return level, bodies.only(chosen), radius[chosen]
+
+
+def _balls(beside: SmoothField, bodies: Bodies, radius, level: float) -> tuple[float, float]:
+    """The level of the field that goes with some bodies, as balls, from a `level` on; -log evidence for both."""
+    bodies, coefficients = bodies.with_modes(1, bodies.of_radii(radius))
+    while True:
+        problem = beside.beside(level)
+        fit = problem.fit(bodies, coefficients, _FIRST_STEPS, _ROUGHLY)
+        surprise, likeliest = problem.surprise(fit) + problem.uncertainty, beside.likeliest(fit)
+        if likeliest >= level:  # from above, so that bodies are not bent by what the field explains
+            return level, surprise
+        level, coefficients = likeliest, fit.coefficients
 
 
 class _Found(NamedTuple):
