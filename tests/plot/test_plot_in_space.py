@@ -211,6 +211,17 @@ def test_electrodes_in_front_are_over_what_is_inside_and_those_behind_under_it(t
         assert on_it == {wanted}
 
 
+def test_one_looks_through_electrodes_that_hide_a_body(tank, image, ax):
+    whole = plates(tank, ["left", "right", "front", "back", "bottom", "top"], 1e-3)
+    plot_isosurfaces(tank, image, whole, camera=Camera(), scale=ColourScale(bar=False), ax=ax)
+    brown = pieces(ax).get_facecolor()
+    brown = brown[(brown[:, 0] > 1.3 * brown[:, 1]) & (brown[:, 1] > 3 * brown[:, 2])]
+    # Three faces in front as glass, drawn last, and three behind.
+    assert set(np.round(brown[-100:, 3], 2)) == {0.16}
+    assert set(np.round(brown[:100, 3], 2)) == {1.0}
+    assert np.mean(brown[:, 3] < 1) == pytest.approx(0.5, abs=0.1)
+
+
 def test_each_sign_has_its_own_surface(tank, image):
     found = level_surfaces(tank, image, (0.5,), both=True)
     assert [np.sign(value) for value, _, _ in found] == [1, -1]

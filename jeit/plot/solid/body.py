@@ -20,6 +20,8 @@ _SHARP = 0.85
 _BEFORE, _AWAY = 0.06, 0.045
 # And how far numbers are apart that can be read.
 _CLEAR = 0.03
+# Share of what is seen of a body beyond which electrodes hide too much, and how much of their colour is left then.
+_HIDES, _GLASS = 0.4, 0.16
 
 
 def size_of(mesh: Mesh) -> float:
@@ -55,20 +57,33 @@ def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarr
     return np.concatenate([edges[pair[drawn]], edges[alone]])
 
 
-def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes) -> None:
-    """Electrodes on a surface: those on the side that is looked at over all behind it, others under it."""
+def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes, *, through: bool = False) -> None:
+    """Electrodes on a surface: those on the side that is looked at over all behind it, others under it.
+
+    To look `through` them, those in front are as glass if they would hide much of the body.
+    """
     surface, size = Draped(points, triangles), float(np.ptp(points, axis=0).max())
     polygons = shapes.polygons()
     normals = surface.normals(np.array([corners.mean(axis=0) for corners in polygons]))
     rims = _rims(polygons, shapes.electrode, 1e-6 * size)
+    front = [one for one, outward in zip(polygons, normals, strict=True) if outward @ scene.camera.toward > 0]
+    hides = through and sum(_seen_area(scene, one) for one in front) > _HIDES * _seen_area(scene, points[triangles]) / 2
     for corners, outward, rim in zip(polygons, normals, rims, strict=True):
         if len(corners) == 1:
             angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
             _, across, up = surface.frames(corners)[0]
             corners = corners + 0.012 * size * (np.outer(np.cos(angle), across) + np.outer(np.sin(angle), up))
             rim = np.ones(12, bool)
-        before = _BEFORE * size * float(np.sign(outward @ scene.camera.toward))
-        scene.add_polygon(corners, METAL, before=before, rim=rim)
+        side = float(np.sign(outward @ scene.camera.toward))
+        colour = to_rgba(METAL, _GLASS if hides and side > 0 else 1.0)
+        scene.add_polygon(corners, colour, before=_BEFORE * size * side, rim=rim)
+
+
+def _seen_area(scene: Scene, corners: Float[np.ndarray, "*m k 3"]) -> float:
+    """On the page, m², of polygons."""
+    x, y = np.moveaxis(scene.camera.on_page(corners.reshape(-1, 3)).reshape(*corners.shape[:-1], 2), -1, 0)
+    twice = (x * np.roll(y, -1, axis=-1) - np.roll(x, -1, axis=-1) * y).sum(axis=-1)
+    return float(np.abs(twice).sum() / 2)
 
 
 def _rims(polygons, electrode, near: float) -> list[np.ndarray]:

@@ -87,7 +87,7 @@ def draw_in_space(
     shapes = shapes_of(mesh, electrodes) if isinstance(electrodes, AbstractElectrodes) else electrodes
     points, wall = np.asarray(mesh.points), np.asarray(mesh.facets)
     if shapes is not None:
-        add_electrodes(scene, points, wall, shapes)
+        add_electrodes(scene, points, wall, shapes, through=bool(surfaces))
     scene.draw(ax)
     bare_in_space(ax, camera, points, numbered=shapes is not None)
     if shapes is not None:
