@@ -143,7 +143,16 @@ def as_discs(position, dimension: int, radius, contact_impedance):
 def disc_window(points, position, radius, edge):
     """Share (q, k, p) that discs at `position` (q, k, d) with `radius` (q, k) cover of quadrature points (q, p, d);
     `edge` (q,) is the half-width of theirs."""
-    squared = sum((points[:, None, :, i] - position[..., None, i]) ** 2 for i in range(points.shape[-1]))
+    return window_within(squared_distances(points, position), radius, edge)
+
+
+def squared_distances(points, position):
+    """Of quadrature points (q, p, d) from `position` (q, k, d): (q, k, p), m²."""
+    return sum((points[:, None, :, i] - position[..., None, i]) ** 2 for i in range(points.shape[-1]))
+
+
+def window_within(squared, radius, edge):
+    """The window of points whose distances have these squares (q, k, p), m²."""
     radius = radius[..., None]
     # r² - ρ² = (r - ρ)(r + ρ) spares the square root, whose derivative does not exist at the centre.
     return smooth_step((radius**2 - squared) / (2 * radius * edge[:, None, None]))

@@ -4,11 +4,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.electrodes.discs import AbstractDiscs, as_discs, check_discs, disc_window
+from jeit.electrodes.discs import AbstractDiscs, as_discs, check_discs, squared_distances, window_within
 from jeit.electrodes.electrodes import Contact
 from jeit.electrodes.window import EDGE, nearest_electrodes, triangle_quadrature, window_contact
 from jeit.mesh import Body, Mesh, Refine, measures, normals
-from jeit.mesh.geodesic import Triangles
+from jeit.mesh.geodesic import Triangles, unfold
 from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated
 
 # Cosine of the angle between normals: a disc as large as the surface's radius of curvature turns by one radian.
@@ -18,10 +18,12 @@ _FACING = float(np.cos(1.0))
 class SurfaceDiscs(AbstractDiscs):
     """Complete electrodes that are discs in a curved sheet, a surface of triangles in space, free of its nodes.
 
-    `SheetDiscs` of curved sheets. A disc is what of the surface lies within its radius, straight through space, and
-    faces as its middle does: on a surface of radius of curvature R that is longer along the surface by a part
-    radius² / 24 R², and nothing of what lies opposite. Differentiable in position, of which only moves along the
-    surface count: a move off it changes nothing to first order.
+    `SheetDiscs` of curved sheets. A disc is what of the surface lies within its radius along it, where what lies round
+    its middle can be laid flat without stretching, as sheets that were bent, and tubes, can: exactly, so that bending
+    changes nothing. Elsewhere ways by which triangles can be laid into a plane lead apart, and a disc is what lies
+    within its radius straight through space and faces as its middle does: with a radius of curvature R longer along
+    the surface by a part radius² / 24 R², and nothing of what lies opposite. Differentiable in position, of which only
+    moves along the surface count: a move off it changes nothing to first order.
 
     **Fields**: `position` (L, 3) metres, on the surface; `radius` (L,) metres; `contact_impedance` (L,) ohm·m².
     """
@@ -47,15 +49,21 @@ class SurfaceDiscs(AbstractDiscs):
         xp = namespace(self, mesh)
         area = measures(mesh)
         barycentric, _ = triangle_quadrature()
-        points = xp.einsum("pi,mid->mpd", barycentric, mesh.points[mesh.cells])
+        corners = mesh.points[mesh.cells]
+        points = xp.einsum("pi,mid->mpd", barycentric, corners)
         edge = EDGE * xp.sqrt(area)
         middle = points.mean(axis=1)
         near = nearest_electrodes(middle, self.position, self.radius)
-        window = disc_window(points, self.position[near], self.radius[near], edge)
-        normal = undifferentiated(normals(mesh))
+        longest = xp.sqrt(((corners - xp.roll(corners, 1, axis=1)) ** 2).sum(axis=-1).max(axis=1))
+        around = unfold(mesh, self.position, self.radius[:, None] + edge + longest)
+        normal = xp.asarray(undifferentiated(normals(mesh)))
         at = xp.argmin(undifferentiated(((self.position[:, None] - middle) ** 2).sum(axis=-1)), axis=1)
-        faces = xp.take_along_axis(normal @ normal[at].T, near, axis=1) > 0
-        window = window * faces[..., None]
+        along, faces = around.exact[near], xp.take_along_axis(normal @ normal[at].T, near, axis=1) > 0
+        covered = xp.where(along, xp.take_along_axis(around.reached.T, near, axis=1), faces)
+        squared = xp.where(
+            along[..., None], around.squared(barycentric, near), squared_distances(points, self.position[near])
+        )
+        window = window_within(squared, self.radius[near], edge) * covered[..., None]
         return window_contact(mesh.cells, area, window, near, self.contact_impedance, mesh.num_points)
 
     def check(self, mesh: Mesh) -> None:

@@ -4,25 +4,38 @@ import csv
 import io
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from jeit.arguments import listed, told
 from jeit.files import check_electrodes, read_as, read_text
 from jeit.layout.layout import LARGEST, SMALLEST, Layout, bounds, check_discs_fit
+from jeit.layout.surface_layout import SurfaceLayout
 from jeit.mesh import Domain
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-_LENGTHS = ("x", "y", "diameter")
+_FLAT = ("x", "y", "diameter")
+_KNOWN = ("x", "y", "z", "diameter")
 # "x_mm", "x [mm]", "x (mm)", "xmm"
-_LENGTH = re.compile(rf"({'|'.join(_LENGTHS)})[ _]*[\[(]?({'|'.join(_UNITS)})[\])]?")
+_LENGTH = re.compile(rf"({'|'.join(_KNOWN)})[ _]*[\[(]?({'|'.join(_UNITS)})[\])]?")
 _LABEL, _IMPEDANCE = "label", "contact_impedance_ohm_m2"
 MOST_BYTES = 2**24
 """Of a file of a layout: electrodes of more could not be read in a minute."""
-_TEMPLATE = f"x_mm, y_mm, diameter_mm and, if wanted, {_LABEL} and {_IMPEDANCE}"
+
+
+class LayoutTable(NamedTuple):
+    """A table of L electrodes: `lengths` (L,) by name, metres, `contact_impedance` (L,) ohm·m² or None, `labels` or
+    None, the numbers of their `lines`, and the `titles` of the lengths' columns."""
+
+    lengths: dict[str, Float[np.ndarray, " L"]]
+    contact_impedance: Float[np.ndarray, " L"] | None
+    labels: list[str] | None
+    lines: list[int]
+    titles: list[str]
 
 
 def millimetres(metres: float) -> float:
@@ -30,10 +43,11 @@ def millimetres(metres: float) -> float:
     return round(1e3 * float(metres), 9) + 0.0
 
 
-def write_csv(layout: Layout, file: BinaryIO) -> None:
-    """Write the electrodes; the outline has no place in a table."""
+def write_csv(layout: Layout | SurfaceLayout, file: BinaryIO) -> None:
+    """Write the electrodes; the outline, or the surface, has no place in a table."""
     lengths = np.column_stack([layout.centres, layout.diameters])
-    header = [*(f"{name}_mm" for name in _LENGTHS), _LABEL]
+    names = _FLAT if lengths.shape[1] == 3 else _KNOWN
+    header = [*(f"{name}_mm" for name in names), _LABEL]
     columns: list[Iterable] = [*(map(millimetres, column) for column in lengths.T), layout.labels]
     if layout.contact_impedance is not None:
         header.append(_IMPEDANCE)
@@ -47,10 +61,26 @@ def write_csv(layout: Layout, file: BinaryIO) -> None:
 
 def read_csv(path: Path, outline: Domain | None) -> Layout:
     """Read what `write_csv` wrote, or a table made by hand. Raises `ValueError`, naming the line."""
-    lines = _lines(path)
+    table = read_table(path, _FLAT)
+    centres, diameters = np.column_stack([table.lengths["x"], table.lengths["y"]]), table.lengths["diameter"]
+    _check_unit(centres, diameters, table.titles)
+    check_discs_fit(centres, diameters, outline, [f"the electrode of line {number}" for number in table.lines])
+    return Layout(
+        centres,
+        diameters,
+        contact_impedance=table.contact_impedance,
+        outline=outline,
+        labels=table.labels,
+        name=path.stem,
+    )
+
+
+def read_table(path: Path, wanted: Sequence[str]) -> LayoutTable:
+    """A table with the lengths `wanted`, of "x", "y", "z" and "diameter", each with a unit. Raises `ValueError`."""
+    lines = _lines(path, wanted)
     delimiter = next((mark for mark in ";\t" if mark in lines[0][1]), ",")
     (_, header), *rows = [(number, _cells(line, delimiter)) for number, line in lines]
-    columns = _columns(header)
+    columns = _columns(header, wanted)
     check_electrodes("the table", len(rows))
     if not rows:
         raise ValueError("there is no electrode below the names of the columns.")
@@ -63,9 +93,9 @@ def read_csv(path: Path, outline: Domain | None) -> Layout:
         place, unit = columns[name]
         return unit * np.array([_number(row[place], delimiter, f"line {at}: {header[place]}") for at, row in rows])
 
-    centres, diameters = np.column_stack([numbers("x"), numbers("y")]), numbers("diameter")
+    lengths = {name: numbers(name) for name in wanted}
     contact_impedance = numbers(_IMPEDANCE) if _IMPEDANCE in columns else None
-    for name, values in (("diameter", diameters), (_IMPEDANCE, contact_impedance)):
+    for name, values in (("diameter", lengths["diameter"]), (_IMPEDANCE, contact_impedance)):
         if values is not None and values.min() <= 0:
             raise ValueError(f"line {rows[int(values.argmin())][0]}: {name} is not positive.")
     labels = (
@@ -73,11 +103,8 @@ def read_csv(path: Path, outline: Domain | None) -> Layout:
         if _LABEL in columns
         else None
     )
-    _check_unit(centres, diameters, [header[columns[name][0]] for name in _LENGTHS])
-    check_discs_fit(centres, diameters, outline, [f"the electrode of line {number}" for number, _ in rows])
-    return Layout(
-        centres, diameters, contact_impedance=contact_impedance, outline=outline, labels=labels, name=path.stem
-    )
+    titles = [header[columns[name][0]] for name in wanted]
+    return LayoutTable(lengths, contact_impedance, labels, [number for number, _ in rows], titles)
 
 
 def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -> None:
@@ -96,7 +123,7 @@ def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -
         )
 
 
-def _lines(path: Path) -> list[tuple[int, str]]:
+def _lines(path: Path, wanted: Sequence[str]) -> list[tuple[int, str]]:
     """Lines that hold something, with their numbers from 1."""
     try:
         text = read_text(path, encoding="utf-8-sig", most=MOST_BYTES)
@@ -105,7 +132,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]
     lines = [(number, line) for number, line in lines if line.strip(" \t,;") and not line.lstrip().startswith("#")]
     if not lines:
-        raise ValueError(f"the file is empty; the first line names the columns: {_TEMPLATE}.")
+        raise ValueError(f"the file is empty; the first line names the columns: {_template(wanted)}.")
     return lines
 
 
@@ -114,27 +141,32 @@ def _cells(line: str, delimiter: str) -> list[str]:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
 
 
-def _columns(header: list[str]) -> dict[str, tuple[int, float]]:
+def _columns(header: list[str], wanted: Sequence[str]) -> dict[str, tuple[int, float]]:
     """Place and unit of every column. Raises `ValueError` for names that say no unit, are missing or not known."""
     columns: dict[str, tuple[int, float]] = {}
     for place, title in enumerate(header):
         length = _LENGTH.fullmatch(title.lower())
         name = length[1] if length else title.lower()
-        if name in _LENGTHS and not length:
+        if name in wanted and not length:
             raise ValueError(
                 f"the column {told(title)} does not say its unit; call it {name}_mm (or {name}_cm, {name}_m)."
             )
-        if name not in (*_LENGTHS, _LABEL, _IMPEDANCE):
+        if name not in (*wanted, _LABEL, _IMPEDANCE):
             raise ValueError(
-                f"there is no column {told(title)} in a layout; the first line names the columns: {_TEMPLATE}."
+                f"there is no column {told(title)} in a layout; the first line names the columns: {_template(wanted)}."
             )
         if name in columns:
             raise ValueError(f"there are two columns for {name}; keep one.")
         columns[name] = (place, _UNITS[length[2]] if length else 1.0)
-    missing = [name for name in _LENGTHS if name not in columns]
+    missing = [name for name in wanted if name not in columns]
     if missing:
-        raise ValueError(f"there is no column {missing[0]}_mm; the first line names the columns: {_TEMPLATE}.")
+        raise ValueError(f"there is no column {missing[0]}_mm; the first line names the columns: {_template(wanted)}.")
     return columns
+
+
+def _template(wanted: Sequence[str]) -> str:
+    first = ", ".join(f"{name}_mm" for name in wanted)
+    return f"{first} and, if wanted, {_LABEL} and {_IMPEDANCE}"
 
 
 def _number(cell: str, delimiter: str, where: str) -> float:

@@ -12,6 +12,7 @@ from jeit.files import written_whole
 from jeit.layout.csv_file import read_csv, write_csv
 from jeit.layout.dxf_file import read_dxf, write_dxf
 from jeit.layout.layout import Layout
+from jeit.layout.surface_layout import SurfaceLayout
 from jeit.layout.svg_file import read_svg, write_svg
 from jeit.mesh import Domain
 
@@ -46,19 +47,22 @@ def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
         raise ValueError(f"{path.name}: {error}") from None
 
 
-def write_layout(layout: Layout, path: str | Path) -> None:
+def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
     """Write a layout in millimetres; the ending of the file's name says the format, as in `read_layout`.
 
     What is read back differs by rounding only (below a millionth of a millimetre), except that a rectangle comes back
     as the polygon it is. DXF and SVG hold a drawing to scale, x to the right and y up: what is to be cut on layers
     (groups in SVG) `OUTLINE` in red and `ELECTRODES` in blue, labels apart from it on `LABELS`. Inside the SVG file
-    y runs down, as in all SVG, so its y is minus the layout's.
+    y runs down, as in all SVG, so its y is minus the layout's. A `SurfaceLayout` goes into CSV, with a column `z_mm`,
+    for `read_surface_layout`.
 
     Raises `ValueError` for another ending or a place that cannot be written; `ImportError` if the extra is missing.
     """
     path = Path(path)
     writer = _by_suffix(path, _WRITERS)
-    if not isinstance(layout, Layout):
+    if isinstance(layout, SurfaceLayout) and writer is not write_csv:
+        raise ValueError(f"path: drawings are flat, and '{layout.name}' is of a curved skin; give a name in .csv.")
+    if not isinstance(layout, Layout | SurfaceLayout):
         raise ValueError(f"layout must be a Layout, not {type(layout).__name__}; see jeit.layout.Layout.")
     try:
         with written_whole(path) as file:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from jeit.arguments import IN_MILLIMETRES, check_metres
-from jeit.layout import Layout
+from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh.generate.unstructured import MOST_POINTS
 
 # Nodes of a plane mesh, times cell size squared over area: 1.155 for equilateral cells, and some for the edge.
@@ -14,7 +14,9 @@ _NODES = 1.2
 _COARSEST = 1.5
 
 
-def check_cell_size(name: str, cell_size: float, layout: Layout, area: float, num_layers: int = 0) -> None:
+def check_cell_size(
+    name: str, cell_size: float, layout: Layout | SurfaceLayout, area: float, num_layers: int = 0
+) -> None:
     """Raise `ValueError`, which speaks of `name` in millimetres, where cells of so many metres are too large for the
     electrodes of `layout`, or too many.
 
@@ -38,6 +40,6 @@ def check_cell_size(name: str, cell_size: float, layout: Layout, area: float, nu
         )
 
 
-def smallest_diameter(layout: Layout) -> float:
+def smallest_diameter(layout: Layout | SurfaceLayout) -> float:
     """Of the electrodes, metres."""
     return float(np.asarray(layout.diameters).min())

@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jeit.design.skin.described_surface import described_surface
 from jeit.design.skin.protocol import skin_protocol
 from jeit.design.skin.skin import Skin
+from jeit.design.study.curved_layouts import curved_layout
 from jeit.design.study.layouts import study_layout
 from jeit.files import check_memory, read_toml
 from jeit.mesh import Rectangle
@@ -25,7 +27,8 @@ def describes_skin(path: str | Path) -> bool:
 
 def read_described_skin(path: str | Path) -> Skin:
     """The skin that a TOML file describes: tables skin, electrodes (with `layout`, a name or a file beside it),
-    measurement and mesh, as in a study file, each key with one value and all but the layout with a default.
+    measurement and mesh, as in a study file, each key with one value and all but the layout with a default; of a curved
+    skin the table surface, too.
 
     Raises `FileNotFoundError`, and `ValueError` for files that are no TOML, keys and values that there are not, and as
     `Skin.create` does.
@@ -46,9 +49,17 @@ def read_described_skin(path: str | Path) -> Skin:
 
 def _made(table: SkinTable, folder: Path) -> Skin:
     material, electrodes, measurement = table.skin, table.electrodes, table.measurement
-    outline = Rectangle(1e-3 * material.width_mm, 1e-3 * material.height_mm)
-    diameter, impedance = 1e-3 * electrodes.diameter_mm, electrodes.contact_impedance_ohm_m2
-    layout = study_layout(electrodes.layout, folder, outline, diameter, impedance, 0.0)
+    diameter, impedance, cell_size = (
+        1e-3 * electrodes.diameter_mm,
+        electrodes.contact_impedance_ohm_m2,
+        1e-3 * table.mesh.cell_mm,
+    )
+    if table.surface is None:
+        outline = Rectangle(1e-3 * material.width_mm, 1e-3 * material.height_mm)
+        layout = study_layout(electrodes.layout, folder, outline, diameter, impedance, 0.0)
+    else:
+        surface, outward = described_surface(table.surface, folder, cell_size), table.surface.outward
+        layout = curved_layout(electrodes.layout, folder, surface, outward, diameter, impedance, 0.0)
     if measurement.protocol == "two-terminal" and measurement.pairs is not None:
         number = layout.num_electrodes
         pairs = measurement.pairs or number * (number - 1) // 2
@@ -59,6 +70,6 @@ def _made(table: SkinTable, folder: Path) -> Skin:
         thickness=1e-3 * material.thickness_mm,
         conductivity=material.conductivity_S_per_m,
         num_layers=table.mesh.layers if material.model == "layer" else 0,
-        cell_size=1e-3 * table.mesh.cell_mm,
+        cell_size=cell_size if table.surface is None else None,
         protocol=skin_protocol(layout, measurement.protocol, num_pairs=measurement.pairs, current=current),
     )

@@ -3,10 +3,11 @@
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from jeit.design import defaults
 from jeit.design.skin.protocol import ProtocolName
+from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_of_curved
 from jeit.files import MOST_ELECTRODES
 from jeit.files.schema import Number, Table, Word
 
@@ -63,6 +64,12 @@ class SkinTable(Table):
 
     what = "a skin"
     skin: MaterialTable = MaterialTable()
+    surface: Annotated[SurfaceTable | None, SURFACE] = None
     electrodes: LayoutTable = Field(default_factory=dict, validate_default=True)
     measurement: MeasurementTable = MeasurementTable()
     mesh: CellsTable = CellsTable()
+
+    @model_validator(mode="after")
+    def _of_curved(self) -> "SkinTable":
+        check_of_curved(self.surface, self.skin, self.mesh)
+        return self

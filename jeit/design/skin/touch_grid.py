@@ -54,6 +54,16 @@ class SurfaceGrid(TouchGrid):
         flat = np.zeros(number, int), np.arange(number)
         return cls(places, *flat, (1, number), (each**0.5, each**0.5), np.full(number, each))
 
+    def on(self, surface: Triangles, face: Triangles) -> "SurfaceGrid":
+        """The same places on another surface: from where they are nearest to `surface` to the same point of the same
+        triangle of `face`, whose nodes are as many; areas as much larger as it is there."""
+        at = surface.nearest(self.places)
+        areas = self.areas * at.of_nodes(surface, face.node_areas / surface.node_areas)
+        each = float(areas.mean())
+        return SurfaceGrid(
+            at.of_nodes(surface, face.points), self.rows, self.columns, self.shape, (each**0.5, each**0.5), areas
+        )
+
     def raster(self, values) -> Float[np.ndarray, "rows columns"]:
         """Raises `ValueError`: places on a curved skin are in no rows and columns."""
         raise ValueError(

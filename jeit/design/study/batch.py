@@ -15,9 +15,10 @@ from jaxtyping import Array, Float
 from jeit.design.scores import TouchPrior, layout_scores
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.cell_size import smallest_diameter
+from jeit.design.skin.reached_cells import touched_surface
 from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.design.skin.skin import Skin, model_conductivity
-from jeit.design.skin.touch_grid import TouchGrid, touch_grid
+from jeit.design.skin.touch_grid import SurfaceGrid, TouchGrid, touch_grid
 from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.design.study.scores import OPTIMALITY
@@ -25,6 +26,8 @@ from jeit.design.study.spec import Point, Shape, Study
 from jeit.design.taxels import find_taxels
 from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.forward import ForwardModel
+from jeit.layout import Layout, SurfaceLayout
+from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit.protocol import Protocol
 
 
@@ -65,6 +68,11 @@ def check_points(study: Study) -> None:
         seen.add(key)
         layers = f" and mesh.layers = {point.layers}" if point.layers else ""
         where = f"mesh.cell_mm = {1e3 * point.cell_size:g}{layers}"
+        if isinstance(point.layout, SurfaceLayout):
+            try:
+                _skin(study, point.shape)
+            except ValueError as error:
+                raise ValueError(f"skin.thickness_mm = {1e3 * point.thickness:g}, {where}: {error}") from None
         try:
             _skin(study, point.shape).with_layout(point.layout)
         except ValueError:
@@ -102,7 +110,7 @@ def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None 
 
 
 def study_grid(study: Study) -> TouchGrid:
-    """Where the skins are touched."""
+    """Where the skins are touched; curved layers above or below these places of their electrodes' surface."""
     return touch_grid(study.outline, study.columns, study.rows)
 
 
@@ -115,18 +123,24 @@ def _skin(study: Study, shape: Shape) -> Skin:
         thickness=point.thickness,
         conductivity=point.conductivity,
         num_layers=point.layers,
-        cell_size=point.cell_size,
+        cell_size=point.cell_size if isinstance(point.layout, Layout) else None,
         protocol=point.measured(study.current),
     )
 
 
 @lru_cache(maxsize=4)
 def _shared(study: Study, shape: Shape) -> _Shared:
-    skin, grid, touches, prior = _skin(study, shape), study_grid(study), None, None
+    skin, grid, touches, prior, lengths = _skin(study, shape), study_grid(study), None, None, None
+    if isinstance(grid, SurfaceGrid) and isinstance(skin.layout, SurfaceLayout):
+        touched_face = touched_surface(skin.model.mesh, skin.touched_face)
+        if not eqx.tree_equal(touched_face, study.outline):
+            grid = grid.on(Triangles.of(skin.layout.surface), touched_face)
     if set(OPTIMALITY) & set(study.scores):
         touches = skin.sheet_touches(grid.places, study.indentation, contrast=study.contrast)
         touched = touches.touched
-        prior = TouchPrior.create(grid.places, correlation=study.correlation)
+        if isinstance(skin.layout, SurfaceLayout):
+            lengths = Geodesics.create(skin.layout.surface).between(grid.places)
+        prior = TouchPrior.create(grid.places, correlation=study.correlation, lengths=lengths)
     else:
         touched = skin.touched_cells(grid.places, study.indentation, contrast=study.contrast)
     return _Shared(skin.model, touched, touches, prior, grid, skin.thickness, jax.random.key(study.seed))

@@ -52,13 +52,14 @@ def study_contents(study: Study) -> Contents:
     coordinates = [point.coordinates for point in study.points]
     along = {name: [values[name] for values in coordinates] for name in coordinates[0]}
     arrays = _arrays(study)
+    axes = ("x_mm", "y_mm", "z_mm") if study.surface else ("x_mm", "y_mm")
 
     def fill(group: Any) -> None:
         grid = study_grid(study)
         for name, values in along.items():
             _write_whole(group, name, "point", values)
         for axis, values in enumerate(np.asarray(grid.places).T):
-            _write_whole(group, ("x_mm", "y_mm")[axis], "place", np.round(1e3 * values, 9).tolist())
+            _write_whole(group, axes[axis], "place", np.round(1e3 * values, 9).tolist())
         number, places = len(study.points), len(grid.places)
         for name, (unit, meaning) in arrays.items():
             wide = name == "sensitivity"
@@ -72,7 +73,7 @@ def study_contents(study: Study) -> Contents:
                 attributes={"units": unit, "long_name": meaning},
             )
 
-    attributes = {"coordinates": " ".join([*along, "x_mm", "y_mm"]), "name": study.name, "study": study.text}
+    attributes = {"coordinates": " ".join([*along, *axes]), "name": study.name, "study": study.text}
     return Contents("study", "'jeit study run'", study.fingerprint, study.chunks, [*arrays], attributes, fill)
 
 

@@ -4,10 +4,11 @@ import math
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jeit.arguments import told
 from jeit.design.defaults import CONTACT_IMPEDANCE
-from jeit.layout import Layout, named_layout, read_layout
+from jeit.layout import Layout, SurfaceLayout, named_layout, read_layout
 from jeit.layout.names import DIAMETER, same_outline
 from jeit.mesh import Rectangle
 
@@ -26,7 +27,8 @@ def study_layout(
         layout = _make(name, folder, outline, diameter)
     except (ValueError, OSError) as error:
         raise ValueError(f"electrodes.layouts: {told(name)}: {str(error).removeprefix('name: ')}") from None
-    _check_gap(layout, minimum_gap)
+    centres = np.asarray(layout.centres)
+    check_spacing(layout, np.linalg.norm(centres[:, None] - centres, axis=-1), minimum_gap)
     if not math.isnan(contact_impedance):
         impedance = contact_impedance
     else:
@@ -42,8 +44,7 @@ def is_file(name: str) -> bool:
 def _make(name: str, folder: Path, outline: Rectangle, diameter: float) -> Layout:
     if not is_file(name):
         layout = named_layout(name, outline, diameter=DIAMETER if math.isnan(diameter) else diameter)
-        if not 4 <= layout.num_electrodes <= 1024:
-            raise ValueError(f"it has {layout.num_electrodes} electrodes; give 4 to 1024.")
+        check_number(layout.num_electrodes)
         return layout
     layout = read_layout(folder / name, outline=outline)
     if not same_outline(layout.outline, outline):
@@ -57,9 +58,16 @@ def _make(name: str, folder: Path, outline: Rectangle, diameter: float) -> Layou
     return Layout(layout.centres, size, contact_impedance=layout.contact_impedance, outline=outline, name=name)
 
 
-def _check_gap(layout: Layout, least: float) -> None:
-    centres, radii = np.asarray(layout.centres), np.asarray(layout.diameters) / 2
-    gap = np.linalg.norm(centres[:, None] - centres, axis=-1) - radii[:, None] - radii
+def check_number(number: int) -> None:
+    """Raise `ValueError` for fewer or more electrodes than those of a study have."""
+    if not 4 <= number <= 1024:
+        raise ValueError(f"it has {number} electrodes; give 4 to 1024.")
+
+
+def check_spacing(layout: Layout | SurfaceLayout, lengths: Float[np.ndarray, "L L"], least: float) -> None:
+    """Raise `ValueError` for gaps below `least` between electrodes whose centres are `lengths` apart, metres."""
+    radii = np.asarray(layout.diameters) / 2
+    gap = lengths - radii[:, None] - radii
     np.fill_diagonal(gap, np.inf)
     if gap.min() < least - 1e-9:
         raise ValueError(

@@ -14,16 +14,19 @@ import numpy as np
 
 from jeit.design import defaults
 from jeit.design.skin.cell_size import check_cell_size
+from jeit.design.skin.described_surface import surface_identity
 from jeit.design.skin.indentation import AbstractIndentation, Bell, Hemisphere
 from jeit.design.skin.protocol import ProtocolName, skin_protocol
 from jeit.design.skin.skin import longer_side, skin_electrodes
-from jeit.design.study.layouts import is_file, study_layout
+from jeit.design.study.layouts import is_file
+from jeit.design.study.meshes import meshes_of
 from jeit.design.study.scores import OPTIMALITY
 from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.files import check_memory, read_text
 from jeit.files.text import parsed_toml
-from jeit.layout import Layout
+from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh import Rectangle
+from jeit.mesh.geodesic import Triangles
 from jeit.protocol import Protocol
 
 if TYPE_CHECKING:
@@ -57,7 +60,7 @@ class Point:
     solid skin's mesh, 0 for a sheet.
     """
 
-    layout: Layout
+    layout: Layout | SurfaceLayout
     thickness: float
     conductivity: float
     protocol: ProtocolName
@@ -103,18 +106,20 @@ class Study:
     """A sweep: every combination of the lists in a study file. Make it with `read_study`.
 
     - `points`: the skins, in the order of the lists, the last list fastest.
-    - `outline`: theirs; `indentation`, `contrast`: the touch, as in `touched_cells`; `exact`: whether its changes
+    - `outline`: theirs, of curved skins the surface of the first.
+    - `indentation`, `contrast`: the touch, as in `touched_cells`; `exact`: whether its changes
       are, or linear; `columns`, `rows`: of the grid of touches.
     - `current`: amperes. `scores`: those wanted; `num_taxels`, `threshold`, `seed`: of `find_taxels`; `correlation`: of
       `TouchPrior`, metres.
-    - `chunk_points`: most points in a chunk. `text`: the study file.
+    - `chunk_points`: most points in a chunk. `text`: the study file. `surface`: what tells the surface of curved skins
+      from others, empty for flat ones.
 
     Studies are equal if their results would be.
     """
 
     name: str
     points: tuple[Point, ...]
-    outline: Rectangle
+    outline: Rectangle | Triangles
     indentation: AbstractIndentation
     contrast: float
     exact: bool
@@ -128,6 +133,7 @@ class Study:
     seed: int
     chunk_points: int
     text: str
+    surface: str = ""
 
     @cached_property
     def chunks(self) -> tuple[tuple[int, ...], ...]:
@@ -143,7 +149,8 @@ class Study:
     @cached_property
     def fingerprint(self) -> str:
         """SHA-256 of all that decides the results: not of comments or the study's name."""
-        content = [_VERSION, *map(float, self.outline.extent), type(self.indentation).__name__]
+        of_skin = [self.surface] if isinstance(self.outline, Triangles) else [*map(float, self.outline.extent)]
+        content = [_VERSION, *of_skin, type(self.indentation).__name__]
         content += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
         content += [self.contrast, self.exact, *self.scores, self.num_taxels, self.threshold, self.correlation]
         content += [self.seed, self.chunk_points]
@@ -170,6 +177,11 @@ def read_study(path: str | Path) -> Study:
         width_mm = 200                       # and height_mm, a rectangle about the origin
         thickness_mm = [5, 10]
         conductivity_S_per_m = 1.0
+        [surface]                            # of curved skins, without sides: inner-N, .csv files
+        kind = "tube"                        # or "forearm", "sphere", "cap", "bent sheet"; or file = "arm.stl" and unit
+        radius_mm = 30
+        height_mm = 120
+        outward = true                       # false: a layer inside of the surface
         [electrodes]
         layouts = ["park-inner", "park-boundary", "grid-8x4", "perimeter-32", "inner-32", "mine.csv"]
         diameter_mm = [6, 8]                 # and contact_impedance_ohm_m2: the file's own, or 6 and 1e-4, unless given
@@ -213,29 +225,41 @@ def read_study(path: str | Path) -> Study:
 
 def _study(text: str, table: StudyTable, folder: Path) -> Study:
     skin, measurement, scores = table.skin, table.measurement, table.scores
-    outline = Rectangle(1e-3 * skin.width_mm, 1e-3 * skin.height_mm)
     indentation = _indentation(table)
     _check_touches(table)
     layers = table.mesh.layers if skin.model == "layer" else 0
     electrodes = table.electrodes
+    gap = 1e-3 * electrodes.minimum_gap_mm
+    cells, outline, makers = meshes_of(table, folder)
+    # Of every layout one on each mesh, which of flat skins is the same.
     layouts = [
-        study_layout(name, folder, outline, diameter, impedance, 1e-3 * electrodes.minimum_gap_mm)
+        [make(name, diameter, impedance, gap) for make in makers]
         for name, diameter, impedance in itertools.product(
             electrodes.layouts, _metres(electrodes.diameter_mm), electrodes.contact_impedance_ohm_m2
         )
     ]
-    for layout in layouts:
-        _check_layout(layout, outline, layers, table)
+    for on_meshes in layouts:
+        for layout in on_meshes:
+            _check_layout(layout, outline, layers, table)
     points = tuple(
-        Point(layout, thickness, conductivity, protocol, _pairs(layout, protocol, pairs), noise, cell_size, layers)
-        for layout, thickness, conductivity, protocol, pairs, noise, cell_size in itertools.product(
+        Point(
+            on_meshes[k % len(on_meshes)],
+            thickness,
+            conductivity,
+            protocol,
+            _pairs(on_meshes[0], protocol, pairs),
+            noise,
+            cells[k],
+            layers,
+        )
+        for on_meshes, thickness, conductivity, protocol, pairs, noise, k in itertools.product(
             layouts,
             _metres(skin.thickness_mm),
             skin.conductivity_S_per_m,
             measurement.protocol,
             measurement.pairs or [None],
             measurement.noise_V,
-            _metres(table.mesh.cell_mm),
+            range(len(cells)),
         )
     )
     return Study(
@@ -255,6 +279,7 @@ def _study(text: str, table: StudyTable, folder: Path) -> Study:
         seed=scores.seed,
         chunk_points=table.chunk_points,
         text=text,
+        surface="" if table.surface is None else surface_identity(table.surface, folder),
     )
 
 
@@ -303,7 +328,9 @@ def _check_touches(table: StudyTable) -> None:
     check_memory(f"scores.wanted = {of_sheets[0]!r} of {touches:,} touches (columns × rows)", 24.0 * touches**2)
 
 
-def _check_layout(layout: Layout, outline: Rectangle, layers: int, table: StudyTable) -> None:
+def _check_layout(
+    layout: Layout | SurfaceLayout, outline: Rectangle | Triangles, layers: int, table: StudyTable
+) -> None:
     """Whether a layout, whatever else is swept, can be measured and meshed."""
     widest, thickest = 1e3 * longer_side(outline), max(table.skin.thickness_mm)
     if thickest > widest:
@@ -319,22 +346,25 @@ def _check_layout(layout: Layout, outline: Rectangle, layers: int, table: StudyT
                 check_memory(
                     f"measurement.pairs: {patterns:,} of {layout.name!r}, touched at {touches:,} places,", size
                 )
+    if isinstance(outline, Triangles) and "cell_mm" not in table.mesh.model_fields_set:
+        return
+    area = float(outline.areas.sum()) if isinstance(outline, Triangles) else outline.area
     for cell_size in _metres(table.mesh.cell_mm):
-        check_cell_size("mesh.cell_mm", cell_size, layout, outline.area, layers)
+        check_cell_size("mesh.cell_mm", cell_size, layout, area, layers)
 
 
-def _pairs(layout: Layout, protocol: str, pairs: int | None) -> int:
+def _pairs(layout: Layout | SurfaceLayout, protocol: str, pairs: int | None) -> int:
     """As many as are asked for, 0 for all; where nobody says, as many as other skins have, or all."""
     if pairs is not None:
         return pairs
     return defaults.NUM_PAIRS if protocol == "two-terminal" and _all_pairs(layout) > defaults.NUM_PAIRS else 0
 
 
-def _all_pairs(layout: Layout) -> int:
+def _all_pairs(layout: Layout | SurfaceLayout) -> int:
     return layout.num_electrodes * (layout.num_electrodes - 1) // 2
 
 
-def _check_measurement(layout: Layout, protocol: str, pairs: int) -> None:
+def _check_measurement(layout: Layout | SurfaceLayout, protocol: str, pairs: int) -> None:
     """Whether the layout has electrodes enough for its protocol and pairs."""
     name, number, fewest = layout.name, layout.num_electrodes, _FEWEST[protocol]
     if number < fewest:

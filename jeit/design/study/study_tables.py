@@ -18,6 +18,7 @@ from jeit.design.skin.skin_tables import (
     SIDE,
     THICKNESS,
 )
+from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_of_curved
 from jeit.design.study.scores import OPTIMALITY, ScoreName
 from jeit.files.schema import Number, Several, Table, Word, fault
 
@@ -103,6 +104,7 @@ class StudyTable(Table):
     name: Word = "study"
     chunk_points: Annotated[int, Number(1, 4096)] = 16
     skin: MaterialSweep = MaterialSweep()
+    surface: Annotated[SurfaceTable | None, SURFACE] = None
     electrodes: LayoutSweep = Field(default_factory=dict, validate_default=True)
     measurement: MeasurementSweep = MeasurementSweep()
     touch: TouchTable = TouchTable()
@@ -138,6 +140,11 @@ class StudyTable(Table):
                     f"{', '.join(map(repr, there))}; leave it out, or change the other.",
                     where,
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _of_curved(self) -> "StudyTable":
+        check_of_curved(self.surface, self.skin, self.mesh)
         return self
 
     @model_validator(mode="after")

@@ -2,6 +2,7 @@
 
 from jeit.mesh.geodesic.geodesics import Geodesics
 from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
+from jeit.mesh.geodesic.unfolding import Unfolding, unfold
 from jeit.mesh.geodesic.unrolled import Unrolled, unroll
 
-__all__ = ["Geodesics", "SurfacePlaces", "Triangles", "Unrolled", "unroll"]
+__all__ = ["Geodesics", "SurfacePlaces", "Triangles", "Unfolding", "Unrolled", "unfold", "unroll"]

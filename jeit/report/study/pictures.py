@@ -2,11 +2,16 @@
 
 import numpy as np
 
+from jeit.design.skin.touch_grid import TouchGrid
 from jeit.design.study.batch import study_grid
 from jeit.design.study.spec import Study
+from jeit.mesh import Rectangle
+from jeit.mesh.geodesic import Geodesics, Triangles, unroll
 
 # More maps than that are no longer looked at.
 _MAPS, _COLUMNS = 24, 4
+# Of an unrolled map, from where on nodes are no longer seen.
+_NODES = 3000
 # Swept values as they stand above a map; electrodes are told by the layout.
 _LABELS = {
     "diameter_mm": "⌀ {:g} mm",
@@ -112,20 +117,18 @@ def draw_maps(study: Study, data):
     height = 2.4 + 0.15 * max(title.count("\n") for title in titles)
     figure = Figure(figsize=(max(2.6 * columns, 4.0) + 0.8, height * rows + 0.3), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    low_x, high_x, low_y, high_y = (1e3 * length for length in study.outline.extent)
+    view = _Unrolled(study.outline, grid) if isinstance(study.outline, Triangles) else _Flat(study.outline, grid)
     image = None
     for axes, number, map_values in zip(panels, numbers, values, strict=False):
         layout = study.points[number].layout
-        image = axes.imshow(
-            grid.raster(map_values), origin="lower", extent=(low_x, high_x, low_y, high_y), norm=scale, cmap="magma"
-        )
+        image = view.draw(axes, map_values, norm=scale, cmap="magma")
         diameter = 1e3 * np.asarray(layout.diameters)
         circles = EllipseCollection(
             diameter,
             diameter,
             np.zeros_like(diameter),
             units="xy",
-            offsets=1e3 * np.asarray(layout.centres),
+            offsets=1e3 * view.places(layout.centres),
             offset_transform=axes.transData,
             facecolors="none",
             edgecolors="c",
@@ -145,6 +148,39 @@ def draw_maps(study: Study, data):
         shrink=min(1.0, 1.5 / rows),
     )
     return figure
+
+
+class _Flat:
+    """Maps of flat skins, in millimetres."""
+
+    def __init__(self, outline: Rectangle, grid: TouchGrid):
+        self.extent, self.grid = tuple(1e3 * length for length in outline.extent), grid
+
+    def draw(self, axes, values, **style):
+        return axes.imshow(self.grid.raster(values), origin="lower", extent=self.extent, **style)
+
+    def places(self, centres) -> np.ndarray:
+        return np.asarray(centres)
+
+
+class _Unrolled:
+    """Maps of curved skins, laid flat, in millimetres: at every place of the skin the value of the touch that is
+    nearest along it."""
+
+    def __init__(self, outline: Triangles, grid: TouchGrid):
+        fine = outline
+        while len(fine.points) < _NODES:
+            fine = fine.finer()
+        self.flat = unroll(fine)
+        self.owners = Geodesics.create(fine).owners(grid.places)[0][self.flat.nodes]
+
+    def draw(self, axes, values, **style):
+        axes.set_aspect("equal")
+        x, y = 1e3 * self.flat.points.T
+        return axes.tripcolor(x, y, self.flat.cells, np.asarray(values)[self.owners], shading="gouraud", **style)
+
+    def places(self, centres) -> np.ndarray:
+        return self.flat.flat(np.asarray(centres))
 
 
 def titles_of(study: Study) -> list[str]:

@@ -46,7 +46,8 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
         *([_picture(draw_scores(data), "Scores of every point; triangles are infinite")] if scores_of(data) else []),
         _picture(
             draw_maps(study, data),
-            f"Sensitivity maps of {len(shown(data))} points, electrodes as circles, axes in millimetres",
+            f"Sensitivity maps of {len(shown(data))} points, electrodes as circles, axes in millimetres"
+            f"{', of the skin unrolled' if study.surface else ''}",
         ),
         "<h2>Points</h2>",
         _table(study, data),

@@ -1,6 +1,5 @@
 """Pressure on the cells of a mesh, at a few samples of each, which a load is balanced on."""
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -9,43 +8,21 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
+from jeit.design.skin.reached_cells import said
 from jeit.design.skin.touched_cells import padded
-from jeit.mesh import Mesh, check_flat, measures
 from jeit.simulate.contact.indenters import Disc
 from jeit.simulate.contact.press import Press
 from jeit.simulate.contact.pressure import AbstractSupport
+from jeit.simulate.contact.samples import Samples
 
-# Of a cell: barycentric coordinates are multiples of 1 / (lattice + 1), moved inwards by the same for all. The finer
-# lattice is for contacts on few samples of the other; it finds all that is as wide as this share of a cell.
-_LATTICE, _FINE_LATTICE, _FEW, _FOUND = 2, 11, 6, 1 / 6
+# A finer lattice is for contacts on few samples; it finds all that is as wide as this share of a cell.
+_FINE_LATTICE, _FEW, _FOUND = 11, 6, 1 / 6
 # Presses whose pressures are worked out at once: so much memory is in the cache.
 _AT_ONCE = 16
 # How much farther a contact reaches that has about half its area on the skin; Winkler's ball: 2^(1/4).
 _MARGIN = 1.25
 # Of the area within reach of a press that is skin: with less, it may be felt farther than that.
 _ON_SKIN = 0.6
-
-
-class Samples(NamedTuple):
-    """Places (m, s, 2) in the plane on m cells of a skin, metres; the `area` (m,) that each of a cell's stands for, m²;
-    the radius of the largest cell, metres; and where the cells' `corners` (m, k, 2) are in the plane."""
-
-    points: Float[np.ndarray, "m s 2"]
-    area: Float[np.ndarray, " m"]
-    radius: float
-    corners: Float[np.ndarray, "m k 2"]
-
-    @classmethod
-    def of(cls, mesh: Mesh) -> "Samples":
-        """Of a sheet, or of a layer, whose cells are all pressed as the skin above them is."""
-        check_flat(mesh, "these presses")
-        corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
-        thickness = np.ptp(corners[..., 2]) if mesh.dimension == 3 else 1.0
-        corners = corners[..., :2]
-        points = lattice(corners, _LATTICE)
-        area = np.asarray(measures(mesh)) / thickness / points.shape[1]
-        radius = np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=-1).max()
-        return cls(points, area, float(radius), corners)
 
 
 class PressedCells(NamedTuple):
@@ -89,22 +66,25 @@ def pressed_cells(
 def _of_each(
     samples: Samples, support: AbstractSupport, presses: Sequence[Press], progress: Callable[[str], None] | None
 ) -> PressedCells:
+    samples.check(presses)
     position = np.array([press.position for press in presses])
     shapes = _shapes(presses)
-    farthest = np.array([press.indenter.reach for press in presses])
-    felt = np.minimum(_reaches(support, presses, shapes), farthest) + samples.radius
+    farthest = samples.chord * np.array([press.indenter.reach for press in presses])
+    # How far a press is felt where the skin is flat says nothing of hollows.
+    reaches = farthest if samples.curved is not None else _reaches(support, presses, shapes)
+    felt = np.minimum(reaches, farthest) + samples.radius
     tree = KDTree(samples.points.mean(axis=1))
     near = tree.query_ball_point(position, felt, return_sorted=True)
     on_skin = samples.points.shape[1] * np.array([samples.area[cells].sum() for cells in near])
     beyond = np.flatnonzero(on_skin < _ON_SKIN * np.pi * felt**2)
     near[beyond] = tree.query_ball_point(position[beyond], farthest[beyond] + samples.radius, return_sorted=True)
+    near = samples.near(presses, near)
     number = np.array([len(cells) for cells in near])
     empty = np.flatnonzero(number == 0)
     if empty.size:
-        x, y = 1e3 * position[empty[0]]
         raise ValueError(
-            f"position: {empty.size} of {len(presses)} presses lie off the skin, the first at ({x:.4g}, {y:.4g}) mm; "
-            "places are in metres."
+            f"position: {empty.size} of {len(presses)} presses lie off the skin, the first at "
+            f"{said(position[empty[0]])} mm; places are in metres."
         )
     rows: list = [None] * len(presses)
     pressures: list = [None] * len(presses)
@@ -155,10 +135,10 @@ def _alike(samples: Samples, support: AbstractSupport, presses: Sequence[Press],
     """Pressures (b, c, s) of presses with one and the same indenter at the samples of `cells` (b, c)."""
     points = samples.points[cells]
     shape = points.shape[:-1]
-    area = np.broadcast_to((samples.area[cells] * there)[..., None], shape).reshape(len(cells), -1)
-    local = _in_frame(presses, points.reshape(len(cells), -1, 2))
+    local, fall, share = samples.seen(presses, cells, points.reshape(len(cells), -1, points.shape[-1]))
+    area = np.broadcast_to((share * samples.area[cells] * there)[..., None], shape).reshape(len(cells), -1)
     load = np.array([press.load for press in presses])
-    pressure = support.spread(presses[0].indenter, load, local, area) * (area > 0)
+    pressure = support.spread(presses[0].indenter, load, local, area, _bulge(samples, fall)) * (area > 0)
     pressure = pressure.reshape(shape)
     for one in np.flatnonzero(np.count_nonzero(pressure, axis=(1, 2)) < _FEW).tolist():
         pressure[one] = _between(samples, support, presses[one], cells[one], there[one])
@@ -168,41 +148,31 @@ def _alike(samples: Samples, support: AbstractSupport, presses: Sequence[Press],
 def _between(samples: Samples, support: AbstractSupport, press: Press, cells, there):
     """Pressures (c, s) of a press on few samples: means of each of the `cells` (c,) over a finer lattice; all on the
     nearest sample where that is missed. Raises `ValueError` for one that touches no skin."""
-    points = lattice(samples.corners[cells], _FINE_LATTICE)
+    points = samples.on(cells, _FINE_LATTICE)
     fine, coarse = points.shape[1], samples.points.shape[1]
-    local = _in_frame([press], points.reshape(1, -1, 2))
-    area = np.repeat(samples.area[cells] * there * coarse / fine, fine)[None]
+    local, fall, share = samples.seen([press], cells[None], points.reshape(1, -1, points.shape[-1]))
+    area = np.repeat(share[0] * samples.area[cells] * there * coarse / fine, fine)[None]
     load = np.array([press.load])
-    pressure = support.spread(press.indenter, load, local, area) * (area > 0)
+    pressure = support.spread(press.indenter, load, local, area, _bulge(samples, fall)) * (area > 0)
     if pressure.any():
         return np.repeat(pressure.reshape(-1, fine).mean(axis=1, keepdims=True), coarse, axis=1)
     pressure = np.zeros((len(cells), coarse))
     distance = np.linalg.norm(local.reshape(-1, fine, 2), axis=-1).min(axis=1)
     cell = np.where(there, distance, np.inf).argmin()
     if not (distance[cell] < _FOUND * samples.radius and np.isfinite(press.indenter.gap(np.zeros(2)))):
-        x, y = 1e3 * press.position
         raise ValueError(
-            f"position: the press at ({x:.4g}, {y:.4g}) mm touches no skin, or does with less than a tenth of a cell's "
-            "width; move it, or give a wider indenter or a finer mesh."
+            f"position: the press at {said(press.position)} mm touches no skin, or does with less than a tenth of a "
+            "cell's width; move it, or give a wider indenter or a finer mesh."
         )
     nearest = np.linalg.norm(samples.points[cells[cell]] - press.position, axis=-1).argmin()
-    here, small = np.zeros((1, 1, 2)), samples.area[cells[cell]].reshape(1, 1)
+    here, small = np.zeros((1, 1, 2)), (share[0, cell] * samples.area[cells[cell]]).reshape(1, 1)
     pressure[cell, nearest] = support.spread(Disc(samples.radius), load, here, small)[0, 0]
     return pressure
 
 
-def lattice(corners: Float[np.ndarray, "m k d"], number: int) -> Float[np.ndarray, "m s d"]:
-    """Places (m, s, d) in cells of these corners, spread evenly; more of them the greater `number` is."""
-    size = corners.shape[1]
-    steps = [each for each in itertools.product(range(number + 1), repeat=size) if sum(each) == number]
-    return np.einsum("sk,mkd->msd", (np.array(steps) + 1 / size) / (number + 1), corners)
-
-
-def _in_frame(presses: Sequence[Press], points: Float[np.ndarray, "b q 2"]) -> Float[np.ndarray, "b q 2"]:
-    """Points in the frames of the presses' indenters."""
-    cos, sin = (function([press.angle for press in presses])[:, None] for function in (np.cos, np.sin))
-    x, y = np.moveaxis(points - np.array([press.position for press in presses])[:, None], -1, 0)
-    return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
+def _bulge(samples: Samples, fall):
+    """None of a flat skin, which falls nowhere."""
+    return None if samples.curved is None else fall
 
 
 def _joined(rows: list, pressures: list) -> PressedCells:

@@ -76,9 +76,10 @@ class Foundation(AbstractSupport):
         reach = float(np.linalg.norm(points[gap < approach], axis=-1).max() + np.hypot(*pixel))
         return FoundationPressure(float(load), approach, reach, indenter, self.stiffness)
 
-    def spread(self, indenter: AbstractIndenter, loads, points, areas):
-        """The approach is the one that balances the load on these very points."""
-        gap = indenter.gap(points)
+    def spread(self, indenter: AbstractIndenter, loads, points, areas, fall=None):
+        """The approach is the one that balances the load on these very points; of a curved skin gaps are as much wider
+        as it falls away."""
+        gap = indenter.gap(points) if fall is None else indenter.gap(points) + fall
         approach = level(gap, areas, loads / self.stiffness)
         deepest = approach.argmax()
         self._check_approach(approach[deepest], loads[deepest])

@@ -74,9 +74,12 @@ class HalfSpace(AbstractSupport):
         reach = float(np.linalg.norm(points[values > 0], axis=-1).max() + np.hypot(*pixel))
         return PressureRaster(float(load), approach, reach, values, pixel)
 
-    def spread(self, indenter: AbstractIndenter, loads, points, areas):
+    def spread(self, indenter: AbstractIndenter, loads, points, areas, fall=None):
         """Each load's own pressure at these points, scaled to carry it: over an edge, what is cut off is made up for by
-        what is left. Raises `ValueError` also where less than a fifth is left."""
+        what is left. Raises `ValueError` also where less than a fifth is left, and for a curved skin, which it is not.
+        """
+        if fall is not None:
+            raise ValueError("support: a HalfSpace is flat, and the skin is curved; take a Foundation.")
         free = [self.pressure(indenter, load) for load in loads]
         pressures = np.stack([one.at(own) for one, own in zip(free, points, strict=True)])
         carried = np.sum(pressures * areas, axis=1)

@@ -14,12 +14,12 @@ from jeit.design import Skin
 from jeit.design.skin.resting_skin import RestingSkin
 from jeit.design.skin.touched_cells import TouchedCells, padded
 from jeit.mesh import Domain, centroids
-from jeit.simulate.contact.cell_pressure import lattice
 from jeit.simulate.contact.indenters import AbstractIndenter, check_indenter
 from jeit.simulate.contact.joined import check_angle, check_position
 from jeit.simulate.contact.materials import material
 from jeit.simulate.contact.press_draws import PressDraws
 from jeit.simulate.contact.pressed_skin import PressedSkin
+from jeit.simulate.contact.samples import lattice
 from jeit_solvers.engines import as_array
 
 # Places in each cell of a mesh, see `lattice`; what of a sheet conducts at least, where it is pressed through.

@@ -56,10 +56,11 @@ class Joined(AbstractIndenter):
         return max(part.reach for part in self.parts)
 
 
-def check_position(position) -> Float[np.ndarray, "2"]:
-    """A place (x, y) in metres as an array. Raises `ValueError` for what is none."""
+def check_position(position, *, in_space: bool = False) -> Float[np.ndarray, " d"]:
+    """A place (x, y) in metres as an array, or where it may be `in_space` (x, y, z). Raises `ValueError` for what is
+    none."""
     where = real_array("position", position, "(x, y) in metres")
-    if where.shape != (2,) or not np.isfinite(where).all():
+    if where.shape not in ((2,), (3,))[: 1 + in_space] or not np.isfinite(where).all():
         raise ValueError(f"position: give (x, y) in metres, not {position!r}.")
     return where
 

@@ -12,11 +12,16 @@ from jeit.simulate.contact.pressure import check_load
 
 
 class Press(eqx.Module):
-    """An `indenter` under a `load` in newtons, turned by `angle` radians, its origin at `position` (x, y), metres."""
+    """An `indenter` under a `load` in newtons, turned by `angle` radians, its origin at `position` (x, y), metres.
+
+    On a curved skin `position` is (x, y, z), on the face that is touched, and the indenter comes down along the inward
+    normal there. With angle 0 its y axis is then up, as near to z as the surface goes, where this is not level, and
+    along y where it is; its x axis to the right, as seen from outside.
+    """
 
     indenter: AbstractIndenter
     load: float
-    position: Float[np.ndarray, "2"]
+    position: Float[np.ndarray, " d"]
     angle: float
 
     def __init__(self, indenter: AbstractIndenter, load: float, position: ArrayLike = (0.0, 0.0), angle: float = 0.0):
@@ -24,16 +29,16 @@ class Press(eqx.Module):
         check_indenter("indenter", indenter)
         check_load(load)
         self.indenter, self.load = indenter, float(load)
-        self.position, self.angle = check_position(position), check_angle(angle)
+        self.position, self.angle = check_position(position, in_space=True), check_angle(angle)
 
 
 class MovingPress(eqx.Module):
-    """The same in time: `load` (T,) newtons, 0 while it is lifted, `position` (T, 2) metres, `angle` (T,) radians, one
-    for each frame; what stays the same may be given once."""
+    """The same in time: `load` (T,) newtons, 0 while it is lifted, `position` (T, 2) metres, on a curved skin (T, 3),
+    `angle` (T,) radians, one for each frame; what stays the same may be given once."""
 
     indenter: AbstractIndenter
     load: Float[np.ndarray, " T"]
-    position: Float[np.ndarray, "T 2"]
+    position: Float[np.ndarray, "T d"]
     angle: Float[np.ndarray, " T"]
 
     def __init__(
@@ -44,14 +49,14 @@ class MovingPress(eqx.Module):
         load = real_array("load", load, "newtons, one or one a frame (T,)")
         position = real_array("position", position, "(x, y) in metres, one or one a frame (T, 2)")
         angle = real_array("angle", angle, "radians, one or one a frame (T,)")
-        if position.shape[-1:] != (2,):
+        if position.shape[-1:] not in ((2,), (3,)):
             raise ValueError(
                 f"position must be (x, y) in metres, one or one a frame (T, 2); it has shape {position.shape}."
             )
         try:
             (number,) = np.broadcast_shapes(load.shape, position.shape[:-1], angle.shape)
             load, angle = np.broadcast_to(load, number), np.broadcast_to(angle, number)
-            position = np.broadcast_to(position, (number, 2))
+            position = np.broadcast_to(position, (number, position.shape[-1]))
         except ValueError:
             raise ValueError(
                 "load, position and angle must be (T,), (T, 2) and (T,) for T frames, or one for all; they have shapes "

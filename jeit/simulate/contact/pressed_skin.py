@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_key, check_kind, is_number, real_array, told
+from jeit.arguments import check_key, check_kind, check_name, is_number, real_array, told
+from jeit.design.skin.reached_cells import is_curved
 from jeit.design.skin.touched_cells import TouchedCells, padded
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
@@ -17,11 +18,12 @@ from jeit.forward.assembly import check_conductivity
 from jeit.forward.contact_sensitivity import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
 from jeit.mesh import Mesh, centroids, measures
-from jeit.simulate.contact.cell_pressure import Samples, pressed_cells
+from jeit.simulate.contact.cell_pressure import pressed_cells
 from jeit.simulate.contact.drift import gains, walk, white_noise
 from jeit.simulate.contact.materials import Material
 from jeit.simulate.contact.press import MovingPress, Press, motions_of, touches_of
 from jeit.simulate.contact.response import advance, held_pressure, unstrained
+from jeit.simulate.contact.samples import Samples
 from jeit_solvers.engines import as_array
 
 # Touches worked on at once; their numbers of cells that part them; and their extent over the root of their area, above
@@ -35,25 +37,40 @@ class PressedSkin(eqx.Module):
     """A sheet, or a layer, of a material that is pressed; readings are exact, by low-rank changes of one factorisation.
 
     **Fields**: `model`, any forward model of a sheet, or of a layer whose top is at its greatest z; `material`;
-    `conductivity` at rest, S/m (2-D: S), also tensors, which presses scale; `gain` (M,) of every channel.
+    `conductivity` at rest, S/m (2-D: S), also tensors, which presses scale; `gain` (M,) of every channel; `face` of a
+    curved layer that is pressed, "outer" or "inner".
+
+    The sheet may be a surface in space, and the layer a shell: presses are then at (x, y, z), and their material's
+    support a `Foundation`.
     """
 
     model: ForwardModel
     material: Material
     conductivity: Float[np.ndarray, "..."]
     gain: Float[np.ndarray, " M"]
+    face: str = eqx.field(static=True)
 
-    def __init__(self, key: Array, model: ForwardModel, material: Material, *, conductivity: ArrayLike | None = None):
+    def __init__(
+        self,
+        key: Array,
+        model: ForwardModel,
+        material: Material,
+        *,
+        conductivity: ArrayLike | None = None,
+        face: str = "outer",
+    ):
         """A skin whose gains are drawn from `key`. `conductivity` at rest, S/m (2-D: S): the material's unless given.
+        `face`: as `jeit.design.Skin.touched_face` says.
 
-        Raises `ValueError` for what is no key, model, material or conductivity.
+        Raises `ValueError` for what is no key, model, material, conductivity or face.
         """
         check_key(key)
         check_model(model)
         check_kind("material", material, Material, 'a Material, such as material("velostat")')
         if conductivity is None:
             conductivity = material.conductivity * (material.thickness if model.mesh.dimension == 2 else 1.0)
-        self.model, self.material = model, material
+        check_name("face", face, ("outer", "inner"))
+        self.model, self.material, self.face = model, material, face
         self.conductivity = np.asarray(check_conductivity(model.mesh, conductivity))
         self.gain = gains(key, material.gain_spread, model.protocol.num_measurements)
 
@@ -92,9 +109,9 @@ class PressedSkin(eqx.Module):
     ) -> TouchedCells:
         """The cells whose conductivity n touches change, and by how much; as of `frames`, whose errors it raises."""
         touches = touches_of(presses)
-        pressed = pressed_cells(Samples.of(self.model.mesh), self.material.support, touches, progress)
+        pressed = pressed_cells(Samples.of(self.model.mesh, self.face), self.material.support, touches, progress)
         change = self.material.change(held_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
-        places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])
+        places = np.array([touch[0].position if touch else np.zeros(self._dimension) for touch in touches])
         return _touched(places, pressed.cells, change, self.model.mesh.num_cells)
 
     def record(
@@ -156,7 +173,7 @@ class PressedSkin(eqx.Module):
         motions = motions_of(motions, len(seconds))
         found = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
         touches = [tuple(press for press in some if press is not None) for some in found]
-        pressed = pressed_cells(Samples.of(self.model.mesh), self.material.support, touches, progress)
+        pressed = pressed_cells(Samples.of(self.model.mesh, self.face), self.material.support, touches, progress)
         there = [own.any(axis=-1) for own in pressed.pressure]
         cells = np.unique(pressed.cells[np.array(there)]) if motions else np.zeros(1, int)
         place = np.searchsorted(cells, pressed.cells)
@@ -168,7 +185,7 @@ class PressedSkin(eqx.Module):
             pressure[place[frame][there[frame]]] = pressed.pressure[frame][there[frame]]
             strain, effective = advance(self.material, strain, pressure.ravel(), now - before)
             change[frame], before = self.material.change(effective.reshape(shape)).mean(axis=-1), now
-        places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])
+        places = np.array([touch[0].position if touch else np.zeros(self._dimension) for touch in touches])
         return _touched(places, np.broadcast_to(cells, change.shape), change, self.model.mesh.num_cells)
 
     def voltages_under(
@@ -209,6 +226,11 @@ class PressedSkin(eqx.Module):
             exact = (exact + (contacts + drift) @ self._contact_slope) * np.exp(-drift)
         deviation = own.noise * float(np.sqrt(np.mean(self._at_rest**2)))
         return self.gain * (exact + white_noise(for_noise, deviation, exact.shape))
+
+    @property
+    def _dimension(self) -> int:
+        """Of the places of presses."""
+        return 3 if is_curved(self.model.mesh) else 2
 
     @cached_property
     def _at_rest(self) -> Float[np.ndarray, " M"]:
@@ -254,7 +276,7 @@ def _kinds(mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, 
     whether these lie together or, of several contacts, apart."""
     there = change != 0
     number = there.sum(axis=1)
-    middles = np.asarray(centroids(mesh))[:, :2][cells]
+    middles = np.asarray(centroids(mesh))[:, : 3 if is_curved(mesh) else 2][cells]
     low, high = (find(np.where(there[..., None], middles, far), axis=1) for find, far in ((np.min, 1), (np.max, -1)))
     area = np.sum(np.where(there, np.asarray(measures(mesh))[cells], 0.0), axis=1)
     apart = np.linalg.norm(high - low, axis=1) > _APART * np.sqrt(area)

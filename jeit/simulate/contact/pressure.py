@@ -41,10 +41,12 @@ class AbstractSupport(eqx.Module):
         loads: Float[np.ndarray, " n"],
         points: Float[np.ndarray, "n q 2"],
         areas: Float[np.ndarray, "n q"],
+        fall: Float[np.ndarray, "n q"] | None = None,
     ) -> Float[np.ndarray, "n q"]:
         """Pressures (n, q) under n `loads`, newtons, at `points` in the indenter's frame, each of which stands for an
-        area, m²: they carry the load among them, all of it, or are zero where the indenter touches none. Raises
-        `ValueError` as `pressure` does."""
+        area, m²: they carry the load among them, all of it, or are zero where the indenter touches none. `fall` of a
+        curved skin: how far below the frame's plane it lies at the points, metres. Raises `ValueError` as `pressure`
+        does, and for a curved skin where it is none of these."""
 
 
 class PressureRaster(AbstractPressure):

@@ -11,9 +11,9 @@ from scipy.spatial import KDTree
 from jeit.design import Skin
 from jeit.forward.contact_sensitivity import ContactSensitivity
 from jeit.forward.model import select_channels
-from jeit.simulate.contact.cell_pressure import lattice
 from jeit.simulate.contact.indent_sets import image_places
 from jeit.simulate.contact.indents import relative_to
+from jeit.simulate.contact.samples import lattice
 from jeit.touch.networks.touches import DEPTHS
 
 # Places in each cell, along a side: pixels are smaller than cells.

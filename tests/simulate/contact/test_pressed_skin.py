@@ -25,7 +25,8 @@ from jeit.simulate.contact import (
     ball,
     material,
 )
-from jeit.simulate.contact.cell_pressure import Samples, pressed_cells
+from jeit.simulate.contact.cell_pressure import pressed_cells
+from jeit.simulate.contact.samples import Samples
 
 KEY = jax.random.key(0)
 VELOSTAT = material("velostat")

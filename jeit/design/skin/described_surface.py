@@ -1,0 +1,69 @@
+"""The surface of a curved skin as its table says: made, or read from a file beside it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jeit.arguments import told
+from jeit.mesh import Mesh, bend, cap, forearm, measures, read, rectangle, sphere, tube
+
+if TYPE_CHECKING:
+    from jeit.design.skin.surface_tables import SurfaceTable
+
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
+# An equilateral triangle's side, over the root of its area.
+_SIDE = 2 / 3**0.25
+
+
+def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
+    """A surface with cells of `cell_size` metres, or as its file has it; files are relative to `folder`.
+
+    Raises `ValueError`, which speaks of surface, for what cannot be made or read, or is no surface.
+    """
+    try:
+        return _made(table, folder, cell_size)
+    except (ValueError, OSError) as error:
+        raise ValueError(f"surface: {error}") from None
+
+
+def surface_identity(table: SurfaceTable, folder: Path) -> str:
+    """Text that differs for other surfaces: of a file by all that is in it."""
+    kept = table.model_dump()
+    if "file" in kept:
+        kept["file"] = hashlib.sha256((folder / kept["file"]).read_bytes()).hexdigest()
+    return json.dumps(kept, default=np.ndarray.tolist)
+
+
+def typical_cell(surface: Mesh) -> float:
+    """Side of an equilateral triangle as large as those of a surface, metres."""
+    return _SIDE * float(np.sqrt(np.mean(np.asarray(measures(surface)))))
+
+
+def _made(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
+    from jeit.design.skin import surface_tables as tables
+
+    match table:
+        case tables.TubeTable():
+            return tube(1e-3 * table.radius_mm, 1e-3 * table.height_mm, cell_size=cell_size)
+        case tables.ForearmTable():
+            wrist, elbow = ((1e-3 * np.broadcast_to(one, 2)).tolist() for one in (table.wrist_mm, table.elbow_mm))
+            return forearm(1e-3 * table.length_mm, wrist, elbow, cell_size=cell_size)
+        case tables.SphereTable():
+            return sphere(1e-3 * table.radius_mm, cell_size=cell_size)
+        case tables.CapTable():
+            return cap(1e-3 * table.radius_mm, float(np.deg2rad(table.angle_degrees)), cell_size=cell_size)
+        case tables.BentSheetTable():
+            flat = rectangle(1e-3 * table.width_mm, 1e-3 * table.height_mm, cell_size=cell_size)
+            return bend(flat, 1e-3 * table.radius_mm, axis=table.axis)
+    surface = read(folder / table.file, scale=_UNITS[table.unit])
+    if not surface.is_surface:
+        raise ValueError(
+            f"{told(table.file)} is flat or a solid; a curved skin needs triangles in space, such as those that "
+            "jeit.mesh.surface_of takes off a solid."
+        )
+    return surface

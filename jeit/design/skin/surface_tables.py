@@ -1,0 +1,84 @@
+"""The table of a curved skin's surface, by its kind: what each key may hold, from where to where, in which unit."""
+
+from typing import Annotated, Any, Literal
+
+from jeit.files.schema import Number, Numbers, OneOf, Table, Word, fault
+
+_RADIUS = Number(2, 5000, "mm")
+_LENGTH = Number(5, 5000, "mm")
+_SECTION = Numbers(((2, 2),), 2, 5000, "mm", single=True)
+
+
+class TubeTable(Table):
+    """Of the side of a cylinder."""
+
+    what = "a tube"
+    kind: Literal["tube"]
+    radius_mm: Annotated[float, _RADIUS]
+    height_mm: Annotated[float, _LENGTH]
+    outward: bool = True
+
+
+class ForearmTable(Table):
+    """Of a tapered sleeve: a radius, or half the widths of an oval, of either end."""
+
+    what = "a forearm"
+    kind: Literal["forearm"]
+    length_mm: Annotated[float, _LENGTH]
+    wrist_mm: Annotated[Any, _SECTION]
+    elbow_mm: Annotated[Any, _SECTION]
+    outward: bool = True
+
+
+class SphereTable(Table):
+    """Of a ball."""
+
+    what = "a sphere"
+    kind: Literal["sphere"]
+    radius_mm: Annotated[float, _RADIUS]
+    outward: bool = True
+
+
+class CapTable(Table):
+    """Of what of a ball lies about its pole."""
+
+    what = "a cap"
+    kind: Literal["cap"]
+    radius_mm: Annotated[float, _RADIUS]
+    angle_degrees: Annotated[float, Number(5, 170, "degrees")]
+    outward: bool = True
+
+
+class BentSheetTable(Table):
+    """Of a flat sheet, rolled round a cylinder along `axis`."""
+
+    what = "a bent sheet"
+    kind: Literal["bent sheet"]
+    width_mm: Annotated[float, _LENGTH]
+    height_mm: Annotated[float, _LENGTH]
+    radius_mm: Annotated[float, _RADIUS]
+    axis: Literal["x", "y"] = "y"
+    outward: bool = True
+
+
+class ScanTable(Table):
+    """Of a file of triangles, and what a length of 1 in it is."""
+
+    what = "a surface's file"
+    file: Word
+    unit: Literal["mm", "cm", "m", "inch"]
+    outward: bool = True
+
+
+SurfaceTable = TubeTable | ForearmTable | SphereTable | CapTable | BentSheetTable | ScanTable
+SURFACE = OneOf("kind", TubeTable, ForearmTable, SphereTable, CapTable, BentSheetTable, mark="file", other=ScanTable)
+
+
+def check_of_curved(surface: SurfaceTable | None, skin: Table, mesh: Table) -> None:
+    """Raise a fault for keys of the tables `skin` and `mesh` that have no effect on a skin with this surface."""
+    if surface is None:
+        return
+    if sides := {"width_mm", "height_mm"} & skin.model_fields_set:
+        raise fault("has no effect: the table surface says how large the skin is; leave it out.", f"skin.{min(sides)}")
+    if isinstance(surface, ScanTable) and "cell_mm" in mesh.model_fields_set:
+        raise fault("has no effect: cells are the triangles of surface.file; leave it out.", "mesh.cell_mm")

@@ -1,0 +1,38 @@
+"""What the skins of a study are meshes of, for each size of cells, and how layouts are made on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jeit.design.skin.described_surface import described_surface, typical_cell
+from jeit.design.study.curved_layouts import curved_layout
+from jeit.design.study.layouts import study_layout
+from jeit.layout import Layout, SurfaceLayout
+from jeit.mesh import Mesh, Rectangle
+from jeit.mesh.geodesic import Triangles
+
+if TYPE_CHECKING:
+    from jeit.design.study.study_tables import StudyTable
+
+Maker = Callable[[str, float, float, float], Layout | SurfaceLayout]
+"""A layout by name, with a diameter, contact impedance and least gap, as in `study_layout`."""
+
+
+def meshes_of(table: StudyTable, folder: Path) -> tuple[list[float], Rectangle | Triangles, Sequence[Maker]]:
+    """Sizes of cells, metres; the outline, of curved skins the surface of the first size; and what makes layouts: one
+    for all sizes, or of curved skins one for each."""
+    cells = [1e-3 * size for size in table.mesh.cell_mm]
+    described = table.surface
+    if described is None:
+        outline = Rectangle(1e-3 * table.skin.width_mm, 1e-3 * table.skin.height_mm)
+        return cells, outline, [lambda name, *sizes: study_layout(name, folder, outline, *sizes)]
+    surfaces = [described_surface(described, folder, size) for size in cells]
+    if "file" in type(described).model_fields:
+        cells = [typical_cell(surfaces[0])]
+
+    def on(surface: Mesh) -> Maker:
+        return lambda name, *sizes: curved_layout(name, folder, surface, described.outward, *sizes)
+
+    return cells, Triangles.of(surfaces[0]), [on(surface) for surface in surfaces]

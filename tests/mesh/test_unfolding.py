@@ -1,0 +1,116 @@
+"""Surfaces unfolded round places: lengths as in the plane where they can be laid into one; and where they cannot be."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jeit.electrodes import SheetDiscs, SurfaceDiscs
+from jeit.layout import grid
+from jeit.mesh import Mesh, bend, forearm, rectangle, sphere, tube
+from jeit.mesh.geodesic import Triangles, unfold
+from jeit_solvers.engines import on_host
+
+WEIGHTS = np.array([[1.0, 0, 0], [0.2, 0.3, 0.5]])
+
+
+def bent_and_flat(radius=0.03, axis="y", sheet=None):
+    """A sheet rolled round a cylinder, and the plane mesh with the same cells; and places on both."""
+    sheet = rectangle(0.12, 0.1, cell_size=4e-3) if sheet is None else sheet
+    bent, flat = bend(sheet, radius, axis=axis), bend(sheet, np.inf, axis=axis)
+    plane = Mesh.create(np.asarray(flat.points)[:, :2], flat.cells)
+    centres = grid(0.08, 0.06, 3, 3) + 0.0011
+    at = Triangles.of(flat).nearest(np.column_stack([centres, np.zeros(len(centres))]))
+    places = np.einsum("pk,pkd->pd", at.weights, np.asarray(bent.points)[np.asarray(bent.cells)[at.triangle]])
+    return bent, plane, places, centres
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+@pytest.mark.parametrize("radius", [0.025, -0.04, 0.5])
+def test_lengths_on_a_bent_sheet_are_those_on_the_flat_one(axis, radius):
+    bent, plane, places, centres = on_host(bent_and_flat(radius, axis))
+    around = unfold(bent, places, np.full((9, 1), 0.02))
+    assert around.exact.all()
+    points = np.einsum("pk,mkd->mpd", WEIGHTS, plane.points[plane.cells])
+    exact = np.linalg.norm(points[:, None] - centres[:, None], axis=-1)
+    which = np.broadcast_to(np.arange(9), (len(points), 9))
+    found = np.sqrt(around.squared(WEIGHTS, which))
+    known, middles = around.reached.T, plane.points[plane.cells].mean(axis=1)
+    assert known[np.linalg.norm(middles[:, None] - centres, axis=-1) < 0.02].all()
+    np.testing.assert_allclose(found[known], exact[known], atol=1e-13)
+
+
+def test_discs_of_a_bent_sheet_are_those_of_the_flat_one():
+    bent, plane, places, centres = on_host(bent_and_flat())
+    found = on_host(SurfaceDiscs(places, 5e-3, 1e-3)).contact(bent)
+    exact = on_host(SheetDiscs(centres, 5e-3, 1e-3)).contact(plane)
+    for one, other in ((found.load, exact.load), (found.mass[0], exact.mass[0])):
+        np.testing.assert_allclose(one, other, atol=1e-12 * float(np.abs(other).max()))
+    through = SurfaceDiscs(places, 5e-3, 1e-3)
+    jitted = jax.jit(lambda electrodes, mesh: electrodes.contact(mesh).load)(through, bent)
+    np.testing.assert_allclose(jitted, found.load, atol=1e-12 * float(np.abs(exact.load).max()))
+    turned = jnp.stack([through.position, through.position[::-1]])
+    moved = jax.jit(jax.vmap(lambda at: eqx.tree_at(lambda one: one.position, through, at).contact(bent).load))
+    both = moved(turned)
+    np.testing.assert_allclose(both[0], found.load, atol=1e-12 * float(np.abs(exact.load).max()))
+
+
+@pytest.mark.parametrize("kind", ["bent", "tube", "forearm", "sphere"])
+def test_contacts_have_derivatives_in_places_and_nodes(kind):
+    surface = {
+        "bent": lambda: bent_and_flat()[0],
+        "tube": lambda: tube(0.03, 0.1, num_points=900),
+        "forearm": lambda: forearm(0.12, (0.03, 0.022), 0.04, num_points=900),
+        "sphere": lambda: sphere(0.04, num_points=900),
+    }[kind]()
+    triangles = Triangles.of(surface)
+    towards = {"bent": [[0.01, 0.013, 0], [-0.03, -0.02, -0.02]]}.get(kind, [[0.04, 0.003, 0.051], [0.0, -0.04, 0.06]])
+    places = triangles.nearest(towards)
+    normal = triangles.normals[places.triangle]
+    key = np.random.default_rng(1)
+    along = key.normal(size=(2, 3))
+    along -= (along * normal).sum(axis=1, keepdims=True) * normal
+    nodes = 0.01 * key.normal(size=np.shape(surface.points))
+
+    @jax.jit
+    def load(size):
+        discs = SurfaceDiscs(jnp.asarray(places.points) + size * along, 6e-3, 1e-3)
+        mesh = eqx.tree_at(lambda one: one.points, surface, jnp.asarray(surface.points) + size * nodes)
+        return discs.contact(mesh).load
+
+    base, slope = jax.jvp(load, (0.0,), (1.0,))
+    errors = [float(jnp.abs(load(size) - base - size * slope).max()) for size in (2e-5, 1e-5)]
+    assert errors[1] < 0.3 * errors[0] + 1e-9 * float(jnp.abs(base).max())
+    assert errors[1] < 0.01 * 1e-5 * float(jnp.abs(slope).max())
+
+
+def test_says_where_a_surface_is_no_bent_sheet():
+    ball, sleeve, cone = (
+        sphere(0.04, num_points=900),
+        tube(0.03, 0.1, num_points=900),
+        forearm(0.12, (0.03, 0.015), 0.04),
+    )
+    for mesh, place, exact in (
+        (ball, [0.04, 0, 0], False),
+        (sleeve, [0.03, 0, 0.05], True),
+        (sleeve, [0.03, 0, 0.004], True),
+        (cone, [0.02, 0.02, 0.06], False),
+    ):
+        at = Triangles.of(mesh).nearest([place]).points
+        around = unfold(on_host(mesh), at, np.full((1, 1), 0.01))
+        assert bool(around.exact[0]) is exact
+        assert around.reached.sum() > 5
+
+
+def test_nothing_of_the_other_side_of_a_narrow_gap():
+    """Of a sheet bent so far that its edges all but meet."""
+    bent, plane, _, _ = bent_and_flat(0.0193, sheet=rectangle(0.12, 0.08, cell_size=4e-3))
+    points = np.asarray(plane.points)
+    at = np.abs(points - [0.057, 0.0]).sum(axis=1).argmin()
+    place, far = np.asarray(bent.points)[at], points[:, 0] < 0
+    assert np.linalg.norm(np.asarray(bent.points)[far] - place, axis=1).min() < 7e-3
+    load = on_host(SurfaceDiscs(place[None], 8e-3, 1e-3)).contact(on_host(bent)).load
+    exact = on_host(SheetDiscs(points[[at]], 8e-3, 1e-3)).contact(on_host(plane)).load
+    np.testing.assert_allclose(load, exact, atol=1e-12 * exact.max())
+    assert (load[far] == 0).all()
