@@ -141,6 +141,14 @@ def test_a_folder_of_sciospec_files_is_a_series(tmp_path):
     )
 
 
+def test_the_rate_of_a_folder_of_sciospec_files_is_the_described_one(tmp_path):
+    for number in range(3):
+        write_sciospec(tmp_path / f"setup_{number}.eit", impedance(8, number)[None], PAIRS)
+    assert data.read(tmp_path).times is None  # all of one date
+    (tmp_path / "description.toml").write_text('[protocol]\nkind = "measured"\n[data]\nframe_rate = 4\n')
+    np.testing.assert_allclose(data.read(tmp_path).times, [0, 0.25, 0.5])
+
+
 def test_join_takes_one_set_up_only(tank):
     one, two = (data.screen(tank(made), made) for made in (protocol.adjacent(8), protocol.opposite(8)))
     with pytest.raises(ValueError, match="is read otherwise"):
