@@ -124,7 +124,8 @@ def check_levels(levels: Sequence[float]) -> list[float]:
     """Shares of the strongest change. Raises `ValueError` for others."""
     shares: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
     if len(shares) == 0 or not all(is_number(one) and 0 < one < 1 for one in shares):
-        raise ValueError(f"levels must be shares of the strongest change, such as (0.3, 0.6); they are {told(levels)}.")
+        given = ", ".join(told(one) for one in shares[:4]) or "none"
+        raise ValueError(f"levels must be shares of the strongest change, from 0 to 1; given were {given}.")
     return [float(one) for one in shares]
 
 
