@@ -125,6 +125,17 @@ def test_sciospec_differences_and_polarity(tmp_path):
     assert impossible_signs(one.without_driven_channels()).max() == 0
 
 
+@pytest.mark.parametrize(("name", "write"), [("a.get", write_get), ("a.eit", write_carefusion)])
+def test_a_rate_is_asked_for_where_none_is_described(name, write, tmp_path):
+    write(tmp_path / name, frames())
+    (tmp_path / "a.toml").write_text(RING + "number = 16\n")
+    assert any("says no rate" in note for note in data.read(tmp_path / name).notes)
+    (tmp_path / "a.toml").write_text(RING + "number = 16\n[data]\nframe_rate = 20\n")
+    found = data.read(tmp_path / name)
+    assert found.frame_rate == pytest.approx(20)
+    assert not any("says no rate" in note for note in found.notes)
+
+
 def test_a_folder_of_sciospec_files_is_a_series(tmp_path):
     for number in range(4):
         write_sciospec(
