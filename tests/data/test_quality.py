@@ -155,6 +155,16 @@ def test_noise_in_the_difference_is_refused(tank, setup):
     assert [q.imageable for q in assess(much, reference)] == [False]
 
 
+@pytest.mark.parametrize("patterns", [protocol.adjacent, protocol.haar])
+def test_the_opposite_sign_is_refused_where_no_edge_tells_it(tank, patterns):
+    """Of solids no sign is known from the protocol; imaged, the change is twice all voltages."""
+    chosen = patterns(16)
+    reference = data.screen(tank(chosen), chosen)
+    data.check_imageable(data.screen(tank(chosen, change=0.5), chosen), reference)
+    with pytest.raises(ValueError, match="opposite sign of its reference's: reverse the polarity"):
+        data.check_imageable(data.screen(-tank(chosen, change=0.5), chosen), reference)
+
+
 def test_currents_that_tell_a_body_best_are_not_taken_for_noise(tank, setup):
     """Optimal currents make the change diagonal: off the diagonal, which reciprocity compares, is nothing but noise."""
     full = protocol.haar(16)
