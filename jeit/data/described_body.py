@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jeit.data.on_solid import check_on_solid
 from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes, FaceDiscs, FacePatches, PointElectrodes, SheetDiscs
 from jeit.electrodes.facets import plates
 from jeit.files import check_electrodes
@@ -86,7 +87,10 @@ def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str)
         make = ELECTRODES[table.kind][coordinates]
         if table.kind == "point":
             return make(position)
-        return make(position, *(getattr(table, size) for size in _SIZES[table.kind]), table.contact_impedance)
+        made = make(position, *(getattr(table, size) for size in _SIZES[table.kind]), table.contact_impedance)
+        if isinstance(body, Solid):
+            check_on_solid(made, body)
+        return made
     except ValueError as error:
         raise located(error, origin, "electrodes") from None
 

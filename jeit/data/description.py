@@ -97,6 +97,14 @@ class Description:
         return self.protocol_section is not None and self.protocol_section.kind == "measured"
 
     @property
+    def mean_removed(self) -> bool:
+        """Whether the file has the potentials of all electrodes less their mean, beside the currents."""
+        section = self.protocol_section
+        if section is None or section.kind != "measured" or section.measurement_key is not None:
+            return False
+        return section.measurement == "mean-removed"
+
+    @property
     def reading(self) -> tuple[Reading, int | None]:
         """What is read of the potentials of all electrodes where the currents lie in the data file, and which electrode
         they are read against."""

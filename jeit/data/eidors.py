@@ -15,7 +15,7 @@ from jeit.data import _matlab
 from jeit.data.description import Description, load_description, parse_description
 from jeit.data.measured_patterns import frames_of
 from jeit.data.measurement import Measurement
-from jeit.data.table import frames_from, measurement_from
+from jeit.data.table import frames_from, measurement_from, part_of
 from jeit.protocol import Protocol, from_channels
 
 DESCRIPTION = "EIDORS-style vectors (.mat with stim, meas, meas_stim, or any with a TOML description)"
@@ -69,6 +69,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
     if described.protocol_section is None:
         protocol = _own_protocol(content, path)
     frames = frames_from(table, described.layout, path.name)
+    described = replace(described, notes=(*described.notes, *part_of(table, described.layout)))
     measurement = measurement_from(path, described, frames, protocol, None)
     return measurement if measurement.frame_names or not names else replace(measurement, frame_names=names)
 

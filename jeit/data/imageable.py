@@ -21,6 +21,8 @@ MOST_IMPOSSIBLE_SIGNS = 0.25
 MOST_OPPOSITE_SIGNS = 0.75
 # Reciprocity error r of a difference means noise over signal of r / sqrt(2 - r²): here a half.
 MOST_DIFFERENCE_RECIPROCITY_ERROR = 0.63
+# Cosine of a frame and its reference, below which one of them has the opposite sign.
+_LEAST_COSINE = -0.5
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,8 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
     - it, or the reference, breaks reciprocity by more than 0.63, or the difference does: its noise is over half its
       signal, each channel trusted as images trust it (`jeit.inverse.relative_noise`): driven electrodes read large
       voltages, mostly of contacts;
+    - its voltages are those of the reference with the opposite sign, nearly: their cosine is less than -0.5, and no
+      change of a passive body turns all of them round;
     - it does not differ from the reference at all;
     - fewer channels than electrodes are usable.
 
@@ -131,6 +135,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
         relative = size / float(np.linalg.norm(np.where(both, np.asarray(mean.filled()), 0)) or np.inf)
         signs = [float(s[0]) for s in (impossible_signs(frame), reference_signs) if s is not None]
         usable = int(both.sum())
+        alike = _cosine(*(np.where(both, np.asarray(one.filled()), 0).ravel() for one in (frame, mean)))
         error = reciprocity_error(change, trusted) if usable and size > 0 else None
         own = {f"the reference '{reference.name}'": reference_error, "the frame": reciprocity_error(frame)}
         wrong = max(signs) if signs else None
@@ -142,7 +147,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                 difference_reciprocity_error=error,
                 impossible_signs=wrong,
                 usable_channels=usable,
-                reason=_reason(measurement.protocol.num_electrodes, usable, relative, wrong, error, own),
+                reason=_reason(measurement.protocol.num_electrodes, usable, relative, wrong, error, own, alike),
             )
         )
     return results
@@ -165,8 +170,9 @@ def _reason(
     signs: float | None,
     reciprocity: float | None,
     own: dict[str, float | None],
+    alike: float,
 ) -> str:
-    """Why a frame cannot be imaged; `own`: the reciprocity errors of both frames themselves."""
+    """Why a frame cannot be imaged; `own`: the reciprocity errors of both frames themselves; `alike`: their cosine."""
     if usable < electrodes:
         return f"only {counted(usable, 'channel')} usable in both it and its reference, for {electrodes} electrodes."
     if difference < 1e-12:
@@ -181,6 +187,10 @@ def _reason(
             f"too noisy: {percent(signs)} of the voltages have a sign that no passive body gives, so that "
             "more than half of them lie below the instrument's noise or offset. Measure with more current or gain."
         )
+    if alike < _LEAST_COSINE:
+        return (
+            "its voltages have the opposite sign of its reference's: reverse the polarity of it, or of its reference."
+        )
     for name, error in own.items():
         if error is not None and error > MOST_DIFFERENCE_RECIPROCITY_ERROR:
             return (
@@ -193,3 +203,9 @@ def _reason(
             "so that its noise is more than half its signal. Average more frames, or use more current."
         )
     return ""
+
+
+def _cosine(one: np.ndarray, other: np.ndarray) -> float:
+    """Of the angle between two frames, 1 where they are alike but for their size; 0 where one is zero."""
+    size = float(np.linalg.norm(one) * np.linalg.norm(other))
+    return float(np.real(np.vdot(one, other))) / size if size > 0 else 0.0

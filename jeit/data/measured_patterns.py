@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 AXES = ("electrodes", "patterns", "frames")
 """What the axes of an array of voltages are called; in this order unless a description says otherwise."""
+# Of the largest potential of a pattern: what the mean of all may be where it was said to be removed.
+_MOST_MEAN = 0.01
 _UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
 
 
@@ -56,6 +58,18 @@ def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[n
         raise ValueError(f"{name}: the voltages have shape {values.shape}; {', '.join(named)} are {len(named)} axes.")
     ordered = np.transpose(values, [named.index(one) for one in ("frames", "patterns", "electrodes")])
     return ordered.reshape(len(ordered), -1)
+
+
+def less_their_mean(frames: Inexact[np.ndarray, "F M"], count: int) -> tuple[Inexact[np.ndarray, "F M"], float]:
+    """Potentials of `count` electrodes less the mean of each pattern, and the largest mean, where any is more than
+    noise: they were against ground, or an electrode. Patterns with NaN stay as they are."""
+    potentials = frames.reshape(len(frames), -1, count)
+    mean = potentials.mean(axis=2, keepdims=True)
+    mean = np.where(np.isfinite(mean), mean, 0)
+    rest = potentials - mean
+    if not (np.abs(mean) > _MOST_MEAN * np.abs(rest).max(axis=2, keepdims=True)).any():
+        return frames, 0.0
+    return rest.reshape(frames.shape), float(np.abs(mean).max())
 
 
 def _read(path: Path, keys: tuple[str, ...]) -> list[np.ndarray]:

@@ -44,11 +44,11 @@ def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M
 
     Returns None when the protocol ties no two usable channels together.
     """
-    error, signal, noise = _asymmetry(measurement, deviation)
+    error, noise, signal = _asymmetry(measurement, deviation)
     if error.size == 0:
         return None
     if deviation is not None:
-        error, signal = error / noise, signal / noise
+        error = error / noise
     size = np.linalg.norm(signal)
     return float(np.linalg.norm(error) / size) if size > 0 else 0.0
 
@@ -80,7 +80,7 @@ def estimate_noise(measurement: Measurement) -> NoiseEstimate | None:
     """
     voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     size = float(np.sqrt(np.mean(np.abs(voltages[mask]) ** 2))) if mask.any() else 0.0
-    error, _, gain = _asymmetry(measurement)
+    error, gain, _ = _asymmetry(measurement)
     if error.size:
         deviation = _robust_deviation(error / gain)
         method = "reciprocity"
@@ -156,15 +156,18 @@ def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
 def reciprocity_noise(measurement: Measurement, deviation: Float[np.ndarray, " M"]) -> float | None:
     """The noise of channels by reciprocity, in units of `deviation` (M,), what they may be off by relative to each
     other; None where the protocol ties no two usable channels together. Robust, as `estimate_noise` is."""
-    error, _, noise = _asymmetry(measurement, deviation)
+    error, noise, _ = _asymmetry(measurement, deviation)
     return _robust_deviation(error / noise) if error.size else None
 
 
 def _asymmetry(
     measurement: Measurement, deviation: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Entries of T - Tᵀ (watts), of T, and what noise of such `deviation`, or of one volt per channel, adds to the
-    first."""
+    """Entries of T - Tᵀ (watts); what noise of such `deviation`, or of one volt per channel, adds to them; and what
+    they are compared with: those entries of T and its diagonal, over that noise where `deviation` is given.
+
+    The diagonal is all there is of a change where currents are those that tell it best (`jeit.protocol.optimal`).
+    """
     protocol = measurement.protocol
     frames = np.unique(np.linspace(0, measurement.num_frames - 1, _MOST_FRAMES).round().astype(int))
     voltages = np.nan_to_num(np.asarray(measurement.voltages)[frames])
@@ -182,10 +185,16 @@ def _asymmetry(
         )
         row, column = np.nonzero(np.triu(known & known.T, k=1))
         upper, lower = transfer[:, row, column], transfer[:, column, row]
-        noise = np.broadcast_to(np.hypot(gain[row, column], gain[column, row]), upper.shape)
-        parts.append((upper - lower, np.sqrt((np.abs(upper) ** 2 + np.abs(lower) ** 2) / 2), noise))
-    error, signal, noise = (np.concatenate([part[k].ravel() for part in parts]) for k in range(3))
-    return error, signal, noise
+        noise = np.hypot(gain[row, column], gain[column, row])
+        size = np.sqrt((np.abs(upper) ** 2 + np.abs(lower) ** 2) / 2)
+        own = np.flatnonzero(np.diag(known))
+        # Of ‖T‖² the diagonal is counted once, and each pair, here one entry, twice.
+        diagonal = np.abs(transfer[:, own, own]) / np.sqrt(2)
+        if deviation is not None:
+            size, diagonal = size / noise, diagonal / (np.sqrt(2) * gain[own, own])
+        parts.append((upper - lower, np.broadcast_to(noise, upper.shape), np.concatenate([size, diagonal], axis=1)))
+    error, noise, signal = (np.concatenate([part[k].ravel() for part in parts]) for k in range(3))
+    return error, noise, signal
 
 
 def _robust_deviation(values: np.ndarray) -> float:

@@ -9,7 +9,6 @@ from jeit.arguments import check_name, listed
 from jeit.data import _matlab, eidors, kit4, ktc2023, table
 from jeit.data.instruments import carefusion, draeger, goettingen, sciospec, swisstom
 from jeit.data.measurement import Measurement
-from jeit.data.series import join
 from jeit.files import check_memory
 
 # Bytes in memory for one of text, at most.
@@ -72,7 +71,7 @@ def read(
         if not members or format not in (None, "sciospec"):
             raise ValueError(f"{file} is a folder. Give one data file in it.")
         check_memory(file.name, _IN_MEMORY * sum(one.stat().st_size for one in members))
-        return replace(join([sciospec.read(one, description) for one in members]), name=file.name, source=str(file))
+        return replace(sciospec.read_all(members, description), name=file.name, source=str(file))
     if not file.is_file():
         raise ValueError(f"There is no file {file}. Check the path.")
     if file.stat().st_size == 0:

@@ -11,7 +11,7 @@ import numpy as np
 from jeit.arguments import listed
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.description import Description, TableLayout, load_description
-from jeit.data.measured_patterns import frames_of
+from jeit.data.measured_patterns import frames_of, less_their_mean
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.files import check_memory, npy_array, npz_arrays
@@ -74,6 +74,7 @@ def read(path: Path, description: str | Path | None = None, like: Measurement | 
     if which is None and like is not None:
         protocol = protocol or like.protocol
     frames = frames_from(table, described.layout, path.name)
+    described = replace(described, notes=(*described.notes, *part_of(table, described.layout)))
     measurement = measurement_from(path, described, frames, protocol, mask)
     if times is None or described.layout.averaged or described.layout.frame_rate is not None:
         return measurement
@@ -107,6 +108,11 @@ def measurement_from(
         raise ValueError(
             f'{described.origin}: no protocol: add a [protocol] section with kind = "adjacent" or another.'
         )
+    notes = described.notes
+    if described.mean_removed and frames.shape[-1] == protocol.num_measurements:
+        frames, mean = less_their_mean(np.atleast_2d(frames), protocol.num_electrodes)
+        said = f"the potentials had a mean, {mean * described.layout.scale:.3g} V at most; it is subtracted."
+        notes = (*notes, said) if mean else notes
     names, number = described.layout.frame_names, len(np.atleast_2d(frames))
     if names and len(names) != number:
         raise ValueError(
@@ -123,7 +129,7 @@ def measurement_from(
         name=path.stem,
         source=str(path),
         frame_names=names,
-        notes=described.notes,
+        notes=notes,
     )
     if described.layout.averaged:
         note = f"the mean of {measurement.num_frames} frames."
@@ -157,6 +163,13 @@ def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray
         # With the sign of the real part: a magnitude alone has lost the direction of the voltage.
         return np.abs(frames) * np.where(np.real(frames) < 0, -1.0, 1.0)
     return frames if layout.component == "complex" else np.real(frames)
+
+
+def part_of(values: np.ndarray, layout: TableLayout) -> tuple[str, ...]:
+    """A note of which part of complex voltages is read."""
+    if not np.iscomplexobj(values) or layout.component == "complex":
+        return ()
+    return (f"of complex voltages this is the {layout.component} part; see [data] component.",)
 
 
 def _from_text(path: Path, layout: TableLayout) -> np.ndarray:

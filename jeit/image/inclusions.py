@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jeit.image.watershed import basins, cell_neighbours
+from jeit.image.watershed import basins, shared_facets
 from jeit.mesh import Mesh, centroids, measures
 
 # Share of a sheet, and of a solid, whose images are of coarser grain: a disc of a fourteenth of its width, and a ball
@@ -104,13 +104,14 @@ def inclusion_regions(
     if strongest == 0:
         return []
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
-    neighbours = cell_neighbours(mesh)
+    # A tetrahedron is next to a higher one across some of its facets only: along a ridge the way goes over nodes.
+    shared = np.asarray(mesh.cells) if mesh.dimension == 3 else shared_facets(mesh)
     if least_area is None:
         least_area = _LEAST_AREA[mesh.dimension]
     found = []
     for sign in (1, -1):
         change = sign * values
-        basin = basins(change, neighbours, floor=level * least_peak * strongest, least_prominence=least_prominence)
+        basin = basins(change, shared, floor=level * least_peak * strongest, least_prominence=least_prominence)
         for label in np.unique(basin[basin >= 0]):
             peak = change[label]
             region = (basin == label) & (change >= level * peak)

@@ -16,7 +16,7 @@ def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray
     if not (is_number(radius) and radius > 0):
         raise ValueError(f"radius must be a positive number of metres; it is {told(radius)}.")
     distance = np.linalg.norm(_from(mesh, centre, "centre"), axis=1)
-    return _some(distance <= radius, "no centroid of a cell is so near to centre; make radius larger")
+    return _some(mesh, distance <= radius, "no centroid of a cell is so near to centre; make radius larger")
 
 
 def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarray, " m"]:
@@ -27,9 +27,8 @@ def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarra
     above, below = _from(mesh, lower, "lower"), _from(mesh, upper, "upper")
     if not (np.asarray(lower, float) < np.asarray(upper, float)).all():
         raise ValueError("upper must be larger than lower in every coordinate.")
-    return _some(
-        (above >= 0).all(axis=1) & (below <= 0).all(axis=1), "no centroid of a cell lies between lower and upper"
-    )
+    between = (above >= 0).all(axis=1) & (below <= 0).all(axis=1)
+    return _some(mesh, between, "no centroid of a cell lies between lower and upper")
 
 
 def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None) -> Bool[np.ndarray, " m"]:
@@ -43,7 +42,7 @@ def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None
         raise ValueError(f"direction must be {mesh.dimension} finite numbers, not all zero; it is {direction!r}.")
     size = np.asarray(measures(mesh))
     middle = size @ np.asarray(centroids(mesh)) / size.sum() if point is None else point
-    return _some(_from(mesh, middle, "point") @ towards > 0, "no cell lies in direction of point")
+    return _some(mesh, _from(mesh, middle, "point") @ towards > 0, "no cell lies in direction of point")
 
 
 def _from(mesh: Mesh, place: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
@@ -54,7 +53,9 @@ def _from(mesh: Mesh, place: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
     return np.asarray(centroids(mesh)) - given
 
 
-def _some(chosen, nothing: str) -> Bool[np.ndarray, " m"]:
+def _some(mesh: Mesh, chosen, nothing: str) -> Bool[np.ndarray, " m"]:
     if not chosen.any():
-        raise ValueError(f"the region is empty: {nothing}.")
+        points = np.asarray(mesh.points)
+        low, high = (", ".join(f"{x:.2g}" for x in one) for one in (points.min(axis=0), points.max(axis=0)))
+        raise ValueError(f"the region is empty: {nothing}. The body spans [{low}] to [{high}], metres.")
     return np.asarray(chosen)

@@ -199,7 +199,8 @@ def _told_places(places: tuple[int, ...], cycles: list[list[int]]) -> str:
     """Which electrodes stand where, in words."""
     if cycles and places in _turns(len(places)):
         way = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"
-        return f"the electrodes look counted {way}, electrode 1 standing where {places[0] + 1} should"
+        first = f", electrode 1 standing where {places[0] + 1} should" if places[0] else ""
+        return f"the electrodes look counted {way}{first}"
     pairs = [f"{first + 1} and {second + 1}" for first, second in (one for one in cycles if len(one) == 2)]
     found = [f"electrodes {', '.join(pairs)} look exchanged"] if pairs else []
     found += [

@@ -132,7 +132,10 @@ def _quietly(path: Path, action: Any) -> Any:
     except (Exception, SystemExit) as error:
         if "GB in memory" in str(error):
             raise
-        reason = _short(said.getvalue().strip() or error)
+        own = isinstance(error, meshio.ReadError | meshio.WriteError | SystemExit)
+        reason = (
+            _short(said.getvalue().strip() or error) if own else "its content does not fit its format, or is cut off"
+        )
         raise ValueError(
             f"path: {path.name[:80]} does not work as a mesh file: {reason}. The ending of the name tells the format: "
             ".vtu, .vtk, .msh, .inp and others that meshio knows."

@@ -1,6 +1,7 @@
 """The demo, and what a first contact with jeit meets: help, version, import."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -9,6 +10,7 @@ import pytest
 
 import jeit
 from jeit.imaging.preparation import SHEET_POINTS, SOLID_POINTS
+from jeit.inverse.prior.defaults import PRIORS
 
 
 @pytest.mark.slow
@@ -57,6 +59,13 @@ def test_help_tells_the_defaults(run):
         assert f"{value} (default)" in told
     assert settings.num_points is None
     assert f"(default {SHEET_POINTS}; of a solid body {SOLID_POINTS})" in told
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "choose"])
+def test_help_names_all_priors(run, command):
+    told = " ".join(run(command, "--help")[1].replace("│", " ").split())
+    for name in PRIORS:
+        assert re.search(rf"\b{name}\b", told.partition("--prior")[2].partition("--contact")[0])
 
 
 def test_contents_page():

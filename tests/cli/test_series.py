@@ -66,7 +66,9 @@ def test_what_is_written(recording, tmp_path, capsys):
         (["--frequency", "fast"], "--frequency: give hertz"),
         (["--frequency", "7"], "--frequency: 7 Hz is not below half the frame rate of 10 Hz"),
         (["--region", "ball:1,2"], "--region: 'ball:1,2' is none"),
-        (["--region", "ball:1,2,0.1"], "region is empty"),
+        (["--region", "ball:1,2,0.1"], "--region 'ball:1,2,0.1': the region is empty"),
+        (["--region", "ball:-50,0,25"], "The body spans [-0.1, -0.1] to [0.1, 0.1], metres."),
+        (["--region", "left"], "--region: 'left' is no shape and numbers"),
         (["--description", "untimed.toml"], "without times"),
         (["--rate", "-1"], "--rate must be positive"),
         (["--film", "film.txt"], "--film must be"),
@@ -77,3 +79,11 @@ def test_what_is_refused(recording, tmp_path, capsys, monkeypatch, options, mess
     assert main(["series", "frames.csv", "-o", str(tmp_path / "out"), "--num-points", "300", *options]) == 1
     assert message in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("options", [["--frequency", "7"], ["--frequency", "2-1"], ["--region", "left"]])
+def test_what_no_mesh_is_needed_for_is_refused_before_it(recording, tmp_path, capsys, monkeypatch, options):
+    monkeypatch.chdir(recording)
+    assert main(["series", "frames.csv", "-o", str(tmp_path / "out"), *options]) == 1
+    told = capsys.readouterr()
+    assert "mesh" not in told.out + told.err

@@ -100,9 +100,12 @@ def test_a_skin_in_space(run, tmp_path):
         (("--plane-mm", "w=3"), "--plane-mm must be such as z=20"),
         (("--plane-mm", "1,2/3"), "--plane-mm must be such as z=20"),
         (("--plane-mm", "z=900"), "misses the body"),
-        (("--level", "2"), "levels must be shares"),
+        (
+            ("--level", "0.5", "--level", "2"),
+            "--level must be shares of the strongest change, from 0 to 1; given were 0.5, 2",
+        ),
         (("--elevation", "100"), "--elevation must lie between"),
-        (("--slices", "0"), "from 1 to 64"),
+        (("--slices", "0"), "--slices must be a number of slices from 1 to 64"),
         (("--axis", "w"), "--axis must be"),
     ],
 )

@@ -41,6 +41,24 @@ def test_a_box_with_patches_in_two_levels():
     found.electrodes.check(found.domain.mesh(num_points=4000))
 
 
+STRIP = {"kind": "patch", "layout": "ring", "number": 8, "width": 0.01, "contact_impedance": 1e-3, "levels": [0.02]}
+
+
+def test_a_strip_may_be_as_tall_as_its_wall_and_no_taller():
+    assert described(CYLINDER, STRIP | {"height": 0.04}).electrodes.num_electrodes == 8
+    with pytest.raises(ValueError, match=r"electrode 1 reaches from -0.005 to 0.045 m, and its wall from 0 to 0.04 m"):
+        described(CYLINDER, STRIP | {"height": 0.05})
+
+
+@pytest.mark.parametrize("size", [{"kind": "disc", "radius": 0.01}, {"kind": "patch", "width": 0.02, "height": 0.02}])
+def test_electrodes_lie_on_the_surface(size):
+    tank = {"shape": "box", "width": 0.1, "depth": 0.08, "height": 0.04}
+    places = [[0.05, 0.0, 0.02], [0.0, 0.0, 0.04]]
+    described(tank, size | {"positions": places, "contact_impedance": 1e-3})
+    with pytest.raises(ValueError, match=r"electrode 2 at \[0.0, 0.0, 0.045\] m lies 5 mm off the body's surface"):
+        described(tank, size | {"positions": [places[0], [0.0, 0.0, 0.045]], "contact_impedance": 1e-3})
+
+
 def test_any_outline_with_a_thickness_is_a_solid():
     corner = {"kind": "point", "positions": [[0.01, 0.01, 0.0], [0.09, 0.01, 0.0]]}
     found = described({"shape": "polygon", "vertices": SQUARE, "thickness": 0.01}, corner)

@@ -125,6 +125,17 @@ def test_sciospec_differences_and_polarity(tmp_path):
     assert impossible_signs(one.without_driven_channels()).max() == 0
 
 
+@pytest.mark.parametrize(("name", "write"), [("a.get", write_get), ("a.eit", write_carefusion)])
+def test_a_rate_is_asked_for_where_none_is_described(name, write, tmp_path):
+    write(tmp_path / name, frames())
+    (tmp_path / "a.toml").write_text(RING + "number = 16\n")
+    assert any("says no rate" in note for note in data.read(tmp_path / name).notes)
+    (tmp_path / "a.toml").write_text(RING + "number = 16\n[data]\nframe_rate = 20\n")
+    found = data.read(tmp_path / name)
+    assert found.frame_rate == pytest.approx(20)
+    assert not any("says no rate" in note for note in found.notes)
+
+
 def test_a_folder_of_sciospec_files_is_a_series(tmp_path):
     for number in range(4):
         write_sciospec(
@@ -139,6 +150,14 @@ def test_a_folder_of_sciospec_files_is_a_series(tmp_path):
     np.testing.assert_allclose(
         found.voltages[3].reshape(8, 8)[0], 1e-3 * impedance(8, 3) @ (np.eye(8)[0] - np.eye(8)[3]), atol=1e-10
     )
+
+
+def test_the_rate_of_a_folder_of_sciospec_files_is_the_described_one(tmp_path):
+    for number in range(3):
+        write_sciospec(tmp_path / f"setup_{number}.eit", impedance(8, number)[None], PAIRS)
+    assert data.read(tmp_path).times is None  # all of one date
+    (tmp_path / "description.toml").write_text('[protocol]\nkind = "measured"\n[data]\nframe_rate = 4\n')
+    np.testing.assert_allclose(data.read(tmp_path).times, [0, 0.25, 0.5])
 
 
 def test_join_takes_one_set_up_only(tank):

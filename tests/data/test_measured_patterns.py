@@ -66,6 +66,23 @@ def test_the_mean_of_the_frames(published, tank, tmp_path):
     assert found.times is None
 
 
+@pytest.mark.parametrize("suffix", [".mat", ".npz"])
+def test_potentials_against_ground_lose_their_mean_and_it_is_said(published, tank, tmp_path, suffix):
+    raw = published | {"frame_voltage": published["frame_voltage"] + 0.5}
+    found = read(tmp_path, raw, suffix=suffix)
+    np.testing.assert_allclose(found.voltages[0], tank(found.protocol), rtol=1e-9)
+    assert found.notes[-1] == "the potentials had a mean, 0.5 V at most; it is subtracted."
+    assert not any("mean" in note for note in read(tmp_path, published, suffix=suffix).notes)
+    raw["frame_voltage"][3, 2, 1] = np.nan
+    assert not np.isfinite(read(tmp_path, raw, suffix=suffix).voltages[1]).all()
+
+
+@pytest.mark.parametrize("suffix", [".mat", ".npz"])
+def test_the_part_of_complex_voltages_is_said(published, tmp_path, suffix):
+    found = read(tmp_path, published | {"frame_voltage": published["frame_voltage"] * (1 + 0.1j)}, suffix=suffix)
+    assert found.notes[-1] == "of complex voltages this is the real part; see [data] component."
+
+
 def test_other_axes_names_and_units(published, tank, tmp_path):
     turned = {"i": 1e3 * published["current_patterns"].T, "u": np.transpose(published["frame_voltage"], (2, 0, 1))}
     said = DESCRIBED.replace("frame_voltage", "u") + 'axes = ["frames", "electrodes", "patterns"]\nframe_rate = 20.0\n'

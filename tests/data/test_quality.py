@@ -155,6 +155,32 @@ def test_noise_in_the_difference_is_refused(tank, setup):
     assert [q.imageable for q in assess(much, reference)] == [False]
 
 
+@pytest.mark.parametrize("patterns", [protocol.adjacent, protocol.haar])
+def test_the_opposite_sign_is_refused_where_no_edge_tells_it(tank, patterns):
+    """Of solids no sign is known from the protocol; imaged, the change is twice all voltages."""
+    chosen = patterns(16)
+    reference = data.screen(tank(chosen), chosen)
+    data.check_imageable(data.screen(tank(chosen, change=0.5), chosen), reference)
+    with pytest.raises(ValueError, match="opposite sign of its reference's: reverse the polarity"):
+        data.check_imageable(data.screen(-tank(chosen, change=0.5), chosen), reference)
+
+
+def test_currents_that_tell_a_body_best_are_not_taken_for_noise(tank, setup):
+    """Optimal currents make the change diagonal: off the diagonal, which reciprocity compares, is nothing but noise."""
+    full = protocol.haar(16)
+    empty = data.transfer_impedance(data.screen(tank(full), full))[0]
+    touched = empty + 1e-5 * empty @ np.diag(np.arange(16.0)) @ empty
+    best = protocol.optimal(empty, touched, number=8, current=1e-3)
+    potentials = [(np.asarray(best.drive) @ one)[np.asarray(best.drive_index)] for one in (empty, touched)]
+    clean, other = (np.einsum("kl,kl->k", best.channel_measurement, one) for one in potentials)
+    noise = 0.02 * np.abs(other - clean).max() * np.random.default_rng(7).normal(size=(2, len(clean)))
+    reference = data.screen(clean + noise[0], best, **setup(16))
+    (quality,) = data.check_imageable(data.screen(other + noise[1], best, **setup(16)), reference)
+    assert quality.difference_reciprocity_error < 0.2
+    with pytest.raises(ValueError, match="breaks reciprocity"):
+        data.check_imageable(data.screen(clean + 10 * noise[1], best, **setup(16)), reference)
+
+
 def test_large_voltages_of_driven_electrodes_do_not_pass_for_noise(tank, setup):
     """One per cent of what is read on driven electrodes, mostly contact, is more than what other channels change by."""
     chosen = protocol.adjacent(16, driven_electrodes=True)

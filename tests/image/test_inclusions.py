@@ -77,6 +77,22 @@ def test_a_ball_at_the_wall_has_what_is_inside_of_it():
     np.testing.assert_allclose(found.centroid, [0.085 - 0.015, 0, 0.085], atol=2e-3)
 
 
+def test_a_column_in_a_solid_is_one():
+    """Tetrahedra of a ridge touch higher ones at their nodes; across facets the way down was a step at every layer."""
+    tank = box(0.2, 0.2, 0.2, cell_size=0.03)
+    away = np.linalg.norm(np.asarray(centroids(tank))[:, :2] - [0.04, 0.02], axis=1)
+    (found,) = find_inclusions(tank, -np.exp(-((away / 0.025) ** 2) / 2))
+    np.testing.assert_allclose(found.centroid, [0.04, 0.02, 0.1], atol=5e-3)
+    assert found.area == pytest.approx(2 * np.pi * np.log(2) * 0.025**2 * 0.2, rel=0.15)
+
+
+def test_balls_in_a_solid_are_told_apart():
+    tank = box(0.2, 0.2, 0.2, cell_size=0.012)
+    from_middles = [np.linalg.norm(np.asarray(centroids(tank)) - [x, 0, 0.1], axis=1) for x in (-0.035, 0.035)]
+    image = sum(np.exp(-((away / 0.02) ** 2) / 2) for away in from_middles)
+    assert len(find_inclusions(tank, image)) == 2
+
+
 def test_the_least_size_in_a_solid_is_a_ball_of_an_eighth_of_its_width():
     """A ball of a seventh of the tank's width is 0.0018 of its volume: no artefact."""
     tank = box(0.1, 0.1, 0.1, cell_size=0.005)

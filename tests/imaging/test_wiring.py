@@ -103,6 +103,10 @@ def test_electrodes_counted_from_another_one_are_found_where_the_body_shows_it()
         assert wiring.places == places
         way = "from another one" if places == shifted else "the other way round"
         assert f"look counted {way}, electrode 1 standing where 4 should" in wiring.told
+    round_again = tuple(-k % COUNT for k in range(COUNT))
+    told = find_wiring(model, measured(model, domain, round_again)).told
+    assert "look counted the other way round" in told
+    assert "electrode 1" not in told
     # A round, even tank looks alike from all electrodes.
     assert find_wiring(MODEL, measured(places=shifted)).as_described
 

@@ -90,6 +90,11 @@ LEADING = {
     "no end of data": ("a.nas", "BEGIN BULK\n", "does not work as a mesh file"),
     "no text": ("a.msh", bytes(range(256)), "does not work as a mesh file"),
     "nothing": ("a.vtk", "", "does not work as a mesh file"),
+    "cut off": (
+        "a.msh",
+        "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n3\n1 0 0 0\n2 1 0",
+        "does not work as a mesh file: its content does not fit its format, or is cut off. The ending",
+    ),
 }
 
 

@@ -226,6 +226,13 @@ def test_as_thick_as_told(layers):
         shell(saddle, 1.01 * most, layers, outward=False)
 
 
+def test_the_thickness_told_is_not_the_one_refused():
+    sleeve = tube(0.03, 0.1, cell_size=5e-3)
+    with pytest.raises(ValueError, match="radius of curvature") as told:
+        shell(sleeve, 0.03, outward=False)
+    shell(sleeve, float(str(told.value).split("It can be ")[1].split(" m")[0]), outward=False)
+
+
 def test_a_skin_that_grows_into_itself():
     """A sheet rolled up one and a half times, its turns 5 mm apart."""
     flat = rectangle(0.1, 0.3, num_points=600)

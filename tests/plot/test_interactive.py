@@ -1,6 +1,7 @@
 """The interactive view, drawn off screen: what is in the scene, and that there is something to be seen."""
 
 import os
+import socket
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -12,6 +13,7 @@ from jeit.electrodes import FacePatches
 from jeit.image import Inclusion
 from jeit.mesh import box, centroids
 from jeit.plot import view_solid
+from jeit.plot.solid import interactive
 from jeit.plot.solid.interactive import can_view
 
 TANK = box(0.17, 0.255, 0.17, num_points=600)
@@ -49,6 +51,19 @@ def test_a_window_needs_a_display(monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert ("display" if find_spec("pyvista") else "pip install") in can_view()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="displays of X11 on Linux")
+def test_a_display_that_nothing_answers_at_is_none(monkeypatch):
+    """As a terminal keeps that of a session that has ended: no window opened, and no pictures were made."""
+    monkeypatch.setattr(interactive, "find_spec", lambda name: name)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", ":4242.0")
+    assert can_view() == "nothing answers at DISPLAY=:4242.0"
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind("\0/tmp/.X11-unix/X4242")
+        server.listen()
+        assert can_view() == ""
 
 
 def test_the_scene_has_all_that_is_asked_for(pyvista, tmp_path):

@@ -281,6 +281,8 @@ def test_the_overview_cuts_through_what_is_strongest(tank, image, patches):
     inclusions = [Inclusion(-1, (-0.03, 0.06, 0.06), 1e-4, -1e-3)]
     figure = plot_solid(tank, image, patches, inclusions=inclusions)
     assert {one.get_title() for one in figure.axes} - {""} == {"x = −30 mm", "y = 60 mm", "z = 60 mm"}
+    space = plot_isosurfaces(tank, image, inclusions=[*inclusions, Inclusion(1, (0.0, 0.0, 0.1), 1e-4, 1e-3)])
+    assert [line.get_marker() for line in space.lines if line.get_marker() in ("+", "_")] == ["_", "+"]
     (words,) = [text.get_text() for one in figure.axes for text in one.texts if "found" in text.get_text()]
     assert "100 cm³ at (−30, 60, 60) mm" in words
 

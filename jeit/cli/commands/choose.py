@@ -38,7 +38,7 @@ def choose(
     ] = None,
     format: Format = None,
     description: Description = None,
-    prior: Annotated[str | None, typer.Option(help="tikhonov, laplace, noser or gaussian (default).")] = None,
+    prior: Annotated[str | None, typer.Option(help="tikhonov, laplace, noser, gaussian (default) or matern.")] = None,
     contact: Contact = None,
     num_points: Nodes = None,
     frame: Frame = None,

@@ -41,15 +41,15 @@ def reconstruct(
     method: Annotated[
         str | None,
         typer.Option(
-            help="auto (default): one-step, or gauss-newton where that is unsound; one-step, back-projection, "
-            "filtered-back-projection; gauss-newton, levenberg-marquardt, total-variation; shapes, outlines of strong "
-            "bodies; network, maps of depth by one that learnt the skin (--model)."
+            help="auto (default): one-step, or gauss-newton and outlines of bodies where that is unsound; one-step, "
+            "back-projection, filtered-back-projection; gauss-newton, levenberg-marquardt, total-variation; shapes, "
+            "outlines of strong bodies; network, maps of depth by one that learnt the skin (--model)."
         ),
     ] = None,
     prior: Annotated[
         str | None,
         typer.Option(
-            help="tikhonov, laplace, noser or gaussian (default); not for back-projection and total-variation."
+            help="tikhonov, laplace, noser, gaussian (default) or matern; not for back-projection and total-variation."
         ),
     ] = None,
     hyperparameter: Annotated[

@@ -64,6 +64,8 @@ def series(
 
     In Python: `jeit.imaging.image_sequence`, `jeit.image.oscillation`, `jeit.report.write_series`.
     """
+    import numpy as np
+
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written, scaled
     from jeit.cli.options import number_or_name
@@ -85,6 +87,7 @@ def series(
     with naming_options({"film": "--film"}):
         films = () if wanted is None else (check_film(wanted),)
     bands = [_band(one) for one in frequency or ()]
+    spelled = {one: _spelled(one) for one in region or ()}
     make_folder(output, (*SERIES_FILES, *films))
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
@@ -93,9 +96,13 @@ def series(
         measured = read(data, format, description, like=base)
         with naming_options({"rate": "--rate"}):
             measured = measured if rate is None else measured.at_rate(rate)
+        with naming_options({"frequency": "--frequency"}):
+            if measured.times is not None:
+                for one in bands:
+                    oscillation(np.zeros((measured.num_frames, 1)), measured.times, one)
         found = image_sequence(measured, base, settings, progress=step)
-        with naming_options({"region": "--region", "frequency": "--frequency"}):
-            regions = {one: _region(one, found.series.mesh) for one in region or ()}
+        regions = {text: _region(text, one, found.series.mesh) for text, one in spelled.items()}
+        with naming_options({"frequency": "--frequency"}):
             told = [oscillation(found.series.changes, found.series.times, one) for one in bands]
         step("write")
         report = write_series(found, output, regions=regions, oscillations=told, film=wanted)
@@ -123,20 +130,27 @@ def _band(text: str) -> "float | tuple[float, float]":
     return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
 
 
-def _region(text: str, mesh: "Mesh"):
+def _spelled(text: str) -> tuple[str, list[float]]:
+    """The shape and the numbers of a region. Raises `ValueError`."""
+    name, _, rest = text.partition(":")
+    try:
+        return name, [float(one) for one in rest.split(",")]
+    except ValueError:
+        raise ValueError(f"--region: {text[:40]!r} is no shape and numbers, such as ball:0.02,0,0.01.") from None
+
+
+def _region(text: str, spelled: tuple[str, list[float]], mesh: "Mesh"):
     """Cells of a region. Raises `ValueError`."""
     from jeit.image import ball_region, box_region, half_region
 
-    name, _, rest = text.partition(":")
-    try:
-        numbers = [float(one) for one in rest.split(",")]
-    except ValueError:
-        numbers = []
-    d = mesh.dimension
+    (name, numbers), d = spelled, mesh.dimension
     wanted = {"ball": d + 1, "box": 2 * d, "half": d}
     if wanted.get(name) != len(numbers):
         example = "ball:0.02,0,0.01" if d == 2 else "ball:0.02,0,0.05,0.01"
         raise ValueError(f"--region: {text[:40]!r} is none of a body of {d} dimensions; give {example}, box: or half:.")
-    if name == "ball":
-        return ball_region(mesh, numbers[:d], numbers[d])
-    return box_region(mesh, numbers[:d], numbers[d:]) if name == "box" else half_region(mesh, numbers)
+    try:
+        if name == "ball":
+            return ball_region(mesh, numbers[:d], numbers[d])
+        return box_region(mesh, numbers[:d], numbers[d:]) if name == "box" else half_region(mesh, numbers)
+    except ValueError as error:
+        raise ValueError(f"--region {text[:40]!r}: {error}") from None

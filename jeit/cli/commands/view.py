@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.options import Quiet, make_folder
+from jeit.cli.options import Quiet, make_folder, naming_options
 
 
 def view(
@@ -58,7 +58,8 @@ def view(
             console.print(f"  pictures, not a window: {missing}", highlight=False, markup=False)
     folder = image.parent / "view" if output is None else output
     make_folder(folder, VIEW_FILES)
-    names = write_views(saved, folder, camera=camera, levels=levels, planes=planes, axis=axis, slices=slices)
+    with naming_options({"levels": "--level", "at": "--slices"}):
+        names = write_views(saved, folder, camera=camera, levels=levels, planes=planes, axis=axis, slices=slices)
     if not quiet:
         say_written(console, folder / names[0], *names[1:])
 

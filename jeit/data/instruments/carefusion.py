@@ -21,10 +21,8 @@ _ORDER, _MARK, _LOOKED_AT = b"\xff\xfe", "<EIT_File>", 512
 _HEAD, _VOLTAGES, _IMAGE = 6, 3, 7
 _NUMBERS = {_VOLTAGES: 256, _IMAGE: 912}
 _FIRST = 47
-_NOTES = (
-    "neither unit nor gain of the voltages is known: trust relative changes, not volts.",
-    "the file says no rate that is known; give it by [data] frame_rate.",
-)
+_NOTE = "neither unit nor gain of the voltages is known: trust relative changes, not volts."
+_NO_RATE = "the file says no rate that is known; give it by [data] frame_rate."
 
 
 def recognises(path: Path) -> bool:
@@ -44,8 +42,10 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
     frames, left = _frames(content, int(found[1]))
     if not frames:
         raise ValueError(f"{path.name} holds no whole frame; is it cut off?")
-    recording = adjacent_recording(np.stack(frames), None, (*_NOTES, *cut_off(left)))
-    return measurement_of(path, recording, description_of(path, description))
+    described = description_of(path, description)
+    no_rate = (_NO_RATE,) if described.layout.frame_rate is None else ()
+    recording = adjacent_recording(np.stack(frames), None, (_NOTE, *no_rate, *cut_off(left)))
+    return measurement_of(path, recording, described)
 
 
 def _text(content: bytes) -> str:

@@ -16,10 +16,8 @@ from jeit.data.measurement import Measurement
 DESCRIPTION = "Göttingen MCEIT (.get): 208 adjacent voltages a frame"
 # Bytes of a frame; and how Dräger's text begins and ends, within how many bytes.
 _FRAME, _MARK, _END, _LONGEST = 1024, b"---Draeger EIT-Software", b"\r\n\r\n\r\n", 65536
-_NOTES = (
-    "neither unit nor gain of the voltages is known: trust relative changes, not volts.",
-    "the file says no rate; give it by [data] frame_rate.",
-)
+_NOTE = "neither unit nor gain of the voltages is known: trust relative changes, not volts."
+_NO_RATE = "the file says no rate; give it by [data] frame_rate."
 
 
 def recognises(path: Path) -> bool:
@@ -37,5 +35,6 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
         start = end + len(_END)
     number, left = frame_at(content, start, _FRAME, path)
     values = np.frombuffer(content, "<f4", number * _FRAME // 4, start).reshape(number, -1)[:, :CHANNELS]
-    recording = adjacent_recording(values, None, (*_NOTES, *cut_off(left)))
-    return measurement_of(path, recording, description_of(path, description))
+    described = description_of(path, description)
+    no_rate = (_NO_RATE,) if described.layout.frame_rate is None else ()
+    return measurement_of(path, adjacent_recording(values, None, (_NOTE, *no_rate, *cut_off(left))), described)

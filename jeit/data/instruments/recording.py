@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Inexact
 
 from jeit.data.description import Description, load_description, parse_description
 from jeit.data.measurement import Measurement
-from jeit.data.table import find_description, frames_from, measurement_from
+from jeit.data.table import find_description, frames_from, measurement_from, part_of
 from jeit.files import check_memory
 from jeit.protocol import Protocol
 
@@ -49,9 +49,8 @@ def measurement_of(path: Path, recording: Recording, described: Description) -> 
 
     Raises `ValueError` where protocol and channels, or names and frames, do not fit.
     """
-    layout, notes = described.layout, list(recording.notes)
-    if np.iscomplexobj(recording.voltages) and layout.component != "complex":
-        notes.append(f"of complex voltages this is the {layout.component} part; see [data] component.")
+    layout = described.layout
+    notes = (*recording.notes, *part_of(recording.voltages, layout))
     layout = replace(layout, frames_in="rows", complex_pairs=False)
     if recording.frame_names and not layout.frame_names:
         layout = replace(layout, frame_names=recording.frame_names)

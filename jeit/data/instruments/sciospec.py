@@ -8,7 +8,7 @@ real and imaginary part of the potential at every channel. Whether currents are 
 not say.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -20,6 +20,7 @@ from jeit.arguments import told
 from jeit.data.description import Description
 from jeit.data.instruments.recording import Recording, content_of, description_of, measurement_of
 from jeit.data.measurement import Measurement
+from jeit.data.series import join
 from jeit.files import check_electrodes
 from jeit.protocol import from_matrices, measurement_patterns
 
@@ -66,6 +67,17 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
     described = description_of(path, description)
     recording = _recording(header, pairs, potentials[:, :, columns], numbers, described, path)
     return measurement_of(path, recording, described)
+
+
+def read_all(paths: Sequence[Path], description: str | Path | None = None) -> Measurement:
+    """Read files of one set-up, one after the other.
+
+    `[data] frame_rate` of a description says when, where each holds one frame; else their dates do. Raises as `read`
+    and `jeit.data.series.join`.
+    """
+    joined = join([read(path, description) for path in paths])
+    rate = description_of(paths[0], description).layout.frame_rate
+    return joined if rate is None or joined.num_frames != len(paths) else joined.at_rate(rate)
 
 
 def _header(lines: list[str], path: Path) -> _Header:

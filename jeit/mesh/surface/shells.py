@@ -93,9 +93,10 @@ def _check_upright(stacked, solid: np.ndarray, turned: np.ndarray, thickness: fl
     worst = int(np.argmin(_volumes(stacked(high), solid, turned)))
     triangle = worst // 3 % count
     place = stacked(0.0)[solid[worst, 0]].round(6).tolist()
+    most = (1 - 5e-4) * low  # in four digits not more than `low`
     raise ValueError(
         f"thickness: {thickness:.4g} m is more than the radius of curvature of the surface at triangle {triangle}, "
-        f"near {place} m: the skin turns inside out there. It can be {low:.4g} m thick at most; or let it grow to the "
+        f"near {place} m: the skin turns inside out there. It can be {most:.4g} m thick at most; or let it grow to the "
         "other side, or smooth the surface."
     )
 

@@ -1,8 +1,10 @@
 """A solid image, or one on a surface, to turn round and cut with the mouse: through PyVista, where it is installed."""
 
 import os
+import socket
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -87,8 +89,27 @@ def can_view() -> str:
     """Why an interactive view cannot be opened here; nothing where it can."""
     if find_spec("pyvista") is None:
         return 'PyVista is not installed: pip install "jeit[view]"'
-    window = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    return "" if window else "there is no display"
+    if sys.platform in ("darwin", "win32") or os.environ.get("WAYLAND_DISPLAY"):
+        return ""
+    if not (display := os.environ.get("DISPLAY", "")):
+        return "there is no display"
+    return "" if _answers(display) else f"nothing answers at DISPLAY={display[:40]}"
+
+
+def _answers(display: str) -> bool:
+    """Whether an X server listens at a display of this machine; True of another machine's, and of what is none."""
+    host, _, rest = display.rpartition(":")
+    number = rest.partition(".")[0]
+    if host not in ("", "unix", "localhost") or not number.isdecimal() or len(number) > 4:
+        return True
+    path = f"/tmp/.X11-unix/X{number}"
+    local = [(socket.AF_UNIX, path), (socket.AF_UNIX, "\0" + path)]
+    for family, address in [(socket.AF_INET, (host, 6000 + int(number)))] if host == "localhost" else local:
+        with socket.socket(family, socket.SOCK_STREAM) as door, suppress(OSError):
+            door.settimeout(1)
+            door.connect(address)
+            return True
+    return False
 
 
 def _pyvista() -> Any:

@@ -18,7 +18,7 @@ from jeit.plot.axes import INK, axes_or_new
 from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale, check_scale
 from jeit.plot.solid.body import add_electrodes, add_hull, number_electrodes
 from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
-from jeit.plot.solid.scene import Scene, bare_in_space
+from jeit.plot.solid.scene import Scene, bare_in_space, mark_sign
 from jeit.plot.solid.shaded_surface import colours_of, mappable
 
 HALF = (0.5,)
@@ -44,9 +44,9 @@ def plot_isosurfaces(
     `values` per cell (m,) or per node (n,); changes of conductivity in S/m unless `scale` says otherwise. `levels`:
     shares from 0 to 1; the greatest is drawn solid, others translucent round it; a sign that is nowhere 0.3 times as
     strong as the other is left out. Of a scale that is not of differences they are shares of the way from the least to
-    the greatest value. `electrodes` are drawn on the body and numbered,
-    `inclusions` marked by the outlines of balls of their volume. Raises `ValueError` for values of another shape,
-    levels that are no shares, a mesh that is no solid, and things of another kind.
+    the greatest value. `electrodes` are drawn on the body and numbered, `inclusions` marked by their sign, and the
+    outlines of balls of their volume. Raises `ValueError` for values of another shape, levels that are no shares, a
+    mesh that is no solid, and things of another kind.
     """
     check_drawn(mesh, electrodes, scale)
     fitted = scale.of(np.asarray(values), "S/m")
@@ -96,6 +96,7 @@ def draw_in_space(
         # A ball is seen as a disc of its radius from every side.
         x, y = camera.on_page(np.array(one.centroid))
         ax.add_patch(Circle((x, y), one.radius, fill=False, edgecolor=INK, linewidth=1, linestyle=_DASHED, zorder=3))
+        mark_sign(ax, x, y, one.sign)
     return ax
 
 
@@ -124,7 +125,8 @@ def check_levels(levels: Sequence[float]) -> list[float]:
     """Shares of the strongest change. Raises `ValueError` for others."""
     shares: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
     if len(shares) == 0 or not all(is_number(one) and 0 < one < 1 for one in shares):
-        raise ValueError(f"levels must be shares of the strongest change, such as (0.3, 0.6); they are {told(levels)}.")
+        given = ", ".join(told(one) for one in shares[:4]) or "none"
+        raise ValueError(f"levels must be shares of the strongest change, from 0 to 1; given were {given}.")
     return [float(one) for one in shares]
 
 

@@ -15,6 +15,7 @@ from jeit.plot.axes import INK, draw_scale_bar
 from jeit.plot.solid.camera import Camera
 
 _RIM = [withStroke(linewidth=2.2, foreground="white")]
+_HALO = [withStroke(linewidth=3, foreground="white")]
 _LETTERS = ("x", "y", "z")
 # Of what has no values.
 BODY = "#b9bec6"
@@ -155,3 +156,9 @@ def draw_number(ax: Axes, place: Float[np.ndarray, "2"], told: str, *, fontsize:
         x, y, told, ha="center", va="center", fontsize=fontsize, color=INK, alpha=0.45 if faint else 1.0,
         path_effects=_RIM, zorder=4,
     )  # fmt: skip
+
+
+def mark_sign(ax: Axes, x: float, y: float, sign: int) -> None:
+    """A plus or a minus in the middle of what is more or less conductive."""
+    marker = "+" if sign > 0 else "_"
+    ax.plot(x, y, marker=marker, color=INK, markersize=8, markeredgewidth=1.4, zorder=4, path_effects=_HALO)

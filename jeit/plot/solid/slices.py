@@ -8,7 +8,6 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 
 from jeit.arguments import told
@@ -23,10 +22,9 @@ from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import size_of
 from jeit.plot.solid.isosurfaces import check_drawn
-from jeit.plot.solid.scene import draw_axes_cross, draw_number
+from jeit.plot.solid.scene import draw_axes_cross, draw_number, mark_sign
 
 MOST_SLICES = 64
-_HALO = [withStroke(linewidth=3, foreground="white")]
 
 
 def plot_slice(
@@ -217,8 +215,7 @@ def _draw_cut_ball(ax: Axes, plane: Plane, inclusion: Inclusion) -> None:
     x, y = plane.on_page(centre)
     radius = float(np.sqrt(squared))
     ax.add_patch(Circle((x, y), radius, fill=False, edgecolor=INK, linewidth=1, linestyle=(0, (4, 3)), zorder=3))
-    marker = "+" if inclusion.sign > 0 else "_"
-    ax.plot(x, y, marker=marker, color=INK, markersize=8, markeredgewidth=1.4, zorder=4, path_effects=_HALO)
+    mark_sign(ax, x, y, inclusion.sign)
 
 
 def _columns(number: int, tall: float) -> int:

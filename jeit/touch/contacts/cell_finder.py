@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse
 
-from jeit.image.watershed import basins, cell_neighbours
+from jeit.image.watershed import basins, shared_facets
 from jeit.mesh import Mesh, centroids, measures
 from jeit.mesh.geodesic import Triangles
 from jeit.touch.contacts.cell_outline import outline_of_cells
@@ -26,7 +26,7 @@ class CellFinder(AbstractFinder):
     The mesh is a flat sheet or a surface in space; contacts of the latter are (3,), on it.
 
     **Fields**: those; `smoothing` (m, m), applied first; of the mesh `cells` (m, 3), `points` (n, d), `centres` (m, d),
-    `areas` (m,) and `neighbours` (m, 3); and its `surface`, of a mesh in space.
+    `areas` (m,) and facets they share, `shared` (m, 3); and its `surface`, of a mesh in space.
     """
 
     smoothing: sparse.csr_array
@@ -34,7 +34,7 @@ class CellFinder(AbstractFinder):
     points: Float[np.ndarray, "n d"]
     centres: Float[np.ndarray, "m d"]
     areas: Float[np.ndarray, " m"]
-    neighbours: Int[np.ndarray, "m 3"]
+    shared: Int[np.ndarray, "m 3"]
     surface: Triangles | None
     level: float
     least_peak: float
@@ -65,14 +65,14 @@ class CellFinder(AbstractFinder):
         self.centres, self.areas = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
         self.surface = Triangles.of(mesh) if mesh.is_surface else None
         self.smoothing = gaussian_means(mesh, smoothing)
-        self.neighbours = cell_neighbours(mesh)
+        self.shared = shared_facets(mesh)
         self.level, self.least_peak, self.least_prominence = float(level), float(least_peak), float(least_prominence)
         self.floor, self.sign = float(floor), int(sign)
 
     def find(self, change, noise):
         """See `find_contacts`."""
         change, clear = self.above_noise(change, noise)
-        basin = basins(clear, self.neighbours, floor=0.0, least_prominence=self.least_prominence)
+        basin = basins(clear, self.shared, floor=0.0, least_prominence=self.least_prominence)
         peaks = np.unique(basin[basin >= 0])
         strong = peaks[change[peaks] >= self.least_peak * change[peaks].max(initial=0.0)]
         return [self._contact(change, noise, peak, basin == peak) for peak in strong.tolist()]
