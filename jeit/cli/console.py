@@ -101,19 +101,24 @@ def in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
     return f"{prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
 
 
-def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str) -> Table:
+def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, ranges: Sequence[tuple[float, float]] = ()) -> Table:
     """A row for each inclusion, of a sheet (or the slice through a solid) or of a solid: kind, place, size and peak;
-    `unit` is that of conductivity."""
-    unit, peaks = in_one_unit([one.peak for one in inclusions], unit)
+    `unit` is that of conductivity. `ranges`: from where to where peaks may lie, if that is known."""
+    ends = [end for both in ranges for end in both]
+    unit, said = in_one_unit([*(one.peak for one in inclusions), *ends], unit)
+    peaks, ends = said[: len(inclusions)], said[len(inclusions) :]
     dimension = max((len(one.centroid) for one in inclusions), default=2)
     solid = any(one.is_solid for one in inclusions)
     places = [f"{axis} / mm" for axis in "xyz"[:dimension]]
     # A million times either: square metres in mm², cubic metres in cm³.
     size, digits = ("volume / cm³", 2) if solid else ("area / mm²", 0)
-    table = Table("inclusion", *places, size, f"peak / {unit}", box=None, padding=(0, 2))
+    more = ["± 1 σ"] if ranges else []
+    table = Table("inclusion", *places, size, f"peak / {unit}", *more, box=None, padding=(0, 2))
     for column in table.columns[1:]:
         column.justify = "right"
-    for inclusion, peak in zip(inclusions, peaks, strict=True):
+        column.no_wrap = True
+    for k, (inclusion, peak) in enumerate(zip(inclusions, peaks, strict=True)):
         place = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
-        table.add_row(inclusion.kind, *place, f"{1e6 * inclusion.area:.{digits}f}", peak)
+        more = [" to ".join(ends[2 * k : 2 * k + 2])] if ranges else []
+        table.add_row(inclusion.kind, *place, f"{1e6 * inclusion.area:.{digits}f}", peak, *more)
     return table

@@ -83,6 +83,19 @@ class ImagedDifference:
         return float(np.real(self.change).min()) / float(np.real(self.calibration.conductivity))
 
     @property
+    def peak_ranges(self) -> tuple[tuple[float, float], ...]:
+        """From where to where the change in each inclusion may lie, S/m (2-D: S), a standard deviation either way;
+        empty where the data do not tell it."""
+        if self.shapes is None or not all(one.weak for one in self.shapes.bodies):
+            return ()
+        background, bodies = float(self.calibration.conductivity), self.shapes.bodies
+        ends = [
+            sorted(float(background * np.expm1(one.sign * (one.contrast + side * deviation))) for side in (-1, 1))
+            for one, deviation in zip(bodies, self.shapes.contrast_deviations, strict=True)
+        ]
+        return tuple((low, high) for low, high in ends)
+
+    @property
     def mesh(self) -> Mesh:
         """The mesh imaged on."""
         return self.calibration.model.mesh

@@ -197,6 +197,6 @@ def show(console, result: "ImagedDifference") -> None:
     console.print()
     console.print(pairs(result.measurement.name, rows))
     console.print()
-    table = inclusion_table(result.inclusions, unit)
+    table = inclusion_table(result.inclusions, unit, result.peak_ranges)
     console.print(table if result.inclusions else "  no inclusion found")
     console.print()
