@@ -20,6 +20,7 @@ NAMES = (
     "learnt",
     "kohonen_speed",
     "first_call",
+    "solids",
     "contacts",
     "kohonen",
     "network_eit",

@@ -1,0 +1,80 @@
+"""Solid bodies: images of a box with 32 plates, first call included, each in a fresh process with its peak memory."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from benchmarks.harness.case import Case, Options, Result, Table, judged
+from benchmarks.harness.tables import duration
+from benchmarks.harness.timing import say
+
+LIMIT = 300.0
+# A box of 0.17 × 0.255 × 0.17 m with plates of 8 × 8 cm, as published tanks have; a ball, noise of 0.1 % of the change.
+_SETUP = """
+import itertools, time
+import numpy as np
+from benchmarks.harness.memory import peak_memory
+from jeit.electrodes import FacePatches
+from jeit.electrodes.body_mesh import body_mesh
+from jeit.forward import ForwardModel
+from jeit.inverse import Gaussian, Laplace, Matern, Noser, TotalVariation, greit, one_step, posterior, reconstruct
+from jeit.mesh import Rectangle, Solid, centroids
+from jeit.protocol import opposite
+
+x, y, z = 0.085, 0.1275, 0.17
+half, three = (-0.0425, 0.0425), (-0.085, 0.0, 0.085)
+places = [(a, s * y, b) for s in (-1, 1) for a in half for b in (0.0425, 0.1275)]
+places += [(s * x, a, b) for s in (-1, 1) for a in three for b in (0.0425, 0.1275)]
+places += [(a, b, s) for s in (0.0, z) for a in half for b in three]
+plates = FacePatches(np.array(places), 0.08, 0.08, 1e-2)
+mesh = body_mesh(Solid(Rectangle(2 * x, 2 * y), z), plates, {nodes})
+model = ForwardModel(mesh, plates, opposite(32, current=1e-3))
+ball = np.linalg.norm(np.asarray(centroids(mesh)) - [0.03, -0.05, 0.1], axis=1) < 0.03
+rest = np.asarray(model.voltages(0.024))
+change = np.asarray(model.voltages(np.where(ball, 0.05, 0.024))) - rest
+change = change + 1e-3 * np.std(change) * np.random.default_rng(0).normal(size=change.shape)
+noise = 0.02 * np.std(change)
+start = time.perf_counter()
+"""
+_DONE = """
+print(mesh.num_points, mesh.num_cells, time.perf_counter() - start, peak_memory())
+"""
+_LINEAR = "one_step(model, 0.024, prior={}, hyperparameter={}).image(change)"
+_NEWTON = "reconstruct(model, rest + change, 0.024, prior={}, hyperparameter={}, noise=noise)"
+# What is made, how, and the seconds that it is allowed.
+JOBS = {
+    "one step, NOSER": (_LINEAR.format("Noser()", 3.0), 10.0),
+    "one step, Gaussian": (_LINEAR.format("Gaussian(0.04)", 3.0), 10.0),
+    "one step, Matérn": (_LINEAR.format("Matern(0.04)", 3.0), 10.0),
+    "one step, Laplace": (_LINEAR.format("Laplace()", 3.0), 10.0),
+    "GREIT": ("greit(model, 0.024).image(change)", 10.0),
+    "Gauss-Newton, Gaussian, with error bars": (
+        f"posterior({_NEWTON.format('Gaussian(0.04)', 5.0)}).standard_deviation()",
+        60.0,
+    ),
+    "total variation": (_NEWTON.format("TotalVariation()", 300.0), 60.0),
+}
+_MEMORY = 2048.0
+
+
+def run(options: Options) -> Result:
+    """Every image in a process of its own, mesh and model ready before the clock starts."""
+    nodes = options.nodes[0] if options.nodes else 1500 if options.quick else 20_000
+    rows, checks, wrong = [], [], []
+    for name, (script, most) in JOBS.items():
+        text = _SETUP.replace("{nodes}", str(nodes)) + script + _DONE
+        done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=LIMIT)
+        if done.returncode:
+            wrong.append(f"{name}: {done.stderr.strip().splitlines()[-1]}")
+            continue
+        points, cells, seconds, memory = (float(one) for one in done.stdout.split()[-4:])
+        rows.append([name, f"{points:.0f}", f"{cells:.0f}", duration(seconds), f"{memory:.0f} MB"])
+        say(" | ".join(rows[-1]))
+        checks.append(judged(f"{name} ≤ {most:g} s, first call included", duration(seconds), seconds <= most))
+        checks.append(judged(f"{name} ≤ 2 GB", f"{memory:.0f} MB", memory <= _MEMORY))
+    heads = ["image of a box with 32 plates", "nodes", "cells", "first call", "peak memory"]
+    return Result([Table(heads, rows)], checks, wrong=wrong)
+
+
+CASE = Case("solids", "images of a box with 32 plates, first call included: seconds and memory", run, 6)
