@@ -1,11 +1,13 @@
 """Bodies in a solid as ellipsoids: derivatives, geometry, and what is found in a box solved on another mesh."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from jeit.electrodes import FaceDiscs
 from jeit.forward import ForwardModel
-from jeit.inverse import Gaussian, reconstruct
+from jeit.inverse import Gaussian, TotalVariation, reconstruct
 from jeit.inverse.shapes import EllipsoidPrior, StarPrior, reconstruct_shapes
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
 from jeit.mesh import box, centroids
@@ -124,6 +126,23 @@ def test_what_a_smooth_field_explains_bends_no_body(coarse):
     np.testing.assert_allclose(strength, 4 * np.pi / 3 * RADIUS**3 * 9 / 12, rtol=0.15)
     floor = np.asarray(centroids(coarse.mesh))[:, 2] < 0.015
     assert 1.1 < np.median(np.asarray(beside.conductivity)[floor]) / BATH < 2.0
+
+
+def test_a_smooth_field_is_of_the_same_channels(coarse):
+    rest = coarse.voltages(BATH)
+
+    def found(smooth: Any):
+        reconstruct_shapes(coarse, rest, BATH, start=[], noise=1e-3, smooth=smooth)
+
+    few = np.arange(len(rest)) < 40
+    settings: Any = {"hyperparameter": 5.0, "noise": 1e-3}
+    masked = reconstruct(coarse, rest, BATH, prior=Gaussian(0.025), mask=few, **settings)
+    with pytest.raises(ValueError, match=r"smooth is an image of \d+ independent channels"):
+        found(masked)
+    with pytest.raises(ValueError, match="by a smooth prior, with no bounds"):
+        found(reconstruct(coarse, rest, BATH, prior=TotalVariation(), **settings))
+    with pytest.raises(ValueError, match="smooth"):
+        found(0.3)
 
 
 def test_a_prior_of_a_sheet_is_refused(coarse):

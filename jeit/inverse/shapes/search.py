@@ -106,7 +106,8 @@ def reconstruct_shapes(
     each is split in two, or taken for weak, where the evidence is for it (`ShapeProblem.surprise`): once splits first,
     once weak ones first, and the better of the two is kept.
 
-    Raises `ValueError` for arguments that do not fit.
+    Raises `ValueError` for arguments that do not fit, and for a `smooth` that is no image of these channels by a smooth
+    prior.
 
     Kolehmainen, Arridge, Lionheart, Vauhkonen and Kaipio, Inverse Problems 15 (1999) 1375, boundaries by Fourier
     coefficients; the choice by evidence is jeit's own.

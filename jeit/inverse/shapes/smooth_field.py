@@ -17,6 +17,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jeit.arguments import check_kind
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit_solvers.engines import on_host
@@ -36,7 +37,17 @@ class SmoothField:
 
     @classmethod
     def create(cls, image: Reconstruction, alone: ShapeProblem) -> SmoothField:
-        """`image`: by Gauss-Newton and a smooth prior."""
+        """Raises `ValueError` for what is no `image` of the same cells and channels by a smooth prior."""
+        check_kind("smooth", image, Reconstruction, "what jeit.inverse.reconstruct has returned")
+        inversion = image.inversion
+        if not inversion.penalty.is_standard_normal or inversion.unknowns:
+            raise ValueError("smooth: give an image by a smooth prior, with no bounds and no further unknowns.")
+        there = (len(inversion.data.weight), len(inversion.reference))
+        if there != (wanted := (len(alone.data.weight), len(alone.background))):
+            raise ValueError(
+                f"smooth is an image of {there[0]} independent channels and {there[1]} cells, and the data of bodies "
+                f"have {wanted[0]} and {wanted[1]}; give one by the same model and mask."
+            )
         image = on_host(image)
         none: Any = np.zeros_like(image.coefficients)
         _, weighted = image.inversion.linearise(none)
@@ -69,5 +80,5 @@ class SmoothField:
         return np.asarray(slope * inversion.basis.expand(coefficients))
 
     def _left(self, fit: Fit) -> Float[np.ndarray, " r"]:
-        """What bodies leave of the weighted voltages, with its sign turned."""
+        """What bodies predict too much of the weighted voltages."""
         return self.alone.linearise(fit.coefficients, fit.bodies)[0][: len(self.jacobian)]
