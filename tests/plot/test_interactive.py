@@ -55,7 +55,7 @@ def test_a_window_needs_a_display(monkeypatch):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="displays of X11 on Linux")
 def test_a_display_that_nothing_answers_at_is_none(monkeypatch):
-    """As a terminal keeps that of a session that has ended: no window opened, and no pictures were made."""
+    """As a terminal keeps that of a screen that is gone: no window opened, and no pictures were made."""
     monkeypatch.setattr(interactive, "find_spec", lambda name: name)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setenv("DISPLAY", ":4242.0")

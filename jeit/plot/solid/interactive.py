@@ -102,6 +102,7 @@ def _answers(display: str) -> bool:
     number = rest.partition(".")[0]
     if host not in ("", "unix", "localhost") or not number.isdecimal() or len(number) > 4:
         return True
+    # Where X11 servers listen on every system (Xtrans); PyVista's own check asks a program that may not be installed.
     path = f"/tmp/.X11-unix/X{number}"
     local = [(socket.AF_UNIX, path), (socket.AF_UNIX, "\0" + path)]
     for family, address in [(socket.AF_INET, (host, 6000 + int(number)))] if host == "localhost" else local:
