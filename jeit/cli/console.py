@@ -113,10 +113,10 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, ranges: Sequen
     # A million times either: square metres in mm², cubic metres in cm³.
     size, digits = ("volume / cm³", 2) if solid else ("area / mm²", 0)
     more = ["± 1 σ"] if ranges else []
-    table = Table("inclusion", *places, size, f"peak / {unit}", *more, box=None, padding=(0, 2))
+    table = Table("inclusion", *places, size, f"peak / {unit}", *more, box=None, padding=(0, 1 if ranges else 2))
+    table.columns[0].min_width = max((len(one.kind) for one in inclusions), default=0)
     for column in table.columns[1:]:
         column.justify = "right"
-        column.no_wrap = True
     for k, (inclusion, peak) in enumerate(zip(inclusions, peaks, strict=True)):
         place = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
         more = [" to ".join(ends[2 * k : 2 * k + 2])] if ranges else []

@@ -37,11 +37,12 @@ def test_a_peak_is_told_with_what_it_may_lie_between():
     bodies = [Inclusion(1, (0.01, 0.02, 0.03), 2e-5, 0.2), Inclusion(-1, (0.0, 0.0, 0.0), 1e-5, -0.004)]
 
     def printed(*ranges):
-        console = Console(width=100, file=io.StringIO(), record=True)
+        console = Console(width=80, file=io.StringIO(), record=True)
         console.print(inclusion_table(bodies, "S/m", *ranges))
         return [line.split() for line in console.export_text().splitlines()]
 
     known = printed([(0.1, 0.4), (-0.005, -0.002)])
+    assert [line[0] for line in known] == ["inclusion", "conductive", "resistive"]
     assert known[0][-3:] == ["±", "1", "σ"]
     assert known[1][-4:] == ["200", "100", "to", "400"]
     assert known[2][-4:] == ["-4", "-5", "to", "-2"]
