@@ -187,7 +187,11 @@ def gather(values: Shaped[Array, "n *k"], index: Int[Array, "*i"]) -> Shaped[Arr
 def gather_or_zero(values: Shaped[Array, "n *k"], index: Int[Array, "*i"]) -> Shaped[Array, "..."]:
     """Rows of `values`, zeros for the index n."""
     if isinstance(values, np.ndarray):
-        return np.concatenate([values, np.zeros((1, *values.shape[1:]), values.dtype)])[index]
+        if not len(values):
+            return host.zeros((*np.shape(index), *values.shape[1:]), values.dtype)
+        found = np.take(values, index, axis=0, mode="clip")  # no copy of all of them, with a row of zeros at the end
+        found[np.asarray(index) == len(values)] = 0
+        return host.asarray(found)
     return values.at[index].get(mode="fill", fill_value=0)
 
 
@@ -214,8 +218,12 @@ def set_at(total: Shaped[Array, "*n"], index: Any, values: Any) -> Shaped[Array,
 
 def add_at(total: Inexact[Array, "*n"], index: Any, values: Inexact[Array, "*i"]) -> Inexact[Array, "*n"]:
     """`total` with `values` added at `index`, repeated indices again and again."""
+    return add_into(host.array(total) if isinstance(total, np.ndarray) else total, index, values)
+
+
+def add_into(total: Inexact[Array, "*n"], index: Any, values: Inexact[Array, "*i"]) -> Inexact[Array, "*n"]:
+    """The same in place of a `total` of NumPy's that nothing else needs."""
     if isinstance(total, np.ndarray):
-        grown: Any = host.array(total)
-        np.add.at(grown, index, values)
-        return grown
+        np.add.at(total, index, values)
+        return host.asarray(total)
     return total.at[index].add(values)

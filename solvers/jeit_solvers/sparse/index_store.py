@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Inexact, Int
 
-from jeit_solvers.engines import add_at, as_array, gather, gather_or_zero, has_values, namespace
+from jeit_solvers.engines import add_into, as_array, gather, gather_or_zero, has_values, namespace
 
 
 class Slot(NamedTuple):
@@ -85,15 +85,20 @@ class PaddedSum(NamedTuple):
         self, indices: Int[Array, " total"], contributions: Inexact[Array, "sources *k"]
     ) -> Inexact[Array, "sums *k"]:
         """The sums of the given contributions."""
-        width, num_sums = self.gather.shape
-        result = namespace(contributions).zeros((num_sums, *contributions.shape[1:]), contributions.dtype)
+        shape = self.gather.shape[1], *contributions.shape[1:]
+        return self.added(indices, contributions, namespace(contributions).zeros(shape, contributions.dtype))
+
+    def added(
+        self, indices: Int[Array, " total"], contributions: Inexact[Array, "sources *k"], total: Inexact[Array, "s *k"]
+    ) -> Inexact[Array, "s *k"]:
+        """`total` with the sums added to it; NumPy's where it is, for what a large front takes is to move memory."""
         gathered = self.gather.read(indices)
-        for layer in range(width):
-            result = result + gather_or_zero(contributions, gathered[layer])
+        for layer in range(len(gathered)):
+            total += gather_or_zero(contributions, gathered[layer])
         if self.overflow_sum.shape[0]:
             overflow = gather(contributions, self.overflow_source.read(indices))
-            result = add_at(result, self.overflow_sum.read(indices), overflow)
-        return result
+            total = add_into(total, self.overflow_sum.read(indices), overflow)
+        return total
 
 
 # Measured on two Zen 4 cores: a scattered contribution costs about as much as this many gathered ones.

@@ -3,6 +3,8 @@
 In NumPy at once where the matrix is NumPy's, else in compiled programs.
 """
 
+import functools
+import operator
 from functools import partial
 
 import equinox as eqx
@@ -75,14 +77,16 @@ def _by_stages(layout: IndexLayout, indices: Int[Array, " total"], values: Inexa
         corner = xp.zeros(stage.batch * border * border, dtype)
         for link in stage.links:
             schur = left[link.source].reshape(-1)
-            panel = panel + link.panel.apply(indices, schur)
-            corner = corner + link.corner.apply(indices, schur)
+            panel = link.panel.added(indices, schur, panel)
+            corner = link.corner.added(indices, schur, corner)
         panel = panel.reshape(stage.batch, pivots + border, pivots)
         inverse = inverse_cholesky(panel[:, :pivots])
         lower = panel[:, pivots:] @ _transposed(inverse)
         inverses.append(inverse)
         lowers.append(lower)
-        left.append(corner.reshape(stage.batch, border, border) - lower @ _transposed(lower))
+        corner = corner.reshape(stage.batch, border, border)
+        corner -= lower @ _transposed(lower)
+        left.append(corner)
     return Factor(tuple(inverses), tuple(lowers))
 
 
@@ -162,12 +166,11 @@ def _half_way(
     reduced, updates = [], []
     for stage, inverse, lower in zip(stages, factor.inverses, factor.lowers, strict=True):
         rows = gather_or_zero(vectors, stage.right_hand_side.read(indices))
-        passed_on = namespace(vectors).zeros((), vectors.dtype)
-        for link in stage.links:
-            received = link.rows.apply(indices, updates[link.source].reshape(-1, count))
-            received = received.reshape(stage.batch, -1, count)
-            rows = rows + received[:, : stage.pivots]
-            passed_on = passed_on + received[:, stage.pivots :]
+        received = [link.rows.apply(indices, updates[link.source].reshape(-1, count)) for link in stage.links]
+        received = [one.reshape(stage.batch, -1, count) for one in received]
+        rows = sum((one[:, : stage.pivots] for one in received), rows)
+        nothing = namespace(vectors).zeros((), vectors.dtype)
+        passed_on = functools.reduce(operator.add, [one[:, stage.pivots :] for one in received] or [nothing])
         reduced.append(inverse @ rows)
         updates.append(passed_on - lower @ reduced[-1])
     return reduced
