@@ -1,5 +1,8 @@
 """The direct solver against SciPy and dense algebra, for every problem and number type."""
 
+import gc
+import weakref
+
 import jax
 import jax.numpy as jnp
 import lineax
@@ -189,3 +192,20 @@ def test_the_order_of_elimination_hangs_neither_on_size_nor_place():
         other = analyse(pattern, factor * points + shift)
         assert other.layout == plan.layout
         np.testing.assert_array_equal(other.indices, plan.indices)
+
+
+def test_a_plan_serves_all_that_have_its_tree_while_any_uses_it():
+    pattern, values, coordinates = sparse_problems.box()
+    plan = analyse(pattern, coordinates)
+    again = SparsityPattern.from_elements([np.stack([pattern.rows, pattern.columns], 1)[pattern.size :]], pattern.size)
+    shared = analyse(again, coordinates)
+    assert shared.indices is plan.indices
+    assert analyse(pattern, coordinates[:, ::-1] * [1.0, 2.0, 3.0]).indices is not plan.indices
+    kept = weakref.ref(plan.indices)
+    del plan, shared
+    gc.collect()
+    assert kept() is None
+    plan = analyse(pattern, coordinates)
+    vector = np.arange(1.0, pattern.size + 1)
+    expected = np.linalg.solve(np.asarray(pattern.to_dense(values)), vector)
+    np.testing.assert_allclose(solve(plan, factorise(plan, values), jnp.asarray(vector)), expected, rtol=1e-12)

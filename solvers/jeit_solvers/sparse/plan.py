@@ -1,6 +1,8 @@
 """The symbolic half of the direct solver: where every number goes, found once for a sparsity pattern, in NumPy."""
 
+import hashlib
 from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
 
 import equinox as eqx
 import numpy as np
@@ -102,14 +104,33 @@ def elimination_tree(pattern: SparsityPattern, coordinates: Any = None) -> Elimi
 
 
 def plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> FactorisationPlan:
-    """All index maps for an elimination tree."""
-    store = IndexStore()
-    stages = tuple(_stage(store, pattern, tree, stage) for stage in range(tree.num_stages))
-    offsets = np.cumsum([0, *(stage.batch * stage.pivots for stage in stages)])
-    stage_of_row = tree.stage[tree.front]
-    solution = offsets[stage_of_row] + tree.slot[tree.front] * np.asarray(tree.pivots)[stage_of_row] + tree.place
-    layout = IndexLayout(stages, store.add(solution))
-    return FactorisationPlan(store.pack(), layout, pattern.size, pattern.num_entries)
+    """All index maps for an elimination tree: those of another plan, while one of the same tree is in use, such as that
+    of a forward model whose mesh a prior has matrices on."""
+    known = _known(pattern, tree)
+    indices, layout = _INDICES.get(known), _LAYOUTS.get(known)
+    if indices is None or layout is None:
+        store = IndexStore()
+        stages = tuple(_stage(store, pattern, tree, stage) for stage in range(tree.num_stages))
+        offsets = np.cumsum([0, *(stage.batch * stage.pivots for stage in stages)])
+        stage_of_row = tree.stage[tree.front]
+        solution = offsets[stage_of_row] + tree.slot[tree.front] * np.asarray(tree.pivots)[stage_of_row] + tree.place
+        layout = IndexLayout(stages, store.add(solution))
+        indices = store.pack()
+        _INDICES[known], _LAYOUTS[known] = indices, layout
+    return FactorisationPlan(indices, layout, pattern.size, pattern.num_entries)
+
+
+def _known(pattern: SparsityPattern, tree: EliminationTree) -> bytes:
+    """By which a plan is known again."""
+    found = hashlib.blake2b(digest_size=16)
+    for one in (pattern.rows, pattern.columns, tree.front, tree.place, tree.parent, tree.stage, tree.slot):
+        found.update(np.asarray(one).tobytes())
+    return found.digest()
+
+
+# Of plans in use: making one of a solid takes seconds, and keeping it hundreds of megabytes.
+_INDICES: WeakValueDictionary[bytes, Array] = WeakValueDictionary()
+_LAYOUTS: WeakValueDictionary[bytes, IndexLayout] = WeakValueDictionary()
 
 
 def _stage(store: IndexStore, pattern: SparsityPattern, tree: EliminationTree, stage: int) -> Stage:
