@@ -25,6 +25,8 @@ from jeit_solvers.engines import gather, has_values, host, namespace, on_device,
 
 # Numbers of a Jacobian at a time, where it is made in pieces.
 _BLOCK = 4_000_000
+# Cells at a time whose fields stay in a core's cache.
+_CELLS = 4000
 
 
 class ForwardModel(eqx.Module):
@@ -251,6 +253,23 @@ def jacobian_blocks(
     for start in range(0, mesh.num_cells, size):
         cells = slice(start, min(start + size, mesh.num_cells))
         yield cells, _of_cells(protocol, gradient[:, cells])
+
+
+def field_products(mesh: Mesh, fields: Inexact[Array, "n L"]) -> Iterator[tuple[slice, Inexact[np.ndarray, "f b"]]]:
+    """∫_e ∇u_a · ∇u_b of the electrodes' fields for a ≤ b, rows as of `np.triu_indices`, some cells after others: what
+    the Jacobian of any channel is a sum of. In NumPy; `fields` as of `fields_of`, ohms."""
+    gradient: Any = field_gradients(mesh, fields)
+    count = gradient.shape[-1]
+    starts = np.cumsum([0, *range(count, 0, -1)])
+    for start in range(0, mesh.num_cells, _CELLS):
+        cells = slice(start, min(start + _CELLS, mesh.num_cells))
+        along = np.ascontiguousarray(np.swapaxes(gradient[:, cells], 1, 2))
+        products = np.zeros((starts[-1], along.shape[-1]), along.dtype)
+        for field in range(count):
+            rows = products[starts[field] : starts[field + 1]]
+            for component in along:
+                rows += component[field] * component[field:]
+        yield cells, products
 
 
 def _of_cells(protocol: Protocol, gradient: Inexact[Array, "d b L"]) -> Inexact[Array, "M b"]:

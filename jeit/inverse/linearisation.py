@@ -12,17 +12,19 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import check_conductivity
-from jeit.forward.model import check_model, evaluate, fields_and_impedance_of, jacobian_blocks
+from jeit.forward.model import check_model, evaluate, field_products, fields_and_impedance_of, jacobian_blocks
 from jeit.inverse.direct_problem import DirectProblem
 from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.defaults import PRIOR
 from jeit.inverse.prior.priors import AbstractPrior
 from jeit.inverse.spectrum import Spectrum
-from jeit.protocol import Protocol, two_terminal
+from jeit.protocol import Protocol
 from jeit_solvers.engines import as_array, has_values, namespace, on_host
 
 # Singular values so small, beside the largest, are rounding.
 _NOTHING = 1e-12
+# So many products of fields are made in less than the time of one channel's product of patterns, and combined.
+_CHEAP = 2
 
 
 class Linearisation(eqx.Module):
@@ -119,13 +121,14 @@ def combined_blocks(
     `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
     """
     fields = evaluate(model, fields_and_impedance_of, check_conductivity(model.mesh, conductivity))[0]
-    mesh, protocol = on_host((model.mesh, model.protocol.subset(channels)))
-    pairs = np.stack(np.triu_indices(protocol.num_electrodes, 1), axis=1)
-    if len(pairs) < len(channels):
-        # A channel is -1/2 of what it sees of every pair of electrodes, driven and read: ∂v = Σ_ab d_a m_b ∂G_ab.
-        weights = -0.5 * weights @ _seen(model.protocol, channels)
-        protocol = on_host(two_terminal(protocol.num_electrodes, pairs, current=1.0))
-    for cells, block in jacobian_blocks(mesh, protocol, on_host(fields)):
+    mesh, protocol, fields = on_host((model.mesh, model.protocol.subset(channels), fields))
+    electrodes = protocol.num_electrodes
+    if electrodes * (electrodes + 1) // 2 < _CHEAP * len(channels):
+        # By way of products of fields: ∂v = -Σ_ab d_a m_b ∫ ∇u_a · ∇u_b.
+        weights, blocks = -weights @ _forms(model.protocol, channels), field_products(mesh, fields)
+    else:
+        blocks = jacobian_blocks(mesh, protocol, fields)
+    for cells, block in blocks:
         yield cells, weights @ np.asarray(block)
 
 
@@ -186,7 +189,14 @@ def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array
 
 def _seen(protocol: Protocol, channels) -> Float[np.ndarray, "K e"]:
     """What channels see of every pair of electrodes."""
+    first, second = np.triu_indices(protocol.num_electrodes)
+    return _forms(protocol, channels)[:, first < second]
+
+
+def _forms(protocol: Protocol, channels) -> Float[np.ndarray, "K f"]:
+    """Channels as linear forms of the upper triangle, diagonal included, of what is symmetric between electrodes."""
     drive = np.asarray(protocol.drive)[np.asarray(protocol.drive_index)[channels]]
     measurement = np.asarray(protocol.measurement)[np.asarray(protocol.measurement_index)[channels]]
-    first, second = np.triu_indices(protocol.num_electrodes, 1)
-    return drive[:, first] * measurement[:, second] + drive[:, second] * measurement[:, first]
+    first, second = np.triu_indices(protocol.num_electrodes)
+    both = drive[:, first] * measurement[:, second] + drive[:, second] * measurement[:, first]
+    return np.where(first < second, both, both / 2)
