@@ -28,6 +28,8 @@ from jeit_solvers.engines import has_values, host, on_host
 _ROBIN = 1.42
 # Nodes up to which variances are worked out; of more they are estimated, from this many fields.
 _FEW, _FIELDS = 3000, 400
+# Fields at a time.
+_AT_ONCE = 50
 
 
 class Matern(AbstractPrior):
@@ -67,7 +69,7 @@ class Matern(AbstractPrior):
     def informed_basis(self, mesh, jacobian):
         """As of any prior, of one field."""
         field = self._field(mesh, jacobian)
-        return informed_shapes(np.asarray(jacobian), field.product, field.variance)
+        return informed_shapes(np.asarray(jacobian), field.product, field.variance())
 
     def _field(self, mesh: Mesh, jacobian) -> "_Field":
         instead = "take Gaussian(length), which can be differentiated"
@@ -79,13 +81,13 @@ class Matern(AbstractPrior):
 
 class _Field(NamedTuple):
     """**Fields**: `means` of cells over their nodes (m, n); `solve`, with A; `mass` of the nodes (n,); `scale` (n,)
-    that makes their variances one; `variance` (m,) of the means."""
+    that makes their variances one; `fields` (n, k) whose products with each other are about its covariance."""
 
     means: scipy.sparse.csr_array
     solve: Solve
     mass: Float[np.ndarray, " n"]
     scale: Float[np.ndarray, " n"]
-    variance: Float[np.ndarray, " m"]
+    fields: Float[np.ndarray, "n k"]
 
     @classmethod
     def create(cls, mesh: Mesh, length: float) -> "_Field":
@@ -100,8 +102,13 @@ class _Field(NamedTuple):
         rim = np.bincount(mesh.facets.ravel(), np.repeat(wall, mesh.dimension), size)
         solve = system.inverse(system.assemble(stiffness, decay**2 * mass + decay / _ROBIN * rim))
         fields = _fields(solve, mass)
-        scale = 1 / np.sqrt(np.sum(fields**2, axis=1))
-        return cls(system.means, solve, mass, scale, np.sum((system.means @ (scale[:, None] * fields)) ** 2, axis=1))
+        scale = 1 / np.sqrt(np.einsum("nk,nk->n", fields, fields))
+        return cls(system.means, solve, mass, scale, scale[:, None] * fields)
+
+    def variance(self) -> Float[np.ndarray, " m"]:
+        """Of the cells."""
+        some = np.array_split(self.fields, max(1, self.fields.shape[1] // _AT_ONCE), axis=1)
+        return np.sum([((self.means @ part) ** 2).sum(axis=1) for part in some], axis=0)
 
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
         """Γ times columns."""

@@ -1,6 +1,7 @@
 """Matrices between the nodes of a mesh, solved by the direct solver, and images of cells as means over their nodes."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,11 +9,11 @@ import scipy.sparse
 from jaxtyping import Float
 
 from jeit.mesh import Mesh
-from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, solve
+from jeit_solvers import Factor, FactorisationPlan, SparsityPattern, analyse, factorise, number_of_cores, solve
 from jeit_solvers.engines import on_host
 
 # Columns solved for at a time: of more, fronts leave the caches, and of all they take the memory of several images.
-_AT_ONCE = 32
+_AT_ONCE, _MOST_AT_ONCE = 32, 4
 
 Solve = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, "n k"]]
 """What solves a system for columns."""
@@ -54,13 +55,18 @@ class NodalSystem(NamedTuple):
     def inverse(self, values: Any) -> Solve:
         """What solves A X = B for columns (n, k), A being of these entries, in the pattern's order."""
         factor = factorise(self.plan, values)
+        return lambda columns: solve_columns(self.plan, factor, columns)
 
-        def solved(columns: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-            found = np.empty_like(columns)
-            for start in range(0, columns.shape[1], _AT_ONCE):
-                some = slice(start, start + _AT_ONCE)
-                part: Any = np.ascontiguousarray(columns[:, some])
-                found[:, some] = solve(self.plan, factor, part)
-            return found
 
-        return solved
+def solve_columns(plan: FactorisationPlan, factor: Factor, columns: Float[np.ndarray, "n k"]) -> Any:
+    """A⁻¹ times columns (n, k) of NumPy's, some at a time on every core."""
+    found = np.empty_like(columns)
+
+    def some(start: int) -> None:
+        part: Any = np.ascontiguousarray(columns[:, start : start + _AT_ONCE])
+        with np.errstate(all="ignore"):  # NaN is told of elsewhere, and threads have error states of their own
+            found[:, start : start + _AT_ONCE] = solve(plan, factor, part)
+
+    with ThreadPoolExecutor(min(number_of_cores(), _MOST_AT_ONCE)) as pool:
+        list(pool.map(some, range(0, columns.shape[1], _AT_ONCE)))
+    return found
