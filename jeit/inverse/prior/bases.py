@@ -168,14 +168,16 @@ class NodalBasis(AbstractBasis):
 
     def restrict_blocks(self, blocks):
         """The same, some cells after others."""
-        total: Any = 0.0
+        total: Any = np.zeros(0)
         count = self.cells.shape[1]
         for cells, block in blocks:
-            nodes = np.asarray(self.cells[cells])
-            to = np.arange(0, nodes.size + 1, count), (len(nodes), self.number)
-            means = scipy.sparse.csr_array((np.full(nodes.size, 1 / count), nodes.ravel(), to[0]), shape=to[1])
-            total = total + means.T @ block.T
-        return np.ascontiguousarray(np.asarray(total).T)
+            total = total if total.size else np.zeros((self.number, len(block)), block.dtype)
+            nodes, corners = np.unique(np.asarray(self.cells[cells]), return_inverse=True)
+            ends = np.arange(0, corners.size + 1, count)
+            shape = len(ends) - 1, len(nodes)
+            means = scipy.sparse.csr_array((np.full(corners.size, 1 / count), corners.ravel(), ends), shape=shape)
+            total[nodes] += means.T @ block.T
+        return np.ascontiguousarray(total.T)
 
     def variance(self):
         """Of means of independent nodes."""

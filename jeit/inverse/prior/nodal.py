@@ -55,17 +55,21 @@ class NodalSystem(NamedTuple):
     def inverse(self, values: Any) -> Solve:
         """What solves A X = B for columns (n, k), A being of these entries, in the pattern's order."""
         factor = factorise(self.plan, values)
-        return lambda columns: solve_columns(self.plan, factor, columns)
+        return lambda columns: in_columns(solve, self.plan, factor, columns)
 
 
-def solve_columns(plan: FactorisationPlan, factor: Factor, columns: Float[np.ndarray, "n k"]) -> Any:
-    """A⁻¹ times columns (n, k) of NumPy's, some at a time on every core."""
-    found = np.empty_like(columns)
+def in_columns(
+    how: Callable[[FactorisationPlan, Factor, Any], Any], plan: FactorisationPlan, factor: Factor, columns: Any
+) -> Any:
+    """`solve` or `half_solve` of columns (n, k); of NumPy's some at a time, on every core."""
+    if not isinstance(columns, np.ndarray):
+        return how(plan, factor, columns)
+    found = np.empty((plan.size if how is solve else plan.num_pivots, columns.shape[1]), columns.dtype)
 
     def some(start: int) -> None:
-        part: Any = np.ascontiguousarray(columns[:, start : start + _AT_ONCE])
+        part = np.ascontiguousarray(columns[:, start : start + _AT_ONCE])
         with np.errstate(all="ignore"):  # NaN is told of elsewhere, and threads have error states of their own
-            found[:, start : start + _AT_ONCE] = solve(plan, factor, part)
+            found[:, start : start + _AT_ONCE] = how(plan, factor, part)
 
     with ThreadPoolExecutor(min(number_of_cores(), _MOST_AT_ONCE)) as pool:
         list(pool.map(some, range(0, columns.shape[1], _AT_ONCE)))

@@ -5,20 +5,25 @@ The energy λ ∫ √(|∇x|² + (β/h)²) dV, h the cell's size and lengths in 
 form that touches it is a stiffness matrix of the nodes.
 """
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.inverse.prior.bases import NodalBasis
+from jeit.inverse.prior.nodal import in_columns
 from jeit.inverse.prior.penalty import AbstractPenalty
 from jeit.mesh import Mesh, gradients, measures
-from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, solve, solve_definite
+from jeit_solvers import (
+    Factor,
+    FactorisationPlan,
+    SparsityPattern,
+    analyse,
+    factorise,
+    half_solve,
+    solve,
+    solve_definite,
+)
 from jeit_solvers.engines import gather, host, namespace, on_host, sum_into
-
-# Columns solved for at a time, where they are NumPy's: fronts of all would take the memory of several images.
-_AT_ONCE = 32
 
 
 class NodalTotalVariation(AbstractPenalty):
@@ -90,7 +95,7 @@ class NodalTotalVariation(AbstractPenalty):
         bend = self.weight * self.steepness**2 / self._height(image) ** 3
         within = gather(mine, self.cells)
         elements = self._elements(bend) * (within[:, :, None] & within[:, None, :])
-        solved = self._solve(elements, jnp.where(mine, self.pull, 1), columns[:size])
+        solved = solve(self.plan, self._factor(elements, jnp.where(mine, self.pull, 1)), columns[:size])
         return jnp.concatenate([solved, columns[size:]])
 
     def model(self, residual, jacobian, coefficients, data):
@@ -106,12 +111,17 @@ class NodalTotalVariation(AbstractPenalty):
             xp = namespace(self, jacobian)
             flux = stiffness[:, None] * self._gradient(self.reference + image)
             gradient = self.pull * image + self._divergence(flux)
+            factor = self._factor(self._elements(stiffness), self.pull)
             columns = xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1)
-            solved = self._solve(self._elements(stiffness), self.pull, columns)
-            product = xp.concatenate([solved[:, :-1], jacobian[:, size:].T]) / (1 + damping)
-            descent = xp.concatenate([solved[:, -1], rest]) / (1 + damping)
-            inner = solve_definite(jacobian @ product + data.covariance, residual - jacobian @ descent)
-            direction = -descent - product @ inner
+            # Products with Γ take half a solve each, and the direction is one more.
+            half = in_columns(half_solve, self.plan, factor, columns)
+            products = half.T @ half
+            further = jacobian[:, size:]
+            outer = (products[:-1, :-1] + further @ further.T) / (1 + damping)
+            descent = (products[:-1, -1] + further @ rest) / (1 + damping)
+            inner = solve_definite(outer + data.covariance, residual - descent)
+            image_direction = solve(self.plan, factor, gradient + inner @ jacobian[:, :size])
+            direction = -xp.concatenate([image_direction, rest + inner @ further]) / (1 + damping)
             across = jacobian @ direction
             own, other = self._parts(direction)
             slope = weighted @ across + gradient @ own + rest @ other
@@ -125,17 +135,11 @@ class NodalTotalVariation(AbstractPenalty):
         """Of the form Σ stiffness |∇x|², (m, k, k)."""
         return namespace(self, stiffness).einsum("mid,mjd,m->mij", self.slope, self.slope, stiffness)
 
-    def _solve(self, elements, diagonal, columns):
-        """(form + diagonal)⁻¹ columns."""
-        xp = namespace(self, columns)
+    def _factor(self, elements, diagonal) -> Factor:
+        """Of form + diagonal."""
         values = self.pattern.assemble(elements)
-        values = values + xp.concatenate([diagonal, xp.zeros(len(values) - len(diagonal))])
-        factor = factorise(self.plan, values)
-        if xp is not np:
-            return solve(self.plan, factor, columns)
-        starts = range(0, columns.shape[1], _AT_ONCE)
-        parts: list[Any] = [np.ascontiguousarray(columns[:, start : start + _AT_ONCE]) for start in starts]
-        return np.concatenate([solve(self.plan, factor, part) for part in parts], axis=1)
+        xp = namespace(self, values)
+        return factorise(self.plan, values + xp.concatenate([diagonal, xp.zeros(len(values) - len(diagonal))]))
 
     def _gradient(self, image):
         """Of an image of the nodes, in every cell, (m, d) 1/m."""

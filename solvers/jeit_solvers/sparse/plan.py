@@ -63,6 +63,11 @@ class FactorisationPlan(eqx.Module):
         return self.layout.content[1]
 
     @property
+    def num_pivots(self) -> int:
+        """Rows of what `half_solve` returns, padding included."""
+        return sum(stage.batch * stage.pivots for stage in self.stages)
+
+    @property
     def num_factor_entries(self) -> int:
         """Numbers in the factor, padding included; its memory is this times the size of a number."""
         return sum(stage.batch * (stage.pivots + stage.border) * stage.pivots for stage in self.stages)
