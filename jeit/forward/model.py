@@ -23,8 +23,8 @@ from jeit.protocol import Protocol
 from jeit_solvers import SparseCholesky, in_turn
 from jeit_solvers.engines import gather, has_values, host, namespace, on_device, on_host, sum_into
 
-# Numbers of a Jacobian at a time, where it is made in pieces.
-_BLOCK = 4_000_000
+# Numbers of a Jacobian at a time, where it is made in pieces: so many stay in a core's cache.
+_BLOCK = 250_000
 # Cells at a time whose fields stay in a core's cache.
 _CELLS = 4000
 

@@ -23,8 +23,6 @@ from jeit_solvers.engines import as_array, has_values, namespace, on_host
 
 # Singular values so small, beside the largest, are rounding.
 _NOTHING = 1e-12
-# So many products of fields are made in less than the time of one channel's product of patterns, and combined.
-_CHEAP = 2
 
 
 class Linearisation(eqx.Module):
@@ -123,8 +121,8 @@ def combined_blocks(
     fields = evaluate(model, fields_and_impedance_of, check_conductivity(model.mesh, conductivity))[0]
     mesh, protocol, fields = on_host((model.mesh, model.protocol.subset(channels), fields))
     electrodes = protocol.num_electrodes
-    if electrodes * (electrodes + 1) // 2 < _CHEAP * len(channels):
-        # By way of products of fields: ∂v = -Σ_ab d_a m_b ∫ ∇u_a · ∇u_b.
+    if electrodes * (electrodes + 1) // 2 < len(channels):
+        # Products of fields are fewer: ∂v = -Σ_ab d_a m_b ∫ ∇u_a · ∇u_b.
         weights, blocks = -weights @ _forms(model.protocol, channels), field_products(mesh, fields)
     else:
         blocks = jacobian_blocks(mesh, protocol, fields)
