@@ -5,6 +5,7 @@ S35-S55. There the body is a disk; here the targets and their images follow the 
 body they are balls.
 """
 
+from collections.abc import Iterator
 from itertools import combinations
 
 import jax.numpy as jnp
@@ -26,6 +27,8 @@ from jeit.mesh import Mesh, centroids, check_flat, measures
 _EDGE = 0.25
 # Samples of a target along its radius: some fifty of a disc, some sixty of a ball.
 _SAMPLED = {2: 4.0, 3: 2.5}
+# Samples at a time; and how far from a centre they are looked at, in radii: all that are in a ball, and hardly more.
+_AT_ONCE, _CLOSE = 500_000, 1 + 1e-9
 # A training target counts if this share of it lies in the body.
 _INSIDE = 0.9
 # Cells of which a mean is taken, about.
@@ -118,16 +121,24 @@ def _ball(radius: float, dimension: int) -> float:
 def _targets(mesh: Mesh, middle, radius: float, number: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
     """Centres (K, 2) of the targets that lie in the body, and the share of every cell that each covers (m, K)."""
     measure, points = np.asarray(measures(mesh)), np.asarray(mesh.points)
+    low, high = points.min(axis=0), points.max(axis=0)
     if mesh.dimension == 2:
         spacing = np.sqrt(2 / np.sqrt(3) * measure.sum() / number)
-        grid = _hexagonal(points.min(axis=0), points.max(axis=0), middle, spacing)
+        grid = _hexagonal(low, high, middle, spacing)
     else:
-        grid = _cubic(points.min(axis=0), points.max(axis=0), middle, np.cbrt(measure.sum() / number))
-    samples, cell, share = _samples(mesh, radius / _SAMPLED[mesh.dimension])
-    pairs = KDTree(grid).sparse_distance_matrix(KDTree(samples), radius, output_type="ndarray")
-    covered = scipy.sparse.coo_array(
-        (share[pairs["j"]], (cell[pairs["j"]], pairs["i"])), shape=(mesh.num_cells, len(grid))
-    ).tocsc()
+        spacing = np.cbrt(measure.sum() / number)
+        grid = _cubic(low, high, middle, spacing)
+    tree, parts = KDTree(grid), []
+    for samples, cell, share in _samples(mesh, radius / _SAMPLED[mesh.dimension]):
+        if mesh.dimension == 3:
+            place = (samples - middle) / spacing
+            place -= np.rint(place)  # from the next centre, in which balls reach some eighth of all samples
+            near = np.flatnonzero(np.einsum("qi,qi->q", place, place) < (_CLOSE * radius / spacing) ** 2)
+            samples, cell, share = samples[near], cell[near], share[near]
+        pairs = tree.sparse_distance_matrix(KDTree(samples), radius, output_type="ndarray")
+        parts.append((share[pairs["j"]], cell[pairs["j"]], pairs["i"]))
+    shares, cells, targets = (np.concatenate(part) for part in zip(*parts, strict=True))
+    covered = scipy.sparse.coo_array((shares, (cells, targets)), shape=(mesh.num_cells, len(grid))).tocsc()
     inside = np.flatnonzero(covered.T @ measure > _INSIDE * _ball(radius, mesh.dimension))
     if inside.size == 0:
         raise ValueError(
@@ -152,8 +163,9 @@ def _cubic(low, high, middle, spacing: float) -> np.ndarray:
     return middle + spacing * np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def _samples(mesh: Mesh, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points (q, 2) spread evenly over every cell, about `spacing` apart, with their cells and their shares of these.
+def _samples(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Points (q, 2) spread evenly over every cell, about `spacing` apart, with their cells and their shares of these,
+    some cells after others.
 
     The centres of the upright triangles that n cuts along each side leave: barycentric (i + 1/3, j + 1/3, k + 1/3) / n
     with i + j + k = n - 1; of tetrahedra likewise.
@@ -164,16 +176,14 @@ def _samples(mesh: Mesh, spacing: float) -> tuple[np.ndarray, np.ndarray, np.nda
         [np.linalg.norm(corners[:, i] - corners[:, j], axis=1) for i, j in combinations(range(count), 2)], 0
     )
     cuts = np.maximum(np.ceil(longest / spacing), 1).astype(int)
-    points, owner, share = [], [], []
     for number in np.unique(cuts):
-        cells = np.flatnonzero(cuts == number)
         steps = np.stack(np.meshgrid(*[np.arange(number)] * (count - 1)), axis=-1).reshape(-1, count - 1)
         steps = steps[steps.sum(axis=1) < number]
         barycentric = (np.column_stack([steps, number - 1 - steps.sum(axis=1)]) + 1 / count) / number
-        points.append((barycentric @ corners[cells]).reshape(-1, corners.shape[2]))
-        owner.append(np.repeat(cells, len(barycentric)))
-        share.append(np.full(len(owner[-1]), 1 / len(barycentric)))
-    return np.concatenate(points), np.concatenate(owner), np.concatenate(share)
+        alike = np.flatnonzero(cuts == number)
+        for cells in np.array_split(alike, -(-alike.size * len(steps) // _AT_ONCE)):
+            samples = (barycentric @ corners[cells]).reshape(-1, corners.shape[2])
+            yield samples, np.repeat(cells, len(steps)), np.full(len(samples), 1 / len(steps))
 
 
 def _desired_images(mesh: Mesh, position, area, radius: float) -> scipy.sparse.csc_array:
