@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jeit.arguments import check_has_values
 from jeit.inverse.prior.bases import DenseBasis
-from jeit.inverse.prior.nodal import NodalSystem, Solve
+from jeit.inverse.prior.nodal import NodalSystem, Solve, by_columns
 from jeit.inverse.prior.priors import AbstractPrior, informed_shapes
 from jeit.mesh import Mesh, gradients, measures
 from jeit.mesh.geometry import facet_measures
@@ -112,8 +112,12 @@ class _Field(NamedTuple):
 
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
         """Γ times columns."""
-        within = self.scale[:, None] * (self.means.T @ columns)
-        return self.means @ (self.scale[:, None] * self.solve(self.mass[:, None] * self.solve(within)))
+
+        def some(part: Any) -> Any:
+            within = self.scale[:, None] * (self.means.T @ part)
+            return self.means @ (self.scale[:, None] * self.solve(self.mass[:, None] * self.solve(within)))
+
+        return by_columns(some, columns, len(columns))
 
     def shapes(self) -> Float[np.ndarray, "m n"]:
         """S with Γ = S Sᵀ."""

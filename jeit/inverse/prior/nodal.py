@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,13 +65,22 @@ def in_columns(
     """`solve` or `half_solve` of columns (n, k); of NumPy's some at a time, on every core."""
     if not isinstance(columns, np.ndarray):
         return how(plan, factor, columns)
-    found = np.empty((plan.size if how is solve else plan.num_pivots, columns.shape[1]), columns.dtype)
+    return by_columns(partial(how, plan, factor), columns, plan.size if how is solve else plan.num_pivots)
+
+
+def by_columns(function: Callable[[Any], Any], columns: Any, rows: int) -> Any:
+    """What `function` makes of columns (n, k) of NumPy's, (rows, k), some at a time on every core."""
+    number = columns.shape[1]
+    found = np.empty((rows, number), columns.dtype)
 
     def some(start: int) -> None:
         part = np.ascontiguousarray(columns[:, start : start + _AT_ONCE])
         with np.errstate(all="ignore"):  # NaN is told of elsewhere, and threads have error states of their own
-            found[:, start : start + _AT_ONCE] = how(plan, factor, part)
+            found[:, start : start + _AT_ONCE] = function(part)
 
+    if number <= _AT_ONCE:
+        some(0)
+        return found
     with ThreadPoolExecutor(min(number_of_cores(), _MOST_AT_ONCE)) as pool:
-        list(pool.map(some, range(0, columns.shape[1], _AT_ONCE)))
+        list(pool.map(some, range(0, number, _AT_ONCE)))
     return found

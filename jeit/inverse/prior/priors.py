@@ -24,7 +24,7 @@ from jeit.inverse.hyperparameter.defaults import RULE
 from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, Regions
 from jeit.inverse.prior.gridded import GriddedGaussian
 from jeit.inverse.prior.low_rank import pivoted_cholesky, traced_pivoted_cholesky
-from jeit.inverse.prior.nodal import NodalSystem
+from jeit.inverse.prior.nodal import NodalSystem, by_columns
 from jeit.inverse.prior.penalty import AbstractPenalty, QuadraticForm, Ridge
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geometry import interior_facets
@@ -289,7 +289,8 @@ def _between_nodes(mesh: Mesh, columns: Float[np.ndarray, "m k"], freedom: float
         diagonal[0] += 2
     values = np.full(system.pattern.num_entries, -2.0)
     values[: len(diagonal)] = diagonal
-    return system.means @ system.inverse(values)(system.means.T @ columns)
+    means, solved = system.means, system.inverse(values)
+    return by_columns(lambda part: means @ solved(means.T @ part), columns, mesh.num_cells)
 
 
 @jax.jit
