@@ -9,7 +9,10 @@ from benchmarks.harness.case import Case, Options, Result, Table, judged
 from benchmarks.harness.tables import duration
 from benchmarks.harness.timing import say
 
-LIMIT = 300.0
+LIMIT = 1200.0
+# Nodes beyond which a body is to be imaged, in whatever time and memory, and the images that are made of one.
+LARGE = 50_000
+AT_LARGE = ("one step, NOSER", "one step, Gaussian", "Gauss-Newton, Gaussian, with error bars")
 # A box of 0.17 × 0.255 × 0.17 m with plates of 8 × 8 cm, as published tanks have; a ball, noise of 0.1 % of the change.
 _SETUP = """
 import itertools, time
@@ -59,20 +62,22 @@ _MEMORY = 2048.0
 
 
 def run(options: Options) -> Result:
-    """Every image in a process of its own, mesh and model ready before the clock starts."""
-    nodes = options.nodes[0] if options.nodes else 1500 if options.quick else 20_000
+    """Every image in a process of its own, mesh and model ready before the clock starts; of large bodies some."""
     rows, checks, wrong = [], [], []
-    for name, (script, most) in JOBS.items():
-        text = _SETUP.replace("{nodes}", str(nodes)) + script + _DONE
-        done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=LIMIT)
-        if done.returncode:
-            wrong.append(f"{name}: {done.stderr.strip().splitlines()[-1]}")
-            continue
-        points, cells, seconds, memory = (float(one) for one in done.stdout.split()[-4:])
-        rows.append([name, f"{points:.0f}", f"{cells:.0f}", duration(seconds), f"{memory:.0f} MB"])
-        say(" | ".join(rows[-1]))
-        checks.append(judged(f"{name} ≤ {most:g} s, first call included", duration(seconds), seconds <= most))
-        checks.append(judged(f"{name} ≤ 2 GB", f"{memory:.0f} MB", memory <= _MEMORY))
+    for nodes in options.nodes or (1500 if options.quick else 20_000,):
+        for name in JOBS if nodes <= LARGE else AT_LARGE:
+            script, most = JOBS[name]
+            text = _SETUP.replace("{nodes}", str(nodes)) + script + _DONE
+            done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, timeout=LIMIT)
+            if done.returncode:
+                wrong.append(f"{name}, {nodes} nodes: {(done.stderr.strip().splitlines() or ['no answer'])[-1]}")
+                continue
+            points, cells, seconds, memory = (float(one) for one in done.stdout.split()[-4:])
+            rows.append([name, f"{points:.0f}", f"{cells:.0f}", duration(seconds), f"{memory:.0f} MB"])
+            say(" | ".join(rows[-1]))
+            if nodes <= LARGE:
+                checks.append(judged(f"{name} ≤ {most:g} s, first call included", duration(seconds), seconds <= most))
+                checks.append(judged(f"{name} ≤ 2 GB", f"{memory:.0f} MB", memory <= _MEMORY))
     heads = ["image of a box with 32 plates", "nodes", "cells", "first call", "peak memory"]
     return Result([Table(heads, rows)], checks, wrong=wrong)
 
