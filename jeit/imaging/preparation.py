@@ -19,7 +19,7 @@ from jeit.imaging.wiring import Wiring, find_wiring
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channel_weights import electrode_misfits
-from jeit.mesh import Body, Mesh, Solid
+from jeit.mesh import Body, Mesh, OwnMesh, Solid
 from jeit_solvers.engines import as_array
 
 # Nodes unless asked for, of a solid body and of a sheet.
@@ -218,11 +218,17 @@ def check_measurement(name: str, given: Measurement) -> None:
     check_kind(name, given, Measurement, "a Measurement, as of jeit.read(path)")
 
 
-def imaging_mesh(domain: Body, electrodes: AbstractElectrodes, num_points: int | None) -> Mesh:
-    """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep; None for
-    2,000 of a sheet, and 10,000 of a solid body."""
-    usual = SOLID_POINTS if isinstance(domain, Solid) else SHEET_POINTS
-    return body_mesh(domain, electrodes, usual if num_points is None else num_points)
+def imaging_mesh(
+    domain: Body, electrodes: AbstractElectrodes, num_points: int | None, *, usual: int | None = None
+) -> Mesh:
+    """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep.
+
+    None is for `usual`: unless given, 2,000 of a sheet, and 10,000 of a solid body. Raises `ValueError` for a number
+    beside a mesh of one's own.
+    """
+    if num_points is None and not isinstance(domain, OwnMesh):
+        num_points = usual or (SOLID_POINTS if isinstance(domain, Solid) else SHEET_POINTS)
+    return body_mesh(domain, electrodes, num_points)
 
 
 def default_contact(measurement: Measurement) -> str:
