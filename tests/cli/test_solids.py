@@ -95,3 +95,20 @@ def test_nodes_of_a_model(tmp_path):
         (tmp_path / "tank.toml").write_text(BODIES[body] + PROTOCOL)
         with pytest.raises(ValueError, match=said):
             load_description(tmp_path / "tank.toml").model("full.csv", num_points=number)
+
+
+SOLIDS = {
+    "box, width 100 mm, depth 80 mm, height 60 mm": "shape = 'box'\nwidth = 0.1\ndepth = 0.08\nheight = 0.06",
+    "cylinder, radius 50 mm, height 40 mm": "shape = 'cylinder'\nradius = 0.05\nheight = 0.04",
+    "rectangle, width 100 mm, height 80 mm": "shape = 'rectangle'\nwidth = 0.1\nheight = 0.08",
+    "polygon, thickness 10 mm": "shape = 'polygon'\nvertices = [[0, 0], [1, 0], [0, 1]]\nthickness = 0.01",
+}
+
+
+@pytest.mark.parametrize("told", SOLIDS)
+def test_info_tells_a_body_in_the_words_of_its_description(told, run, tmp_path):
+    (tmp_path / "full.toml").write_text(f"[geometry]\n{SOLIDS[told]}\n{PROTOCOL}number = 8\n")
+    np.savetxt(tmp_path / "full.csv", np.arange(1.0, 41)[None], delimiter=",")
+    status, out, error = run("info", tmp_path / "full.csv")
+    assert (status, error) == (0, "")
+    assert f" {told} " in " ".join(out.split()) + " "
