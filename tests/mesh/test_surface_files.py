@@ -98,6 +98,11 @@ def test_faults_of_files(tmp_path):
         (tmp_path / "bad.obj").write_text(corners + text)
         with pytest.raises(ValueError, match=match):
             read(tmp_path / "bad.obj")
+    (tmp_path / "bad.obj").write_text("v 0 0 0\n" * 6 + "f 1 2 3\nf 4 5 6\n")
+    with pytest.raises(
+        ValueError, match=r"no triangle in it has an area. All .* within 0 of \[0.0, 0.0, 0.0\].*scale="
+    ):
+        read(tmp_path / "bad.obj")
     for text, match in {
         "solid nothing\nendsolid nothing\n": "no triangles",
         "something else": "neither a text",
