@@ -15,6 +15,7 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
 from jeit.imaging.clock import Clock
+from jeit.imaging.exchanged_rows import told_exchanges
 from jeit.imaging.wiring import Wiring, find_wiring
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
@@ -133,7 +134,8 @@ def prepare_difference(
 
     Arguments as in `jeit.imaging.image_difference` and its settings; `clock` takes the time of each step. Raises
     `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`), that do not say where the electrodes
-    are, whose wiring is not as described (see `jeit.imaging.wiring`) unless `as_is`, or on which the calibration fails.
+    are, whose wiring is not as described (see `jeit.imaging.wiring`), or not its reference's, unless `as_is`, or on
+    which the calibration fails.
     """
     clock = Clock(None) if clock is None else clock
     with clock("check"):
@@ -142,6 +144,8 @@ def prepare_difference(
         domain, electrodes = body_of(one, base)
         both = np.asarray(one.mask)[0] & np.asarray(base.mask)[0]
         difference = as_array(np.where(both, np.asarray(one.voltages)[0] - np.asarray(base.voltages)[0], 0))
+        if not as_is and (exchanged := told_exchanges(one, base)):
+            raise ValueError(f"'{one.name}' does not fit its reference: {exchanged}")
     with clock("mesh"):
         model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
     with clock("wiring"):
