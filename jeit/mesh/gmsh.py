@@ -14,8 +14,10 @@ from jeit.mesh.files import read
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Domain
 
+CAD = (".step", ".stp", ".iges", ".igs", ".brep")
+"""Files of geometry without cells, by the ends of their names."""
 # Of these Gmsh reads the geometry, whatever is in the file; all else it takes for a script.
-_PLAIN = (".step", ".stp", ".iges", ".igs", ".brep", ".stl")
+_PLAIN = (*CAD, ".stl")
 
 
 def from_gmsh(
