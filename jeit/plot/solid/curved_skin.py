@@ -66,7 +66,15 @@ def plot_curved_skin(
         ax.plot(*camera.on_page(seen).T, "o", color=colour, markersize=5, markeredgecolor="white", label=name, zorder=5)
     bare_in_space(ax, camera, points, numbered=False)
     if marks:
-        ax.legend(loc="lower center", ncols=len(marks), frameon=False, labelcolor=INK, borderaxespad=0)
+        # Under the axes: in them are the arrows that say where x, y and z point.
+        ax.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.5, 0.0),
+            ncols=len(marks),
+            frameon=False,
+            labelcolor=INK,
+            borderaxespad=0,
+        )
     if title is not None:
         ax.set_title(title)
     if fitted is not None:
