@@ -390,3 +390,15 @@ def test_the_legend_of_a_curved_skin_is_clear_of_the_axes_letters(ax):
         letters = [one for one in ax.texts if one.get_text() in ("x", "y", "z")]
         assert len(letters) == 3
         assert not any(legend.overlaps(one.get_window_extent()) for one in letters)
+
+
+def test_marks_above_a_curved_skin_are_drawn_on_it(ax):
+    layout = SurfaceLayout.spread(tube(0.03, 0.12, num_points=400), 6, 8e-3)
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    above = np.stack([0.04 * np.cos(angle), 0.04 * np.sin(angle), np.full(12, 0.06)], axis=1)
+    plot_curved_skin(layout, marks={"touched": above}, camera=Camera(0, 0), ax=ax)
+    (drawn,) = (one for one in ax.lines if one.get_label() == "touched")
+    across = np.asarray(drawn.get_xdata())
+    assert np.abs(across).max() <= 0.0301
+    # Of the two on the silhouette, either side's edge may be seen; the five behind it are not.
+    assert 5 <= len(across) <= 7
