@@ -139,5 +139,8 @@ def test_cad_files_through_gmsh(tmp_path):
     solid = from_gmsh(tmp_path / "part.step", cell_size=10, scale=1e-3)
     assert solid.dimension == 3
     assert float(measures(surface_of(solid)).sum()) == pytest.approx(whole, rel=0.02)
+    (tmp_path / "broken.step").write_text("ISO-10303-21;")
+    with pytest.raises(ValueError, match=r"could not mesh the geometry: Could not read file 'broken\.step'"):
+        from_gmsh(tmp_path / "broken.step", dimension=2)
     write(cap(0.05, 1.0, num_points=200), tmp_path / "cap.stl")
     assert from_gmsh(tmp_path / "cap.stl").is_surface
