@@ -113,10 +113,12 @@ class Description:
             return "mean-removed", None
         return section.measurement, section.reference
 
-    def model(self, path: str | Path, *, num_points: int) -> ForwardModel:
-        """A model, on a new mesh of about `num_points` nodes, of what the file at `path` was measured on.
+    def model(self, path: str | Path, *, num_points: int | None = None) -> ForwardModel:
+        """A model of what the file at `path` was measured on: on a new mesh of about `num_points` nodes, or, without
+        them, on a mesh of one's own.
 
-        Raises `ValueError` where geometry, electrodes or protocol are not described.
+        Raises `ValueError` where geometry, electrodes or protocol are not described, and for `num_points` where it is
+        missing or has no effect.
         """
         domain, electrodes, protocol = self.domain, self.electrodes, self.protocol(path)
         if domain is None or electrodes is None or protocol is None:

@@ -5,7 +5,7 @@ from jaxtyping import Float
 
 from jeit.electrodes.electrodes import AbstractElectrodes
 from jeit.electrodes.patches import FacePatches
-from jeit.mesh import Body, Mesh, Rectangle, Solid
+from jeit.mesh import Body, Mesh, OwnMesh, Rectangle, Solid
 from jeit.mesh.graded import graded_box, graded_layers
 
 # How far from a face a position may be and yet lie on it, relative to the body's size; as a check of electrodes has it.
@@ -14,9 +14,21 @@ _ON = 1e-3
 _ROUND = 16
 
 
-def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int) -> Mesh:
+def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None = None) -> Mesh:
     """A mesh of about `num_points` nodes, finer where electrodes are, their edges in faces of its cells where they are
-    rectangles on a box, or on the wall of a cylinder."""
+    rectangles on a box, or on the wall of a cylinder; of a body that comes as a mesh, that. Raises `ValueError` where
+    `num_points` is missing, and where it has no effect."""
+    if isinstance(body, OwnMesh):
+        if num_points is not None:
+            raise ValueError(
+                f"num_points has no effect: the body is a mesh of your own, of {body.given.num_points} nodes, and is "
+                "taken as it is; leave it out, or give a finer or coarser mesh."
+            )
+        return body.given
+    if num_points is None:
+        raise ValueError(
+            "num_points is missing: give about how many nodes the mesh is to have, such as 2000, or 10000 of a solid."
+        )
     if not (isinstance(body, Solid) and isinstance(electrodes, FacePatches)):
         return body.mesh(num_points=num_points, refine=electrodes.refinement(body) or None)
     outline, height = body.outline, float(body.thickness)

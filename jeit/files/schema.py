@@ -159,7 +159,7 @@ class Number:
             if not (self.low <= 1000 * given <= self.high if larger else self.low <= given / 1000 <= self.high):
                 continue
             if self.unit == "m":
-                return "" if larger else f" {IN_MILLIMETRES.capitalize()}"
+                return "" if larger else f" {given:g} mm are {given / 1000:g} m. {IN_MILLIMETRES.capitalize()}"
             other = f"in {metric}" if self.unit == "mm" else "off by a factor of 1000"
             return f" Is it {other}? Then write {1000 * given if larger else given / 1000:g}."
         return ""

@@ -15,11 +15,12 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
 from jeit.imaging.clock import Clock
+from jeit.imaging.exchanged_rows import told_exchanges
 from jeit.imaging.wiring import Wiring, find_wiring
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channel_weights import electrode_misfits
-from jeit.mesh import Body, Mesh, Solid
+from jeit.mesh import Body, Mesh, OwnMesh, Solid
 from jeit_solvers.engines import as_array
 
 # Nodes unless asked for, of a solid body and of a sheet.
@@ -133,7 +134,8 @@ def prepare_difference(
 
     Arguments as in `jeit.imaging.image_difference` and its settings; `clock` takes the time of each step. Raises
     `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`), that do not say where the electrodes
-    are, whose wiring is not as described (see `jeit.imaging.wiring`) unless `as_is`, or on which the calibration fails.
+    are, whose wiring is not as described (see `jeit.imaging.wiring`), or not its reference's, unless `as_is`, or on
+    which the calibration fails.
     """
     clock = Clock(None) if clock is None else clock
     with clock("check"):
@@ -142,6 +144,8 @@ def prepare_difference(
         domain, electrodes = body_of(one, base)
         both = np.asarray(one.mask)[0] & np.asarray(base.mask)[0]
         difference = as_array(np.where(both, np.asarray(one.voltages)[0] - np.asarray(base.voltages)[0], 0))
+        if not as_is and (exchanged := told_exchanges(one, base)):
+            raise ValueError(f"'{one.name}' does not fit its reference: {exchanged}")
     with clock("mesh"):
         model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
     with clock("wiring"):
@@ -218,11 +222,17 @@ def check_measurement(name: str, given: Measurement) -> None:
     check_kind(name, given, Measurement, "a Measurement, as of jeit.read(path)")
 
 
-def imaging_mesh(domain: Body, electrodes: AbstractElectrodes, num_points: int | None) -> Mesh:
-    """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep; None for
-    2,000 of a sheet, and 10,000 of a solid body."""
-    usual = SOLID_POINTS if isinstance(domain, Solid) else SHEET_POINTS
-    return body_mesh(domain, electrodes, usual if num_points is None else num_points)
+def imaging_mesh(
+    domain: Body, electrodes: AbstractElectrodes, num_points: int | None, *, usual: int | None = None
+) -> Mesh:
+    """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep.
+
+    None is for `usual`: unless given, 2,000 of a sheet, and 10,000 of a solid body. Raises `ValueError` for a number
+    beside a mesh of one's own.
+    """
+    if num_points is None and not isinstance(domain, OwnMesh):
+        num_points = usual or (SOLID_POINTS if isinstance(domain, Solid) else SHEET_POINTS)
+    return body_mesh(domain, electrodes, num_points)
 
 
 def default_contact(measurement: Measurement) -> str:

@@ -1,7 +1,7 @@
 """Every frame of a measurement against one reference, in one factorisation: a series of linear images."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool
@@ -21,6 +21,7 @@ from jeit.imaging.preparation import (
 )
 from jeit.imaging.settings import AUTO, ImagingSettings, as_settings
 from jeit.inverse.linear.one_step import LinearReconstruction
+from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array
 
 # Frames that are imaged at once, and bytes of a number that is kept.
@@ -32,12 +33,14 @@ _MOST_FRAMES = 0.5
 @dataclass(frozen=True)
 class ImagedSequence:
     """What `image_sequence` found: the `series` of images; `prepared`, how the body was modelled; the `reconstruction`
-    matrix that made all of them; `refused` (F,), True for frames that lack channels and have no image."""
+    matrix that made all of them; `refused` (F,), True for frames that lack channels and have no image; `regions`, (m,)
+    True for the cells of each that was asked for, by name."""
 
     series: ImageSeries
     prepared: PreparedDifference
     reconstruction: LinearReconstruction
     refused: Bool[np.ndarray, " F"]
+    regions: Mapping[str, Bool[np.ndarray, " m"]] = field(default_factory=dict)
 
 
 def image_sequence(
@@ -45,6 +48,7 @@ def image_sequence(
     reference: Measurement | None = None,
     settings: ImagingSettings | None = None,
     *,
+    regions: Mapping[str, Callable[[Mesh], Bool[np.ndarray, " m"]]] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ImagedSequence:
     """Image every frame of a measurement that has times, with one linear method and one λ.
@@ -52,6 +56,8 @@ def image_sequence(
     - `reference`: the undisturbed body; unless given a frame named "reference", or else the mean over all frames: then
       images are changes about what the body is like on average.
     - `settings`: of a linear method, one-step unless given. λ is chosen for the frame that differs most.
+    - `regions`: of interest, by name, each a function of the mesh, such as
+      `lambda mesh: jeit.image.ball_region(mesh, (0, 0), 0.01)`; called before any image, so that what they raise is.
 
     Channels that fewer than half of the frames have are left out of all; frames that lack another are refused. The
     images take four bytes a cell and frame. Raises `ValueError` as `image_difference`, for a measurement without times
@@ -91,6 +97,7 @@ def image_sequence(
         as_is=settings.as_is,
         clock=clock,
     )
+    chosen = {name: region(prepared.mesh) for name, region in (regions or {}).items()}
     number, cells = measurement.num_frames, prepared.mesh.num_cells
     check_memory(f"the images of '{measurement.name}', {number} frames,", float(_KEPT * number * cells))
     with clock("image"):
@@ -107,4 +114,4 @@ def image_sequence(
             changes[some] = np.asarray(found.image(difference))
     background = float(np.real(prepared.calibration.conductivity))
     series = ImageSeries(prepared.mesh, changes, np.asarray(measurement.times), background)
-    return ImagedSequence(series, prepared, found, refused)
+    return ImagedSequence(series, prepared, found, refused, chosen)

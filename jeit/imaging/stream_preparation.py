@@ -29,6 +29,9 @@ from jeit.inverse.nonlinear.solvers import AbstractSolver, as_solver
 from jeit.inverse.prior.defaults import MEASURED
 from jeit.inverse.streaming.imager import check_memory
 
+# Of the mesh of a body that is not one itself, unless another number is given.
+STREAM_POINTS = 1200
+
 
 @dataclass(frozen=True)
 class StreamSettings:
@@ -40,7 +43,7 @@ class StreamSettings:
     - `prior`: a name in `jeit.inverse.prior.defaults.PRIORS`, or a quadratic prior.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; "noise-figure" unless given.
     - `memory`: frames over which an image changes, see `jeit.inverse.Imager`; 0 takes every frame alone.
-    - `contact`, `num_points`, `as_is`: as in `jeit.imaging.ImagingSettings`.
+    - `contact`, `num_points` (1,200 unless given), `as_is`: as in `jeit.imaging.ImagingSettings`.
 
     Raises `ValueError` for a solver that does not image frames, a prior that there is not, a memory that is no number
     of frames, and as `jeit.imaging.ImagingSettings`.
@@ -52,7 +55,7 @@ class StreamSettings:
     hyperparameter: float | str | None = None
     memory: float = 0.0
     contact: str | None = None
-    num_points: int = 1200
+    num_points: int | None = None
     as_is: bool = False
 
     def __post_init__(self):
@@ -88,7 +91,8 @@ def prepare_imager(
     domain, electrodes = body_of(measured, base)
     clock = Clock(progress)
     with clock("mesh"):
-        model = ForwardModel(imaging_mesh(domain, electrodes, settings.num_points), electrodes, base.protocol)
+        mesh = imaging_mesh(domain, electrodes, settings.num_points, usual=STREAM_POINTS)
+        model = ForwardModel(mesh, electrodes, base.protocol)
     with clock("wiring"):
         check_wiring(find_wiring(model, base), base, settings.as_is)
     calibration, _ = calibrated_model(model, base, contact=settings.contact, clock=clock)

@@ -14,8 +14,10 @@ from jeit.mesh.files import read
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Domain
 
+CAD = (".step", ".stp", ".iges", ".igs", ".brep")
+"""Files of geometry without cells, by the ends of their names."""
 # Of these Gmsh reads the geometry, whatever is in the file; all else it takes for a script.
-_PLAIN = (".step", ".stp", ".iges", ".igs", ".brep", ".stl")
+_PLAIN = (*CAD, ".stl")
 
 
 def from_gmsh(
@@ -58,13 +60,15 @@ def from_gmsh(
         gmsh.initialize(interruptible=False)
     quiet = gmsh.option.getNumber("General.Terminal")
     gmsh.option.setNumber("General.Terminal", 0)
+    name = str(source)
     try:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "mesh.msh"
             if isinstance(source, (str, Path)) and not scripts:
                 # Beside it there may be options, which Gmsh opens with it, and they are a script.
+                name = Path(source).name
                 source = shutil.copy(str(source), Path(folder) / f"geometry{Path(source).suffix.lower()}")
-            _write(gmsh, source, cell_size, dimension, path)
+            _write(gmsh, source, cell_size, dimension, path, name)
             return read(path, scale=scale)
     finally:
         gmsh.option.setNumber("General.Terminal", quiet)
@@ -84,8 +88,14 @@ def _import() -> ModuleType:
 
 
 def _write(
-    gmsh: ModuleType, source: str | Path | Domain | None, cell_size: float | None, dimension: int | None, path: Path
+    gmsh: ModuleType,
+    source: str | Path | Domain | None,
+    cell_size: float | None,
+    dimension: int | None,
+    path: Path,
+    name: str,
 ) -> None:
+    """To `path`; what is said of the geometry calls it `name`."""
     try:
         if isinstance(source, (str, Path)):
             gmsh.open(str(source))
@@ -109,7 +119,8 @@ def _write(
         if added:
             gmsh.model.removePhysicalGroups(added)
     except Exception as error:
-        raise ValueError(f"source: Gmsh could not mesh the geometry: {str(error)[:80]}.") from error
+        said = str(error).replace(str(source), name[:40]).rstrip(".")[:80]
+        raise ValueError(f"source: Gmsh could not mesh the geometry: {said}.") from error
 
 
 class _Kernel:

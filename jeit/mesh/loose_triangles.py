@@ -42,7 +42,14 @@ def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(f"path: {name} does not work as a mesh file: a coordinate is no finite number.")
     used, number = np.unique(cells, return_inverse=True)
     points, cells = points[used], number.reshape(cells.shape)
-    return merged(points, cells, _SEAM * float(np.abs(points).max()))
+    size, place = float(np.ptp(points, axis=0).max()), points[0].tolist()
+    points, cells = merged(points, cells, _SEAM * float(np.abs(points).max()))
+    if not len(cells):
+        raise ValueError(
+            f"path: {name} does not work as a mesh file: no triangle in it has an area. All that it holds lies within "
+            f"{size:.3g} of {place}. Were its digits lost? Write it again, in millimetres, and read it with scale=1e-3."
+        )
+    return points, cells
 
 
 def _stl(content: bytes) -> tuple[np.ndarray, np.ndarray]:

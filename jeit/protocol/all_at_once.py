@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
+from jeit.arguments import counted
 from jeit.protocol._check import check_amplitude, check_count, check_current
 from jeit.protocol.matrices import from_matrices
 from jeit.protocol.pairs import Current
@@ -153,6 +154,11 @@ def _sorted(found) -> tuple[np.ndarray, np.ndarray]:
 
 def _checked(name: str, given: ArrayLike) -> np.ndarray:
     matrix = np.asarray(given)
+    if matrix.ndim == 3 and matrix.shape[1] == matrix.shape[2]:
+        raise ValueError(
+            f"{name} has shape {matrix.shape}, of {counted(len(matrix), 'frame')}; give one, (L, L): {name}[0] of the "
+            "first, or their mean over axis 0."
+        )
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1] or len(matrix) < 2 or matrix.dtype.kind not in "fiu":
         raise ValueError(f"{name} has shape {matrix.shape} of {matrix.dtype}; give real ohms, one row per electrode.")
     if not np.isfinite(matrix).all():

@@ -47,7 +47,7 @@ def _wiring(measurement: Measurement) -> str | None:
     if domain is None or electrodes is None:
         return None
     _, reference = measurement.split_reference() if "reference" in measurement.frame_names else (None, measurement)
-    model = ForwardModel(imaging_mesh(domain, electrodes, _NODES), electrodes, measurement.protocol)
+    model = ForwardModel(imaging_mesh(domain, electrodes, None, usual=_NODES), electrodes, measurement.protocol)
     found, broken = find_wiring(model, reference), reciprocity_error(reference)
     if broken is not None and broken > MOST_DIFFERENCE_RECIPROCITY_ERROR and not found.told:
         return (

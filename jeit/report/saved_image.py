@@ -13,7 +13,16 @@ from jeit.files import need, npz_arrays
 from jeit.image import Inclusion
 from jeit.mesh import Mesh
 
-_OTHERWISE = "not an image that jeit wrote; give the image.npz of jeit reconstruct"
+_GIVE = "give the image.npz that jeit reconstruct writes"
+# What a file is instead of an image, by the end of its name.
+_OTHERS = {
+    "a table of data, which is to be imaged first": (".csv", ".txt", ".mat", ".eit", ".get", ".npy"),
+    "a picture, which any viewer shows": (".png", ".gif", ".mp4", ".jpg", ".jpeg", ".svg", ".pdf"),
+    "a file for ParaView": (".vtu", ".vtk", ".xdmf", ".pvd"),
+    "a mesh": (".msh", ".stl", ".obj", ".step", ".stp"),
+    "a description": (".toml",),
+    "a report": (".json", ".html"),
+}
 _NEEDED = ("conductivity", "points", "cells")
 _KEPT = (
     *_NEEDED,
@@ -79,7 +88,10 @@ def read_image(path: str | Path) -> SavedImage:
     if path.is_dir():
         raise ValueError(f"{name} is a folder; give the image.npz in it.")
     try:
-        arrays = npz_arrays(path, *_KEPT, otherwise=_OTHERWISE)
+        with path.open("rb") as file:
+            if file.read(2) != b"PK":
+                raise ValueError(f"not an image that jeit wrote{_instead(path)}; {_GIVE}.")
+        arrays = npz_arrays(path, *_KEPT)
         _check_kind(arrays)
         need(arrays, *_NEEDED)
         if arrays["points"].dtype.kind not in "fiu":
@@ -93,8 +105,16 @@ def read_image(path: str | Path) -> SavedImage:
 def _check_kind(arrays: dict[str, np.ndarray]) -> None:
     """Other files of jeit's that hold arrays: which command is for them."""
     held = set(arrays[""].tolist())
-    if "images" in held or "depth" in held:
+    if held & {"images", "depth", "functional"}:
         raise ValueError("it holds many frames; give the image.npz of one, of jeit reconstruct.")
+    if not held & {*_NEEDED}:
+        few = ", ".join(name[:40] for name in sorted(held)[:6])
+        raise ValueError(f"it holds {few or 'nothing'}, and no image; {_GIVE}.")
+
+
+def _instead(path: Path) -> str:
+    kind = next((kind for kind, ends in _OTHERS.items() if path.suffix.lower() in ends), None)
+    return "" if kind is None else f", but {kind}"
 
 
 def _image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:

@@ -12,6 +12,7 @@ from jeit.arguments import counted
 from jeit.cli.console import in_one_unit
 from jeit.data import read, write_table
 from jeit.imaging import StreamSettings
+from jeit.imaging.stream_preparation import STREAM_POINTS
 from jeit.inverse.streaming.imager import FRAME_STEPS
 
 FEW = ("--num-points", 250)
@@ -180,7 +181,7 @@ def test_the_help_of_a_stream_tells_the_defaults(run):
     settings = StreamSettings()
     told = " ".join(run("stream", "--help")[1].replace("│", " ").split())
     assert f"{settings.solver.name} (default)" in told
-    assert f"(default {settings.num_points})" in told
+    assert f"(default {STREAM_POINTS})" in told
     assert f"{settings.memory:g} (default)" in told
     assert f"(default {FRAME_STEPS})" in told
 

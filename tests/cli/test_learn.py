@@ -48,6 +48,18 @@ def test_a_described_skin(tmp_path):
     assert read_described_skin(tmp_path / "layer.toml").num_layers == 3
 
 
+def test_curved_skins_are_refused_before_a_folder_is_made(run, tmp_path):
+    surface = "[surface]\nkind = 'tube'\nradius_mm = 30\nheight_mm = 80\n"
+    (tmp_path / "arm.toml").write_text(
+        f"{surface}[electrodes]\nlayout = 'inner-8'\ndiameter_mm = 8\n[mesh]\ncell_mm = 12"
+    )
+    status, _, error = run("learn", "image", tmp_path / "arm.toml", "--output", tmp_path / "model")
+    assert status == 1
+    assert "networks image flat skins" in error
+    assert "in place of the table [surface]" in error
+    assert not (tmp_path / "model").exists()
+
+
 def test_no_such_preset(run, tmp_path):
     (tmp_path / "skin.toml").write_text(SKIN)
     status, _, error = run("learn", "image", tmp_path / "skin.toml", "--output", tmp_path / "m", "--preset", "slow")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jeit.cli import main
+from jeit.cli.console import Steps
 from jeit.data import load_description
 
 DESCRIBED = """
@@ -87,3 +88,17 @@ def test_what_no_mesh_is_needed_for_is_refused_before_it(recording, tmp_path, ca
     assert main(["series", "frames.csv", "-o", str(tmp_path / "out"), *options]) == 1
     told = capsys.readouterr()
     assert "mesh" not in told.out + told.err
+
+
+@pytest.mark.parametrize("region", ["ball:1,2,0.1", "ball:0,0,0,0.1"])
+def test_a_region_that_is_none_of_the_mesh_is_refused_before_any_image(
+    recording, tmp_path, capsys, monkeypatch, region
+):
+    begun, told = [], Steps.__call__
+    monkeypatch.setattr(Steps, "__call__", lambda self, name: (begun.append(name), told(self, name)))
+    monkeypatch.chdir(recording)
+    output = ["-o", str(tmp_path / "out"), "--num-points", "300"]
+    assert main(["series", "frames.csv", *output, "--region", "half:1,0", "--region", region]) == 1
+    assert "--region" in capsys.readouterr().err
+    assert "mesh" in begun
+    assert "image" not in begun

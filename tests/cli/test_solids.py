@@ -37,18 +37,22 @@ positions = {[[0.049 * float(f(k)) for f in (np.cos, np.sin)] for k in np.arange
 }
 
 
+NODES = {"solid": {"num_points": 4000}, "mesh": {}}
+
+
 @pytest.mark.parametrize("body", BODIES)
 def test_from_description_to_picture(body, run, tmp_path):
     write(Disk(0.05).mesh(num_points=400), tmp_path / "tank.vtu")
     (tmp_path / "full.toml").write_text(BODIES[body] + PROTOCOL)
-    model = load_description(tmp_path / "full.toml").model(tmp_path / "full.csv", num_points=4000)
+    model = load_description(tmp_path / "full.toml").model(tmp_path / "full.csv", **NODES[body])
     where = np.asarray(centroids(model.mesh)) - np.array([0.02, 0.0, 0.02])[: model.mesh.dimension]
     for name, change in (("empty", 1.0), ("full", 3.0)):
         conductivity = np.where(np.linalg.norm(where, axis=1) < 0.012, change, 1.0)
         np.savetxt(tmp_path / f"{name}.csv", np.asarray(model.voltages(conductivity))[None], delimiter=",")
     status, told, error = run(
         "reconstruct", tmp_path / "full.csv", "--reference", tmp_path / "empty.csv",
-        "--description", tmp_path / "full.toml", "--output", tmp_path / "out", "--num-points", 1200,
+        "--description", tmp_path / "full.toml", "--output", tmp_path / "out",
+        *(["--num-points", 1200] if NODES[body] else []),
     )  # fmt: skip
     assert (status, error) == (0, "")
     assert ("volume / cm³" in told) == (body == "solid")
@@ -67,3 +71,44 @@ def test_from_description_to_picture(body, run, tmp_path):
         assert report["geometry"]["thickness"] == 0.04
     else:
         assert report["geometry"]["mesh"]["points"] == model.mesh.num_points
+
+
+@pytest.mark.parametrize("command", [["reconstruct"], ["stream"], ["choose"]])
+def test_nodes_of_a_mesh_that_is_there_are_refused(command, run, tmp_path):
+    write(Disk(0.05).mesh(num_points=400), tmp_path / "tank.vtu")
+    (tmp_path / "full.toml").write_text(BODIES["mesh"] + PROTOCOL)
+    model = load_description(tmp_path / "full.toml").model(tmp_path / "full.csv")
+    np.savetxt(tmp_path / "full.csv", np.asarray(model.voltages(1.0))[None], delimiter=",")
+    status, _, error = run(
+        *command, tmp_path / "full.csv", "--reference", tmp_path / "full.csv", "--description", tmp_path / "full.toml",
+        "--output", tmp_path / "out", "--num-points", 1200,
+    )  # fmt: skip
+    assert status == 1
+    nodes = model.mesh.num_points
+    assert f"--num-points has no effect: the body is a mesh of your own, of {nodes} nodes" in " ".join(error.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_nodes_of_a_model(tmp_path):
+    write(Disk(0.05).mesh(num_points=400), tmp_path / "tank.vtu")
+    for body, number, said in (("mesh", 400, "num_points has no effect"), ("solid", None, "num_points is missing")):
+        (tmp_path / "tank.toml").write_text(BODIES[body] + PROTOCOL)
+        with pytest.raises(ValueError, match=said):
+            load_description(tmp_path / "tank.toml").model("full.csv", num_points=number)
+
+
+SOLIDS = {
+    "box, width 100 mm, depth 80 mm, height 60 mm": "shape = 'box'\nwidth = 0.1\ndepth = 0.08\nheight = 0.06",
+    "cylinder, radius 50 mm, height 40 mm": "shape = 'cylinder'\nradius = 0.05\nheight = 0.04",
+    "rectangle, width 100 mm, height 80 mm": "shape = 'rectangle'\nwidth = 0.1\nheight = 0.08",
+    "polygon, thickness 10 mm": "shape = 'polygon'\nvertices = [[0, 0], [1, 0], [0, 1]]\nthickness = 0.01",
+}
+
+
+@pytest.mark.parametrize("told", SOLIDS)
+def test_info_tells_a_body_in_the_words_of_its_description(told, run, tmp_path):
+    (tmp_path / "full.toml").write_text(f"[geometry]\n{SOLIDS[told]}\n{PROTOCOL}number = 8\n")
+    np.savetxt(tmp_path / "full.csv", np.arange(1.0, 41)[None], delimiter=",")
+    status, out, error = run("info", tmp_path / "full.csv")
+    assert (status, error) == (0, "")
+    assert f" {told} " in " ".join(out.split()) + " "

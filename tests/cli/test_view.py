@@ -123,5 +123,19 @@ def test_files_that_are_none(run, tmp_path):
         status, _, error = run("view", tmp_path / name)
         assert status == 1
         assert said in error
+    others = {
+        "frames.csv": "a table of data, which is to be imaged first",
+        "image.vtu": "a file for ParaView",
+        "image.PNG": "a picture, which any viewer shows",
+        "tank.toml": "a description",
+    }
+    for name, kind in others.items():
+        (tmp_path / name).write_text("1, 2, 3")
+        said = f"{name}: not an image that jeit wrote, but {kind}; give the image.npz that jeit reconstruct writes.\n"
+        assert run("view", tmp_path / name)[2].endswith(said)
+    np.savez(tmp_path / "frames.npz", voltages=np.ones((3, 4)))
+    assert "it holds voltages, and no image" in run("view", tmp_path / "frames.npz")[2]
+    np.savez(tmp_path / "series.npz", changes=np.ones((3, 4)), functional=np.ones(4), points=1, cells=1)
+    assert "it holds many frames; give the image.npz of one" in run("view", tmp_path / "series.npz")[2]
     flat = save(tmp_path / "flat.npz", disk(0.05, num_points=60), np.zeros(disk(0.05, num_points=60).num_cells))
     assert "planes cut solids" in run("view", flat, "-o", tmp_path / "out", "--plane-mm", "z=1")[2]

@@ -118,7 +118,7 @@ WRONG = {
     "millimetres": (
         {"shape": "disk", "radius": 1500},
         RING,
-        r"geometry\.radius is 1500, and must be .* m\. Were millimetres given for metres\?$",
+        r"geometry\.radius is 1500, and must be .* m\. 1500 mm are 1\.5 m\. Were millimetres given for metres\?$",
     ),
     "all at once": (
         {"shape": "disk", "radius": "0.1", "centre": [0, True]},
@@ -193,3 +193,8 @@ def test_a_plain_mesh_is_a_body_and_a_path_is_none():
     electrodes = BoundaryElectrodes(ring(0.05, 8), 0.005, 0.1)
     with pytest.raises(ValueError, match=r"domain must be an outline such as Disk\(0.05\), a Solid, or a Mesh"):
         screen(np.arange(40.0) + 1, adjacent(8), electrodes=electrodes, domain="tank.msh")
+
+
+def test_a_radius_in_millimetres_is_told_in_metres():
+    with pytest.warns(UserWarning, match=r"^radius: 150 is read as 150 m, .* If it is millimetres, give 0\.15 "):
+        described({"shape": "disk", "radius": 150}, {"kind": "point", "positions": [[0, 150]]})

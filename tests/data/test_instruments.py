@@ -237,7 +237,7 @@ FAULTS = {
     "sciospec, an electrode that is none": (text("1 4\n", "1 9\n"), "electrode 9"),
     "sciospec, words": (text("1 4\n", "one four\n"), "is not numbers"),
     "sciospec, no current": (text("0.001\n", "0\n"), "positive"),
-    "sciospec, a pair of one": (text("1 4\n", "1 1\n"), "sums to"),
+    "sciospec, a pair of one": (text("1 4\n", "1 1\n"), "line 19: current enters and leaves at electrode 1;"),
 }
 
 

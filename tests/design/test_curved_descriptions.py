@@ -1,5 +1,8 @@
 """Curved skins from TOML files, described and swept: as of Python, and what is refused before anything runs."""
 
+import importlib.util
+import sys
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -8,7 +11,7 @@ from jeit.design import Skin, read_described_skin, touch_grid
 from jeit.design.study import open_results, read_study, run_study
 from jeit.design.study.batch import check_points
 from jeit.layout import SurfaceLayout, read_surface_layout, write_layout
-from jeit.mesh import forearm, sphere, tube, write
+from jeit.mesh import forearm, measures, sphere, tube, write
 from jeit.mesh.geodesic import Triangles
 from jeit.report.study.pictures import draw_maps
 
@@ -86,6 +89,39 @@ def test_a_scan_is_read_in_its_unit_with_its_own_cells(described, tmp_path):
     assert cell == pytest.approx(np.linalg.norm(np.diff(edges, axis=1), axis=-1).mean(), rel=0.2)
     write(forearm(0.12, (0.03, 0.02), 0.046, num_points=400), tmp_path / "arm.stl")
     assert described(text.replace("layout =", "layouts ="), read_study) != study
+
+
+STEP = 'file = "part.STEP"\nunit = "mm"'
+
+
+@pytest.mark.skipif(importlib.util.find_spec("gmsh") is None, reason='needs the extra "mesh" (the gmsh package)')
+def test_a_cad_file_is_meshed_in_cells_of_the_table(described, tmp_path):
+    import gmsh
+
+    gmsh.initialize(interruptible=False)
+    gmsh.option.setNumber("General.Terminal", 0)
+    gmsh.model.add("part")
+    gmsh.model.occ.addCylinder(0, 0, 0, 0, 0, 80, 30)
+    gmsh.model.occ.synchronize()
+    gmsh.write(str(tmp_path / "part.step"))
+    gmsh.finalize()
+    (tmp_path / "part.step").rename(tmp_path / "part.STEP")
+    text = SKIN.replace(TUBE, STEP)
+    coarse, fine = (described(text.replace("cell_mm = 8", f"cell_mm = {size}")).model.mesh for size in (10, 6))
+    assert coarse.is_surface
+    assert fine.num_cells > 2 * coarse.num_cells
+    assert float(np.sum(measures(fine))) == pytest.approx(2 * np.pi * 0.03 * (0.08 + 0.03), rel=0.02)
+    study = described(text.replace("layout =", "layouts =").replace("cell_mm = 8", "cell_mm = [6, 10]"), read_study)
+    assert {point.cell_size for point in study.points} == {6e-3, 10e-3}
+
+
+@pytest.mark.parametrize("kind", ["layout", "layouts"])
+def test_a_cad_file_without_gmsh_says_what_to_install(described, tmp_path, monkeypatch, kind):
+    (tmp_path / "part.STEP").write_text("ISO-10303-21;")
+    monkeypatch.setitem(sys.modules, "gmsh", None)
+    read = read_described_skin if kind == "layout" else read_study
+    with pytest.raises(ImportError, match=r'pip install "jeit\[mesh\]"'):
+        described(SKIN.replace(TUBE, STEP).replace("layout =", f"{kind} ="), read)
 
 
 def test_electrodes_by_position(described, tmp_path):

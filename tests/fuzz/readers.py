@@ -36,7 +36,7 @@ from jeit.design.study import read_study, run_study, study_progress
 from jeit.electrodes import FaceDiscs
 from jeit.image import Inclusion
 from jeit.layout import named_layout, read_layout, write_layout
-from jeit.mesh import Disk, Rectangle, box
+from jeit.mesh import Disk, Rectangle, box, tube
 from jeit.mesh import read as read_mesh
 from jeit.mesh import write as write_mesh
 from jeit.report import read_image
@@ -67,6 +67,7 @@ class Reader:
 
 
 READERS: dict[str, Reader] = {}
+_ARM = tube(0.02, 0.05, num_points=60)
 
 
 @cache
@@ -277,6 +278,59 @@ def _study(folder):
 @_reader("skin", "a.toml", read_described_skin)
 def _skin(folder):
     (folder / "a.toml").write_text(SKIN)
+
+
+CURVED = """[skin]
+thickness_mm = 5
+[surface]
+kind = "forearm"
+length_mm = 80
+wrist_mm = [20, 15]
+elbow_mm = 30
+outward = true
+[electrodes]
+layout = "inner-8"
+diameter_mm = 6
+[mesh]
+cell_mm = 12
+"""
+SCANNED = """[surface]
+file = "arm.obj"
+unit = "mm"
+outward = false
+[electrodes]
+layout = "inner-6"
+diameter_mm = 6
+"""
+
+
+BENT = """[surface]
+kind = "bent sheet"
+width_mm = 100
+height_mm = 80
+radius_mm = 60
+axis = "x"
+"""
+
+
+@_reader("skin, curved", "a.toml", read_described_skin)
+def _curved_skin(folder):
+    (folder / "a.toml").write_text(CURVED)
+
+
+@_reader("skin, scanned", "a.toml", read_described_skin)
+def _scanned_skin(folder):
+    (folder / "a.toml").write_text(SCANNED)
+    points, cells = (np.asarray(one) for one in (_ARM.points, _ARM.cells))
+    corners = [f"v {x:.6g} {y:.6g} {z:.6g}" for x, y, z in 1e3 * points]
+    (folder / "arm.obj").write_text("\n".join([*corners, *(f"f {a} {b} {c}" for a, b, c in 1 + cells)]))
+
+
+@_reader("study, curved", "a.toml", read_study)
+def _curved_study(folder):
+    (folder / "a.toml").write_text(
+        SMALL.replace("width_mm = 100\nheight_mm = 80\n", "").replace('grid-4x2", "perimeter-8', "inner-8") + BENT
+    )
 
 
 @_reader("store of a study", "a.zarr", lambda path: study_progress(read_study(path.parent / "a.toml"), path))

@@ -98,6 +98,11 @@ def test_faults_of_files(tmp_path):
         (tmp_path / "bad.obj").write_text(corners + text)
         with pytest.raises(ValueError, match=match):
             read(tmp_path / "bad.obj")
+    (tmp_path / "bad.obj").write_text("v 0 0 0\n" * 6 + "f 1 2 3\nf 4 5 6\n")
+    with pytest.raises(
+        ValueError, match=r"no triangle in it has an area. All .* within 0 of \[0.0, 0.0, 0.0\].*scale="
+    ):
+        read(tmp_path / "bad.obj")
     for text, match in {
         "solid nothing\nendsolid nothing\n": "no triangles",
         "something else": "neither a text",
@@ -134,5 +139,8 @@ def test_cad_files_through_gmsh(tmp_path):
     solid = from_gmsh(tmp_path / "part.step", cell_size=10, scale=1e-3)
     assert solid.dimension == 3
     assert float(measures(surface_of(solid)).sum()) == pytest.approx(whole, rel=0.02)
+    (tmp_path / "broken.step").write_text("ISO-10303-21;")
+    with pytest.raises(ValueError, match=r"could not mesh the geometry: Could not read file 'broken\.step'"):
+        from_gmsh(tmp_path / "broken.step", dimension=2)
     write(cap(0.05, 1.0, num_points=200), tmp_path / "cap.stl")
     assert from_gmsh(tmp_path / "cap.stl").is_surface

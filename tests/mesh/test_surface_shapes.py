@@ -233,6 +233,13 @@ def test_the_thickness_told_is_not_the_one_refused():
     shell(sleeve, float(str(told.value).split("It can be ")[1].split(" m")[0]), outward=False)
 
 
+def test_a_thickness_in_another_unit_than_the_surface():
+    with pytest.raises(
+        ValueError, match=r"^thickness: 3 m is more than the surface is large, 0\.1 m\. .* give 0\.003; .*scale=1e-3\)"
+    ):
+        shell(tube(0.03, 0.1, cell_size=5e-3), 3.0, outward=False)
+
+
 def test_a_skin_that_grows_into_itself():
     """A sheet rolled up one and a half times, its turns 5 mm apart."""
     flat = rectangle(0.1, 0.3, num_points=600)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
@@ -16,9 +17,18 @@ from jeit.electrodes import (
 )
 from jeit.electrodes.electrode_shapes import shapes_of
 from jeit.image import Inclusion, Plane
-from jeit.layout import ring
-from jeit.mesh import box, centroids, cylinder, disk
-from jeit.plot import Camera, ColourScale, plot_isosurfaces, plot_slice, plot_slices, plot_solid, plot_surface
+from jeit.layout import SurfaceLayout, ring
+from jeit.mesh import box, centroids, cylinder, disk, tube
+from jeit.plot import (
+    Camera,
+    ColourScale,
+    plot_curved_skin,
+    plot_isosurfaces,
+    plot_slice,
+    plot_slices,
+    plot_solid,
+    plot_surface,
+)
 from jeit.plot.solid.isosurfaces import level_surfaces
 from jeit.plot.solid.scene import Scene
 
@@ -330,6 +340,28 @@ def test_electrodes_on_a_surface_are_numbered_and_those_behind_it_hidden():
         plot_surface(sleeve.points, wall, None, FaceDiscs(places, 0.012, 1e-3))
 
 
+def test_electrodes_behind_each_other_share_a_place_for_their_numbers(ax):
+    rings = np.concatenate([ring(0.05, 8, height=height) for height in (0.01, 0.03)])
+    body = cylinder(0.05, 0.04, num_points=600)
+    plot_isosurfaces(body, np.zeros(body.num_cells), FaceDiscs(rings, 0.006, 1e-3), camera=Camera(-90, 90), ax=ax)
+    told = {one for one in shown(ax) if one[:1].isdigit() and "mm" not in one}
+    assert told == {f"{k}, {k + 8}" for k in range(1, 9)}
+
+
+def test_numbers_behind_each_other_stand_beside_the_body(tank):
+    """From the front, of walls seen from their edge: away from the body, runs of numbers from first to last."""
+    low, high = np.asarray(tank.points).min(axis=0), np.asarray(tank.points).max(axis=0)
+    sides = [[x, y, 0.5 * (low[2] + high[2])] for x in (low[0], high[0]) for y in np.linspace(low[1], high[1], 6)[1:-1]]
+    ax = Figure().subplots()
+    electrodes = FacePatches(sides, 0.004, 0.004, 1e-3)
+    plot_isosurfaces(tank, np.zeros(tank.num_cells), electrodes, camera=Camera(-90, 0), ax=ax)
+    found = {one.get_text(): (one.get_position()[0], one.get_ha()) for one in ax.texts}
+    assert found["1–4"][0] < low[0]
+    assert found["1–4"][1] == "right"
+    assert found["5–8"][0] > high[0]
+    assert found["5–8"][1] == "left"
+
+
 def test_a_group_of_facets_has_one_rim(tank, ax):
     plot_isosurfaces(tank, np.zeros(tank.num_cells), plates(tank, ["top"], 1e-3), camera=Camera(0, 90), ax=ax)
     lines = np.abs(np.array(pieces(ax).get_linewidths()) - 0.5) < 1e-9
@@ -345,3 +377,28 @@ def test_electrodes_on_the_far_side_are_under_the_wall_that_they_are_on(tank, ax
     faces = pieces(ax).get_facecolor()
     hull = np.flatnonzero((faces[:, 3] > 0) & (faces[:, 3] < 0.2))
     assert np.flatnonzero(is_metal(faces)).max() < hull.min()
+
+
+def test_the_legend_of_a_curved_skin_is_clear_of_the_axes_letters(ax):
+    layout = SurfaceLayout.spread(tube(0.03, 0.12, num_points=150), 6, 8e-3)
+    marks = {"touched": [[0.03, 0.0, 0.06]], "found": [[0.0, -0.03, 0.06]]}
+    for elevation in (25, 60):
+        ax.clear()
+        plot_curved_skin(layout, marks=marks, camera=Camera(130, elevation), ax=ax)
+        FigureCanvasAgg(ax.figure).draw()
+        legend = ax.get_legend().get_window_extent()
+        letters = [one for one in ax.texts if one.get_text() in ("x", "y", "z")]
+        assert len(letters) == 3
+        assert not any(legend.overlaps(one.get_window_extent()) for one in letters)
+
+
+def test_marks_above_a_curved_skin_are_drawn_on_it(ax):
+    layout = SurfaceLayout.spread(tube(0.03, 0.12, num_points=400), 6, 8e-3)
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    above = np.stack([0.04 * np.cos(angle), 0.04 * np.sin(angle), np.full(12, 0.06)], axis=1)
+    plot_curved_skin(layout, marks={"touched": above}, camera=Camera(0, 0), ax=ax)
+    (drawn,) = (one for one in ax.lines if one.get_label() == "touched")
+    across = np.asarray(drawn.get_xdata())
+    assert np.abs(across).max() <= 0.0301
+    # Of the two on the silhouette, either side's edge may be seen; the five behind it are not.
+    assert 5 <= len(across) <= 7

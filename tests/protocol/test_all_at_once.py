@@ -112,6 +112,11 @@ def test_readings_of_potentials(measurement):
         (lambda one, two: protocol.optimal(one, one), "equals transfer"),
         (lambda one, two: protocol.optimal(one, two[:5, :5]), r"\(5, 5\)"),
         (lambda one, two: protocol.optimal(one[:5]), r"\(5, 12\)"),
+        (
+            lambda one, two: protocol.optimal(one[None]),
+            r"transfer has shape \(1, 12, 12\), of 1 frame; .* transfer\[0\]",
+        ),
+        (lambda one, two: protocol.optimal(one, np.stack([two, two])), r"other .* of 2 frames; .* other\[0\]"),
         (lambda one, two: protocol.optimal(one * np.nan), "NaN"),
         (lambda one, two: protocol.optimal(np.triu(one)), "not symmetric"),
         (lambda one, two: protocol.optimal(one, power=1e-3), "power needs other"),

@@ -1,11 +1,17 @@
 """`jeit info`: what a file holds, and how good it is."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from jeit.cli.options import Description, Format
+
+# What a solid on an outline is called, and its sizes where a description has other words for them.
+_SOLIDS = {
+    "rectangle": ("box", {"height": "depth", "thickness": "height"}),
+    "disk": ("cylinder", {"thickness": "height"}),
+}
 
 
 def info(
@@ -24,11 +30,6 @@ def info(
     body, noise = found["body"], found["noise"]
     names = f" ({', '.join(found['frame_names'])})" if found["frame_names"] else ""
     rate = f", {found['frame_rate']:.4g} a second" if found["frame_rate"] else ""
-    size = ", ".join(
-        f"{key} {1e3 * body[key]:g} mm" for key in ("radius", "width", "height", "thickness") if key in body
-    )
-    if body["shape"] == "mesh":
-        size = f"{body['dimension']}-D, {counted(body['points'], 'node')}"
     known = noise and f"{scaled(noise['standard_deviation'], 'V')}, from {noise['method']}"
     rows = [
         ("frames", f"{found['frames']}{names}{rate}"),
@@ -37,7 +38,7 @@ def info(
         ("masked", f"{found['masked']} of {found['voltages']} voltages"),
         ("largest current", scaled(found["largest_current"], "A")),
         ("largest voltage", scaled(found["largest_voltage"], "V")),
-        ("body", f"{body['shape']}, {size}" if size else body["shape"]),
+        ("body", _told(body)),
         ("electrodes", f"{found['electrodes']['number']}, {found['electrodes']['kind']}"),
         ("reciprocity error", percent(found["reciprocity_error"])),
         ("noise", known or "not known"),
@@ -46,3 +47,17 @@ def info(
     rows.append(("wiring", found["wiring"] or "not known: the file does not say where electrodes are"))
     rows += [("note", note) for note in found["notes"]]
     plain_console().print(pairs(measurement.name, rows))
+
+
+def _told(body: dict[str, Any]) -> str:
+    """Shape and size of a body, in the words of a description."""
+    from jeit.arguments import counted
+
+    if body["shape"] == "mesh":
+        return f"mesh, {body['dimension']}-D, {counted(body['points'], 'node')}"
+    names = {key: key for key in ("radius", "width", "height", "thickness")}
+    shape = body["shape"]
+    if "thickness" in body and shape in _SOLIDS:
+        shape, renamed = _SOLIDS[shape]
+        names |= renamed
+    return ", ".join([shape, *(f"{name} {1e3 * body[key]:g} mm" for key, name in names.items() if key in body)])

@@ -1,5 +1,6 @@
 """`jeit series`: every frame of a recording at once; what regions do over time, and what oscillates where."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -100,12 +101,12 @@ def series(
             if measured.times is not None:
                 for one in bands:
                     oscillation(np.zeros((measured.num_frames, 1)), measured.times, one)
-        found = image_sequence(measured, base, settings, progress=step)
-        regions = {text: _region(text, one, found.series.mesh) for text, one in spelled.items()}
+        regions = {text: partial(_region, text, one) for text, one in spelled.items()}
+        found = image_sequence(measured, base, settings, regions=regions, progress=step)
         with naming_options({"frequency": "--frequency"}):
             told = [oscillation(found.series.changes, found.series.times, one) for one in bands]
         step("write")
-        report = write_series(found, output, regions=regions, oscillations=told, film=wanted)
+        report = write_series(found, output, regions=found.regions, oscillations=told, film=wanted)
     if quiet:
         return
     frames, unit = counted(report["frames"], "frame"), report["unit"]

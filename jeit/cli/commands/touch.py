@@ -72,6 +72,7 @@ def fit(
     """
     from jeit.cli.console import Steps, pairs, plain_console, say_written
     from jeit.data import load_description
+    from jeit.mesh import OwnMesh
     from jeit.report.learnt_skin import SKIN_FILES, summary, write_learnt_skin
     from jeit.touch import LearntSkin, read_presses
 
@@ -80,7 +81,10 @@ def fit(
     with Steps(console, quiet=quiet) as step:
         step("read")
         recorded = read_presses(presses)
-        model = None if description is None else load_description(description).model(presses, num_points=_NODES)
+        model = None
+        if description is not None:
+            described = load_description(description)
+            model = described.model(presses, num_points=None if isinstance(described.domain, OwnMesh) else _NODES)
         step("learn")
         with naming_options({"num_channels": "--channels", "per_session": "--per-session", "model": "--description"}):
             skin = LearntSkin.fit(

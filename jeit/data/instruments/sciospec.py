@@ -117,6 +117,11 @@ def _injections(lines: list[str], header: _Header, path: Path) -> tuple[np.ndarr
         if len(rows) == frequencies * len(pairs):
             if len(values) != 2 or (values != values.round()).any() or not (values > 0).all() or values.max() > 1e5:
                 raise ValueError(f"{path.name}, line {at + 1}: must be the two electrodes of an injection.")
+            if values[0] == values[1]:
+                raise ValueError(
+                    f"{path.name}, line {at + 1}: current enters and leaves at electrode {values[0]:g}; an injection "
+                    "has two different electrodes."
+                )
             pairs.append(values.astype(int))
             continue
         if len(values) < 4 or len(values) % 2 or (rows and len(values) != 2 * len(rows[0])):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jeit.arguments import told
-from jeit.mesh import Mesh, bend, cap, forearm, measures, read, rectangle, sphere, tube
+from jeit.mesh import Mesh, bend, cap, forearm, from_gmsh, measures, read, rectangle, sphere, tube
 
 if TYPE_CHECKING:
     from jeit.design.skin.surface_tables import SurfaceTable
@@ -21,9 +21,10 @@ _SIDE = 2 / 3**0.25
 
 
 def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
-    """A surface with cells of `cell_size` metres, or as its file has it; files are relative to `folder`.
+    """A surface with cells of `cell_size` metres, or as its file of triangles has it; files are relative to `folder`.
 
-    Raises `ValueError`, which speaks of surface, for what cannot be made or read, or is no surface.
+    Raises `ValueError`, which speaks of surface, for what cannot be made or read, or is no surface; `ImportError` for a
+    CAD file without Gmsh.
     """
     try:
         return _made(table, folder, cell_size)
@@ -60,7 +61,11 @@ def _made(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
         case tables.BentSheetTable():
             flat = rectangle(1e-3 * table.width_mm, 1e-3 * table.height_mm, cell_size=cell_size)
             return bend(flat, 1e-3 * table.radius_mm, axis=table.axis)
-    surface = read(folder / table.file, scale=_UNITS[table.unit])
+    file, scale = folder / table.file, _UNITS[table.unit]
+    if table.has_cells:
+        surface = read(file, scale=scale)
+    else:
+        surface = from_gmsh(file, cell_size=cell_size / scale, dimension=2, scale=scale)
     if not surface.is_surface:
         raise ValueError(
             f"{told(table.file)} is flat or a solid; a curved skin needs triangles in space, such as those that "

@@ -3,6 +3,7 @@
 from typing import Annotated, Any, Literal
 
 from jeit.files.schema import Number, Numbers, OneOf, Table, Word, fault
+from jeit.mesh.gmsh import CAD
 
 _RADIUS = Number(2, 5000, "mm")
 _LENGTH = Number(5, 5000, "mm")
@@ -62,12 +63,17 @@ class BentSheetTable(Table):
 
 
 class ScanTable(Table):
-    """Of a file of triangles, and what a length of 1 in it is."""
+    """Of a file of triangles or of CAD, and what a length of 1 in it is."""
 
     what = "a surface's file"
     file: Word
     unit: Literal["mm", "cm", "m", "inch"]
     outward: bool = True
+
+    @property
+    def has_cells(self) -> bool:
+        """Whether its triangles are the cells; those of a CAD file Gmsh makes."""
+        return not self.file.lower().endswith(CAD)
 
 
 SurfaceTable = TubeTable | ForearmTable | SphereTable | CapTable | BentSheetTable | ScanTable
@@ -80,5 +86,5 @@ def check_of_curved(surface: SurfaceTable | None, skin: Table, mesh: Table) -> N
         return
     if sides := {"width_mm", "height_mm"} & skin.model_fields_set:
         raise fault("has no effect: the table surface says how large the skin is; leave it out.", f"skin.{min(sides)}")
-    if isinstance(surface, ScanTable) and "cell_mm" in mesh.model_fields_set:
+    if isinstance(surface, ScanTable) and surface.has_cells and "cell_mm" in mesh.model_fields_set:
         raise fault("has no effect: cells are the triangles of surface.file; leave it out.", "mesh.cell_mm")

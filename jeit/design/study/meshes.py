@@ -23,13 +23,15 @@ Maker = Callable[[str, float, float, float], Layout | SurfaceLayout]
 def meshes_of(table: StudyTable, folder: Path) -> tuple[list[float], Rectangle | Triangles, Sequence[Maker]]:
     """Sizes of cells, metres; the outline, of curved skins the surface of the first size; and what makes layouts: one
     for all sizes, or of curved skins one for each."""
+    from jeit.design.skin.surface_tables import ScanTable  # it was imported when the table was read
+
     cells = [1e-3 * size for size in table.mesh.cell_mm]
     described = table.surface
     if described is None:
         outline = Rectangle(1e-3 * table.skin.width_mm, 1e-3 * table.skin.height_mm)
         return cells, outline, [lambda name, *sizes: study_layout(name, folder, outline, *sizes)]
     surfaces = [described_surface(described, folder, size) for size in cells]
-    if "file" in type(described).model_fields:
+    if isinstance(described, ScanTable) and described.has_cells:
         cells = [typical_cell(surfaces[0])]
 
     def on(surface: Mesh) -> Maker:

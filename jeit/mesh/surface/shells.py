@@ -85,6 +85,12 @@ def _check_upright(stacked, solid: np.ndarray, turned: np.ndarray, thickness: fl
     volume = _volumes(stacked(thickness), solid, turned)
     if volume.min() > 0:
         return
+    if thickness > (size := float(np.ptp(stacked(0.0), axis=0).max())):
+        raise ValueError(
+            f"thickness: {thickness:.4g} m is more than the surface is large, {size:.4g} m. Are both in metres? If the "
+            f"thickness is millimetres, give {1e-3 * thickness:.4g}; if the surface came from a file of another unit, "
+            "read it with that: jeit.mesh.read(..., scale=1e-3) for millimetres, 0.0254 for inches, 1 for metres."
+        )
     low, high = 0.0, thickness
     for _ in range(_HALVINGS):
         middle = (low + high) / 2

@@ -32,7 +32,7 @@ def draw_numbers(
     shift[~beside] = 0
     fontsize = 9 if len(places) <= 20 else 7
     rim = [withStroke(linewidth=2, foreground="white")]
-    for one in _at_one_place(places, 0.1 * away):
+    for one in at_one_place(places, 0.1 * away):
         k = one[0]
         effects = rim if inside[k] or not beside[k] else None  # the image lies behind
         style = {"ha": "center", "va": "center", "fontsize": fontsize, "color": INK, "zorder": 4}
@@ -40,8 +40,8 @@ def draw_numbers(
         ax.text(x, y, told, path_effects=effects, **style)
 
 
-def _at_one_place(places, near: float) -> list[list[int]]:
-    """Electrodes above each other, as rings round a tank have them, seen from above: together."""
+def at_one_place(places: Float[np.ndarray, "L 2"], near: float) -> list[list[int]]:
+    """Electrodes within `near` of each other, as rings round a tank have them, seen from above: together."""
     together: list[list[int]] = []
     for k, place in enumerate(places):
         for one in together:

@@ -10,6 +10,7 @@ from matplotlib.colors import to_rgba
 from jeit.electrodes.electrode_shapes import Draped, ElectrodeShapes, surface_triangles
 from jeit.mesh import Mesh
 from jeit.plot.axes import SOFT
+from jeit.plot.imaging.electrode_numbers import at_one_place
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.scene import BODY, Scene, draw_number
 
@@ -100,16 +101,36 @@ def _rims(polygons, electrode, near: float) -> list[np.ndarray]:
 def number_electrodes(
     ax: Axes, scene: Scene, points, triangles, shapes: ElectrodeShapes, *, behind: bool = True
 ) -> None:
-    """Numbers from 1 beside electrodes, outward; faint ones on the side that is not looked at, if `behind` is shown."""
+    """Numbers from 1 beside electrodes, outward; faint ones on the side that is not looked at, if `behind` is shown.
+
+    Electrodes that are seen behind each other share a place for their numbers, away from the middle of the picture.
+    """
     middles = shapes.middles()
     normals = Draped(points, triangles).normals(middles)
     places = scene.camera.on_page(middles + _AWAY * float(np.ptp(points, axis=0).max()) * normals)
     fontsize = 8 if len(places) <= 20 else 6.5
     faint = normals @ scene.camera.toward < -0.05
     near, clear = places[~faint], _CLEAR * float(np.ptp(points, axis=0).max())
-    for k, place in enumerate(places):
-        # What is behind has no number where one in front has its own.
-        if faint[k] and not behind:
-            continue
-        if not faint[k] or not len(near) or np.linalg.norm(near - place, axis=1).min() > clear:
-            draw_number(ax, place, str(k + 1), fontsize=fontsize, faint=bool(faint[k]))
+    seen = scene.camera.on_page(points)[:, 0]
+    left, right = seen.min() + clear, seen.max() - clear
+    for side in (False, True) if behind else (False,):
+        some = np.flatnonzero(faint == side)
+        for one in at_one_place(places[some], clear):
+            place = places[some[one]].mean(axis=0)
+            # What is behind has no number where one in front has its own.
+            if side and len(near) and np.linalg.norm(near - place, axis=1).min() <= clear:
+                continue
+            outward = "right" if place[0] < left else "left" if place[0] > right else "center"
+            align = outward if len(one) > 1 else "center"
+            draw_number(ax, place, _told((some[one] + 1).tolist()), fontsize=fontsize, faint=side, align=align)
+
+
+def _told(numbers: list[int]) -> str:
+    """Rising numbers, three or more that follow each other as "4–6"."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return ", ".join(f"{run[0]}–{run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs)

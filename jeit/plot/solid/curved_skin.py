@@ -11,6 +11,7 @@ from jeit.arguments import check_kind
 from jeit.electrodes.electrode_shapes import Draped, shapes_of
 from jeit.layout import SurfaceLayout
 from jeit.mesh import measures
+from jeit.mesh.geodesic import Triangles
 from jeit.plot.axes import INK, SERIES_COLOURS, axes_or_new
 from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
 from jeit.plot.imaging.electrodes import METAL
@@ -36,7 +37,8 @@ def plot_curved_skin(
     """Draw the surface of a curved skin in space, with its electrodes as discs on it.
 
     `values`: one for each triangle of `layout.surface`, flat, or for each of its nodes; grey without. `marks`: places
-    (p, 3), metres, by what the legend calls them; those on the far side are left out. `camera`: from where it is seen.
+    (p, 3), metres, by what the legend calls them, drawn at the nearest place of the surface, as those on the other face
+    of a layer are not on it; those on the far side are left out. `camera`: from where it is seen.
     `scale`: how values become colours; changes of sheet conductivity in S unless it says otherwise. Raises `ValueError`
     for values of another shape or not finite, and things of another kind.
     """
@@ -61,12 +63,22 @@ def plot_curved_skin(
         rim = np.ones(len(corners), bool)
         scene.add_polygon(corners, METAL, before=before / max(facing, 0.1), rim=rim)
     scene.draw(ax)
+    triangles = Triangles.of(mesh)
     for (name, places), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
-        seen = _on_this_side(mesh, np.atleast_2d(np.asarray(places, float)), camera)
+        on_it = triangles.nearest(np.atleast_2d(np.asarray(places, float))).points
+        seen = _on_this_side(mesh, on_it, camera)
         ax.plot(*camera.on_page(seen).T, "o", color=colour, markersize=5, markeredgecolor="white", label=name, zorder=5)
     bare_in_space(ax, camera, points, numbered=False)
     if marks:
-        ax.legend(loc="lower center", ncols=len(marks), frameon=False, labelcolor=INK, borderaxespad=0)
+        # Under the axes: in them are the arrows that say where x, y and z point.
+        ax.legend(
+            loc="upper center",
+            bbox_to_anchor=(0.5, 0.0),
+            ncols=len(marks),
+            frameon=False,
+            labelcolor=INK,
+            borderaxespad=0,
+        )
     if title is not None:
         ax.set_title(title)
     if fitted is not None:

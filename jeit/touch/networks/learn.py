@@ -14,6 +14,7 @@ from jaxtyping import Float
 from jeit.arguments import check_kind, check_name, told
 from jeit.design import Skin, touches_away_from_the_edge
 from jeit.design.study.store import OtherContents, require
+from jeit.layout import Layout
 from jeit.simulate import Indent, IndentSet, ball, relative_changes, simulate_presses
 from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.needed import need_learning
@@ -103,13 +104,18 @@ def learn_images(
     trainings in checkpoints. `preset`: "quick", under two minutes, "full", or one of one's own; `design`: "unrolled", a
     network that knows the skin's physics, or "three-stages", that of Park et al. 2022. `touches`: how many to learn
     from, as many as fit on the disk; the preset's unless given. `client`: of a dask cluster, which then simulates.
-    `progress` is called with how far it is. Raises `ValueError` for names that there are not, no number, and a folder
-    of another skin's work; `ImportError` without the extras `learn` and `cluster`.
+    `progress` is called with how far it is. Raises `ValueError` for curved skins, names that there are not, no number,
+    and a folder of another skin's work; `ImportError` without the extras `learn` and `cluster`.
     """
     need_learning()
     for package in ("xarray", "zarr"):
         require(package)
     check_kind("skin", skin, Skin, "a Skin, as of read_described_skin('skin.toml')")
+    if not isinstance(skin.layout, Layout):
+        raise ValueError(
+            f"skin: networks image flat skins, and {told(skin.layout.name)} is of a curved one; give its surface as a "
+            "rectangle, skin.width_mm and skin.height_mm in place of the table [surface]."
+        )
     check_name("design", design, DESIGNS)
     if not isinstance(preset, Preset):
         check_name("preset", preset, PRESETS)
