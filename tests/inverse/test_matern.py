@@ -118,6 +118,23 @@ def test_gaussian_by_way_of_a_grid():
     assert np.abs(about - exact).max() < 5e-3 * np.abs(exact).max()
 
 
+def test_a_grid_of_more_points_than_cells_is_still_a_gain():
+    """Of cells a cylinder has fewer than its bounding box has grid points; pairs of cells are far more."""
+    mesh = box(1.0, 1.0, 1.0, num_points=1500)
+    centre = np.asarray(centroids(mesh))
+    assert GriddedGaussian.suits(centre, 0.14)
+    assert np.prod(3 / 0.14 * np.ptp(centre, axis=0) + 5) > mesh.num_cells
+    assert not GriddedGaussian.suits(centre, 0.05)
+
+
+def test_any_number_of_columns_goes_over_the_grid_alike():
+    centre = np.random.default_rng(2).uniform(size=(300, 3))
+    columns = np.random.default_rng(3).normal(size=(300, 130))
+    grid = GriddedGaussian(centre, 0.4)
+    alone = np.stack([grid.product(one[:, None])[:, 0] for one in columns.T], axis=1)
+    np.testing.assert_allclose(grid.product(columns), alone, rtol=1e-10, atol=1e-10)
+
+
 def test_laplace_of_many_cells_is_of_their_nodes(monkeypatch):
     """Γ is symmetric and positive, and smooth: of white rows it keeps a small share of the steps between cells."""
     mesh = box(1.0, 1.0, 1.0, num_points=300)

@@ -11,8 +11,10 @@ from jaxtyping import Float
 
 # Grid points per correlation length, and points of a cubic along an axis.
 _PER_LENGTH, _CUBIC = 3, 4
-# Grid points beyond which a grid is no gain.
-_MOST = 500_000
+# Grid points, for every place and in all, beyond which a grid is no gain; all pairs of places cost far more than that.
+_EACH, _MOST = 8, 500_000
+# Columns at a time, for all on the grid at once would take more memory than the places do.
+_COLUMNS = 64
 
 
 class GriddedGaussian:
@@ -33,16 +35,20 @@ class GriddedGaussian:
 
     @staticmethod
     def suits(places: Float[np.ndarray, "m d"], length: float) -> bool:
-        """Whether the grid would have fewer points than there are places."""
+        """Whether the grid would be small beside the pairs of places."""
         extent = np.ptp(places, axis=0) / length * _PER_LENGTH + 5
-        return bool(np.prod(extent) < min(len(places), _MOST))
+        return bool(np.prod(extent) < min(_EACH * len(places), _MOST))
 
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
         """Γ times columns."""
-        grid = (self._interpolation.T @ columns).reshape(*self._shape, -1)
-        for axis, along in enumerate(self._along):
-            grid = np.moveaxis(np.tensordot(along, grid, axes=(1, axis)), 0, axis)
-        return self._interpolation @ grid.reshape(-1, columns.shape[1])
+        found = np.empty(columns.shape)
+        for start in range(0, columns.shape[1], _COLUMNS):
+            some = slice(start, start + _COLUMNS)
+            grid = (self._interpolation.T @ columns[:, some]).reshape(*self._shape, -1)
+            for axis, along in enumerate(self._along):
+                grid = np.moveaxis(np.tensordot(along, grid, axes=(1, axis)), 0, axis)
+            found[:, some] = self._interpolation @ grid.reshape(int(np.prod(self._shape)), -1)
+        return found
 
 
 def _weights(place: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
