@@ -9,6 +9,7 @@ from jeit.arguments import percent
 from jeit.imaging.method import METHODS, Imaged, NamedPrior, shapes_in
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
+from jeit.inverse.prior.defaults import MEASURED
 from jeit.inverse.shapes import ShapeReconstruction
 
 # Change relative to the background beyond which voltages are far from linear in it; and beyond which that must be
@@ -18,6 +19,8 @@ _STRONG, _STRONG_IN_NOISE, _NOISY = 0.3, 0.1, 0.3
 _WORSE, _MUCH = 1.1, 0.1
 # Share of the background that conductivity is kept above where a linear image claims less.
 _LEAST = 0.01
+# Change relative to the background beyond which bodies are looked for in a solid, where smooth images are poorest.
+_TELLING = 0.05
 # Step along the linear image that gives its derivative.
 _STEP = 1e-4
 
@@ -35,7 +38,8 @@ class Chosen(NamedTuple):
 def image_automatically(prepared: PreparedDifference, prior: NamedPrior, segmented: bool = False) -> Chosen:
     """The one-step image, unless it is unsound; then Gauss-Newton's with its bodies as shapes, unless that fails.
 
-    Each with its default λ. To be `segmented`, and no shapes: the image by total variation.
+    In a solid, bodies are looked for beside a sound one too. Each with its default λ. To be `segmented`, and no shapes:
+    the image by total variation.
     """
     linear, newton = METHODS["one-step"], METHODS["gauss-newton"]
     imaged = linear.image(prepared, prior, linear.hyperparameter)
@@ -52,11 +56,30 @@ def image_automatically(prepared: PreparedDifference, prior: NamedPrior, segment
         if shapes is not None or not segmented:
             outlined = "" if shapes is None else ", and its bodies' outlines fitted"
             return Chosen("gauss-newton", f"{fault}: solved for conductivity itself{outlined}.", better, shapes)
+    elif not segmented and (bodies := _bodies_in_solid(prepared, imaged[1])):
+        return bodies
     if segmented:
         pieces = METHODS["total-variation"]
         why = f"{fault or 'bodies are weak'}: cut up an image of few pieces."
         return Chosen("total-variation", why, pieces.image(prepared, prior, pieces.hyperparameter))
     return Chosen("one-step", "the linear image is sound: changes are small, and it explains the voltages.", imaged)
+
+
+def _bodies_in_solid(prepared: PreparedDifference, change: Float[Array, " m"]) -> Chosen | None:
+    """Bodies that the data of a solid tell of, where a sound linear image shows more than a trace and noise allows."""
+    noise = prepared.quality.difference_noise
+    strongest = np.abs(np.asarray(change)).max() / float(prepared.calibration.conductivity)
+    if prepared.mesh.dimension < 3 or strongest < _TELLING or (noise is not None and noise.relative > _NOISY):
+        return None
+    newton = METHODS["gauss-newton"]
+    try:
+        smooth = newton.image(prepared, MEASURED, newton.hyperparameter)
+    except ValueError:
+        return None
+    assert isinstance(smooth[0], Reconstruction)
+    shapes = _shapes(prepared, smooth[0])
+    why = "the voltages tell of bodies, which a linear image of a solid blurs: their outlines were fitted."
+    return shapes and Chosen("gauss-newton", why, smooth, shapes)
 
 
 def _shapes(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReconstruction | None:
