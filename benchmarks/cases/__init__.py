@@ -28,6 +28,7 @@ NAMES = (
     "skin_health",
     "mixed_tanks",
     "cut_tanks",
+    "solid_tanks",
     "untuned_arrays",
     "ktc2023",
     "real_skins",

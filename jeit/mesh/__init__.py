@@ -7,6 +7,7 @@ and `surface_of` a solid, and what has a thickness on them, a `shell`. From else
 """
 
 from jeit.arguments.moved import tell_old_names as _tell_old_names
+from jeit.mesh.bisection import bisect, cut
 from jeit.mesh.body import Body
 from jeit.mesh.cell_quality import quality
 from jeit.mesh.files import read, write
@@ -34,10 +35,12 @@ __all__ = [
     "Refine",
     "Solid",
     "bend",
+    "bisect",
     "box",
     "cap",
     "centroids",
     "check_flat",
+    "cut",
     "cylinder",
     "disk",
     "forearm",

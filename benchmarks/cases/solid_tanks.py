@@ -1,0 +1,56 @@
+"""One or two balls in boxes and cylinders: what the default image tells of them; `problems/solid_tanks.py`."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from benchmarks.harness.case import Case, Options, Result, Table, judged
+from benchmarks.harness.timing import say
+from benchmarks.problems.solid_tanks import draw, matched
+from jeit import image_difference
+from jeit.imaging import ImagingSettings
+
+TANKS, FIRST = 30, 700_000
+_CONTRAST = 0.15
+HEADER = ["tank", "electrodes", "channels", "method", "balls", "off / r", "volume", "contrast", "not balls", "seconds"]
+
+
+def run(options: Options) -> Result:
+    """All tanks, one row each."""
+    rows, off, contrasts, spurious, missed, refused = [], [], [], 0, 0, []
+    for seed in range(FIRST, FIRST + (1 if options.quick else TANKS)):
+        tank, start = draw(seed), time.perf_counter()
+        try:
+            found = image_difference(
+                tank.frame, tank.reference, ImagingSettings(num_points=2000 if options.quick else None)
+            )
+        except ValueError as error:
+            refused.append(f"tank {seed}: {error}"[:160])
+            continue
+        seconds = time.perf_counter() - start
+        bodies = () if found.shapes is None else found.shapes.bodies
+        which, more = matched(tank, [body.centroid for body in bodies], [body.sign for body in bodies])
+        told = [(ball, bodies[one]) for ball, one in zip(tank.balls, which, strict=True) if one >= 0]
+        distance = [float(np.linalg.norm(body.centroid - ball.centre)) / ball.radius for ball, body in told]
+        volume = [body.volume / ball.volume for ball, body in told]
+        contrast = [float(np.exp(body.sign * body.contrast)) / ball.factor for ball, body in told]
+        off, contrasts, spurious = off + distance, contrasts + contrast, spurious + more
+        missed += len(tank.balls) - len(told)
+        factors = ", ".join(f"{ball.factor:g}" for ball in tank.balls)
+        figures = [" ".join(f"{one:.2f}" for one in many) for many in (distance, volume, contrast)]
+        kind = tank.frame.protocol.name.split(",")[0]
+        rows.append([str(seed), tank.kind, kind, found.settings.method, factors, *figures, str(more), f"{seconds:.0f}"])
+        say(" | ".join(rows[-1]))
+    close = sum(abs(one - 1) <= _CONTRAST for one in contrasts)
+    total = len(off) + missed
+    checks = [
+        judged("contrasts ≤ 15 % off", f"{close} of {total}", close == total),
+        judged("none missed", str(missed), missed == 0),
+        judged("nothing else told", str(spurious), spurious == 0),
+    ]
+    return Result([Table(HEADER, rows)], checks, [f"{len(refused)} tanks refused", *refused])
+
+
+CASE = Case("solid_tanks", "balls in simulated boxes and cylinders: places, volumes, contrasts", run, 8, timed=False)

@@ -1,0 +1,189 @@
+"""Boxes and cylinders with one or two balls in them, drawn at random: solved on meshes cut along the balls' surfaces.
+
+Those meshes are other and finer ones than images are made on. What differs from tank to tank: size, electrodes, contact
+impedances, currents and what is read, and number, size, place and conductivity of the balls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from jeit.data import Measurement
+from jeit.electrodes import FacePatches
+from jeit.electrodes.body_mesh import body_mesh
+from jeit.forward import ForwardModel
+from jeit.forward.changes import solved_fields
+from jeit.mesh import Disk, Rectangle, Solid, bisect, centroids, cut
+from jeit.protocol import Protocol, adjacent, from_matrices, haar, opposite, skip, trigonometric
+from jeit_solvers.engines import on_host
+
+FACTORS = (0.1, 0.3, 3.0, 12.0)
+"""Conductivities of balls over that of the bath."""
+KINDS = ("plates", "strips", "rings")
+"""Boxes with plates all round, cylinders with a ring of tall strips, and with two rings of patches."""
+_NODES, _NOISE, _FLOOR = 14_000, 2e-4, 3e-5
+_EDGE = 0.25
+_REACH = 2.0
+
+
+class Ball(NamedTuple):
+    """**Fields**: `centre` (3,) and `radius`, metres; `factor`, its conductivity over the bath's."""
+
+    centre: np.ndarray
+    radius: float
+    factor: float
+
+    @property
+    def volume(self) -> float:
+        """m³."""
+        return 4 / 3 * np.pi * self.radius**3
+
+    def level(self, points: np.ndarray) -> np.ndarray:
+        """How far points (n, 3) lie outside, metres."""
+        return np.linalg.norm(points - self.centre, axis=-1) - self.radius
+
+    def edge(self, corners: np.ndarray) -> np.ndarray:
+        """How long edges of cells (m, 4, 3) may be, metres: short on the surface."""
+        outside = self.level(corners)
+        return np.where((outside.min(axis=1) < 0) & (outside.max(axis=1) > 0), _EDGE * self.radius, np.inf)
+
+
+class SolidTank(NamedTuple):
+    """**Fields**: `frame`, the tank with its balls, and `reference`, without; `balls`; `kind`, of `KINDS`."""
+
+    frame: Measurement
+    reference: Measurement
+    balls: tuple[Ball, ...]
+    kind: str
+
+
+def draw(seed: int) -> SolidTank:
+    """A tank, the same for the same seed."""
+    rng = np.random.default_rng(seed)
+    kind = KINDS[int(rng.integers(len(KINDS)))]
+    domain, electrodes, protocol = _tank(rng, kind)
+    conductivity = np.exp(rng.uniform(np.log(0.01), np.log(1.0)))
+    size = float(domain.outline.area) ** 0.5
+    impedance = np.exp(rng.uniform(np.log(1e-3), np.log(0.03))) * size / conductivity
+    electrodes = electrodes.with_contact_impedance(impedance * np.exp(rng.normal(0, 0.2, electrodes.num_electrodes)))
+    balls = _balls(rng, domain, middle=kind == "strips")
+    mesh = body_mesh(domain, electrodes, _NODES)
+    for ball in balls:
+        mesh = bisect(mesh, ball.edge)
+    for ball in balls:
+        mesh = cut(mesh, ball.level)
+    model = on_host(ForwardModel(mesh, electrodes, protocol, solver="cholesky"))
+    centres = np.asarray(centroids(mesh))
+    factors = np.ones(len(centres))
+    for ball in balls:
+        factors[ball.level(centres) < 0] = ball.factor
+
+    def measured(factors, name):
+        voltages = solved_fields(model, conductivity * factors).voltages
+        floor = _FLOOR * np.median(np.abs(voltages))
+        voltages = voltages * (1 + _NOISE * rng.normal(size=voltages.shape)) + floor * rng.normal(size=voltages.shape)
+        mask = np.ones(voltages.shape, bool)
+        unknown = electrodes.with_contact_impedance(np.full(electrodes.num_electrodes, impedance))
+        return Measurement(voltages, mask, protocol, electrodes=unknown, domain=domain, name=name)
+
+    frame, reference = measured(factors, f"tank {seed}"), measured(np.ones(len(centres)), "empty")
+    return SolidTank(frame, reference, balls, kind)
+
+
+def _tank(rng, kind: str) -> tuple[Solid, FacePatches, Protocol]:
+    current = np.exp(rng.uniform(np.log(1e-4), np.log(1e-2)))
+    scale = np.exp(rng.uniform(np.log(0.3), np.log(2.0)))
+    if kind == "plates":
+        x, y, z = scale * np.array([0.17, 0.17 * rng.uniform(1, 1.6), 0.17])
+        at = [(a * x / 4, s * y / 2, b * z / 4) for s in (-1, 1) for a in (-1, 1) for b in (1, 3)]
+        at += [(s * x / 2, a * y / 3, b * z / 4) for s in (-1, 1) for a in (-1, 0, 1) for b in (1, 3)]
+        at += [(a * x / 4, b * y / 3, s * z) for s in (0, 1) for a in (-1, 1) for b in (-1, 0, 1)]
+        side = rng.uniform(0.5, 0.94) * min(x / 2, y / 3, z / 2)
+        electrodes = FacePatches(np.array(at), side, side, 1.0)
+        return Solid(Rectangle(x, y), z), electrodes, _all_at_once(rng, 32, current)
+    radius = scale * 0.1
+    height = radius * rng.uniform(0.8, 2.0)
+    angle = 2 * np.pi * np.arange(16) / 16
+    around = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    width = rng.uniform(0.3, 0.75) * 2 * np.pi * radius / 16
+    if kind == "strips":
+        at = np.column_stack([around, np.full(16, height / 2)])
+        electrodes = FacePatches(at, width, height * rng.uniform(0.3, 0.95), 1.0)
+        return Solid(Disk(radius), height), electrodes, _ring_of(rng, 16, current)
+    low, high = rng.uniform(0.2, 0.35), rng.uniform(0.65, 0.8)
+    at = np.concatenate([np.column_stack([around, np.full(16, one * height)]) for one in (low, high)])
+    electrodes = FacePatches(at, width, height * rng.uniform(0.1, 0.35), 1.0)
+    if rng.integers(2):
+        return Solid(Disk(radius), height), electrodes, _all_at_once(rng, 32, current)
+    return Solid(Disk(radius), height), electrodes, _pairs(rng, current)
+
+
+def _all_at_once(rng, count: int, current: float) -> Protocol:
+    kind = int(rng.integers(4))
+    if kind == 0:
+        return trigonometric(count, current=current)
+    if kind == 1:
+        return haar(count, current=current)
+    if kind == 2:
+        return opposite(count, current=current)
+    return skip(count, int(rng.integers(2, 9)), current=current)
+
+
+def _ring_of(rng, count: int, current: float) -> Protocol:
+    kind = int(rng.integers(4))
+    if kind == 0:
+        return adjacent(count, current=current)
+    if kind == 1:
+        return opposite(count, current=current)
+    if kind == 2:
+        return trigonometric(count, current=current)
+    return skip(count, int(rng.integers(1, 5)), current=current)
+
+
+def _pairs(rng, current: float) -> Protocol:
+    """Across within each of two rings and between them, read between neighbours of a ring and above each other."""
+    one, ring = np.eye(32), np.arange(16)
+    across = int(rng.integers(3, 9))
+    ends = [(a + r, (a + across) % 16 + r) for r in (0, 16) for a in ring] + [(a, (a + across) % 16 + 16) for a in ring]
+    read = [(a + r, (a + 1) % 16 + r) for r in (0, 16) for a in ring] + [(a, a + 16) for a in ring]
+    drive, measurement = (np.array([one[a] - one[b] for a, b in pairs]) for pairs in (ends, read))
+    return from_matrices(current * drive, measurement)
+
+
+def _balls(rng, domain: Solid, *, middle: bool) -> tuple[Ball, ...]:
+    """Anywhere, or at half the height: one ring of strips does not tell above from below."""
+    number, balls = int(rng.integers(1, 3)), []
+    height = domain.thickness
+    disk = isinstance(domain.outline, Disk)
+    x_max, y_max = (domain.extent[1], domain.extent[3])
+    least = min(x_max, height / 2)
+    while len(balls) < number:
+        radius = rng.uniform(0.28, 0.5) * least
+        room, gap = radius + 0.06 * least, 0.3 * least
+        centre = rng.uniform([-x_max, -y_max, 0], [x_max, y_max, height])
+        if middle:
+            centre[2] = height / 2
+        wall = x_max - np.hypot(*centre[:2]) if disk else np.min([x_max, y_max] - np.abs(centre[:2]))
+        apart = all(np.linalg.norm(centre - other.centre) > radius + other.radius + gap for other in balls)
+        if wall > room and apart and room < centre[2] < height - room:
+            balls.append(Ball(centre, radius, float(rng.choice(FACTORS))))
+    return tuple(balls)
+
+
+def matched(tank: SolidTank, places: Sequence[np.ndarray], signs: Sequence[int]) -> tuple[np.ndarray, int]:
+    """Which of what was found, at `places`, metres, is each ball: the nearest of the same sign within two radii, -1
+    where there is none; and how many are no ball's."""
+    if not len(places):
+        return np.full(len(tank.balls), -1), 0
+    distance = np.array([np.linalg.norm(np.array(places) - ball.centre, axis=1) / ball.radius for ball in tank.balls])
+    same = np.array([[(ball.factor > 1) == (sign > 0) for sign in signs] for ball in tank.balls])
+    distance = np.where(same & (distance < _REACH), distance, 1e3)
+    ball, one = linear_sum_assignment(distance)
+    found = np.full(len(tank.balls), -1)
+    near = distance[ball, one] < _REACH
+    found[ball[near]] = one[near]
+    return found, len(places) - int(near.sum())
