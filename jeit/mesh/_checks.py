@@ -48,8 +48,8 @@ def warn_large(extent: float, name: str) -> None:
     """Warn if a length in metres looks like millimetres."""
     if extent > _LARGE:
         warnings.warn(
-            f"{name}: {extent:g} is read as {extent:g} m, large for what electrodes are put on. If it is millimetres, "
-            f"give {1e-3 * extent:g} (a file is read with scale=1e-3), if inches, {0.0254 * extent:g} (scale=0.0254): "
+            f"{name}: {extent:g} m is large for what electrodes are put on. If the lengths are millimetres, give "
+            f"{1e-3 * extent:g} (a file is read with scale=1e-3), if inches, {0.0254 * extent:g} (scale=0.0254): "
             "jeit computes in metres.",
             UserWarning,
             stacklevel=4,

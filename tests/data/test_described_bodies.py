@@ -196,5 +196,5 @@ def test_a_plain_mesh_is_a_body_and_a_path_is_none():
 
 
 def test_a_radius_in_millimetres_is_told_in_metres():
-    with pytest.warns(UserWarning, match=r"^radius: 150 is read as 150 m, .* If it is millimetres, give 0\.15 "):
+    with pytest.warns(UserWarning, match=r"^radius: 150 m is large .* If the lengths are millimetres, give 0\.15 "):
         described({"shape": "disk", "radius": 150}, {"kind": "point", "positions": [[0, 150]]})
