@@ -42,6 +42,9 @@ def test_a_ball_is_fitted_beside_a_smooth_field(monkeypatch):
     (body,), ((low, high),) = result.shapes.bodies, result.peak_ranges
     assert np.linalg.norm(body.centroid - BALL) < 0.004
     assert low < result.inclusions[0].peak < high
+    assert result.settings.method == "shapes"
+    in_ball = np.linalg.norm(np.asarray(centroids(result.mesh)) - BALL, axis=1) < 0.5 * RADIUS
+    assert np.asarray(result.change)[in_ball].mean() > 0.8 * result.inclusions[0].peak  # the image is of the body
     (deviation,) = result.shapes.contrast_deviations
     background = float(result.calibration.conductivity)
     np.testing.assert_allclose([low, high], background * np.expm1(body.contrast + np.array([-1, 1]) * deviation))
