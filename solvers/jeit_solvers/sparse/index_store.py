@@ -86,12 +86,7 @@ class PaddedSum(NamedTuple):
     ) -> Inexact[Array, "sums *k"]:
         """The sums of the given contributions."""
         shape = self.gather.shape[1], *contributions.shape[1:]
-        return self.added(indices, contributions, namespace(contributions).zeros(shape, contributions.dtype))
-
-    def added(
-        self, indices: Int[Array, " total"], contributions: Inexact[Array, "sources *k"], total: Inexact[Array, "s *k"]
-    ) -> Inexact[Array, "s *k"]:
-        """`total` with the sums added to it; NumPy's where it is, for what a large front takes is to move memory."""
+        total = namespace(contributions).zeros(shape, contributions.dtype)
         gathered = self.gather.read(indices)
         for layer in range(len(gathered)):
             total += gather_or_zero(contributions, gathered[layer])

@@ -77,8 +77,8 @@ def _by_stages(layout: IndexLayout, indices: Int[Array, " total"], values: Inexa
         corner = xp.zeros(stage.batch * border * border, dtype)
         for link in stage.links:
             schur = left[link.source].reshape(-1)
-            panel = link.panel.added(indices, schur, panel)
-            corner = link.corner.added(indices, schur, corner)
+            panel += link.panel.apply(indices, schur)
+            corner += link.corner.apply(indices, schur)
         panel = panel.reshape(stage.batch, pivots + border, pivots)
         inverse = inverse_cholesky(panel[:, :pivots])
         lower = panel[:, pivots:] @ _transposed(inverse)
