@@ -80,23 +80,30 @@ def _sample(cell, image):
 def find_cells(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """Index of the cell that holds each position (q, d), -1 where none does.
 
-    Tries the cells with the nearest centroids first and widens the search for what is left.
+    Tries the cells with the nearest centroids first and widens the search for what is left; of a slice's positions only
+    cells that it cuts.
     """
     corners = points[cells]
+    slack = 1e-9 * np.ptp(points, axis=0).max()
+    low, high = positions.min(axis=0) - slack, positions.max(axis=0) + slack
+    near = np.flatnonzero(((corners.max(axis=1) >= low) & (corners.min(axis=1) <= high)).all(axis=1))
+    if not len(near):
+        return np.full(len(positions), -1)
+    corners = corners[near]
     inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
     tree = KDTree(corners.mean(axis=1))
     reach = np.linalg.norm(corners - corners.mean(axis=1)[:, None], axis=-1).max()
     found = np.full(len(positions), -1)
     left = np.flatnonzero(tree.query(positions)[0] <= reach)
     tried, number = 0, 8
-    while left.size and tried < len(cells):
-        number = min(number, len(cells))
+    while left.size and tried < len(near):
+        number = min(number, len(near))
         nearest = tree.query(positions[left], k=number)
         distance, candidate = np.asarray(nearest[0])[:, tried:], np.asarray(nearest[1])[:, tried:]
         local = np.einsum("qkij,qkj->qki", inverse[candidate], positions[left][:, None] - corners[candidate, 0])
         inside = np.minimum(local.min(axis=-1), 1 - local.sum(axis=-1)) > -1e-9
         hit = inside.any(axis=1)
-        found[left[hit]] = candidate[hit, inside[hit].argmax(axis=1)]
+        found[left[hit]] = near[candidate[hit, inside[hit].argmax(axis=1)]]
         # A cell cannot hold what is farther from its centroid than its farthest corner.
         left = left[~hit & (distance[:, -1] <= reach)]
         tried, number = number, 4 * number
