@@ -18,7 +18,7 @@ _FLAT = 1e-10
 # Nodes closer than this, relative to the extent, count as one node given twice.
 _COINCIDING = 1e-10
 # Three node numbers of a facet are packed into one 64-bit integer.
-_MOST_POINTS = 2_000_000
+MOST_POINTS = 2_000_000
 # No tank or skin is larger; coordinates beyond it are nearly always millimetres.
 _LARGE = 10.0
 
@@ -67,8 +67,8 @@ def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray
     if not np.issubdtype(array.dtype, np.integer):
         raise ValueError(f"cells: node indices must be integers, got {array.dtype}. Convert with .astype(int).")
     array = array.astype(np.int64)
-    if num_points > _MOST_POINTS:
-        raise ValueError(f"points: {num_points} nodes are more than the {_MOST_POINTS} that jeit can index.")
+    if num_points > MOST_POINTS:
+        raise ValueError(f"points: {num_points} nodes are more than the {MOST_POINTS} that jeit can index.")
     low, high = int(array.min()), int(array.max())
     if low < 0 or high >= num_points:
         hint = " They look one-based: subtract 1." if low >= 1 and high == num_points else ""

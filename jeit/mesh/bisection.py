@@ -1,4 +1,5 @@
-"""`bisect`: a mesh made finer where that is asked for; `cut`: a mesh cut along a surface. Of triangles or tetrahedra.
+"""`bisect`: a mesh made finer where that is asked for; `cut`: a mesh cut along a surface. Of triangles, in the plane or
+in space, or tetrahedra.
 
 Edges are split, each in all the cells round it, so that cells go on meeting side to side. At their middles only where
 they are the longest of all those cells: Rivara, International Journal for Numerical Methods in Engineering 20 (1984)
@@ -15,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jeit.arguments import check_kind, told
+from jeit.mesh._checks import MOST_POINTS
 from jeit.mesh.mesh import Mesh
 
 # Of an edge that a surface crosses nearer to its end than so many times its length, the end is moved onto it.
@@ -32,7 +34,7 @@ def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.nda
     infinite where cells stay as they are. Neighbours are divided as far as that needs. Tags stay; the boundary is that
     of the given mesh, of more facets.
 
-    Raises `ValueError` for a `size` that is not one number per cell, above zero.
+    Raises `ValueError` for a `size` that is not one number per cell, above zero, or asks for more than 2,000,000 nodes.
     """
     division = _Division.of(mesh)
     wanted = _too_long(division, slice(None), size)
@@ -52,6 +54,8 @@ def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.nda
                 break
             near |= _nodes(edges[marked], len(points))
         chosen = edges[marked & _first_of_all(number, rank)]
+        if len(points) + len(chosen) > MOST_POINTS:
+            raise ValueError(f"size asks for more than {MOST_POINTS:,} nodes; give longer edges. Are they in metres?")
         division, came = division.split(chosen, points[chosen].mean(axis=1))
         new, wanted = np.bincount(came)[came] > 1, wanted[came]
         wanted[new] = _too_long(division, new, size)
@@ -137,8 +141,7 @@ def _moved_onto(division: _Division, level) -> tuple[_Division, Float[np.ndarray
     edges, _, _ = _edges(points, cells[side.min(axis=1) * side.max(axis=1) < 0])
     edges = edges[np.prod(np.sign(value)[edges], axis=1) < 0]
     place = _crossing(points[edges], value[edges[:, 0]], level)
-    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
-    distance = np.linalg.norm(points[edges] - place[:, None], axis=2) / length[:, None]
+    distance = np.linalg.norm(points[edges] - place[:, None], axis=2) / _lengths(points[edges])[:, None]
     ends, order = edges.ravel(), np.argsort(-distance.ravel())  # the nearest comes last, and stays
     nearest, target = np.full(len(points), np.inf), points.copy()
     nearest[ends[order]], target[ends[order]] = distance.ravel()[order], np.repeat(place, 2, axis=0)[order]
@@ -165,13 +168,18 @@ def _crossing(ends: Float[np.ndarray, "e 2 s"], first: Float[np.ndarray, " e"], 
 
 def _edges(points, simplices) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "m k"], Int[np.ndarray, " e"]]:
     """All edges, the lower node first; the numbers of those of every simplex; and their ranks by length."""
-    pairs = np.array(list(itertools.combinations(range(simplices.shape[1]), 2)))
-    ends = np.sort(simplices[:, pairs].reshape(-1, 2).astype(np.int64), axis=1)
+    ends = _ends(simplices).reshape(-1, 2)
     key, number = np.unique(ends[:, 0] * len(points) + ends[:, 1], return_inverse=True)
     edges = np.stack(np.divmod(key, len(points)), axis=1)
     rank = np.empty(len(edges), int)
     rank[np.argsort(_lengths(points[edges]), kind="stable")] = np.arange(len(edges))
     return edges, number.reshape(len(simplices), -1), rank
+
+
+def _ends(simplices) -> Int[np.ndarray, "m k 2"]:
+    """The nodes of every simplex's edges, the lower one first."""
+    pairs = np.array(list(itertools.combinations(range(simplices.shape[1]), 2)))
+    return np.sort(simplices[:, pairs].astype(np.int64), axis=2)
 
 
 def _lengths(ends: Float[np.ndarray, "... 2 s"]) -> Float[np.ndarray, "..."]:
@@ -181,8 +189,7 @@ def _lengths(ends: Float[np.ndarray, "... 2 s"]) -> Float[np.ndarray, "..."]:
 
 def _longest(points, cells) -> Float[np.ndarray, " m"]:
     """The length of every cell's longest edge, metres."""
-    pairs = itertools.combinations(range(cells.shape[1]), 2)
-    return np.max([_lengths(points[cells[:, pair]]) for pair in pairs], axis=0)
+    return _lengths(points[_ends(cells)]).max(axis=1)
 
 
 def _first(number, rank) -> Int[np.ndarray, " m"]:
@@ -203,8 +210,11 @@ def _nodes(simplices, num_points: int) -> Bool[np.ndarray, " n"]:
 
 
 def _volumes(points, cells) -> Float[np.ndarray, " m"]:
-    """Of cells, negative where turned round; up to a factor. Triangles in space have none."""
-    return np.linalg.det(points[cells[:, 1:]] - points[cells[:, :1]])
+    """Of cells, up to a factor; negative where turned round, but for triangles in space, which have no sign."""
+    sides = points[cells[:, 1:]] - points[cells[:, :1]]
+    if sides.shape[1] < sides.shape[2]:
+        return np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    return np.linalg.det(sides)
 
 
 def _halved(simplices, edges, node, num_points: int) -> tuple[np.ndarray, np.ndarray]:
@@ -212,8 +222,7 @@ def _halved(simplices, edges, node, num_points: int) -> tuple[np.ndarray, np.nda
     some = np.flatnonzero(_nodes(edges, num_points)[simplices].sum(axis=1) > 1)
     key = edges @ [num_points, 1]
     order = np.argsort(key)
-    pairs = np.array(list(itertools.combinations(range(simplices.shape[1]), 2)))
-    ends = np.sort(simplices[some][:, pairs].astype(np.int64), axis=2)
+    ends = _ends(simplices[some])
     own = ends @ [num_points, 1]
     place = order[np.minimum(np.searchsorted(key[order], own), len(key) - 1)]
     split = key[place] == own

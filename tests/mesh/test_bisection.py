@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.mesh import bisect, box, centroids, cut, disk, measures, quality
+from jeit.mesh import bisect, bisection, box, centroids, cut, disk, measures, quality, sphere, tube
 
 
 def finer(centre, radius, edge):
@@ -80,6 +80,24 @@ def test_surfaces_may_leave_the_body():
     side[np.abs(side) < 1e-8] = 0
     within = np.sign(side)[np.asarray(found.cells)].min(axis=1) < 0
     assert np.asarray(measures(found))[within].sum() == pytest.approx(0.61 - 0.15, rel=1e-6)
+
+
+@pytest.mark.parametrize("surface", [sphere(1.0, num_points=400), tube(0.5, 1.5, num_points=400)], ids=["ball", "tube"])
+def test_surfaces_in_space_are_divided_and_cut(surface):
+    edge = 0.08
+    finer_there = bisect(surface, finer([0.5, 0.2, 0.1], 0.5, edge))
+    found = cut(finer_there, lambda points: points[:, 0] - 0.21)
+    np.testing.assert_allclose(np.sum(measures(finer_there)), np.sum(measures(surface)), rtol=1e-12)
+    assert longest(finer_there).min() <= edge < longest(surface).min()
+    side = np.asarray(found.points)[:, 0] - 0.21
+    sides = np.sign(np.where(np.abs(side) < 1e-8, 0, side))[np.asarray(found.cells)]
+    assert (sides.min(axis=1) * sides.max(axis=1) >= 0).all()
+
+
+def test_more_nodes_than_can_be_indexed_are_refused(monkeypatch):
+    monkeypatch.setattr(bisection, "MOST_POINTS", 1000)
+    with pytest.raises(ValueError, match=r"size asks for more than 1,000 nodes; give longer"):
+        bisect(MESHES["disk"], lambda corners: np.full(len(corners), 1e-6))
 
 
 def test_what_does_not_fit_is_refused():
