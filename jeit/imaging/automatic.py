@@ -9,7 +9,6 @@ from jeit.arguments import percent
 from jeit.imaging.method import METHODS, Imaged, NamedPrior, shapes_in
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
-from jeit.inverse.prior.defaults import MEASURED
 from jeit.inverse.shapes import ShapeReconstruction
 
 # Change relative to the background beyond which voltages are far from linear in it; and beyond which that must be
@@ -56,7 +55,7 @@ def image_automatically(prepared: PreparedDifference, prior: NamedPrior, segment
         if shapes is not None or not segmented:
             outlined = "" if shapes is None else ", and its bodies' outlines fitted"
             return _with_bodies(prepared, f"{fault}: solved for conductivity itself{outlined}.", better, shapes)
-    elif not segmented and (bodies := _bodies_in_solid(prepared, imaged[1])):
+    elif not segmented and (bodies := _bodies_in_solid(prepared, prior, imaged[1])):
         return bodies
     if segmented:
         pieces = METHODS["total-variation"]
@@ -65,7 +64,7 @@ def image_automatically(prepared: PreparedDifference, prior: NamedPrior, segment
     return Chosen("one-step", "the linear image is sound: changes are small, and it explains the voltages.", imaged)
 
 
-def _bodies_in_solid(prepared: PreparedDifference, change: Float[Array, " m"]) -> Chosen | None:
+def _bodies_in_solid(prepared: PreparedDifference, prior: NamedPrior, change: Float[Array, " m"]) -> Chosen | None:
     """Bodies that the data of a solid tell of, where a sound linear image shows more than a trace and noise allows."""
     noise = prepared.quality.difference_noise
     strongest = np.abs(np.asarray(change)).max() / float(prepared.calibration.conductivity)
@@ -73,7 +72,7 @@ def _bodies_in_solid(prepared: PreparedDifference, change: Float[Array, " m"]) -
         return None
     newton = METHODS["gauss-newton"]
     try:
-        smooth = newton.image(prepared, MEASURED, newton.hyperparameter)
+        smooth = newton.image(prepared, prior, newton.hyperparameter)
     except ValueError:
         return None
     assert isinstance(smooth[0], Reconstruction)

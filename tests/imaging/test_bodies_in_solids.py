@@ -71,7 +71,8 @@ def test_bodies_are_looked_for_in_solids_where_data_can_tell_of_them(monkeypatch
         raise ValueError("no image")
 
     monkeypatch.setitem(automatic.METHODS, "gauss-newton", SimpleNamespace(image=image, hyperparameter=5.0))
-    assert automatic._bodies_in_solid(*prepared(dimension, strongest, noise)) is None
+    data, change = prepared(dimension, strongest, noise)
+    assert automatic._bodies_in_solid(data, "gaussian", change) is None
     assert bool(asked) == looks
 
 
