@@ -12,7 +12,7 @@ from benchmarks.problems.solid_tanks import draw, matched
 from jeit import image_difference
 from jeit.imaging import ImagingSettings
 
-TANKS, FIRST = 30, 700_000
+TANKS, FIRST = 20, 700_000
 _CONTRAST = 0.15
 HEADER = ["tank", "electrodes", "channels", "method", "balls", "off / r", "volume", "contrast", "not balls", "seconds"]
 
@@ -53,4 +53,4 @@ def run(options: Options) -> Result:
     return Result([Table(HEADER, rows)], checks, [f"{len(refused)} tanks refused", *refused])
 
 
-CASE = Case("solid_tanks", "balls in simulated boxes and cylinders: places, volumes, contrasts", run, 8, timed=False)
+CASE = Case("solid_tanks", "balls in simulated boxes and cylinders: places, volumes, contrasts", run, 30, timed=False)

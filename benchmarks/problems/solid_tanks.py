@@ -6,7 +6,7 @@ impedances, currents and what is read, and number, size, place and conductivity 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -104,7 +104,7 @@ def _tank(rng, kind: str) -> tuple[Solid, FacePatches, Protocol]:
         at += [(a * x / 4, b * y / 3, s * z) for s in (0, 1) for a in (-1, 1) for b in (-1, 0, 1)]
         side = rng.uniform(0.5, 0.94) * min(x / 2, y / 3, z / 2)
         electrodes = FacePatches(np.array(at), side, side, 1.0)
-        return Solid(Rectangle(x, y), z), electrodes, _all_at_once(rng, 32, current)
+        return Solid(Rectangle(x, y), z), electrodes, _by_number(rng, haar, 32, current, 8)
     radius = scale * 0.1
     height = radius * rng.uniform(0.8, 2.0)
     angle = 2 * np.pi * np.arange(16) / 16
@@ -113,35 +113,20 @@ def _tank(rng, kind: str) -> tuple[Solid, FacePatches, Protocol]:
     if kind == "strips":
         at = np.column_stack([around, np.full(16, height / 2)])
         electrodes = FacePatches(at, width, height * rng.uniform(0.3, 0.95), 1.0)
-        return Solid(Disk(radius), height), electrodes, _ring_of(rng, 16, current)
+        return Solid(Disk(radius), height), electrodes, _by_number(rng, adjacent, 16, current, 4)
     low, high = rng.uniform(0.2, 0.35), rng.uniform(0.65, 0.8)
     at = np.concatenate([np.column_stack([around, np.full(16, one * height)]) for one in (low, high)])
     electrodes = FacePatches(at, width, height * rng.uniform(0.1, 0.35), 1.0)
     if rng.integers(2):
-        return Solid(Disk(radius), height), electrodes, _all_at_once(rng, 32, current)
+        return Solid(Disk(radius), height), electrodes, _by_number(rng, haar, 32, current, 8)
     return Solid(Disk(radius), height), electrodes, _pairs(rng, current)
 
 
-def _all_at_once(rng, count: int, current: float) -> Protocol:
-    kind = int(rng.integers(4))
-    if kind == 0:
-        return trigonometric(count, current=current)
-    if kind == 1:
-        return haar(count, current=current)
-    if kind == 2:
-        return opposite(count, current=current)
-    return skip(count, int(rng.integers(2, 9)), current=current)
-
-
-def _ring_of(rng, count: int, current: float) -> Protocol:
-    kind = int(rng.integers(4))
-    if kind == 0:
-        return adjacent(count, current=current)
-    if kind == 1:
-        return opposite(count, current=current)
-    if kind == 2:
-        return trigonometric(count, current=current)
-    return skip(count, int(rng.integers(1, 5)), current=current)
+def _by_number(rng, own: Callable[..., Protocol], count: int, current: float, most: int) -> Protocol:
+    """By the electrodes' numbers: trigonometric, opposite, up to `most` skipped, or of the kind's `own`."""
+    kind = (trigonometric, own, opposite, skip)[int(rng.integers(4))]
+    skipped = (int(rng.integers(1, most + 1)),) if kind is skip else ()
+    return kind(count, *skipped, current=current)
 
 
 def _pairs(rng, current: float) -> Protocol:
