@@ -30,7 +30,15 @@ from jeit_solvers.optimise.small_problems import (
 from jeit_solvers.optimise.status import Status, ended, ended_number
 from jeit_solvers.sparse.choose import choose_solver
 from jeit_solvers.sparse.conjugate_gradient import ConjugateGradient
-from jeit_solvers.sparse.multifrontal import Factor, factorise, half_solve, quadratic_form, solve
+from jeit_solvers.sparse.multifrontal import (
+    Factor,
+    factorise,
+    half_solve,
+    inverse_entries,
+    inverse_root,
+    quadratic_form,
+    solve,
+)
 from jeit_solvers.sparse.near_inverse import NearInverse, Strips, near_inverse
 from jeit_solvers.sparse.operator import SparseSymmetric
 from jeit_solvers.sparse.pattern import SparsityPattern
@@ -63,6 +71,8 @@ __all__ = [
     "half_solve",
     "hessian_small",
     "in_turn",
+    "inverse_entries",
+    "inverse_root",
     "inverse_small",
     "kmeans",
     "lbfgsb",

@@ -20,9 +20,12 @@ from jeit_solvers import (
     choose_solver,
     factorise,
     half_solve,
+    inverse_entries,
+    inverse_root,
     quadratic_form,
     solve,
 )
+from jeit_solvers.engines import on_device, on_host
 
 # Residuals relative to |A| |x|; a backward stable solver reaches a small multiple of the unit roundoff.
 TOLERANCE = {"float32": 3e-6, "float64": 5e-15, "complex128": 5e-15}
@@ -68,6 +71,40 @@ def test_solves_every_problem_to_roundoff(case, dtype):
     loose = 1e3 * TOLERANCE[dtype]
     np.testing.assert_allclose(form, vectors.T @ solution, rtol=0, atol=loose * abs(form).max())
     np.testing.assert_allclose(half.T @ half, form, rtol=0, atol=loose * abs(form).max())
+
+
+@pytest.mark.parametrize("engine", [on_host, on_device], ids=["numpy", "jax"])
+@pytest.mark.parametrize("case", sparse_problems.PROBLEMS, ids=lambda case: case.__name__)
+def test_entries_and_root_of_the_inverse_are_those_of_the_dense_one(case, engine):
+    pattern, values, coordinates = case()
+    inverse = np.linalg.inv(np.asarray(pattern.to_dense(values)))
+    pattern, plan, values = engine((pattern, analyse(pattern, coordinates), values))
+    factor = factorise(plan, values)
+    entries = inverse_entries(plan, factor)
+    assert isinstance(entries, np.ndarray) == (engine is on_host)
+    least = 1e-12 * abs(inverse).max()
+    np.testing.assert_allclose(
+        entries, inverse[np.asarray(pattern.rows), np.asarray(pattern.columns)], rtol=0, atol=least
+    )
+    root = inverse_root(plan, factor, engine(np.eye(plan.num_pivots)))
+    np.testing.assert_allclose(root @ root.T, inverse, rtol=0, atol=least)
+
+
+def test_the_inverse_has_entries_where_elements_have_nodes():
+    points, cells = sparse_problems.disk_cells(30)
+    pattern, values, _ = sparse_problems.from_cells(points, cells)
+    inverse = np.linalg.inv(np.asarray(pattern.to_dense(values)))
+    plan = analyse(pattern, points)
+    between = pattern.entries_between(inverse_entries(plan, factorise(plan, values)))
+    row, column = np.tril_indices(3)
+    np.testing.assert_allclose(between, inverse[cells[:, row], cells[:, column]].T, rtol=1e-11)
+
+
+def test_roots_are_refused_of_rows_of_another_order():
+    pattern, values, coordinates = sparse_problems.disk()
+    plan = analyse(pattern, coordinates)
+    with pytest.raises(ValueError, match="inverse_root: rows"):
+        inverse_root(plan, factorise(plan, values), jnp.ones((plan.num_pivots + 1, 2)))
 
 
 def test_agrees_with_superlu_on_a_large_disk():

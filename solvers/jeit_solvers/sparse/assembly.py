@@ -1,5 +1,6 @@
 """Summing element matrices into matrix entries."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,14 @@ class AssemblyMap(NamedTuple):
         """The matrix entries that the group's element matrices add up to; see `SparsityPattern.assemble`."""
         flat = self._packed(matrices, name).reshape(-1)
         return namespace(flat).concatenate([self.diagonal.apply(indices, flat), self.below.apply(indices, flat)])
+
+    def read_back(self, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Inexact[Array, "..."]:
+        """The matrix entry that each packed value is added to; see `SparsityPattern.entries_between`."""
+        packed = (len(np.tril_indices(self.shape[1])[0]), self.shape[0]) if len(self.shape) > 1 else self.shape
+        size = self.diagonal.gather.shape[1]
+        into = namespace(values).zeros(math.prod(packed) + 1, values.dtype)
+        into = self.diagonal.read_back(indices, values[:size], into)
+        return self.below.read_back(indices, values[size:], into)[:-1].reshape(packed)
 
     def _packed(self, matrices: Inexact[Array, "..."], name: str) -> Inexact[Array, "..."]:
         """One row of m values for each entry of the elements' lower triangles."""

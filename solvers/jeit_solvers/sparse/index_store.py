@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Inexact, Int
 
-from jeit_solvers.engines import add_into, as_array, gather, gather_or_zero, has_values, namespace
+from jeit_solvers.engines import add_into, as_array, gather, gather_or_zero, has_values, namespace, set_at
 
 
 class Slot(NamedTuple):
@@ -94,6 +94,18 @@ class PaddedSum(NamedTuple):
             overflow = gather(contributions, self.overflow_source.read(indices))
             total = add_into(total, self.overflow_sum.read(indices), overflow)
         return total
+
+    def read_back(
+        self, indices: Int[Array, " total"], sums: Inexact[Array, " sums"], into: Inexact[Array, " sources"]
+    ) -> Inexact[Array, " sources"]:
+        """`into` with the sum that each contribution is added to in its place, one of them where it is added to more;
+        it must have one place more than there are contributions, which is overwritten."""
+        for layer in self.gather.read(indices):
+            into = set_at(into, layer, sums)
+        if self.overflow_sum.shape[0]:
+            overflow = gather(sums, self.overflow_sum.read(indices))
+            into = set_at(into, self.overflow_source.read(indices), overflow)
+        return into
 
 
 # Measured on two Zen 4 cores: a scattered contribution costs about as much as this many gathered ones.

@@ -144,6 +144,87 @@ def quadratic_form(
     return half.T @ half
 
 
+def inverse_root(plan: FactorisationPlan, factor: Factor, rows: Inexact[Array, "rows k"]) -> Inexact[Array, "n k"]:
+    """P^T L^-T times vectors, rows as `half_solve` returns them: of standard normal ones, vectors of covariance A^-1.
+
+    Raises `ValueError` for another number of rows.
+    """
+    if rows.ndim != 2 or rows.shape[0] != plan.num_pivots:
+        raise ValueError(f"inverse_root: rows must have shape ({plan.num_pivots}, k); got {rows.shape}.")
+    if isinstance(rows, np.ndarray):
+        return _other_half(plan.layout, plan.indices, factor, rows)
+    return _compiled_other_half(plan.layout, plan.indices, factor, rows)
+
+
+def inverse_entries(plan: FactorisationPlan, factor: Factor) -> Inexact[Array, " nnz"]:
+    """The entries of A^-1 where A has some (nnz,), in the order of its pattern, diagonal first.
+
+    They follow from the factor and from each other, from the root of the elimination tree down, in about the time of a
+    factorisation, where all of A^-1 would take as many solves as there are rows. Takahashi, Fagan and Chin, Proc. 8th
+    PICA Conf. (1973) 63-69; Erisman and Tinney, Commun. ACM 18 (1975) 177-179.
+    """
+    if isinstance(factor.inverses[0], np.ndarray):
+        return _inverse_entries(plan.layout, plan.num_entries, plan.indices, factor)
+    return _compiled_inverse_entries(plan.layout, plan.num_entries, plan.indices, factor)
+
+
+def _inverse_entries(
+    layout: IndexLayout, num_entries: int, indices: Int[Array, " total"], factor: Factor
+) -> Inexact[Array, " nnz"]:
+    """With A = L L^T a front's part of the inverse Z, that of its border taken from its parent's, is
+    Z_bp = -Z_bb K, Z_pp = L_pp^-T L_pp^-1 + K^T Z_bb K, K = L_bp L_pp^-1."""
+    stages, _ = layout.content
+    xp, dtype = namespace(factor), factor.inverses[0].dtype
+    entries = xp.zeros(num_entries + 2, dtype)  # one for padded pivots, and one for what is no entry
+    first_child = {one.parent: number for number, one in reversed(list(enumerate(stages))) if one.border}
+    fronts: dict[int, Inexact[Array, "batch height height"]] = {}
+    for number in reversed(range(len(stages))):
+        stage, inverse = stages[number], factor.inverses[number]
+        mine = _transposed(inverse) @ inverse
+        whole = mine
+        if stage.border:
+            above = fronts[stage.parent]
+            corner = _within(above, stage.above.read(indices))
+            pulled = factor.lowers[number] @ inverse
+            side = corner @ pulled
+            mine = mine + _transposed(pulled) @ side
+            panel = xp.concatenate([mine, -side], axis=1)
+            whole = xp.concatenate([panel, xp.concatenate([-_transposed(side), corner], axis=1)], axis=2)
+        entries = stage.entries.read_back(indices, whole[:, :, : stage.pivots].reshape(-1), entries)
+        if number in first_child:
+            fronts[number] = whole
+        if stage.border and first_child[stage.parent] == number:
+            del fronts[stage.parent]  # no front further down hangs on it
+    return entries[:num_entries]
+
+
+def _within(above: Inexact[Array, "parents height height"], rows: Int[Array, "batch border"]):
+    """Of the inverse in parents' fronts what is between the rows of children's borders, zero for padding."""
+    height = above.shape[-1]
+    slot, place = rows // height, rows % height
+    # Padding is one beyond the last front.
+    flat = (slot[:, :, None] * height + place[:, :, None]) * height + place[:, None, :]
+    there = rows < above.shape[0] * height
+    flat = namespace(above).where(there[:, :, None] & there[:, None, :], flat, above.size)
+    return gather_or_zero(above.reshape(-1), flat)
+
+
+_compiled_inverse_entries = jax.jit(_inverse_entries, static_argnums=(0, 1))
+
+
+def _other_half(
+    layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, rows: Inexact[Array, "rows k"]
+) -> Inexact[Array, "n k"]:
+    stages, solution = layout.content
+    ends = np.cumsum([stage.batch * stage.pivots for stage in stages])
+    parts = namespace(rows).split(rows, ends[:-1])
+    parts = [part.reshape(stage.batch, stage.pivots, -1) for part, stage in zip(parts, stages, strict=True)]
+    return _backward(stages, indices, factor, parts)[solution.read(indices)]
+
+
+_compiled_other_half = jax.jit(_other_half, static_argnums=0)
+
+
 def _transposed(matrices: Inexact[Array, "batch a b"]) -> Inexact[Array, "batch b a"]:
     return namespace(matrices).swapaxes(matrices, -1, -2)
 

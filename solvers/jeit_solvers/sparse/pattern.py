@@ -187,6 +187,11 @@ class SparsityPattern(eqx.Module):
             raise ValueError("assemble: every group is None, so there is nothing to assemble.")
         return sum(parts[1:], start=parts[0])
 
+    def entries_between(self, values: Inexact[Array, " nnz"], group: int = 0) -> Inexact[Array, "pairs m"]:
+        """The matrix's entries between the nodes of each element of a group, packed as `assemble` takes them:
+        (k (k + 1) / 2, m), rows in the order of `numpy.tril_indices(k)`."""
+        return self._assembly[group].read_back(self.indices, values)
+
     def diagonal(self, values: Inexact[Array, " nnz"]) -> Inexact[Array, " n"]:
         """The matrix's diagonal (n,)."""
         return values[: self.size]
