@@ -1,8 +1,9 @@
 """Matrices between the nodes of a mesh, solved by the direct solver, and images of cells as means over their nodes."""
 
+import functools
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,11 +66,12 @@ def in_columns(
     """`solve` or `half_solve` of columns (n, k); of NumPy's some at a time, on every core."""
     if not isinstance(columns, np.ndarray):
         return how(plan, factor, columns)
-    return by_columns(partial(how, plan, factor), columns, plan.size if how is solve else plan.num_pivots)
+    return by_columns(functools.partial(how, plan, factor), columns, plan.size if how is solve else plan.num_pivots)
 
 
 def by_columns(function: Callable[[Any], Any], columns: Any, rows: int) -> Any:
-    """What `function` makes of columns (n, k) of NumPy's, (rows, k), some at a time on every core."""
+    """What `function` makes of columns (n, k) of NumPy's, (rows, k), some at a time on every core. It may ask for the
+    same of as many columns as it is given."""
     number = columns.shape[1]
     found = np.empty((rows, number), columns.dtype)
 
@@ -81,6 +83,12 @@ def by_columns(function: Callable[[Any], Any], columns: Any, rows: int) -> Any:
     if number <= _AT_ONCE:
         some(0)
         return found
-    with ThreadPoolExecutor(min(number_of_cores(), _MOST_AT_ONCE)) as pool:
-        list(pool.map(some, range(0, number, _AT_ONCE)))
+    list(_workers(os.getpid()).map(some, range(0, number, _AT_ONCE)))
     return found
+
+
+@functools.cache
+def _workers(process: int) -> ThreadPoolExecutor:
+    """Threads of a process, which a fork of it has not. They are kept: what new ones allocate and free stays with the
+    process, a hundred megabytes every time."""
+    return ThreadPoolExecutor(min(number_of_cores(), _MOST_AT_ONCE))
