@@ -57,6 +57,10 @@ JOBS = {
         60.0,
     ),
     "total variation": (_NEWTON.format("TotalVariation()", 300.0), 60.0),
+    "total variation, with error bars": (
+        f"posterior({_NEWTON.format('TotalVariation()', 300.0)}).standard_deviation()",
+        60.0,
+    ),
 }
 _MEMORY = 2048.0
 

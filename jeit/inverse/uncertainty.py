@@ -1,26 +1,36 @@
 """Uncertainty: what the data leave open about an image, by the Laplace approximation.
 
-At the solution ĉ of ½ rᵀGr + ½‖c‖² the posterior is taken for the Gaussian of the linearised problem, with covariance
+At the solution ĉ of ½ rᵀGr + penalty(c) the posterior is taken for the Gaussian of the linearised problem, with
+covariance
 
-    Σ = (1 + JᵀGJ)⁻¹ = 1 - Jᵀ(JJᵀ + C)⁻¹J,
+    Σ = (Q + JᵀGJ)⁻¹ = Q⁻¹ - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹JQ⁻¹,
 
-exact where voltages are linear in c, and computed in the space of the data. Tarantola, Inverse Problem Theory (SIAM
-2005), ch. 3; Kaipio and Somersalo, Statistical and Computational Inverse Problems (Springer 2005), ch. 3.
+computed in the space of the data. Of smooth priors Q is 1, and Σ is exact where voltages are linear in c. Tarantola,
+Inverse Problem Theory (SIAM 2005), ch. 3; Kaipio and Somersalo, Statistical and Computational Inverse Problems
+(Springer 2005), ch. 3; MacKay, Neural Comput. 4 (1992) 415-447.
+
+Of total variation Q is the form that touches its energy at ĉ from above, that of lagged diffusivity (Vogel and Oman,
+SIAM J. Sci. Comput. 17 (1996) 227-238): a jump of height d between cells is held at it with a stiffness of 1 / √(d² +
+β²), a jump of none with that of 1 / β. So Σ is what would be left open if one knew where the edges are, and how high
+about: conditional on the edges found. Where an edge lies the energy itself bends less than Q, and the data may be as
+well explained by an edge elsewhere: there the truth is spread wider.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 import scipy.special
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jeit.arguments import check_has_values, check_key, check_kind
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
+from jeit.inverse.prior.normal import AbstractNormal
 from jeit.mesh import measures
 from jeit_solvers import Status
-from jeit_solvers.engines import either_engine, has_values, namespace, on_host
+from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
 
 # Rows of an image's size at a time.
 _ROWS = 32
@@ -29,13 +39,16 @@ _ROWS = 32
 class Posterior(eqx.Module):
     """What is known of an image after the data: a Gaussian of its coefficients, with mean ĉ. Made by `posterior`.
 
-    **Fields**: `inversion`; `coefficients` ĉ (n,); `jacobian` J (r, n) there; `root` W (r, r) with WᵀW = (JJᵀ + C)⁻¹.
+    **Fields**: `inversion`; `coefficients` ĉ (n,); `jacobian` J (r, n) there; `root` W (r, r) with WᵀW =
+    (JQ⁻¹Jᵀ + C)⁻¹; `cross` JQ⁻¹ (r, n), J itself where Q is 1; `prior`, the normal distribution of precision Q.
     """
 
     inversion: Inversion
     coefficients: Float[Array, " n"]
     jacobian: Float[Array, "r n"]
     root: Float[Array, "r r"]
+    cross: Float[Array, "r n"]
+    prior: AbstractNormal
 
     def standard_deviation(self) -> Float[Array, " m"]:
         """Of the conductivity of every cell, S/m (2-D: S), to first order in the link."""
@@ -80,7 +93,7 @@ class Posterior(eqx.Module):
         `Reconstruction.unknowns`; to first order where a logarithm was estimated."""
         model, values = self.inversion.model, self.inversion.values(self.coefficients)
         start = self.inversion.basis.num_coefficients
-        deviation = jnp.sqrt(1 - jnp.sum((self.root @ self.jacobian) ** 2, axis=0))
+        deviation = jnp.sqrt(1 - jnp.sum((self.root @ self.cross) ** 2, axis=0))
         found = {}
         for unknown, value in zip(self.inversion.unknowns, values, strict=True):
             ones = jnp.ones_like(value)
@@ -93,50 +106,63 @@ class Posterior(eqx.Module):
         """Conductivities (number, m) drawn from the posterior, S/m (2-D: S). Raises `ValueError` for what is
         no key."""
         check_key(key)
-        return _sample(self, key, number)
+        prior, noise = jax.random.split(key)
+        numbers = jax.random.normal(prior, (number, self.prior.num_draws(len(self.coefficients))))
+        return as_array(_sample(self, numbers, jax.random.normal(noise, (number, len(self.root)))))
 
 
 def posterior(reconstruction: Reconstruction) -> Posterior:
-    """The posterior round a reconstruction with a smooth prior, by the Laplace approximation.
+    """The posterior round a reconstruction, by the Laplace approximation.
 
-    Its standard deviations are as honest as the noise, the prior and the forward model are: with λ = 1 and a prior of
-    the right variance they hold at their nominal rate; λ = 2 says that the image varies half as much. Raises
-    `ValueError` for total variation and bounded solvers, whose posterior is not near a Gaussian, and for a
-    reconstruction that has failed, or is none.
+    With a smooth prior its standard deviations are as honest as the noise, the prior and the forward model are: with
+    λ = 1 and a prior of the right variance they hold at their nominal rate; λ = 2 says that the image varies half as
+    much. With total variation they are conditional on the edges found: what would be left open were it known where the
+    image has edges, and how high about. At an edge, which may lie elsewhere, the truth is spread wider. Raises
+    `ValueError` for bounded solvers, whose posterior is not near a Gaussian, and for a reconstruction that has failed,
+    or is none.
     """
     check_kind("reconstruction", reconstruction, Reconstruction, "what reconstruct has returned")
-    if not reconstruction.inversion.penalty.is_standard_normal:
-        raise ValueError(
-            "posterior: only for smooth priors (Tikhonov, Noser, Laplace, Gaussian) and unbounded solvers; total "
-            "variation and bounds have no Gaussian posterior."
-        )
+    inversion, coefficients = reconstruction.inversion, reconstruction.coefficients
     if has_values(reconstruction.outcome) and Status.FAILED.number in np.ravel(reconstruction.outcome):
         raise ValueError(f"posterior: the reconstruction failed. {reconstruction.reason}")
-    inversion, coefficients = reconstruction.inversion, reconstruction.coefficients
-    if not (has_values(inversion, coefficients) and inversion.model.mesh.dimension == 3):
+    in_pieces = inversion.model.mesh.dimension == 3 or not inversion.penalty.is_standard_normal
+    if not (has_values(inversion, coefficients) and in_pieces):
         return _posterior(inversion, coefficients)
-    # Of a solid body compiled programs would hold the Jacobian several times over.
+    # Of a solid body compiled programs would hold the Jacobian several times over; those of factors take seconds.
     with np.errstate(all="ignore"):
         known, ended = on_host((inversion, coefficients))
-        _, jacobian = known.linearise(ended)
-        root = scipy.linalg.inv(np.linalg.cholesky(jacobian @ jacobian.T + known.data.covariance))
-    return Posterior(known, ended, jacobian, root)
+        jacobian, cross, inner, normal = _within_data(known, ended)
+        root = scipy.linalg.inv(np.linalg.cholesky(inner))
+    return Posterior(known, ended, jacobian, root, cross, normal)
 
 
 @eqx.filter_jit
 def _posterior(inversion: Inversion, coefficients) -> Posterior:
-    _, jacobian = inversion.linearise(coefficients)
-    lower = jnp.linalg.cholesky(jacobian @ jacobian.T + inversion.data.covariance)
+    jacobian, cross, inner, normal = _within_data(inversion, coefficients)
+    lower = jnp.linalg.cholesky(inner)
     root = jax.scipy.linalg.solve_triangular(lower, jnp.eye(len(lower)), lower=True)
-    return Posterior(inversion, coefficients, jacobian, root)
+    return Posterior(inversion, coefficients, jacobian, root, cross, normal)
+
+
+def _within_data(inversion: Inversion, coefficients):
+    """J, JQ⁻¹, JQ⁻¹Jᵀ + C, and the normal distribution of precision Q."""
+    normal = inversion.penalty.normal(coefficients)
+    if normal is None:
+        raise ValueError(
+            "posterior: only for unbounded solvers, for what bounds cut off is no Gaussian; take link=Bounded(lower, "
+            "upper) in place of bounds."
+        )
+    _, jacobian = inversion.linearise(coefficients)
+    cross = normal.covariance_product(jacobian.T).T
+    return jacobian, cross, cross @ jacobian.T + inversion.data.covariance, normal
 
 
 @either_engine
 def _estimate(posterior: Posterior):
     """x at the solution, background unknowns included, and its standard deviation, per cell, on the link's scale.
 
-    With S the shapes and what unknowns add to the image, the variance is diag(S Sᵀ) - diag(S Jᵀ WᵀW J Sᵀ), of which the
-    rows W J Sᵀ are made some at a time.
+    With S the shapes and what unknowns add to the image, the variance is diag(S Q⁻¹ Sᵀ) - diag(S Q⁻¹Jᵀ WᵀW JQ⁻¹ Sᵀ), of
+    which the rows W JQ⁻¹ Sᵀ are made some at a time.
     """
     inversion, coefficients = posterior.inversion, posterior.coefficients
     basis, xp = inversion.basis, namespace(posterior)
@@ -144,10 +170,10 @@ def _estimate(posterior: Posterior):
     # Unknowns change the image linearly, if at all.
     further = [np.arange(len(coefficients)) == number for number in range(count, len(coefficients))]
     added = [inversion.estimate(coefficients + one) - estimate for one in further]
-    variance = basis.variance() + sum(one**2 for one in added)
+    variance = posterior.prior.variance(basis) + sum(one**2 for one in added)
     rows = len(posterior.root)
     for start in range(0, rows, _ROWS):
-        gain = posterior.root[start : start + _ROWS] @ posterior.jacobian
+        gain = posterior.root[start : start + _ROWS] @ posterior.cross
         seen = xp.stack([basis.expand(row[:count]) for row in gain])
         for number, one in enumerate(added):
             seen = seen + gain[:, count + number, None] * one
@@ -155,20 +181,25 @@ def _estimate(posterior: Posterior):
     return estimate, xp.sqrt(xp.maximum(variance, 0))
 
 
-@eqx.filter_jit
+@either_engine
 def _weighted(posterior: Posterior, weight):
-    mean, gradient = jax.value_and_grad(lambda c: weight @ posterior.inversion.conductivity(c))(posterior.coefficients)
-    variance = gradient @ gradient - jnp.sum((posterior.root @ (posterior.jacobian @ gradient)) ** 2)
-    return mean, jnp.sqrt(variance)
+    """The weighted sum of cells' conductivities and its standard deviation."""
+    inversion, coefficients, xp = posterior.inversion, posterior.coefficients, namespace(posterior, weight)
+    estimate, count = inversion.estimate(coefficients), inversion.basis.num_coefficients
+    slope = weight * inversion.link.slope(estimate)
+    further = [np.arange(len(coefficients)) == number for number in range(count, len(coefficients))]
+    added = [slope @ (inversion.estimate(coefficients + one) - estimate) for one in further]
+    gradient = xp.concatenate([inversion.basis.restrict(slope[None])[0], xp.asarray(added, slope.dtype)])
+    own = gradient @ posterior.prior.covariance_product(gradient[:, None])[:, 0]
+    variance = own - xp.sum((posterior.root @ (posterior.cross @ gradient)) ** 2)
+    return weight @ inversion.link.conductivity(estimate), xp.sqrt(xp.maximum(variance, 0))
 
 
-@eqx.filter_jit
-def _sample(posterior: Posterior, key, number: int):
-    """c = ĉ + z - Jᵀ(JJᵀ + C)⁻¹(Jz + e), with z from the prior and e from the noise."""
-    prior, noise = jax.random.split(key)
-    jacobian, root = posterior.jacobian, posterior.root
-    drawn = jax.random.normal(prior, (number, jacobian.shape[1]))
-    errors = jax.random.normal(noise, (number, len(root))) @ jnp.linalg.cholesky(posterior.inversion.data.covariance).T
-    seen = drawn @ jacobian.T + errors
-    change = drawn - (seen @ root.T @ root) @ jacobian
-    return jax.vmap(posterior.inversion.conductivity)(posterior.coefficients + change)
+@either_engine
+def _sample(posterior: Posterior, numbers, errors):
+    """c = ĉ + z - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹(Jz + e), with z from the prior and e from the noise."""
+    inversion, root, xp = posterior.inversion, posterior.root, namespace(posterior, numbers)
+    drawn = posterior.prior.drawn(numbers.T).T
+    seen = drawn @ posterior.jacobian.T + errors @ xp.linalg.cholesky(inversion.data.covariance).T
+    change = drawn - (seen @ root.T @ root) @ posterior.cross
+    return xp.stack([inversion.conductivity(one) for one in posterior.coefficients + change])

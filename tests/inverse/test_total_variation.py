@@ -16,7 +16,6 @@ from jeit.inverse import (
     Tikhonov,
     TotalVariation,
     one_step,
-    posterior,
     reconstruct,
 )
 from jeit.inverse.channels import IndependentChannels
@@ -146,9 +145,3 @@ def test_there_is_no_linear_image(model, frame):
 def test_smoothing_must_be_positive():
     with pytest.raises(ValueError, match="smoothing"):
         TotalVariation(0.0)
-
-
-def test_there_is_no_gaussian_posterior(model, frame):
-    result = reconstruct(model, frame[0], 1.0, prior=TotalVariation(), noise=frame[1], solver=GaussNewton(max_steps=1))
-    with pytest.raises(ValueError, match="smooth priors"):
-        posterior(result)

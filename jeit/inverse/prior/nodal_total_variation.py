@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jeit.inverse.prior.bases import NodalBasis
 from jeit.inverse.prior.nodal import in_columns
+from jeit.inverse.prior.normal import SparseNormal
 from jeit.inverse.prior.penalty import AbstractPenalty
 from jeit.mesh import Mesh, gradients, measures
 from jeit_solvers import (
@@ -97,6 +98,12 @@ class NodalTotalVariation(AbstractPenalty):
         elements = self._elements(bend) * (within[:, :, None] & within[:, None, :])
         solved = solve(self.plan, self._factor(elements, jnp.where(mine, self.pull, 1)), columns[:size])
         return jnp.concatenate([solved, columns[size:]])
+
+    def normal(self, coefficients):
+        """Of the form that touches the energy at c, as of `jeit.inverse.prior.total_variation`."""
+        image, _ = self._parts(coefficients)
+        factor = self._factor(self._elements(self.weight / self._height(image)), self.pull)
+        return SparseNormal(self.pattern, self.plan, factor)
 
     def model(self, residual, jacobian, coefficients, data):
         """Gauss-Newton for the data, lagged diffusivity for the energy, in data space; as of

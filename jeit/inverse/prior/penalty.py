@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.inverse.channels import Data
+from jeit.inverse.prior.normal import AbstractNormal, StandardNormal
 from jeit_solvers import QuadraticModel, ridge_model
 from jeit_solvers.engines import namespace
 
@@ -43,6 +44,10 @@ class AbstractPenalty(eqx.Module):
         """About the inverse of the penalty's Hessian at c, of the coefficients that are `free` (n,), times columns that
         are zero for the others: what makes derivatives of a minimum cheap, and need not be exact."""
 
+    def normal(self, coefficients: Float[Array, " n"]) -> AbstractNormal | None:
+        """The normal distribution that the penalty stands for near c; None where what data leave open is near none."""
+        return None
+
     @abc.abstractmethod
     def model(self, residual, jacobian, coefficients, data: Data) -> QuadraticModel:
         """The whole cost at c and its `step`, for `jeit_solvers.Descent`."""
@@ -67,6 +72,10 @@ class Ridge(AbstractPenalty):
     def inverse_hessian(self, coefficients, free, columns):
         """The columns themselves."""
         return columns
+
+    def normal(self, coefficients):
+        """The standard one."""
+        return StandardNormal()
 
     def model(self, residual, jacobian, coefficients, data):
         """Gauss-Newton's, in the space of data or of coefficients."""

@@ -9,6 +9,7 @@ Graham, Adler and Lionheart, IEEE Trans. Med. Imaging 29 (2010) 44-54.
 
 from typing import NoReturn
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -16,11 +17,12 @@ from jaxtyping import Array, Float, Int
 from jeit.inverse.hyperparameter.defaults import EDGE_PRICE
 from jeit.inverse.prior.bases import DiagonalBasis
 from jeit.inverse.prior.nodal_total_variation import NodalTotalVariation
+from jeit.inverse.prior.normal import SparseNormal
 from jeit.inverse.prior.penalty import AbstractPenalty
 from jeit.inverse.prior.priors import AbstractPrior, cell_factorisation, check_cells
 from jeit.mesh import measures
 from jeit.mesh.geometry import interior_facets
-from jeit_solvers import FactorisationPlan, SparsityPattern, factorise, solve, solve_definite
+from jeit_solvers import Factor, FactorisationPlan, SparsityPattern, factorise, solve, solve_definite
 from jeit_solvers.engines import has_values, host, namespace, on_host, sum_into
 
 # Pull to the background, relative to the price of an edge: what fixes an image that the data do not.
@@ -92,6 +94,7 @@ class TotalVariation(AbstractPrior):
             reference=reference,
             pattern=pattern,
             plan=plan,
+            between_bounds=per_cell,
         )
         return DiagonalBasis(host.ones(mesh.num_cells)), penalty
 
@@ -104,7 +107,10 @@ def _refuse(what: str) -> NoReturn:
 
 
 class TotalVariationPenalty(AbstractPenalty):
-    """Σ weight √(d² + β²) + ½ Σ level c², d the jumps of reference + c; with a unit ridge on further unknowns."""
+    """Σ weight √(d² + β²) + ½ Σ level c², d the jumps of reference + c; with a unit ridge on further unknowns.
+
+    `between_bounds`: it is for solvers that keep bounds.
+    """
 
     pairs: Int[Array, "f 2"]
     weight: Float[Array, " f"]
@@ -113,6 +119,7 @@ class TotalVariationPenalty(AbstractPenalty):
     reference: Float[Array, " m"]
     pattern: SparsityPattern
     plan: FactorisationPlan
+    between_bounds: bool = eqx.field(static=True, default=False)
 
     @property
     def tolerance(self) -> float:
@@ -144,6 +151,14 @@ class TotalVariationPenalty(AbstractPenalty):
         factor = factorise(self.plan, self.pattern.assemble(link, level[:, None, None]))
         image_columns, other = columns[: len(mine)], columns[len(mine) :]
         return jnp.concatenate([solve(self.plan, factor, image_columns), other])
+
+    def normal(self, coefficients):
+        """Of the form that touches the energy at c: each jump normal of variance √(d² + β²) / weight, as if where the
+        edges are, and how high, were known. None between bounds."""
+        if self.between_bounds:
+            return None
+        image, _ = self._parts(coefficients)
+        return SparseNormal(self.pattern, self.plan, self._factor(self.weight / self._height(image)))
 
     def model(self, residual, jacobian, coefficients, data):
         """Gauss-Newton for the data, lagged diffusivity for the energy, in data space.
@@ -177,9 +192,12 @@ class TotalVariationPenalty(AbstractPenalty):
 
     def _solve(self, stiffness, columns):
         """Q⁻¹ columns, Q the touching form of these weights of jumps."""
+        return solve(self.plan, self._factor(stiffness), columns)
+
+    def _factor(self, stiffness) -> Factor:
+        """Of Q."""
         link = stiffness[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
-        factor = factorise(self.plan, self.pattern.assemble(link, self.level[:, None, None]))
-        return solve(self.plan, factor, columns)
+        return factorise(self.plan, self.pattern.assemble(link, self.level[:, None, None]))
 
     def _divergence(self, flux):
         first, second = self.pairs[:, 0], self.pairs[:, 1]
