@@ -14,6 +14,7 @@ from jeit.inverse.nonlinear import Background, GaussNewton, LevenbergMarquardt
 from jeit.layout import ring
 from jeit.mesh import Disk, Rectangle, Solid, centroids, gradients, measures
 from jeit.protocol import adjacent
+from jeit_solvers.engines import on_host
 
 
 def sheet():
@@ -142,6 +143,21 @@ def test_samples_spread_as_the_whole_matrix_inverted_says(model):
     np.testing.assert_allclose(drawn.std(axis=0), np.sqrt(diagonal(shapes, inverse)), rtol=0.08)
     even = shapes.mean(axis=0)
     assert drawn.mean(axis=1).std() == pytest.approx(np.sqrt(even @ inverse @ even), rel=0.08)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.7])
+def test_steps_are_those_of_the_whole_matrix(damping, model):
+    """To the minimum of the misfit linearised and of the form that touches the energy, weighted with 1 + damping."""
+    inversion, point = on_host((sharp(model).inversion, sharp(model).coefficients))
+    point = point + 0.05 * np.random.default_rng(0).normal(size=point.shape)
+    residual, jacobian = inversion.linearise(point)
+    form, gradient = precision(inversion, point)[0], np.asarray(jax.grad(inversion.penalty.cost)(jnp.asarray(point)))
+    matrix = jacobian.T @ inversion.data.precision @ jacobian + (1 + damping) * form
+    expected = -np.linalg.solve(matrix, jacobian.T @ inversion.data.precision @ residual + gradient)
+    direction, _, curvature = inversion.quadratic_model(point)[1](damping)
+    np.testing.assert_allclose(direction, expected, rtol=0, atol=1e-8 * abs(expected).max())
+    undamped = matrix - damping * form
+    assert curvature == pytest.approx(expected @ undamped @ expected, rel=1e-8)
 
 
 @pytest.mark.slow

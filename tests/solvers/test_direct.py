@@ -246,3 +246,18 @@ def test_a_plan_serves_all_that_have_its_tree_while_any_uses_it():
     vector = np.arange(1.0, pattern.size + 1)
     expected = np.linalg.solve(np.asarray(pattern.to_dense(values)), vector)
     np.testing.assert_allclose(solve(plan, factorise(plan, values), jnp.asarray(vector)), expected, rtol=1e-12)
+
+
+def test_patterns_of_one_tree_but_other_entries_share_no_plan():
+    """Eliminated in the same order, all in one front, but read from other places."""
+    size, random = 12, np.random.default_rng(0)
+    row, column = np.tril_indices(size, -1)
+    kept = []
+    for near in (row - column < size, row - column < 2):
+        matrix = np.zeros((size, size))
+        matrix[row[near], column[near]] = random.uniform(-1, 1, near.sum())
+        matrix += matrix.T + 2 * size * np.eye(size)
+        pattern, values = SparsityPattern.from_matrix(matrix)
+        kept.append(analyse(pattern, np.arange(size, dtype=float)[:, None]))
+        solution = solve(kept[-1], factorise(kept[-1], values), jnp.arange(1.0, size + 1))
+        np.testing.assert_allclose(matrix @ solution, np.arange(1.0, size + 1), rtol=1e-12)

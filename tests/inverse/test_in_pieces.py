@@ -1,0 +1,87 @@
+"""What is worked out some cells, or some columns, at a time: the same as all at once, however the pieces fall."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from jeit.electrodes import BoundaryElectrodes
+from jeit.forward import ForwardModel
+from jeit.forward import model as forward_model
+from jeit.inverse.linear import greit
+from jeit.inverse.linearisation import combined_jacobian
+from jeit.inverse.prior.bases import DenseBasis, DiagonalBasis, NodalBasis
+from jeit.inverse.prior.nodal import by_columns
+from jeit.layout import ring
+from jeit.mesh import Disk, box
+from jeit.protocol import adjacent
+
+RANDOM = np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return ForwardModel(Disk(0.1).mesh(num_points=200), BoundaryElectrodes(ring(0.1, 16), 0.012, 1e-3), adjacent(16))
+
+
+@pytest.mark.parametrize("number", [208, 100], ids=["of fields' products", "of channels"])
+def test_jacobians_are_joined_of_pieces(number, model, monkeypatch):
+    """Of more channels than fields have products, and of fewer."""
+    weights, channels = RANDOM.normal(size=(3, number)), np.arange(number)
+    expected = weights @ np.asarray(model.jacobian(1.0))[:number]
+    monkeypatch.setattr(forward_model, "_CELLS", 70)
+    monkeypatch.setattr(forward_model, "_BLOCK", 70 * number)
+    assert model.mesh.num_cells > 3 * 70
+    assert model.mesh.num_cells % 70
+    found = combined_jacobian(model, 1.0, channels, weights)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * abs(expected).max())
+
+
+@pytest.mark.parametrize("kind", ["nodal", "diagonal", "dense"])
+def test_rows_are_restricted_in_pieces_as_whole(kind):
+    mesh = box(0.1, 0.1, 0.1, num_points=60)
+    count, cells = mesh.num_cells, np.asarray(mesh.cells)
+    means = np.zeros((count, mesh.num_points))
+    np.add.at(means, (np.arange(count)[:, None], cells), 1 / 4)
+    given = {
+        "nodal": (NodalBasis(cells, mesh.num_points), means),
+        "diagonal": (DiagonalBasis(np.arange(1.0, count + 1)), np.diag(np.arange(1.0, count + 1))),
+        "dense": (DenseBasis(means), means),
+    }
+    (basis, shapes), rows = given[kind], RANDOM.normal(size=(5, count))
+    pieces = [slice(start, min(start + 50, count)) for start in range(0, count, 50)]
+    assert len(pieces) > 2
+    found = basis.restrict_blocks((cells, rows[:, cells]) for cells in pieces)
+    np.testing.assert_allclose(found, rows @ shapes, atol=1e-12)
+    np.testing.assert_allclose(basis.restrict(rows), rows @ shapes, atol=1e-12)
+
+
+@pytest.mark.parametrize("number", [1, 32, 33, 64, 100])
+def test_columns_are_joined_of_pieces(number):
+    matrix, columns = RANDOM.normal(size=(7, 5)), RANDOM.normal(size=(5, number))
+    np.testing.assert_allclose(by_columns(lambda part: matrix @ part, columns, 7), matrix @ columns, rtol=1e-12)
+
+
+def test_columns_are_always_solved_for_on_the_same_threads():
+    """What new ones allocate would stay with the process."""
+    pools = set()
+
+    def noted(part):
+        pools.add(threading.current_thread().name.rpartition("_")[0])
+        return part
+
+    for _ in range(3):
+        by_columns(noted, np.ones((2, 640)), 2)
+    assert len(pools) == 1
+
+
+def test_samples_far_from_all_of_greits_targets_are_passed_over_unnoticed(monkeypatch):
+    """Shares of balls are those of all samples; the grid is not that of the body's corner."""
+    mesh = box(0.1, 0.13, 0.09, num_points=400)
+    middle = np.array([0.003, -0.004, 0.046])
+    position, covered = greit._targets(mesh, middle, 0.012, 60)
+    monkeypatch.setattr(greit, "_CLOSE", 1e6)
+    everywhere, expected = greit._targets(mesh, middle, 0.012, 60)
+    np.testing.assert_array_equal(position, everywhere)
+    assert len(position) > 5
+    np.testing.assert_allclose(covered.toarray(), expected.toarray(), rtol=0, atol=1e-12)
