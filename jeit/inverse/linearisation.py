@@ -104,7 +104,8 @@ class Linearisation(eqx.Module):
         """The same as images (m, k) and their weights (k, M), 1 / volts, of which it is the product: the smaller of two
         things to keep. Of a problem that has values."""
         assert isinstance(self.spectrum, Spectrum)
-        images, whitened = (np.asarray(part) for part in self.spectrum.factors(hyperparameter))
+        known, chosen = on_host((self.spectrum, hyperparameter))  # what is NumPy's stays so, and is not copied
+        images, whitened = (np.asarray(part) for part in known.factors(chosen))
         weights: Any = np.zeros((whitened.shape[0], self.num_channels), whitened.dtype)
         weights[:, self.channels] = whitened * self.root_weight
         return images, weights

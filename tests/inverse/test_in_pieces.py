@@ -8,13 +8,15 @@ import pytest
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.forward import model as forward_model
+from jeit.inverse import Laplace, one_step
 from jeit.inverse.linear import greit
-from jeit.inverse.linearisation import combined_jacobian
+from jeit.inverse.linearisation import Linearisation, combined_jacobian
 from jeit.inverse.prior.bases import DenseBasis, DiagonalBasis, NodalBasis
 from jeit.inverse.prior.nodal import by_columns
 from jeit.layout import ring
 from jeit.mesh import Disk, box
 from jeit.protocol import adjacent
+from jeit_solvers.engines import host
 
 RANDOM = np.random.default_rng(0)
 
@@ -40,12 +42,12 @@ def test_jacobians_are_joined_of_pieces(number, model, monkeypatch):
 @pytest.mark.parametrize("kind", ["nodal", "diagonal", "dense"])
 def test_rows_are_restricted_in_pieces_as_whole(kind):
     mesh = box(0.1, 0.1, 0.1, num_points=60)
-    count, cells = mesh.num_cells, np.asarray(mesh.cells)
-    means = np.zeros((count, mesh.num_points))
+    count, cells = mesh.num_cells, host.asarray(mesh.cells)
+    means, deviation = host.zeros((count, mesh.num_points)), host.arange(1.0, count + 1)
     np.add.at(means, (np.arange(count)[:, None], cells), 1 / 4)
     given = {
         "nodal": (NodalBasis(cells, mesh.num_points), means),
-        "diagonal": (DiagonalBasis(np.arange(1.0, count + 1)), np.diag(np.arange(1.0, count + 1))),
+        "diagonal": (DiagonalBasis(deviation), np.diag(deviation)),
         "dense": (DenseBasis(means), means),
     }
     (basis, shapes), rows = given[kind], RANDOM.normal(size=(5, count))
@@ -73,6 +75,14 @@ def test_columns_are_always_solved_for_on_the_same_threads():
     for _ in range(3):
         by_columns(noted, np.ones((2, 640)), 2)
     assert len(pools) == 1
+
+
+def test_images_of_a_linear_problem_are_not_copied_for_jax(model):
+    """A solid body's take a third of a gigabyte each: JAX's, which cannot be written into, would be there besides."""
+    images, weights = Linearisation.create(model, 1.0, prior=Laplace()).factors(3.0)
+    assert images.flags.writeable
+    matrix = one_step(model, 1.0, prior=Laplace(), hyperparameter=3.0).matrix
+    np.testing.assert_allclose(images @ weights, matrix, rtol=0, atol=1e-9 * abs(np.asarray(matrix)).max())
 
 
 def test_samples_far_from_all_of_greits_targets_are_passed_over_unnoticed(monkeypatch):
