@@ -17,9 +17,9 @@ AUTO = "auto"
 class ImagingSettings:
     """How to image. The defaults here are jeit's defaults, for Python and command line alike.
 
-    - `method`: "auto", the one-step image where it is sound, where it is not Gauss-Newton's, its bodies outlined, in
-      solids as ellipsoids (`jeit.inverse.shapes`); or one of `METHODS`: linear ones, iterative ones that solve for
-      conductivity itself, and "shapes", outlines alone.
+    - `method`: "auto", the one-step image where it is sound, where it is not Gauss-Newton's, its bodies outlined; in
+      solids, bodies as ellipsoids wherever the data tell of them (`jeit.inverse.shapes`); or one of `METHODS`: linear
+      ones, iterative ones that solve for conductivity itself, and "shapes", outlines alone.
     - `prior`: a name in `jeit.inverse.prior.defaults.PRIORS`, or a quadratic prior; used by one-step, Gauss-Newton and
       Levenberg-Marquardt imaging.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; a number for total variation and filtered

@@ -36,7 +36,14 @@ def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.nda
 
     Raises `ValueError` for a `size` that is not one number per cell, above zero, or asks for more than 2,000,000 nodes.
     """
+    return bisected(mesh, size)[0]
+
+
+def bisected(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]) -> tuple[Mesh, Int[np.ndarray, " m"]]:
+    """What `bisect` gives, and the cell of the given mesh that each of its cells comes from. Raises `ValueError` as it
+    does."""
     division = _Division.of(mesh)
+    parent = np.arange(len(division.cells))
     wanted = _too_long(division, slice(None), size)
     while wanted.any():
         points, cells = division.points, division.cells
@@ -57,9 +64,10 @@ def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.nda
         if len(points) + len(chosen) > MOST_POINTS:
             raise ValueError(f"size asks for more than {MOST_POINTS:,} nodes; give longer edges. Are they in metres?")
         division, came = division.split(chosen, points[chosen].mean(axis=1))
+        parent = parent[came]
         new, wanted = np.bincount(came)[came] > 1, wanted[came]
         wanted[new] = _too_long(division, new, size)
-    return division.mesh(mesh.tags)
+    return division.mesh(mesh.tags), parent
 
 
 def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, " n"]]) -> Mesh:

@@ -2,15 +2,19 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.electrodes import FaceDiscs
+from jeit.electrodes import CombinedElectrodes, FaceDiscs, plates
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, TotalVariation, reconstruct
-from jeit.inverse.shapes import EllipsoidPrior, StarPrior, reconstruct_shapes
+from jeit.inverse.nonlinear.observed import independent_data
+from jeit.inverse.shapes import EllipsoidPrior, StarPrior, reconstruct_shapes, search
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
-from jeit.mesh import box, centroids
+from jeit.inverse.shapes.finer import finer
+from jeit.inverse.shapes.problem import Fit, ShapeProblem
+from jeit.mesh import bisect, box, centroids, cut, measures
 from jeit.protocol import opposite
 
 SIZE, BATH = (0.1, 0.14, 0.1), 0.02
@@ -27,6 +31,27 @@ def discs():
 
 def model(num_points):
     return ForwardModel(box(*SIZE, num_points=num_points), discs(), opposite(16, current=1e-3))
+
+
+def sharp(num_points):
+    """A model whose mesh is cut along the ball, and which of its cells lie inside."""
+
+    def outside(points):
+        return np.linalg.norm(points - BALL, axis=-1) - RADIUS
+
+    def edge(corners):
+        return np.where((outside(corners).min(axis=1) < 0) & (outside(corners).max(axis=1) > 0), RADIUS / 3, np.inf)
+
+    mesh = cut(bisect(model(num_points).mesh, edge), outside)
+    return ForwardModel(mesh, discs(), opposite(16, current=1e-3)), outside(np.asarray(centroids(mesh))) < 0
+
+
+def shape_problem(given):
+    """Of the voltages of the bath alone."""
+    number: Any = given.protocol.num_measurements
+    every, noise = jnp.ones(number, bool), jnp.full(number, 1e-6)
+    small, data = independent_data(given, given.voltages(BATH), every, noise, at_once=True)  # pyright: ignore
+    return ShapeProblem(small, data, np.full(given.mesh.num_cells, BATH))
 
 
 @pytest.fixture(scope="module")
@@ -80,8 +105,7 @@ def test_a_ball_over_the_wall_ends_there(coarse):
 
 @pytest.mark.parametrize("ratio", [4.0, 0.2])
 def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, ratio):
-    fine = model(9000)
-    held = np.linalg.norm(np.asarray(centroids(fine.mesh)) - BALL, axis=1) < RADIUS
+    fine, held = sharp(6000)
     rest, there = np.asarray(fine.voltages(BATH)), np.asarray(fine.voltages(BATH * np.where(held, ratio, 1.0)))
     change = there - rest
     noise = 0.03 * np.sqrt(np.mean(change**2))
@@ -108,10 +132,9 @@ def test_balls_keep_their_volume_on_any_mesh(coarse):
 @pytest.mark.slow
 def test_what_a_smooth_field_explains_bends_no_body(coarse):
     """Salt that has sunk to the floor, twice as conductive there as the bath, under a ball ten times as conductive."""
-    fine = model(9000)
+    fine, held = sharp(6000)
     place = np.asarray(centroids(fine.mesh))
     sunk = np.exp(np.log(2) * np.exp(-place[:, 2] / 0.015))
-    held = np.linalg.norm(place - BALL, axis=1) < RADIUS
     change = np.asarray(fine.voltages(BATH * np.where(held, 10.0, sunk))) - np.asarray(fine.voltages(BATH))
     noise = 0.05 * np.sqrt(np.mean(change**2))
     frame = np.asarray(coarse.voltages(BATH)) + change
@@ -148,3 +171,82 @@ def test_a_smooth_field_is_of_the_same_channels(coarse):
 def test_a_prior_of_a_sheet_is_refused(coarse):
     with pytest.raises(ValueError, match="such as EllipsoidPrior"):
         reconstruct_shapes(coarse, coarse.voltages(BATH), BATH, start=[], prior=StarPrior())
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.3, 3.0, 12.0])
+def test_on_a_finer_mesh_a_ball_changes_voltages_as_on_one_cut_along_it(coarse, factor):
+    """Told from the background's voltages, which are those of the given mesh."""
+    fine, held = sharp(6000)
+    inside = np.asarray(measures(fine.mesh))[held].sum()
+    rest, there = np.asarray(fine.voltages(BATH)), np.asarray(fine.voltages(BATH * np.where(held, factor, 1.0)))
+    wanted = (there - rest) * (4 / 3 * np.pi * RADIUS**3 / inside)
+    prior = EllipsoidPrior(modes=1, contrast=abs(np.log(factor)))
+    balls = Ellipsoids.create(coarse.mesh, prior, [BALL], [1 if factor > 1 else -1])
+    fit = Fit(balls, balls.of_radii([RADIUS]), 0.0)
+    there = finer(shape_problem(coarse), fit, (0.5,))
+    assert coarse.mesh.num_points < there.problem.model.mesh.num_points < 3 * coarse.mesh.num_points
+    change = there.change(coarse.protocol, there.bodies.image(fit.coefficients).image, 0.0)
+    assert np.linalg.norm(change - wanted) < 0.08 * np.linalg.norm(wanted)
+    np.testing.assert_allclose(there.problem.linearise(np.zeros(1), there.bodies.only([]))[0], 0, atol=1e-6)
+
+
+def test_plates_and_discs_stay_where_they_are_on_a_finer_mesh():
+    mesh = box(*SIZE, num_points=600)
+    electrodes = CombinedElectrodes(plates(mesh, ["left"], 0.01), discs(), plates(mesh, ["right"], 0.02))
+    given = ForwardModel(mesh, electrodes, opposite(18, current=1e-3))
+    problem = shape_problem(given)
+    balls = Ellipsoids.create(mesh, EllipsoidPrior(), [[0.0, -0.06, 0.05]], [1])  # over the wall
+    there = finer(problem, Fit(balls, balls.of_radii([0.02]), 0.0), (0.3,))
+    model = there.problem.model
+    assert model.mesh.num_points > 2 * mesh.num_points
+    area, given_area = (np.asarray(one.electrodes.contact(one.mesh).load).sum(axis=0) for one in (model, given))
+    np.testing.assert_allclose(area, given_area, rtol=0.01)
+
+
+def test_cut_cells_are_harmonic_means_of_conductive_bodies_and_gentler_ones_of_resistive(ellipsoids):
+    share = np.array([0.0, 0.5, 1.0])
+    conductive, resistive = (np.exp(ellipsoids.mixture(share, np.log(ratio))[0]) for ratio in (4.0, 0.25))
+    np.testing.assert_allclose(conductive, [1, 1 / (0.5 + 0.5 / 4), 4], rtol=1e-12)
+    np.testing.assert_allclose(resistive, [1, (0.5 + 0.5 * 0.5) ** 2, 0.25], rtol=1e-12)
+
+
+def test_finer_cells_know_which_they_come_from(coarse):
+    balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
+    there = finer(shape_problem(coarse), Fit(balls, balls.of_radii([RADIUS]), 0.0), (0.3,))
+    volume = np.asarray(measures(there.problem.model.mesh))
+    np.testing.assert_allclose(np.bincount(there.cell, volume), np.asarray(measures(coarse.mesh)), rtol=1e-9)
+
+
+def test_the_first_edges_that_make_a_mesh_grow_little_are_taken(coarse):
+    balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
+    fit, problem = Fit(balls, balls.of_radii([RADIUS]), 0.0), shape_problem(coarse)
+    few, many = (finer(problem, fit, (edge,)).problem.model.mesh.num_points for edge in (1.0, 0.2))
+    assert few < 1.5 * coarse.mesh.num_points < many
+    assert finer(problem, fit, (0.2, 1.0)).problem.model.mesh.num_points == few
+    assert finer(problem, fit, (1.0, 0.2)).problem.model.mesh.num_points == few
+
+
+def test_bodies_have_moved_once_their_surfaces_have(ellipsoids):
+    before = ellipsoids.of_radii([0.02, 0.02, 0.02])
+    for coefficient in (1, 4, 6):  # the first one's place, radius and a stretch
+        little, far = before.copy(), before.copy()
+        little[coefficient] += 0.02
+        far[coefficient] += 2.0
+        assert not ellipsoids.moved(before, little)
+        assert ellipsoids.moved(before, far)
+    stronger = before.copy()
+    stronger[5] += 2.0
+    assert not ellipsoids.moved(before, stronger)
+    assert ellipsoids.moved(before, before[:-10])
+
+
+def test_of_many_to_start_from_only_those_that_data_ask_for_are_taken(coarse):
+    fine, held = sharp(6000)
+    change = np.asarray(fine.voltages(BATH * np.where(held, 4.0, 1.0))) - np.asarray(fine.voltages(BATH))
+    frame, noise = np.asarray(coarse.voltages(BATH)) + change, np.full(len(change), 0.03 * np.sqrt(np.mean(change**2)))
+    small, data = independent_data(coarse, frame, np.ones(len(change), bool), noise, at_once=True)  # pyright: ignore
+    setting = search._Setting(ShapeProblem(small, data, np.full(coarse.mesh.num_cells, BATH)), None)
+    balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), [BALL + 0.008, [-0.03, 0.04, 0.03]], [1, -1])
+    _, fit, chosen = search._told_one_by_one(setting, balls, balls.of_radii([0.025, 0.02]))
+    assert chosen == [0]
+    assert len(fit.bodies.sign) == 1

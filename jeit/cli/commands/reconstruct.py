@@ -41,9 +41,10 @@ def reconstruct(
     method: Annotated[
         str | None,
         typer.Option(
-            help="auto (default): one-step, or gauss-newton and outlines of bodies where that is unsound; one-step, "
-            "back-projection, filtered-back-projection; gauss-newton, levenberg-marquardt, total-variation; shapes, "
-            "outlines of strong bodies; network, maps of depth by one that learnt the skin (--model)."
+            help="auto (default): one-step, or gauss-newton and outlines of bodies where that is unsound, bodies in "
+            "solids wherever they are told of; one-step, back-projection, filtered-back-projection; gauss-newton, "
+            "levenberg-marquardt, total-variation; shapes, outlines of strong bodies; network, maps of depth by one "
+            "that learnt the skin (--model)."
         ),
     ] = None,
     prior: Annotated[

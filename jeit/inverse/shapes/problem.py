@@ -32,11 +32,13 @@ class Fit(NamedTuple):
 
 @dataclass(frozen=True)
 class ShapeProblem:
-    """**Fields**: `model` of the independent channels; `data` with ŷ, w and G; `background` σ₀ (m,), S/m (2-D: S)."""
+    """**Fields**: `model` of the independent channels; `data` with ŷ, w and G; `background` σ₀ (m,), S/m (2-D: S);
+    `rtol` of the cost, to which it is fitted."""
 
     model: ForwardModel
     data: Data
     background: Float[np.ndarray, " m"]
+    rtol: float = 3e-3
 
     def linearise(self, coefficients: Float[np.ndarray, " n"], bodies: Bodies) -> tuple[Any, Any, Any, Any]:
         """Residual (r + p,), a function that gives its Jacobian (r + p, n), covariance and precision (r + p, r + p)."""
@@ -68,9 +70,9 @@ class ShapeProblem:
 
         return cost, step
 
-    def fit(self, bodies: Bodies, start: Float[np.ndarray, " n"], max_steps: int, rtol: float = 3e-3) -> Fit:
+    def fit(self, bodies: Bodies, start: Float[np.ndarray, " n"], max_steps: int, rtol: float | None = None) -> Fit:
         """The least cost near `start`, by Levenberg-Marquardt."""
-        descent = Descent(rtol=rtol, damping=1.0, history=max_steps + 1)
+        descent = Descent(rtol=rtol or self.rtol, damping=1.0, history=max_steps + 1)
         coefficients, state = descent.at_once(self.quadratic_model, start, bodies, max_steps)
         return Fit(bodies, coefficients, float(state.cost))
 

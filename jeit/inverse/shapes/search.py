@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -17,6 +18,7 @@ from jeit.inverse.nonlinear.observed import independent_data
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior
 from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior, Ellipsoids
+from jeit.inverse.shapes.finer import Finer, finer
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.inverse.shapes.smooth_field import SmoothField
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
@@ -33,6 +35,9 @@ _MOST_REFUSED = 2
 _SURELY = 10.0
 # How many changes of their number or kind are made at most.
 _MOST_CHANGES = 10
+# How often the mesh is made finer where bodies are, at most: they move by it. And the lengths of edges there, of the
+# least half axis, that are tried in turn: first while ghosts are among the bodies, and then.
+_MOST_MESHES, _EDGES = 3, ((0.7,), (0.5, 0.6, 0.7))
 # How much likelier (of the logarithm) more has to make the data than less, to be told.
 _MARGIN = 2.0
 
@@ -124,25 +129,31 @@ def reconstruct_shapes(
         raise ValueError(f"least_rise must be a number from 1; it is {told(least_rise)}.")
     sign, centre, radius = _checked_start(start, model.mesh.dimension)
     small, data = independent_data(model, measured, used, deviation, at_once=True)
-    problem = ShapeProblem(small, data, background)
+    solid = model.mesh.dimension == 3
+    problem = ShapeProblem(small, data, background, _ROUGHLY if solid else ShapeProblem.rtol)
     bodies = form.create(model.mesh, prior, centre, sign)
-    level, beside = 0.0, None
+    setting = _Setting(problem, None if smooth is None else SmoothField.create(smooth, problem))
+    level, coefficients = 0.0, bodies.of_radii(radius)
     if smooth is not None:
-        beside = SmoothField.create(smooth, problem)
-        level, bodies, radius = _told_one_by_one(beside, bodies, radius)
-        problem = beside.beside(level)
-    fitted = problem.fit(*_grown(problem, bodies, bodies.of_radii(radius), _FIRST_STEPS), _STEPS)
+        level, balls, _ = _told_one_by_one(setting, *bodies.with_modes(1, coefficients))
+        bodies, coefficients = balls.bodies.with_modes(prior.modes, balls.coefficients)
+        problem = setting.problem(level)
+    fitted = problem.fit(*_grown(problem, bodies, coefficients, _FIRST_STEPS), _STEPS)
     found = _without_ghosts(problem, fitted, (), least_rise)
     changes = [_in_two(problem, found.fit, least_rise), _as_weak(problem, found.fit)]
     ways = [_searched(problem, found, one, least_rise) for one in changes if one is not None] or [found]
-    fitted, rises, doubtful = min(ways, key=lambda one: problem.surprise(one.fit))
+    best, there = _Told(setting, level, min(ways, key=lambda one: problem.surprise(one.fit))), None
+    if solid:
+        best, there = _on_finer_meshes(best, least_rise)
+    (setting, level, (fitted, rises, doubtful)), beside = best, best.setting.beside
     bodies, coefficients = fitted.bodies, fitted.coefficients
-    image = bodies.image(coefficients).image
-    if beside is not None:
-        image = image + beside.estimate(level, fitted)
-    conductivity = background * np.exp(image)
-    predicted = np.asarray(model.voltages(conductivity))
-    spread = bodies.rows(problem.deviations(fitted))[:, bodies.dimension + 1]
+    shown = bodies.on(model.mesh) if isinstance(bodies, Ellipsoids) else bodies
+    field = 0.0 if beside is None else beside.estimate(level, fitted)
+    conductivity = background * np.exp(shown.image(coefficients).image + field)
+    predicted = np.asarray(model.voltages(conductivity if there is None else background))
+    if there is not None:
+        predicted = predicted + there.change(model.protocol, bodies.image(coefficients).image, field)
+    spread = bodies.rows(setting.problem(level).deviations(fitted))[:, bodies.dimension + 1]
     slopes = [bodies.contrast(k, row)[1] for k, row in enumerate(bodies.rows(coefficients))]
     excess = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
     order = np.argsort(-np.asarray(rises), kind="stable")
@@ -177,31 +188,45 @@ def _grown(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
     return rounded.with_modes(bodies.prior.modes, found.coefficients)
 
 
-def _told_one_by_one(beside: SmoothField, bodies: Bodies, radius) -> tuple[float, Bodies, Any]:
-    """The level of a smooth field, and the bodies that data ask for besides, as balls: of those to start from, each
-    after those before it; and their radii."""
-    chosen: list[int] = []
-    (level, least), refused = _balls(beside, bodies.only([]), radius[:0], 1.0), 0
-    for k in range(len(radius)):
-        some = [*chosen, k]
-        tried, surprise = _balls(beside, bodies.only(some), radius[some], level)
+class _Setting(NamedTuple):
+    """What bodies are fitted in: the problem of them `alone`, or with a smooth field `beside` it."""
+
+    alone: ShapeProblem
+    beside: SmoothField | None
+
+    def problem(self, level: float) -> ShapeProblem:
+        """With the field at a level."""
+        return self.alone if self.beside is None else self.beside.beside(level)
+
+    def on(self, alone: ShapeProblem) -> _Setting:
+        """The same with the problem on another mesh."""
+        return _Setting(alone, self.beside and replace(self.beside, alone=alone))
+
+    def settled(self, bodies: Bodies, coefficients, level: float, steps: int) -> tuple[float, Fit, float]:
+        """The level of the field that goes with some bodies, from a `level` on; their fit, and -log evidence for both.
+        From above, so that bodies are not bent by what the field explains."""
+        while True:
+            problem = self.problem(level)
+            fit = problem.fit(bodies, coefficients, steps, _ROUGHLY)
+            likeliest = level if self.beside is None else self.beside.likeliest(fit)
+            if likeliest >= level:
+                return level, fit, problem.surprise(fit) + problem.uncertainty
+            level, coefficients = likeliest, fit.coefficients
+
+
+def _told_one_by_one(setting: _Setting, bodies: Bodies, coefficients) -> tuple[float, Fit, list[int]]:
+    """The level of a smooth field, the bodies that data ask for besides, each after those before it, and which they
+    are."""
+    chosen, refused, rows = [], 0, bodies.rows(coefficients)
+    level, fit, least = setting.settled(bodies.only([]), coefficients[:1], 1.0, _FIRST_STEPS)
+    for k, row in enumerate(rows):
+        start = np.append(fit.coefficients, row)
+        tried, one, surprise = setting.settled(bodies.only([*chosen, k]), start, level, _FIRST_STEPS)
         if surprise + _MARGIN <= least:
-            chosen, level, least, refused = some, tried, surprise, 0
+            level, fit, least, chosen, refused = tried, one, surprise, [*chosen, k], 0
         elif (refused := refused + 1) == _MOST_REFUSED:
             break
-    return level, bodies.only(chosen), radius[chosen]
-
-
-def _balls(beside: SmoothField, bodies: Bodies, radius, level: float) -> tuple[float, float]:
-    """The level of the field that goes with some bodies, as balls, from a `level` on; -log evidence for both."""
-    bodies, coefficients = bodies.with_modes(1, bodies.of_radii(radius))
-    while True:
-        problem = beside.beside(level)
-        fit = problem.fit(bodies, coefficients, _FIRST_STEPS, _ROUGHLY)
-        surprise, likeliest = problem.surprise(fit) + problem.uncertainty, beside.likeliest(fit)
-        if likeliest >= level:  # from above, so that bodies are not bent by what the field explains
-            return level, surprise
-        level, coefficients = likeliest, fit.coefficients
+    return level, fit, chosen
 
 
 class _Found(NamedTuple):
@@ -212,9 +237,56 @@ class _Found(NamedTuple):
     doubtful: tuple[Body, ...]
 
 
-def _without_ghosts(problem: ShapeProblem, fitted: Fit, doubtful: Sequence[Body], least_rise: float) -> _Found:
-    """The bodies that are missed when they are left out and the rest fitted again; the least missed goes first."""
-    doubtful, missed = list(doubtful), np.zeros(len(fitted.bodies.sign))  # cost without each star, at least
+class _Told(NamedTuple):
+    """What was `found` in a `setting`, with the field at its `level`."""
+
+    setting: _Setting
+    level: float
+    found: _Found
+
+
+def _on_finer_meshes(told: _Told, least_rise: float) -> tuple[_Told, Finer | None]:
+    """The same fitted where the mesh is finer on their surfaces, again until they stay there; ghosts that a coarser one
+    made are not. And the last of those meshes."""
+    given, there = told.setting, None
+    for again in range(_MOST_MESHES):
+        _, level, (before, rises, doubtful) = told
+        if not len(before.bodies.sign):
+            break
+        there = finer(given.alone, before, _EDGES[again > 0])
+        setting, bodies, coefficients = given.on(there.problem), there.bodies, before.coefficients
+        missed = np.array(rises) * before.cost
+        if again:
+            level, fit, _ = setting.settled(bodies, coefficients, level, _STEPS)
+        else:
+            order = np.argsort(-missed)
+            start = np.append(coefficients[0], bodies.rows(coefficients)[order])
+            level, fit, some = _told_one_by_one(setting, bodies.only(order), start)
+            left = np.setdiff1d(np.arange(len(order)), some)
+            doubtful = (*doubtful, *(bodies.body(k, coefficients, rises[k]) for k in order[left]))
+            missed = missed[order[some]]
+            coefficients = np.append(coefficients[0], bodies.rows(coefficients)[order[some]])
+        problem = setting.problem(level)
+        fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
+        told = _Told(setting, level, _without_ghosts(problem, fit, doubtful, least_rise, missed))
+        after = told.found.fit
+        if again and isinstance(after.bodies, Ellipsoids) and not after.bodies.moved(coefficients, after.coefficients):
+            break
+    return told, there
+
+
+def _without_ghosts(
+    problem: ShapeProblem,
+    fitted: Fit,
+    doubtful: Sequence[Body],
+    least_rise: float,
+    known: Float[np.ndarray, " k"] | None = None,
+) -> _Found:
+    """The bodies that are missed when they are left out and the rest fitted again; the least missed goes first.
+
+    `known`: the cost without each, at least, if that is known.
+    """
+    doubtful, missed = list(doubtful), np.zeros(len(fitted.bodies.sign)) if known is None else known.copy()
     while True:
         bodies, coefficients, cost = fitted
         # With one ghost fewer in whose place others can step, what was missed is missed as much.

@@ -29,10 +29,12 @@ _LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
 @dataclass(frozen=True)
 class SmoothField:
     """**Fields**: `image` that is smooth, of the same channels; `jacobian` (r, n) of the channels of `alone` by its
-    coefficients, of unit variance, at the background; `alone`, the problem of bodies and noise and nothing else."""
+    coefficients, of unit variance, at the background; `scale` (m,), of log σ by what they are expanded to; `alone`, the
+    problem of bodies and noise and nothing else."""
 
     image: Reconstruction
     jacobian: Float[np.ndarray, "r n"]
+    scale: Float[np.ndarray, " m"]
     alone: ShapeProblem
 
     @classmethod
@@ -52,7 +54,8 @@ class SmoothField:
         none: Any = np.zeros_like(image.coefficients)
         _, weighted = image.inversion.linearise(none)
         relative = np.asarray(alone.data.weight) / image.inversion.data.weight
-        return cls(image, relative[:, None] * weighted, alone)
+        scale = np.asarray(inversion.link.slope(inversion.reference)) / alone.background
+        return cls(image, relative[:, None] * weighted, scale, alone)
 
     def beside(self, level: float) -> ShapeProblem:
         """The problem of bodies with the field at a level."""
@@ -75,9 +78,7 @@ class SmoothField:
         """level · field (m,), of log σ/σ₀, that explains best what the bodies leave of the voltages."""
         precision = self.beside(level).data.precision
         coefficients: Any = -(level**2) * self.jacobian.T @ (precision @ self._left(fit))
-        inversion = self.image.inversion
-        slope = inversion.link.slope(inversion.reference) / self.alone.background
-        return np.asarray(slope * inversion.basis.expand(coefficients))
+        return self.scale * np.asarray(self.image.inversion.basis.expand(coefficients))
 
     def _left(self, fit: Fit) -> Float[np.ndarray, " r"]:
         """What bodies predict too much of the weighted voltages."""
