@@ -1,4 +1,4 @@
-"""One or two balls in boxes and cylinders: what the default image tells of them; `problems/solid_tanks.py`."""
+"""One or two balls or columns in boxes and cylinders: what the default image tells; `problems/solid_tanks.py`."""
 
 from __future__ import annotations
 
@@ -13,15 +13,18 @@ from jeit import image_difference
 from jeit.imaging import ImagingSettings
 
 TANKS, FIRST = 20, 700_000
+COLUMNS, FIRST_COLUMNS = 6, 720_000
 _CONTRAST = 0.15
-HEADER = ["tank", "electrodes", "channels", "method", "balls", "off / r", "volume", "contrast", "not balls", "seconds"]
+HEADER = ["tank", "electrodes", "channels", "method", "bodies", "off / r", "volume", "contrast", "others", "seconds"]
 
 
 def run(options: Options) -> Result:
     """All tanks, one row each."""
     rows, off, contrasts, spurious, missed, refused = [], [], [], 0, 0, []
-    for seed in range(FIRST, FIRST + (1 if options.quick else TANKS)):
-        tank, start = draw(seed), time.perf_counter()
+    tanks = [(seed, False) for seed in range(FIRST, FIRST + TANKS)]
+    tanks += [(seed, True) for seed in range(FIRST_COLUMNS, FIRST_COLUMNS + COLUMNS)]
+    for seed, columns in tanks[:1] if options.quick else tanks:
+        tank, start = draw(seed, columns=columns), time.perf_counter()
         try:
             found = image_difference(
                 tank.frame, tank.reference, ImagingSettings(num_points=2000 if options.quick else None)
@@ -41,7 +44,10 @@ def run(options: Options) -> Result:
         factors = ", ".join(f"{ball.factor:g}" for ball in tank.balls)
         figures = [" ".join(f"{one:.2f}" for one in many) for many in (distance, volume, contrast)]
         kind = tank.frame.protocol.name.split(",")[0]
-        rows.append([str(seed), tank.kind, kind, found.settings.method, factors, *figures, str(more), f"{seconds:.0f}"])
+        electrodes = f"{tank.kind}, columns" if columns else tank.kind
+        rows.append(
+            [str(seed), electrodes, kind, found.settings.method, factors, *figures, str(more), f"{seconds:.0f}"]
+        )
         say(" | ".join(rows[-1]))
     close = sum(abs(one - 1) <= _CONTRAST for one in contrasts)
     total = len(off) + missed
@@ -53,4 +59,4 @@ def run(options: Options) -> Result:
     return Result([Table(HEADER, rows)], checks, [f"{len(refused)} tanks refused", *refused])
 
 
-CASE = Case("solid_tanks", "balls in simulated boxes and cylinders: places, volumes, contrasts", run, 30, timed=False)
+CASE = Case("solid_tanks", "balls and columns in simulated tanks: places, volumes, contrasts", run, 40, timed=False)

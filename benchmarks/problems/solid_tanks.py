@@ -1,7 +1,8 @@
-"""Boxes and cylinders with one or two balls in them, drawn at random: solved on meshes cut along the balls' surfaces.
+"""Boxes and cylinders with one or two balls or columns in them, drawn at random: solved on meshes cut along these.
 
 Those meshes are other and finer ones than images are made on. What differs from tank to tank: size, electrodes, contact
-impedances, currents and what is read, and number, size, place and conductivity of the balls.
+impedances, currents and what is read, and number, size, place and conductivity of the balls. Columns stand in cylinders
+with a ring of tall strips, as they do in most tanks.
 """
 
 from __future__ import annotations
@@ -26,30 +27,33 @@ FACTORS = (0.1, 0.3, 3.0, 12.0)
 KINDS = ("plates", "strips", "rings")
 """Boxes with plates all round, cylinders with a ring of tall strips, and with two rings of patches."""
 _NODES, _NOISE, _FLOOR = 14_000, 2e-4, 3e-5
-_EDGE = 0.25
+_EDGE, _COLUMNS_EDGE = 0.25, 0.35
 _REACH = 2.0
 
 
 class Ball(NamedTuple):
-    """**Fields**: `centre` (3,) and `radius`, metres; `factor`, its conductivity over the bath's."""
+    """**Fields**: `centre` (3,) and `radius`, metres; `factor`, its conductivity over the bath's; `height` of the tank,
+    metres, of what is no ball but a column through it."""
 
     centre: np.ndarray
     radius: float
     factor: float
+    height: float | None = None
 
     @property
     def volume(self) -> float:
         """m³."""
-        return 4 / 3 * np.pi * self.radius**3
+        return np.pi * self.radius**2 * (4 / 3 * self.radius if self.height is None else self.height)
 
     def level(self, points: np.ndarray) -> np.ndarray:
         """How far points (n, 3) lie outside, metres."""
-        return np.linalg.norm(points - self.centre, axis=-1) - self.radius
+        along = 3 if self.height is None else 2
+        return np.linalg.norm((points - self.centre)[..., :along], axis=-1) - self.radius
 
     def edge(self, corners: np.ndarray) -> np.ndarray:
         """How long edges of cells (m, 4, 3) may be, metres: short on the surface."""
-        outside = self.level(corners)
-        return np.where((outside.min(axis=1) < 0) & (outside.max(axis=1) > 0), _EDGE * self.radius, np.inf)
+        outside, edge = self.level(corners), _EDGE if self.height is None else _COLUMNS_EDGE
+        return np.where((outside.min(axis=1) < 0) & (outside.max(axis=1) > 0), edge * self.radius, np.inf)
 
 
 class SolidTank(NamedTuple):
@@ -61,16 +65,18 @@ class SolidTank(NamedTuple):
     kind: str
 
 
-def draw(seed: int) -> SolidTank:
-    """A tank, the same for the same seed."""
+def draw(seed: int, *, columns: bool = False) -> SolidTank:
+    """A tank, the same for the same seed; with `columns` in place of balls a cylinder with strips."""
     rng = np.random.default_rng(seed)
-    kind = KINDS[int(rng.integers(len(KINDS)))]
+    kind = "strips" if columns else KINDS[int(rng.integers(len(KINDS)))]
     domain, electrodes, protocol = _tank(rng, kind)
     conductivity = np.exp(rng.uniform(np.log(0.01), np.log(1.0)))
     size = float(domain.outline.area) ** 0.5
     impedance = np.exp(rng.uniform(np.log(1e-3), np.log(0.03))) * size / conductivity
     electrodes = electrodes.with_contact_impedance(impedance * np.exp(rng.normal(0, 0.2, electrodes.num_electrodes)))
     balls = _balls(rng, domain, middle=kind == "strips")
+    if columns:
+        balls = tuple(ball._replace(height=domain.thickness) for ball in balls)
     mesh = body_mesh(domain, electrodes, _NODES)
     for ball in balls:
         mesh = bisect(mesh, ball.edge)

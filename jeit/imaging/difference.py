@@ -86,7 +86,7 @@ class ImagedDifference:
     def peak_ranges(self) -> tuple[tuple[float, float], ...]:
         """From where to where the change in each inclusion may lie, S/m (2-D: S), a standard deviation either way;
         empty where the data do not tell it."""
-        if self.shapes is None or not all(one.weak for one in self.shapes.bodies):
+        if self.shapes is None or not all(one.contrast_is_told for one in self.shapes.bodies):
             return ()
         background, bodies = float(self.calibration.conductivity), self.shapes.bodies
         ends = [

@@ -230,7 +230,7 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
                 "centroid": one.centroid,
                 **_form(one),
                 "conductivity_over_background": math.exp(one.sign * one.contrast),
-                "conductivity_is": "told by the data" if one.weak else "assumed, as of what is strong",
+                "conductivity_is": "told by the data" if one.contrast_is_told else "assumed, as of what is strong",
                 "rise": one.rise,
             }
             for one in bodies
@@ -251,10 +251,11 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
 
 
 def _form(body: Star | Ellipsoid) -> dict[str, Any]:
-    """What its kind has: the outline of a star, the half axes of an ellipsoid."""
+    """What its kind has: the outline of a star, the half axes of an ellipsoid or a column."""
     if isinstance(body, Star):
         return {"area": body.area, "outline": body.outline}
-    return {"volume": body.volume, "centre": body.centre, "half_axes": body.axes}
+    form = "column" if body.column else "ellipsoid"
+    return {"form": form, "volume": body.volume, "centre": body.centre, "half_axes": body.axes}
 
 
 def _prior(settings: ImagingSettings) -> str | None:

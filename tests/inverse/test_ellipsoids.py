@@ -68,6 +68,7 @@ def ellipsoids(coarse):
 def test_derivatives_are_those_of_finite_differences(ellipsoids, coarse):
     rng = np.random.default_rng(0)
     point = ellipsoids.of_radii([0.03, 0.02, 0.03]) + 0.3 * rng.normal(size=31)
+    ellipsoids, point = ellipsoids.otherwise([2], point)
     along, step = rng.normal(size=31), 1e-6
     here = ellipsoids.image(point)
     ahead, behind = ellipsoids.image(point + step * along), ellipsoids.image(point - step * along)
@@ -93,6 +94,27 @@ def test_an_ellipsoid_knows_its_volume_its_middle_and_what_it_holds(ellipsoids):
     ends = np.concatenate([body.centre + 0.99 * body.axes, body.centre - 0.99 * body.axes])
     assert body.holds(ends).all()
     assert not body.holds(body.centre + 1.01 * body.axes).any()
+
+
+def test_a_column_stands_through_the_whole_height(ellipsoids):
+    point = ellipsoids.of_radii([0.02, 0.02, 0.02])
+    point[[4, 6, 7, 8, 9]] = [1.0, 0.8, 0.5, -0.6, 0.3]  # radius and stretches of the first
+    before = ellipsoids.body(0, point).volume
+    columns, point = ellipsoids.otherwise([0], point)
+    body = columns.body(0, point)
+    assert body.column
+    np.testing.assert_allclose(body.volume, before, rtol=0.03)
+    length = np.linalg.norm(body.axes, axis=1)
+    np.testing.assert_allclose(body.axes[0], [0, 0, np.copysign(SIZE[2] / 2, body.axes[0, 2])], atol=1e-12)
+    np.testing.assert_allclose(np.pi * length[1] * length[2] * SIZE[2], body.volume, rtol=0.03)
+    assert length[1] > 1.2 * length[2]
+    np.testing.assert_allclose(body.centroid[2], SIZE[2] / 2, atol=1e-3)
+    level = np.concatenate([body.axes[1:], -body.axes[1:]])
+    for height in (0.001, 0.099):
+        at = np.append(body.centre[:2], height)
+        assert body.holds(at + 0.99 * level).all()
+        assert not body.holds(at + 1.01 * level).any()
+    np.testing.assert_allclose(np.abs(columns.axis(0, columns.rows(point)[0], 0) @ body.axes[1]), length[1], rtol=1e-6)
 
 
 def test_a_ball_over_the_wall_ends_there(coarse):
@@ -232,12 +254,17 @@ def test_bodies_have_moved_once_their_surfaces_have(ellipsoids):
         little, far = before.copy(), before.copy()
         little[coefficient] += 0.02
         far[coefficient] += 2.0
-        assert not ellipsoids.moved(before, little)
-        assert ellipsoids.moved(before, far)
+        assert not ellipsoids.moved(before, ellipsoids, little)
+        assert ellipsoids.moved(before, ellipsoids, far)
     stronger = before.copy()
     stronger[5] += 2.0
-    assert not ellipsoids.moved(before, stronger)
-    assert ellipsoids.moved(before, before[:-10])
+    assert not ellipsoids.moved(before, ellipsoids, stronger)
+    assert ellipsoids.moved(before, ellipsoids.only([0, 1]), before[:-10])
+    columns, upright = ellipsoids.otherwise([0], before)
+    assert ellipsoids.moved(before, columns, upright)
+    upright, risen = upright.copy(), upright.copy()
+    risen[3] += 2.0  # what a column has no use for
+    assert not columns.moved(upright, columns, risen)
 
 
 def test_of_many_to_start_from_only_those_that_data_ask_for_are_taken(coarse):

@@ -147,6 +147,7 @@ def show(console, result: "ImagedDifference") -> None:
     from jeit.arguments import counted, percent
     from jeit.cli.console import inclusion_table, pairs, scaled
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
+    from jeit.inverse.shapes import Ellipsoid
     from jeit_solvers import Status
 
     calibration, reconstruction = result.calibration, result.reconstruction
@@ -184,9 +185,13 @@ def show(console, result: "ImagedDifference") -> None:
     if result.shapes is not None:
         left = f"; {counted(len(result.shapes.doubtful), 'ghost')} left out" if result.shapes.doubtful else ""
         drift = f"the background has drifted by {percent(result.shapes.drift)}"
-        strong = sum(not one.weak for one in result.shapes.bodies)
+        strong = sum(not one.contrast_is_told for one in result.shapes.bodies)
+        upright = sum(isinstance(one, Ellipsoid) and one.column for one in result.shapes.bodies)
+        columns = f", {upright} as columns through the whole height" if upright else ""
         assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""
-        rows.append(("bodies", f"{counted(len(result.shapes.bodies), 'outline')} fitted{left}{assumed}; {drift}"))
+        rows.append(
+            ("bodies", f"{counted(len(result.shapes.bodies), 'outline')} fitted{columns}{left}{assumed}; {drift}")
+        )
     if result.why:
         rows.append(("chosen, for", result.why))
     if unlike := result.unlike_electrodes:

@@ -59,8 +59,8 @@ class BodyPrior(abc.ABC):
         """Standard deviations of a body's values, 1 of its contrast; `span` of the whole body, metres."""
 
     @abc.abstractmethod
-    def contrast_of(self, coefficient: float, weak: bool) -> tuple[float, float]:
-        """Contrast of log σ of a body, positive, and its derivative."""
+    def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
+        """Contrast of log σ of a body, of the `other` kind or not, positive, and its derivative."""
 
 
 class BodyImage(NamedTuple):
@@ -88,8 +88,8 @@ class Bodies(abc.ABC):
     """Bodies of one form. Coefficients: the drift, then body by body: centre, log radius, contrast, and the form's own.
 
     **Fields**: `prior` of every body; `weight` (m,), every cell's share of the whole measure; `span`, the longest side
-    of the whole body; `start` (k, d), metres, and `sign` (k,) of every body; `weak` (k,), whether it is taken for weak,
-    not strong.
+    of the whole body; `start` (k, d), metres, and `sign` (k,) of every body; `other` (k,), whether it is of the form's
+    other kind: weak among stars, a column among ellipsoids.
     """
 
     prior: Any
@@ -97,7 +97,7 @@ class Bodies(abc.ABC):
     span: float
     start: Float[np.ndarray, "k d"]
     sign: Float[np.ndarray, " k"]
-    weak: Bool[np.ndarray, " k"]
+    other: Bool[np.ndarray, " k"]
 
     @property
     @abc.abstractmethod
@@ -110,8 +110,8 @@ class Bodies(abc.ABC):
         """Along how many of its axes, from the longest, it is tried whether a body is two."""
 
     @abc.abstractmethod
-    def weakened(self, some: Any, coefficients: Float[np.ndarray, " n"]) -> tuple[Self, Float[np.ndarray, " n"]]:
-        """The same with `some` bodies taken for weak."""
+    def otherwise(self, some: Any, coefficients: Float[np.ndarray, " n"]) -> tuple[Self, Float[np.ndarray, " n"]]:
+        """The same with `some` bodies taken for the other kind, and about as much of an effect."""
 
     @abc.abstractmethod
     def mixture(self, share: Float[np.ndarray, " c"], contrast: float) -> tuple[Any, Any, Any]:
@@ -155,12 +155,12 @@ class Bodies(abc.ABC):
 
     def contrast(self, k: int, row: Float[np.ndarray, " q"]) -> tuple[float, float]:
         """Of log σ of body k, positive, and its derivative by the coefficient."""
-        return self.prior.contrast_of(row[self.dimension + 1], self.weak[k])
+        return self.prior.contrast_of(row[self.dimension + 1], bool(self.other[k]))
 
     def only(self, some) -> Self:
         """Some of them."""
         some = np.asarray(some, int)
-        return replace(self, start=self.start[some], sign=self.sign[some], weak=self.weak[some])
+        return replace(self, start=self.start[some], sign=self.sign[some], other=self.other[some])
 
     def without(self, k: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
         """The others, and their coefficients."""
@@ -179,8 +179,8 @@ class Bodies(abc.ABC):
             step = step * 2 ** (-1 / 3)  # as far out as the middles of the two halves, and some more
         middle = self.centre(k, row)
         start = np.concatenate([others.start, [middle + step, middle - step]])
-        sign, weak = np.append(others.sign, [self.sign[k]] * 2), np.append(others.weak, [self.weak[k]] * 2)
-        return replace(self, start=start, sign=sign, weak=weak), np.concatenate([remaining, half, half])
+        sign, other = np.append(others.sign, [self.sign[k]] * 2), np.append(others.other, [self.other[k]] * 2)
+        return replace(self, start=start, sign=sign, other=other), np.concatenate([remaining, half, half])
 
     def with_modes(self, modes: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
         """The same bodies with more modes, or fewer."""

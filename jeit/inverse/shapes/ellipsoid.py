@@ -1,5 +1,7 @@
 """Ellipsoids: bodies in a solid, |exp(-S) (x - centre)| < r with S symmetric and of no trace: of the volume 4π r³ / 3.
 
+Their other kind are columns, which stand through the whole height: the same along x and y alone, of the area π r².
+
 Contrasts, and what they make of the conductivity, are those of `jeit.inverse.shapes.bodies`. The derivative of a
 matrix's exponential by its eigenvectors: Higham, Functions of Matrices (SIAM 2008), section 3.2.
 """
@@ -39,6 +41,8 @@ _STRETCHES = np.array(
         np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]]) / np.sqrt(2),
     ]
 )
+# Which of them are level, and of no trace along x and y.
+_LEVEL = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -62,8 +66,8 @@ class EllipsoidPrior(BodyPrior):
         first = [self.place * span] * 3 + [self.radius_spread, 1.0]
         return np.concatenate([first, np.full(self.size - 5, self.roughness)])
 
-    def contrast_of(self, coefficient: float, weak: bool) -> tuple[float, float]:
-        """Contrast of log σ of a body, positive, and its derivative."""
+    def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
+        """Contrast of log σ of a body of either kind, positive, and its derivative."""
         contrast = self.contrast * np.exp(self.contrast_spread * coefficient)
         return contrast, self.contrast_spread * contrast
 
@@ -73,8 +77,9 @@ class Ellipsoid(eqx.Module):
 
     **Fields**: `sign`, +1 conductive or -1 resistive; `centre` (3,) metres; `axes` (3, 3), half axes as rows, metres,
     the longest first; `volume` m³ and `centroid` (3,) metres, of the part that lies in the whole body; `contrast` of
-    log σ, positive, told by the data where the body is `weak`, else the prior's, "at least about so much"; `rise`, how
-    many times the objective is, at its least, without this body: what tells a body from a ghost.
+    log σ, positive; `column`, whether it is no ellipsoid, but stands through the whole height, half of which is one of
+    the half axes then; `rise`, how many times the objective is, at its least, without this body: what tells a body from
+    a ghost.
     """
 
     sign: int
@@ -83,7 +88,7 @@ class Ellipsoid(eqx.Module):
     volume: float
     centroid: Float[np.ndarray, "3"]
     contrast: float
-    weak: bool
+    column: bool
     rise: float
 
     @property
@@ -91,10 +96,18 @@ class Ellipsoid(eqx.Module):
         """The volume, m³."""
         return self.volume
 
+    @property
+    def contrast_is_told(self) -> bool:
+        """Whether by the data: of every ellipsoid."""
+        return True
+
     def holds(self, points: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
         """Which of points, metres, lie inside."""
         length = (self.axes**2).sum(axis=1)
-        return (((points - self.centre) @ self.axes.T / length) ** 2).sum(axis=-1) < 1
+        along = (points - self.centre) @ self.axes.T / length
+        if self.column:
+            along = along[..., np.abs(self.axes[:, 2]) < 0.5 * np.sqrt(length)]
+        return (along**2).sum(axis=-1) < 1
 
 
 @dataclass(frozen=True)
@@ -102,12 +115,13 @@ class Ellipsoids(Bodies):
     """Ellipsoids on a mesh.
 
     **Fields**, besides those of `Bodies`: `points` (m, s, 3), where cells are sampled, metres; `width` (m,) of the
-    blur, metres; `total` volume, m³.
+    blur, metres; `total` volume, m³; `ends` of the height, z in metres.
     """
 
     points: Float[np.ndarray, "m s 3"]
     width: Float[np.ndarray, " m"]
     total: float
+    ends: tuple[float, float]
 
     @classmethod
     def create(cls, mesh: Mesh, prior: BodyPrior, start, sign) -> Ellipsoids:
@@ -115,13 +129,13 @@ class Ellipsoids(Bodies):
         points, volume = np.asarray(mesh.points), np.asarray(measures(mesh))
         sampled = _SAMPLES @ points[np.asarray(mesh.cells)]
         start, total = np.reshape(np.asarray(start, float), (-1, 3)), float(volume.sum())
-        sign, weak = np.asarray(sign, float), np.ones(len(start), bool)
-        span = float(np.ptp(points, axis=0).max())
-        return cls(prior, volume / total, span, start, sign, weak, sampled, _BLUR * np.cbrt(volume), total)
+        sign, other = np.asarray(sign, float), np.zeros(len(start), bool)
+        span, ends = float(np.ptp(points, axis=0).max()), (float(points[:, 2].min()), float(points[:, 2].max()))
+        return cls(prior, volume / total, span, start, sign, other, sampled, _BLUR * np.cbrt(volume), total, ends)
 
     @property
     def odds(self) -> float:
-        """None: they are of one kind, of any contrast."""
+        """None: either kind is as likely."""
         return 0.0
 
     @property
@@ -129,9 +143,16 @@ class Ellipsoids(Bodies):
         """The longest: neighbours that merge make a long one, and every try is some tens of solves of a solid."""
         return 1
 
-    def weakened(self, some, coefficients):
-        """As they are: the data tell the contrast of all."""
-        return self, coefficients
+    def otherwise(self, some, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
+        """The same with `some` taken for columns of the same volume, the rest of their coefficients kept."""
+        rows, other = self.rows(coefficients).copy(), self.other.copy()
+        for k in some:
+            area = max(self.body(k, coefficients).volume, 1e-6 * self.total) / (self.ends[1] - self.ends[0])
+            radius = np.log(np.sqrt(area / np.pi) / (self.prior.radius * self.span))
+            rows[k, 3], other[k] = radius / self.prior.radius_spread, True
+            rows[k, 2] = 0
+            rows[k, 5:] *= _LEVEL[: self.prior.size - 5]
+        return replace(self, other=other), np.append(coefficients[0], rows)
 
     def mixture(self, share, contrast):
         """log(1 + share (exp(p contrast) - 1)) / p: of a conductive body and the bath the harmonic mean, p = -1, of
@@ -143,14 +164,14 @@ class Ellipsoids(Bodies):
 
     def on(self, mesh: Mesh) -> Ellipsoids:
         """The same on another mesh of the same solid."""
-        return replace(Ellipsoids.create(mesh, self.prior, self.start, self.sign), weak=self.weak, span=self.span)
+        return replace(Ellipsoids.create(mesh, self.prior, self.start, self.sign), other=self.other, span=self.span)
 
     def edges(self, coefficients, edge: float, corners: Float[np.ndarray, "m 4 3"]) -> Float[np.ndarray, " m"]:
         """How long edges of cells of some `corners`, metres, may be, metres: on surfaces `edge` times the least half
         axis, infinite elsewhere."""
         longest = np.full(len(corners), np.inf)
         for k, row in enumerate(self.rows(coefficients)):
-            form, offset = self._form(row), corners - self.centre(k, row)
+            form, offset = self._form(k, row), (corners - self.centre(k, row)) * self._axes_of(k)
             least = self._least_axis(form)
             distance = np.linalg.norm(offset, axis=2)
             reach = np.linalg.norm(offset @ np.linalg.inv(form), axis=2)
@@ -161,21 +182,25 @@ class Ellipsoids(Bodies):
             longest[near] = np.minimum(longest[near], edge * least)
         return longest
 
-    def moved(self, before, after) -> bool:
-        """Whether surfaces have left the cells that were made finer for them, from some coefficients to others; or
-        bodies have gone."""
-        if len(before) != len(after):
+    def moved(self, coefficients, others: Bodies, after) -> bool:
+        """Whether surfaces have left the cells that were made finer for them, from some coefficients to those `after`
+        of `others`; or bodies have gone, or are of another kind."""
+        if not np.array_equal(self.other, others.other):
             return True
-        for one, other in zip(self.rows(before), self.rows(after), strict=True):
-            shift = np.linalg.norm(self.centre(0, one) - self.centre(0, other))
-            stretch = np.linalg.norm(self._form(one) - self._form(other), 2)
-            if shift + stretch > 2 * _BAND * self._least_axis(self._form(one)):
+        for k, (row, other) in enumerate(zip(self.rows(coefficients), others.rows(after), strict=True)):
+            shift = np.linalg.norm((self.centre(k, row) - others.centre(k, other)) * self._axes_of(k))
+            form = self._form(k, row)
+            if shift + np.linalg.norm(form - self._form(k, other), 2) > 2 * _BAND * self._least_axis(form):
                 return True
         return False
 
-    def _form(self, row) -> Float[np.ndarray, "3 3"]:
+    def _axes_of(self, k: int) -> Float[np.ndarray, "3"]:
+        """1 for the axes along which body k ends: x, y and, unless it is a column, z."""
+        return np.array([1.0, 1.0, 0.0 if self.other[k] else 1.0])
+
+    def _form(self, k: int, row) -> Float[np.ndarray, "3 3"]:
         """r exp(S), metres: what makes the body of the unit ball."""
-        log_stretch, direction = np.linalg.eigh(self._stretch(row))
+        log_stretch, direction = np.linalg.eigh(self._stretch(k, row))
         return (direction * np.exp(self.log_radius(row) + log_stretch)) @ direction.T
 
     @staticmethod
@@ -185,29 +210,33 @@ class Ellipsoids(Bodies):
         return float(max(axes[0], _LEAST_AXIS * np.cbrt(axes.prod())))
 
     def axis(self, k: int, row, number: int):
-        """Eigenvectors of S, that of the greatest first."""
-        return np.linalg.eigh(self._stretch(row))[1][:, 2 - number]
+        """Eigenvectors of S, that of the greatest first; of a column those that lie level."""
+        form = self._form(k, row) * self._axes_of(k)
+        return np.linalg.eigh(form)[1][:, 2 - number]
 
     def body(self, k: int, coefficients, rise: float = np.nan) -> Ellipsoid:
         """Body k, with what lies in the whole one of it."""
         row = self.rows(coefficients)[k]
-        stretch, direction = np.linalg.eigh(self._stretch(row))
-        axes = (np.exp(self.log_radius(row) + stretch) * direction).T[::-1]
         cells, share, _ = self.covered(k, row)
         within = share * self.weight[cells]
         centre, volume = self.centre(k, row), float(within.sum()) * self.total
         centroid = within @ self.points[cells].mean(axis=1) / within.sum() if volume > 0 else centre
-        contrast = float(self.contrast(k, row)[0])
-        return Ellipsoid(int(self.sign[k]), centre, axes, volume, centroid, contrast, bool(self.weak[k]), float(rise))
+        form, column = self._form(k, row), bool(self.other[k])
+        if column:
+            form[2, 2], centre[2] = (self.ends[1] - self.ends[0]) / 2, sum(self.ends) / 2
+        length, direction = np.linalg.eigh(form)
+        contrast, axes = float(self.contrast(k, row)[0]), (length * direction).T[::-1]
+        return Ellipsoid(int(self.sign[k]), centre, axes, volume, centroid, contrast, column, float(rise))
 
     def covered(self, k: int, row) -> Covered:
         """Cells that ellipsoid k reaches."""
-        log_stretch, direction = np.linalg.eigh(self._stretch(row))
+        log_stretch, direction = np.linalg.eigh(self._stretch(k, row))
         squeeze = (direction * np.exp(-log_stretch)) @ direction.T
         centre, radius = self.centre(k, row), np.exp(min(self.log_radius(row), np.log(10 * self.span)))
-        farthest = radius * np.exp(log_stretch[-1])
-        cells = np.flatnonzero(np.linalg.norm(self.points[:, 0] - centre, axis=1) < farthest + _REACH * self.width)
-        offset, width = self.points[cells] - centre, self.width[cells, None]
+        farthest, axes = radius * np.exp(log_stretch[-1]), self._axes_of(k)
+        reached = np.linalg.norm((self.points[:, 0] - centre) * axes, axis=1) < farthest + _REACH * self.width
+        cells = np.flatnonzero(reached)
+        offset, width = (self.points[cells] - centre) * axes, self.width[cells, None]
         offset = np.where(np.abs(offset).max(axis=-1, keepdims=True) > 0, offset, 1e-9 * self.span)
         distance = np.linalg.norm(offset, axis=-1)
         round_offset = offset @ squeeze
@@ -215,7 +244,7 @@ class Ellipsoids(Bodies):
         # Along the line from the centre, the surface lies at radius · distance / reach.
         surface = radius * distance / reach
         # What is blurred off a convex body is less than what is blurred on: less by that, it keeps its volume.
-        excess = (np.pi * width) ** 2 / (3 * surface)
+        excess = (np.pi * width) ** 2 * (axes.sum() - 1) / (6 * surface)
         inside = 0.5 * (1 + np.tanh(0.5 * (surface - excess - distance) / width))
         edge = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(surface - excess - distance)
         grown = surface + excess  # d(surface - excess) / d log surface
@@ -223,15 +252,19 @@ class Ellipsoids(Bodies):
         by_offset = (edge * (grown - distance) / distance**2)[..., None] * offset
         by_centre = -(by_offset + by_reach[..., None] * (round_offset @ squeeze)).sum(axis=1)
         outer = np.einsum("cs,csi,csj->cij", by_reach, round_offset, offset)
-        stretches = self._squeeze_slopes(log_stretch, direction)[: self.prior.size - 5]
+        stretches = (self._squeeze_slopes(log_stretch, direction) * self._kept(k)[:, None, None])[: self.prior.size - 5]
         form = outer.reshape(len(cells), 9) @ stretches.reshape(-1, 9).T
         columns = [by_centre, (edge * grown).sum(axis=1)[:, None], np.zeros((len(cells), 1)), form]
         slope = np.concatenate(columns, axis=1) * self.prior.deviation(self.span)
         return Covered(cells, inside.mean(axis=1), slope)
 
-    def _stretch(self, row) -> Float[np.ndarray, "3 3"]:
+    def _kept(self, k: int) -> Float[np.ndarray, "5"]:
+        """1 for the directions of S that body k is stretched along."""
+        return _LEVEL if self.other[k] else np.ones(5)
+
+    def _stretch(self, k: int, row) -> Float[np.ndarray, "3 3"]:
         """S."""
-        values = self.prior.roughness * row[5:]
+        values = self.prior.roughness * row[5:] * self._kept(k)[: len(row) - 5]
         return np.tensordot(values, _STRETCHES[: len(values)], 1) if len(values) else np.zeros((3, 3))
 
     @staticmethod

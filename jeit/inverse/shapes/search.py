@@ -108,8 +108,8 @@ def reconstruct_shapes(
     All are fitted together, as strong disks or balls first. Then one after the other is left out and the rest fitted
     again, and that which is missed least goes, for as long as it is missed so little. What errors of the model and
     electrodes gone missing make of themselves is missed little, for other bodies can take its place. Of what is left,
-    each is split in two, or taken for weak, where the evidence is for it (`ShapeProblem.surprise`): once splits first,
-    once weak ones first, and the better of the two is kept.
+    each is split in two, or taken for the other kind, a weak star or a column from floor to lid, where the evidence is
+    for it (`ShapeProblem.surprise`): once splits first, once kinds first, and the better of the two is kept.
 
     Raises `ValueError` for arguments that do not fit, and for a `smooth` that is no image of these channels by a smooth
     prior.
@@ -140,11 +140,10 @@ def reconstruct_shapes(
         problem = setting.problem(level)
     fitted = problem.fit(*_grown(problem, bodies, coefficients, _FIRST_STEPS), _STEPS)
     found = _without_ghosts(problem, fitted, (), least_rise)
-    changes = [_in_two(problem, found.fit, least_rise), _as_weak(problem, found.fit)]
-    ways = [_searched(problem, found, one, least_rise) for one in changes if one is not None] or [found]
-    best, there = _Told(setting, level, min(ways, key=lambda one: problem.surprise(one.fit))), None
     if solid:
-        best, there = _on_finer_meshes(best, least_rise)
+        best, there = _on_finer_meshes(_Told(setting, level, found), least_rise)
+    else:
+        best, there = _Told(setting, level, _changed(problem, found, least_rise)), None
     (setting, level, (fitted, rises, doubtful)), beside = best, best.setting.beside
     bodies, coefficients = fitted.bodies, fitted.coefficients
     shown = bodies.on(model.mesh) if isinstance(bodies, Ellipsoids) else bodies
@@ -268,9 +267,13 @@ def _on_finer_meshes(told: _Told, least_rise: float) -> tuple[_Told, Finer | Non
             coefficients = np.append(coefficients[0], bodies.rows(coefficients)[order[some]])
         problem = setting.problem(level)
         fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
-        told = _Told(setting, level, _without_ghosts(problem, fit, doubtful, least_rise, missed))
-        after = told.found.fit
-        if again and isinstance(after.bodies, Ellipsoids) and not after.bodies.moved(coefficients, after.coefficients):
+        found = _without_ghosts(problem, fit, doubtful, least_rise, missed)
+        if not again:
+            found = _changed(problem, found, least_rise)
+        elif again < _MOST_MESHES - 1 and (other := _otherwise(problem, found.fit)):
+            found = _without_ghosts(problem, other, found.doubtful, least_rise)
+        told, after = _Told(setting, level, found), found.fit
+        if again and not bodies.moved(coefficients, after.bodies, after.coefficients):
             break
     return told, there
 
@@ -311,23 +314,27 @@ def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None
         for k in range(len(bodies.sign))
         for number in range(bodies.num_splits)
     ]
-    found = _best(problem, tried)
+    found = _best(problem, fitted, tried)
     return found if found and cost >= least_rise * found.cost and _is_told(problem, fitted, found) else None
 
 
-def _as_weak(problem: ShapeProblem, fitted: Fit) -> Fit | None:
-    """The bodies with one or all of the strong ones taken for weak; None if the data do not tell of it."""
-    strong = np.flatnonzero(~fitted.bodies.weak)
-    some = [[k] for k in strong] + [strong] * (len(strong) > 1)
-    found = _best(problem, [fitted.bodies.weakened(one, fitted.coefficients) for one in some])
+def _otherwise(problem: ShapeProblem, fitted: Fit) -> Fit | None:
+    """The bodies with one or all of them taken for the other kind, weak stars or columns; None if the data do not tell
+    of it."""
+    plain = np.flatnonzero(~fitted.bodies.other)
+    some = [[k] for k in plain] + [plain] * (len(plain) > 1)
+    found = _best(problem, fitted, [fitted.bodies.otherwise(one, fitted.coefficients) for one in some])
     return found if found and _is_told(problem, fitted, found) else None
 
 
-def _best(problem: ShapeProblem, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]) -> Fit | None:
-    """The least cost from several starts, by which a few steps are best."""
+def _best(problem: ShapeProblem, fitted: Fit, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]) -> Fit | None:
+    """The least cost from several starts, by which a few steps are best; None where those are hopeless beside what is
+    fitted."""
     tried = [problem.fit(*one, _STEPS_TRIED, _ROUGHLY) for one in starts]
     best = min(tried, key=lambda one: one.cost, default=None)
-    return best and problem.fit(best.bodies, best.coefficients, _STEPS)
+    if best is None or best.cost > _SURELY * fitted.cost:
+        return None
+    return problem.fit(best.bodies, best.coefficients, _STEPS)
 
 
 def _is_told(problem: ShapeProblem, simple: Fit, other: Fit) -> bool:
@@ -335,11 +342,18 @@ def _is_told(problem: ShapeProblem, simple: Fit, other: Fit) -> bool:
     return problem.surprise(other) + _MARGIN <= problem.surprise(simple)
 
 
+def _changed(problem: ShapeProblem, found: _Found, least_rise: float) -> _Found:
+    """The bodies that explain the data best once some are split and others of the other kind; or as they are."""
+    changes = [_in_two(problem, found.fit, least_rise), _otherwise(problem, found.fit)]
+    ways = [_searched(problem, found, one, least_rise) for one in changes if one is not None] or [found]
+    return min(ways, key=lambda one: problem.surprise(one.fit))
+
+
 def _searched(problem: ShapeProblem, found: _Found, changed: Fit, least_rise: float) -> _Found:
-    """The bodies that explain the data once they are `changed`: split one after the other, and then taken for weak."""
+    """The bodies that explain the data once they are `changed`: split one by one, and then other kinds tried."""
     for _ in range(_MOST_CHANGES):
         found = _without_ghosts(problem, changed, found.doubtful, least_rise)
-        change = _in_two(problem, found.fit, least_rise) or _as_weak(problem, found.fit)
+        change = _in_two(problem, found.fit, least_rise) or _otherwise(problem, found.fit)
         if change is None:
             break
         changed = change

@@ -55,9 +55,9 @@ class StarPrior(BodyPrior):
         first = [self.place * span, self.place * span, self.radius_spread, 1.0]
         return np.concatenate([first, np.repeat(mode, 2)])
 
-    def contrast_of(self, coefficient: float, weak: bool) -> tuple[float, float]:
-        """Contrast of log σ of a body, positive, and its derivative."""
-        if not weak:
+    def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
+        """Contrast of log σ of a body, weak if `other`, positive, and its derivative."""
+        if not other:
             return self.contrast + self.contrast_spread * coefficient, self.contrast_spread
         contrast = self.weak_contrast * np.exp(self.weak_spread * coefficient)
         return contrast, self.weak_spread * contrast
@@ -88,6 +88,11 @@ class Star(eqx.Module):
     def measure(self) -> float:
         """The area, m²."""
         return self.area
+
+    @property
+    def contrast_is_told(self) -> bool:
+        """Whether by the data: of weak bodies."""
+        return self.weak
 
     @property
     def centroid(self) -> Float[np.ndarray, "2"]:
@@ -141,27 +146,27 @@ class Stars(Bodies):
         area = np.asarray(measures(mesh))
         start = np.reshape(np.asarray(start, float), (-1, 2))
         width, weight = _BLUR * np.sqrt(area), area / area.sum()
-        sign, weak = np.asarray(sign, float), np.zeros(len(start), bool)
-        return cls(prior, weight, span, start, sign, weak, corners @ _SAMPLES.T, width, edges)
+        sign, other = np.asarray(sign, float), np.zeros(len(start), bool)
+        return cls(prior, weight, span, start, sign, other, corners @ _SAMPLES.T, width, edges)
 
     @property
     def odds(self) -> float:
         """What weak ones are less likely by beforehand."""
-        return float(self.weak.sum() * np.log(self.prior.odds_against_weak))
+        return float(self.other.sum() * np.log(self.prior.odds_against_weak))
 
     @property
     def num_splits(self) -> int:
         """Both."""
         return 2
 
-    def weakened(self, some, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
+    def otherwise(self, some, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
         """The same with `some` stars taken for weak, and so much larger that they do as much to the field."""
-        rows, weak = self.rows(coefficients).copy(), self.weak.copy()
+        rows, weak = self.rows(coefficients).copy(), self.other.copy()
         for k in some:
             strength = np.tanh(self.contrast(k, rows[k])[0] / 2) / np.tanh(self.prior.weak_contrast / 2)
             rows[k, 2] += np.log(strength) / 2 / self.prior.radius_spread
             rows[k, 3], weak[k] = 0, True
-        return replace(self, weak=weak), np.append(coefficients[0], rows)
+        return replace(self, other=weak), np.append(coefficients[0], rows)
 
     def mixture(self, share, contrast):
         """2 artanh(share · tanh(contrast / 2)): Maxwell Garnett's. What a cell of which a share is covered does to the
@@ -193,7 +198,7 @@ class Stars(Bodies):
         pair = np.stack([outline.real, outline.imag], axis=1)
         middle = np.array([centre.real, centre.imag])
         contrast = float(self.contrast(k, row)[0])
-        return Star(int(self.sign[k]), middle, pair, contrast, bool(self.weak[k]), float(rise))
+        return Star(int(self.sign[k]), middle, pair, contrast, bool(self.other[k]), float(rise))
 
     def _values(self, k: int, row) -> _Values:
         values = self.prior.deviation(self.span)[4:] * row[4:]
