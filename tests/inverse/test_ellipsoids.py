@@ -33,14 +33,15 @@ def model(num_points):
     return ForwardModel(box(*SIZE, num_points=num_points), discs(), opposite(16, current=1e-3))
 
 
-def sharp(num_points):
-    """A model whose mesh is cut along the ball, and which of its cells lie inside."""
+def sharp(num_points, along=3):
+    """A model whose mesh is cut along the ball, or the column along two axes, and which of its cells lie inside."""
 
     def outside(points):
-        return np.linalg.norm(points - BALL, axis=-1) - RADIUS
+        return np.linalg.norm((points - BALL)[..., :along], axis=-1) - RADIUS
 
     def edge(corners):
-        return np.where((outside(corners).min(axis=1) < 0) & (outside(corners).max(axis=1) > 0), RADIUS / 3, np.inf)
+        on_surface = (outside(corners).min(axis=1) < 0) & (outside(corners).max(axis=1) > 0)
+        return np.where(on_surface, RADIUS / (3 if along == 3 else 2), np.inf)
 
     mesh = cut(bisect(model(num_points).mesh, edge), outside)
     return ForwardModel(mesh, discs(), opposite(16, current=1e-3)), outside(np.asarray(centroids(mesh))) < 0
@@ -137,12 +138,28 @@ def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, ratio):
     found = reconstruct_shapes(coarse, np.asarray(coarse.voltages(BATH)) + change, BATH, start=start, noise=noise)
     (body,) = found.bodies
     assert body.sign == sign
+    assert not body.column
     assert np.linalg.norm(body.centroid - BALL) < 0.003
     # What it does to the field: volume times (ratio - 1) / (ratio + 2); which of the two is hardly told.
     strength = body.volume * np.expm1(sign * body.contrast) / (np.exp(sign * body.contrast) + 2)
     true = 4 * np.pi / 3 * RADIUS**3 * (ratio - 1) / (ratio + 2)
     np.testing.assert_allclose(strength, true, rtol=0.15)
     assert len(found.doubtful) == 1
+
+
+@pytest.mark.slow
+def test_a_column_is_told_from_a_ball(coarse):
+    fine, held = sharp(4000, along=2)
+    change = np.asarray(fine.voltages(BATH * np.where(held, 4.0, 1.0))) - np.asarray(fine.voltages(BATH))
+    noise = 0.03 * np.sqrt(np.mean(change**2))
+    start = [(1, BALL + 0.005, 0.03)]
+    found = reconstruct_shapes(coarse, np.asarray(coarse.voltages(BATH)) + change, BATH, start=start, noise=noise)
+    (body,) = found.bodies
+    assert body.column
+    assert np.linalg.norm((body.centroid - BALL)[:2]) < 0.002
+    # What it does to the field, as of a disk in a sheet: volume times (ratio - 1) / (ratio + 1).
+    strength = body.volume * np.tanh(body.contrast / 2)
+    np.testing.assert_allclose(strength, np.pi * RADIUS**2 * SIZE[2] * 3 / 5, rtol=0.15)
 
 
 def test_balls_keep_their_volume_on_any_mesh(coarse):

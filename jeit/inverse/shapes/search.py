@@ -37,7 +37,7 @@ _SURELY = 10.0
 _MOST_CHANGES = 10
 # How often the mesh is made finer where bodies are, at most: they move by it. And the lengths of edges there, of the
 # least half axis, that are tried in turn: first while ghosts are among the bodies, and then.
-_MOST_MESHES, _EDGES = 3, ((0.7,), (0.5, 0.6, 0.7))
+_MOST_MESHES, _EDGES = 3, ((0.7,), (0.35, 0.5, 0.7))
 # How much likelier (of the logarithm) more has to make the data than less, to be told.
 _MARGIN = 2.0
 
