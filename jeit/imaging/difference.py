@@ -84,16 +84,18 @@ class ImagedDifference:
 
     @property
     def peak_ranges(self) -> tuple[tuple[float, float], ...]:
-        """From where to where the change in each inclusion may lie, S/m (2-D: S), a standard deviation either way;
-        empty where the data do not tell it."""
+        """From where to where the change in each inclusion may lie, S/m (2-D: S), a standard deviation either way, of
+        either kind where the data do not tell an ellipsoid from a column; empty where the data do not tell it."""
         if self.shapes is None or not all(one.contrast_is_told for one in self.shapes.bodies):
             return ()
         background, bodies = float(self.calibration.conductivity), self.shapes.bodies
-        ends = [
-            sorted(float(background * np.expm1(one.sign * (one.contrast + side * deviation))) for side in (-1, 1))
-            for one, deviation in zip(bodies, self.shapes.contrast_deviations, strict=True)
-        ]
-        return tuple((low, high) for low, high in ends)
+        deviations, ranges = self.shapes.contrast_deviations, []
+        for one, deviation, other in zip(bodies, deviations, self.shapes.alternatives, strict=True):
+            contrasts = [one.contrast, *([other.contrast] if other else [])]
+            ends = [contrast + side * deviation for contrast in contrasts for side in (-1, 1)]
+            changes = [float(background * np.expm1(one.sign * end)) for end in ends]
+            ranges.append((min(changes), max(changes)))
+        return tuple(ranges)
 
     @property
     def mesh(self) -> Mesh:
@@ -111,7 +113,7 @@ class ImagedDifference:
     @property
     def doubts(self) -> tuple[str, ...]:
         """What speaks against believing the image, in sentences: an iteration that did not converge, voltages that it
-        does not explain."""
+        does not explain, bodies that may as well be of another kind."""
         if isinstance(self.reconstruction, LinearReconstruction):
             return ()
         found, said = self.reconstruction, []
@@ -125,6 +127,15 @@ class ImagedDifference:
                 f"its voltages miss the data by {misfit:.2g} standard deviations: bodies may be missing, or shown "
                 "where none are."
             )
+        for one in found.alternatives if isinstance(found, ShapeReconstruction) else ():
+            if one is not None:
+                x, y = 1e3 * one.centroid[:2]
+                kind = "a column through the whole height" if one.column else "no column but an ellipsoid"
+                said.append(
+                    f"the body at x {x:.0f} mm, y {y:.0f} mm may as well be {kind}, of "
+                    f"{np.exp(one.sign * one.contrast):.2g} times the background and {1e6 * one.volume:.3g} cm³: these "
+                    "electrodes do not tell which."
+                )
         return tuple(said)
 
     @property

@@ -49,8 +49,8 @@ def warn_large(extent: float, name: str) -> None:
     if extent > _LARGE:
         warnings.warn(
             f"{name}: {extent:g} m is large for what electrodes are put on. If the lengths are millimetres, give "
-            f"{1e-3 * extent:g} (a file is read with scale=1e-3), if inches, {0.0254 * extent:g} (scale=0.0254): "
-            "jeit computes in metres.",
+            f"{1e-3 * extent:g} (a file is read with scale=1e-3), if centimetres, {1e-2 * extent:g} (scale=1e-2), if "
+            f"inches, {0.0254 * extent:g} (scale=0.0254): jeit computes in metres.",
             UserWarning,
             stacklevel=4,
         )

@@ -237,8 +237,11 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
         ]
         for bodies in (result.shapes.bodies, result.shapes.doubtful)
     )
-    for one, deviation in zip(kept, result.shapes.contrast_deviations, strict=True):
+    for one, deviation, other in zip(kept, result.shapes.contrast_deviations, result.shapes.alternatives, strict=True):
         one["deviation_of_logarithm"] = deviation
+        if other is not None:
+            ratio = math.exp(other.sign * other.contrast)
+            one["or"] = {"centroid": other.centroid, **_form(other), "conductivity_over_background": ratio}
     return {
         "bodies": kept,
         "left_out": left,

@@ -118,6 +118,15 @@ def test_a_column_stands_through_the_whole_height(ellipsoids):
     np.testing.assert_allclose(np.abs(columns.axis(0, columns.rows(point)[0], 0) @ body.axes[1]), length[1], rtol=1e-6)
 
 
+def test_a_column_is_an_ellipsoid_again_of_its_volume(ellipsoids):
+    point = ellipsoids.of_radii([0.02, 0.02, 0.02])
+    columns, upright = ellipsoids.otherwise([0, 1], point)
+    again, back = columns.otherwise([0, 1], upright)
+    assert again.other.tolist() == [False] * 3
+    np.testing.assert_allclose(again.body(0, back).volume, ellipsoids.body(0, point).volume, rtol=0.05)
+    np.testing.assert_allclose(columns.odds, -2 * np.log(EllipsoidPrior().odds_for_columns))
+
+
 def test_a_ball_over_the_wall_ends_there(coarse):
     """Its middle on the wall: half the volume, its centroid 3/8 of the radius inside."""
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), [[0.05, 0.0, 0.05]], [1])
@@ -139,6 +148,7 @@ def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, ratio):
     (body,) = found.bodies
     assert body.sign == sign
     assert not body.column
+    assert found.alternatives == (None,)
     assert np.linalg.norm(body.centroid - BALL) < 0.003
     # What it does to the field: volume times (ratio - 1) / (ratio + 2); which of the two is hardly told.
     strength = body.volume * np.expm1(sign * body.contrast) / (np.exp(sign * body.contrast) + 2)
@@ -156,6 +166,7 @@ def test_a_column_is_told_from_a_ball(coarse):
     found = reconstruct_shapes(coarse, np.asarray(coarse.voltages(BATH)) + change, BATH, start=start, noise=noise)
     (body,) = found.bodies
     assert body.column
+    assert found.alternatives == (None,)
     assert np.linalg.norm((body.centroid - BALL)[:2]) < 0.002
     # What it does to the field, as of a disk in a sheet: volume times (ratio - 1) / (ratio + 1).
     strength = body.volume * np.tanh(body.contrast / 2)

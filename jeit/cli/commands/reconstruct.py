@@ -187,7 +187,7 @@ def show(console, result: "ImagedDifference") -> None:
         drift = f"the background has drifted by {percent(result.shapes.drift)}"
         strong = sum(not one.contrast_is_told for one in result.shapes.bodies)
         upright = sum(isinstance(one, Ellipsoid) and one.column for one in result.shapes.bodies)
-        columns = f", {upright} as columns through the whole height" if upright else ""
+        columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
         assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""
         rows.append(
             ("bodies", f"{counted(len(result.shapes.bodies), 'outline')} fitted{columns}{left}{assumed}; {drift}")

@@ -48,13 +48,15 @@ _LEVEL = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
 @dataclass(frozen=True)
 class EllipsoidPrior(BodyPrior):
     """Of ellipsoids: `modes` 2, or 1 for balls; `roughness`, of the logarithm of the axes' ratios; `contrast` of log σ
-    and the spread of its logarithm. Smooth images of solids tell places well, so `place` is small. The rest as of
+    and the spread of its logarithm; `odds_for_columns`, how many times as likely as an ellipsoid a column is
+    beforehand: most tanks hold columns. Smooth images of solids tell places well, so `place` is small. The rest as of
     `BodyPrior`."""
 
     modes: int = 2
     place: float = 0.04
     contrast: float = 1.5
     contrast_spread: float = 0.7
+    odds_for_columns: float = 20.0
 
     @property
     def size(self) -> int:
@@ -135,8 +137,8 @@ class Ellipsoids(Bodies):
 
     @property
     def odds(self) -> float:
-        """None: either kind is as likely."""
-        return 0.0
+        """What columns are more likely by beforehand."""
+        return -float(self.other.sum() * np.log(self.prior.odds_for_columns))
 
     @property
     def num_splits(self) -> int:
@@ -144,13 +146,14 @@ class Ellipsoids(Bodies):
         return 1
 
     def otherwise(self, some, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
-        """The same with `some` taken for columns of the same volume, the rest of their coefficients kept."""
+        """The same with `some` taken for columns, columns for ellipsoids, of the same volume, the rest of their
+        coefficients kept."""
         rows, other = self.rows(coefficients).copy(), self.other.copy()
         for k in some:
-            area = max(self.body(k, coefficients).volume, 1e-6 * self.total) / (self.ends[1] - self.ends[0])
-            radius = np.log(np.sqrt(area / np.pi) / (self.prior.radius * self.span))
-            rows[k, 3], other[k] = radius / self.prior.radius_spread, True
-            rows[k, 2] = 0
+            volume = max(self.body(k, coefficients).volume, 1e-6 * self.total) / np.pi
+            radius = np.cbrt(3 / 4 * volume) if other[k] else np.sqrt(volume / (self.ends[1] - self.ends[0]))
+            rows[k, 3] = np.log(radius / (self.prior.radius * self.span)) / self.prior.radius_spread
+            rows[k, 2], other[k] = 0, not other[k]
             rows[k, 5:] *= _LEVEL[: self.prior.size - 5]
         return replace(self, other=other), np.append(coefficients[0], rows)
 

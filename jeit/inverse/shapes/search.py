@@ -38,8 +38,9 @@ _MOST_CHANGES = 10
 # How often the mesh is made finer where bodies are, at most: they move by it. And the lengths of edges there, of the
 # least half axis, that are tried in turn: first while ghosts are among the bodies, and then.
 _MOST_MESHES, _EDGES = 3, ((0.7,), (0.35, 0.5, 0.7))
-# How much likelier (of the logarithm) more has to make the data than less, to be told.
-_MARGIN = 2.0
+# How much likelier (of the logarithm) more has to make the data than less, to be told; and one kind of body than the
+# other, not to be told as one of two.
+_MARGIN, _UNDECIDED = 2.0, 4.0
 
 
 Body = Star | Ellipsoid
@@ -53,7 +54,8 @@ class ShapeReconstruction(eqx.Module):
     measured over the channels used, in standard deviations; `drift`, how many times as conductive as its `background`
     the bath is, less one; `doubtful`, bodies that were started from and left out again, their `rise` too small;
     `contrast_deviations`, standard deviation of each body's contrast, after the data and as far as noise is all that is
-    wrong.
+    wrong; `alternatives`, each body of a solid as the other kind, ellipsoid or column, where the data do not tell which
+    it is, else None.
     """
 
     bodies: tuple[Body, ...]
@@ -63,6 +65,7 @@ class ShapeReconstruction(eqx.Module):
     drift: float
     doubtful: tuple[Body, ...]
     contrast_deviations: tuple[float, ...]
+    alternatives: tuple[Ellipsoid | None, ...]
 
     @property
     def hyperparameter(self) -> float:
@@ -152,6 +155,7 @@ def reconstruct_shapes(
     predicted = np.asarray(model.voltages(conductivity if there is None else background))
     if there is not None:
         predicted = predicted + there.change(model.protocol, bodies.image(coefficients).image, field)
+    others = _alternatives(setting.problem(level), fitted)
     spread = bodies.rows(setting.problem(level).deviations(fitted))[:, bodies.dimension + 1]
     slopes = [bodies.contrast(k, row)[1] for k, row in enumerate(bodies.rows(coefficients))]
     excess = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
@@ -164,6 +168,7 @@ def reconstruct_shapes(
         drift=float(np.expm1(prior.drift * coefficients[0])),
         doubtful=doubtful,
         contrast_deviations=tuple(float(spread[k] * slopes[k]) for k in order),
+        alternatives=tuple(others[k] for k in order),
     )
 
 
@@ -325,6 +330,19 @@ def _otherwise(problem: ShapeProblem, fitted: Fit) -> Fit | None:
     some = [[k] for k in plain] + [plain] * (len(plain) > 1)
     found = _best(problem, fitted, [fitted.bodies.otherwise(one, fitted.coefficients) for one in some])
     return found if found and _is_told(problem, fitted, found) else None
+
+
+def _alternatives(problem: ShapeProblem, fitted: Fit) -> list[Ellipsoid | None]:
+    """Every ellipsoid as a column, and every column as an ellipsoid, that explains the data about as well."""
+    bodies, found = fitted.bodies, []
+    for k in range(len(bodies.sign)):
+        body = None
+        if isinstance(bodies, Ellipsoids):
+            other = problem.fit(*bodies.otherwise([k], fitted.coefficients), _STEPS_WITHOUT, _ROUGHLY)
+            if problem.surprise(other) < problem.surprise(fitted) + _UNDECIDED:
+                body = other.bodies.body(k, other.coefficients)
+        found.append(body)
+    return found
 
 
 def _best(problem: ShapeProblem, fitted: Fit, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]) -> Fit | None:
