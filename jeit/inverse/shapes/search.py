@@ -143,10 +143,9 @@ def reconstruct_shapes(
         problem = setting.problem(level)
     fitted = problem.fit(*_grown(problem, bodies, coefficients, _FIRST_STEPS), _STEPS)
     found = _without_ghosts(problem, fitted, (), least_rise)
+    best, there = _Told(setting, level, _changed(problem, found, least_rise)), None
     if solid:
-        best, there = _on_finer_meshes(_Told(setting, level, found), least_rise)
-    else:
-        best, there = _Told(setting, level, _changed(problem, found, least_rise)), None
+        best, there = _on_finer_meshes(best, least_rise)
     (setting, level, (fitted, rises, doubtful)), beside = best, best.setting.beside
     bodies, coefficients = fitted.bodies, fitted.coefficients
     shown = bodies.on(model.mesh) if isinstance(bodies, Ellipsoids) else bodies
@@ -273,9 +272,7 @@ def _on_finer_meshes(told: _Told, least_rise: float) -> tuple[_Told, Finer | Non
         problem = setting.problem(level)
         fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
         found = _without_ghosts(problem, fit, doubtful, least_rise, missed)
-        if not again:
-            found = _changed(problem, found, least_rise)
-        elif again < _MOST_MESHES - 1 and (other := _otherwise(problem, found.fit)):
+        if again < _MOST_MESHES - 1 and (other := _otherwise(problem, found.fit)):
             found = _without_ghosts(problem, other, found.doubtful, least_rise)
         told, after = _Told(setting, level, found), found.fit
         if again and not bodies.moved(coefficients, after.bodies, after.coefficients):
