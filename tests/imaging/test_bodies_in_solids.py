@@ -1,6 +1,7 @@
 """A strong ball in a tank of plates: fitted beside a smooth field, its conductivity told with its range."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ from jeit.data import Measurement
 from jeit.electrodes import FacePatches
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
-from jeit.imaging import ImagingSettings, automatic, method
+from jeit.imaging import ImagedDifference, ImagingSettings, automatic, method
+from jeit.inverse.shapes import Ellipsoid, ShapeReconstruction
 from jeit.mesh import Disk, Rectangle, Solid, centroids
 from jeit.protocol import opposite, skip
+from jeit.report import image as image_report
 
 BOX, BATH, TIMES = Solid(Rectangle(0.1, 0.14), 0.1), 0.2, 4.0
 BALL, RADIUS = np.array([0.012, -0.025, 0.055]), 0.022
@@ -92,3 +95,32 @@ def test_bodies_of_a_sound_linear_image_are_told_in_a_cylinder():
     body = result.shapes.bodies[0]
     assert np.linalg.norm(body.centroid - middle) < 0.004
     assert body.sign == -1
+
+
+def test_where_electrodes_do_not_tell_the_kind_of_a_body_it_is_doubted_and_the_range_is_of_both():
+    def body(column, contrast):
+        return Ellipsoid(1, BALL, 0.02 * np.eye(3), 3e-5, BALL, contrast, column, 2.0)
+
+    zero: Any = np.zeros(1)
+    shapes = ShapeReconstruction(
+        bodies=(body(True, np.log(3)), body(False, np.log(4))),
+        conductivity=zero,
+        voltages=zero,
+        misfit=np.zeros(()),  # pyright: ignore
+        drift=0.0,
+        doubtful=(),
+        contrast_deviations=(0.1, 0.2),
+        alternatives=(body(False, np.log(6)), None),
+    )
+    calibration = SimpleNamespace(conductivity=BATH)
+    image: Any = SimpleNamespace(shapes=shapes, reconstruction=shapes, calibration=calibration)
+    low, high = np.transpose(ImagedDifference.peak_ranges.fget(image))  # pyright: ignore
+    np.testing.assert_allclose(low, BATH * (np.array([3, 4]) * np.exp([-0.1, -0.2]) - 1))
+    np.testing.assert_allclose(high, BATH * (np.array([6, 4]) * np.exp([0.1, 0.2]) - 1))
+    (doubt,) = ImagedDifference.doubts.fget(image)  # pyright: ignore
+    assert "x 12 mm, y -25 mm may as well be no column but an ellipsoid, of 6 times the background and 30 cm³" in doubt
+    told = image_report._shapes(image)["bodies"]  # pyright: ignore
+    assert told[0]["form"] == "column"
+    assert told[0]["or"]["form"] == "ellipsoid"
+    np.testing.assert_allclose(told[0]["or"]["conductivity_over_background"], 6)
+    assert "or" not in told[1]

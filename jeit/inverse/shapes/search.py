@@ -331,14 +331,13 @@ def _otherwise(problem: ShapeProblem, fitted: Fit) -> Fit | None:
 
 def _alternatives(problem: ShapeProblem, fitted: Fit) -> list[Ellipsoid | None]:
     """Every ellipsoid as a column, and every column as an ellipsoid, that explains the data about as well."""
-    bodies, found = fitted.bodies, []
-    for k in range(len(bodies.sign)):
-        body = None
-        if isinstance(bodies, Ellipsoids):
-            other = problem.fit(*bodies.otherwise([k], fitted.coefficients), _STEPS_WITHOUT, _ROUGHLY)
-            if problem.surprise(other) < problem.surprise(fitted) + _UNDECIDED:
-                body = other.bodies.body(k, other.coefficients)
-        found.append(body)
+    bodies, number = fitted.bodies, len(fitted.bodies.sign)
+    if not (number and isinstance(bodies, Ellipsoids)):
+        return [None] * number
+    most, found = problem.surprise(fitted) + _UNDECIDED, []
+    for k in range(number):
+        other = problem.fit(*bodies.otherwise([k], fitted.coefficients), _STEPS_WITHOUT, _ROUGHLY)
+        found.append(other.bodies.body(k, other.coefficients) if problem.surprise(other) < most else None)
     return found
 
 
