@@ -10,6 +10,7 @@ from jeit.image.plane import Plane, cut_by_plane
 from jeit.image.raster import Raster
 from jeit.image.regions import ball_region, box_region, half_region
 from jeit.image.segmentation import segment
+from jeit.image.solid_form import SolidForm
 
 _tell_old_names(__name__)
 
@@ -19,6 +20,7 @@ __all__ = [
     "Oscillation",
     "Plane",
     "Raster",
+    "SolidForm",
     "TriangleSurface",
     "amplitude_spectrum",
     "ball_region",

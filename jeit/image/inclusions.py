@@ -4,6 +4,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jeit.image.solid_form import SolidForm
 from jeit.image.watershed import basins, shared_facets
 from jeit.mesh import Mesh, centroids, measures
 
@@ -17,7 +18,8 @@ class Inclusion(eqx.Module):
 
     **Fields**: `sign`, +1 conductive or -1 resistive; `centroid` in metres, weighted by the change; `area` in m² (of
     solids volume in m³); `peak`, the strongest change in it, in the image's unit; `on_surface`, whether it lies on a
-    surface in space, which has an area though its centroid has three coordinates.
+    surface in space, which has an area though its centroid has three coordinates; `form`, of what was fitted to data as
+    a body of a solid.
     """
 
     sign: int
@@ -25,6 +27,7 @@ class Inclusion(eqx.Module):
     area: float
     peak: float
     on_surface: bool = False
+    form: SolidForm | None = None
 
     @property
     def is_solid(self) -> bool:
@@ -35,6 +38,11 @@ class Inclusion(eqx.Module):
     def kind(self) -> str:
         """'conductive' or 'resistive'."""
         return "conductive" if self.sign > 0 else "resistive"
+
+    @property
+    def is_column(self) -> bool:
+        """Whether it stands through the whole height of a solid."""
+        return self.form is not None and self.form.column
 
     @property
     def radius(self) -> float:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Inexact, UInt8
 
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
-from jeit.image import Inclusion, Raster
+from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
 from jeit.image.score import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
@@ -239,7 +239,8 @@ def _inclusions(
         bodies = found.shapes.bodies
         labels = _labels(found.mesh, bodies, grid) if settings.segment else None
         listed = [
-            Inclusion(one.sign, tuple(one.centroid.tolist()), one.measure, one.sign * one.contrast) for one in bodies
+            Inclusion(one.sign, tuple(one.centroid.tolist()), one.measure, one.sign * one.contrast, form=_form(one))
+            for one in bodies
         ]
         return [_with_change(one, background) for one in listed], labels
     departure, noise = as_array(np.real(found.departure)), None
@@ -248,6 +249,14 @@ def _inclusions(
     regions = inclusion_regions(found.mesh, departure, level=found.level, least_peak=settings.least_peak, noise=noise)
     inclusions = [_with_change(one, background) if found.iterative else one for one, _ in regions]
     return inclusions, _covered(regions, grid) if settings.segment else None
+
+
+def _form(body: Star | Ellipsoid) -> SolidForm | None:
+    """What pictures draw of a body in a solid."""
+    if isinstance(body, Star):
+        return None
+    axes = sorted(body.axes.tolist(), key=lambda axis: abs(axis[2])) if body.column else body.axes.tolist()
+    return SolidForm(tuple(body.centre.tolist()), tuple(map(tuple, axes)), body.column)
 
 
 def _covered(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:

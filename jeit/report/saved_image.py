@@ -10,7 +10,7 @@ from jeit.arguments import counted, told
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.files import need, npz_arrays
-from jeit.image import Inclusion
+from jeit.image import Inclusion, SolidForm
 from jeit.mesh import Mesh
 
 _GIVE = "give the image.npz that jeit reconstruct writes"
@@ -34,6 +34,9 @@ _KEPT = (
     "inclusion_centroids",
     "inclusion_sizes",
     "inclusion_peaks",
+    "inclusion_centres",
+    "inclusion_axes",
+    "inclusion_columns",
 )
 
 
@@ -65,9 +68,10 @@ def saved_extras(
 ) -> dict[str, np.ndarray]:
     """Arrays of an `image.npz` beside the image itself: electrodes as polygons, `electrode_corners` (q, d) of all of
     them, `electrode_sizes` (p,) how many are each one's, `electrode_numbers` (p,) whose, from 0; and of inclusions
-    `inclusion_centroids` (i, d), `inclusion_sizes` (i,) m² (of solids m³), `inclusion_peaks` (i,)."""
+    `inclusion_centroids` (i, d), `inclusion_sizes` (i,) m² (of solids m³), `inclusion_peaks` (i,); of bodies that were
+    fitted to a solid `inclusion_centres` (i, 3), `inclusion_axes` (i, 3, 3) and `inclusion_columns` (i,)."""
     shapes, dimension = shapes_of(mesh, electrodes), np.shape(mesh.points)[1]
-    return {
+    extras = {
         "electrode_corners": shapes.corners,
         "electrode_sizes": shapes.sizes,
         "electrode_numbers": shapes.electrode,
@@ -75,6 +79,14 @@ def saved_extras(
         "inclusion_sizes": np.array([one.area for one in inclusions], float),
         "inclusion_peaks": np.array([one.peak for one in inclusions], float),
     }
+    forms = [one.form for one in inclusions if one.form is not None]
+    if forms and len(forms) == len(inclusions):
+        extras |= {
+            "inclusion_centres": np.array([one.centre for one in forms]),
+            "inclusion_axes": np.array([one.axes for one in forms]),
+            "inclusion_columns": np.array([one.column for one in forms]),
+        }
+    return extras
 
 
 def read_image(path: str | Path) -> SavedImage:
@@ -171,7 +183,23 @@ def _inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusion, .
         raise ValueError("'inclusion_centroids', '_sizes' and '_peaks' do not belong together; write it again.")
     if not all(one.dtype.kind == "f" and np.isfinite(one).all() for one in (centroids, sizes, peaks)):
         raise ValueError("inclusions have values that are not finite; write it again.")
+    listed = zip(centroids.tolist(), sizes.tolist(), peaks.tolist(), _forms(arrays, number), strict=True)
     return tuple(
-        Inclusion(1 if peak > 0 else -1, tuple(centroid), size, peak, mesh.is_surface)
-        for centroid, size, peak in zip(centroids.tolist(), sizes.tolist(), peaks.tolist(), strict=True)
+        Inclusion(1 if peak > 0 else -1, tuple(centroid), size, peak, mesh.is_surface, form)
+        for centroid, size, peak, form in listed
     )
+
+
+def _forms(arrays: dict[str, np.ndarray], number: int) -> list[SolidForm | None]:
+    if "inclusion_axes" not in arrays:
+        return [None] * number
+    need(arrays, "inclusion_centres", "inclusion_columns")
+    centres, axes, columns = (arrays[f"inclusion_{name}"] for name in ("centres", "axes", "columns"))
+    if not (centres.shape == (number, 3) and axes.shape == (number, 3, 3) and columns.shape == (number,)):
+        raise ValueError("'inclusion_centres', '_axes' and '_columns' are not of every inclusion; write it again.")
+    if not all(one.dtype.kind == "f" and np.isfinite(one).all() for one in (centres, axes)):
+        raise ValueError("inclusions have places that are not finite; write it again.")
+    return [
+        SolidForm(tuple(centre), tuple(map(tuple, three)), bool(column))
+        for centre, three, column in zip(centres.tolist(), axes.tolist(), columns.tolist(), strict=True)
+    ]

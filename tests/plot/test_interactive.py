@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jeit.electrodes import FacePatches
-from jeit.image import Inclusion
+from jeit.image import Inclusion, SolidForm
 from jeit.mesh import box, centroids
 from jeit.plot import view_solid
 from jeit.plot.solid import interactive
@@ -68,10 +68,13 @@ def test_a_display_that_nothing_answers_at_is_none(monkeypatch):
 
 def test_the_scene_has_all_that_is_asked_for(pyvista, tmp_path):
     ball = Inclusion(1, (0.03, -0.05, 0.1), 1e-4, 1e-3)
-    plotter = view_solid(TANK, IMAGE, PATCHES, levels=(0.3, 0.6), inclusions=[ball], off_screen=True)
-    named = {"hull", "edges", "isosurface 0", "isosurface 1", "electrodes", "inclusion 0", "plane"}
+    form = SolidForm((0.0, 0.0, 0.085), ((0.03, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.085)), True)
+    found = [ball, Inclusion(1, (0.0, 0.0, 0.085), 1e-4, 1e-3, form=form)]
+    plotter = view_solid(TANK, IMAGE, PATCHES, levels=(0.3, 0.6), inclusions=found, off_screen=True)
+    named = {"hull", "edges", "isosurface 0", "isosurface 1", "electrodes", "inclusion 0", "inclusion 1", "plane"}
     assert named <= set(plotter.actors)
     assert list(plotter.scalar_bars.keys()) == ["Change of conductivity\n(µS/m)"]
+    np.testing.assert_allclose(np.ptp(plotter.actors["inclusion 1"].mapper.dataset.points, axis=0), [60, 20, 170])
     hull, electrodes = (plotter.actors[name].mapper.dataset for name in ("hull", "electrodes"))
     np.testing.assert_allclose(np.ptp(hull.points, axis=0), [170, 255, 170], rtol=1e-6)
     assert electrodes.area == pytest.approx(2 * 60 * 60, rel=1e-6)

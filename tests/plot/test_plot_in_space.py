@@ -5,7 +5,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Polygon
 
 from jeit.electrodes import (
     BoundaryElectrodes,
@@ -16,7 +16,7 @@ from jeit.electrodes import (
     plates,
 )
 from jeit.electrodes.electrode_shapes import shapes_of
-from jeit.image import Inclusion, Plane
+from jeit.image import Inclusion, Plane, SolidForm
 from jeit.layout import SurfaceLayout, ring
 from jeit.mesh import box, centroids, cylinder, disk, tube
 from jeit.plot import (
@@ -269,6 +269,25 @@ def test_a_slice_shows_electrodes_that_it_passes_and_cuts_balls(tank, image, pat
     other = Figure().subplots()
     plot_slice(tank, image, Plane.at("z", 0.14), inclusions=inclusions, ax=other)
     assert not other.patches
+
+
+def test_bodies_that_were_fitted_are_outlined_as_what_they_are(tank, image, ax):
+    form = SolidForm((0.02, -0.05, 0.085), ((0.03, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.085)), True)
+    column = Inclusion(1, (0.02, -0.05, 0.085), 1e-4, 1e-3, form=form)
+    plot_slice(tank, image, Plane.at("z", 0.02), inclusions=[column], ax=ax)
+    plot_slice(tank, image, Plane.at("y", -0.05), inclusions=[column], ax=(side := Figure().subplots()))
+    plot_slice(tank, image, Plane.at("y", -0.03), inclusions=[column], ax=(beside := Figure().subplots()))
+    for panel, least, most in ((ax, (-0.01, -0.06), (0.05, -0.04)), (side, (-0.01, 0.0), (0.05, 0.17))):
+        (outline,) = [one for one in panel.patches if isinstance(one, Polygon)]
+        np.testing.assert_allclose(outline.get_xy().min(axis=0), least, atol=1e-5)
+        np.testing.assert_allclose(outline.get_xy().max(axis=0), most, atol=1e-5)
+    assert not beside.patches
+    overview = plot_solid(tank, image, inclusions=[column], camera=Camera(azimuth=-90, elevation=0))
+    (outline,) = [one for one in overview.axes[0].patches if isinstance(one, Polygon)]
+    np.testing.assert_allclose(np.ptp(outline.get_xy(), axis=0), (0.06, 0.17), atol=1e-5)
+    (words,) = [text.get_text() for one in overview.axes for text in one.texts if "found" in text.get_text()]
+    assert "found, dashed:" in words
+    assert "column of 100 cm³" in words
 
 
 def test_grids_have_one_scale(tank, image, patches):

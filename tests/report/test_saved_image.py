@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.electrodes import BoundaryElectrodes, FacePatches
-from jeit.image import Inclusion
+from jeit.image import Inclusion, SolidForm
 from jeit.layout import ring
 from jeit.mesh import box, disk
 from jeit.report import read_image
@@ -38,6 +38,20 @@ def test_a_solid_comes_back(tmp_path):
     assert image.inclusions == FOUND
     assert image.electrodes is not None
     np.testing.assert_allclose(image.electrodes.middles(), PATCHES.position, atol=1e-12)
+
+
+def test_bodies_that_were_fitted_come_back_with_their_forms(tmp_path):
+    axes = ((0.01, 0.0, 0.0), (0.0, 0.02, 0.0), (0.0, 0.0, 0.03))
+    forms = [SolidForm((0.0, 0.01, 0.03), axes, column) for column in (True, False)]
+    found = tuple(Inclusion(1, (0.0, 0.01, 0.03), 1e-6, 2e-3, form=form) for form in forms)
+    arrays = content(inclusions=found)
+    np.savez(tmp_path / "image.npz", **arrays)
+    assert read_image(tmp_path / "image.npz").inclusions == found
+    bad = {"inclusion_axes": np.full((2, 3, 3), np.nan)}, {"inclusion_columns": np.array([True])}
+    for changed, said in zip(bad, ("not finite", "not of every inclusion"), strict=True):
+        np.savez(tmp_path / "image.npz", **arrays | changed)
+        with pytest.raises(ValueError, match=said):
+            read_image(tmp_path / "image.npz")
 
 
 def test_a_sheet_and_a_complex_image_come_back(tmp_path):

@@ -77,8 +77,12 @@ def view_solid(
         shapes = shapes_of(mesh, electrodes) if isinstance(electrodes, AbstractElectrodes) else electrodes
         _add_electrodes(plotter, pv, shapes)
     for k, one in enumerate(inclusions):
-        ball = pv.Sphere(radius=1e3 * one.radius, center=1e3 * np.array(one.centroid))
-        plotter.add_mesh(ball, style="wireframe", color=INK, opacity=0.15, name=f"inclusion {k}")
+        if one.form is None:
+            form = pv.Sphere(radius=1e3 * one.radius, center=1e3 * np.array(one.centroid))
+        else:
+            surface = one.form.surface()
+            form = pv.PolyData.from_regular_faces(1e3 * surface.points, surface.triangles)
+        plotter.add_mesh(form, style="wireframe", color=INK, opacity=0.15, name=f"inclusion {k}")
     plotter.add_axes()  # pyright: ignore[reportCallIssue]
     plotter.camera_position = [(-1, -1.7, 1), (0, 0, 0), (0, 0, 1)]
     plotter.reset_camera()  # pyright: ignore[reportCallIssue]

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.patches import Circle
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, is_number, told
@@ -18,14 +17,14 @@ from jeit.plot.axes import INK, axes_or_new
 from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale, check_scale
 from jeit.plot.solid.body import add_electrodes, add_hull, number_electrodes
 from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
-from jeit.plot.solid.scene import Scene, bare_in_space, mark_sign
+from jeit.plot.solid.outlines import draw_seen
+from jeit.plot.solid.scene import Scene, bare_in_space
 from jeit.plot.solid.shaded_surface import colours_of, mappable
 
 HALF = (0.5,)
 OUTER = 0.3
 # Over the strongest change of either sign: as inclusions are looked for.
 _LEAST_PEAK = 0.3
-_DASHED = (0, (4, 3))
 
 
 def plot_isosurfaces(
@@ -45,8 +44,8 @@ def plot_isosurfaces(
     shares from 0 to 1; the greatest is drawn solid, others translucent round it; a sign that is nowhere 0.3 times as
     strong as the other is left out. Of a scale that is not of differences they are shares of the way from the least to
     the greatest value. `electrodes` are drawn on the body and numbered, `inclusions` marked by their sign, and the
-    outlines of balls of their volume. Raises `ValueError` for values of another shape, levels that are no shares, a
-    mesh that is no solid, and things of another kind.
+    outlines of their form, or of balls of their volume. Raises `ValueError` for values of another shape, levels that
+    are no shares, a mesh that is no solid, and things of another kind.
     """
     check_drawn(mesh, electrodes, scale)
     fitted = scale.of(np.asarray(values), "S/m")
@@ -93,10 +92,7 @@ def draw_in_space(
     if shapes is not None:
         number_electrodes(ax, scene, points, wall, shapes)
     for one in inclusions:
-        # A ball is seen as a disc of its radius from every side.
-        x, y = camera.on_page(np.array(one.centroid))
-        ax.add_patch(Circle((x, y), one.radius, fill=False, edgecolor=INK, linewidth=1, linestyle=_DASHED, zorder=3))
-        mark_sign(ax, x, y, one.sign)
+        draw_seen(ax, camera, one)
     return ax
 
 

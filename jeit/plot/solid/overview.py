@@ -84,10 +84,12 @@ def _tell(ax: Axes, place, levels, inclusions: Sequence[Inclusion], *, differenc
     of = "of the strongest change" if difference else "of the way from least to greatest"
     lines = [f"slices through ({_millimetres(place)}) mm", f"surfaces at {shares} % {of}"]
     if inclusions:
-        lines += ["", "found, drawn as balls of their volume:"]
+        balls = "" if all(one.form for one in inclusions) else ", drawn as balls of their volume"
+        lines += ["", f"found, dashed{balls}:"]
     for one in inclusions[:_MOST_LISTED]:
         sign = "+" if one.sign > 0 else "−"
-        lines.append(f"{sign}  {1e6 * one.area:.3g} cm³ at ({_millimetres(one.centroid)}) mm")
+        column = "column of " if one.is_column else ""
+        lines.append(f"{sign}  {column}{1e6 * one.area:.3g} cm³ at ({_millimetres(one.centroid)}) mm")
     if len(inclusions) > _MOST_LISTED:
         lines.append(f"and {len(inclusions) - _MOST_LISTED} more")
     ax.text(0, 0.9, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=8.5, color=INK, linespacing=1.6)

@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 from numpy.typing import ArrayLike
 
 from jeit.arguments import told
@@ -22,7 +21,8 @@ from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import size_of
 from jeit.plot.solid.isosurfaces import check_drawn
-from jeit.plot.solid.scene import draw_axes_cross, draw_number, mark_sign
+from jeit.plot.solid.outlines import draw_cut
+from jeit.plot.solid.scene import draw_axes_cross, draw_number
 
 MOST_SLICES = 64
 
@@ -41,8 +41,8 @@ def plot_slice(
 
     `values` per cell (m,), or per node (n,), of which cells have the mean; changes of conductivity in S/m unless
     `scale` says otherwise, and as strong as anywhere in the body at the ends of the colour bar. `electrodes` are drawn
-    where the plane passes them, `inclusions` as what it cuts off a ball of their volume. Raises `ValueError` for a
-    plane beside the body, values of another shape, and things of another kind.
+    where the plane passes them, `inclusions` as what it cuts off their form, or a ball of their volume. Raises
+    `ValueError` for a plane beside the body, values of another shape, and things of another kind.
     """
     check_drawn(mesh, electrodes, scale)
     image = cell_values(mesh, values)
@@ -136,7 +136,7 @@ def draw_slice(
     if shapes is not None:
         _draw_cut_electrodes(ax, plane, shapes, 0.05 * size_of(mesh), cut.polygons.reshape(-1, 2).mean(axis=0))
     for one in inclusions:
-        _draw_cut_ball(ax, plane, one)
+        draw_cut(ax, plane, one)
     return cells
 
 
@@ -204,18 +204,6 @@ def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, away: 
         outward = np.linalg.svd(ends - place)[2][1]
         place = place + away * outward * np.sign(outward @ (place - middle))
         draw_number(ax, place, str(number + 1), fontsize=7, faint=False)
-
-
-def _draw_cut_ball(ax: Axes, plane: Plane, inclusion: Inclusion) -> None:
-    """The circle that a plane cuts a ball of an inclusion's volume in, and its sign."""
-    centre = np.array(inclusion.centroid)
-    squared = inclusion.radius**2 - float(plane.distance(centre)) ** 2
-    if squared <= 0:
-        return
-    x, y = plane.on_page(centre)
-    radius = float(np.sqrt(squared))
-    ax.add_patch(Circle((x, y), radius, fill=False, edgecolor=INK, linewidth=1, linestyle=(0, (4, 3)), zorder=3))
-    mark_sign(ax, x, y, inclusion.sign)
 
 
 def _columns(number: int, tall: float) -> int:
