@@ -15,7 +15,7 @@ from jaxtyping import Array, Inexact
 
 from jeit_solvers.engines import host, namespace
 
-_BLOCK = 8
+_BLOCK, _BLOCK_OF_LAPACK = 8, 32
 _LARGEST_IN_HALVES = 128
 _LARGE_BATCH = 16
 
@@ -28,7 +28,7 @@ def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "b
     factorised comes back as NaN.
     """
     if isinstance(matrices, np.ndarray):
-        return _by_halves(matrices) if np.iscomplexobj(matrices) else _by_lapack(matrices)
+        return _by_halves(matrices)
     if matrices.shape[-1] > _LARGEST_IN_HALVES:
         return _by_block_rows(matrices)
     return _by_halves(matrices)
@@ -103,13 +103,17 @@ def _inverse_square_root(pivot: Inexact[Array, "batch 1"]) -> Inexact[Array, "ba
 
 
 def _by_halves(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """Two by two blocks, each half in the same way. Large batches of the smallest blocks are worth unrolled code; few
-    are better off with a loop of short vectors, which may be longer the fewer there are."""
+    """Two by two blocks, each half in the same way: nearly all is matrix products, which LAPACK's inverse of a triangle
+    is three to four times slower than. Large batches of the smallest blocks are worth unrolled code; few are better off
+    with a loop of short vectors, which may be longer the fewer there are."""
     batch, size, _ = matrices.shape
-    block = _BLOCK if batch > 4 else 2 * _BLOCK
+    on_host = isinstance(matrices, np.ndarray)
+    by_lapack = on_host and not np.iscomplexobj(matrices)
+    block = _BLOCK_OF_LAPACK if by_lapack else _BLOCK if batch > 4 else 2 * _BLOCK
     if size <= block:
-        at_once = batch > _LARGE_BATCH or isinstance(matrices, np.ndarray)
-        return _unrolled(matrices) if at_once else _row_by_row(matrices)
+        if by_lapack:
+            return _by_lapack(matrices)
+        return _unrolled(matrices) if batch > _LARGE_BATCH or on_host else _row_by_row(matrices)
     half = block * -(-size // (2 * block))
     first = _by_halves(matrices[:, :half, :half])
     lower = matrices[:, half:, :half] @ _transposed(first)
