@@ -196,5 +196,6 @@ def test_a_plain_mesh_is_a_body_and_a_path_is_none():
 
 
 def test_a_radius_in_millimetres_is_told_in_metres():
-    with pytest.warns(UserWarning, match=r"^radius: 150 m is large .* If the lengths are millimetres, give 0\.15 "):
+    said = r"^d\.toml: geometry\.radius: 150 m is large .* If the lengths are millimetres, give 0\.15, "
+    with pytest.warns(UserWarning, match=said):
         described({"shape": "disk", "radius": 150}, {"kind": "point", "positions": [[0, 150]]})
