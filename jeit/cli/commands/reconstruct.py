@@ -135,13 +135,13 @@ def reconstruct(
         step("write")
         write_image(result, output)
     if not quiet:
-        show(console, result)
+        show(console, result, asked=frame is not None)
         solid = ("image.vtu",) if result.mesh.dimension == 3 else ()
         say_written(console, output / "image.png", "image.npz", "report.json", *solid)
 
 
-def show(console, result: "ImagedDifference") -> None:
-    """Print what was found."""
+def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
+    """Print what was found; `asked`: of a frame that was asked for."""
     import numpy as np
 
     from jeit.arguments import counted, percent
@@ -201,8 +201,22 @@ def show(console, result: "ImagedDifference") -> None:
         rows.append(("wiring", result.wiring.fault))
     rows += [("note", note) for note in dict.fromkeys((*result.measurement.notes, *result.reference.notes))]
     console.print()
+    if result.num_frames > 1:
+        rows.insert(0, ("frame", _which(result, asked)))
     console.print(pairs(result.measurement.name, rows))
     console.print()
     table = inclusion_table(result.inclusions, unit, result.peak_ranges)
     console.print(table if result.inclusions else "  no inclusion found")
     console.print()
+
+
+def _which(result: "ImagedDifference", asked: bool) -> str:
+    """Which frame of how many was imaged, and how to image others."""
+    names = result.measurement.frame_names
+    said = f"{names[0]!r}, " if names else ""
+    said += f"{result.frame} of {result.num_frames}"
+    if asked:
+        return said
+    # Frames with names are of different things: nobody wants their mean.
+    mean = "" if names else ', or their mean: frames = "mean" in [data] of the description'
+    return f"{said}, from 0; --frame takes another{mean}"
