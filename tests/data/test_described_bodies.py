@@ -59,6 +59,23 @@ def test_electrodes_lie_on_the_surface(size):
         described(tank, size | {"positions": [places[0], [0.0, 0.0, 0.045]], "contact_impedance": 1e-3})
 
 
+@pytest.mark.parametrize(
+    ("place", "off"),
+    [
+        ([0.0, 15.0, 0.02], "14.9 m"),  # beyond the wall by far more than from either lid
+        ([0.0, 0.15, 0.02], "100 mm"),
+        ([0.0, 0.15, 0.04], "100 mm"),  # as high as the lid, but not on it
+        ([0.0, 0.08, 0.08], "50 mm"),  # beyond wall and lid, by 30 and 40 mm
+        ([0.0, 0.0, 0.055], "15 mm"),
+        ([0.0, 0.04, 0.025], "10 mm"),  # inside
+    ],
+)
+def test_the_distance_from_the_surface_is_the_real_one(place, off):
+    disc = {"kind": "disc", "radius": 0.004, "contact_impedance": 1e-3, "positions": [[0.05, 0.0, 0.02], place]}
+    with pytest.raises(ValueError, match=rf"electrode 2 at .* m lies {off} off the body's surface"):
+        described(CYLINDER, disc)
+
+
 def test_any_outline_with_a_thickness_is_a_solid():
     corner = {"kind": "point", "positions": [[0.01, 0.01, 0.0], [0.09, 0.01, 0.0]]}
     found = described({"shape": "polygon", "vertices": SQUARE, "thickness": 0.01}, corner)
