@@ -32,18 +32,34 @@ def test_what_is_not_known():
     assert percent(None) == "not known"
 
 
+def printed(bodies, *ranges, **known):
+    console = Console(width=80, file=io.StringIO(), record=True)
+    console.print(inclusion_table(bodies, "S/m", *ranges, **known))
+    return [line.split() for line in console.export_text().splitlines()]
+
+
+BODIES = [Inclusion(1, (0.01, 0.02, 0.03), 2e-5, 0.2), Inclusion(-1, (0.0, 0.0, 0.0), 1e-5, -0.004)]
+
+
 def test_a_peak_is_told_with_what_it_may_lie_between():
     """In one unit, each beside its own body; nothing where it is not known."""
-    bodies = [Inclusion(1, (0.01, 0.02, 0.03), 2e-5, 0.2), Inclusion(-1, (0.0, 0.0, 0.0), 1e-5, -0.004)]
+    known = printed(BODIES, [(0.1, 0.4), (-0.005, -0.002)])
+    assert [line[0] for line in known] == ["volume", "inclusion", "conductive", "resistive"]
+    assert known[1][-3:] == ["±", "1", "σ"]
+    assert known[2][-4:] == ["200", "100", "to", "400"]
+    assert known[3][-4:] == ["-4", "-5", "to", "-2"]
+    assert [line[-1] for line in printed(BODIES)] == ["change", "mS/m", "200", "-4"]
 
-    def printed(*ranges):
-        console = Console(width=80, file=io.StringIO(), record=True)
-        console.print(inclusion_table(bodies, "S/m", *ranges))
-        return [line.split() for line in console.export_text().splitlines()]
 
-    known = printed([(0.1, 0.4), (-0.005, -0.002)])
-    assert [line[0] for line in known] == ["inclusion", "conductive", "resistive"]
-    assert known[0][-3:] == ["±", "1", "σ"]
-    assert known[1][-4:] == ["200", "100", "to", "400"]
-    assert known[2][-4:] == ["-4", "-5", "to", "-2"]
-    assert [line[-1] for line in printed()] == ["mS/m", "200", "-4"]
+def test_a_peak_is_told_as_a_change_and_with_the_share_of_the_background_that_it_is():
+    lines = printed(BODIES, background=0.05)
+    assert lines[0][-4:] == ["peak", "change", "of", "back-"]
+    assert lines[1][-3:] == ["/", "mS/m", "ground"]
+    assert [line[-3:] for line in lines[2:]] == [["200", "400", "%"], ["-4", "-8", "%"]]
+
+
+def test_all_that_is_known_of_a_large_body_goes_on_a_line():
+    bodies = [Inclusion(1, (-0.2595, -0.1297, 0.1477), 0.0123456, 0.999), Inclusion(-1, (0.0,) * 3, 1e-5, -0.25)]
+    lines = printed(bodies, [(0.529, 0.9999), (-0.4567, -0.111)], background=0.205)
+    assert len(lines) == 4
+    assert lines[3][-6:] == ["-0.25", "-0.457", "to", "-0.111", "-122", "%"]

@@ -205,7 +205,7 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
         rows.insert(0, ("frame", _which(result, asked)))
     console.print(pairs(result.measurement.name, rows))
     console.print()
-    table = inclusion_table(result.inclusions, unit, result.peak_ranges)
+    table = inclusion_table(result.inclusions, unit, result.peak_ranges, background=background.real)
     console.print(table if result.inclusions else "  no inclusion found")
     console.print()
 
