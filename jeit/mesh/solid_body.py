@@ -9,12 +9,13 @@ from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind
 from jeit.mesh.body import Body
+from jeit.mesh.generate.few_nodes import nodes_of_solid
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Domain
 from jeit.mesh.outline.domain import check_length
 from jeit.mesh.sizes import size_told
-from jeit.mesh.solids import choose_layers, layer
+from jeit.mesh.solids import choose_layers, in_plane, layer
 from jeit_solvers.engines import as_array
 
 
@@ -52,7 +53,9 @@ class Solid(Body):
         Tags: 'bottom', 'top', 'side', and those of the outline's mesh. Raises as `jeit.mesh.box`.
         """
         number, layers = choose_layers(float(self.outline.area), self.thickness, num_points, cell_size, None)
-        return layer(self.outline.mesh(num_points=number, cell_size=cell_size, refine=refine), self.thickness, layers)
+        with nodes_of_solid(num_points, in_plane(float(self.outline.area), self.thickness, None)):
+            plane = self.outline.mesh(num_points=number, cell_size=cell_size, refine=refine)
+        return layer(plane, self.thickness, layers)
 
 
 class OwnMesh(Body):

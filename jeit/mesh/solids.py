@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jeit.mesh.generate import unstructured
+from jeit.mesh.generate.few_nodes import nodes_of_solid
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import check_length
@@ -94,7 +97,7 @@ def box(
     width, depth = check_length("width", width), check_length("depth", depth)
     height = check_length("height", height)
     base_points, layers = choose_layers(width * depth, height, num_points, cell_size, num_layers)
-    with size_told():
+    with size_told(), nodes_of_solid(num_points, in_plane(width * depth, height, num_layers)):
         base = rectangle(width, depth, num_points=base_points, cell_size=cell_size, refine=refine)
         return layer(base, height, layers)
 
@@ -119,7 +122,7 @@ def cylinder(
     """
     radius, height = check_length("radius", radius, 2), check_length("height", height)
     base_points, layers = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)
-    with size_told():
+    with size_told(), nodes_of_solid(num_points, in_plane(np.pi * radius**2, height, num_layers)):
         base = disk(
             radius,
             num_points=base_points,
@@ -129,6 +132,11 @@ def cylinder(
             boundary_points=boundary_points,
         )
         return layer(base, height, layers)
+
+
+def in_plane(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
+    """How many of a solid's nodes its base has."""
+    return lambda number: choose_layers(area, height, number, None, num_layers)[0] or number
 
 
 def choose_layers(
