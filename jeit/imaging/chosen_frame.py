@@ -16,7 +16,7 @@ def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> in
 
 @contextmanager
 def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
-    """Errors that name the measurement name the frame too, where it has several."""
+    """A `ValueError` that names the measurement and is raised within names the frame too, where there are several."""
     try:
         yield
     except ValueError as error:

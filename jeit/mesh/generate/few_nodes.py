@@ -18,8 +18,8 @@ class TooFewNodes(ValueError):
 
 @contextmanager
 def nodes_of_solid(asked: int | None, in_plane: Callable[[int], int]) -> Iterator[None]:
-    """Errors about the nodes of a plane mesh speak of those `asked` of the solid that stands on it; `in_plane`: how
-    many of them its plane mesh has."""
+    """A `ValueError` about the nodes of a plane mesh, raised within, speaks of those `asked` of the solid on it;
+    `in_plane`: how many of them its plane mesh has."""
     try:
         yield
     except TooFewNodes as error:
