@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from jeit.cli.networks import NETWORK, check_method, image_by_network
 from jeit.cli.options import (
     AsIs,
     Contact,
@@ -18,6 +19,7 @@ from jeit.cli.options import (
     Reference,
     make_folder,
     number_or_name,
+    read_file,
 )
 
 if TYPE_CHECKING:
@@ -82,9 +84,7 @@ def reconstruct(
 
     In Python: `jeit.image_difference` and `jeit.report.write_image`; `jeit.reconstruct` makes absolute images.
     """
-    if method == "network" or model is not None:
-        from jeit.cli.networks import image_by_network
-
+    if method == NETWORK or model is not None:
         unused = {
             "prior": prior,
             "hyperparameter": hyperparameter,
@@ -105,10 +105,11 @@ def reconstruct(
         )
         return
     from jeit.cli.console import Steps, plain_console, say_written
-    from jeit.data import read
     from jeit.imaging import METHODS, ImagingSettings, image_difference
+    from jeit.imaging.settings import AUTO
     from jeit.report import write_image
 
+    check_method(method, (AUTO, *METHODS))
     given = {
         "segment": segment,
         "method": method,
@@ -128,8 +129,8 @@ def reconstruct(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        base = None if reference is None else read(reference, format, description)
-        measurement = read(data, format, description, like=base)
+        base = None if reference is None else read_file("--reference", reference, format, description)
+        measurement = read_file("DATA", data, format, description, like=base)
         chosen = None if frame is None else number_or_name(frame, int)
         result = image_difference(measurement, base, settings, frame=chosen, progress=step)
         step("write")
