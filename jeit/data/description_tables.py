@@ -391,9 +391,15 @@ ConstructedTable = (
 ProtocolTable = ConstructedTable | OptimalTable | MatricesTable | ChannelsTable | MeasuredTable
 
 _SHAPE = OneOf(
-    "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable, mark="mesh", other=MeshTable
+    "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable, mark="mesh", other=MeshTable,
+    meant={"circle": "disk", "tank": "cylinder", "tube": "cylinder", "cube": "box", "cuboid": "box",
+           "square": "rectangle"},
 )  # fmt: skip
-_ELECTRODES = OneOf("kind", BoundaryTable, DiscTable, PatchTable, PointTable, FacetsTable)
+_ELECTRODES = OneOf(
+    "kind", BoundaryTable, DiscTable, PatchTable, PointTable, FacetsTable,
+    meant={"strip": "patch", "plate": "patch", "bar": "patch", "rectangle": "patch", "square": "patch",
+           "circle": "disc", "round": "disc", "arc": "boundary", "edge": "boundary", "mesh": "facets"},
+)  # fmt: skip
 _PROTOCOL = OneOf(
     "kind", AdjacentTable, SkipTable, OppositeTable, AgainstOneTable, ReferenceTable, TwoTerminalTable,
     TrigonometricTable, HaarTable, OptimalTable, BipolarTable, MatricesTable, ChannelsTable, MeasuredTable,

@@ -175,6 +175,15 @@ WRONG = {
         {k: v for k, v in RING.items() if k not in ("radius", "levels")} | PATCH,
         "give x, y and z",
     ),
+    "strips": (CYLINDER, RING | {"kind": "strip"}, r"'strip' \(did you mean 'patch', with width and height\?\)\.$"),
+    "circles": (CYLINDER, RING | {"kind": "Circles"}, r"'Circles' \(did you mean 'disc', with radius\?\)\.$"),
+    "a tank": (CYLINDER | {"shape": "tank"}, RING, r"'tank' \(did you mean 'cylinder', with radius and height\?\)\.$"),
+    "misspelt twice": (
+        {"shape": "cylinder", "raduis": 0.05, "height": 0.04},
+        {**{key: value for key, value in STRIP.items() if key != "contact_impedance"}, "height": 0.04, "impedance": 1},
+        r"geometry\.radius is missing; .* geometry\.raduis is no key of a cylinder .*'radius'\?\).*"
+        r" electrodes\.contact_impedance is missing; give it\. (Wrong too: )?electrodes\.impedance",
+    ),
     "facets": (CYLINDER, FACETS, r"facets that a mesh has names for: give \[geometry\] mesh"),
 }
 
