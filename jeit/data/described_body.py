@@ -79,7 +79,7 @@ def _own_mesh(table: MeshTable, folder: Path, origin: str) -> OwnMesh:
     try:
         return OwnMesh(read_mesh(file, scale=table.scale))
     except (ValueError, OSError) as error:
-        raise located(error, origin, "geometry.mesh") from None
+        raise located(str(error).removeprefix("path: "), origin, "geometry.mesh") from None
 
 
 def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str) -> AbstractElectrodes:

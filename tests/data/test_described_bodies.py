@@ -195,6 +195,14 @@ def test_what_is_wrong_is_said(name):
         described(geometry, electrodes)
 
 
+def test_what_is_no_mesh_is_told_with_the_key_alone(tmp_path):
+    (tmp_path / "junk.msh").write_text("hello")
+    with pytest.raises(
+        ValueError, match=r"^d\.toml: geometry\.mesh: junk\.msh does not work .* its content does not fit"
+    ):
+        described({"mesh": "junk.msh"}, FACETS, tmp_path)
+
+
 def test_a_layout_on_a_mesh_is_refused(folder):
     with pytest.raises(ValueError, match="needs a shape to lie on; on a mesh of your own give 'positions'"):
         described({"mesh": "plates.msh", "scale": 1e-2}, RING, folder)
