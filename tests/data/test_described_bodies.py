@@ -30,6 +30,14 @@ def test_a_cylinder_with_a_ring_of_discs():
     found.electrodes.check(mesh)
 
 
+def test_one_level_may_be_a_number_or_a_list_of_one():
+    as_number, as_list = described(CYLINDER, RING | {"levels": 0.03}), described(CYLINDER, RING | {"levels": [0.03]})
+    np.testing.assert_array_equal(as_number.electrodes.position, as_list.electrodes.position)
+    assert np.asarray(as_number.electrodes.position)[:, 2].tolist() == [0.03] * 8
+    with pytest.raises(ValueError, match=r"electrodes\.levels must be a number or a list, 1 to 1024, from 0"):
+        described(CYLINDER, RING | {"levels": "middle"})
+
+
 def test_a_box_with_patches_in_two_levels():
     patches = {"kind": "patch", "layout": "perimeter", "number": 6, "start": 0.02, "levels": [0.01, 0.03]}
     patches |= {"width": 0.01, "height": 0.008, "contact_impedance": 1e-3}
