@@ -1,11 +1,14 @@
 """Numbers as the commands print them."""
 
 import io
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from rich.console import Console
 
 from jeit.arguments import percent
+from jeit.cli.commands.reconstruct import told_bodies
 from jeit.cli.console import inclusion_table
 from jeit.image import Inclusion
 
@@ -63,3 +66,13 @@ def test_all_that_is_known_of_a_large_body_goes_on_a_line():
     lines = printed(bodies, [(0.529, 0.9999), (-0.4567, -0.111)], background=0.205)
     assert len(lines) == 4
     assert lines[3][-6:] == ["-0.25", "-0.457", "to", "-0.111", "-122", "%"]
+
+
+@pytest.mark.parametrize(("dimension", "edge"), [(2, "outlines"), (3, "surfaces")])
+def test_bodies_end_at_outlines_in_a_sheet_and_at_surfaces_in_a_solid(dimension, edge):
+    told, strong = (SimpleNamespace(contrast_is_told=known) for known in (True, False))
+    shapes: Any = SimpleNamespace(bodies=[told, strong], doubtful=[told], drift=0.01)
+    assert told_bodies(shapes, dimension) == (
+        f"2 {edge} fitted; 1 ghost left out; 1 taken for strong, with peaks at least about as given; the background "
+        "has drifted by 1 %"
+    )

@@ -24,6 +24,7 @@ from jeit.cli.options import (
 
 if TYPE_CHECKING:
     from jeit.imaging import ImagedDifference
+    from jeit.inverse.shapes import ShapeReconstruction
 
 
 def reconstruct(
@@ -45,8 +46,8 @@ def reconstruct(
         typer.Option(
             help="auto (default): one-step, or gauss-newton and outlines of bodies where that is unsound, bodies in "
             "solids wherever they are told of; one-step, back-projection, filtered-back-projection; gauss-newton, "
-            "levenberg-marquardt, total-variation; shapes, outlines of strong bodies; network, maps of depth by one "
-            "that learnt the skin (--model)."
+            "levenberg-marquardt, total-variation; shapes, outlines of strong bodies, in solids their surfaces; "
+            "network, maps of depth by one that learnt the skin (--model)."
         ),
     ] = None,
     prior: Annotated[
@@ -148,7 +149,6 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
     from jeit.arguments import counted, percent
     from jeit.cli.console import inclusion_table, pairs, scaled
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
-    from jeit.inverse.shapes import Ellipsoid
     from jeit_solvers import Status
 
     calibration, reconstruction = result.calibration, result.reconstruction
@@ -184,15 +184,7 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
         rows.append(("linear image", fall))
     rows += [("doubt", doubt) for doubt in result.doubts]
     if result.shapes is not None:
-        left = f"; {counted(len(result.shapes.doubtful), 'ghost')} left out" if result.shapes.doubtful else ""
-        drift = f"the background has drifted by {percent(result.shapes.drift)}"
-        strong = sum(not one.contrast_is_told for one in result.shapes.bodies)
-        upright = sum(isinstance(one, Ellipsoid) and one.column for one in result.shapes.bodies)
-        columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
-        assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""
-        rows.append(
-            ("bodies", f"{counted(len(result.shapes.bodies), 'outline')} fitted{columns}{left}{assumed}; {drift}")
-        )
+        rows.append(("bodies", told_bodies(result.shapes, result.mesh.dimension)))
     if result.why:
         rows.append(("chosen, for", result.why))
     if unlike := result.unlike_electrodes:
@@ -209,6 +201,21 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
     table = inclusion_table(result.inclusions, unit, result.peak_ranges, background=background.real)
     console.print(table if result.inclusions else "  no inclusion found")
     console.print()
+
+
+def told_bodies(shapes: "ShapeReconstruction", dimension: int) -> str:
+    """What was fitted as shapes, in half a sentence: outlines in a sheet, surfaces in a solid."""
+    from jeit.arguments import counted, percent
+    from jeit.inverse.shapes import Ellipsoid
+
+    edge = "surface" if dimension == 3 else "outline"
+    left = f"; {counted(len(shapes.doubtful), 'ghost')} left out" if shapes.doubtful else ""
+    strong = sum(not one.contrast_is_told for one in shapes.bodies)
+    upright = sum(isinstance(one, Ellipsoid) and one.column for one in shapes.bodies)
+    columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
+    assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""
+    drift = f"the background has drifted by {percent(shapes.drift)}"
+    return f"{counted(len(shapes.bodies), edge)} fitted{columns}{left}{assumed}; {drift}"
 
 
 def _which(result: "ImagedDifference", asked: bool) -> str:
