@@ -198,12 +198,14 @@ def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
 
 def _no_number(cells: list[str], delimiter: str | None, *, first: bool) -> str:
     """What is wrong with the cells of a line, the `first` of the file or a later one, that are not all numbers."""
-    column, cell = next((k, cell.strip()) for k, cell in enumerate(cells, start=1) if not _is_number(cell))
+    wrong = [k for k, cell in enumerate(cells) if not _is_number(cell)]
+    cell = cells[wrong[0]].strip()
     said = f"{cell[:40]!r} is no number" if cell else "nothing stands there"
     if len(cells) == 1:
         return f": {said}, nor numbers separated by {delimiter or 'spaces'!r}. {_SET}"
-    other = f" {_SET}" if first else ""
-    return f", column {column}: {said}; where a value is missing write nan.{other}"
+    # A heading is words for the most part.
+    other = f" {_SET}" if first and 2 * len(wrong) > len(cells) else ""
+    return f", column {wrong[0] + 1}: {said}; where a value is missing write nan.{other}"
 
 
 def _is_number(cell: str) -> bool:

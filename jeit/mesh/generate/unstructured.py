@@ -252,7 +252,7 @@ def _corrected(
             f"num_points: the outline and refinement alone need about {least} nodes, more than the {num_points} asked. "
             "Ask for more nodes, less refinement (larger cell_size, smaller factor) or faster growth.",
             least,
-            "the surface, finer at electrodes or where asked for, alone needs about {least} nodes, more than the "
+            "the surface alone, as fine as electrodes or refine want it, needs about {least} nodes, more than the "
             "{asked} asked. Ask for more.",
         )
     # Factors of `value`: the mesh of a body twice as large is twice as large, to the last bit.
