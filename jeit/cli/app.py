@@ -6,7 +6,7 @@ import logging
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import typer
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = as_command()
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = _show_warning
+            warnings.showwarning = _shown_once()
             if arguments is None:
                 _start(quickly=not " ".join(sys.argv[1:3]).startswith(_REPEATING))
             status = command.main(
@@ -159,10 +159,17 @@ def _told(message: str) -> str:
     return line if len(line) <= _LONGEST else f"{line[:half]} … {line[-half:]}"
 
 
-def _show_warning(message, category, filename, lineno, file=None, line=None) -> None:
-    if discarded_damaged(str(message)):
-        return
-    print(f"jeit: warning: {_told(str(message))}", file=sys.stderr)
+def _shown_once() -> Callable[..., None]:
+    """What shows a command's warnings, the same one once: what it computes with is often made again."""
+    shown: set[str] = set()
+
+    def show(message, category, filename, lineno, file=None, line=None) -> None:
+        said = str(message)
+        if said not in shown and not discarded_damaged(said):
+            shown.add(said)
+            print(f"jeit: warning: {_told(said)}", file=sys.stderr)
+
+    return show
 
 
 def _start(*, quickly: bool) -> None:

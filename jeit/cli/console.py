@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from jeit.arguments import percent
+
 if TYPE_CHECKING:
     from jeit.image import Inclusion
 
@@ -101,9 +103,16 @@ def in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
     return f"{prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
 
 
-def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, ranges: Sequence[tuple[float, float]] = ()) -> Table:
-    """A row for each inclusion, of a sheet (or the slice through a solid) or of a solid: kind, place, size and peak;
-    `unit` is that of conductivity. `ranges`: from where to where peaks may lie, if that is known."""
+def inclusion_table(
+    inclusions: "Sequence[Inclusion]",
+    unit: str,
+    ranges: Sequence[tuple[float, float]] = (),
+    *,
+    background: float | None = None,
+) -> Table:
+    """A row for each inclusion, of a sheet (or the slice through a solid) or of a solid: kind, place, size, and the
+    change of conductivity at its peak; `unit` is that of conductivity. `ranges`: from where to where peaks may lie, if
+    that is known. `background`: the conductivity that they are changes of, if it is known."""
     ends = [end for both in ranges for end in both]
     unit, said = in_one_unit([*(one.peak for one in inclusions), *ends], unit)
     peaks, ends = said[: len(inclusions)], said[len(inclusions) :]
@@ -111,14 +120,17 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, ranges: Sequen
     solid = any(one.is_solid for one in inclusions)
     places = [f"{axis} / mm" for axis in "xyz"[:dimension]]
     # A million times either: square metres in mm², cubic metres in cm³.
-    size, digits = ("volume / cm³", 2) if solid else ("area / mm²", 0)
-    more = ["± 1 σ"] if ranges else []
-    table = Table("inclusion", *places, size, f"peak / {unit}", *more, box=None, padding=(0, 1 if ranges else 2))
+    size, digits = ("volume\n/ cm³", 2) if solid else ("area / mm²", 0)
+    more = [*(["± 1 σ"] if ranges else []), *(["of back-\nground"] if background else [])]
+    # All that a solid body has goes into 80 columns.
+    close = {"box": None, "padding": (0, 1 if ranges else 2), "collapse_padding": True, "pad_edge": not ranges}
+    table = Table("inclusion", *places, size, f"peak change\n/ {unit}", *more, **close)
     table.columns[0].min_width = max((len(one.kind) for one in inclusions), default=0)
     for column in table.columns[1:]:
         column.justify = "right"
     for k, (inclusion, peak) in enumerate(zip(inclusions, peaks, strict=True)):
         place = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
         more = [" to ".join(ends[2 * k : 2 * k + 2])] if ranges else []
+        more += [percent(inclusion.peak / background)] if background else []
         table.add_row(inclusion.kind, *place, f"{1e6 * inclusion.area:.{digits}f}", peak, *more)
     return table

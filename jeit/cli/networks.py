@@ -1,6 +1,7 @@
 """Frames imaged by a network on the command line: what `reconstruct` and `stream` share of it."""
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,6 +11,9 @@ if TYPE_CHECKING:
 
     from jeit.touch.networks import FrameDepth, ImageNetwork
 
+NETWORK = "network"
+"""The method that `--method` has beside those of `jeit.imaging`."""
+
 
 class _Given(NamedTuple):
     """Frames of a file, volts, NaN where there is no reading, what number each has there, and the reference beside
@@ -18,6 +22,14 @@ class _Given(NamedTuple):
     frames: "Float[np.ndarray, 'F M']"
     numbers: "Int[np.ndarray, ' F']"
     reference: "Float[np.ndarray, 'r M'] | None"
+
+
+def check_method(method: str | None, others: Iterable[str]) -> None:
+    """Raise `ValueError` for a `--method` that is neither among `others` nor the network's."""
+    from jeit.arguments import check_name
+
+    if method is not None:
+        check_name("--method", method, (*others, NETWORK))
 
 
 def image_by_network(
@@ -50,7 +62,7 @@ def image_by_network(
     from jeit.report.stream import PICTURES
     from jeit.touch.networks import read_network, resting_frame, stream_depths
 
-    if method != "network":
+    if method != NETWORK:
         raise ValueError(f"--model is for --method network, not {method or 'the default'}; leave one out.")
     if model is None:
         raise ValueError("--method network needs --model, the folder of 'jeit learn image'.")
@@ -66,13 +78,17 @@ def image_by_network(
             skin, description = read_described_skin(description), None
         network = read_network(model, skin=skin)
         plain = skin is not None
-        base = None if reference is None else _read(reference, kind, description, network, None, plain=plain)
+        base = (
+            None
+            if reference is None
+            else _read("--reference", reference, kind, description, network, None, plain=plain)
+        )
         still = None if base is None else base.frames
         if data == "-":
             frames, numbers = parse_frames(sys.stdin), None
         else:
             one = None if streamed else 0 if frame is None else frame
-            measured = _read(data, kind, description, network, one, plain=plain, like=reference)
+            measured = _read("DATA", data, kind, description, network, one, plain=plain, like=reference)
             frames, numbers, still = measured.frames, measured.numbers, measured.reference if still is None else still
         if still is None:
             raise ValueError("--reference: give a file of frames of the skin that nobody touches.")
@@ -104,6 +120,7 @@ def image_by_network(
 
 
 def _read(
+    option: str,
     path: Path,
     kind: str | None,
     description: str | None,
@@ -117,7 +134,8 @@ def _read(
     order of channels, and so has one that is `plain`; its units and columns are those of the file that it is `like`."""
     import numpy as np
 
-    from jeit.data import load_description, read, read_frame_recording, table
+    from jeit.cli.options import read_file
+    from jeit.data import load_description, read_frame_recording, table
     from jeit.imaging.stream_preparation import frames_of
     from jeit.touch.networks.measured import check_measured
 
@@ -137,7 +155,7 @@ def _read(
                 raise ValueError(f"--frame must be a number from 0 to {len(frames) - 1}; it is {frame!r}.")
             numbers = numbers[[frame]]
         return _Given(frames[numbers], numbers, still)
-    measured = read(path, kind, description)
+    measured = read_file(option, path, kind, description)
     check_measured(network, measured)
     names, numbers = measured.frame_names, np.arange(measured.num_frames)
     still = frames_of(measured.frame("reference")) if "reference" in names else None

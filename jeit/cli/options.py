@@ -5,9 +5,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from jeit.data import Measurement
 
 Data = Annotated[Path, typer.Argument(help="Measured file to image.", show_default=False)]
 Reference = Annotated[
@@ -88,6 +91,20 @@ def naming_options(options: dict[str, str]) -> Iterator[None]:
         if (told := in_options(said, options)) == said:
             raise
         raise ValueError(told) from error
+
+
+def read_file(
+    option: str,
+    path: Path,
+    format: str | None,
+    description: str | None,
+    like: "Measurement | None" = None,
+) -> "Measurement":
+    """The measurement in a file given as `option`, "DATA" or "--reference", which an error says that has no file."""
+    from jeit.data import read
+
+    with naming_options({"path": option}):
+        return read(path, format, description, like=like)
 
 
 def in_options(said: str, options: dict[str, str]) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jeit.data.large_body import warn_large_body
 from jeit.data.on_solid import check_on_solid
 from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes, FaceDiscs, FacePatches, PointElectrodes, SheetDiscs
 from jeit.electrodes.facets import plates
@@ -16,6 +17,7 @@ from jeit.layout import perimeter, ring
 from jeit.mesh import Body, Disk, Domain, OwnMesh, Rectangle, Solid
 from jeit.mesh import read as read_mesh
 from jeit.mesh.outline import OUTLINES
+from jeit.mesh.sizes import size_told
 
 if TYPE_CHECKING:
     from jeit.data.description_tables import ElectrodesTable, FacetsTable, GeometryTable, MeshTable, PlacedTable
@@ -44,7 +46,15 @@ _NO_ARGUMENT = {"shape", "thickness"}
 
 
 def described_body(table: GeometryTable, folder: Path, origin: str) -> Body:
-    """The body of a table `[geometry]`; a mesh's file is looked for in `folder`. Raises `ValueError`."""
+    """The body of a table `[geometry]`; a mesh's file is looked for in `folder`. Raises `ValueError`, and warns once of
+    lengths that are too large for metres, by their keys."""
+    with size_told():
+        body = _body(table, folder, origin)
+    warn_large_body(table, body, origin)
+    return body
+
+
+def _body(table: GeometryTable, folder: Path, origin: str) -> Body:
     from jeit.data.description_tables import MeshTable  # it was imported when the table was read
 
     if isinstance(table, MeshTable):
@@ -69,7 +79,7 @@ def _own_mesh(table: MeshTable, folder: Path, origin: str) -> OwnMesh:
     try:
         return OwnMesh(read_mesh(file, scale=table.scale))
     except (ValueError, OSError) as error:
-        raise located(error, origin, "geometry.mesh") from None
+        raise located(str(error).removeprefix("path: "), origin, "geometry.mesh") from None
 
 
 def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str) -> AbstractElectrodes:

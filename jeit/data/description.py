@@ -10,7 +10,7 @@ Sections (`tank6cm.toml` in this folder is an example; only `[protocol]` must be
   solid: `width`, `height`), "point", or "facets" (`tags`, the names of groups of a mesh's facets); `contact_impedance`,
   ohm·m² (on the edge of a sheet ohm·m); and where they are: `layout` = "ring" (disk, cylinder: `number`,
   `start_angle_degrees`, `clockwise`) or "perimeter" (`number`, `start`), on a solid at each height z of `levels`, one
-  level after the other; or `positions`, of two or three coordinates.
+  number or a list, one level after the other; or `positions`, of two or three coordinates.
 - `[protocol]`: `kind` = name of a constructor in `jeit.protocol` with its arguments, or "matrices" with
   `drive` (S, L) in amperes and `measurement` (K, L), or "channels" with those and `drive_index` (M,) and
   `measurement_index` (M,), from 0. `current` in amperes, or `current_unit`; or `current_from_name`, the name of

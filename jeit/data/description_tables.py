@@ -19,6 +19,7 @@ Sizes = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-9, 1e3, "m", s
 Place = Annotated[np.ndarray, Numbers(((2, 2),), -1e3, 1e3, "m")]
 Loop = Annotated[np.ndarray, Numbers(((3, _MOST_VERTICES), (2, 2)), -1e3, 1e3, "m")]
 Positions = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES), (2, 3)), -1e3, 1e3, "m")]
+# One ring is as well told by its height alone as each size by one for all.
 Levels = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 0, 1e3, "m", single=True)]
 # Of arcs on the edge of a sheet in ohm·m.
 Impedances = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-15, 1e12, "ohm·m²", single=True)]
@@ -391,9 +392,15 @@ ConstructedTable = (
 ProtocolTable = ConstructedTable | OptimalTable | MatricesTable | ChannelsTable | MeasuredTable
 
 _SHAPE = OneOf(
-    "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable, mark="mesh", other=MeshTable
+    "shape", DiskTable, RectangleTable, PolygonTable, BoxTable, CylinderTable, mark="mesh", other=MeshTable,
+    meant={"circle": "disk", "tank": "cylinder", "tube": "cylinder", "cube": "box", "cuboid": "box",
+           "square": "rectangle"},
 )  # fmt: skip
-_ELECTRODES = OneOf("kind", BoundaryTable, DiscTable, PatchTable, PointTable, FacetsTable)
+_ELECTRODES = OneOf(
+    "kind", BoundaryTable, DiscTable, PatchTable, PointTable, FacetsTable,
+    meant={"strip": "patch", "plate": "patch", "bar": "patch", "rectangle": "patch", "square": "patch",
+           "circle": "disc", "round": "disc", "arc": "boundary", "edge": "boundary", "mesh": "facets"},
+)  # fmt: skip
 _PROTOCOL = OneOf(
     "kind", AdjacentTable, SkipTable, OppositeTable, AgainstOneTable, ReferenceTable, TwoTerminalTable,
     TrigonometricTable, HaarTable, OptimalTable, BipolarTable, MatricesTable, ChannelsTable, MeasuredTable,

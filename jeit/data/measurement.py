@@ -143,6 +143,10 @@ class Measurement(eqx.Module):
 
         Raises `ValueError` for a frame that does not exist.
         """
+        return self._frames(np.array([self.frame_number(which)]))
+
+    def frame_number(self, which: int | str) -> int:
+        """The number, from 0, of a frame given as in `frame`. Raises `ValueError` as that does."""
         if isinstance(which, str):
             if which not in self.frame_names:
                 known = ", ".join(self.frame_names) or "none: give a number"
@@ -151,7 +155,7 @@ class Measurement(eqx.Module):
             which = self.frame_names.index(which)
         if not -self.num_frames <= which < self.num_frames:
             raise ValueError(f"'{self.name}' has frames 0 to {self.num_frames - 1}; there is no frame {which}.")
-        return self._frames(np.array([which % self.num_frames]))
+        return which % self.num_frames
 
     def split_reference(self) -> tuple["Measurement", "Measurement"]:
         """The frames to image, and the file's own reference frame (the one named "reference").

@@ -21,12 +21,15 @@ def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
         return
     place = np.asarray(electrodes.position)
     z, top = place[:, 2], body.thickness
-    off_wall = np.abs(np.asarray(body.outline.signed_distance(place[:, :2])))
-    off_lid = np.minimum(np.abs(z), np.abs(z - top))
-    for number in np.flatnonzero(np.minimum(off_wall, off_lid) > _MOST_OFF * smaller)[:1]:
+    within, between = np.asarray(body.outline.signed_distance(place[:, :2])), np.minimum(z, top - z)
+    off_wall, off_lid = np.abs(within), np.abs(between)
+    # Outside, beyond the wall and beyond the lid are two sides of a right angle.
+    outside = np.hypot(np.minimum(within, 0), np.minimum(between, 0))
+    off = np.where(outside > 0, outside, np.minimum(off_wall, off_lid))
+    for number in np.flatnonzero(off > _MOST_OFF * smaller)[:1]:
         raise ValueError(
             f"positions: electrode {number + 1} at {np.round(place[number], 6).tolist()} m lies "
-            f"{1e3 * min(off_wall[number], off_lid[number]):.3g} mm off the body's surface; give a place on it."
+            f"{_distance(float(off[number]))} off the body's surface; give a place on it."
         )
     out = np.maximum(height / 2 - z, z + height / 2 - top)
     for number in np.flatnonzero((off_wall <= off_lid) & (out > _MOST_OUT * height))[:1]:
@@ -35,3 +38,7 @@ def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
             f"electrode {number + 1} reaches from {low:.4g} to {high:.4g} m, and its wall from 0 to {top:.4g} m: give "
             "the size of what lies on the wall, and its middle."
         )
+
+
+def _distance(metres: float) -> str:
+    return f"{1e3 * metres:.3g} mm" if metres < 1 else f"{metres:.3g} m"

@@ -73,7 +73,7 @@ def read(
         check_memory(file.name, _IN_MEMORY * sum(one.stat().st_size for one in members))
         return replace(sciospec.read_all(members, description), name=file.name, source=str(file))
     if not file.is_file():
-        raise ValueError(f"There is no file {file}. Check the path.")
+        raise ValueError(f"path: there is no file {file}. Check the name and the working directory.")
     if file.stat().st_size == 0:
         raise ValueError(f"{file.name} is empty.")
     name = _recognise(file, description) if format is None else format

@@ -23,6 +23,7 @@ SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
 _WORDS = ("mask", "protocol_name", "frame_names", "notes", "times")
 # Bytes in memory of a number of two letters, twice: as rows, and as the table that they make.
 _IN_MEMORY = 8
+_SET = "Set [data] delimiter and skip_rows in the description, if it is a heading or cells are separated otherwise."
 
 
 def recognises(path: Path) -> bool:
@@ -179,14 +180,11 @@ def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
     for number, line in enumerate(_lines(path), start=1):
         if number <= layout.skip_rows or not line.strip() or line.lstrip().startswith("#"):
             continue
+        cells = line.split(delimiter)
         try:
-            row = [float(cell) for cell in line.split(delimiter)]
+            row = [float(cell) for cell in cells]
         except ValueError:
-            raise ValueError(
-                f"{path.name}, line {number}: {line.strip()[:40]!r} is not numbers separated by "
-                f"{delimiter or 'spaces'!r}. Set [data] delimiter and skip_rows in the description (missing "
-                "values are written nan)."
-            ) from None
+            raise ValueError(f"{path.name}, line {number}{_no_number(cells, delimiter, first=not length)}") from None
         length = length or len(row)
         if len(row) != length:
             raise ValueError(
@@ -196,6 +194,26 @@ def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
     if not numbers:
         raise ValueError(f"{path.name} holds no numbers.")
     return np.array(numbers).reshape(-1, length)
+
+
+def _no_number(cells: list[str], delimiter: str | None, *, first: bool) -> str:
+    """What is wrong with the cells of a line, the `first` of the file or a later one, that are not all numbers."""
+    wrong = [k for k, cell in enumerate(cells) if not _is_number(cell)]
+    cell = cells[wrong[0]].strip()
+    said = f"{cell[:40]!r} is no number" if cell else "nothing stands there"
+    if len(cells) == 1:
+        return f": {said}, nor numbers separated by {delimiter or 'spaces'!r}. {_SET}"
+    # A heading is words for the most part.
+    other = f" {_SET}" if first and 2 * len(wrong) > len(cells) else ""
+    return f", column {wrong[0] + 1}: {said}; where a value is missing write nan.{other}"
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _lines(path: Path) -> Iterator[str]:

@@ -25,9 +25,12 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field, GetCoreSchemaHandle
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
 
 from jeit.arguments import IN_MILLIMETRES, did_you_mean, told
+from jeit.files.faults import ALL, KEY, cut, told_faults
 
-# Characters of a whole message, of a key and of names listed in it, at most; and how many faults are told.
-_LONGEST, _KEY, _NAMES, _FAULTS = 390, 40, 160, 4
+# Characters of names listed in a message, at most.
+_NAMES = 160
+# Keys that are named with what is likely meant.
+_SIZES = ("radius", "width", "depth", "height", "vertices", "tags")
 _LARGEST = sys.float_info.max
 # Keys of a table that are looked at though they are not known.
 _UNKNOWN = 100
@@ -68,8 +71,8 @@ class Table(BaseModel):
                 return "is missing; give it."
             case "extra_forbidden":
                 known = [*cls.model_fields]
-                meant = did_you_mean(str(one["loc"][-1])[:_KEY], known)
-                return f"is no key of {cls.what}{meant}; there are {_few(known)}."
+                meant = did_you_mean(str(one["loc"][-1])[:KEY], known)
+                return f"is no key of {cls.what}{meant}{ALL}{_few(known)}."
             case "literal_error":
                 return not_among(given, re.findall("'([^']+)'", context["expected"]))
             case "bool_type" if not isinstance(given, list):
@@ -251,10 +254,18 @@ Several = Annotated[list[Item], FailFast(), Swept()]
 
 class OneOf:
     """Of a key that is one of several tables, as the word under `key` in it says; one that has a default for the word
-    is meant where there is none, and `other` where there is `mark`."""
+    is meant where there is none, and `other` where there is `mark`. `meant`: other words that people write, and which
+    of those there are is likely meant."""
 
-    def __init__(self, key: str, *tables: type[Table], mark: str = "", other: type[Table] | None = None):
-        self.key, self.mark, self.other = key, mark, other
+    def __init__(
+        self,
+        key: str,
+        *tables: type[Table],
+        mark: str = "",
+        other: type[Table] | None = None,
+        meant: Mapping[str, str] | None = None,
+    ):
+        self.key, self.mark, self.other, self.meant = key, mark, other, meant or {}
         self.tables = {word: one for one in tables for word in get_args(one.model_fields[key].annotation)}
         self.usual = next((one for one in tables if not one.model_fields[key].is_required()), None)
 
@@ -273,8 +284,16 @@ class OneOf:
             return self.usual.model_validate(given)
         word = given[self.key]
         if not (isinstance(word, str) and word in self.tables):
-            raise fault(not_among(word, self.tables), self.key)
+            raise fault(not_among(word, self.tables, self._likely(word)), self.key)
         return self.tables[word].model_validate(given)
+
+    def _likely(self, word: Any) -> str:
+        """What is likely meant by a word that people write, with the sizes that it needs."""
+        meant = self.meant.get(word.lower().rstrip("s")) if isinstance(word, str) else None
+        if meant is None:
+            return ""
+        sizes = [name for name, one in self.tables[meant].model_fields.items() if one.is_required() and name in _SIZES]
+        return f" (did you mean {meant!r}, with {' and '.join(sizes)}?)"
 
 
 def validated(table: type[T], given: Any, origin: str) -> T:
@@ -284,25 +303,15 @@ def validated(table: type[T], given: Any, origin: str) -> T:
         return table.model_validate(given)
     except ValidationError as error:
         faults = error.errors(include_url=False, include_input=False)
-    raise ValueError(told_faults(origin, [f"{_place(_steps(one))}{one['msg']}" for one in faults]))
+    keys = [_place(_steps(one)) for one in faults]
+    said = [f"{key}{one['msg']}" for key, one in zip(keys, faults, strict=True)]
+    raise ValueError(told_faults(origin, said, [key.strip() for key in keys]))
 
 
-def told_faults(origin: str, sentences: list[str]) -> str:
-    """One message of several `sentences` about the file `origin`: the first, and more as far as there is room."""
-    message = _cut(f"{_cut(origin, 2 * _KEY)}: {sentences[0]}", _LONGEST - 20)
-    shown = 1
-    for one in sentences[1:_FAULTS]:
-        if len(message) + len(one) > _LONGEST - 20:
-            break
-        message += f" {one}"
-        shown += 1
-    return f"{message} And {len(sentences) - shown} more." if len(sentences) > shown else message
-
-
-def not_among(given: Any, words: Iterable[str]) -> str:
-    """What is said of a word that is none of `words`."""
+def not_among(given: Any, words: Iterable[str], likely: str = "") -> str:
+    """What is said of a word that is none of `words`; `likely`: which of them is meant, if that is known."""
     known = [*words]
-    meant = did_you_mean(given[:_KEY] if isinstance(given, str) else given, known)
+    meant = likely or did_you_mean(given[:KEY] if isinstance(given, str) else given, known)
     return f"must be one of {_few(known)}; it is {told(given)}{meant}."
 
 
@@ -321,7 +330,7 @@ def _place(steps: tuple[int | str, ...]) -> str:
 
 
 def _key(name: str) -> str:
-    short = _cut(name, _KEY)
+    short = cut(name, KEY)
     return short if re.fullmatch(r"[\w.-]+…?", short) else repr(short)
 
 
@@ -348,8 +357,4 @@ def _plain(number: float) -> str:
 
 
 def _few(names: Iterable[str]) -> str:
-    return _cut(", ".join(names), _NAMES)
-
-
-def _cut(text: str, most: int) -> str:
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+    return cut(", ".join(names), _NAMES)

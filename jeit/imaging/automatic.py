@@ -53,7 +53,7 @@ def image_automatically(prepared: PreparedDifference, prior: NamedPrior, segment
         assert isinstance(better[0], Reconstruction)
         shapes = _shapes(prepared, better[0])
         if shapes is not None or not segmented:
-            outlined = "" if shapes is None else ", and its bodies' outlines fitted"
+            outlined = "" if shapes is None else f", and its bodies' {_edges(prepared)} fitted"
             return _with_bodies(prepared, f"{fault}: solved for conductivity itself{outlined}.", better, shapes)
     elif not segmented and (bodies := _bodies_in_solid(prepared, prior, imaged[1])):
         return bodies
@@ -77,7 +77,7 @@ def _bodies_in_solid(prepared: PreparedDifference, prior: NamedPrior, change: Fl
         return None
     assert isinstance(smooth[0], Reconstruction)
     shapes = _shapes(prepared, smooth[0])
-    why = "the voltages tell of bodies, which a linear image of a solid blurs: their outlines were fitted."
+    why = f"the voltages tell of bodies, which a linear image of a solid blurs: their {_edges(prepared)} were fitted."
     return shapes and _with_bodies(prepared, why, smooth, shapes)
 
 
@@ -87,6 +87,11 @@ def _with_bodies(prepared: PreparedDifference, why: str, smooth: Imaged, shapes:
     if shapes is None or prepared.mesh.dimension < 3:
         return Chosen("gauss-newton", why, smooth, shapes)
     return Chosen("shapes", why, (shapes, shapes.conductivity - prepared.calibration.conductivity), shapes)
+
+
+def _edges(prepared: PreparedDifference) -> str:
+    """What bodies end at."""
+    return "surfaces" if prepared.mesh.dimension == 3 else "outlines"
 
 
 def _shapes(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReconstruction | None:

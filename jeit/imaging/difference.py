@@ -58,6 +58,7 @@ class ImagedDifference:
       explain the voltages.
     - `labels`: 0 background, 1 resistive, 2 conductive for every pixel of the raster, if asked for.
     - `timings`: seconds of each step.
+    - `frame`: the number in its file of the frame imaged, from 0, of `num_frames`.
     """
 
     measurement: Measurement
@@ -76,6 +77,8 @@ class ImagedDifference:
     shapes: ShapeReconstruction | None = None
     labels: UInt8[np.ndarray, "rows columns"] | None = None
     timings: dict[str, float] = field(default_factory=dict)
+    frame: int = 0
+    num_frames: int = 1
 
     @property
     def lowest(self) -> float:
@@ -225,6 +228,8 @@ def image_difference(
             unlike_electrodes=prepared.unlike_electrodes,
             shapes=shapes,
             timings=clock.seconds,
+            frame=prepared.frame,
+            num_frames=prepared.num_frames,
         )
         inclusions, labels = _inclusions(found, grid)
     return replace(found, inclusions=tuple(inclusions), labels=labels)

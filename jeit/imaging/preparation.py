@@ -14,6 +14,7 @@ from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
+from jeit.imaging.chosen_frame import chosen_frame, naming_frame
 from jeit.imaging.clock import Clock
 from jeit.imaging.exchanged_rows import told_exchanges
 from jeit.imaging.wiring import Wiring, find_wiring
@@ -44,6 +45,7 @@ class PreparedDifference:
     - `wiring`: how electrodes and channels seem to be connected.
     - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
     - `difference`: (M,) volts, zero in masked channels; `mask` (M,), True for channels usable in both frames.
+    - `frame`: the number of the frame in its file, from 0, of `num_frames`.
     """
 
     measurement: Measurement
@@ -55,6 +57,8 @@ class PreparedDifference:
     calibration: Calibration
     difference: Float[Array, " M"]
     mask: Bool[Array, " M"]
+    frame: int = 0
+    num_frames: int = 1
 
     @property
     def model(self) -> ForwardModel:
@@ -138,8 +142,9 @@ def prepare_difference(
     which the calibration fails.
     """
     clock = Clock(None) if clock is None else clock
-    with clock("check"):
-        one, base = select_frames(measurement, reference, frame)
+    one, base = select_frames(measurement, reference, frame)
+    number = chosen_frame(measurement, frame)
+    with clock("check"), naming_frame(measurement, number):
         (quality,) = assess(one, base)
         domain, electrodes = body_of(one, base)
         both = np.asarray(one.mask)[0] & np.asarray(base.mask)[0]
@@ -153,9 +158,12 @@ def prepare_difference(
         if wiring.told or quality.imageable:  # noise may look like another wiring, but not be explained by it
             check_wiring(wiring, base, as_is)
         if not quality.imageable:
-            raise ValueError(f"'{one.name}' cannot be imaged: {quality.reason}")
+            with naming_frame(measurement, number):
+                raise ValueError(f"'{one.name}' cannot be imaged: {quality.reason}")
     calibration, chosen = calibrated_model(model, base, contact=contact, clock=clock)
-    return PreparedDifference(one, base, quality, domain, chosen, wiring, calibration, difference, both)
+    return PreparedDifference(
+        one, base, quality, domain, chosen, wiring, calibration, difference, both, number, measurement.num_frames
+    )
 
 
 def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
@@ -206,14 +214,10 @@ def select_frames(
     if reference is not None:
         check_measurement("reference", reference)
     if reference is None:
-        objects, reference = measurement.split_reference()
-    elif "reference" in measurement.frame_names and measurement.num_frames > 1:
-        objects, _ = measurement.split_reference()
-    else:
-        objects = measurement
+        _, reference = measurement.split_reference()
     if "reference" in reference.frame_names and reference.num_frames > 1:
         _, reference = reference.split_reference()
-    one = objects.frame(0) if frame is None else measurement.frame(frame)
+    one = measurement.frame(chosen_frame(measurement, frame))
     return one, as_driven(reference.mean_frame(), one)
 
 

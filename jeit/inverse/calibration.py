@@ -72,10 +72,14 @@ class Calibration(eqx.Module):
         """What a large misfit means, in a sentence; empty where it is not large."""
         if not float(self.misfit) > _MUCH:
             return ""
+        if self.model.mesh.dimension == 3:
+            what, or_else = "size of the body, how high it is filled, places and sizes of the electrodes", ""
+        else:
+            what, or_else = "radius, width of the electrodes", ", or the body deeper than a sheet"
         return (
-            f"the model misses {100 * float(self.misfit):.0f} % of the reference: radius, width of the electrodes, "
-            "protocol or gain may be others than described, or the body deeper than a sheet. What is missed alike in "
-            "both frames does little to where a change is seen; but do not trust its size, nor the background's."
+            f"the model misses {100 * float(self.misfit):.0f} % of the reference: {what}, protocol or gain may be "
+            f"others than described{or_else}. What is missed alike in both frames does little to where a change is "
+            "seen; but do not trust its size, nor the background's."
         )
 
 

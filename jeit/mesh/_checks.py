@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -12,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from jeit.mesh import _topology
+from jeit.mesh.sizes import warn_large
 
 # A cell flatter than this, relative to its longest edge, has gradients of no use in double precision.
 _FLAT = 1e-10
@@ -19,8 +19,6 @@ _FLAT = 1e-10
 _COINCIDING = 1e-10
 # Three node numbers of a facet are packed into one 64-bit integer.
 MOST_POINTS = 2_000_000
-# No tank or skin is larger; coordinates beyond it are nearly always millimetres.
-_LARGE = 10.0
 
 
 def check_points(points: ArrayLike) -> np.ndarray:
@@ -40,20 +38,8 @@ def check_points(points: ArrayLike) -> np.ndarray:
         )
     if not len(array):
         raise ValueError("points: the array is empty; a mesh needs at least one cell.")
-    warn_large(float(np.ptp(array, axis=0).max()), "points")
+    warn_large(float(np.ptp(array, axis=0).max()), "points", of_file=True)
     return array
-
-
-def warn_large(extent: float, name: str) -> None:
-    """Warn if a length in metres looks like millimetres."""
-    if extent > _LARGE:
-        warnings.warn(
-            f"{name}: {extent:g} m is large for what electrodes are put on. If the lengths are millimetres, give "
-            f"{1e-3 * extent:g} (a file is read with scale=1e-3), if centimetres, {1e-2 * extent:g} (scale=1e-2), if "
-            f"inches, {0.0254 * extent:g} (scale=0.0254): jeit computes in metres.",
-            UserWarning,
-            stacklevel=4,
-        )
 
 
 def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray:

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from jeit.arguments import check_kind, told
 from jeit.mesh._checks import MOST_POINTS
 from jeit.mesh.mesh import Mesh
+from jeit.mesh.sizes import size_told
 
 # Of an edge that a surface crosses nearer to its end than so many times its length, the end is moved onto it.
 _NEAR = 0.25
@@ -116,7 +117,8 @@ class _Division:
     def mesh(self, tags) -> Mesh:
         """The mesh, with the `tags` of that which was divided."""
         named = {name: self.facets[np.isin(self.side, np.asarray(index))] for name, index in tags.items()}
-        return Mesh.create(self.points, self.cells, tags=named)
+        with size_told():
+            return Mesh.create(self.points, self.cells, tags=named)
 
     def split(self, edges: Int[np.ndarray, "e 2"], middles: Float[np.ndarray, "e s"]) -> tuple[_Division, np.ndarray]:
         """With `edges`, no two of one cell, split at their `middles`, metres; and the cell that each comes from."""

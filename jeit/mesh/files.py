@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 from collections.abc import Mapping
 from contextlib import nullcontext
 from numbers import Real
@@ -49,6 +50,8 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
     if not isinstance(scale, Real) or not 0 < scale < np.inf:
         raise ValueError(f"scale: expected the file's unit in metres, such as 1e-3 for millimetres, got {scale!r}.")
+    if not path.stat().st_size:
+        raise ValueError(f"path: {path.name[:80]} does not work as a mesh file: it is empty.")
     kind = None if trusted else check_foreign(path)
     if path.suffix.lower() in _LOOSE:
         points, cells = read_loose(path, path.name[:80])
@@ -104,7 +107,7 @@ def write(
         data["gmsh:geometrical"] = physical
     try:
         content = {"point_data": dict(nodes), "cell_data": data, "field_data": field_data}
-        _quietly(path, lambda meshio: meshio.Mesh(points, blocks, **content).write(path, **options))
+        _quietly(path, lambda meshio: meshio.Mesh(points, blocks, **content).write(path, **options), writing=True)
     except OSError as error:
         raise ValueError(f"path: {path} cannot be written: {error.strerror}. Is there such a folder?") from None
 
@@ -119,7 +122,7 @@ def _data(argument: str, name: str, value: ArrayLike, length: int) -> np.ndarray
     return array
 
 
-def _quietly(path: Path, action: Any) -> Any:
+def _quietly(path: Path, action: Any, *, writing: bool = False) -> Any:
     """Do something with meshio: it prints, and leaves the interpreter, where it should raise."""
     import meshio  # takes a tenth of a second
 
@@ -133,12 +136,12 @@ def _quietly(path: Path, action: Any) -> Any:
         if "GB in memory" in str(error):
             raise
         own = isinstance(error, meshio.ReadError | meshio.WriteError | SystemExit)
-        reason = (
-            _short(said.getvalue().strip() or error) if own else "its content does not fit its format, or is cut off"
-        )
+        words = _short((said.getvalue().strip() or str(error)).replace(f"{path.parent}{os.sep}", "")) if own else ""
+        fault = words if writing and words else "its content does not fit its format, or is cut off"
+        says = f", which says: {words}" if words and not writing else ""
         raise ValueError(
-            f"path: {path.name[:80]} does not work as a mesh file: {reason}. The ending of the name tells the format: "
-            ".vtu, .vtk, .msh, .inp and others that meshio knows."
+            f"path: {path.name[:80]} does not work as a mesh file: {fault}. The ending of the name tells the format: "
+            f".vtu, .vtk, .msh, .inp and others that meshio knows{says}."
         ) from None
 
 
@@ -151,6 +154,8 @@ def _short(error: BaseException | str) -> str:
 def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
     kinds = {block.type for block in content.cells}
     dimension = 3 if "tetra" in kinds else 2
+    if not kinds:
+        raise ValueError(f"path: {source} does not work as a mesh file: there are no cells in it.")
     if _CELLS[dimension] not in kinds:
         raise ValueError(
             f"path: {source} holds cells of type {sorted(kinds)}, but jeit needs linear triangles or tetrahedra. "

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import brentq
 
+from jeit.mesh.generate.few_nodes import nodes_of_solid
 from jeit.mesh.generate.refine import Refine
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Disk, Domain, Rectangle
@@ -54,17 +55,20 @@ def graded_layers(
         # Finer at the rims, cells are smaller than the largest by a third or so.
         return len(_divided(stops, size)) * (1 + 1.1 * area / (0.65 * size) ** 2)
 
-    size = _largest(nodes, num_points, max(height, np.sqrt(area)))
-    heights = _divided(stops, size)
+    def levels(number: int) -> Float[np.ndarray, " n"]:
+        return _divided(stops, _largest(nodes, number, max(height, np.sqrt(area))))
+
+    heights = levels(num_points)
     refine = Refine(rims, factor=1 / _FINEST, growth=_GROWTH) if len(rims) else None
     number = max(4, round(num_points / len(heights)))
-    if isinstance(outline, Disk) and len(rims):
-        offset = rims - np.asarray(outline.centre)
-        on_edge = np.abs(np.hypot(*offset.T) - float(outline.radius)) < _SAME * float(outline.radius)
-        angles = np.arctan2(offset[on_edge, 1], offset[on_edge, 0])
-        plane = outline.mesh(num_points=number, refine=refine, boundary_points=angles if len(angles) else None)
-    else:
-        plane = outline.mesh(num_points=number, refine=refine)
+    with nodes_of_solid(num_points, lambda asked: round(asked / len(levels(asked)))):
+        if isinstance(outline, Disk) and len(rims):
+            offset = rims - np.asarray(outline.centre)
+            on_edge = np.abs(np.hypot(*offset.T) - float(outline.radius)) < _SAME * float(outline.radius)
+            angles = np.arctan2(offset[on_edge, 1], offset[on_edge, 0])
+            plane = outline.mesh(num_points=number, refine=refine, boundary_points=angles if len(angles) else None)
+        else:
+            plane = outline.mesh(num_points=number, refine=refine)
     return layer(plane, height, heights=heights)
 
 

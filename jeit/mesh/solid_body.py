@@ -9,11 +9,13 @@ from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind
 from jeit.mesh.body import Body
+from jeit.mesh.generate.few_nodes import nodes_of_solid
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Domain
 from jeit.mesh.outline.domain import check_length
-from jeit.mesh.solids import choose_layers, layer
+from jeit.mesh.sizes import size_told
+from jeit.mesh.solids import choose_layers, in_plane, layer
 from jeit_solvers.engines import as_array
 
 
@@ -44,13 +46,16 @@ class Solid(Body):
         """The outline, and the thickness."""
         return {**self.outline.describe(), "thickness": float(self.thickness)}
 
+    @size_told()
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
         """Layers of tetrahedra above a mesh of the outline, about as high as its cells are wide; see `jeit.mesh.box`.
 
         Tags: 'bottom', 'top', 'side', and those of the outline's mesh. Raises as `jeit.mesh.box`.
         """
         number, layers = choose_layers(float(self.outline.area), self.thickness, num_points, cell_size, None)
-        return layer(self.outline.mesh(num_points=number, cell_size=cell_size, refine=refine), self.thickness, layers)
+        with nodes_of_solid(num_points, in_plane(float(self.outline.area), self.thickness, None)):
+            plane = self.outline.mesh(num_points=number, cell_size=cell_size, refine=refine)
+        return layer(plane, self.thickness, layers)
 
 
 class OwnMesh(Body):

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jeit.mesh.generate import unstructured
+from jeit.mesh.generate.few_nodes import nodes_of_solid
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import check_length
 from jeit.mesh.prisms import stacked_cells, stacked_wall
 from jeit.mesh.shapes import disk, rectangle
+from jeit.mesh.sizes import size_told
 
 # In a solid 'bottom' and 'top' are the faces across z, so the sides of a rectangle across y get new names.
 _RENAMED = {"bottom": "front", "top": "back"}
@@ -53,7 +57,8 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
         if new in tags:
             raise ValueError(f"mesh: its tag {name!r} would be called {new!r} in the layer, which is taken. Rename it.")
         tags[new] = side(facets[np.asarray(index)])
-    return Mesh.create(points, solid, tags=tags)
+    with size_told():
+        return Mesh.create(points, solid, tags=tags)
 
 
 def _levels(thickness: float, num_layers: int, heights: ArrayLike | None) -> np.ndarray:
@@ -92,8 +97,9 @@ def box(
     width, depth = check_length("width", width), check_length("depth", depth)
     height = check_length("height", height)
     base_points, layers = choose_layers(width * depth, height, num_points, cell_size, num_layers)
-    base = rectangle(width, depth, num_points=base_points, cell_size=cell_size, refine=refine)
-    return layer(base, height, layers)
+    with size_told(), nodes_of_solid(num_points, in_plane(width * depth, height, num_layers)):
+        base = rectangle(width, depth, num_points=base_points, cell_size=cell_size, refine=refine)
+        return layer(base, height, layers)
 
 
 def cylinder(
@@ -114,17 +120,23 @@ def cylinder(
     `jeit.mesh.disk`, seen from above. Tags: 'bottom', 'top', 'side'. Raises `ValueError` on bad or
     contradicting arguments.
     """
-    radius, height = check_length("radius", radius), check_length("height", height)
+    radius, height = check_length("radius", radius, 2), check_length("height", height)
     base_points, layers = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)
-    base = disk(
-        radius,
-        num_points=base_points,
-        cell_size=cell_size,
-        refine=refine,
-        num_boundary=num_boundary,
-        boundary_points=boundary_points,
-    )
-    return layer(base, height, layers)
+    with size_told(), nodes_of_solid(num_points, in_plane(np.pi * radius**2, height, num_layers)):
+        base = disk(
+            radius,
+            num_points=base_points,
+            cell_size=cell_size,
+            refine=refine,
+            num_boundary=num_boundary,
+            boundary_points=boundary_points,
+        )
+        return layer(base, height, layers)
+
+
+def in_plane(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
+    """How many of a solid's nodes its base has."""
+    return lambda number: choose_layers(area, height, number, None, num_layers)[0] or number
 
 
 def choose_layers(

@@ -118,7 +118,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
     reconstruction, quality, settings = result.reconstruction, result.quality, result.settings
     noise = quality.difference_noise
     content = {
-        "data": describe_measurement(result.measurement),
+        "data": {**describe_measurement(result.measurement), **_frame(result)},
         "reference": describe_measurement(result.reference),
         "geometry": {
             **describe_domain(result.measurement.domain or result.reference.domain),
@@ -164,6 +164,12 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         "versions": {name: version_of(name) for name in _PACKAGES},
     }
     return plain(content)
+
+
+def _frame(result: ImagedDifference) -> dict[str, Any]:
+    """Which frame of how many was imaged: its name, or its number from 0 where it has none."""
+    names = result.measurement.frame_names
+    return {"frame": names[0] if names else result.frame, "frames": result.num_frames}
 
 
 def _unit(result: ImagedDifference) -> str:

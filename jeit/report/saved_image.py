@@ -12,6 +12,7 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.files import need, npz_arrays
 from jeit.image import Inclusion, SolidForm
 from jeit.mesh import Mesh
+from jeit.mesh.sizes import size_told
 
 _GIVE = "give the image.npz that jeit reconstruct writes"
 # What a file is instead of an image, by the end of its name.
@@ -108,7 +109,8 @@ def read_image(path: str | Path) -> SavedImage:
         need(arrays, *_NEEDED)
         if arrays["points"].dtype.kind not in "fiu":
             raise ValueError(f"'points' is {told(arrays['points'])}; real numbers are wanted, metres.")
-        mesh = Mesh.create(arrays["points"], arrays["cells"])
+        with size_told():  # by the command that wrote it
+            mesh = Mesh.create(arrays["points"], arrays["cells"])
         return _image(mesh, arrays)
     except ValueError as error:
         raise ValueError(f"{name}: {error}"[:400]) from None

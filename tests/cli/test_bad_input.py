@@ -245,8 +245,11 @@ def matlab(tank, **content):
 
 
 COMMANDS = {
-    "no such data": (lambda t: ["reconstruct", "absent.mat"], "There is no file absent.mat"),
-    "no such reference": (lambda t: [*good(t)[:2], "--reference", "absent.csv"], "no file absent.csv"),
+    "no such data": (lambda t: ["reconstruct", "absent.mat"], "jeit: DATA: there is no file absent.mat"),
+    "no such reference": (
+        lambda t: [*good(t)[:2], "--reference", "absent.csv"],
+        "jeit: --reference: there is no file absent.csv. Check",
+    ),
     "data is a folder": (lambda t: ["reconstruct", t.folder], "is a folder"),
     "empty file": (lambda t: raw(t, "a.csv", b""), "is empty"),
     "a spreadsheet": (lambda t: raw(t, "a.xlsx", b"PK\x03\x04"), "no known format"),
@@ -350,7 +353,7 @@ COMMANDS = {
     ),
     "no file of a study": (lambda t: ["study", "status", "a.toml"], "study: there is no file"),
     "noise below zero": (lambda t: ["demo", "--noise", "-1"], "zero or positive"),
-    "info on nothing": (lambda t: ["info", "absent.csv"], "There is no file"),
+    "info on nothing": (lambda t: ["info", "absent.csv"], "jeit: DATA: there is no file"),
     "info on a folder": (lambda t: ["info", t.folder], "is a folder"),
 }
 POINTS = "[" + ", ".join(f"[{x}, {y}]" for x, y in ly.ring(0.05, 8).tolist()) + "]"
@@ -423,4 +426,4 @@ def test_a_real_process_leaves_one_line_and_a_status(tmp_path):
     command = [sys.executable, "-m", "jeit", "reconstruct", "absent.mat", "--output", "out"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=os.environ, check=False)
     assert done.returncode == 1
-    assert done.stderr == "jeit: There is no file absent.mat. Check the path.\n"
+    assert done.stderr == "jeit: DATA: there is no file absent.mat. Check the name and the working directory.\n"

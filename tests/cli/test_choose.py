@@ -118,7 +118,7 @@ BAD = {
     "unknown rule": (lambda t: good(t, "--rule", "luck"), "--rule must be one of gcv, l-curve"),
     "unknown prior": (lambda t: good(t, "--prior", "flat"), "tikhonov, laplace, noser, gaussian"),
     "no reference": (lambda t: [t.folder / "touched.csv"], "reference"),
-    "no such file": (lambda t: ["absent.csv", "--reference", t.folder / "rest.csv"], "There is no file"),
+    "no such file": (lambda t: ["absent.csv", "--reference", t.folder / "rest.csv"], "DATA: there is no file"),
     "mesh of three nodes": (lambda t: good(t, "--num-points", "3"), "50 to 100,000"),
     "equal frames": (lambda t: [t.folder / "rest.csv", "--reference", t.folder / "rest.csv"], "no difference to image"),
 }

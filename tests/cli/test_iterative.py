@@ -10,8 +10,10 @@ from scipy.ndimage import label
 
 from jeit.arguments import counted
 from jeit.cli.console import in_one_unit
+from jeit.cli.networks import NETWORK
 from jeit.data import read, write_table
-from jeit.imaging import StreamSettings
+from jeit.imaging import METHODS, StreamSettings
+from jeit.imaging.settings import AUTO
 from jeit.imaging.stream_preparation import STREAM_POINTS
 from jeit.inverse.streaming.imager import FRAME_STEPS
 
@@ -186,15 +188,25 @@ def test_the_help_of_a_stream_tells_the_defaults(run):
     assert f"(default {FRAME_STEPS})" in told
 
 
+def test_the_help_lists_the_methods_that_are_taken(run):
+    told = " ".join(run("reconstruct", "--help")[1].replace("│", " ").split())
+    assert [name for name in (AUTO, *METHODS, NETWORK) if name not in told] == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("reconstruct", "--method", "newton"), "gauss-newton"),
+        (
+            ("reconstruct", "--method", "shape"),
+            "total-variation, shapes, network; it is 'shape' (did you mean 'shapes'?",
+        ),
+        (("reconstruct", "--method", "networks"), "--method must be one of auto, one-step, "),
         (("reconstruct", "--method", "total-variation", "--prior", "noser"), "--prior"),
         (("reconstruct", "--method", "total-variation", "--hyperparameter", "gcv"), "takes a number"),
         (
             ("stream", "--method", "magic"),
-            "--method must be one of one-step, gauss-newton, levenberg",
+            "--method must be one of one-step, gauss-newton, levenberg-marquardt, network; it is 'magic'",
         ),
         (("stream", "--method", "l-bfgs-b"), "--method: l-bfgs-b does not image frames in a bounded time"),
         (("stream", "--steps", "0"), "--steps must be"),

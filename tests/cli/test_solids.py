@@ -55,8 +55,10 @@ def test_from_description_to_picture(body, run, tmp_path):
         *(["--num-points", 1200] if NODES[body] else []),
     )  # fmt: skip
     assert (status, error) == (0, "")
-    assert ("volume / cm³" in told) == (body == "solid")
+    assert ("volume" in told) == (body == "solid")
     assert ("area / mm²" in told) == (body == "mesh")
+    assert "peak change" in told
+    assert "of back-" in told
     assert (tmp_path / "out" / "image.png").stat().st_size > 10_000
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     (found,) = report["inclusions"]

@@ -110,6 +110,13 @@ BAD_FILES = {
         "as many as the frames of a.csv, 1; they are 2",
     ),
     "header not skipped": (table("first,second\n" + FRAME), "line 1"),
+    "a word for a number": (
+        table(FRAME + "\n" + FRAME.replace(",", ",abc,", 1)),
+        "a.csv, line 2, column 2: 'abc' is no n",
+    ),
+    "an empty cell": (table(FRAME + ","), r"a.csv, line 1, column 41: nothing stands there; where .* write nan\.$"),
+    "semicolons": (table("1;2;3"), "a.csv, line 1: '1;2;3' is no number, nor numbers separated by ','. Set .* delim"),
+    "a heading": (table("first,second\n" + FRAME), "line 1, column 1: 'first' is no number; .* skip_rows"),
     "ragged": (table(FRAME + "\n1,2,3"), "line 2 has length 3"),
     "only comments": (table("# nothing\n"), "no numbers"),
     "binary": (lambda folder: table()(folder) and raw("a.csv", b"\xff\xfe\x00PK")(folder), "not a text file"),

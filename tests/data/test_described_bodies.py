@@ -30,6 +30,14 @@ def test_a_cylinder_with_a_ring_of_discs():
     found.electrodes.check(mesh)
 
 
+def test_one_level_may_be_a_number_or_a_list_of_one():
+    as_number, as_list = described(CYLINDER, RING | {"levels": 0.03}), described(CYLINDER, RING | {"levels": [0.03]})
+    np.testing.assert_array_equal(as_number.electrodes.position, as_list.electrodes.position)
+    assert np.asarray(as_number.electrodes.position)[:, 2].tolist() == [0.03] * 8
+    with pytest.raises(ValueError, match=r"electrodes\.levels must be a number or a list, 1 to 1024, from 0"):
+        described(CYLINDER, RING | {"levels": "middle"})
+
+
 def test_a_box_with_patches_in_two_levels():
     patches = {"kind": "patch", "layout": "perimeter", "number": 6, "start": 0.02, "levels": [0.01, 0.03]}
     patches |= {"width": 0.01, "height": 0.008, "contact_impedance": 1e-3}
@@ -57,6 +65,23 @@ def test_electrodes_lie_on_the_surface(size):
     described(tank, size | {"positions": places, "contact_impedance": 1e-3})
     with pytest.raises(ValueError, match=r"electrode 2 at \[0.0, 0.0, 0.045\] m lies 5 mm off the body's surface"):
         described(tank, size | {"positions": [places[0], [0.0, 0.0, 0.045]], "contact_impedance": 1e-3})
+
+
+@pytest.mark.parametrize(
+    ("place", "off"),
+    [
+        ([0.0, 15.0, 0.02], "14.9 m"),  # beyond the wall by far more than from either lid
+        ([0.0, 0.15, 0.02], "100 mm"),
+        ([0.0, 0.15, 0.04], "100 mm"),  # as high as the lid, but not on it
+        ([0.0, 0.08, 0.08], "50 mm"),  # beyond wall and lid, by 30 and 40 mm
+        ([0.0, 0.0, 0.055], "15 mm"),
+        ([0.0, 0.04, 0.025], "10 mm"),  # inside
+    ],
+)
+def test_the_distance_from_the_surface_is_the_real_one(place, off):
+    disc = {"kind": "disc", "radius": 0.004, "contact_impedance": 1e-3, "positions": [[0.05, 0.0, 0.02], place]}
+    with pytest.raises(ValueError, match=rf"electrode 2 at .* m lies {off} off the body's surface"):
+        described(CYLINDER, disc)
 
 
 def test_any_outline_with_a_thickness_is_a_solid():
@@ -158,6 +183,15 @@ WRONG = {
         {k: v for k, v in RING.items() if k not in ("radius", "levels")} | PATCH,
         "give x, y and z",
     ),
+    "strips": (CYLINDER, RING | {"kind": "strip"}, r"'strip' \(did you mean 'patch', with width and height\?\)\.$"),
+    "circles": (CYLINDER, RING | {"kind": "Circles"}, r"'Circles' \(did you mean 'disc', with radius\?\)\.$"),
+    "a tank": (CYLINDER | {"shape": "tank"}, RING, r"'tank' \(did you mean 'cylinder', with radius and height\?\)\.$"),
+    "misspelt twice": (
+        {"shape": "cylinder", "raduis": 0.05, "height": 0.04},
+        {**{key: value for key, value in STRIP.items() if key != "contact_impedance"}, "height": 0.04, "impedance": 1},
+        r"geometry\.radius is missing; .* geometry\.raduis is no key of a cylinder .*'radius'\?\).*"
+        r" electrodes\.contact_impedance is missing; give it\. (Wrong too: )?electrodes\.impedance",
+    ),
     "facets": (CYLINDER, FACETS, r"facets that a mesh has names for: give \[geometry\] mesh"),
 }
 
@@ -167,6 +201,14 @@ def test_what_is_wrong_is_said(name):
     geometry, electrodes, message = WRONG[name]
     with pytest.raises(ValueError, match=rf"^d\.toml.*{message}"):
         described(geometry, electrodes)
+
+
+def test_what_is_no_mesh_is_told_with_the_key_alone(tmp_path):
+    (tmp_path / "junk.msh").write_text("hello")
+    with pytest.raises(
+        ValueError, match=r"^d\.toml: geometry\.mesh: junk\.msh does not work .* its content does not fit"
+    ):
+        described({"mesh": "junk.msh"}, FACETS, tmp_path)
 
 
 def test_a_layout_on_a_mesh_is_refused(folder):
@@ -196,5 +238,6 @@ def test_a_plain_mesh_is_a_body_and_a_path_is_none():
 
 
 def test_a_radius_in_millimetres_is_told_in_metres():
-    with pytest.warns(UserWarning, match=r"^radius: 150 m is large .* If the lengths are millimetres, give 0\.15 "):
+    said = r"^d\.toml: geometry\.radius: 150 m is large .* If the lengths are millimetres, give 0\.15, "
+    with pytest.warns(UserWarning, match=said):
         described({"shape": "disk", "radius": 150}, {"kind": "point", "positions": [[0, 150]]})

@@ -22,6 +22,7 @@ from jeit.data import description_tables, load_description
 from jeit.data.described_body import ELECTRODES, SHAPES
 from jeit.design import read_described_skin
 from jeit.design.study import read_study
+from jeit.files.faults import told_faults
 from jeit.files.schema import Number, Table, validated
 
 DESCRIPTIONS = {
@@ -345,8 +346,23 @@ def test_every_key_is_told_by_its_place():
         validated(Small, {"microphones": [{"a": 1}, {"a": -1}], "strengths": 3}, "a.json")
     with pytest.raises(ValueError, match=r"^a\.json: 'a b' is no key of a list; there are microphones, strengths\.$"):
         validated(Small, {"microphones": [], "strengths": [], "a b": 1}, "a.json")
-    with pytest.raises(ValueError, match=r" And 9[0-9] more\.$"):
+    with pytest.raises(ValueError, match=r" Wrong too: 2, 3, 4, .*, 11\. And 88 more\.$"):
         validated(Small, {str(key): 1 for key in range(999)}, "a" * 1000)
+
+
+def test_what_there_is_no_room_for_is_named_by_its_key():
+    """Up to ten of them; and the list of all keys makes room for other faults where one is likely meant."""
+    eight = {name * 9: 1 for name in "abcdefgh"}
+    with pytest.raises(ValueError, match=r"^a\.json: ") as caught:
+        validated(Small, {"microphones": [], "strengths": [], **eight}, "a.json")
+    assert all(name in str(caught.value) for name in eight)
+    assert "more" not in str(caught.value)
+    there = ", ".join("x" * 30 for _ in range(10))
+    sentences = ["a is missing; give it.", f"b is no key (did you mean 'c'?); there are {there}.", "d is bad."]
+    told = told_faults("a.json", sentences, ["a", "b", "d"])
+    assert told == "a.json: a is missing; give it. b is no key (did you mean 'c'?). d is bad."
+    assert told_faults("a.json", [f"{there}."] * 3, ["a", "b", "d"]) == f"a.json: {there}. Wrong too: b, d."
+    assert len(told_faults("a.json", [there] * 30, ["k" * 40] * 30)) <= 400
 
 
 class One(Table):

@@ -79,6 +79,26 @@ def test_bodies_are_looked_for_in_solids_where_data_can_tell_of_them(monkeypatch
     assert bool(asked) == looks
 
 
+@pytest.mark.parametrize("strongest", [0.1, 1.0])
+@pytest.mark.parametrize(("dimension", "edges"), [(2, "outlines"), (3, "surfaces")])
+def test_what_is_fitted_is_named_for_the_body(monkeypatch, dimension, edges, strongest):
+    """An outline in a sheet, a surface in a solid: beside a sound linear image, and where it is none."""
+    data, change = prepared(dimension, strongest, 0.1)
+    data.difference, data.calibration.conductivity = change, BATH
+    data.mask = np.ones(2, bool)
+    monkeypatch.setattr(automatic, "unsound", lambda *_: "it is strong" if strongest == 1 else "")
+    monkeypatch.setattr(automatic, "Reconstruction", SimpleNamespace)
+    monkeypatch.setattr(automatic, "_shapes", lambda *_: SimpleNamespace(conductivity=change))
+    for name in ("one-step", "gauss-newton"):
+        made = SimpleNamespace(image=lambda *_: (SimpleNamespace(), change), hyperparameter=5.0)
+        monkeypatch.setitem(automatic.METHODS, name, made)
+    chosen = automatic.image_automatically(data, "gaussian")
+    if dimension == 3 or strongest == 1:
+        assert f"{edges} " in chosen.why
+    else:
+        assert chosen.method == "one-step"
+
+
 @pytest.mark.slow
 def test_bodies_of_a_sound_linear_image_are_told_in_a_cylinder():
     """A ball a fifth as conductive, that one step shows at a tenth of its contrast, by currents between two rings."""

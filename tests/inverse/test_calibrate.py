@@ -1,5 +1,6 @@
 """Calibration: what was put in comes out; a frame it cannot explain says so."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from jeit.forward import ForwardModel
 from jeit.forward.contact_sensitivity import ContactSensitivity
 from jeit.inverse import calibrate
 from jeit.layout import ring
-from jeit.mesh import disk
+from jeit.mesh import cylinder, disk
 from jeit.protocol import skip
 
 MESH = disk(0.1, num_points=300)
@@ -55,6 +56,20 @@ def test_noise_ends_up_in_the_misfit(model):
     spoilt = calibrate(model, voltages + 12 * noise)
     assert "misses 2" in spoilt.note
     assert "width of the electrodes" in spoilt.note
+
+
+def test_a_misfit_is_explained_by_what_the_body_is(model):
+    places = ring(0.1, 8, height=0.02)
+    solid = ForwardModel(cylinder(0.1, 0.05, num_points=300), PointElectrodes(places), PROTOCOL)
+    notes = []
+    for one in (model, solid):
+        found = calibrate(one, one.voltages(1.0), contact="fixed")
+        notes.append(eqx.tree_at(lambda found: found.misfit, found, jnp.asarray(0.2)).note)
+    sheet, solid = notes
+    assert "misses 20 % of the reference: radius, width of the electrodes, protocol" in sheet
+    assert "deeper than a sheet" in sheet
+    assert "misses 20 % of the reference: size of the body, how high it is filled, places and sizes of" in solid
+    assert "sheet" not in solid
 
 
 def test_every_impedance_is_recovered_and_told_apart(model):

@@ -50,6 +50,10 @@ def refused(path):
     return message
 
 
+UNFIT = (
+    "its content does not fit its format, or is cut off. The ending of the name tells the format: .vtu, .vtk, .msh, "
+    ".inp and others that meshio knows"
+)
 LEADING = {
     "entities": ("a.vtu", BOMB + VTU, "document type"),
     "entities in UTF-16": (
@@ -89,7 +93,9 @@ LEADING = {
     ),
     "no end of data": ("a.nas", "BEGIN BULK\n", "does not work as a mesh file"),
     "no text": ("a.msh", bytes(range(256)), "does not work as a mesh file"),
-    "nothing": ("a.vtk", "", "does not work as a mesh file"),
+    "nothing": ("a.vtk", "", "does not work as a mesh file: it is empty"),
+    "no mesh at all": ("a.msh", "hello", f"file: {UNFIT}, which says: Error: Couldn't read file a.msh as gmsh."),
+    "no cells": ("a.inp", "hello", "does not work as a mesh file: there are no cells in it"),
     "cut off": (
         "a.msh",
         "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n3\n1 0 0 0\n2 1 0",

@@ -1,9 +1,14 @@
 """Layers, boxes and cylinders: volumes, conformity, tags."""
 
+import re
+
 import numpy as np
 import pytest
 
-from jeit.mesh import Refine, box, cylinder, disk, layer, polygon, quality, rectangle
+from jeit.electrodes import FacePatches
+from jeit.electrodes.body_mesh import body_mesh
+from jeit.layout import ring
+from jeit.mesh import Disk, Rectangle, Refine, Solid, box, cylinder, disk, layer, polygon, quality, rectangle
 
 HOLED = polygon(
     [[0, 0], [0.1, 0], [0.1, 0.1], [0, 0.1]], holes=[[[0.04, 0.04], [0.06, 0.04], [0.05, 0.06]]], cell_size=0.02
@@ -95,3 +100,28 @@ def test_plane_tags_become_parts_of_the_side():
     assert set(mesh.tags) == {"bottom", "top", "side", "left", "right", "front", "back"}
     for tag, length in {"left": 0.1, "front": 0.2}.items():
         assert surface(mesh, tag) == pytest.approx(0.01 * length, rel=1e-12)
+
+
+STRIPS = FacePatches(ring(0.15, 16, height=0.05), 0.02, 0.08, 1e-3)
+TANK = Solid(Disk(0.15), 0.1)
+REFINED = Refine([[0.0, 0.0]], cell_size=2e-3)
+SLAB = Solid(Rectangle(0.5, 0.01), 0.01)
+FEW = {
+    "strips on a tank": (lambda number: body_mesh(TANK, STRIPS, number), 60),
+    "a tank refined": (lambda number: TANK.mesh(num_points=number, refine=REFINED), 60),
+    "a cylinder refined": (lambda number: cylinder(0.1, 0.1, num_points=number, refine=REFINED), 50),
+    "a slab": (lambda number: SLAB.mesh(num_points=number), 70),
+    "a long box": (lambda number: box(0.5, 0.01, 0.01, num_points=number), 70),
+}
+
+
+@pytest.mark.parametrize("name", FEW)
+def test_too_few_nodes_are_told_of_the_solid(name):
+    """Those asked for, not those of the plane mesh that it is made of; and as many as it says will do."""
+    make, few = FEW[name]
+    with pytest.raises(ValueError, match=rf"^num_points: .*\b{few}\b") as caught:
+        make(few)
+    enough = int(re.findall("about ([0-9]+)", str(caught.value))[0])
+    assert few < enough < 4000
+    assert "outline" not in str(caught.value)
+    assert make(round(1.2 * enough)).dimension == 3

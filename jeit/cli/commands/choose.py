@@ -18,6 +18,7 @@ from jeit.cli.options import (
     make_folder,
     naming_options,
     number_or_name,
+    read_file,
 )
 
 if TYPE_CHECKING:
@@ -47,7 +48,6 @@ def choose(
 ) -> None:
     """Compare the rules that choose the hyperparameter of DATA's image; writes choice.png and choice.json."""
     from jeit.cli.console import Steps, plain_console, say_written
-    from jeit.data import read
     from jeit.imaging import ImagingSettings, compare_on_data
     from jeit.report import write_choice
 
@@ -57,8 +57,8 @@ def choose(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        base = None if reference is None else read(reference, format, description)
-        measurement = read(data, format, description, like=base)
+        base = None if reference is None else read_file("--reference", reference, format, description)
+        measurement = read_file("DATA", data, format, description, like=base)
         chosen = None if frame is None else number_or_name(frame, int)
         with naming_options({"rules": "--rule"}):
             result = compare_on_data(measurement, base, settings, rules=rule or None, frame=chosen, progress=step)

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from jeit.cli.options import Description, Format
+from jeit.cli.options import Description, Format, read_file
 
 # What a solid on an outline is called, and its sizes where a description has other words for them.
 _SOLIDS = {
@@ -22,10 +22,9 @@ def info(
     """Say what DATA holds: frames, electrodes, protocol, noise, and what was assumed or masked."""
     from jeit.arguments import counted, percent
     from jeit.cli.console import pairs, plain_console, scaled
-    from jeit.data import read
     from jeit.report import report_measurement
 
-    measurement = read(data, format, description)
+    measurement = read_file("DATA", data, format, description)
     found = report_measurement(measurement)
     body, noise = found["body"], found["noise"]
     names = f" ({', '.join(found['frame_names'])})" if found["frame_names"] else ""

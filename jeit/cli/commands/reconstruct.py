@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from jeit.cli.networks import NETWORK, check_method, image_by_network
 from jeit.cli.options import (
     AsIs,
     Contact,
@@ -18,10 +19,12 @@ from jeit.cli.options import (
     Reference,
     make_folder,
     number_or_name,
+    read_file,
 )
 
 if TYPE_CHECKING:
     from jeit.imaging import ImagedDifference
+    from jeit.inverse.shapes import ShapeReconstruction
 
 
 def reconstruct(
@@ -43,8 +46,8 @@ def reconstruct(
         typer.Option(
             help="auto (default): one-step, or gauss-newton and outlines of bodies where that is unsound, bodies in "
             "solids wherever they are told of; one-step, back-projection, filtered-back-projection; gauss-newton, "
-            "levenberg-marquardt, total-variation; shapes, outlines of strong bodies; network, maps of depth by one "
-            "that learnt the skin (--model)."
+            "levenberg-marquardt, total-variation; shapes, outlines of strong bodies, in solids their surfaces; "
+            "network, maps of depth by one that learnt the skin (--model)."
         ),
     ] = None,
     prior: Annotated[
@@ -82,9 +85,7 @@ def reconstruct(
 
     In Python: `jeit.image_difference` and `jeit.report.write_image`; `jeit.reconstruct` makes absolute images.
     """
-    if method == "network" or model is not None:
-        from jeit.cli.networks import image_by_network
-
+    if method == NETWORK or model is not None:
         unused = {
             "prior": prior,
             "hyperparameter": hyperparameter,
@@ -105,10 +106,11 @@ def reconstruct(
         )
         return
     from jeit.cli.console import Steps, plain_console, say_written
-    from jeit.data import read
     from jeit.imaging import METHODS, ImagingSettings, image_difference
+    from jeit.imaging.settings import AUTO
     from jeit.report import write_image
 
+    check_method(method, (AUTO, *METHODS))
     given = {
         "segment": segment,
         "method": method,
@@ -128,26 +130,25 @@ def reconstruct(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        base = None if reference is None else read(reference, format, description)
-        measurement = read(data, format, description, like=base)
+        base = None if reference is None else read_file("--reference", reference, format, description)
+        measurement = read_file("DATA", data, format, description, like=base)
         chosen = None if frame is None else number_or_name(frame, int)
         result = image_difference(measurement, base, settings, frame=chosen, progress=step)
         step("write")
         write_image(result, output)
     if not quiet:
-        show(console, result)
+        show(console, result, asked=frame is not None)
         solid = ("image.vtu",) if result.mesh.dimension == 3 else ()
         say_written(console, output / "image.png", "image.npz", "report.json", *solid)
 
 
-def show(console, result: "ImagedDifference") -> None:
-    """Print what was found."""
+def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
+    """Print what was found; `asked`: of a frame that was asked for."""
     import numpy as np
 
     from jeit.arguments import counted, percent
     from jeit.cli.console import inclusion_table, pairs, scaled
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
-    from jeit.inverse.shapes import Ellipsoid
     from jeit_solvers import Status
 
     calibration, reconstruction = result.calibration, result.reconstruction
@@ -183,15 +184,7 @@ def show(console, result: "ImagedDifference") -> None:
         rows.append(("linear image", fall))
     rows += [("doubt", doubt) for doubt in result.doubts]
     if result.shapes is not None:
-        left = f"; {counted(len(result.shapes.doubtful), 'ghost')} left out" if result.shapes.doubtful else ""
-        drift = f"the background has drifted by {percent(result.shapes.drift)}"
-        strong = sum(not one.contrast_is_told for one in result.shapes.bodies)
-        upright = sum(isinstance(one, Ellipsoid) and one.column for one in result.shapes.bodies)
-        columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
-        assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""
-        rows.append(
-            ("bodies", f"{counted(len(result.shapes.bodies), 'outline')} fitted{columns}{left}{assumed}; {drift}")
-        )
+        rows.append(("bodies", told_bodies(result.shapes, result.mesh.dimension)))
     if result.why:
         rows.append(("chosen, for", result.why))
     if unlike := result.unlike_electrodes:
@@ -201,8 +194,37 @@ def show(console, result: "ImagedDifference") -> None:
         rows.append(("wiring", result.wiring.fault))
     rows += [("note", note) for note in dict.fromkeys((*result.measurement.notes, *result.reference.notes))]
     console.print()
+    if result.num_frames > 1:
+        rows.insert(0, ("frame", _which(result, asked)))
     console.print(pairs(result.measurement.name, rows))
     console.print()
-    table = inclusion_table(result.inclusions, unit, result.peak_ranges)
+    table = inclusion_table(result.inclusions, unit, result.peak_ranges, background=background.real)
     console.print(table if result.inclusions else "  no inclusion found")
     console.print()
+
+
+def told_bodies(shapes: "ShapeReconstruction", dimension: int) -> str:
+    """What was fitted as shapes, in half a sentence: outlines in a sheet, surfaces in a solid."""
+    from jeit.arguments import counted, percent
+    from jeit.inverse.shapes import Ellipsoid
+
+    edge = "surface" if dimension == 3 else "outline"
+    left = f"; {counted(len(shapes.doubtful), 'ghost')} left out" if shapes.doubtful else ""
+    strong = sum(not one.contrast_is_told for one in shapes.bodies)
+    upright = sum(isinstance(one, Ellipsoid) and one.column for one in shapes.bodies)
+    columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
+    assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""
+    drift = f"the background has drifted by {percent(shapes.drift)}"
+    return f"{counted(len(shapes.bodies), edge)} fitted{columns}{left}{assumed}; {drift}"
+
+
+def _which(result: "ImagedDifference", asked: bool) -> str:
+    """Which frame of how many was imaged, and how to image others."""
+    names = result.measurement.frame_names
+    said = f"{names[0]!r}, " if names else ""
+    said += f"{result.frame} of {result.num_frames}"
+    if asked:
+        return said
+    # Frames with names are of different things: nobody wants their mean.
+    mean = "" if names else ', or their mean: frames = "mean" in [data] of the description'
+    return f"{said}, from 0; --frame takes another{mean}"

@@ -6,7 +6,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.options import AsIs, Contact, Data, Description, Format, Nodes, Quiet, make_folder, naming_options
+from jeit.cli.options import (
+    AsIs,
+    Contact,
+    Data,
+    Description,
+    Format,
+    Nodes,
+    Quiet,
+    make_folder,
+    naming_options,
+    number_or_name,
+    read_file,
+)
 
 if TYPE_CHECKING:
     from jeit.mesh import Mesh
@@ -69,8 +81,6 @@ def series(
 
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written, scaled
-    from jeit.cli.options import number_or_name
-    from jeit.data import read
     from jeit.image import oscillation
     from jeit.imaging import ImagingSettings, image_sequence
     from jeit.report import write_series
@@ -93,8 +103,8 @@ def series(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        base = None if reference is None else read(reference, format, description)
-        measured = read(data, format, description, like=base)
+        base = None if reference is None else read_file("--reference", reference, format, description)
+        measured = read_file("DATA", data, format, description, like=base)
         with naming_options({"rate": "--rate"}):
             measured = measured if rate is None else measured.at_rate(rate)
         with naming_options({"frequency": "--frequency"}):

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from jeit.cli.networks import NETWORK, check_method, image_by_network
 from jeit.cli.options import (
     AsIs,
     Contact,
@@ -16,6 +17,7 @@ from jeit.cli.options import (
     make_folder,
     naming_options,
     number_or_name,
+    read_file,
 )
 
 
@@ -78,9 +80,7 @@ def stream(
     some frames on one colour scale; and a film. If all were refused, the exit status is 1. With --method network, how
     deep a skin is indented: frames.csv, depth.npz, depth.png and report.json.
     """
-    if method == "network" or model is not None:
-        from jeit.cli.networks import image_by_network
-
+    if method == NETWORK or model is not None:
         unused = {
             "hyperparameter": hyperparameter,
             "steps": steps,
@@ -99,13 +99,15 @@ def stream(
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written, scaled
     from jeit.cli.stopping import FramesTold, Stopping
-    from jeit.data import read
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as images_of
+    from jeit.inverse.nonlinear.solvers import SOLVERS, frame_solvers
     from jeit.report import write_stream
     from jeit.report.film import check_film
     from jeit.report.stream import PICTURES
 
+    if method not in SOLVERS:
+        check_method(method, frame_solvers())
     given = {
         "solver": method,
         "max_steps": steps,
@@ -125,8 +127,8 @@ def stream(
         make_folder(output, ("frames.csv", "images.npz", "frames.png", *films))
         with Steps(console, quiet=quiet) as step:
             step("read")
-            empty = read(reference, format, description)
-            measured = empty if data == "-" else read(Path(data), format, description, like=empty)
+            empty = read_file("--reference", reference, format, description)
+            measured = empty if data == "-" else read_file("DATA", Path(data), format, description, like=empty)
             imager, calibration = prepare_imager(empty, settings, measurement=measured, progress=step)
         if data == "-":
             frames, number = parse_frames(sys.stdin), None

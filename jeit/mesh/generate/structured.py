@@ -11,6 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from jeit.mesh.generate.few_nodes import TooFewNodes
+
 # Height of a row per mean edge along it: between a square's 1 and an equilateral triangle's 0.87.
 _ROW = 0.93
 
@@ -97,9 +99,12 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
                 best = (cost, num_columns, num_rows)
     if best is None or best[0][0]:
         least = 2 * max(width / height, height / width) + 3
-        raise ValueError(
+        raise TooFewNodes(
             f"num_points: {num_points} nodes in a rectangle of {width:g} by {height:g} m make flat cells. Ask for at "
-            f"least about {least:.0f}."
+            f"least about {least:.0f}.",
+            round(least),
+            f"{{asked}} nodes in a solid on {width:g} by {height:g} m make flat cells. Ask for at least about "
+            "{least}.",
         )
     return best[1], best[2]
 

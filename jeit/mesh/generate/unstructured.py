@@ -17,6 +17,7 @@ from jeit.mesh import loops
 from jeit.mesh.generate import _triangulate
 from jeit.mesh.generate._delaunay import Front, doubled_areas, triangulate
 from jeit.mesh.generate.curve import Curve, Size, within
+from jeit.mesh.generate.few_nodes import TooFewNodes
 from jeit.mesh.generate.refine import Refinement, SizeField
 from jeit.mesh.mesh import Mesh
 
@@ -247,9 +248,12 @@ def _corrected(
     wanted = total(value) / (1.0 + miss)
     if total(1e3 * value) > 1.1 * wanted:
         least = round(num_points * total(1e3 * value) / wanted)
-        raise ValueError(
+        raise TooFewNodes(
             f"num_points: the outline and refinement alone need about {least} nodes, more than the {num_points} asked. "
-            "Ask for more nodes, less refinement (larger cell_size, smaller factor) or faster growth."
+            "Ask for more nodes, less refinement (larger cell_size, smaller factor) or faster growth.",
+            least,
+            "the surface alone, as fine as electrodes or refine want it, needs about {least} nodes, more than the "
+            "{asked} asked. Ask for more.",
         )
     # Factors of `value`: the mesh of a body twice as large is twice as large, to the last bit.
     low, high = -np.log(1e3), np.log(1e3)

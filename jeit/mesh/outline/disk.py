@@ -16,6 +16,7 @@ from jeit.mesh.generate.refine import Refine, Refinement
 from jeit.mesh.generate.unstructured import Target, check_count, check_positions, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import Domain, Pen, check_length, check_near_origin, check_position, numerics
+from jeit.mesh.sizes import size_told
 from jeit_solvers.engines import as_array
 
 
@@ -27,7 +28,7 @@ class Disk(Domain):
 
     def __init__(self, radius: float, centre: Sequence[float] = (0.0, 0.0)):
         """`radius` > 0 and `centre` (x, y) in metres; raises `ValueError` otherwise."""
-        self.radius = check_length("radius", radius)
+        self.radius = check_length("radius", radius, 2)
         self.centre = check_position("centre", centre)
         check_near_origin("centre", self.centre, self.radius)
 
@@ -86,6 +87,7 @@ class Disk(Domain):
         """One circle."""
         pen.circle(self.centre, self.radius)
 
+    @size_told()
     def mesh(
         self,
         num_points: int | None = None,

@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.arguments import told
-from jeit.mesh._checks import warn_large
 from jeit.mesh.body import Body
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
+from jeit.mesh.sizes import warn_large
 from jeit_solvers.engines import has_values
 
 # How many times an outline's size it may lie away from the origin: ten digits of its shape are left there.
@@ -105,8 +105,9 @@ def numerics(*values: Any) -> Any:
     return np if has_values(*values) else jnp
 
 
-def check_length(name: str, value: Any) -> Any:
-    """Check a length in metres and make it a float (traced values pass); `ValueError` unless it is positive."""
+def check_length(name: str, value: Any, across: float = 1.0) -> Any:
+    """Check a length in metres and make it a float (traced values pass); `ValueError` unless it is positive. What it is
+    the length of is `across` times as large, and warned of by that."""
     if not has_values(value):
         return value
     try:
@@ -115,7 +116,7 @@ def check_length(name: str, value: Any) -> Any:
         raise ValueError(f"{name}: expected one length in metres, got {value!r}.") from None
     if not np.isfinite(number) or number <= 0:
         raise ValueError(f"{name}: expected a positive length in metres, got {told(value)}.")
-    warn_large(number, name)
+    warn_large(number, name, across)
     return number
 
 

@@ -10,13 +10,13 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.mesh import loops
-from jeit.mesh._checks import warn_large
 from jeit.mesh.generate.curve import closed_line
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.generate.unstructured import Target, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import polyline
 from jeit.mesh.outline.domain import Domain, Pen, check_near_origin
+from jeit.mesh.sizes import size_told, warn_large
 from jeit_solvers.engines import as_array, has_values
 
 
@@ -91,6 +91,7 @@ class Polygon(Domain):
         for loop in self.loops():
             pen.loop(np.asarray(loop))
 
+    @size_told()
     def mesh(
         self,
         num_points: int | None = None,

@@ -6,6 +6,7 @@ import numpy as np
 
 from jeit.arguments import check_name
 from jeit.mesh.mesh import Mesh
+from jeit.mesh.sizes import size_told
 
 
 def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
@@ -21,4 +22,5 @@ def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
         check_name("tag", tag, mesh.tags)
         facets = facets[np.asarray(mesh.tags[tag])]
     used, cells = np.unique(facets, return_inverse=True)
-    return Mesh.create(np.asarray(mesh.points)[used], cells.reshape(facets.shape))
+    with size_told():
+        return Mesh.create(np.asarray(mesh.points)[used], cells.reshape(facets.shape))
