@@ -132,5 +132,6 @@ def inclusion_table(
         place = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
         more = [" to ".join(ends[2 * k : 2 * k + 2])] if ranges else []
         more += [percent(inclusion.peak / background)] if background else []
-        table.add_row(inclusion.kind, *place, f"{1e6 * inclusion.area:.{digits}f}", peak, *more)
+        kind = f"{inclusion.kind}\ncolumn" if inclusion.is_column else inclusion.kind
+        table.add_row(kind, *place, f"{1e6 * inclusion.area:.{digits}f}", peak, *more)
     return table

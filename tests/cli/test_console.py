@@ -10,7 +10,7 @@ from rich.console import Console
 from jeit.arguments import percent
 from jeit.cli.commands.reconstruct import told_bodies
 from jeit.cli.console import inclusion_table
-from jeit.image import Inclusion
+from jeit.image import Inclusion, SolidForm
 
 SAID = {
     0.0: "0 %",
@@ -66,6 +66,13 @@ def test_all_that_is_known_of_a_large_body_goes_on_a_line():
     lines = printed(bodies, [(0.529, 0.9999), (-0.4567, -0.111)], background=0.205)
     assert len(lines) == 4
     assert lines[3][-6:] == ["-0.25", "-0.457", "to", "-0.111", "-122", "%"]
+
+
+def test_columns_are_called_so():
+    form = SolidForm((0.0, 0.0, 0.0), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.05)), True)
+    column = Inclusion(1, (0.0, 0.0, 0.0), 3e-5, 0.2, form=form)
+    first = [line[0] for line in printed([column, BODIES[1]]) if line]
+    assert first[-3:] == ["conductive", "column", "resistive"]
 
 
 @pytest.mark.parametrize(("dimension", "edge"), [(2, "outlines"), (3, "surfaces")])
