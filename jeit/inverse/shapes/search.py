@@ -330,14 +330,16 @@ def _otherwise(problem: ShapeProblem, fitted: Fit) -> Fit | None:
 
 
 def _alternatives(problem: ShapeProblem, fitted: Fit) -> list[Ellipsoid | None]:
-    """Every ellipsoid as a column, and every column as an ellipsoid, that explains the data about as well."""
+    """Every ellipsoid as a column, and every column as an ellipsoid, that explains the data about as well, whichever is
+    more likely beforehand."""
     bodies, number = fitted.bodies, len(fitted.bodies.sign)
     if not (number and isinstance(bodies, Ellipsoids)):
         return [None] * number
-    most, found = problem.surprise(fitted) + _UNDECIDED, []
+    most, found = problem.surprise(fitted) - bodies.odds + _UNDECIDED, []
     for k in range(number):
         other = problem.fit(*bodies.otherwise([k], fitted.coefficients), _STEPS_WITHOUT, _ROUGHLY)
-        found.append(other.bodies.body(k, other.coefficients) if problem.surprise(other) < most else None)
+        undecided = problem.surprise(other) - other.bodies.odds < most
+        found.append(other.bodies.body(k, other.coefficients) if undecided else None)
     return found
 
 
