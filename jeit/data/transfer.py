@@ -86,7 +86,9 @@ def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
     drive, reading = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     impedance = transfer_impedance(measurement)
     voltages = np.stack([np.einsum("km,km->k", reading @ one, drive) for one in impedance])
-    note = f"measured with '{measurement.protocol.name}', and turned into what '{protocol.name}' reads."
+    same = protocol.name == measurement.protocol.name
+    reads = "other currents of that name read" if same else f"'{protocol.name}' reads"
+    note = f"'{measurement.name}' was measured with '{measurement.protocol.name}', and turned into what {reads}."
     return Measurement(
         voltages,
         np.ones(voltages.shape, bool),

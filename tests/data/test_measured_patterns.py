@@ -217,6 +217,7 @@ def test_a_reference_of_other_currents_is_turned_into_those_of_the_frames(tank):
     _, base = select_frames(frame, other)
     np.testing.assert_allclose(base.voltages[0], tank(frame.protocol), rtol=0, atol=1e-10 * np.abs(base.voltages).max())
     assert any("turned into what" in note for note in base.notes)
+    assert any(note.startswith(f"'{other.name}' was measured with") for note in base.notes)
     # Not where they do not tell, or only how large they are differs.
     for made in (protocol.adjacent(COUNT), protocol.haar(COUNT, current=2e-3)):
         _, base = select_frames(frame, data.screen(tank(made), made))
