@@ -78,7 +78,8 @@ def _symmetric_inverse_jvp(primals, tangents):
     return inverse, -inverse @ tangents[0] @ inverse
 
 
-def _by_lapack(matrices: Inexact[np.ndarray, "batch s s"]) -> Any:
+def _by_lapack(matrices: Any) -> Any:
+    """`inverse_cholesky` by LAPACK, of NumPy's arrays."""
     # To a diagonal of order one, by powers of two: LAPACK's inverse loses what rows of other orders have.
     diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
     scale = np.ldexp(1.0, -(np.frexp(diagonal)[1] // 2)).astype(matrices.dtype)
