@@ -15,7 +15,7 @@ from jaxtyping import Array, Inexact
 
 from jeit_solvers.engines import host, namespace
 
-_BLOCK, _BLOCK_OF_LAPACK = 8, 32
+_BLOCK, _BLOCK_OF_LAPACK = 8, 128
 _LARGEST_IN_HALVES = 128
 _LARGE_BATCH = 16
 
