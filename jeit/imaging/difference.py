@@ -92,10 +92,11 @@ class ImagedDifference:
         if self.shapes is None or not all(one.contrast_is_told for one in self.shapes.bodies):
             return ()
         background, bodies = float(self.calibration.conductivity), self.shapes.bodies
-        deviations, ranges = self.shapes.contrast_deviations, []
-        for one, deviation, other in zip(bodies, deviations, self.shapes.alternatives, strict=True):
-            contrasts = [one.contrast, *([other.contrast] if other else [])]
-            ends = [contrast + side * deviation for contrast in contrasts for side in (-1, 1)]
+        others = zip(self.shapes.alternatives, self.shapes.alternative_deviations, strict=True)
+        ranges = []
+        for one, deviation, (other, its) in zip(bodies, self.shapes.contrast_deviations, others, strict=True):
+            told = [(one.contrast, deviation), *([(other.contrast, its)] if other else [])]
+            ends = [contrast + side * spread for contrast, spread in told for side in (-1, 1)]
             changes = [float(background * np.expm1(one.sign * end)) for end in ends]
             ranges.append((min(changes), max(changes)))
         return tuple(ranges)

@@ -243,11 +243,13 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
         ]
         for bodies in (result.shapes.bodies, result.shapes.doubtful)
     )
-    for one, deviation, other in zip(kept, result.shapes.contrast_deviations, result.shapes.alternatives, strict=True):
+    others = zip(result.shapes.alternatives, result.shapes.alternative_deviations, strict=True)
+    for one, deviation, (other, its) in zip(kept, result.shapes.contrast_deviations, others, strict=True):
         one["deviation_of_logarithm"] = deviation
         if other is not None:
             ratio = math.exp(other.sign * other.contrast)
-            one["or"] = {"centroid": other.centroid, **_form(other), "conductivity_over_background": ratio}
+            said = {"conductivity_over_background": ratio, "deviation_of_logarithm": its}
+            one["or"] = {"centroid": other.centroid, **_form(other), **said}
     return {
         "bodies": kept,
         "left_out": left,

@@ -132,16 +132,18 @@ def test_where_electrodes_do_not_tell_the_kind_of_a_body_it_is_doubted_and_the_r
         doubtful=(),
         contrast_deviations=(0.1, 0.2),
         alternatives=(body(False, np.log(6)), None),
+        alternative_deviations=(0.5, np.nan),
     )
     calibration = SimpleNamespace(conductivity=BATH)
     image: Any = SimpleNamespace(shapes=shapes, reconstruction=shapes, calibration=calibration)
     low, high = np.transpose(ImagedDifference.peak_ranges.fget(image))  # pyright: ignore
     np.testing.assert_allclose(low, BATH * (np.array([3, 4]) * np.exp([-0.1, -0.2]) - 1))
-    np.testing.assert_allclose(high, BATH * (np.array([6, 4]) * np.exp([0.1, 0.2]) - 1))
+    np.testing.assert_allclose(high, BATH * (np.array([6, 4]) * np.exp([0.5, 0.2]) - 1))
     (doubt,) = ImagedDifference.doubts.fget(image)  # pyright: ignore
     assert "x 12 mm, y -25 mm may as well be no column but an ellipsoid, of 6 times the background and 30 cm³" in doubt
     told = image_report._shapes(image)["bodies"]  # pyright: ignore
     assert told[0]["form"] == "column"
     assert told[0]["or"]["form"] == "ellipsoid"
     np.testing.assert_allclose(told[0]["or"]["conductivity_over_background"], 6)
+    assert told[0]["or"]["deviation_of_logarithm"] == 0.5
     assert "or" not in told[1]

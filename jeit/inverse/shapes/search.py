@@ -58,7 +58,7 @@ class ShapeReconstruction(eqx.Module):
     the bath is, less one; `doubtful`, bodies that were started from and left out again, their `rise` too small;
     `contrast_deviations`, standard deviation of each body's contrast, after the data and as far as noise is all that is
     wrong, in solids with 0.1 for the mesh besides; `alternatives`, each body of a solid as the other kind, ellipsoid or
-    column, where the data do not tell which it is, else None.
+    column, where the data do not tell which it is, else None; `alternative_deviations`, of their contrasts, or NaN.
     """
 
     bodies: tuple[Body, ...]
@@ -69,6 +69,7 @@ class ShapeReconstruction(eqx.Module):
     doubtful: tuple[Body, ...]
     contrast_deviations: tuple[float, ...]
     alternatives: tuple[Ellipsoid | None, ...]
+    alternative_deviations: tuple[float, ...]
 
     @property
     def hyperparameter(self) -> float:
@@ -158,8 +159,7 @@ def reconstruct_shapes(
     if there is not None:
         predicted = predicted + there.change(model.protocol, bodies.image(coefficients).image, field)
     others = _alternatives(setting.problem(level), fitted)
-    spread = bodies.rows(setting.problem(level).deviations(fitted))[:, bodies.dimension + 1]
-    slopes = [bodies.contrast(k, row)[1] for k, row in enumerate(bodies.rows(coefficients))]
+    deviations = _contrast_deviations(setting.problem(level), fitted)
     excess = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
     order = np.argsort(-np.asarray(rises), kind="stable")
     return ShapeReconstruction(
@@ -169,8 +169,9 @@ def reconstruct_shapes(
         misfit=as_array(np.sqrt(np.mean(excess**2))),
         drift=float(np.expm1(prior.drift * coefficients[0])),
         doubtful=doubtful,
-        contrast_deviations=tuple(float(np.hypot(spread[k] * slopes[k], _BY_THE_MESH * solid)) for k in order),
-        alternatives=tuple(others[k] for k in order),
+        contrast_deviations=tuple(deviations[k] for k in order),
+        alternatives=tuple(others[k][0] for k in order),
+        alternative_deviations=tuple(others[k][1] for k in order),
     )
 
 
@@ -332,17 +333,27 @@ def _otherwise(problem: ShapeProblem, fitted: Fit) -> Fit | None:
     return found if found and _is_told(problem, fitted, found) else None
 
 
-def _alternatives(problem: ShapeProblem, fitted: Fit) -> list[Ellipsoid | None]:
+def _contrast_deviations(problem: ShapeProblem, fitted: Fit) -> list[float]:
+    """Standard deviations of the contrasts of bodies."""
+    bodies = fitted.bodies
+    spread = bodies.rows(problem.deviations(fitted))[:, bodies.dimension + 1]
+    slopes = [bodies.contrast(k, row)[1] for k, row in enumerate(bodies.rows(fitted.coefficients))]
+    return [float(one) for one in np.hypot(spread * slopes, _BY_THE_MESH * (bodies.dimension == 3))]
+
+
+def _alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | None, float]]:
     """Every ellipsoid as a column, and every column as an ellipsoid, that explains the data about as well, whichever is
-    more likely beforehand."""
+    more likely beforehand; and the deviation of its contrast."""
     bodies, number = fitted.bodies, len(fitted.bodies.sign)
     if not (number and isinstance(bodies, Ellipsoids)):
-        return [None] * number
+        return [(None, np.nan)] * number
     most, found = problem.surprise(fitted) - bodies.odds + _UNDECIDED, []
     for k in range(number):
         other = problem.fit(*bodies.otherwise([k], fitted.coefficients), _STEPS_WITHOUT, _ROUGHLY)
-        undecided = problem.surprise(other) - other.bodies.odds < most
-        found.append(other.bodies.body(k, other.coefficients) if undecided else None)
+        if problem.surprise(other) - other.bodies.odds < most:
+            found.append((other.bodies.body(k, other.coefficients), _contrast_deviations(problem, other)[k]))
+        else:
+            found.append((None, np.nan))
     return found
 
 
