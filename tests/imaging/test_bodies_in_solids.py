@@ -11,7 +11,7 @@ from jeit.data import Measurement
 from jeit.electrodes import FacePatches
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
-from jeit.imaging import ImagedDifference, ImagingSettings, automatic, method
+from jeit.imaging import ImagedDifference, ImagingSettings, automatic, difference, method
 from jeit.inverse.shapes import Ellipsoid, ShapeReconstruction
 from jeit.mesh import Disk, Rectangle, Solid, centroids
 from jeit.protocol import opposite, skip
@@ -147,3 +147,12 @@ def test_where_electrodes_do_not_tell_the_kind_of_a_body_it_is_doubted_and_the_r
     np.testing.assert_allclose(told[0]["or"]["conductivity_over_background"], 6)
     assert told[0]["or"]["deviation_of_logarithm"] == 0.5
     assert "or" not in told[1]
+
+
+def test_the_last_axis_of_a_column_that_is_drawn_stands():
+    axes = np.array([[0.0, 0.0, 0.05], [0.03, 0.0, 0.0], [0.0, 0.01, 0.0]])
+    form = difference._form(Ellipsoid(1, BALL, axes, 3e-5, BALL, 1.0, True, 2.0))  # pyright: ignore
+    assert form is not None
+    assert form.column
+    np.testing.assert_allclose(np.ptp(form.surface().points, axis=0), [0.06, 0.02, 0.1])
+    np.testing.assert_allclose(form.axes[-1], [0, 0, 0.05])

@@ -173,6 +173,34 @@ def test_a_column_is_told_from_a_ball(coarse):
     np.testing.assert_allclose(strength, np.pi * RADIUS**2 * SIZE[2] * 3 / 5, rtol=0.15)
 
 
+@pytest.mark.parametrize("column", [True, False])
+@pytest.mark.parametrize(("worse", "told"), [(3.0, False), (5.0, True)])
+def test_a_kind_is_doubted_by_the_data_alone_and_has_a_deviation_of_its_own(coarse, worse, told, column):
+    bodies = Ellipsoids.create(coarse.mesh, EllipsoidPrior(odds_for_columns=1e6), [[0.0, 0.0, 0.05]], [1])
+    bodies, coefficients = bodies.otherwise([0] if column else [], bodies.of_radii([RADIUS]))
+
+    class Told:
+        """The other kind is `worse`, and has twice the deviation."""
+
+        def fit(self, bodies, coefficients, *steps):
+            return Fit(bodies, coefficients, 1.0)
+
+        def surprise(self, fit):
+            return fit.bodies.odds + (0.0 if fit.bodies.other[0] == column else worse)
+
+        def deviations(self, fit):
+            return np.full(len(fit.coefficients), 0.1 if fit.bodies.other[0] == column else 0.2)
+
+    problem: Any = Told()
+    fitted = Fit(bodies, coefficients, 1.0)
+    ((other, deviation),) = search._alternatives(problem, fitted)  # pyright: ignore
+    assert (other is None) == told
+    if other is not None:
+        (own,) = search._contrast_deviations(problem, fitted)  # pyright: ignore
+        assert other.column != column
+        assert deviation**2 - 0.01 == pytest.approx(4 * (own**2 - 0.01))
+
+
 def test_balls_keep_their_volume_on_any_mesh(coarse):
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), [[0.0, 0.0, 0.05]], [1])
     for radius in (0.012, 0.02, 0.03):
