@@ -6,12 +6,12 @@
 - `dense`: small systems that batch;
 - `optimise`: descent along quadratic models, many small problems at once, problems between bounds, derivatives of a
   minimum, and `Status`;
-- `kmeans`; `over_cores` and `in_turn`, which share work out.
+- `kmeans`; `over_cores`, `on_cores` and `in_turn`, which share work out.
 """
 
 from jeit_solvers.batching import in_turn
 from jeit_solvers.clustering import KMeans, kmeans
-from jeit_solvers.cores import number_of_cores, over_cores
+from jeit_solvers.cores import number_of_cores, on_cores, over_cores
 from jeit_solvers.dense.cholesky import lower_cholesky, symmetric_eigen, symmetric_inverse
 from jeit_solvers.dense.ridge import QuadraticModel, ridge_model, ridge_step, solve_definite
 from jeit_solvers.optimise.bounded import BoundedMinimum, lbfgsb, projected_gradient, scipy_lbfgsb
@@ -80,6 +80,7 @@ __all__ = [
     "minimise_small",
     "near_inverse",
     "number_of_cores",
+    "on_cores",
     "over_cores",
     "projected_gradient",
     "quadratic_form",

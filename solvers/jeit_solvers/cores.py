@@ -1,17 +1,28 @@
 """Long work of many equal parts, shared between the cores of a machine.
 
 XLA spreads one product of large matrices over all cores, but runs gathers, sums and small products of a compiled loop
-on one; two loops side by side, each on a thread of its own, keep two cores busy.
+on one; two loops side by side, each on a thread of its own, keep two cores busy. So does NumPy, whose products alone
+are spread by its BLAS: threads of ours and of the BLAS's own would wait for each other, and it is kept to one.
 """
 
+import contextlib
+import functools
+import itertools
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import threadpoolctl
 from jaxtyping import Array, Int
+
+# Threads at most, that work in NumPy side by side: each takes memory of its own, and they share the memory's bandwidth.
+_MOST_THREADS = 4
+_TOLD = "jeit-core"
 
 
 def number_of_cores() -> int:
@@ -32,3 +43,57 @@ def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], number: int,
     with ThreadPoolExecutor(cores) as pool:
         results = list(pool.map(lambda part: jax.block_until_ready(function(part)), parts))
     return results[0] if cores == 1 else jnp.concatenate(results)
+
+
+def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
+    """`function` of each of some parts, in NumPy, side by side on every core; it puts what it makes in place.
+
+    One part, and what is asked for by a part of other work, is done at once. NaN is told of elsewhere: nothing warns.
+    """
+    if len(parts) == 1 or threading.current_thread().name.startswith(_TOLD):
+        for part in parts:
+            function(part)
+        return
+
+    def quietly(part: Any) -> None:
+        with np.errstate(all="ignore"):  # threads have error states of their own
+            function(part)
+
+    with _one_thread_of_blas():
+        list(_workers(os.getpid()).map(quietly, parts))
+
+
+def parts_for_cores(number: int) -> list[slice]:
+    """0 … `number` - 1 in parts of about equal size, one for each core."""
+    ends = np.linspace(0, number, min(number_of_cores(), _MOST_THREADS, number) + 1).astype(int).tolist()
+    return [slice(*both) for both in itertools.pairwise(ends)]
+
+
+@functools.cache
+def _workers(process: int) -> ThreadPoolExecutor:
+    """Threads of a process, which a fork of it has not. They are kept: what new ones allocate and free stays with the
+    process, a hundred megabytes every time."""
+    return ThreadPoolExecutor(min(number_of_cores(), _MOST_THREADS), _TOLD)
+
+
+@functools.cache
+def _blas() -> threadpoolctl.ThreadpoolController:
+    return threadpoolctl.ThreadpoolController()
+
+
+_kept: list[Any] = []
+_keeping = threading.Lock()
+
+
+@contextlib.contextmanager
+def _one_thread_of_blas() -> Iterator[None]:
+    """Within it, and for as long as anyone else is, the BLAS keeps to one thread; a few microseconds."""
+    with _keeping:
+        _kept.append(None if _kept else _blas().limit(limits=1, user_api="blas"))
+    try:
+        yield
+    finally:
+        with _keeping:
+            limit = _kept.pop()
+            if limit is not None:  # the first, who knows how many threads there were, is the last in the list to go
+                limit.restore_original_limits()

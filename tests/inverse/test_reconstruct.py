@@ -31,7 +31,7 @@ from jeit.inverse.nonlinear import (
     Log,
     ProjectedGradient,
 )
-from jeit.inverse.nonlinear.solvers import SOLVERS, as_solver
+from jeit.inverse.nonlinear.solvers import SOLVERS, LeastSquares, as_solver
 from jeit.layout import ring
 from jeit.mesh import Disk, Refine, centroids, measures
 from jeit.protocol import adjacent
@@ -123,6 +123,18 @@ def test_solvers_of_optimistix_find_the_same(model, frame):
     theirs = reconstruct(model, voltages, 1.0, solver=optx.LevenbergMarquardt(1e-8, 1e-8), **options)
     assert theirs.status == "converged"
     np.testing.assert_allclose(theirs.conductivity, ours.conductivity, rtol=1e-3)
+
+
+@pytest.mark.parametrize("rounding", [0, 1, 2, 3])
+def test_solvers_of_optimistix_that_stand_still_for_rounding_have_converged(rounding, model, frame):
+    """Tolerances at the root of a number's precision are reached or not by luck; one step is no such luck."""
+    voltages, noise = frame
+    options = {"prior": Gaussian(0.05), "noise": noise, "hyperparameter": 100.0}
+    solver = optx.LevenbergMarquardt(1e-9, 1e-9)
+    result = reconstruct(model, voltages * (1 + rounding * 1e-15), 1.0, solver=solver, **options)
+    assert result.status == "converged"
+    short = reconstruct(model, voltages, 1.0, solver=LeastSquares(solver, max_steps=2), **options)
+    assert short.status == "step limit"
 
 
 def test_a_warm_start_needs_fewer_steps(model, frame):

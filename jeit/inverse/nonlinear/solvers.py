@@ -29,6 +29,9 @@ _REASONS = {
     Status.STALLED: "No shorter step lowered the objective; the model is at odds with the data.",
 }
 
+_ROUNDED = "The next step would change the objective by less than its rounding."
+# Of the objective, in units of its last place, that a sum over all channels is off by.
+_ROUNDINGS = 100.0
 _TRACED = "It was solved inside a transformation of JAX; the status says how that ended."
 
 
@@ -207,6 +210,8 @@ class LeastSquares(AbstractSolver):
         solution = _least_squares(inversion, start, self.solver, self.max_steps, {})
         costs = jnp.stack([_cost(inversion, start), _cost(inversion, solution.value)])
         status, iterations = ended(solution.result), int(solution.stats["num_steps"])
+        if status == Status.STEP_LIMIT and _is_within_rounding(inversion, solution.value):
+            return Solved(solution.value, iterations, costs, Status.CONVERGED, _ROUNDED)
         return Solved(solution.value, iterations, costs, status, _reason(status, iterations))
 
 
@@ -373,6 +378,15 @@ def minimise_between(
         tolerance=tolerance,
     )
     return BoundedMinimum(scale * found.x, found.steps, found.converged)
+
+
+@eqx.filter_jit
+def _is_within_rounding(inversion: Inversion, coefficients):
+    """Whether a Gauss-Newton step would lower the objective by no more than its rounding: solvers that accept steps by
+    what they gain stand still there, short of tolerances near the root of a number's precision."""
+    cost, step = inversion.quadratic_model(coefficients)
+    _, slope, curvature = step(0.0)
+    return abs(slope + 0.5 * curvature) <= _ROUNDINGS * jnp.finfo(cost.dtype).eps * cost
 
 
 @eqx.filter_jit

@@ -1,9 +1,7 @@
 """Matrices between the nodes of a mesh, solved by the direct solver, and images of cells as means over their nodes."""
 
 import functools
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,11 +9,11 @@ import scipy.sparse
 from jaxtyping import Float
 
 from jeit.mesh import Mesh
-from jeit_solvers import Factor, FactorisationPlan, SparsityPattern, analyse, factorise, number_of_cores, solve
+from jeit_solvers import Factor, FactorisationPlan, SparsityPattern, analyse, factorise, on_cores, solve
 from jeit_solvers.engines import on_host
 
 # Columns solved for at a time: of more, fronts leave the caches, and of all they take the memory of several images.
-_AT_ONCE, _MOST_AT_ONCE = 32, 4
+_AT_ONCE = 32
 
 Solve = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, "n k"]]
 """What solves a system for columns."""
@@ -77,18 +75,7 @@ def by_columns(function: Callable[[Any], Any], columns: Any, rows: int) -> Any:
 
     def some(start: int) -> None:
         part = np.ascontiguousarray(columns[:, start : start + _AT_ONCE])
-        with np.errstate(all="ignore"):  # NaN is told of elsewhere, and threads have error states of their own
-            found[:, start : start + _AT_ONCE] = function(part)
+        found[:, start : start + _AT_ONCE] = function(part)
 
-    if number <= _AT_ONCE:
-        some(0)
-        return found
-    list(_workers(os.getpid()).map(some, range(0, number, _AT_ONCE)))
+    on_cores(some, range(0, number, _AT_ONCE))
     return found
-
-
-@functools.cache
-def _workers(process: int) -> ThreadPoolExecutor:
-    """Threads of a process, which a fork of it has not. They are kept: what new ones allocate and free stays with the
-    process, a hundred megabytes every time."""
-    return ThreadPoolExecutor(min(number_of_cores(), _MOST_AT_ONCE))

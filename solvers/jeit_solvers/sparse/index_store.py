@@ -57,12 +57,14 @@ class PaddedSum(NamedTuple):
     """Sums of scattered contributions. Scattering is slow on a CPU, so most contributions are *gathered*.
 
     `gather` (width, sums) says which contributions each sum reads, with numbers out of range where it has fewer;
-    `overflow_sum` and `overflow_source` pair sums with the contributions beyond `width`, which are scattered.
+    `overflow_sum` and `overflow_source` pair sums with the contributions beyond `width`, which are scattered: in rounds
+    that end at `rounds`, in each of which no sum is met twice and sums ascend.
     """
 
     gather: Slot
     overflow_sum: Slot
     overflow_source: Slot
+    rounds: tuple[int, ...]
 
     @classmethod
     def create(
@@ -79,7 +81,10 @@ class PaddedSum(NamedTuple):
         gather = np.full((width, num_sums), num_sources, dtype=np.int32)
         inside = rank < width
         gather[rank[inside], target[inside]] = source[inside]
-        return cls(store.add(gather), store.add(target[~inside]), store.add(source[~inside]))
+        rounds = np.argsort(rank, kind="stable")
+        rounds = rounds[~inside[rounds]]
+        ends = np.cumsum(np.bincount(rank[rounds] - width))
+        return cls(store.add(gather), store.add(target[rounds]), store.add(source[rounds]), tuple(ends.tolist()))
 
     def apply(
         self, indices: Int[Array, " total"], contributions: Inexact[Array, "sources *k"]
@@ -87,6 +92,9 @@ class PaddedSum(NamedTuple):
         """The sums of the given contributions."""
         shape = self.gather.shape[1], *contributions.shape[1:]
         total = namespace(contributions).zeros(shape, contributions.dtype)
+        if isinstance(contributions, np.ndarray):
+            self.add_some(indices, contributions, total, 0, shape[0])
+            return total
         gathered = self.gather.read(indices)
         for layer in range(len(gathered)):
             total += gather_or_zero(contributions, gathered[layer])
@@ -94,6 +102,25 @@ class PaddedSum(NamedTuple):
             overflow = gather(contributions, self.overflow_source.read(indices))
             total = add_into(total, self.overflow_sum.read(indices), overflow)
         return total
+
+    def add_some(
+        self, indices: Any, contributions: Inexact[Array, "sources *k"], total: Any, start: int, stop: int
+    ) -> None:
+        """In NumPy: the sums from `start` to before `stop`, added to a `total` (sums, k) in place; so many at a time
+        that what is made on the way stays near the processor."""
+        at_once = max(1, _AT_ONCE // math.prod(contributions.shape[1:]))
+        gathered: Any = self.gather.read(indices)
+        for first in range(start, stop, at_once) if len(gathered) else ():
+            some = slice(first, min(first + at_once, stop))
+            for layer in gathered:
+                total[some] += gather_or_zero(contributions, layer[some])
+        sums: Any = self.overflow_sum.read(indices)
+        sources: Any = self.overflow_source.read(indices)
+        for begin, end in zip((0, *self.rounds), self.rounds, strict=False):
+            first, last = begin + np.searchsorted(sums[begin:end], (start, stop))
+            for one in range(first, last, at_once):
+                some = slice(one, min(one + at_once, last))
+                total[sums[some]] += gather(contributions, sources[some])
 
     def read_back(
         self, indices: Int[Array, " total"], sums: Inexact[Array, " sums"], into: Inexact[Array, " sources"]
@@ -110,6 +137,8 @@ class PaddedSum(NamedTuple):
 
 # Measured on two Zen 4 cores: a scattered contribution costs about as much as this many gathered ones.
 _SCATTER_COST = 4.0
+# Entries that NumPy gathers at a time.
+_AT_ONCE = 16384
 
 
 class IndexLayout:

@@ -14,10 +14,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Inexact, Int
 
 from jeit_solvers.batching import differentiable_batches, in_turn, one_by_one
+from jeit_solvers.cores import on_cores, parts_for_cores
 from jeit_solvers.dense.cholesky import inverse_cholesky
 from jeit_solvers.engines import gather_or_zero, has_values, namespace
 from jeit_solvers.sparse.index_store import IndexLayout
 from jeit_solvers.sparse.plan import FactorisationPlan, Stage
+
+# Entries of the fronts of a stage, from which threads are worth it; and of the fronts that are updated together.
+_WORTH_A_THREAD, _TOGETHER = 200_000, 100_000
 
 
 class Factor(eqx.Module):
@@ -61,20 +65,20 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
             f"got {values.shape}. Use jax.vmap for a batch of matrices."
         )
     if isinstance(values, np.ndarray):
-        return _by_stages(plan.layout, plan.indices, values)
+        return _on_cores(plan.layout, plan.indices, values)
     numeric = in_turn(partial(_factorise, plan.layout))
     return numeric(plan.indices, values)
 
 
 def _by_stages(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Factor:
     stages, _ = layout.content
-    dtype, xp = values.dtype, namespace(values)
-    extended = xp.concatenate([values, xp.ones(1, dtype)])
+    dtype = values.dtype
+    extended = jnp.concatenate([values, jnp.ones(1, dtype)])
     inverses, lowers, left = [], [], []
     for stage in stages:
         pivots, border = stage.pivots, stage.border
         panel = stage.entries.apply(indices, extended)
-        corner = xp.zeros(stage.batch * border * border, dtype)
+        corner = jnp.zeros(stage.batch * border * border, dtype)
         for link in stage.links:
             schur = left[link.source].reshape(-1)
             panel += link.panel.apply(indices, schur)
@@ -92,6 +96,45 @@ def _by_stages(layout: IndexLayout, indices: Int[Array, " total"], values: Inexa
 
 # Compiled functions of their own, so that a second program with the same plan need not trace them again.
 _factorise = jax.jit(_by_stages, static_argnums=0)
+
+
+def _on_cores(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[np.ndarray, " nnz"]) -> Factor:
+    """The same in NumPy: in place, the fronts of a stage shared between the cores."""
+    stages, _ = layout.content
+    extended = np.concatenate([values, np.ones(1, values.dtype)])
+    inverses, lowers, left = [], [], []
+    for stage in stages:
+        batch, pivots, border = stage.batch, stage.pivots, stage.border
+        panel = np.zeros((batch, pivots + border, pivots), values.dtype)
+        corner = np.zeros((batch, border, border), values.dtype)
+        inverse, lower = np.empty_like(panel, shape=(batch, pivots, pivots)), np.empty_like(panel[:, pivots:])
+        some = partial(_some_fronts, stage, indices, extended, left, panel, corner, inverse, lower)
+        many = batch * (pivots + border) ** 2 > _WORTH_A_THREAD
+        on_cores(some, parts_for_cores(batch) if many else [slice(0, batch)])
+        inverses.append(inverse)
+        lowers.append(lower)
+        left.append(corner)
+    return Factor(tuple(inverses), tuple(lowers))
+
+
+def _some_fronts(stage: Stage, indices, extended, left, panel, corner, inverse, lower, some: slice) -> None:
+    """Assembles and eliminates some fronts of a stage, in place."""
+
+    def add(sums, values, total):
+        size = total[0].size
+        sums.add_some(indices, values, total.reshape(-1), some.start * size, some.stop * size)
+
+    add(stage.entries, extended, panel)
+    for link in stage.links:
+        schur = left[link.source].reshape(-1)
+        add(link.panel, schur, panel)
+        add(link.corner, schur, corner)
+    inverse[some] = inverse_cholesky(panel[some, : stage.pivots])
+    np.matmul(panel[some, stage.pivots :], _transposed(inverse[some]), out=lower[some])
+    together = max(1, _TOGETHER // max(stage.border**2, 1))
+    for first in range(some.start, some.stop, together):
+        few = slice(first, min(first + together, some.stop))
+        corner[few] -= lower[few] @ _transposed(lower[few])
 
 
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:

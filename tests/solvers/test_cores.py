@@ -1,0 +1,75 @@
+"""Work of NumPy's that is shared between cores: the same whoever does it, and the BLAS as it was before."""
+
+import warnings
+
+import numpy as np
+import pytest
+import sparse_problems
+import threadpoolctl
+
+from jeit_solvers import analyse, factorise, on_cores
+from jeit_solvers.cores import parts_for_cores
+from jeit_solvers.engines import on_host
+from jeit_solvers.sparse import multifrontal
+
+
+def threads_of_blas():
+    return [one["num_threads"] for one in threadpoolctl.threadpool_info() if one["user_api"] == "blas"]
+
+
+def test_every_part_is_done_with_one_thread_of_blas_and_its_own_parts_at_once():
+    found, threads = np.zeros((6, 3)), []
+
+    def part(row):
+        def inner(column):
+            found[row, column] += row + 10 * column
+
+        on_cores(inner, range(3))
+        threads.extend(threads_of_blas())
+
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        on_cores(part, range(6))
+        assert set(threads) == {1}
+        assert set(threads_of_blas()) == {2}
+    np.testing.assert_array_equal(found, np.arange(6)[:, None] + 10 * np.arange(3))
+
+
+def test_a_part_that_fails_is_told_of_and_the_blas_has_its_threads_again():
+    def part(number):
+        if number == 2:
+            raise ValueError("the second")
+
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        with pytest.raises(ValueError, match="the second"):
+            on_cores(part, range(4))
+        assert set(threads_of_blas()) == {2}
+
+
+def test_parts_do_not_warn_of_nan():
+    found = np.zeros(2)
+
+    def part(number):
+        found[number] = np.sqrt(-1.0 - number * np.ones(()))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        on_cores(part, range(2))
+    assert np.isnan(found).all()
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 7, 1000])
+def test_parts_for_cores_cover_all_once(number):
+    covered = np.concatenate([np.arange(number)[part] for part in parts_for_cores(number)])
+    np.testing.assert_array_equal(covered, np.arange(number))
+
+
+@pytest.mark.parametrize("case", [sparse_problems.box, sparse_problems.disk])
+def test_a_factor_does_not_depend_on_how_its_fronts_are_shared(case, monkeypatch):
+    pattern, values, coordinates = case()
+    plan, values = on_host((analyse(pattern, coordinates), values))
+    alone = factorise(plan, values)
+    monkeypatch.setattr(multifrontal, "_WORTH_A_THREAD", 0)
+    monkeypatch.setattr(multifrontal, "parts_for_cores", lambda number: [slice(k, k + 1) for k in range(number)])
+    shared = factorise(plan, values)
+    for one, other in zip(alone.inverses + alone.lowers, shared.inverses + shared.lowers, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-14)
