@@ -18,6 +18,8 @@ from jeit.mesh import bisect, box, centroids, cut, measures
 from jeit.protocol import opposite
 
 SIZE, BATH = (0.1, 0.14, 0.1), 0.02
+# Of fits that are only looked at where they are.
+ROWS: Any = None
 BALL, RADIUS = np.array([0.012, -0.025, 0.055]), 0.022
 
 
@@ -183,7 +185,7 @@ def test_a_kind_is_doubted_by_the_data_alone_and_has_a_deviation_of_its_own(coar
         """The other kind is `worse`, and has twice the deviation."""
 
         def fit(self, bodies, coefficients, *steps):
-            return Fit(bodies, coefficients, 1.0)
+            return Fit(bodies, coefficients, 1.0, ROWS)
 
         def surprise(self, fit):
             return fit.bodies.odds + (0.0 if fit.bodies.other[0] == column else worse)
@@ -192,7 +194,7 @@ def test_a_kind_is_doubted_by_the_data_alone_and_has_a_deviation_of_its_own(coar
             return np.full(len(fit.coefficients), 0.1 if fit.bodies.other[0] == column else 0.2)
 
     problem: Any = Told()
-    fitted = Fit(bodies, coefficients, 1.0)
+    fitted = Fit(bodies, coefficients, 1.0, ROWS)
     ((other, deviation),) = search._alternatives(problem, fitted)  # pyright: ignore
     assert (other is None) == told
     if other is not None:
@@ -260,7 +262,7 @@ def test_on_a_finer_mesh_a_ball_changes_voltages_as_on_one_cut_along_it(coarse, 
     wanted = (there - rest) * (4 / 3 * np.pi * RADIUS**3 / inside)
     prior = EllipsoidPrior(modes=1, contrast=abs(np.log(factor)))
     balls = Ellipsoids.create(coarse.mesh, prior, [BALL], [1 if factor > 1 else -1])
-    fit = Fit(balls, balls.of_radii([RADIUS]), 0.0)
+    fit = Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS)
     there = finer(shape_problem(coarse), fit, (0.5,))
     assert coarse.mesh.num_points < there.problem.model.mesh.num_points < 3 * coarse.mesh.num_points
     change = there.change(coarse.protocol, there.bodies.image(fit.coefficients).image, 0.0)
@@ -274,7 +276,7 @@ def test_plates_and_discs_stay_where_they_are_on_a_finer_mesh():
     given = ForwardModel(mesh, electrodes, opposite(18, current=1e-3))
     problem = shape_problem(given)
     balls = Ellipsoids.create(mesh, EllipsoidPrior(), [[0.0, -0.06, 0.05]], [1])  # over the wall
-    there = finer(problem, Fit(balls, balls.of_radii([0.02]), 0.0), (0.3,))
+    there = finer(problem, Fit(balls, balls.of_radii([0.02]), 0.0, ROWS), (0.3,))
     model = there.problem.model
     assert model.mesh.num_points > 2 * mesh.num_points
     area, given_area = (np.asarray(one.electrodes.contact(one.mesh).load).sum(axis=0) for one in (model, given))
@@ -290,14 +292,14 @@ def test_cut_cells_are_harmonic_means_of_conductive_bodies_and_gentler_ones_of_r
 
 def test_finer_cells_know_which_they_come_from(coarse):
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
-    there = finer(shape_problem(coarse), Fit(balls, balls.of_radii([RADIUS]), 0.0), (0.3,))
+    there = finer(shape_problem(coarse), Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), (0.3,))
     volume = np.asarray(measures(there.problem.model.mesh))
     np.testing.assert_allclose(np.bincount(there.cell, volume), np.asarray(measures(coarse.mesh)), rtol=1e-9)
 
 
 def test_the_first_edges_that_make_a_mesh_grow_little_are_taken(coarse):
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
-    fit, problem = Fit(balls, balls.of_radii([RADIUS]), 0.0), shape_problem(coarse)
+    fit, problem = Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), shape_problem(coarse)
     few, many = (finer(problem, fit, (edge,)).problem.model.mesh.num_points for edge in (1.0, 0.2))
     assert few < 1.5 * coarse.mesh.num_points < many
     assert finer(problem, fit, (0.2, 1.0)).problem.model.mesh.num_points == few

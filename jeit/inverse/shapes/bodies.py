@@ -195,7 +195,7 @@ class Bodies(abc.ABC):
         size, d = len(self.weight), self.dimension
         rows = self.rows(coefficients)
         parts = [self.covered(k, row) for k, row in enumerate(rows)]
-        drift, everywhere = np.full((size, 1), self.prior.drift), slice(None)
+        drift, everywhere = np.full((size, 1), self.prior.drift), None
         image = coefficients[0] * drift[:, 0]
         slopes: list[tuple[Any, Any]] = [(everywhere, drift)]
         shares = np.zeros((len(parts), size))

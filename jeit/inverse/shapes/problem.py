@@ -23,11 +23,13 @@ from jeit_solvers import Descent, QuadraticModel, ridge_model
 
 
 class Fit(NamedTuple):
-    """Bodies and their `coefficients` (n,) of least `cost`."""
+    """Bodies and their `coefficients` (n,) of least `cost`; there, the residual and its Jacobian as `rows`, of the
+    problem that they were fitted to, whatever its covariance."""
 
     bodies: Bodies
     coefficients: Float[np.ndarray, " n"]
     cost: float
+    rows: tuple[Float[np.ndarray, " r"], Float[np.ndarray, "r n"]]
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,8 @@ class ShapeProblem:
         apart, more = bodies.prior.apart, np.eye(len(overlap))
 
         def jacobian():
-            changes = [Change(cells, conductivity[cells, None] * slope) for cells, slope in slopes]
+            there = [conductivity if cells is None else conductivity[cells] for cells, _ in slopes]
+            changes = [Change(cells, one[:, None] * slope) for one, (cells, slope) in zip(there, slopes, strict=True)]
             return np.concatenate([weight[:, None] * fields.derivatives(changes), apart * overlap_slope])
 
         return (
@@ -60,21 +63,25 @@ class ShapeProblem:
             scipy.linalg.block_diag(self.data.precision, more),
         )
 
-    def quadratic_model(self, coefficients: Float[np.ndarray, " n"], bodies: Bodies) -> QuadraticModel:
-        """Cost and step, for `jeit_solvers.Descent`; points that are refused need no Jacobian."""
-        residual, jacobian, covariance, precision = self.linearise(coefficients, bodies)
-        cost = 0.5 * (residual @ precision @ residual + coefficients @ coefficients)
-
-        def step(damping):
-            return ridge_model(residual, jacobian(), coefficients, covariance, precision)[1](damping)  # pyright: ignore
-
-        return cost, step
-
     def fit(self, bodies: Bodies, start: Float[np.ndarray, " n"], max_steps: int, rtol: float | None = None) -> Fit:
         """The least cost near `start`, by Levenberg-Marquardt."""
+        unknown = np.full((len(self.data.voltages), 1 + len(start)), np.nan)
+        accepted: list[Any] = [unknown[:, 0], unknown[:, 1:]]
+
+        def expand(coefficients, bodies) -> QuadraticModel:
+            residual, jacobian, covariance, precision = self.linearise(coefficients, bodies)
+            cost = 0.5 * (residual @ precision @ residual + coefficients @ coefficients)
+
+            def step(damping):  # points that are refused need no Jacobian
+                rows = jacobian()
+                accepted[:] = residual, rows
+                return ridge_model(residual, rows, coefficients, covariance, precision)[1](damping)  # pyright: ignore
+
+            return cost, step
+
         descent = Descent(rtol=rtol or self.rtol, damping=1.0, history=max_steps + 1)
-        coefficients, state = descent.at_once(self.quadratic_model, start, bodies, max_steps)
-        return Fit(bodies, coefficients, float(state.cost))
+        coefficients, state = descent.at_once(expand, start, bodies, max_steps)
+        return Fit(bodies, coefficients, float(state.cost), (accepted[0], accepted[1]))
 
     @property
     def uncertainty(self) -> float:
@@ -91,6 +98,7 @@ class ShapeProblem:
 
     def _hessian(self, fit: Fit) -> Float[np.ndarray, "n n"]:
         """H at the least cost."""
-        _, jacobian, _, precision = self.linearise(fit.coefficients, fit.bodies)
-        rows = jacobian()
-        return np.eye(len(fit.coefficients)) + rows.T @ (precision @ rows)
+        _, rows = fit.rows
+        channels = len(self.data.voltages)
+        weighed = np.concatenate([self.data.precision @ rows[:channels], rows[channels:]])
+        return np.eye(len(fit.coefficients)) + rows.T @ weighed

@@ -191,8 +191,8 @@ def _checked_start(start, dimension: int):
 
 def _grown(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
     """Bodies with all their modes, fitted to the data as round ones; and their coefficients."""
-    rounded, _, _ = found = problem.fit(*bodies.with_modes(1, coefficients), steps, _ROUGHLY)
-    return rounded.with_modes(bodies.prior.modes, found.coefficients)
+    found = problem.fit(*bodies.with_modes(1, coefficients), steps, _ROUGHLY)
+    return found.bodies.with_modes(bodies.prior.modes, found.coefficients)
 
 
 class _Setting(NamedTuple):
@@ -297,7 +297,7 @@ def _without_ghosts(
     """
     doubtful, missed = list(doubtful), np.zeros(len(fitted.bodies.sign)) if known is None else known.copy()
     while True:
-        bodies, coefficients, cost = fitted
+        bodies, coefficients, cost, _ = fitted
         # With one ghost fewer in whose place others can step, what was missed is missed as much.
         beyond_doubt = max(_SURELY * cost, problem.surprise(fitted) + _MARGIN)
         unsure, others = np.flatnonzero(missed <= beyond_doubt).tolist(), {}
@@ -314,7 +314,7 @@ def _without_ghosts(
 
 def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
     """The bodies with one of them split in two; None if the data do not tell of it."""
-    bodies, coefficients, cost = fitted
+    bodies, coefficients, cost, _ = fitted
     tried = [
         _grown(problem, *bodies.split(k, coefficients, number), _STEPS_TRIED)
         for k in range(len(bodies.sign))

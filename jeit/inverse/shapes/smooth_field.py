@@ -82,4 +82,4 @@ class SmoothField:
 
     def _left(self, fit: Fit) -> Float[np.ndarray, " r"]:
         """What bodies predict too much of the weighted voltages."""
-        return self.alone.linearise(fit.coefficients, fit.bodies)[0][: len(self.jacobian)]
+        return fit.rows[0][: len(self.jacobian)]
