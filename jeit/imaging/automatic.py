@@ -1,5 +1,6 @@
 """Linear or not: one step where that is sound, Gauss-Newton and shapes of strong bodies where it is not; and why."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from jeit.arguments import percent
 from jeit.imaging.method import METHODS, Imaged, NamedPrior, shapes_in
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
+from jeit.inverse.prior.defaults import MEASURED
 from jeit.inverse.shapes import ShapeReconstruction
 
 # Change relative to the background beyond which voltages are far from linear in it; and beyond which that must be
@@ -34,28 +36,34 @@ class Chosen(NamedTuple):
     shapes: ShapeReconstruction | None = None
 
 
-def image_automatically(prepared: PreparedDifference, prior: NamedPrior, segmented: bool = False) -> Chosen:
+def image_automatically(
+    prepared: PreparedDifference,
+    prior: NamedPrior,
+    segmented: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> Chosen:
     """The one-step image, unless it is unsound; then Gauss-Newton's with its bodies as shapes, unless that fails.
 
-    In a solid, bodies are looked for beside a sound one too. Each with its default λ. To be `segmented`, and no shapes:
-    the image by total variation.
+    In a solid, bodies are looked for beside a sound one too, unless a prior was asked for: it would only be that of the
+    field beside them. Each with its default λ. To be `segmented`, and no shapes: the image by total variation.
+    `progress` is called with the name of each stage of what takes long.
     """
     linear, newton = METHODS["one-step"], METHODS["gauss-newton"]
     imaged = linear.image(prepared, prior, linear.hyperparameter)
     if np.iscomplexobj(prepared.difference):
         return Chosen("one-step", "images of complex voltages are linear.", imaged)
-    fault = unsound(prepared, imaged[1])
+    fault, plain = unsound(prepared, imaged[1]), prepared.mesh.dimension == 3 and prior != MEASURED
     if fault:
         try:
             better = newton.image(prepared, prior, newton.hyperparameter)
         except ValueError as error:
             return Chosen("one-step", f"{fault}; but Gauss-Newton found no image. {error}", imaged)
         assert isinstance(better[0], Reconstruction)
-        shapes = _shapes(prepared, better[0])
+        shapes = None if plain else _shapes(prepared, better[0], progress)
         if shapes is not None or not segmented:
             outlined = "" if shapes is None else f", and its bodies' {_edges(prepared)} fitted"
             return _with_bodies(prepared, f"{fault}: solved for conductivity itself{outlined}.", better, shapes)
-    elif not segmented and (bodies := _bodies_in_solid(prepared, prior, imaged[1])):
+    elif not (segmented or plain) and (bodies := _bodies_in_solid(prepared, prior, imaged[1], progress)):
         return bodies
     if segmented:
         pieces = METHODS["total-variation"]
@@ -64,7 +72,9 @@ def image_automatically(prepared: PreparedDifference, prior: NamedPrior, segment
     return Chosen("one-step", "the linear image is sound: changes are small, and it explains the voltages.", imaged)
 
 
-def _bodies_in_solid(prepared: PreparedDifference, prior: NamedPrior, change: Float[Array, " m"]) -> Chosen | None:
+def _bodies_in_solid(
+    prepared: PreparedDifference, prior: NamedPrior, change: Float[Array, " m"], progress=None
+) -> Chosen | None:
     """Bodies that the data of a solid tell of, where a sound linear image shows more than a trace and noise allows."""
     noise = prepared.quality.difference_noise
     strongest = np.abs(np.asarray(change)).max() / float(prepared.calibration.conductivity)
@@ -76,7 +86,7 @@ def _bodies_in_solid(prepared: PreparedDifference, prior: NamedPrior, change: Fl
     except ValueError:
         return None
     assert isinstance(smooth[0], Reconstruction)
-    shapes = _shapes(prepared, smooth[0])
+    shapes = _shapes(prepared, smooth[0], progress)
     why = f"the voltages tell of bodies, which a linear image of a solid blurs: their {_edges(prepared)} were fitted."
     return shapes and _with_bodies(prepared, why, smooth, shapes)
 
@@ -94,10 +104,10 @@ def _edges(prepared: PreparedDifference) -> str:
     return "surfaces" if prepared.mesh.dimension == 3 else "outlines"
 
 
-def _shapes(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReconstruction | None:
+def _shapes(prepared: PreparedDifference, smooth: Reconstruction, progress) -> ShapeReconstruction | None:
     """The bodies of a smooth image as shapes, if there are any and they explain the voltages within what sharp outlines
     may miss, or as well as the image does."""
-    found = shapes_in(prepared, smooth)
+    found = shapes_in(prepared, smooth, progress)
     explains = float(found.misfit) <= max(1.0, float(smooth.misfit))
     return found if found.bodies and explains else None
 

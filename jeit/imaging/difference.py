@@ -197,7 +197,7 @@ def image_difference(
         why, shapes = "", None
         if settings.method == AUTO:
             chosen, why, (reconstruction, change), shapes = image_automatically(
-                prepared, settings.prior, settings.segment
+                prepared, settings.prior, settings.segment, progress
             )
             settings = replace(settings, method=chosen)
         else:

@@ -136,8 +136,11 @@ def _iterated(
     return found, found.conductivity - background
 
 
-def shapes_in(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReconstruction:
-    """The bodies that explain a difference, started from all that a smooth image of it shows.
+def shapes_in(
+    prepared: PreparedDifference, smooth: Reconstruction, progress: Callable[[str], None] | None = None
+) -> ShapeReconstruction:
+    """The bodies that explain a difference, started from all that a smooth image of it shows; `progress` is called with
+    the name of each stage.
 
     How much a body has to be missed, beyond what the evidence asks, is for errors of the model, which no noise tells.
     """
@@ -155,6 +158,7 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction) -> ShapeReco
         # Errors of the model are let stay in a solid, as a smooth field.
         least_rise=1 if solid else 1 + (LEAST_RISE - 1) * prepared.modelled_share,
         smooth=smooth if solid else None,
+        progress=progress,
     )
 
 

@@ -21,7 +21,8 @@ class ImagingSettings:
       solids, bodies as ellipsoids wherever the data tell of them (`jeit.inverse.shapes`); or one of `METHODS`: linear
       ones, iterative ones that solve for conductivity itself, and "shapes", outlines alone.
     - `prior`: a name in `jeit.inverse.prior.defaults.PRIORS`, or a quadratic prior; used by one-step, Gauss-Newton and
-      Levenberg-Marquardt imaging.
+      Levenberg-Marquardt imaging. With "auto", one that is not the default asks in solids for an image by it, and no
+      bodies.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; a number for total variation and filtered
       back-projection; not used by plain back-projection. With "auto" it asks for a one-step image. None:
       "noise-figure" for one-step images, 5 for Gauss-Newton and Levenberg-Marquardt, 300 for total variation, what

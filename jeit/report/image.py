@@ -148,7 +148,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "method": settings.method,
             "why": result.why or None,
             "least_change_relative_to_background": result.lowest,
-            "prior": _prior(settings),
+            "prior": _prior(settings, result.mesh.dimension),
             **_iteration(result),
         },
         "hyperparameter": {
@@ -269,9 +269,11 @@ def _form(body: Star | Ellipsoid) -> dict[str, Any]:
     return {"form": form, "volume": body.volume, "centre": body.centre, "half_axes": body.axes}
 
 
-def _prior(settings: ImagingSettings) -> str | None:
+def _prior(settings: ImagingSettings, dimension: int) -> str | None:
     """The prior's name, or that of the method's own; None where there is none."""
     method = METHODS[settings.method]
+    if settings.method == "shapes" and dimension == 3:
+        return "ellipsoids and columns"
     if not method.takes_prior:
         return method.prior
     return settings.prior if isinstance(settings.prior, str) else type(settings.prior).__name__

@@ -12,6 +12,7 @@ from jeit.electrodes import FacePatches
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
 from jeit.imaging import ImagedDifference, ImagingSettings, automatic, difference, method
+from jeit.inverse import Laplace
 from jeit.inverse.shapes import Ellipsoid, ShapeReconstruction
 from jeit.mesh import Disk, Rectangle, Solid, centroids
 from jeit.protocol import opposite, skip
@@ -78,6 +79,21 @@ def test_bodies_are_looked_for_in_solids_where_data_can_tell_of_them(monkeypatch
     data, change = prepared(dimension, strongest, noise)
     assert automatic._bodies_in_solid(data, "gaussian", change) is None
     assert bool(asked) == looks
+
+
+@pytest.mark.parametrize("fault", ["", "it is strong"])
+@pytest.mark.parametrize("prior", ["gaussian", "noser", Laplace()])
+def test_a_prior_that_is_asked_for_is_that_of_the_image(monkeypatch, prior, fault):
+    data, change = prepared(3, 0.1, 0.1)
+    data.difference = change
+    monkeypatch.setattr(automatic, "unsound", lambda *_: fault)
+    monkeypatch.setattr(automatic, "Reconstruction", SimpleNamespace)
+    monkeypatch.setattr(automatic, "_shapes", lambda *_: SimpleNamespace(conductivity=change))
+    for name in ("one-step", "gauss-newton"):
+        made = SimpleNamespace(image=lambda *_: (SimpleNamespace(), change), hyperparameter=5.0)
+        monkeypatch.setitem(automatic.METHODS, name, made)
+    chosen = automatic.image_automatically(data, prior)
+    assert chosen.method == ("shapes" if prior == "gaussian" else "gauss-newton" if fault else "one-step")
 
 
 @pytest.mark.parametrize("strongest", [0.1, 1.0])

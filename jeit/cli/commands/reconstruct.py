@@ -53,7 +53,8 @@ def reconstruct(
     prior: Annotated[
         str | None,
         typer.Option(
-            help="tikhonov, laplace, noser, gaussian (default) or matern; not for back-projection and total-variation."
+            help="tikhonov, laplace, noser, gaussian (default) or matern; not for back-projection and total-variation. "
+            "Another than the default asks in solids for an image by it, not for bodies."
         ),
     ] = None,
     hyperparameter: Annotated[

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -98,6 +98,7 @@ def reconstruct_shapes(
     prior: BodyPrior | None = None,
     least_rise: float = LEAST_RISE,
     smooth: Reconstruction | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> ShapeReconstruction:
     """The bodies, star shapes in a sheet and ellipsoids in a solid, that explain measured `voltages` (M,), in volts.
 
@@ -111,6 +112,7 @@ def reconstruct_shapes(
       evidence is not for them.
     - `smooth`: an image of the same channels by a smooth prior and no bounds; what it shows beside bodies is let stay
       as a `SmoothField`, of as much as the evidence is for, and only bodies that are told beside it are fitted.
+    - `progress` is called with the name of each stage as it begins: those of a solid take up to a minute.
 
     All are fitted together, as strong disks or balls first. Then one after the other is left out and the rest fitted
     again, and that which is missed least goes, for as long as it is missed so little. What errors of the model and
@@ -140,16 +142,19 @@ def reconstruct_shapes(
     problem = ShapeProblem(small, data, background, _ROUGHLY if solid else ShapeProblem.rtol)
     bodies = form.create(model.mesh, prior, centre, sign)
     setting = _Setting(problem, None if smooth is None else SmoothField.create(smooth, problem))
-    level, coefficients = 0.0, bodies.of_radii(radius)
+    level, coefficients, tell = 0.0, bodies.of_radii(radius), progress or (lambda stage: None)
+    tell("bodies")
     if smooth is not None:
         level, balls, _ = _told_one_by_one(setting, *bodies.with_modes(1, coefficients))
         bodies, coefficients = balls.bodies.with_modes(prior.modes, balls.coefficients)
         problem = setting.problem(level)
     fitted = problem.fit(*_grown(problem, bodies, coefficients, _FIRST_STEPS), _STEPS)
     found = _without_ghosts(problem, fitted, (), least_rise)
+    tell("bodies, how many")
     best, there = _Told(setting, level, _changed(problem, found, least_rise)), None
     if solid:
-        best, there = _on_finer_meshes(best, least_rise)
+        best, there = _on_finer_meshes(best, least_rise, tell)
+        tell("bodies, of which kind")
     (setting, level, (fitted, rises, doubtful)), beside = best, best.setting.beside
     bodies, coefficients = fitted.bodies, fitted.coefficients
     shown = bodies.on(model.mesh) if isinstance(bodies, Ellipsoids) else bodies
@@ -252,7 +257,7 @@ class _Told(NamedTuple):
     found: _Found
 
 
-def _on_finer_meshes(told: _Told, least_rise: float) -> tuple[_Told, Finer | None]:
+def _on_finer_meshes(told: _Told, least_rise: float, tell: Callable[[str], None]) -> tuple[_Told, Finer | None]:
     """The same fitted where the mesh is finer on their surfaces, again until they stay there; ghosts that a coarser one
     made are not. And the last of those meshes."""
     given, there = told.setting, None
@@ -260,6 +265,7 @@ def _on_finer_meshes(told: _Told, least_rise: float) -> tuple[_Told, Finer | Non
         _, level, (before, rises, doubtful) = told
         if not len(before.bodies.sign):
             break
+        tell(f"bodies, finer mesh {again + 1}")
         there = finer(given.alone, before, _EDGES[again > 0])
         setting, bodies, coefficients = given.on(there.problem), there.bodies, before.coefficients
         missed = np.array(rises) * before.cost
