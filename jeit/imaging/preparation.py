@@ -169,9 +169,11 @@ def prepare_difference(
 def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
     """Raise `ValueError` for a wiring that is not as described, as found on `reference`; not if taken `as_is`."""
     if wiring.fault and not as_is:
+        # With the opposite sign nothing can be calibrated, as it is or not.
+        otherwise = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
         raise ValueError(
-            f"'{reference.name}' does not fit its description: {wiring.fault} Mend the wires or the description; or go "
-            "on as it is (as_is=True, --as-is)."
+            f"'{reference.name}' does not fit its description: {wiring.fault} Mend the wires or the description"
+            f"{otherwise}."
         )
 
 

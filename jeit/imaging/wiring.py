@@ -114,7 +114,7 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
 
     best = misfit_of(plain)
     described = 1.0 if best.reversed_signs else best.misfit
-    if described < MOST_MISFIT:
+    if best.misfit < MOST_MISFIT:  # as described, or but for the sign
         return replace(best, described=described)
     best = with_exchanges(least([replace(plain, order=order) for order in orders], best))
     turned = [Wiring(places, order) for places in _turns(count) for order in orders]

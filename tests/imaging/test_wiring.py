@@ -93,6 +93,19 @@ def test_the_opposite_sign_is_found_also_beside_an_exchange():
     assert "opposite sign" in wiring.told
 
 
+def test_a_sign_that_explains_a_frame_alone_is_told_alone_and_with_no_way_out_that_is_shut():
+    """One of many turns may explain a little more."""
+    angle = 2 * np.pi * np.arange(64) / 64
+    oval = Polygon(np.stack([0.102 * np.cos(angle), 0.1 * np.sin(angle)], axis=1))
+    electrodes = BoundaryElectrodes(perimeter(oval, COUNT), 0.01, 0.05)
+    model = ForwardModel(imaging_mesh(oval, electrodes, 700), electrodes, adjacent(COUNT))
+    turned = tuple((k + 1) % COUNT for k in range(COUNT))
+    empty = measured(model, oval, turned, sign=-1)
+    assert find_wiring(model, empty).places == PLACES
+    with pytest.raises(ValueError, match=r"opposite sign: .* Mend the wires or the description\.$"):
+        prepare_difference(measured(model, oval, turned, sign=-1, conductivity=0.03), empty)
+
+
 def test_electrodes_counted_from_another_one_are_found_where_the_body_shows_it():
     domain = Polygon(np.array([[0, 0], [0.1, 0], [0.08, 0.06], [0, 0.05]]))
     electrodes = BoundaryElectrodes(perimeter(domain, COUNT, start=0.013), 0.008, 0.05)
