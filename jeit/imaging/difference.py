@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Array, Float, Inexact, UInt8
 
+from jeit.arguments import percent
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
 from jeit.image import Inclusion, Raster, SolidForm
@@ -33,6 +34,8 @@ from jeit_solvers.engines import as_array
 _MIDDLE = 0.5
 # Standard deviations by which the voltages of an image may miss the data.
 _MISFIT = 3.0
+# Share of the voltages that is to be left; and S/m, from tap water and fat to brine, with room on both sides.
+_FEW_CHANNELS, _CONDUCTIVITIES = 0.5, (1e-3, 30.0)
 
 
 @dataclass(frozen=True)
@@ -116,11 +119,11 @@ class ImagedDifference:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What speaks against believing the image, in sentences: an iteration that did not converge, voltages that it
-        does not explain, bodies that may as well be of another kind."""
-        if isinstance(self.reconstruction, LinearReconstruction):
-            return ()
-        found, said = self.reconstruction, []
+        """What speaks against believing the image, in sentences: channels too few or in another unit, an iteration that
+        did not converge, voltages that it does not explain, bodies that may as well be of another kind."""
+        found, said = self.reconstruction, _doubts_of_data(self)
+        if isinstance(found, LinearReconstruction):
+            return tuple(said)
         if isinstance(found, Reconstruction) and found.status != Status.CONVERGED:
             said.append(
                 f"the iteration did not converge ({found.status}): neither peaks nor places are to be trusted. "
@@ -163,6 +166,23 @@ class ImagedDifference:
         if not self.iterative:
             return self.change
         return as_array(np.log1p(np.asarray(self.change) / float(self.calibration.conductivity)))
+
+
+def _doubts_of_data(found: ImagedDifference) -> list[str]:
+    """Too few channels, or a background that no solid has."""
+    used, said = np.asarray(found.measurement.mask)[0], []
+    if (left := np.mean(used)) < _FEW_CHANNELS:
+        said.append(
+            f"only {used.sum()} of {used.size} voltages are left ({percent(float(left))}): they tell little of what "
+            "is where."
+        )
+    background, (low, high) = abs(complex(found.calibration.conductivity)), _CONDUCTIVITIES
+    if found.mesh.dimension == 3 and not low < background < high:
+        said.append(
+            f"a background of {background:.3g} S/m is no water's, gel's or tissue's, which conduct {low:g} to "
+            f"{high:g}: are currents in amperes, voltages in volts, lengths in metres?"
+        )
+    return said
 
 
 def image_difference(

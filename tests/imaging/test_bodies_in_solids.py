@@ -81,6 +81,28 @@ def test_bodies_are_looked_for_in_solids_where_data_can_tell_of_them(monkeypatch
     assert bool(asked) == looks
 
 
+@pytest.mark.parametrize(
+    ("background", "dimension", "left", "told"),
+    [
+        (0.2, 3, 0.9, []),
+        (0.2, 3, 0.3, ["only 3 of 10 voltages are left (30 %)"]),
+        (220.0, 3, 0.9, ["a background of 220 S/m is no water's"]),
+        (2e-4, 3, 0.9, ["a background of 0.0002 S/m is no water's"]),
+        (220.0, 2, 0.9, []),  # sheets have any
+    ],
+)
+def test_thin_data_and_units_that_cannot_be_are_doubted(background, dimension, left, told):
+    used = np.arange(10) < 10 * left
+    image: Any = SimpleNamespace(
+        measurement=SimpleNamespace(mask=used[None]),
+        calibration=SimpleNamespace(conductivity=background),
+        mesh=SimpleNamespace(dimension=dimension),
+    )
+    doubts = difference._doubts_of_data(image)
+    assert len(doubts) == len(told)
+    assert all(one in doubt for one, doubt in zip(told, doubts, strict=True))
+
+
 @pytest.mark.parametrize("fault", ["", "it is strong"])
 @pytest.mark.parametrize("prior", ["gaussian", "noser", Laplace()])
 def test_a_prior_that_is_asked_for_is_that_of_the_image(monkeypatch, prior, fault):
@@ -151,7 +173,8 @@ def test_where_electrodes_do_not_tell_the_kind_of_a_body_it_is_doubted_and_the_r
         alternative_deviations=(0.5, np.nan),
     )
     calibration = SimpleNamespace(conductivity=BATH)
-    image: Any = SimpleNamespace(shapes=shapes, reconstruction=shapes, calibration=calibration)
+    whole = SimpleNamespace(measurement=SimpleNamespace(mask=np.ones((1, 2), bool)), mesh=SimpleNamespace(dimension=3))
+    image: Any = SimpleNamespace(shapes=shapes, reconstruction=shapes, calibration=calibration, **vars(whole))
     low, high = np.transpose(ImagedDifference.peak_ranges.fget(image))  # pyright: ignore
     np.testing.assert_allclose(low, BATH * (np.array([3, 4]) * np.exp([-0.1, -0.2]) - 1))
     np.testing.assert_allclose(high, BATH * (np.array([6, 4]) * np.exp([0.5, 0.2]) - 1))
