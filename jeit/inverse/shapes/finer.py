@@ -28,7 +28,7 @@ from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
 # How many times the nodes a finer mesh may have.
-_MOST = 1.5
+_MOST = 2.5
 
 
 class Finer(NamedTuple):

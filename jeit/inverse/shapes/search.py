@@ -37,12 +37,13 @@ _SURELY = 10.0
 _MOST_CHANGES = 10
 # How often the mesh is made finer where bodies are, at most: they move by it. And the lengths of edges there, of the
 # least half axis, that are tried in turn: first while ghosts are among the bodies, and then.
-_MOST_MESHES, _EDGES = 3, ((0.7,), (0.35, 0.5, 0.7))
+_MOST_MESHES, _EDGES = 3, ((0.7,), (0.25, 0.35, 0.5, 0.7))
 # How much likelier (of the logarithm) more has to make the data than less, to be told; and one kind of body than the
 # other, not to be told as one of two.
 _MARGIN, _UNDECIDED = 2.0, 4.0
 # What the mesh adds to the deviation of a solid body's contrast, of log σ: balls of three times the bath are told as
-# 3.87, 3.59 and 3.31 times where edges on their surfaces are 0.7, 0.5 and 0.35 of the radius.
+# 3.87, 3.59 and 3.31 times where edges on their surfaces are 0.7, 0.5 and 0.35 of the radius, and as 3.1 to 3.2 times
+# where they are 0.25.
 _BY_THE_MESH = 0.1
 
 
