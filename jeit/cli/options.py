@@ -81,6 +81,23 @@ def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
+class StoppedError(Exception):
+    """Ctrl-C ended a command; what is said of it."""
+
+
+def telling_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
+    """A command that raises `StoppedError` on Ctrl-C, of which typer would say nothing."""
+
+    @wraps(command)
+    def call(*given: Any, **values: Any) -> Any:
+        try:
+            return command(*given, **values)
+        except KeyboardInterrupt:
+            raise StoppedError("stopped.") from None
+
+    return call
+
+
 @contextmanager
 def naming_options(options: dict[str, str]) -> Iterator[None]:
     """Errors that speak of these arguments speak of their options instead, see `in_options`."""

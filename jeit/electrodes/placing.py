@@ -27,7 +27,7 @@ def check_on_surface(position: Float[np.ndarray, "L 3"], allowed: Float[np.ndarr
             hint = "is the mesh in millimetres? Read it with scale = 1e-3."
         raise ValueError(
             f"position: electrode {number + 1} at {np.round(position[number], 6).tolist()} m lies "
-            f"{_told(far[number])} off the body's surface; {hint}"
+            f"{_told(float(far[number]))} off the body's surface; {hint}"
         )
 
 
@@ -51,10 +51,9 @@ def check_size(name: str, sizes: Float[np.ndarray, " L"], most: float, of: str) 
     """Raise `ValueError`, about the argument `name`, for the first electrode of more than `most` metres, the length
     `of` what it lies on."""
     for number in np.flatnonzero(sizes > (1 + _SAME) * most)[:1]:
-        hint = IN_MILLIMETRES if 10 * most < sizes[number] <= 1000 * most else "give the size of what lies on it."
-        raise ValueError(
-            f"{name}: electrode {number + 1}'s is {_told(sizes[number])}, larger than {of}, {_told(most)}; {hint}"
-        )
+        size = float(sizes[number])
+        hint = IN_MILLIMETRES if 10 * most < size <= 1000 * most else "give the size of what lies on it."
+        raise ValueError(f"{name}: electrode {number + 1}'s is {_told(size)}, larger than {of}, {_told(most)}; {hint}")
 
 
 def check_placed(electrodes: AbstractPlacedElectrodes, mesh: Mesh) -> None:
