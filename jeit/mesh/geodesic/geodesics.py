@@ -82,8 +82,9 @@ class Geodesics(eqx.Module):
         `ValueError` for places farther off the surface than a twentieth of its extent.
         """
         begun = sources if isinstance(sources, SurfacePlaces) else self._nearest("sources", sources)
-        reached = targets
-        if not (isinstance(targets, SurfacePlaces) or targets is None):
+        if isinstance(targets, SurfacePlaces) or targets is None:
+            reached = targets
+        else:
             reached = self._nearest("targets", targets)
         found = []
         for low in range(0, len(begun.triangle), _TOGETHER):
