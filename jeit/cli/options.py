@@ -131,9 +131,12 @@ def in_options(said: str, options: dict[str, str]) -> str:
     """
     from jeit.arguments import IN_MILLIMETRES
 
+    questions = IN_MILLIMETRES, "are both in metres?"
+
     for argument, option in options.items():
         if said.startswith((f"{argument} ", f"{argument}:")):
-            said = said.replace(f"; {IN_MILLIMETRES}", ".") if option.endswith("-mm") else said
+            for question in questions if option.endswith("-mm") else ():
+                said = said.replace(f"; {question}", ".")
             said = option + said.removeprefix(argument)
         said = re.sub(rf"\b{argument}=(?!\w)", option, said)
     return said
