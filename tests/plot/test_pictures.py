@@ -17,7 +17,7 @@ from jeit.electrodes import (
     plates,
 )
 from jeit.forward import ForwardModel
-from jeit.image import Inclusion
+from jeit.image import ImageSeries, Inclusion
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
@@ -25,6 +25,7 @@ from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import plot_raster
 from jeit.plot.imaging.inclusions import draw_inclusions
 from jeit.plot.imaging.sensitivity import plot_sensitivity
+from jeit.plot.imaging.series import plot_series
 from jeit.plot.imaging.voltages import plot_voltages
 from jeit.protocol import adjacent
 
@@ -208,6 +209,23 @@ def test_slice_of_a_solid(ax):
     assert colour_bar_label(ax) == "Change of conductivity (S/m)"
     with pytest.raises(ValueError, match="no mesh at z = 1"):
         plot_image(solid, lower, height=1.0)
+
+
+@pytest.mark.parametrize(("number", "titles"), [(4, 2), (5, 2), (6, 3)])
+def test_too_few_frames_have_no_spectrum(mesh, number, titles):
+    """Five have one frequency, which is no line."""
+    swing = np.cos(np.arange(number))[:, None] * np.ones(mesh.num_cells)
+    drawn = plot_series(ImageSeries(mesh, swing, 0.1 * np.arange(number)), {"all": np.ones(mesh.num_cells, bool)})
+    said = [ax.get_title() for ax in drawn.axes if ax.get_title()]
+    assert said == ["functional image", "regions over time", "their spectra"][:titles]
+    assert all(len(ax.lines[0].get_xdata()) > 1 for ax in drawn.axes if ax.get_title() in said[1:])
+
+
+def test_a_functional_image_of_a_solid_says_where_it_is_cut():
+    tank = Solid(Disk(RADIUS), 0.04).mesh(num_points=600)
+    series = ImageSeries(tank, np.ones((2, tank.num_cells)), np.arange(2.0))
+    for height, said in ((None, "20.0"), (0.03, "30.0")):
+        assert plot_series(series, {}, height=height).axes[0].get_title() == f"functional image, slice at z = {said} mm"
 
 
 def test_sensitivity_is_least_in_the_middle(mesh, electrodes, ax):
