@@ -21,6 +21,7 @@ from jeit.image import ImageSeries, Inclusion
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
+from jeit.plot.axes import bare, extent_of
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import plot_raster
 from jeit.plot.imaging.inclusions import draw_inclusions
@@ -144,6 +145,26 @@ def test_rings_round_a_tank_share_the_places_of_their_numbers(ax):
     assert not [c for c in ax.collections if isinstance(c, PatchCollection)]  # on the wall a disc is seen from its side
     draw_electrodes(tank, FacePatches(rings[:4], 0.01, 0.01, 0.1), ax=ax)
     assert not [c for c in ax.collections if isinstance(c, PatchCollection)]
+
+
+@pytest.mark.parametrize(("outline", "inches"), [(Disk(RADIUS), (5.0, 4.4)), (Rectangle(0.15, 0.2), (4.0, 3.6))])
+def test_numbers_of_rings_lie_beside_their_electrodes(outline, inches, ax):
+    tank = Solid(outline, 0.04).mesh(num_points=600)
+    level = ring(RADIUS, 16)
+    if isinstance(outline, Rectangle):
+        quarter = [[0.075, 0.025], [0.075, 0.075], [0.055, 0.1], [0.018, 0.1]]
+        level = np.concatenate([np.array(quarter) * side for side in ([1, 1], [-1, 1], [-1, -1], [1, -1])])
+    places = np.concatenate([np.column_stack([level, np.full(16, height)]) for height in (0.01, 0.03)])
+    bare(draw_electrodes(tank, FaceDiscs(places, 0.004, 0.1), ax=ax), extent_of(tank.points))
+    ax.figure.set_size_inches(inches)
+    ax.figure.canvas.draw()
+    dots, radius = ax.transData.transform(level), np.sqrt(28 / np.pi) * ax.figure.dpi / 72
+    assert len(ax.texts) == 16
+    for text in ax.texts:
+        box = text.get_window_extent()
+        away = np.maximum([box.x0, box.y0] - dots, dots - [box.x1, box.y1]).clip(0)
+        assert np.linalg.norm(away, axis=1).min() > radius, text.get_text()
+        assert ax.bbox.x0 <= box.x0 < box.x1 <= ax.bbox.x1  # not under the colour bar
 
 
 def test_a_slice_through_a_solid_has_its_outline(ax):
