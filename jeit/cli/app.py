@@ -25,7 +25,13 @@ from jeit.cli.commands.stream import stream
 from jeit.cli.commands.study import study
 from jeit.cli.commands.touch import touch
 from jeit.cli.commands.view import view
-from jeit.cli.options import naming_options, remembering_files, remove_empty_folders
+from jeit.cli.options import (
+    StoppedError,
+    naming_options,
+    remembering_files,
+    remove_empty_folders,
+    telling_when_stopped,
+)
 from jeit.start import discarded_damaged
 
 # Commands that run one program again and again: a frame in a third of the time.
@@ -98,8 +104,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             status = command.main(
                 args=sys.argv[1:] if arguments is None else list(arguments), prog_name="jeit", standalone_mode=False
             )
-    except KeyboardInterrupt:
-        return _fail("stopped.", 130)
+    except (KeyboardInterrupt, StoppedError) as stopped:
+        remove_empty_folders()
+        return _fail(str(stopped) or "stopped.", 130)
     except Exception as error:
         remove_empty_folders()
         if os.environ.get("JEIT_DEBUG"):
@@ -122,6 +129,8 @@ def _name_options(command) -> None:
     options = {one.name: max(one.opts, key=len) for one in command.params if one.param_type_name == "option"}
     if command.callback is not None and options:
         command.callback = remembering_files(naming_options(options)(command.callback))
+    if command.callback is not None:
+        command.callback = telling_when_stopped(command.callback)
 
 
 def _explain(error: Exception) -> int:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from jeit.image import Inclusion
 
 
+# Columns that all that is known of a body goes into.
+_WIDTH = 80
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
 
@@ -124,14 +126,23 @@ def inclusion_table(
     more = [*(["± 1 σ"] if ranges else []), *(["of back-\nground"] if background else [])]
     # All that a solid body has goes into 80 columns.
     close = {"box": None, "padding": (0, 1 if ranges else 2), "collapse_padding": True, "pad_edge": not ranges}
-    table = Table("inclusion", *places, size, f"peak change\n/ {unit}", *more, **close)
-    table.columns[0].min_width = max((len(one.kind) for one in inclusions), default=0)
-    for column in table.columns[1:]:
-        column.justify = "right"
+
+    rows = []
     for k, (inclusion, peak) in enumerate(zip(inclusions, peaks, strict=True)):
         place = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
-        more = [" to ".join(ends[2 * k : 2 * k + 2])] if ranges else []
-        more += [percent(inclusion.peak / background)] if background else []
-        kind = f"{inclusion.kind}\ncolumn" if inclusion.is_column else inclusion.kind
-        table.add_row(kind, *place, f"{1e6 * inclusion.area:.{digits}f}", peak, *more)
-    return table
+        after = [" to ".join(ends[2 * k : 2 * k + 2])] if ranges else []
+        after += [percent(inclusion.peak / background)] if background else []
+        rows.append([*place, f"{1e6 * inclusion.area:.{digits}f}", peak, *after])
+
+    def table_of(parted: str) -> Table:
+        """With this between the kind of a body and "column"."""
+        table = Table("inclusion", *places, size, f"peak change\n/ {unit}", *more, **close)
+        table.columns[0].min_width = max((len(one.kind) for one in inclusions), default=0)
+        for column in table.columns[1:]:
+            column.justify = "right"
+        for inclusion, row in zip(inclusions, rows, strict=True):
+            table.add_row(f"{inclusion.kind}{parted}column" if inclusion.is_column else inclusion.kind, *row)
+        return table
+
+    whole = table_of(" ")
+    return whole if Console(width=_WIDTH + 1).measure(whole).maximum <= _WIDTH else table_of("\n")

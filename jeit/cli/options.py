@@ -81,6 +81,23 @@ def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
+class StoppedError(Exception):
+    """Ctrl-C ended a command; what is said of it."""
+
+
+def telling_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
+    """A command that raises `StoppedError` on Ctrl-C, of which typer would say nothing."""
+
+    @wraps(command)
+    def call(*given: Any, **values: Any) -> Any:
+        try:
+            return command(*given, **values)
+        except KeyboardInterrupt:
+            raise StoppedError("stopped.") from None
+
+    return call
+
+
 @contextmanager
 def naming_options(options: dict[str, str]) -> Iterator[None]:
     """Errors that speak of these arguments speak of their options instead, see `in_options`."""
@@ -114,9 +131,12 @@ def in_options(said: str, options: dict[str, str]) -> str:
     """
     from jeit.arguments import IN_MILLIMETRES
 
+    questions = IN_MILLIMETRES, "are both in metres?"
+
     for argument, option in options.items():
         if said.startswith((f"{argument} ", f"{argument}:")):
-            said = said.replace(f"; {IN_MILLIMETRES}", ".") if option.endswith("-mm") else said
+            for question in questions if option.endswith("-mm") else ():
+                said = said.replace(f"; {question}", ".")
             said = option + said.removeprefix(argument)
         said = re.sub(rf"\b{argument}=(?!\w)", option, said)
     return said

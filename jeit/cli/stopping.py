@@ -20,7 +20,7 @@ _NO_MORE = object()
 _EVERY = 0.25
 
 
-class StoppedError(Exception):
+class _StoppedError(Exception):
     """A stream was stopped, and what is left to do is left out."""
 
 
@@ -58,7 +58,7 @@ class Stopping:
         def tell(what: str) -> None:
             part = "draw" if what.partition(":")[0] in pictures else "write"
             if part == "draw" and self.signal is not None:
-                raise StoppedError
+                raise _StoppedError
             if step.under_way != part:
                 step(part)
             step.tell(what)
@@ -72,10 +72,14 @@ class Stopping:
         try:
             yield
             held = f"; {' and '.join(files)} have them"
-        except (StoppedError, ValueError) as error:
+        except (_StoppedError, ValueError) as error:
             if self.signal is None:
                 raise
-            held = f"; {' and '.join(files)} have them" if isinstance(error, StoppedError) else ""
+            held = f"; {' and '.join(files)} have them" if isinstance(error, _StoppedError) else ""
+        except KeyboardInterrupt:
+            if self.signal is None or come.number:
+                raise
+            held = ""  # the first frame's programs were being compiled
         if self.signal is not None:
             self._end(f" after {counted(come.number, 'frame')}{held}")
 

@@ -100,9 +100,18 @@ def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str)
         made = make(position, *(getattr(table, size) for size in _SIZES[table.kind]), table.contact_impedance)
         if isinstance(body, Solid):
             check_on_solid(made, body)
+        elif isinstance(body, OwnMesh) and isinstance(made, FacePatches):
+            made.check(body.given)
         return made
     except ValueError as error:
-        raise located(error, origin, "electrodes") from None
+        raise located(_of_keys(str(error)), origin, "electrodes") from None
+
+
+def _of_keys(message: str) -> str:
+    """A message that begins with an argument of electrodes, beginning with the key of that."""
+    argument, colon, rest = message.partition(": ")
+    key = {"position": "positions", "positions": "positions", "width": "width", "height": "height"}.get(argument)
+    return f"electrodes.{key}{colon}{rest}" if key else message
 
 
 def _facets(table: FacetsTable, body: Body | None) -> AbstractElectrodes:

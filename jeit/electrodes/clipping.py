@@ -58,7 +58,7 @@ def _pushed_within(outline: Float[Array, "*q k 2"], axis: int, half: Float[Array
     meets = [xp.clip((side * half - outline[..., axis]) / slope, 0, 1) for side in (-1, 1)]
     share = xp.stack([xp.zeros_like(along), xp.minimum(*meets), xp.maximum(*meets)], axis=-1)
     corners = outline[..., None, :] + share[..., None] * step[..., None, :]
-    corners = corners.reshape(*corners.shape[:-3], -1, 2)
+    corners = corners.reshape(*corners.shape[:-3], 3 * corners.shape[-3], 2)  # of no triangle too
     own = xp.clip(corners[..., axis], -half, half)
     other = corners[..., 1 - axis]
     return xp.stack([own, other] if axis == 0 else [other, own], axis=-1)

@@ -112,7 +112,8 @@ def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> Fac
     for tag in tags:
         if tag not in mesh.tags:
             known = ", ".join(sorted(mesh.tags)) or "none"
-            raise ValueError(f"The mesh has no facets tagged '{tag}'; its tags are: {known}.")
+            flat = " It is a surface, without tetrahedra: mesh the volume within." if mesh.is_surface else ""
+            raise ValueError(f"The mesh has no facets tagged '{tag}'; its tags are: {known}.{flat}")
     return FacetElectrodes(mesh, [np.asarray(mesh.tags[tag]) for tag in tags], contact_impedance)
 
 

@@ -17,6 +17,7 @@ from jeit.electrodes.electrodes import (
     as_positions,
     check_dimension,
 )
+from jeit.electrodes.placing import check_apart, check_placed
 from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undifferentiated
@@ -100,16 +101,19 @@ class FacePatches(AbstractPlacedElectrodes):
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for patches off the surface, overlapping, or too small for the mesh."""
+        """Raise `ValueError` for patches off the surface, overlapping, larger than the body, or too small for the
+        mesh."""
         check_dimension("FacePatches", mesh, 3)
         if not has_values(self, mesh):
             return
         electrodes, mesh = on_host((self, mesh))
+        check_apart(electrodes.position, np.minimum(electrodes.width, electrodes.height))
         touched = electrodes.contact(mesh).load * electrodes.contact_impedance
         share = touched.sum(axis=0) / (electrodes.width * electrodes.height)
         # A patch bent round a wall is longer than its chord, by a tenth at 80° of arc.
         wrong = np.flatnonzero((share < 0.8) | (share > 1.25))
         if wrong.size:
+            check_placed(electrodes, mesh)
             raise ValueError(
                 f"position: {100 * share[wrong[0]]:.0f} % of electrode {wrong[0] + 1}'s area is found on the mesh's "
                 "surface; move it onto the surface, or refine the mesh there if the patch is smaller than a facet."

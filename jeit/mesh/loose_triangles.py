@@ -17,6 +17,8 @@ _HEADER = 84
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 # Nodes that are nearer, relative to the largest coordinate, are one: such files keep six digits of them.
 _SEAM = 2e-6
+# Letters of what is said of a file's content.
+_LONGEST = 120
 # Times its size in the file that what is read of one takes in memory, at most: faces of an .obj file are told in few
 # letters.
 _GROWTH = {".stl": 8, ".obj": 16}
@@ -34,7 +36,8 @@ def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     try:
         points, cells = _stl(content) if ending == ".stl" else _obj(content)
     except (ValueError, IndexError, OverflowError) as error:
-        said = " ".join(str(error).split())[:80]
+        said = " ".join(str(error).split())
+        said = said if len(said) <= _LONGEST else f"{said[:_LONGEST]} …"
         raise ValueError(f"path: {name} does not work as a mesh file: {said}.") from None
     if not len(cells):
         raise ValueError(f"path: {name} does not work as a mesh file: there are no triangles in it.")

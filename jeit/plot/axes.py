@@ -29,14 +29,24 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes
     return pyplot.subplots(figsize=size, layout="constrained")[1]
 
 
+# Over the size of a body: how far numbers stand from it, and how long a digit is in a small picture.
+_AWAY, _LETTER = 0.04, 0.021
+
+
 def bare(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool = True) -> None:
     """Equal scales, no frame and no ticks; round the `extent` (metres) room for a scale bar and, if electrodes are
-    `numbered`, for that."""
+    `numbered`, for that: as much as numbers that begin beside it are long."""
     x_min, x_max, y_min, y_max = extent
     size = max(x_max - x_min, y_max - y_min)
     room = (0.12 if numbered else 0.06) * size
+    begun = [
+        one
+        for one in ax.texts
+        if one.get_horizontalalignment() != "center" and not x_min <= one.get_position()[0] <= x_max
+    ]
+    across = max([room, *((_AWAY + _LETTER * len(one.get_text())) * size for one in begun)])
     ax.set_aspect("equal")
-    ax.set_xlim(x_min - room, x_max + room)
+    ax.set_xlim(x_min - across, x_max + across)
     ax.set_ylim(y_min - 0.18 * size, y_max + (room if numbered else 0.03 * size))
     ax.set_axis_off()
 

@@ -50,8 +50,10 @@ def write_film(
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
 
+    from jeit.plot.axes import SOFT
     from jeit.plot.colour_scale import ColourScale
     from jeit.plot.imaging.frames import FramePicture, chosen_frames, fit_scale
+    from jeit.plot.imaging.mesh import slice_told
 
     path, values = Path(path), np.asarray(changes)
     check_film(path.name)
@@ -61,6 +63,8 @@ def write_film(
     picture = FramePicture(figure.subplots(), mesh, electrodes, fitted)
     fitted.draw_bar(picture.ax, picture.drawn)
     picture.show(values[chosen[0]], said[chosen[0]])
+    if told := slice_told(mesh):
+        figure.supxlabel(told, fontsize=9, color=SOFT)
     figure.canvas.draw()
     figure.set_layout_engine("none")  # or the picture would move from frame to frame
     pace = min(_PACE if rate is None else rate * len(chosen) / len(values), _FASTEST)

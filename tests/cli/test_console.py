@@ -69,10 +69,13 @@ def test_all_that_is_known_of_a_large_body_goes_on_a_line():
 
 
 def test_columns_are_called_so():
+    """On one line where all of the table goes into 80 columns."""
     form = SolidForm((0.0, 0.0, 0.0), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.05)), True)
-    column = Inclusion(1, (0.0, 0.0, 0.0), 3e-5, 0.2, form=form)
-    first = [line[0] for line in printed([column, BODIES[1]]) if line]
-    assert first[-3:] == ["conductive", "column", "resistive"]
+    column = Inclusion(1, (-0.2595, -0.1297, 0.1477), 0.0123456, 0.999, form=form)
+    first = [line[:2] for line in printed([column, BODIES[1]]) if line]
+    assert [first[-2], first[-1][0]] == [["conductive", "column"], "resistive"]
+    lines = printed([column, BODIES[1]], [(0.529, 0.9999), (-0.4567, -0.111)], background=0.205)
+    assert [line[0] for line in lines if line][-3:] == ["conductive", "column", "resistive"]
 
 
 @pytest.mark.parametrize(("dimension", "edge"), [(2, "outlines"), (3, "surfaces")])

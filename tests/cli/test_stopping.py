@@ -64,6 +64,11 @@ def test_before_there_is_a_frame(tank, streamed, tmp_path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["frames.csv"]
 
 
+def test_before_the_first_frame_is_asked_for(streamed, tank, monkeypatch):
+    monkeypatch.setattr("jeit.report.write_stream", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    assert streamed(lines(tank, 3)) == (130, "", "jeit: stopped after 0 frames.\n")
+
+
 def test_while_it_is_made_ready(tank, streamed, tmp_path, monkeypatch):
     monkeypatch.setattr("jeit.imaging.stream_preparation.find_wiring", lambda *_: signal.raise_signal(signal.SIGTERM))
     status, _, error = streamed(lines(tank, 3))
@@ -105,6 +110,13 @@ def test_while_images_are_written_and_again(tank, streamed, tmp_path, monkeypatc
     status, _, error = streamed(lines(tank, 3))
     assert (status, error) == (143, "jeit: stopped.\n")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["frames.csv"]
+
+
+def test_an_image_is_stopped(tank, run, tmp_path, monkeypatch):
+    monkeypatch.setattr("jeit.imaging.preparation.find_wiring", lambda *_: signal.raise_signal(signal.SIGINT))
+    given = "--reference", tank.folder / "rest.csv", "--num-points", 250, "--quiet", "--output", tmp_path / "a" / "out"
+    assert run("reconstruct", tank.folder / "touched.csv", *given) == (130, "", "jeit: stopped.\n")
+    assert not (tmp_path / "a").exists()
 
 
 def test_what_was_ignored_is_ignored():

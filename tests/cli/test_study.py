@@ -2,6 +2,7 @@
 
 import errno
 import os
+import signal
 import sys
 
 import pytest
@@ -62,6 +63,18 @@ def test_run_stop_resume_and_report(file, run, monkeypatch):
     assert "something else already" in failed(run("study", "run", file, "--output", file))
     file.write_text(SMALL.replace("rows = 5", "rows = 6"), "utf-8")
     assert "another study, or of this one before it was changed" in failed(run("study", "resume", file))
+
+
+def test_a_study_is_stopped_and_goes_on(file, run, monkeypatch):
+    def stopped(*_):
+        signal.raise_signal(signal.SIGINT)
+
+    for output, asked in ((), ""), (("--output", file.parent / "o.zarr"), f" --output {file.parent / 'o.zarr'}"):
+        with monkeypatch.context() as patch:
+            patch.setattr(Store, "write_array", stopped)
+            status, _, error = run("study", "run", file, "--quiet", *output)
+        assert (status, error) == (130, f"jeit: stopped; 'jeit study resume {file}{asked}' goes on with it.\n")
+    assert run("study", "resume", file, "--quiet")[0] == 0
 
 
 @pytest.mark.parametrize("command", ["run", "resume"])

@@ -16,7 +16,8 @@ SQUARE = [[0.0, 0.0], [0.1, 0.0], [0.1, 0.1], [0.0, 0.1]]
 
 
 def described(geometry, electrodes=RING, folder="."):
-    return parse_description({"geometry": geometry, "electrodes": electrodes}, "d.toml", folder)
+    electrodes = {} if electrodes is None else {"electrodes": electrodes}
+    return parse_description({"geometry": geometry, **electrodes}, "d.toml", folder)
 
 
 def test_a_cylinder_with_a_ring_of_discs():
@@ -192,6 +193,27 @@ WRONG = {
         r"geometry\.radius is missing; .* geometry\.raduis is no key of a cylinder .*'radius'\?\).*"
         r" electrodes\.contact_impedance is missing; give it\. (Wrong too: )?electrodes\.impedance",
     ),
+    "wide": (
+        CYLINDER,
+        STRIP | {"width": 12, "height": 0.02},
+        r"electrodes\.width: electrode 1's is 12 m, larger than the body, 100 mm; were millimetres given for metres\?$",
+    ),
+    "tall": (CYLINDER, STRIP | {"height": 0.08}, r"electrodes\.height: electrode 1 reaches from -0\.02 to 0\.06 m"),
+    "one place": (
+        CYLINDER,
+        PATCH | {"positions": [[0.05, 0, 0.02]] * 16, "contact_impedance": 1e-3},
+        r"electrodes\.positions: electrodes 1 and 2 are at the same place, \[0\.05, 0\.0, 0\.02\] m; give each its own",
+    ),
+    "places in millimetres": (
+        CYLINDER,
+        PATCH | {"positions": [[50, 0, 20], [0, 50, 20]], "contact_impedance": 1e-3},
+        r"electrodes\.positions: electrode 1 .* lies 53\.8 m off .*; were millimetres given for metres\?$",
+    ),
+    "a place near the wall": (
+        CYLINDER,
+        PATCH | {"positions": [[0.055, 0, 0.02], [0, 0.05, 0.02]], "contact_impedance": 1e-3},
+        r"electrode 1 .* lies 5 mm off the body's surface; give a place on it\.$",
+    ),
     "facets": (CYLINDER, FACETS, r"facets that a mesh has names for: give \[geometry\] mesh"),
 }
 
@@ -209,6 +231,28 @@ def test_what_is_no_mesh_is_told_with_the_key_alone(tmp_path):
         ValueError, match=r"^d\.toml: geometry\.mesh: junk\.msh does not work .* its content does not fit"
     ):
         described({"mesh": "junk.msh"}, FACETS, tmp_path)
+
+
+def test_patches_on_a_mesh_of_another_unit(folder):
+    """None of its facets is near one."""
+    patches = PATCH | {"positions": [[0.05, 0, 0.02], [0, 0.05, 0.02]], "contact_impedance": 1e-3}
+    described({"mesh": "plates.msh", "scale": 1e-2}, patches | {"width": 0.03, "height": 0.03}, folder)
+    said = r"lies 20 mm off the body's surface; is the mesh in millimetres\? Read it with scale = 1e-3\.$"
+    with pytest.warns(UserWarning, match="is large"), pytest.raises(ValueError, match=said):
+        described({"mesh": "plates.msh", "scale": 10}, patches, folder)
+    placed = FacePatches([[50, 0, 20], [0, 50, 20]], 0.01, 0.01, 1e-3)
+    body = described({"mesh": "plates.msh", "scale": 1e-2}, None, folder).domain
+    with pytest.raises(ValueError, match=r"^position: electrode 1 .* were millimetres given for metres\?$"):
+        placed.check(body.given)
+    with pytest.raises(ValueError, match=r"^d\.toml: electrodes\.width: .* 12 m, larger than the body, 14\d mm"):
+        described({"mesh": "plates.msh", "scale": 1e-2}, patches | {"width": 12}, folder)
+
+
+def test_a_surface_is_no_volume(folder):
+    corners = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    write(Mesh.create(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]), folder / "shell.vtu")
+    with pytest.raises(ValueError, match=r"tagged 'a'.* It is a surface, without tetrahedra: mesh the volume"):
+        described({"mesh": "shell.vtu"}, FACETS, folder)
 
 
 def test_a_layout_on_a_mesh_is_refused(folder):

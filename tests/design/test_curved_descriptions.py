@@ -13,6 +13,7 @@ from jeit.design.study.batch import check_points
 from jeit.layout import SurfaceLayout, read_surface_layout, write_layout
 from jeit.mesh import forearm, measures, sphere, tube, write
 from jeit.mesh.geodesic import Triangles
+from jeit.mesh.sizes import size_told
 from jeit.report.study.pictures import draw_maps
 
 TUBE = 'kind = "tube"\nradius_mm = 30\nheight_mm = 80'
@@ -91,6 +92,18 @@ def test_a_scan_is_read_in_its_unit_with_its_own_cells(described, tmp_path):
     assert described(text.replace("layout =", "layouts ="), read_study) != study
 
 
+@pytest.mark.parametrize("kind", ["layout", "layouts"])
+@pytest.mark.parametrize(("of_file", "given", "across"), [("mm", "m", "120 m"), ("m", "mm", "0.12 mm")])
+def test_a_scan_in_another_unit_is_told_by_its_key(described, tmp_path, kind, of_file, given, across):
+    length = {"mm": 120.0, "m": 0.12}[of_file]
+    with size_told():
+        write(forearm(length, (length / 4, length / 6), length / 3, num_points=400), tmp_path / "arm.stl")
+    text = SKIN.replace(TUBE, f'file = "arm.stl"\nunit = "{given}"').replace("[mesh]\ncell_mm = 8\n", "")
+    said = rf'^skin\.toml: surface\.unit: in "{given}" the skin would be {across} across; give "{of_file}", in which'
+    with pytest.raises(ValueError, match=said):
+        described(text.replace("layout =", f"{kind} ="), read_described_skin if kind == "layout" else read_study)
+
+
 STEP = 'file = "part.STEP"\nunit = "mm"'
 
 
@@ -151,6 +164,7 @@ def test_electrodes_by_position(described, tmp_path):
             "[skin]\nwidth_mm = 100\nheight_mm = 80\n[surface]",
             r"skin\.height_mm has no effect: the table surface says",
         ),
+        ("[surface]", "[skin]\nwidth_mm = 100\n[surface]", r"skin\.width_mm has no effect: the table surface says"),
         (TUBE, 'file = "arm.stl"\nunit = "mm"', r"mesh\.cell_mm has no effect"),
         (TUBE, 'file = "arm.stl"', r"surface\.unit is missing"),
         (f"{TUBE}\n", 'file = "no.stl"\nunit = "mm"\n', "surface: .*no file"),

@@ -95,6 +95,7 @@ LEADING = {
     "no text": ("a.msh", bytes(range(256)), "does not work as a mesh file"),
     "nothing": ("a.vtk", "", "does not work as a mesh file: it is empty"),
     "no mesh at all": ("a.msh", "hello", f"file: {UNFIT}, which says: Error: Couldn't read file a.msh as gmsh."),
+    "no triangles": ("a.stl", "hello\n", "text that begins with 'solid' nor as long as its number of triangles asks."),
     "no cells": ("a.inp", "hello", "does not work as a mesh file: there are no cells in it"),
     "cut off": (
         "a.msh",

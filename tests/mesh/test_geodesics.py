@@ -131,6 +131,16 @@ def test_limits_and_nearness():
         assert set(np.flatnonzero(full[row] < 0.0399)) <= set(index)
 
 
+def test_refuses_places_off_the_surface():
+    ways, on = Geodesics.create(tube(RADIUS, 0.1, num_points=300)), [[RADIUS, 0, 0.05]]
+    assert np.isfinite(ways.distances([[1.04 * RADIUS, 0, 0.05]], on)).all()
+    said = r": 1 of 1 lie off the surface, the first, at \[5\.0, 0\.0, 0\.0\] m, by 4\.9\d+e\+03 mm; give places on it"
+    with pytest.raises(ValueError, match="^sources" + said):
+        ways.distances([[5.0, 0, 0]], on)
+    with pytest.raises(ValueError, match="^targets" + said):
+        ways.distances(on, [[5.0, 0, 0]])
+
+
 def test_what_is_not_developable_says_how_far_it_is_stretched():
     told = unroll(sphere(0.05, num_points=600))
     assert told.mean_distortion > 0.05

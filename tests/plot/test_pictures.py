@@ -17,14 +17,16 @@ from jeit.electrodes import (
     plates,
 )
 from jeit.forward import ForwardModel
-from jeit.image import Inclusion
+from jeit.image import ImageSeries, Inclusion
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
+from jeit.plot.axes import bare, extent_of
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import plot_raster
 from jeit.plot.imaging.inclusions import draw_inclusions
 from jeit.plot.imaging.sensitivity import plot_sensitivity
+from jeit.plot.imaging.series import plot_series
 from jeit.plot.imaging.voltages import plot_voltages
 from jeit.protocol import adjacent
 
@@ -145,6 +147,26 @@ def test_rings_round_a_tank_share_the_places_of_their_numbers(ax):
     assert not [c for c in ax.collections if isinstance(c, PatchCollection)]
 
 
+@pytest.mark.parametrize(("outline", "inches"), [(Disk(RADIUS), (5.0, 4.4)), (Rectangle(0.15, 0.2), (4.0, 3.6))])
+def test_numbers_of_rings_lie_beside_their_electrodes(outline, inches, ax):
+    tank = Solid(outline, 0.04).mesh(num_points=600)
+    level = ring(RADIUS, 16)
+    if isinstance(outline, Rectangle):
+        quarter = [[0.075, 0.025], [0.075, 0.075], [0.055, 0.1], [0.018, 0.1]]
+        level = np.concatenate([np.array(quarter) * side for side in ([1, 1], [-1, 1], [-1, -1], [1, -1])])
+    places = np.concatenate([np.column_stack([level, np.full(16, height)]) for height in (0.01, 0.03)])
+    bare(draw_electrodes(tank, FaceDiscs(places, 0.004, 0.1), ax=ax), extent_of(tank.points))
+    ax.figure.set_size_inches(inches)
+    ax.figure.canvas.draw()
+    dots, radius = ax.transData.transform(level), np.sqrt(28 / np.pi) * ax.figure.dpi / 72
+    assert len(ax.texts) == 16
+    for text in ax.texts:
+        box = text.get_window_extent()
+        away = np.maximum([box.x0, box.y0] - dots, dots - [box.x1, box.y1]).clip(0)
+        assert np.linalg.norm(away, axis=1).min() > radius, text.get_text()
+        assert ax.bbox.x0 <= box.x0 < box.x1 <= ax.bbox.x1  # not under the colour bar
+
+
 def test_a_slice_through_a_solid_has_its_outline(ax):
     tank = Solid(Disk(RADIUS), 0.04).mesh(num_points=1200)
     plot_image(tank, np.zeros(tank.num_cells), ax=ax)
@@ -208,6 +230,23 @@ def test_slice_of_a_solid(ax):
     assert colour_bar_label(ax) == "Change of conductivity (S/m)"
     with pytest.raises(ValueError, match="no mesh at z = 1"):
         plot_image(solid, lower, height=1.0)
+
+
+@pytest.mark.parametrize(("number", "titles"), [(4, 2), (5, 2), (6, 3)])
+def test_too_few_frames_have_no_spectrum(mesh, number, titles):
+    """Five have one frequency, which is no line."""
+    swing = np.cos(np.arange(number))[:, None] * np.ones(mesh.num_cells)
+    drawn = plot_series(ImageSeries(mesh, swing, 0.1 * np.arange(number)), {"all": np.ones(mesh.num_cells, bool)})
+    said = [ax.get_title() for ax in drawn.axes if ax.get_title()]
+    assert said == ["functional image", "regions over time", "their spectra"][:titles]
+    assert all(len(ax.lines[0].get_xdata()) > 1 for ax in drawn.axes if ax.get_title() in said[1:])
+
+
+def test_a_functional_image_of_a_solid_says_where_it_is_cut():
+    tank = Solid(Disk(RADIUS), 0.04).mesh(num_points=600)
+    series = ImageSeries(tank, np.ones((2, tank.num_cells)), np.arange(2.0))
+    for height, said in ((None, "20.0"), (0.03, "30.0")):
+        assert plot_series(series, {}, height=height).axes[0].get_title() == f"functional image, slice at z = {said} mm"
 
 
 def test_sensitivity_is_least_in_the_middle(mesh, electrodes, ax):

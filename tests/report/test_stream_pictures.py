@@ -96,6 +96,15 @@ def test_long_streams_make_short_films(tmp_path, monkeypatch):
         assert (shown.n_frames, shown.info["duration"]) == (4, 40)  # no faster than 25 a second
 
 
+def test_a_film_of_a_solid_says_where_its_slices_are(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr("matplotlib.figure.Figure.supxlabel", lambda _, said, **__: told.append(said))
+    solid = Solid(Disk(RADIUS), 0.04).mesh(num_points=600)
+    write_film(tmp_path / "a.gif", solid, np.ones((1, solid.num_cells)))
+    write_film(tmp_path / "b.gif", MESH, changes(1))
+    assert told == ["slice at z = 20.0 mm"]
+
+
 def test_films_of_other_kinds_are_refused(tmp_path, monkeypatch):
     from matplotlib.animation import FFMpegWriter
 

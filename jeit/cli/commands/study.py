@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.options import Quiet, naming_options
+from jeit.cli.options import Quiet, StoppedError, naming_options
 
 if TYPE_CHECKING:
     from jeit.design.study import Progress, Study
@@ -122,17 +122,23 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
     console = plain_console()
     done, left = (TextColumn(f"{{{said}}}", markup=False) for said in ("task.description", "task.fields[left]"))
     columns = (done, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), left)
-    with ExitStack() as stack:
-        client = None if scheduler is None else stack.enter_context(connected(scheduler))
-        bar = stack.enter_context(Bar(*columns, console=console, disable=quiet))
-        task = bar.add_task("points", total=len(sweep.points), left="")
+    try:
+        with ExitStack() as stack:
+            client = None if scheduler is None else stack.enter_context(connected(scheduler))
+            bar = stack.enter_context(Bar(*columns, console=console, disable=quiet))
+            task = bar.add_task("points", total=len(sweep.points), left="")
 
-        def show(now: "Progress") -> None:
-            left = "" if now.seconds_left is None else f"{_duration(now.seconds_left)} left"
-            bar.update(task, completed=now.points, left=left)
+            def show(now: "Progress") -> None:
+                left = "" if now.seconds_left is None else f"{_duration(now.seconds_left)} left"
+                bar.update(task, completed=now.points, left=left)
 
-        run_study(sweep, store, client=client, progress=show)
-    write_study_report(sweep, store, where)
+            run_study(sweep, store, client=client, progress=show)
+        write_study_report(sweep, store, where)
+    except KeyboardInterrupt:
+        if not store.exists():
+            raise
+        other = "" if store == file.with_suffix(".zarr") else f" --output {store}"
+        raise StoppedError(f"stopped; 'jeit study resume {file}{other}' goes on with it.") from None
     if not quiet:
         say_written(console, store, str(where))
 

@@ -58,7 +58,7 @@ def view(
             console.print(f"  pictures, not a window: {missing}", highlight=False, markup=False)
     folder = image.parent / "view" if output is None else output
     make_folder(folder, VIEW_FILES)
-    with naming_options({"levels": "--level", "at": "--slices"}):
+    with naming_options({"levels": "--level", "at": "--slices", "plane": "--plane-mm"}):
         names = write_views(saved, folder, camera=camera, levels=levels, planes=planes, axis=axis, slices=slices)
     if not quiet:
         say_written(console, folder / names[0], *names[1:])

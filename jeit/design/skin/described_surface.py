@@ -10,12 +10,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jeit.arguments import told
+from jeit.layout.layout import LARGEST, SMALLEST
 from jeit.mesh import Mesh, bend, cap, forearm, from_gmsh, measures, read, rectangle, sphere, tube
+from jeit.mesh.sizes import size_told
 
 if TYPE_CHECKING:
     from jeit.design.skin.surface_tables import SurfaceTable
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
+# A skin's extent, metres, from which a likely unit is found.
+_USUAL = 0.15
 # An equilateral triangle's side, over the root of its area.
 _SIDE = 2 / 3**0.25
 
@@ -27,9 +31,31 @@ def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Me
     CAD file without Gmsh.
     """
     try:
-        return _made(table, folder, cell_size)
+        with size_told():  # what is too large is refused
+            surface = _made(table, folder, cell_size)
     except (ValueError, OSError) as error:
         raise ValueError(f"surface: {error}") from None
+    _check_unit(table, surface)
+    return surface
+
+
+def _check_unit(table: SurfaceTable, surface: Mesh) -> None:
+    """Raise `ValueError` for a file's surface as large, or small, as no skin is, with the likely unit."""
+    from jeit.design.skin.surface_tables import ScanTable
+
+    extent = float(np.ptp(np.asarray(surface.points), axis=0).max())
+    if not isinstance(table, ScanTable) or SMALLEST <= extent <= LARGEST:
+        return
+    across = {unit: extent * one / _UNITS[table.unit] for unit, one in _UNITS.items()}
+    likely = min(across, key=lambda unit: abs(np.log(across[unit] / _USUAL)))
+    hint = (
+        f'give "{likely}", in which it is {_told(across[likely])}' if likely != table.unit else "is it the right file?"
+    )
+    raise ValueError(f'surface.unit: in "{table.unit}" the skin would be {_told(extent)} across; {hint}.')
+
+
+def _told(metres: float) -> str:
+    return f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
 
 
 def surface_identity(table: SurfaceTable, folder: Path) -> str:

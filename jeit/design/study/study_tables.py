@@ -36,13 +36,6 @@ class MaterialSweep(Table):
     thickness_mm: Annotated[list[float], THICKNESS] = Field(default=[1e3 * defaults.THICKNESS])
     conductivity_S_per_m: Annotated[list[float], CONDUCTIVITY] = Field(default=[defaults.CONDUCTIVITY])
 
-    @model_validator(mode="after")
-    def _both_sides(self) -> "MaterialSweep":
-        given = {"width_mm", "height_mm"} & self.model_fields_set
-        if len(given) == 1:
-            raise fault("is given alone; give both skin.width_mm and skin.height_mm.", given.pop())
-        return self
-
 
 class LayoutSweep(Table):
     """Of their electrodes. NaN is for the layout to say."""
@@ -145,6 +138,9 @@ class StudyTable(Table):
     @model_validator(mode="after")
     def _of_curved(self) -> "StudyTable":
         check_of_curved(self.surface, self.skin, self.mesh)
+        sides = {"width_mm", "height_mm"} & self.skin.model_fields_set
+        if len(sides) == 1:
+            raise fault("is given alone; give both skin.width_mm and skin.height_mm.", f"skin.{sides.pop()}")
         return self
 
     @model_validator(mode="after")

@@ -27,6 +27,8 @@ _ENOUGH, _TOGETHER = 1e-10, 128
 _FARTHEST = 2.6
 # Of a side, that lengths of one wave may miss each other by.
 _APART = 0.02
+# Of the surface's extent: how far off it places may be.
+_OFF = 0.05
 
 
 class _Corners(NamedTuple):
@@ -76,10 +78,14 @@ class Geodesics(eqx.Module):
         """Lengths (s, p), metres, of the shortest ways from `sources` (s, 3) to `targets` (p, 3), places on the
         surface, or near it, for the nearest of it is taken; to all nodes (s, n) unless targets are given.
 
-        Infinite beyond `limit`, metres, where that is given, and between parts that do not hang together.
+        Infinite beyond `limit`, metres, where that is given, and between parts that do not hang together. Raises
+        `ValueError` for places farther off the surface than a twentieth of its extent.
         """
-        begun = sources if isinstance(sources, SurfacePlaces) else self.surface.nearest(sources)
-        reached = targets if isinstance(targets, SurfacePlaces) or targets is None else self.surface.nearest(targets)
+        begun = sources if isinstance(sources, SurfacePlaces) else self._nearest("sources", sources)
+        if isinstance(targets, SurfacePlaces) or targets is None:
+            reached = targets
+        else:
+            reached = self._nearest("targets", targets)
         found = []
         for low in range(0, len(begun.triangle), _TOGETHER):
             some = SurfacePlaces(*(getattr(begun, one)[low : low + _TOGETHER] for one in _FIELDS))
@@ -88,6 +94,19 @@ class Geodesics(eqx.Module):
         found = np.concatenate(found) if found else np.zeros((0, 0))
         found[found > limit] = np.inf
         return found
+
+    def _nearest(self, name: str, places: ArrayLike) -> SurfacePlaces:
+        """Places on the surface. Raises `ValueError`, about the argument `name`, for those that are not near it."""
+        at = self.surface.nearest(places)
+        extent = float(np.ptp(self.surface.points, axis=0).max())
+        lost = np.flatnonzero(~(at.away <= _OFF * extent))
+        if lost.size:
+            raise ValueError(
+                f"{name}: {lost.size} of {len(at.away)} lie off the surface, the first, at "
+                f"{np.asarray(places, float)[lost[0]].tolist()} m, by {1e3 * at.away[lost[0]]:.3g} mm; give places on "
+                "it, in metres."
+            )
+        return at
 
     def between(self, places: ArrayLike) -> Float[np.ndarray, "p p"]:
         """Lengths between all of some places (p, 3), metres: symmetric, zero on the diagonal."""

@@ -10,6 +10,8 @@ from jeit.plot.axes import INK
 
 # Over the size of the body: how far a number stands from its electrode, and how near the edge one lies that is on it.
 _AWAY, _ON_EDGE = 0.058, 0.02
+# Over that distance: how far numbers stand that begin there, in place of having their middle there.
+_CLOSER = 0.7
 # Free outside the outline, over that distance, or else the number stands inside.
 _ROOM = 1.6
 
@@ -36,8 +38,18 @@ def draw_numbers(
         k = one[0]
         effects = rim if inside[k] or not beside[k] else None  # the image lies behind
         style = {"ha": "center", "va": "center", "fontsize": fontsize, "color": INK, "zorder": 4}
-        (x, y), told = places[k] + shift[k], ", ".join(str(k + first) for k in one)
+        told = ", ".join(str(k + first) for k in one)
+        if len(one) > 1:
+            style["ha"] = _beside(shift[k])
+        x, y = places[k] + (1.0 if style["ha"] == "center" else _CLOSER) * shift[k]
         ax.text(x, y, told, path_effects=effects, **style)
+
+
+def _beside(shift: Float[np.ndarray, " 2"]) -> str:
+    """How several numbers, which are wide, are aligned that far from their electrode: off it, not across it."""
+    if abs(shift[0]) < 0.8 * abs(shift[1]):
+        return "center"
+    return "left" if shift[0] > 0 else "right"
 
 
 def at_one_place(places: Float[np.ndarray, "L 2"], near: float) -> list[list[int]]:

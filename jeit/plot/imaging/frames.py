@@ -18,7 +18,7 @@ from jeit.mesh import Mesh
 from jeit.plot.axes import INK, SOFT, bare, draw_colour_bar, draw_scale_bar
 from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale, check_scale
 from jeit.plot.imaging.electrodes import draw_electrodes
-from jeit.plot.imaging.mesh import check_body, draw_outline, draw_slice_outline
+from jeit.plot.imaging.mesh import check_body, draw_outline, draw_slice_outline, slice_told
 from jeit_solvers.engines import as_array
 
 # Pixels along a side of a picture, and the grey of a body without an image.
@@ -150,7 +150,4 @@ def _told(count: FrameCount, chosen: int, mesh: Mesh) -> str:
     if count.refused:
         some = ", ".join(count.names[:_NAMED]) + (" …" if count.refused > _NAMED else "")
         parts.append(f"{count.refused} of {count.number} refused: {some}")
-    if mesh.dimension == 3:
-        z = np.asarray(mesh.points)[:, 2]
-        parts.append(f"slices at z = {500 * (z.min() + z.max()):.1f} mm")
-    return "; ".join(parts)
+    return "; ".join([*parts, *filter(None, [slice_told(mesh, what="slices")])])

@@ -58,3 +58,11 @@ def draw_slice_outline(
     width, height = (extent[1] - extent[0]) / pixels.shape[1], (extent[3] - extent[2]) / pixels.shape[0]
     wider = (extent[0] - width, extent[1] + width, extent[2] - height, extent[3] + height)
     ax.contour(shown, [0.5], extent=wider, origin="upper", colors=INK, linewidths=0.9, zorder=2)
+
+
+def slice_told(mesh: Mesh, height: float | None = None, what: str = "slice") -> str:
+    """Where a solid is cut, at z = `height` metres or half way up: "slice at z = 20.0 mm"; of a plane mesh nothing."""
+    if mesh.dimension == 2:
+        return ""
+    z = np.asarray(mesh.points)[:, 2]
+    return f"{what} at z = {1e3 * ((z.min() + z.max()) / 2 if height is None else height):.1f} mm"
