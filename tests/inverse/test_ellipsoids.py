@@ -175,6 +175,18 @@ def test_a_column_is_told_from_a_ball(coarse):
     np.testing.assert_allclose(strength, np.pi * RADIUS**2 * SIZE[2] * 3 / 5, rtol=0.15)
 
 
+def test_what_is_shown_is_half_of_a_body_on_its_surface(coarse):
+    """Cells that are covered by half, whatever the contrast: a surface drawn there is the body's."""
+    balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
+    coefficients = balls.of_radii([RADIUS])
+    _, share, _ = balls.covered(0, balls.rows(coefficients)[0])
+    contrast, shown = balls.body(0, coefficients).contrast, balls.shown(coefficients)
+    np.testing.assert_allclose(shown.sum(), share.sum() * contrast)
+    assert shown.max() <= contrast * (1 + 1e-9)
+    drifted = balls.shown(coefficients + np.eye(len(coefficients))[0])
+    np.testing.assert_allclose(drifted - shown, EllipsoidPrior().drift)
+
+
 @pytest.mark.parametrize("column", [True, False])
 @pytest.mark.parametrize(("worse", "told"), [(3.0, False), (5.0, True)])
 def test_a_kind_is_doubted_by_the_data_alone_and_has_a_deviation_of_its_own(coarse, worse, told, column):

@@ -165,6 +165,15 @@ class Ellipsoids(Bodies):
         mean = 1 + share * rise
         return np.log(mean) / power, rise / (power * mean), share * (1 + rise) / mean
 
+    def shown(self, coefficients) -> Float[np.ndarray, " m"]:
+        """log σ/σ₀ (m,) for pictures, in which it is half of a body's on its surface: of cells that are covered in part
+        the geometric mean, which is not what their voltages are those of."""
+        image = np.full(len(self.weight), coefficients[0] * self.prior.drift)
+        for k, row in enumerate(self.rows(coefficients)):
+            cells, share, _ = self.covered(k, row)
+            image[cells] += share * self.sign[k] * self.contrast(k, row)[0]
+        return image
+
     def on(self, mesh: Mesh) -> Ellipsoids:
         """The same on another mesh of the same solid."""
         return replace(Ellipsoids.create(mesh, self.prior, self.start, self.sign), other=self.other, span=self.span)

@@ -54,12 +54,13 @@ class ShapeReconstruction(eqx.Module):
     """What `reconstruct_shapes` found.
 
     **Fields**: `bodies`, `Star`s of a sheet and `Ellipsoid`s of a solid, those that explain most first; `conductivity`
-    (m,), S/m (2-D: S); `voltages` (M,), what the model predicts for it; `misfit`, root mean square of predicted -
-    measured over the channels used, in standard deviations; `drift`, how many times as conductive as its `background`
-    the bath is, less one; `doubtful`, bodies that were started from and left out again, their `rise` too small;
-    `contrast_deviations`, standard deviation of each body's contrast, after the data and as far as noise is all that is
-    wrong, in solids with 0.1 for the mesh besides; `alternatives`, each body of a solid as the other kind, ellipsoid or
-    column, where the data do not tell which it is, else None; `alternative_deviations`, of their contrasts, or NaN.
+    (m,), S/m (2-D: S), of a solid's cells that are covered in part the geometric mean; `voltages` (M,), what the model
+    predicts for the bodies; `misfit`, root mean square of predicted - measured over the channels used, in standard
+    deviations; `drift`, how many times as conductive as its `background` the bath is, less one; `doubtful`, bodies that
+    were started from and left out again, their `rise` too small; `contrast_deviations`, standard deviation of each body's contrast, after the
+    data and as far as noise is all that is wrong, in solids with 0.1 for the mesh besides; `alternatives`, each body of a
+    solid as the other kind, ellipsoid or column, where the data do not tell which it is, else None;
+    `alternative_deviations`, of their contrasts, or NaN.
     """
 
     bodies: tuple[Body, ...]
