@@ -57,10 +57,10 @@ class ShapeReconstruction(eqx.Module):
     (m,), S/m (2-D: S), of a solid's cells that are covered in part the geometric mean; `voltages` (M,), what the model
     predicts for the bodies; `misfit`, root mean square of predicted - measured over the channels used, in standard
     deviations; `drift`, how many times as conductive as its `background` the bath is, less one; `doubtful`, bodies that
-    were started from and left out again, their `rise` too small; `contrast_deviations`, standard deviation of each body's contrast, after the
-    data and as far as noise is all that is wrong, in solids with 0.1 for the mesh besides; `alternatives`, each body of a
-    solid as the other kind, ellipsoid or column, where the data do not tell which it is, else None;
-    `alternative_deviations`, of their contrasts, or NaN.
+    were started from and left out again, their `rise` too small; `contrast_deviations`, standard deviation of each
+    body's contrast, after the data and as far as noise is all that is wrong, in solids with 0.1 for the mesh besides;
+    `alternatives`, each body of a solid as the other kind, ellipsoid or column, where the data do not tell which it is,
+    else None; `alternative_deviations`, of their contrasts, or NaN.
     """
 
     bodies: tuple[Body, ...]
@@ -159,9 +159,10 @@ def reconstruct_shapes(
         tell("bodies, of which kind")
     (setting, level, (fitted, rises, doubtful)), beside = best, best.setting.beside
     bodies, coefficients = fitted.bodies, fitted.coefficients
-    shown = bodies.on(model.mesh) if isinstance(bodies, Ellipsoids) else bodies
     field = 0.0 if beside is None else beside.estimate(level, fitted)
-    conductivity = background * np.exp(shown.image(coefficients).image + field)
+    solids = isinstance(bodies, Ellipsoids)
+    shown = bodies.on(model.mesh).shown(coefficients) if solids else bodies.image(coefficients).image
+    conductivity = background * np.exp(shown + field)
     predicted = np.asarray(model.voltages(conductivity if there is None else background))
     if there is not None:
         predicted = predicted + there.change(model.protocol, bodies.image(coefficients).image, field)
