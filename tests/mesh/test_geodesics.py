@@ -134,6 +134,7 @@ def test_limits_and_nearness():
 def test_refuses_places_off_the_surface():
     ways, on = Geodesics.create(tube(RADIUS, 0.1, num_points=300)), [[RADIUS, 0, 0.05]]
     assert np.isfinite(ways.distances([[1.04 * RADIUS, 0, 0.05]], on)).all()
+    assert np.isfinite(ways.distances([[1.3 * RADIUS, 0, 0.05]], on)).all()  # across a thick skin
     said = r": 1 of 1 lie off the surface, the first, at \[5\.0, 0\.0, 0\.0\] m, by 4\.9\d+e\+03 mm; give places on it"
     with pytest.raises(ValueError, match="^sources" + said):
         ways.distances([[5.0, 0, 0]], on)

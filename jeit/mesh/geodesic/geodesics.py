@@ -27,8 +27,8 @@ _ENOUGH, _TOGETHER = 1e-10, 128
 _FARTHEST = 2.6
 # Of a side, that lengths of one wave may miss each other by.
 _APART = 0.02
-# Of the surface's extent: how far off it places may be.
-_OFF = 0.05
+# Of the surface's extent: how far off it places may be, such as those on the other side of a thick skin.
+_OFF = 0.25
 
 
 class _Corners(NamedTuple):
@@ -79,7 +79,7 @@ class Geodesics(eqx.Module):
         surface, or near it, for the nearest of it is taken; to all nodes (s, n) unless targets are given.
 
         Infinite beyond `limit`, metres, where that is given, and between parts that do not hang together. Raises
-        `ValueError` for places farther off the surface than a twentieth of its extent.
+        `ValueError` for places farther off the surface than a quarter of its extent.
         """
         begun = sources if isinstance(sources, SurfacePlaces) else self._nearest("sources", sources)
         if isinstance(targets, SurfacePlaces) or targets is None:
