@@ -22,7 +22,8 @@ from jaxtyping import Array, Int
 
 # Threads at most, that work in NumPy side by side: each takes memory of its own, and they share the memory's bandwidth.
 _MOST_THREADS = 4
-_TOLD = "jeit-core"
+# What names of our threads begin with.
+_NAME = "jeit-core"
 
 
 def number_of_cores() -> int:
@@ -50,15 +51,15 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
 
     One part, and what is asked for by a part of other work, is done at once. NaN is told of elsewhere: nothing warns.
     """
-    if len(parts) == 1 or threading.current_thread().name.startswith(_TOLD):
-        for part in parts:
-            function(part)
-        return
 
     def quietly(part: Any) -> None:
         with np.errstate(all="ignore"):  # threads have error states of their own
             function(part)
 
+    if len(parts) <= 1 or threading.current_thread().name.startswith(_NAME):
+        for part in parts:
+            quietly(part)
+        return
     with _one_thread_of_blas():
         list(_workers(os.getpid()).map(quietly, parts))
 
@@ -73,7 +74,7 @@ def parts_for_cores(number: int) -> list[slice]:
 def _workers(process: int) -> ThreadPoolExecutor:
     """Threads of a process, which a fork of it has not. They are kept: what new ones allocate and free stays with the
     process, a hundred megabytes every time."""
-    return ThreadPoolExecutor(min(number_of_cores(), _MOST_THREADS), _TOLD)
+    return ThreadPoolExecutor(min(number_of_cores(), _MOST_THREADS), _NAME)
 
 
 @functools.cache

@@ -45,15 +45,16 @@ def test_a_part_that_fails_is_told_of_and_the_blas_has_its_threads_again():
         assert set(threads_of_blas()) == {2}
 
 
-def test_parts_do_not_warn_of_nan():
-    found = np.zeros(2)
+@pytest.mark.parametrize("number", [1, 2])
+def test_parts_do_not_warn_of_nan(number):
+    found = np.zeros(number)
 
     def part(number):
         found[number] = np.sqrt(-1.0 - number * np.ones(()))
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        on_cores(part, range(2))
+        on_cores(part, range(number))
     assert np.isnan(found).all()
 
 

@@ -65,7 +65,7 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
             f"got {values.shape}. Use jax.vmap for a batch of matrices."
         )
     if isinstance(values, np.ndarray):
-        return _on_cores(plan.layout, plan.indices, values)
+        return _in_numpy(plan.layout, plan.indices, values)
     numeric = in_turn(partial(_factorise, plan.layout))
     return numeric(plan.indices, values)
 
@@ -98,7 +98,7 @@ def _by_stages(layout: IndexLayout, indices: Int[Array, " total"], values: Inexa
 _factorise = jax.jit(_by_stages, static_argnums=0)
 
 
-def _on_cores(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[np.ndarray, " nnz"]) -> Factor:
+def _in_numpy(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[np.ndarray, " nnz"]) -> Factor:
     """The same in NumPy: in place, the fronts of a stage shared between the cores."""
     stages, _ = layout.content
     extended = np.concatenate([values, np.ones(1, values.dtype)])
