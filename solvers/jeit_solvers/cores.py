@@ -78,8 +78,9 @@ def _workers(process: int) -> ThreadPoolExecutor:
 
 
 @functools.cache
-def _blas() -> threadpoolctl.ThreadpoolController:
-    return threadpoolctl.ThreadpoolController()
+def blas() -> threadpoolctl.ThreadpoolController:
+    """NumPy's BLAS, and others that were loaded when it was first asked for; what comes later is not NumPy's."""
+    return threadpoolctl.ThreadpoolController().select(user_api="blas")
 
 
 _kept: list[Any] = []
@@ -90,7 +91,7 @@ _keeping = threading.Lock()
 def _one_thread_of_blas() -> Iterator[None]:
     """Within it, and for as long as anyone else is, the BLAS keeps to one thread; a few microseconds."""
     with _keeping:
-        _kept.append(None if _kept else _blas().limit(limits=1, user_api="blas"))
+        _kept.append(None if _kept else blas().limit(limits=1))
     try:
         yield
     finally:

@@ -8,13 +8,13 @@ import sparse_problems
 import threadpoolctl
 
 from jeit_solvers import analyse, factorise, on_cores
-from jeit_solvers.cores import parts_for_cores
+from jeit_solvers.cores import blas, parts_for_cores
 from jeit_solvers.engines import on_host
 from jeit_solvers.sparse import multifrontal
 
 
 def threads_of_blas():
-    return [one["num_threads"] for one in threadpoolctl.threadpool_info() if one["user_api"] == "blas"]
+    return [one["num_threads"] for one in blas().info()]
 
 
 def test_every_part_is_done_with_one_thread_of_blas_and_its_own_parts_at_once():
