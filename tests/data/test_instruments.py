@@ -75,6 +75,19 @@ def test_channels_that_reciprocity_repeats_may_be_left_out(tmp_path):
     assert any("104 of 208 channels were not measured" in note for note in found.notes)
 
 
+def test_the_rate_of_goettingen_frames_is_in_the_record_beside_them(tmp_path):
+    write_get(tmp_path / "a.get", frames())
+    (tmp_path / "a.prl").write_text("Number of frames = 3\r\nFramerate = 13 per second\r\nGain = 1000")
+    found = data.read(tmp_path / "a.get")
+    assert found.frame_rate == pytest.approx(13)
+    assert not any("rate" in note for note in found.notes)
+    (tmp_path / "a.toml").write_text("[data]\nframe_rate = 26\n")
+    assert data.read(tmp_path / "a.get").frame_rate == pytest.approx(26)
+    (tmp_path / "a.toml").unlink()
+    (tmp_path / "a.prl").write_text("Framerate = 0 per second")
+    assert data.read(tmp_path / "a.get").frame_rate is None
+
+
 def test_swisstom(tmp_path):
     made = np.array([1e-3 * impedance(32, seed) * (1 + 0.1j) for seed in range(3)])
     times = np.array([2**32 - 30_000, 2**32 - 10_000, 2**32 + 10_000])  # the counter goes round

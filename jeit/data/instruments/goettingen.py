@@ -2,9 +2,11 @@
 
 Frames of 256 numbers of four bytes (little-endian), without a header, of which 208 are the adjacent voltages, then 16
 currents, 16 voltages of the drives and 16 auxiliary inputs. Dräger's put a text before them, which ends with two empty
-lines. A system that leaves out what reciprocity repeats writes zeros there.
+lines. A system that leaves out what reciprocity repeats writes zeros there. The record of a measurement, a text of the
+same name with the ending .prl, says the frame rate, as "Framerate = 13 per second".
 """
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,8 @@ DESCRIPTION = "Göttingen MCEIT (.get): 208 adjacent voltages a frame"
 # Bytes of a frame; and how Dräger's text begins and ends, within how many bytes.
 _FRAME, _MARK, _END, _LONGEST = 1024, b"---Draeger EIT-Software", b"\r\n\r\n\r\n", 65536
 _NOTE = "neither unit nor gain of the voltages is known: trust relative changes, not volts."
-_NO_RATE = "the file says no rate; give it by [data] frame_rate."
+_NO_RATE = "the file says no rate, nor a record beside it (.prl); give it by [data] frame_rate."
+_RATE = re.compile(rb"Framerate\s*=\s*(\d+(?:\.\d+)?)\s*per second", re.IGNORECASE)
 
 
 def recognises(path: Path) -> bool:
@@ -35,6 +38,19 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
         start = end + len(_END)
     number, left = frame_at(content, start, _FRAME, path)
     values = np.frombuffer(content, "<f4", number * _FRAME // 4, start).reshape(number, -1)[:, :CHANNELS]
-    described = description_of(path, description)
-    no_rate = (_NO_RATE,) if described.layout.frame_rate is None else ()
-    return measurement_of(path, adjacent_recording(values, None, (_NOTE, *no_rate, *cut_off(left))), described)
+    described, rate = description_of(path, description), _recorded_rate(path)
+    no_rate = (_NO_RATE,) if rate is None and described.layout.frame_rate is None else ()
+    times = None if rate is None else np.arange(number) / rate
+    return measurement_of(path, adjacent_recording(values, times, (_NOTE, *no_rate, *cut_off(left))), described)
+
+
+def _recorded_rate(path: Path) -> float | None:
+    """Frames a second, from the record beside a file; None where there is none, or it does not say."""
+    for ending in (".prl", ".PRL"):
+        record = path.with_suffix(ending)
+        if record.is_file():
+            with record.open("rb") as file:
+                said = _RATE.search(file.read(_LONGEST))
+            if said and float(said[1]) > 0:
+                return float(said[1])
+    return None
