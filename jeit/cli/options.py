@@ -48,6 +48,14 @@ Frame = Annotated[
         help="Frame of DATA to image, by number from 0 (negative: from the end) or by name; the first unless given."
     ),
 ]
+ReferenceFrames = Annotated[
+    str | None,
+    typer.Option(
+        help="Frames, from 0, whose mean is the undisturbed body, such as 0-17 or 5: of REFERENCE, or of DATA where no "
+        "REFERENCE is given. All of REFERENCE unless given.",
+        metavar="FIRST-LAST",
+    ),
+]
 BandLow = Annotated[
     float | None, typer.Option(help="Lowest frequency of the band, hertz (default 50, or the calibration's).")
 ]
@@ -122,6 +130,25 @@ def read_file(
 
     with naming_options({"path": option}):
         return read(path, format, description, like=like)
+
+
+def read_pair(
+    data: Path, reference: Path | None, frames: str | None, format: str | None, description: str | None
+) -> "tuple[Measurement, Measurement | None]":
+    """The measurement in DATA and its reference: a file's, or only some `frames` of that, or else of DATA's own."""
+    base = None if reference is None else read_file("--reference", reference, format, description)
+    measurement = read_file("DATA", data, format, description, like=base)
+    if frames is None:
+        return measurement, base
+    whole = measurement if base is None else base
+    spelled = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", frames.strip())
+    first, last = (int(spelled[1]), int(spelled[2] or spelled[1])) if spelled else (0, -1)
+    if not first <= last < whole.num_frames:
+        raise ValueError(
+            f"--reference-frames: give FIRST-LAST, such as 0-17, or one number, of the frames 0 to "
+            f"{whole.num_frames - 1} of '{whole.name}'; it is {frames!r}."
+        )
+    return measurement, whole.frames(slice(first, last + 1))
 
 
 def in_options(said: str, options: dict[str, str]) -> str:

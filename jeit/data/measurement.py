@@ -163,10 +163,11 @@ class Measurement(eqx.Module):
         Raises `ValueError` when the file has no frame of that name, or no other.
         """
         if "reference" not in self.frame_names or self.num_frames < 2:
+            some = "say which (--reference-frames 0-17; measurement.frames(slice(0, 18))), or "
             raise ValueError(
-                f"'{self.name}' holds no reference frame of its own. Measure the undisturbed body and give "
-                'that file as the reference; or, if one of its frames is that, name it "reference" in the '
-                "description: [data] frame_names."
+                f"'{self.name}' holds no reference frame of its own. Measure the undisturbed body and give that file "
+                f"as the reference; or, if frames of this one are that, {some if self.num_frames > 1 else ''}"
+                'name one "reference" in the description: [data] frame_names.'
             )
         index = self.frame_names.index("reference")
         others = np.array([k for k in range(self.num_frames) if k != index])

@@ -1,13 +1,12 @@
 """Linear or not: one step where that is sound, Gauss-Newton and shapes of strong bodies where it is not; and why."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import percent
-from jeit.imaging.method import METHODS, Imaged, NamedPrior, shapes_in
+from jeit.imaging.method import METHODS, Asked, Imaged, shapes_in
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.prior.defaults import MEASURED
@@ -36,57 +35,53 @@ class Chosen(NamedTuple):
     shapes: ShapeReconstruction | None = None
 
 
-def image_automatically(
-    prepared: PreparedDifference,
-    prior: NamedPrior,
-    segmented: bool = False,
-    progress: Callable[[str], None] | None = None,
-) -> Chosen:
+def image_automatically(prepared: PreparedDifference, asked: Asked, segmented: bool = False) -> Chosen:
     """The one-step image, unless it is unsound; then Gauss-Newton's with its bodies as shapes, unless that fails.
 
     In a solid, bodies are looked for beside a sound one too, unless a prior was asked for: it would only be that of the
-    field beside them. Each with its default λ. To be `segmented`, and no shapes: the image by total variation.
-    `progress` is called with the name of each stage of what takes long.
+    field beside them. Each with its default λ, not the one asked for. To be `segmented`, and no shapes: the image by
+    total variation.
     """
-    linear, newton = METHODS["one-step"], METHODS["gauss-newton"]
-    imaged = linear.image(prepared, prior, linear.hyperparameter)
+    imaged = _by("one-step", prepared, asked)
     if np.iscomplexobj(prepared.difference):
         return Chosen("one-step", "images of complex voltages are linear.", imaged)
-    fault, plain = unsound(prepared, imaged[1]), prepared.mesh.dimension == 3 and prior != MEASURED
+    fault, plain = unsound(prepared, imaged[1]), prepared.mesh.dimension == 3 and asked.prior != MEASURED
     if fault:
         try:
-            better = newton.image(prepared, prior, newton.hyperparameter)
+            better = _by("gauss-newton", prepared, asked)
         except ValueError as error:
             return Chosen("one-step", f"{fault}; but Gauss-Newton found no image. {error}", imaged)
         assert isinstance(better[0], Reconstruction)
-        shapes = None if plain else _shapes(prepared, better[0], progress)
+        shapes = None if plain else _shapes(prepared, better[0], asked)
         if shapes is not None or not segmented:
             outlined = "" if shapes is None else f", and its bodies' {_edges(prepared)} fitted"
             return _with_bodies(prepared, f"{fault}: solved for conductivity itself{outlined}.", better, shapes)
-    elif not (segmented or plain) and (bodies := _bodies_in_solid(prepared, prior, imaged[1], progress)):
+    elif not (segmented or plain) and (bodies := _bodies_in_solid(prepared, asked, imaged[1])):
         return bodies
     if segmented:
-        pieces = METHODS["total-variation"]
         why = f"{fault or 'bodies are weak'}: cut up an image of few pieces."
-        return Chosen("total-variation", why, pieces.image(prepared, prior, pieces.hyperparameter))
+        return Chosen("total-variation", why, _by("total-variation", prepared, asked))
     return Chosen("one-step", "the linear image is sound: changes are small, and it explains the voltages.", imaged)
 
 
-def _bodies_in_solid(
-    prepared: PreparedDifference, prior: NamedPrior, change: Float[Array, " m"], progress=None
-) -> Chosen | None:
+def _by(name: str, prepared: PreparedDifference, asked: Asked) -> Imaged:
+    """The image by the method of that name, with its own λ."""
+    method = METHODS[name]
+    return method.image(prepared, asked._replace(hyperparameter=method.hyperparameter))
+
+
+def _bodies_in_solid(prepared: PreparedDifference, asked: Asked, change: Float[Array, " m"]) -> Chosen | None:
     """Bodies that the data of a solid tell of, where a sound linear image shows more than a trace and noise allows."""
     noise = prepared.quality.difference_noise
     strongest = np.abs(np.asarray(change)).max() / float(prepared.calibration.conductivity)
     if prepared.mesh.dimension < 3 or strongest < _TELLING or (noise is not None and noise.relative > _NOISY):
         return None
-    newton = METHODS["gauss-newton"]
     try:
-        smooth = newton.image(prepared, prior, newton.hyperparameter)
+        smooth = _by("gauss-newton", prepared, asked)
     except ValueError:
         return None
     assert isinstance(smooth[0], Reconstruction)
-    shapes = _shapes(prepared, smooth[0], progress)
+    shapes = _shapes(prepared, smooth[0], asked)
     why = f"the voltages tell of bodies, which a linear image of a solid blurs: their {_edges(prepared)} were fitted."
     return shapes and _with_bodies(prepared, why, smooth, shapes)
 
@@ -104,10 +99,10 @@ def _edges(prepared: PreparedDifference) -> str:
     return "surfaces" if prepared.mesh.dimension == 3 else "outlines"
 
 
-def _shapes(prepared: PreparedDifference, smooth: Reconstruction, progress) -> ShapeReconstruction | None:
+def _shapes(prepared: PreparedDifference, smooth: Reconstruction, asked: Asked) -> ShapeReconstruction | None:
     """The bodies of a smooth image as shapes, if there are any and they explain the voltages within what sharp outlines
     may miss, or as well as the image does."""
-    found = shapes_in(prepared, smooth, progress)
+    found = shapes_in(prepared, smooth, asked)
     explains = float(found.misfit) <= max(1.0, float(smooth.misfit))
     return found if found.bodies and explains else None
 

@@ -18,7 +18,7 @@ from jeit.image.inclusions import inclusion_regions
 from jeit.image.score import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
 from jeit.imaging.clock import Clock
-from jeit.imaging.method import METHODS
+from jeit.imaging.method import METHODS, Asked
 from jeit.imaging.preparation import prepare_difference
 from jeit.imaging.settings import AUTO, ImagingSettings, as_settings
 from jeit.imaging.wiring import Wiring
@@ -26,7 +26,7 @@ from jeit.inverse.calibration import Calibration
 from jeit.inverse.image_noise import image_noise
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
-from jeit.inverse.shapes import Ellipsoid, ShapeReconstruction, Star
+from jeit.inverse.shapes import KINDS, Ellipsoid, ShapeReconstruction, Star
 from jeit.mesh import Mesh
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array
@@ -141,7 +141,7 @@ class ImagedDifference:
                 said.append(
                     f"the body at x {x:.0f} mm, y {y:.0f} mm may as well be {kind}, of "
                     f"{np.exp(one.sign * one.contrast):.2g} times the background and {1e6 * one.volume:.3g} cm³: these "
-                    "electrodes do not tell which."
+                    "electrodes do not tell which. If you know, bodies (--bodies) says so."
                 )
         return tuple(said)
 
@@ -213,16 +213,16 @@ def image_difference(
         clock=clock,
     )
     calibration, mesh = prepared.calibration, prepared.mesh
+    if mesh.dimension == 2 and settings.bodies != KINDS[0]:
+        raise ValueError("bodies: ellipsoids and columns are of solids, and this is a sheet; leave it out.")
     with clock("image"):
         why, shapes = "", None
+        asked = Asked(settings.prior, settings.hyperparameter, settings.bodies, progress)
         if settings.method == AUTO:
-            chosen, why, (reconstruction, change), shapes = image_automatically(
-                prepared, settings.prior, settings.segment, progress
-            )
+            chosen, why, (reconstruction, change), shapes = image_automatically(prepared, asked, settings.segment)
             settings = replace(settings, method=chosen)
         else:
-            method = METHODS[settings.method]
-            reconstruction, change = method.image(prepared, settings.prior, settings.hyperparameter)
+            reconstruction, change = METHODS[settings.method].image(prepared, asked)
             shapes = reconstruction if isinstance(reconstruction, ShapeReconstruction) else None
         largest = float(np.abs(change).max())
         if not largest > 1e-9 * abs(complex(calibration.conductivity)):

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Inexact
@@ -18,7 +19,7 @@ from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.nonlinear.solvers import AbstractSolver
 from jeit.inverse.prior.defaults import MEASURED, PRIORS
 from jeit.inverse.prior.priors import AbstractPrior
-from jeit.inverse.shapes import LEAST_RISE, ShapeReconstruction, reconstruct_shapes
+from jeit.inverse.shapes import KINDS, LEAST_RISE, EllipsoidPrior, ShapeReconstruction, reconstruct_shapes
 from jeit.mesh import Body
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array, host
@@ -30,6 +31,17 @@ NamedPrior = str | AbstractPrior
 NamedWeight = float | str | None
 """λ, or the name of the rule that chooses it; None for methods that have no use for one."""
 
+
+class Asked(NamedTuple):
+    """What is asked of a method: the `prior` and λ, `hyperparameter`; `kinds` of bodies of a solid, see
+    `jeit.inverse.shapes.EllipsoidPrior`; `progress`, called with the name of each stage of what takes long."""
+
+    prior: NamedPrior
+    hyperparameter: NamedWeight = None
+    kinds: str = KINDS[0]
+    progress: Callable[[str], None] | None = None
+
+
 # What shapes start from: as many peaks of a smooth image as may be bodies, ghosts among them.
 _PEAK, _AREA, _MOST = 0.15, 0.002, 8
 
@@ -38,13 +50,13 @@ _PEAK, _AREA, _MOST = 0.15, 0.002, 8
 class Method:
     """How to image a difference.
 
-    - `image`: the function that does it, given the prior and λ of the settings.
+    - `image`: the function that does it, given what the settings ask.
     - `takes_prior`: whether it uses the prior of the settings; `prior`, what it is called where the method has its own.
     - `hyperparameter`: λ unless given. `takes_hyperparameter`: whether it has any use for one; `number`: one that
       serves, where λ cannot be chosen by a rule.
     """
 
-    image: Callable[[PreparedDifference, NamedPrior, NamedWeight], Imaged]
+    image: Callable[[PreparedDifference, Asked], Imaged]
     takes_prior: bool = False
     prior: str | None = None
     hyperparameter: float | str | None = None
@@ -79,12 +91,12 @@ def _weight(prepared: PreparedDifference, hyperparameter: NamedWeight) -> float 
     return rule_for(hyperparameter, prepared) if isinstance(hyperparameter, str) else hyperparameter
 
 
-def _one_step(prepared: PreparedDifference, prior: NamedPrior, hyperparameter: NamedWeight) -> Imaged:
+def _one_step(prepared: PreparedDifference, asked: Asked) -> Imaged:
     found = one_step(
         prepared.model,
         prepared.calibration.conductivity,
-        prior=prior_for(prior, prepared.domain),
-        hyperparameter=_weight(prepared, hyperparameter),
+        prior=prior_for(asked.prior, prepared.domain),
+        hyperparameter=_weight(prepared, asked.hyperparameter),
         difference=prepared.difference,
         noise=prepared.relative_noise,
         mask=prepared.mask,
@@ -92,10 +104,9 @@ def _one_step(prepared: PreparedDifference, prior: NamedPrior, hyperparameter: N
     return found, found.image(prepared.difference)
 
 
-def _back_projection(
-    prepared: PreparedDifference, prior: NamedPrior, hyperparameter: NamedWeight, *, filtered: bool
-) -> Imaged:
-    given = {"hyperparameter": hyperparameter} if isinstance(hyperparameter, (int, float)) else {}
+def _back_projection(prepared: PreparedDifference, asked: Asked, *, filtered: bool) -> Imaged:
+    weight = asked.hyperparameter
+    given = {"hyperparameter": weight} if isinstance(weight, (int, float)) else {}
     # Bands lie between the equipotential lines of the real background; complex voltages are imaged part by part.
     conductivity = np.real(prepared.calibration.conductivity)
     found = back_projection(prepared.model, conductivity, filtered=filtered, mask=prepared.mask, **given)
@@ -103,12 +114,7 @@ def _back_projection(
 
 
 def _iterated(
-    prepared: PreparedDifference,
-    prior: NamedPrior,
-    hyperparameter: NamedWeight,
-    *,
-    solver: AbstractSolver,
-    own: AbstractPrior | None = None,
+    prepared: PreparedDifference, asked: Asked, *, solver: AbstractSolver, own: AbstractPrior | None = None
 ) -> Imaged:
     """The conductivity whose voltages differ from the model's own as the frame differs from its reference.
 
@@ -125,8 +131,8 @@ def _iterated(
         model,
         host.add(model.voltages(background), prepared.difference),
         background,
-        prior=prior_for(prior, prepared.domain) if own is None else own,
-        hyperparameter=_weight(prepared, hyperparameter),
+        prior=prior_for(asked.prior, prepared.domain) if own is None else own,
+        hyperparameter=_weight(prepared, asked.hyperparameter),
         noise=prepared.modelled_noise if own is None else prepared.relative_noise,
         mask=prepared.mask,
         solver=solver,
@@ -136,11 +142,8 @@ def _iterated(
     return found, found.conductivity - background
 
 
-def shapes_in(
-    prepared: PreparedDifference, smooth: Reconstruction, progress: Callable[[str], None] | None = None
-) -> ShapeReconstruction:
-    """The bodies that explain a difference, started from all that a smooth image of it shows; `progress` is called with
-    the name of each stage.
+def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, asked: Asked) -> ShapeReconstruction:
+    """The bodies that explain a difference, started from all that a smooth image of it shows.
 
     How much a body has to be missed, beyond what the evidence asks, is for errors of the model, which no noise tells.
     """
@@ -155,17 +158,18 @@ def shapes_in(
         start=[(one.sign, one.centroid, one.radius) for one in peaks[:_MOST]],
         noise=prepared.sharp_noise,
         mask=prepared.mask,
+        prior=EllipsoidPrior(kinds=asked.kinds) if solid else None,
         # Errors of the model are let stay in a solid, as a smooth field.
         least_rise=1 if solid else 1 + (LEAST_RISE - 1) * prepared.modelled_share,
         smooth=smooth if solid else None,
-        progress=progress,
+        progress=asked.progress,
     )
 
 
-def _shapes(prepared: PreparedDifference, prior: NamedPrior, hyperparameter: NamedWeight) -> Imaged:
-    smooth, _ = _iterated(prepared, MEASURED, ITERATED, solver=_GAUSS_NEWTON)
+def _shapes(prepared: PreparedDifference, asked: Asked) -> Imaged:
+    smooth, _ = _iterated(prepared, Asked(MEASURED, ITERATED), solver=_GAUSS_NEWTON)
     assert isinstance(smooth, Reconstruction)
-    found = shapes_in(prepared, smooth)
+    found = shapes_in(prepared, smooth, asked)
     return found, found.conductivity - prepared.calibration.conductivity
 
 

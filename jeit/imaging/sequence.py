@@ -11,7 +11,7 @@ from jeit.data.imageable import check_same_setup
 from jeit.files import check_memory
 from jeit.image.image_series import ImageSeries
 from jeit.imaging.clock import Clock
-from jeit.imaging.method import METHODS
+from jeit.imaging.method import METHODS, Asked
 from jeit.imaging.preparation import (
     PreparedDifference,
     check_measurement,
@@ -101,7 +101,7 @@ def image_sequence(
     number, cells = measurement.num_frames, prepared.mesh.num_cells
     check_memory(f"the images of '{measurement.name}', {number} frames,", float(_KEPT * number * cells))
     with clock("image"):
-        found, _ = METHODS[settings.method].image(prepared, settings.prior, settings.hyperparameter)
+        found, _ = METHODS[settings.method].image(prepared, Asked(settings.prior, settings.hyperparameter))
         if not isinstance(found, LinearReconstruction):
             raise ValueError(
                 f"method: {settings.method} images frame by frame; take a linear one, or `jeit.inverse.stream`."

@@ -8,6 +8,7 @@ from jeit.imaging.method import METHODS
 from jeit.inverse import RULES
 from jeit.inverse.prior.defaults import MEASURED, PRIORS
 from jeit.inverse.prior.priors import AbstractPrior
+from jeit.inverse.shapes import KINDS
 
 CONTACTS = ("each", "common", "fixed")
 AUTO = "auto"
@@ -35,6 +36,7 @@ class ImagingSettings:
     - `as_is`: image even where the wiring is found to be another than described, see `jeit.imaging.wiring`.
     - `segment`: whether to cut the image up into background, resistive and conductive: by the outlines where there are
       any, else at half of every inclusion's own peak; with "auto", of an image by total variation.
+    - `bodies`: of which kind those of a solid are: "either", "ellipsoids", or "columns" through its whole height.
 
     Raises `ValueError`, naming the setting, for what there is not or what does not go together.
     """
@@ -49,9 +51,11 @@ class ImagingSettings:
     least_peak: float = 0.3
     segment: bool = False
     as_is: bool = False
+    bodies: str = KINDS[0]
 
     def __post_init__(self):
         check_name("method", self.method, (AUTO, *METHODS))
+        check_name("bodies", self.bodies, KINDS)
         check_prior(self.prior)
         if isinstance(self.prior, AbstractPrior) and not self.prior.is_quadratic:
             raise ValueError("prior: total variation is a method of its own; give method='total-variation'.")
@@ -65,6 +69,10 @@ class ImagingSettings:
             if isinstance(self.hyperparameter, str) and (number := METHODS[self.method].number) is not None:
                 name = self.method.replace("-", " ").replace("back ", "back-")
                 raise ValueError(f"hyperparameter: {name} takes a number such as {number:g}, not a rule.")
+        if self.bodies != KINDS[0] and (self.method not in (AUTO, "shapes") or self.prior != MEASURED):
+            raise ValueError(
+                "bodies: only methods 'auto' and 'shapes' with the default prior look for any; leave it out."
+            )
         check_body(self.contact, self.num_points)
 
 

@@ -236,7 +236,7 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
                 "centroid": one.centroid,
                 **_form(one),
                 "conductivity_over_background": math.exp(one.sign * one.contrast),
-                "conductivity_is": "told by the data" if one.contrast_is_told else "assumed, as of what is strong",
+                "conductivity_is": _told_by(one),
                 "rise": one.rise,
             }
             for one in bodies
@@ -267,6 +267,15 @@ def _form(body: Star | Ellipsoid) -> dict[str, Any]:
         return {"area": body.area, "outline": body.outline}
     form = "column" if body.column else "ellipsoid"
     return {"form": form, "volume": body.volume, "centre": body.centre, "half_axes": body.axes}
+
+
+def _told_by(body: Star | Ellipsoid) -> str:
+    """Where the conductivity of a body is from."""
+    if not body.contrast_is_told:
+        return "assumed, as of what is strong"
+    if isinstance(body, Ellipsoid) and body.alike:
+        return "told by the data, as of one material with all others of its sign"
+    return "told by the data"
 
 
 def _prior(settings: ImagingSettings, dimension: int) -> str | None:

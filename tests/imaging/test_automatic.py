@@ -50,6 +50,11 @@ def test_a_small_change_is_imaged_in_one_step():
     assert report_image(result)["reconstruction"]["why"] == result.why
 
 
+def test_a_sheet_has_no_columns():
+    with pytest.raises(ValueError, match="bodies: ellipsoids and columns are of solids, and this is a sheet"):
+        image(1.05, bodies="columns")
+
+
 @pytest.mark.parametrize(("factor", "why"), [(20.0, "no longer linear"), (1e-3, "below -100 %")])
 def test_a_strong_change_is_solved_for(factor, why):
     result = image(factor)

@@ -77,7 +77,7 @@ def test_bodies_are_looked_for_in_solids_where_data_can_tell_of_them(monkeypatch
 
     monkeypatch.setitem(automatic.METHODS, "gauss-newton", SimpleNamespace(image=image, hyperparameter=5.0))
     data, change = prepared(dimension, strongest, noise)
-    assert automatic._bodies_in_solid(data, "gaussian", change) is None
+    assert automatic._bodies_in_solid(data, method.Asked("gaussian"), change) is None
     assert bool(asked) == looks
 
 
@@ -114,7 +114,7 @@ def test_a_prior_that_is_asked_for_is_that_of_the_image(monkeypatch, prior, faul
     for name in ("one-step", "gauss-newton"):
         made = SimpleNamespace(image=lambda *_: (SimpleNamespace(), change), hyperparameter=5.0)
         monkeypatch.setitem(automatic.METHODS, name, made)
-    chosen = automatic.image_automatically(data, prior)
+    chosen = automatic.image_automatically(data, method.Asked(prior))
     assert chosen.method == ("shapes" if prior == "gaussian" else "gauss-newton" if fault else "one-step")
 
 
@@ -131,11 +131,34 @@ def test_what_is_fitted_is_named_for_the_body(monkeypatch, dimension, edges, str
     for name in ("one-step", "gauss-newton"):
         made = SimpleNamespace(image=lambda *_: (SimpleNamespace(), change), hyperparameter=5.0)
         monkeypatch.setitem(automatic.METHODS, name, made)
-    chosen = automatic.image_automatically(data, "gaussian")
+    chosen = automatic.image_automatically(data, method.Asked("gaussian"))
     if dimension == 3 or strongest == 1:
         assert f"{edges} " in chosen.why
     else:
         assert chosen.method == "one-step"
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_what_is_asked_of_bodies_reaches_their_search(monkeypatch, dimension):
+    data, _ = prepared(dimension, 0.1, 0.1)
+    data.model, data.difference = SimpleNamespace(voltages=lambda background: np.zeros(2)), np.zeros(2)
+    data.sharp_noise = data.mask = None
+    data.modelled_share = 0.5
+    monkeypatch.setattr(method, "find_inclusions", lambda *_, **__: [])
+    monkeypatch.setattr(method, "reconstruct_shapes", lambda *_, **searched: searched)
+    smooth: Any = SimpleNamespace(conductivity=np.ones(2))
+    searched: Any = method.shapes_in(data, smooth, method.Asked("gaussian", kinds="columns", progress=print))
+    assert searched["progress"] is print
+    assert (searched["prior"] is None) if dimension == 2 else (searched["prior"].kinds == "columns")
+
+
+@pytest.mark.parametrize("given", [{"method": "one-step"}, {"prior": "noser"}, {"hyperparameter": 3.0}])
+def test_kinds_of_bodies_are_asked_for_where_bodies_are_looked_for(given):
+    assert ImagingSettings(method="shapes", bodies="columns").bodies == "columns"
+    with pytest.raises(ValueError, match="bodies: only methods 'auto' and 'shapes' with the default prior"):
+        ImagingSettings(bodies="ellipsoids", **given)
+    with pytest.raises(ValueError, match=r"bodies must be one of either, ellipsoids, columns; .* mean 'columns'"):
+        ImagingSettings(bodies="column")
 
 
 @pytest.mark.slow
@@ -158,7 +181,7 @@ def test_bodies_of_a_sound_linear_image_are_told_in_a_cylinder():
 
 def test_where_electrodes_do_not_tell_the_kind_of_a_body_it_is_doubted_and_the_range_is_of_both():
     def body(column, contrast):
-        return Ellipsoid(1, BALL, 0.02 * np.eye(3), 3e-5, BALL, contrast, column, 2.0)
+        return Ellipsoid(1, BALL, 0.02 * np.eye(3), 3e-5, BALL, contrast, column, column, 2.0)
 
     zero: Any = np.zeros(1)
     shapes = ShapeReconstruction(
@@ -186,11 +209,13 @@ def test_where_electrodes_do_not_tell_the_kind_of_a_body_it_is_doubted_and_the_r
     np.testing.assert_allclose(told[0]["or"]["conductivity_over_background"], 6)
     assert told[0]["or"]["deviation_of_logarithm"] == 0.5
     assert "or" not in told[1]
+    assert told[0]["conductivity_is"] == "told by the data, as of one material with all others of its sign"
+    assert told[1]["conductivity_is"] == "told by the data"
 
 
 def test_the_last_axis_of_a_column_that_is_drawn_stands():
     axes = np.array([[0.0, 0.0, 0.05], [0.03, 0.0, 0.0], [0.0, 0.01, 0.0]])
-    form = difference._form(Ellipsoid(1, BALL, axes, 3e-5, BALL, 1.0, True, 2.0))  # pyright: ignore
+    form = difference._form(Ellipsoid(1, BALL, axes, 3e-5, BALL, 1.0, True, False, 2.0))  # pyright: ignore
     assert form is not None
     assert form.column
     np.testing.assert_allclose(np.ptp(form.surface().points, axis=0), [0.06, 0.02, 0.1])

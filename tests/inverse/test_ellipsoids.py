@@ -10,7 +10,7 @@ from jeit.electrodes import CombinedElectrodes, FaceDiscs, plates
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, TotalVariation, reconstruct
 from jeit.inverse.nonlinear.observed import independent_data
-from jeit.inverse.shapes import EllipsoidPrior, StarPrior, reconstruct_shapes, search
+from jeit.inverse.shapes import EllipsoidPrior, StarPrior, certainty, reconstruct_shapes, search
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
 from jeit.inverse.shapes.finer import finer
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
@@ -81,6 +81,81 @@ def test_derivatives_are_those_of_finite_differences(ellipsoids, coarse):
     np.testing.assert_allclose(change, (ahead.image - behind.image) / (2 * step), rtol=1e-6, atol=1e-6)
     assert here.overlap.min() > 1e-5
     np.testing.assert_allclose(here.overlap_slope @ along, (ahead.overlap - behind.overlap) / (2 * step), rtol=1e-5)
+
+
+def test_bodies_of_one_material_have_the_contrast_of_the_first(ellipsoids, coarse):
+    rng = np.random.default_rng(4)
+    point = ellipsoids.of_radii([0.03, 0.02, 0.03]) + 0.3 * rng.normal(size=31)
+    same, point = ellipsoids.of_one_material(1, point)
+    assert same.alike.tolist() == [True, False, True]
+    assert [same.body(k, point).alike for k in range(3)] == [True, False, True]
+    moved = point + rng.normal(size=31)
+    bodies = [same.body(k, moved) for k in range(3)]
+    assert bodies[0].contrast == bodies[2].contrast != bodies[1].contrast
+    np.testing.assert_allclose(same.odds, -np.log(EllipsoidPrior().odds_for_one_material))
+    alone, rest = same.without(0, moved)
+    assert not alone.body(1, rest).alike
+    assert alone.body(1, rest).contrast == bodies[2].contrast
+    assert alone.odds == 0
+    problem, along, step = shape_problem(coarse), rng.normal(size=31), 1e-6
+    (_, jacobian, _, _) = problem.linearise(point, same)
+    ahead, behind = (problem.linearise(point + side * step * along, same)[0] for side in (1, -1))
+    np.testing.assert_allclose(jacobian() @ along, (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-3)
+
+
+def test_bodies_that_become_of_one_material_keep_their_effect(ellipsoids):
+    """Volume times (ρ - 1) / (ρ + 2), of a column (ρ - 1) / (ρ + 1)."""
+    point = ellipsoids.of_radii([0.02, 0.02, 0.02])
+    point[[5, 25]] = 0.6, -0.6  # contrasts of the first and the last
+    ellipsoids, point = ellipsoids.otherwise([2], point)
+    same, after = ellipsoids.of_one_material(1, point)
+    for k, ends in ((0, 2), (2, 1)):
+        effect = []
+        for one, values in ((ellipsoids, point), (same, after)):
+            body, row = one.body(k, values), one.rows(values)[k]
+            size = np.exp((1 + ends) * one.log_radius(row))
+            effect.append(size * np.expm1(body.contrast) / (np.exp(body.contrast) + ends))
+        np.testing.assert_allclose(*effect)
+
+
+def test_the_kind_of_bodies_may_be_known(coarse):
+    with pytest.raises(ValueError, match=r"kinds must be one of either, ellipsoids, columns; .* mean 'columns'"):
+        EllipsoidPrior(kinds="colums")
+    bodies = Ellipsoids.create(coarse.mesh, EllipsoidPrior(kinds="columns"), [[0.0, 0.0, 0.05]], [1])
+    columns, point = bodies.otherwise([0], bodies.of_radii([RADIUS]))
+    assert columns.odds == 0
+    problem: Any = None
+    assert search._otherwise(problem, Fit(bodies, point, 1.0, ROWS)) is None  # pyright: ignore
+    assert certainty.alternatives(problem, Fit(columns, point, 1.0, ROWS)) == [
+        (None, pytest.approx(np.nan, nan_ok=True))
+    ]
+
+
+@pytest.mark.parametrize(("worse", "told"), [(3.0, False), (5.0, True)])
+def test_the_range_of_bodies_of_one_material_is_of_each_for_itself_too(ellipsoids, worse, told):
+    same, point = ellipsoids.of_one_material(1, ellipsoids.of_radii([0.02, 0.02, 0.02]))
+    spread, contrast = EllipsoidPrior().contrast_spread, EllipsoidPrior().contrast
+
+    class Told:
+        """Each for itself is `worse`, has three times the deviation, and the last twice the contrast."""
+
+        def fit(self, bodies, coefficients, *steps):
+            assert not bodies.alike.any()
+            moved = coefficients.copy()
+            moved[25] = np.log(2) / spread
+            return Fit(bodies, moved, 1.0, ROWS)
+
+        def surprise(self, fit):
+            return fit.bodies.odds + (0.0 if fit.bodies.alike.any() else worse)
+
+        def deviations(self, fit):
+            return np.full(len(fit.coefficients), 0.1 if fit.bodies.alike.any() else 0.3)
+
+    problem: Any = Told()
+    found = certainty.contrast_deviations(problem, Fit(same, point, 1.0, ROWS))
+    slope = spread * contrast
+    wide = [0.3 * slope, 0.3 * slope, contrast + 0.3 * 2 * slope]
+    np.testing.assert_allclose(found, np.hypot([0.1 * slope] * 3 if told else wide, 0.1))
 
 
 def test_an_ellipsoid_knows_its_volume_its_middle_and_what_it_holds(ellipsoids):
@@ -178,6 +253,36 @@ def test_a_column_is_told_from_a_ball(coarse):
     np.testing.assert_allclose(strength, np.pi * RADIUS**2 * SIZE[2] * 3 / 5, rtol=0.15)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("ratios", "alike"), [((4.0, 4.0), True), ((2.0, 10.0), False)])
+def test_two_balls_are_of_one_material_unless_the_data_tell_otherwise(coarse, ratios, alike):
+    """Strong ones are hardly told by how much: together they are told better."""
+    places, mesh = (BALL, np.array([-0.012, 0.035, 0.045])), model(5000).mesh
+    balls = [lambda points, place=place: np.linalg.norm(points - place, axis=-1) - RADIUS for place in places]
+    for outside in balls:
+
+        def edge(corners, outside=outside):
+            on_surface = (outside(corners).min(axis=1) < 0) & (outside(corners).max(axis=1) > 0)
+            return np.where(on_surface, RADIUS / 3, np.inf)
+
+        mesh = cut(bisect(mesh, edge), outside)
+    fine = ForwardModel(mesh, discs(), opposite(16, current=1e-3))
+    factor = np.ones(mesh.num_cells)
+    for outside, ratio in zip(balls, ratios, strict=True):
+        factor[outside(np.asarray(centroids(mesh))) < 0] = ratio
+    change = np.asarray(fine.voltages(BATH * factor)) - np.asarray(fine.voltages(BATH))
+    noise = 0.01 * np.sqrt(np.mean(change**2))
+    frame = np.asarray(coarse.voltages(BATH)) + change
+    found = reconstruct_shapes(coarse, frame, BATH, start=[(1, one + 0.004, 0.022) for one in places], noise=noise)
+    order = np.argsort([body.centroid[1] for body in found.bodies])
+    bodies, deviations = [found.bodies[k] for k in order], np.array(found.contrast_deviations)[order]
+    assert [body.alike for body in bodies] == [alike, alike]
+    off = np.abs([body.contrast for body in bodies] - np.log(ratios))
+    assert np.all(off < deviations)
+    assert np.all(off < 0.15)  # 15 %
+    assert (bodies[0].contrast == bodies[1].contrast) == alike
+
+
 def test_what_is_shown_is_half_of_a_body_on_its_surface(coarse):
     """Cells that are covered by half, whatever the contrast: a surface drawn there is the body's."""
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
@@ -210,10 +315,10 @@ def test_a_kind_is_doubted_by_the_data_alone_and_has_a_deviation_of_its_own(coar
 
     problem: Any = Told()
     fitted = Fit(bodies, coefficients, 1.0, ROWS)
-    ((other, deviation),) = search._alternatives(problem, fitted)  # pyright: ignore
+    ((other, deviation),) = certainty.alternatives(problem, fitted)  # pyright: ignore
     assert (other is None) == told
     if other is not None:
-        (own,) = search._contrast_deviations(problem, fitted)  # pyright: ignore
+        (own,) = certainty.contrast_deviations(problem, fitted)  # pyright: ignore
         assert other.column != column
         assert deviation**2 - 0.01 == pytest.approx(4 * (own**2 - 0.01))
 

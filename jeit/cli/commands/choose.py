@@ -15,10 +15,11 @@ from jeit.cli.options import (
     Nodes,
     Quiet,
     Reference,
+    ReferenceFrames,
     make_folder,
     naming_options,
     number_or_name,
-    read_file,
+    read_pair,
 )
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ def choose(
         Path, typer.Option("--output", "-o", help="Folder for choice.png and choice.json.", show_default=False)
     ],
     reference: Reference = None,
+    reference_frames: ReferenceFrames = None,
     rule: Annotated[
         list[str] | None,
         typer.Option(
@@ -57,8 +59,7 @@ def choose(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        base = None if reference is None else read_file("--reference", reference, format, description)
-        measurement = read_file("DATA", data, format, description, like=base)
+        measurement, base = read_pair(data, reference, reference_frames, format, description)
         chosen = None if frame is None else number_or_name(frame, int)
         with naming_options({"rules": "--rule"}):
             result = compare_on_data(measurement, base, settings, rules=rule or None, frame=chosen, progress=step)

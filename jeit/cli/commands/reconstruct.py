@@ -17,9 +17,10 @@ from jeit.cli.options import (
     Nodes,
     Quiet,
     Reference,
+    ReferenceFrames,
     make_folder,
     number_or_name,
-    read_file,
+    read_pair,
 )
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ def reconstruct(
         ),
     ],
     reference: Reference = None,
+    reference_frames: ReferenceFrames = None,
     format: Format = None,
     description: Description = None,
     method: Annotated[
@@ -74,6 +76,13 @@ def reconstruct(
             help="Cut inclusions out; add labels to image.npz: 0 background, 1 resistive, 2 conductive.",
         ),
     ] = False,
+    bodies: Annotated[
+        str | None,
+        typer.Option(
+            help="Of bodies in a solid, if it is known: ellipsoids, balls and the like, or columns through its whole "
+            "height; either (default)."
+        ),
+    ] = None,
     num_points: Nodes = None,
     frame: Frame = None,
     as_is: AsIs = False,
@@ -93,6 +102,8 @@ def reconstruct(
             "contact": contact,
             "num-points": num_points,
             "segment": segment or None,
+            "reference-frames": reference_frames,
+            "bodies": bodies,
             "as-is": as_is or None,
         }
         which = None if frame is None else number_or_name(frame, int)
@@ -118,6 +129,7 @@ def reconstruct(
         "prior": prior,
         "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
         "contact": contact,
+        "bodies": bodies,
         "num_points": num_points,
         "as_is": as_is,
     }
@@ -131,8 +143,7 @@ def reconstruct(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        base = None if reference is None else read_file("--reference", reference, format, description)
-        measurement = read_file("DATA", data, format, description, like=base)
+        measurement, base = read_pair(data, reference, reference_frames, format, description)
         chosen = None if frame is None else number_or_name(frame, int)
         result = image_difference(measurement, base, settings, frame=chosen, progress=step)
         step("write")
@@ -215,8 +226,10 @@ def told_bodies(shapes: "ShapeReconstruction", dimension: int) -> str:
     upright = sum(isinstance(one, Ellipsoid) and one.column for one in shapes.bodies)
     columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
     assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""
+    alike = any(isinstance(one, Ellipsoid) and one.alike for one in shapes.bodies)
+    material = ", as of one material: the data do not tell otherwise" if alike else ""
     drift = f"the background has drifted by {percent(shapes.drift)}"
-    return f"{counted(len(shapes.bodies), edge)} fitted{columns}{left}{assumed}; {drift}"
+    return f"{counted(len(shapes.bodies), edge)} fitted{columns}{material}{left}{assumed}; {drift}"
 
 
 def _which(result: "ImagedDifference", asked: bool) -> str:

@@ -14,10 +14,11 @@ from jeit.cli.options import (
     Format,
     Nodes,
     Quiet,
+    ReferenceFrames,
     make_folder,
     naming_options,
     number_or_name,
-    read_file,
+    read_pair,
 )
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ def series(
             help="Measured file of the undisturbed body; DATA's frame 'reference', or its mean, unless given."
         ),
     ] = None,
+    reference_frames: ReferenceFrames = None,
     frequency: Annotated[
         list[str] | None,
         typer.Option(
@@ -103,8 +105,7 @@ def series(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        base = None if reference is None else read_file("--reference", reference, format, description)
-        measured = read_file("DATA", data, format, description, like=base)
+        measured, base = read_pair(data, reference, reference_frames, format, description)
         with naming_options({"rate": "--rate"}):
             measured = measured if rate is None else measured.at_rate(rate)
         with naming_options({"frequency": "--frequency"}):

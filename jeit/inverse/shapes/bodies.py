@@ -15,9 +15,12 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jeit.arguments import is_number, told
+
+# Fields of `Bodies` that say one thing of every body, besides where it starts.
+_OF_EACH = ("sign", "other", "alike")
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,21 @@ class BodyPrior(abc.ABC):
     apart: float = 1e3
 
     def __post_init__(self):
-        for name, value in vars(self).items():
+        for name, value in self._numbers.items():
             if not (is_number(value) and value > 0):
                 raise ValueError(f"{name} must be a positive number; it is {told(value)}.")
         if self.modes != int(self.modes):
             raise ValueError(f"modes must be a whole number from 1; it is {told(self.modes)}.")
+
+    @property
+    def _numbers(self) -> dict[str, Any]:
+        """What has to be positive."""
+        return vars(self)
+
+    @property
+    def is_of_one_kind(self) -> bool:
+        """Whether it is known beforehand of which of two kinds bodies are."""
+        return False
 
     @property
     @abc.abstractmethod
@@ -89,7 +102,8 @@ class Bodies(abc.ABC):
 
     **Fields**: `prior` of every body; `weight` (m,), every cell's share of the whole measure; `span`, the longest side
     of the whole body; `start` (k, d), metres, and `sign` (k,) of every body; `other` (k,), whether it is of the form's
-    other kind: weak among stars, a column among ellipsoids.
+    other kind: weak among stars, a column among ellipsoids; `alike` (k,), whether it is of one material with all others
+    of its sign that are: the contrast of the first of them is theirs, and their own coefficients of it tell nothing.
     """
 
     prior: Any
@@ -98,6 +112,7 @@ class Bodies(abc.ABC):
     start: Float[np.ndarray, "k d"]
     sign: Float[np.ndarray, " k"]
     other: Bool[np.ndarray, " k"]
+    alike: Bool[np.ndarray, " k"]
 
     @property
     @abc.abstractmethod
@@ -134,9 +149,28 @@ class Bodies(abc.ABC):
         """d."""
         return self.start.shape[1]
 
+    @property
+    def first(self) -> Int[np.ndarray, " k"]:
+        """The body whose contrast every one has: itself, or the first that is of one material with it."""
+        order, first = np.arange(len(self.sign)), np.arange(len(self.sign))
+        for one in (self.alike & (self.sign == sign) for sign in (-1, 1)):
+            first[one] = order[one].min(initial=len(order))
+        return first
+
     def rows(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "k q"]:
         """Coefficients of every body."""
-        return coefficients[1:].reshape(len(self.sign), self.prior.size)
+        rows = coefficients[1:].reshape(len(self.sign), self.prior.size).copy()
+        rows[:, self.dimension + 1] = rows[self.first, self.dimension + 1]
+        return rows
+
+    def by_coefficients(self, by_rows: Float[np.ndarray, "r n"]) -> Float[np.ndarray, "r n"]:
+        """Derivatives by the coefficients from those by the drift and every body's row."""
+        by_rows, order = by_rows.copy(), np.arange(len(self.sign))
+        contrast = 1 + order * self.prior.size + self.dimension + 1
+        for k in order[self.first != order]:
+            by_rows[:, contrast[self.first[k]]] += by_rows[:, contrast[k]]
+            by_rows[:, contrast[k]] = 0
+        return by_rows
 
     def of_radii(self, radii) -> Float[np.ndarray, " n"]:
         """Coefficients of disks or balls, metres, at the start."""
@@ -160,7 +194,7 @@ class Bodies(abc.ABC):
     def only(self, some) -> Self:
         """Some of them."""
         some = np.asarray(some, int)
-        return replace(self, start=self.start[some], sign=self.sign[some], other=self.other[some])
+        return replace(self, **{name: getattr(self, name)[some] for name in ("start", *_OF_EACH)})
 
     def without(self, k: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
         """The others, and their coefficients."""
@@ -179,8 +213,8 @@ class Bodies(abc.ABC):
             step = step * 2 ** (-1 / 3)  # as far out as the middles of the two halves, and some more
         middle = self.centre(k, row)
         start = np.concatenate([others.start, [middle + step, middle - step]])
-        sign, other = np.append(others.sign, [self.sign[k]] * 2), np.append(others.other, [self.other[k]] * 2)
-        return replace(self, start=start, sign=sign, other=other), np.concatenate([remaining, half, half])
+        each = {name: np.append(getattr(others, name), [getattr(self, name)[k]] * 2) for name in _OF_EACH}
+        return replace(self, start=start, **each), np.concatenate([remaining, half, half])
 
     def with_modes(self, modes: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
         """The same bodies with more modes, or fewer."""

@@ -14,8 +14,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jeit.arguments import check_name
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior, Covered
 from jeit.mesh import Mesh, measures
+
+KINDS = ("either", "ellipsoids", "columns")
+"""Of bodies that there may be in a solid: balls and the like, those through its whole height, or either."""
 
 # Corners' weights of the twenty points at which a cell is asked whether it lies in a body: each stands for as much.
 _SAMPLES = np.array([[2 * n + 1 for n in one] for one in np.ndindex(4, 4, 4, 4) if sum(one) == 3]) / 10
@@ -49,14 +53,33 @@ _LEVEL = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
 class EllipsoidPrior(BodyPrior):
     """Of ellipsoids: `modes` 2, or 1 for balls; `roughness`, of the logarithm of the axes' ratios; `contrast` of log σ
     and the spread of its logarithm; `odds_for_columns`, how many times as likely as an ellipsoid a column is
-    beforehand: most tanks hold columns. Smooth images of solids tell places well, so `place` is small. The rest as of
-    `BodyPrior`."""
+    beforehand: most tanks hold columns; `odds_for_one_material`, how many times as likely all bodies of a sign, more or
+    less conductive than the bath, are of the same as each of its own; `kinds` of bodies that there may be, one
+    of `KINDS`. Smooth images of solids tell places well, so `place` is small. The rest as of `BodyPrior`.
+
+    Raises `ValueError` for what is not positive, and for other kinds.
+    """
 
     modes: int = 2
     place: float = 0.04
     contrast: float = 1.5
     contrast_spread: float = 0.7
     odds_for_columns: float = 20.0
+    odds_for_one_material: float = 3.0
+    kinds: str = KINDS[0]
+
+    def __post_init__(self):
+        super().__post_init__()
+        check_name("kinds", self.kinds, KINDS)
+
+    @property
+    def _numbers(self):
+        return {name: value for name, value in vars(self).items() if name != "kinds"}
+
+    @property
+    def is_of_one_kind(self) -> bool:
+        """Whether it is known beforehand whether bodies are columns."""
+        return self.kinds != KINDS[0]
 
     @property
     def size(self) -> int:
@@ -80,8 +103,8 @@ class Ellipsoid(eqx.Module):
     **Fields**: `sign`, +1 conductive or -1 resistive; `centre` (3,) metres; `axes` (3, 3), half axes as rows, metres,
     the longest first; `volume` m³ and `centroid` (3,) metres, of the part that lies in the whole body; `contrast` of
     log σ, positive; `column`, whether it is no ellipsoid, but stands through the whole height, half of which is one of
-    the half axes then; `rise`, how many times the objective is, at its least, without this body: what tells a body from
-    a ghost.
+    the half axes then; `alike`, whether it is taken to be of one material with the others of its sign; `rise`, how many
+    times the objective is, at its least, without this body: what tells a body from a ghost.
     """
 
     sign: int
@@ -91,6 +114,7 @@ class Ellipsoid(eqx.Module):
     centroid: Float[np.ndarray, "3"]
     contrast: float
     column: bool
+    alike: bool
     rise: float
 
     @property
@@ -131,14 +155,17 @@ class Ellipsoids(Bodies):
         points, volume = np.asarray(mesh.points), np.asarray(measures(mesh))
         sampled = _SAMPLES @ points[np.asarray(mesh.cells)]
         start, total = np.reshape(np.asarray(start, float), (-1, 3)), float(volume.sum())
-        sign, other = np.asarray(sign, float), np.zeros(len(start), bool)
+        sign, no = np.asarray(sign, float), np.zeros(len(start), bool)
         span, ends = float(np.ptp(points, axis=0).max()), (float(points[:, 2].min()), float(points[:, 2].max()))
-        return cls(prior, volume / total, span, start, sign, other, sampled, _BLUR * np.cbrt(volume), total, ends)
+        return cls(prior, volume / total, span, start, sign, no, no, sampled, _BLUR * np.cbrt(volume), total, ends)
 
     @property
     def odds(self) -> float:
-        """What columns are more likely by beforehand."""
-        return -float(self.other.sum() * np.log(self.prior.odds_for_columns))
+        """What columns, and bodies of one material, are more likely by beforehand."""
+        materials = len(set(self.sign[self.first != np.arange(len(self.sign))]))
+        columns = 0 if self.prior.is_of_one_kind else self.other.sum()
+        prior = np.log([self.prior.odds_for_columns, self.prior.odds_for_one_material])
+        return -float(prior @ [columns, materials])
 
     @property
     def num_splits(self) -> int:
@@ -148,7 +175,7 @@ class Ellipsoids(Bodies):
     def otherwise(self, some, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
         """The same with `some` taken for columns, columns for ellipsoids, of the same volume, the rest of their
         coefficients kept."""
-        rows, other = self.rows(coefficients).copy(), self.other.copy()
+        rows, other = self.rows(coefficients), self.other.copy()
         for k in some:
             volume = max(self.body(k, coefficients).volume, 1e-6 * self.total) / np.pi
             radius = np.cbrt(3 / 4 * volume) if other[k] else np.sqrt(volume / (self.ends[1] - self.ends[0]))
@@ -156,6 +183,21 @@ class Ellipsoids(Bodies):
             rows[k, 2], other[k] = 0, not other[k]
             rows[k, 5:] *= _LEVEL[: self.prior.size - 5]
         return replace(self, other=other), np.append(coefficients[0], rows)
+
+    def of_one_material(self, sign: int, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
+        """The same with all bodies of a sign of one material, of their mean contrast, and of about the same effect:
+        volume times (ρ - 1) / (ρ + 2), of a column (ρ - 1) / (ρ + 1), ρ times as conductive as the bath."""
+        rows, some, contrast = self.rows(coefficients), np.flatnonzero(self.sign == sign), self.dimension + 1
+        before = rows[:, contrast].copy()
+        rows[some, contrast] = before[some].mean()
+        for k in some:
+            after, past = (
+                np.exp(sign * self.prior.contrast_of(one, False)[0]) for one in (rows[k, contrast], before[k])
+            )
+            ends = 1.0 if self.other[k] else 2.0
+            larger = (past - 1) * (after + ends) / ((past + ends) * (after - 1))
+            rows[k, 3] += np.log(larger) / (ends + 1) / self.prior.radius_spread
+        return replace(self, alike=self.alike | (self.sign == sign)), np.append(coefficients[0], rows)
 
     def mixture(self, share, contrast):
         """log(1 + share (exp(p contrast) - 1)) / p: of a conductive body and the bath the harmonic mean, p = -1, of
@@ -176,7 +218,8 @@ class Ellipsoids(Bodies):
 
     def on(self, mesh: Mesh) -> Ellipsoids:
         """The same on another mesh of the same solid."""
-        return replace(Ellipsoids.create(mesh, self.prior, self.start, self.sign), other=self.other, span=self.span)
+        there = Ellipsoids.create(mesh, self.prior, self.start, self.sign)
+        return replace(there, other=self.other, alike=self.alike, span=self.span)
 
     def edges(self, coefficients, edge: float, corners: Float[np.ndarray, "m 4 3"]) -> Float[np.ndarray, " m"]:
         """How long edges of cells of some `corners`, metres, may be, metres: on surfaces `edge` times the least half
@@ -238,7 +281,8 @@ class Ellipsoids(Bodies):
             form[2, 2], centre[2] = (self.ends[1] - self.ends[0]) / 2, sum(self.ends) / 2
         length, direction = np.linalg.eigh(form)
         contrast, axes = float(self.contrast(k, row)[0]), (length * direction).T[::-1]
-        return Ellipsoid(int(self.sign[k]), centre, axes, volume, centroid, contrast, column, float(rise))
+        alike = int((self.first == self.first[k]).sum()) > 1
+        return Ellipsoid(int(self.sign[k]), centre, axes, volume, centroid, contrast, column, alike, float(rise))
 
     def covered(self, k: int, row) -> Covered:
         """Cells that ellipsoid k reaches."""

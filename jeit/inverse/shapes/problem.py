@@ -54,7 +54,8 @@ class ShapeProblem:
         def jacobian():
             there = [conductivity if cells is None else conductivity[cells] for cells, _ in slopes]
             changes = [Change(cells, one[:, None] * slope) for one, (cells, slope) in zip(there, slopes, strict=True)]
-            return np.concatenate([weight[:, None] * fields.derivatives(changes), apart * overlap_slope])
+            voltages = bodies.by_coefficients(fields.derivatives(changes))
+            return np.concatenate([weight[:, None] * voltages, apart * overlap_slope])
 
         return (
             np.concatenate([weight * (fields.voltages - self.data.voltages), apart * overlap]),

@@ -17,6 +17,7 @@ from jeit.inverse.nonlinear.checks import check_background, check_frame, check_n
 from jeit.inverse.nonlinear.observed import independent_data
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior
+from jeit.inverse.shapes.certainty import alternatives, contrast_deviations
 from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior, Ellipsoids
 from jeit.inverse.shapes.finer import Finer, finer
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
@@ -38,13 +39,8 @@ _MOST_CHANGES = 10
 # How often the mesh is made finer where bodies are, at most: they move by it. And the lengths of edges there, of the
 # least half axis, that are tried in turn: first while ghosts are among the bodies, and then.
 _MOST_MESHES, _EDGES = 3, ((0.7,), (0.25, 0.35, 0.5, 0.7))
-# How much likelier (of the logarithm) more has to make the data than less, to be told; and one kind of body than the
-# other, not to be told as one of two.
-_MARGIN, _UNDECIDED = 2.0, 4.0
-# What the mesh adds to the deviation of a solid body's contrast, of log σ: balls of three times the bath are told as
-# 3.87, 3.59 and 3.31 times where edges on their surfaces are 0.7, 0.5 and 0.35 of the radius, and as 3.1 to 3.2 times
-# where they are 0.25.
-_BY_THE_MESH = 0.1
+# How much likelier (of the logarithm) more has to make the data than less, to be told.
+_MARGIN = 2.0
 
 
 Body = Star | Ellipsoid
@@ -143,8 +139,11 @@ def reconstruct_shapes(
     solid = model.mesh.dimension == 3
     problem = ShapeProblem(small, data, background, _ROUGHLY if solid else ShapeProblem.rtol)
     bodies = form.create(model.mesh, prior, centre, sign)
+    coefficients = bodies.of_radii(radius)
+    if isinstance(prior, EllipsoidPrior) and prior.kinds == "columns":
+        bodies, coefficients = bodies.otherwise(range(len(radius)), coefficients)
     setting = _Setting(problem, None if smooth is None else SmoothField.create(smooth, problem))
-    level, coefficients, tell = 0.0, bodies.of_radii(radius), progress or (lambda stage: None)
+    level, tell = 0.0, progress or (lambda stage: None)
     tell("bodies")
     if smooth is not None:
         level, balls, _ = _told_one_by_one(setting, *bodies.with_modes(1, coefficients))
@@ -166,8 +165,8 @@ def reconstruct_shapes(
     predicted = np.asarray(model.voltages(conductivity if there is None else background))
     if there is not None:
         predicted = predicted + there.change(model.protocol, bodies.image(coefficients).image, field)
-    others = _alternatives(setting.problem(level), fitted)
-    deviations = _contrast_deviations(setting.problem(level), fitted)
+    others = alternatives(setting.problem(level), fitted)
+    deviations = contrast_deviations(setting.problem(level), fitted)
     excess = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
     order = np.argsort(-np.asarray(rises), kind="stable")
     return ShapeReconstruction(
@@ -287,6 +286,8 @@ def _on_finer_meshes(told: _Told, least_rise: float, tell: Callable[[str], None]
         found = _without_ghosts(problem, fit, doubtful, least_rise, missed)
         if again < _MOST_MESHES - 1 and (other := _otherwise(problem, found.fit)):
             found = _without_ghosts(problem, other, found.doubtful, least_rise)
+        if again:
+            found = found._replace(fit=_of_one_material(problem, found.fit))
         told, after = _Told(setting, level, found), found.fit
         if again and not bodies.moved(coefficients, after.bodies, after.coefficients):
             break
@@ -336,34 +337,20 @@ def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None
 def _otherwise(problem: ShapeProblem, fitted: Fit) -> Fit | None:
     """The bodies with one or all of them taken for the other kind, weak stars or columns; None if the data do not tell
     of it."""
-    plain = np.flatnonzero(~fitted.bodies.other)
+    plain = np.flatnonzero(~fitted.bodies.other & (not fitted.bodies.prior.is_of_one_kind))
     some = [[k] for k in plain] + [plain] * (len(plain) > 1)
     found = _best(problem, fitted, [fitted.bodies.otherwise(one, fitted.coefficients) for one in some])
     return found if found and _is_told(problem, fitted, found) else None
 
 
-def _contrast_deviations(problem: ShapeProblem, fitted: Fit) -> list[float]:
-    """Standard deviations of the contrasts of bodies."""
-    bodies = fitted.bodies
-    spread = bodies.rows(problem.deviations(fitted))[:, bodies.dimension + 1]
-    slopes = [bodies.contrast(k, row)[1] for k, row in enumerate(bodies.rows(fitted.coefficients))]
-    return [float(one) for one in np.hypot(spread * slopes, _BY_THE_MESH * (bodies.dimension == 3))]
-
-
-def _alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | None, float]]:
-    """Every ellipsoid as a column, and every column as an ellipsoid, that explains the data about as well, whichever is
-    more likely beforehand; and the deviation of its contrast."""
-    bodies, number = fitted.bodies, len(fitted.bodies.sign)
-    if not (number and isinstance(bodies, Ellipsoids)):
-        return [(None, np.nan)] * number
-    most, found = problem.surprise(fitted) - bodies.odds + _UNDECIDED, []
-    for k in range(number):
-        other = problem.fit(*bodies.otherwise([k], fitted.coefficients), _STEPS_WITHOUT, _ROUGHLY)
-        if problem.surprise(other) - other.bodies.odds < most:
-            found.append((other.bodies.body(k, other.coefficients), _contrast_deviations(problem, other)[k]))
-        else:
-            found.append((None, np.nan))
-    return found
+def _of_one_material(problem: ShapeProblem, fitted: Fit) -> Fit:
+    """The ellipsoids with those of either sign of one material, where that is likelier than that each is of its own."""
+    for sign in (1, -1):
+        bodies = fitted.bodies
+        if isinstance(bodies, Ellipsoids) and ((bodies.sign == sign) & ~bodies.alike).sum() > 1:
+            alike = problem.fit(*bodies.of_one_material(sign, fitted.coefficients), _STEPS)
+            fitted = min(fitted, alike, key=problem.surprise)
+    return fitted
 
 
 def _best(problem: ShapeProblem, fitted: Fit, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]) -> Fit | None:

@@ -146,8 +146,8 @@ class Stars(Bodies):
         area = np.asarray(measures(mesh))
         start = np.reshape(np.asarray(start, float), (-1, 2))
         width, weight = _BLUR * np.sqrt(area), area / area.sum()
-        sign, other = np.asarray(sign, float), np.zeros(len(start), bool)
-        return cls(prior, weight, span, start, sign, other, corners @ _SAMPLES.T, width, edges)
+        sign, no = np.asarray(sign, float), np.zeros(len(start), bool)
+        return cls(prior, weight, span, start, sign, no, no, corners @ _SAMPLES.T, width, edges)
 
     @property
     def odds(self) -> float:
@@ -161,7 +161,7 @@ class Stars(Bodies):
 
     def otherwise(self, some, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
         """The same with `some` stars taken for weak, and so much larger that they do as much to the field."""
-        rows, weak = self.rows(coefficients).copy(), self.other.copy()
+        rows, weak = self.rows(coefficients), self.other.copy()
         for k in some:
             strength = np.tanh(self.contrast(k, rows[k])[0] / 2) / np.tanh(self.prior.weak_contrast / 2)
             rows[k, 2] += np.log(strength) / 2 / self.prior.radius_spread

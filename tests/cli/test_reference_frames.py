@@ -1,0 +1,56 @@
+"""A recording that begins with the undisturbed body: its own frames as the reference."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jeit.cli.options import read_pair
+
+
+@pytest.fixture
+def recording(tank):
+    """Two frames at rest, a little apart, and a third that is touched; described beside it."""
+    return tank.write("frames", [0.999 * tank.rest, 1.001 * tank.rest, tank.touched])
+
+
+def test_the_reference_is_the_mean_of_frames_of_data_or_of_the_file_given(tank, recording):
+    voltages = np.loadtxt(recording, delimiter=",")
+    measurement, base = read_pair(recording, None, "0-1", None, None)
+    assert measurement.num_frames == 3
+    assert base is not None
+    np.testing.assert_allclose(base.voltages, voltages[:2])
+    _, base = read_pair(tank.folder / "touched.csv", recording, "1", None, None)
+    assert base is not None
+    np.testing.assert_allclose(base.voltages, voltages[1:2])
+    _, base = read_pair(tank.folder / "touched.csv", recording, None, None, None)
+    assert base is not None
+    assert base.num_frames == 3
+
+
+@pytest.mark.parametrize("frames", ["1-0", "0-3", "3", "-1", "0:2", "a", ""])
+def test_frames_that_there_are_not_are_refused(recording, frames):
+    with pytest.raises(ValueError, match=r"--reference-frames: give FIRST-LAST, .* frames 0 to 2 of 'frames'; it is '"):
+        read_pair(recording, None, frames, None, None)
+
+
+def test_an_image_by_own_frames_is_that_by_a_file_of_them(tank, recording, run, tmp_path):
+    found = []
+    for name, given in (("own", ("--reference-frames", "0-1")), ("file", ("--reference", tank.folder / "rest.csv"))):
+        folder = tmp_path / name
+        asked = ("--frame", 2, "--num-points", 300, "--method", "one-step", "--hyperparameter", 1.0, "--output", folder)
+        status, _, error = run("reconstruct", recording, *given, *asked)
+        assert (status, error) == (0, "")
+        found.append(json.loads((folder / "report.json").read_text())["inclusions"])
+    own, file = ([one["peak"] for one in inclusions] for inclusions in found)
+    np.testing.assert_allclose(own, file, rtol=1e-6)
+
+
+@pytest.mark.parametrize("command", ["choose", "series"])
+def test_other_commands_take_frames_too(recording, run, tmp_path, command):
+    status, _, error = run(command, recording, "--reference-frames", "5", "--output", tmp_path / "out")
+    assert status != 0
+    assert "--reference-frames: give FIRST-LAST" in error
+    asked = ("--num-points", 300, "--output", tmp_path, *(("--rate", 10) if command == "series" else ()))
+    status, _, error = run(command, recording, "--reference-frames", "0-1", *asked)
+    assert (status, error) == (0, "")
