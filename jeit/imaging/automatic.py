@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import percent
-from jeit.imaging.method import METHODS, Asked, Imaged, shapes_in
+from jeit.imaging.method import METHODS, Asked, Imaged, of_shapes, shapes_in
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.prior.defaults import MEASURED
@@ -91,7 +91,7 @@ def _with_bodies(prepared: PreparedDifference, why: str, smooth: Imaged, shapes:
     them: a smooth image alone shows strong ones at a tenth of their contrast there, with ghosts about as strong."""
     if shapes is None or prepared.mesh.dimension < 3:
         return Chosen("gauss-newton", why, smooth, shapes)
-    return Chosen("shapes", why, (shapes, shapes.conductivity - prepared.calibration.conductivity), shapes)
+    return Chosen("shapes", why, of_shapes(prepared, shapes), shapes)
 
 
 def _edges(prepared: PreparedDifference) -> str:

@@ -13,6 +13,8 @@ from jaxtyping import Array, Float, Inexact, UInt8
 from jeit.arguments import percent
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
+from jeit.electrodes import AbstractElectrodes
+from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
 from jeit.image.score import CONDUCTIVE, RESISTIVE
@@ -106,8 +108,13 @@ class ImagedDifference:
 
     @property
     def mesh(self) -> Mesh:
-        """The mesh imaged on."""
-        return self.calibration.model.mesh
+        """The mesh imaged on: of bodies in a solid finer at their surfaces than that of the calibration."""
+        return _imaged_on(self.reconstruction, self.calibration).mesh
+
+    @property
+    def electrodes(self) -> AbstractElectrodes:
+        """On that mesh."""
+        return _imaged_on(self.reconstruction, self.calibration).electrodes
 
     @property
     def chosen_by(self) -> str:
@@ -168,6 +175,12 @@ class ImagedDifference:
         return as_array(np.log1p(np.asarray(self.change) / float(self.calibration.conductivity)))
 
 
+def _imaged_on(found, calibration: Calibration) -> ForwardModel:
+    """The model on whose mesh something was found."""
+    finer = found.finer if isinstance(found, ShapeReconstruction) else None
+    return calibration.model if finer is None else finer.model
+
+
 def _doubts_of_data(found: ImagedDifference) -> list[str]:
     """Too few channels, or a background that no solid has."""
     used, said = np.asarray(found.measurement.mask)[0], []
@@ -212,8 +225,8 @@ def image_difference(
         as_is=settings.as_is,
         clock=clock,
     )
-    calibration, mesh = prepared.calibration, prepared.mesh
-    if mesh.dimension == 2 and settings.bodies != KINDS[0]:
+    calibration = prepared.calibration
+    if prepared.mesh.dimension == 2 and settings.bodies != KINDS[0]:
         raise ValueError("bodies: ellipsoids and columns are of solids, and this is a sheet; leave it out.")
     with clock("image"):
         why, shapes = "", None
@@ -232,7 +245,7 @@ def image_difference(
                 "another, or a rule."
             )
     with clock("raster and inclusions"):
-        grid = Raster.create(mesh, shape=settings.raster_shape)
+        grid = Raster.create(_imaged_on(reconstruction, calibration).mesh, shape=settings.raster_shape)
         found = ImagedDifference(
             measurement=prepared.measurement,
             reference=prepared.reference,

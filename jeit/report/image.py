@@ -41,7 +41,7 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
         if result.mesh.dimension == 3:
             background, change = np.asarray(result.calibration.conductivity), np.asarray(result.change)
             values = {"change of conductivity": change, "conductivity": background + change}
-            draft_vtu(made / "image.vtu", result.mesh, values, electrodes=result.calibration.model.electrodes)
+            draft_vtu(made / "image.vtu", result.mesh, values, electrodes=result.electrodes)
 
 
 def _arrays(result: ImagedDifference) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def _arrays(result: ImagedDifference) -> dict[str, Any]:
         arrays["labels"] = result.labels
     if result.iterative and not result.is_complex:
         arrays["departure"] = _drawn(result)
-    return {**arrays, **saved_extras(result.mesh, result.calibration.model.electrodes, result.inclusions)}
+    return {**arrays, **saved_extras(result.mesh, result.electrodes, result.inclusions)}
 
 
 def _drawn(result: ImagedDifference) -> np.ndarray:
@@ -80,11 +80,11 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     if result.is_complex:
         figure = Figure(figsize=(11.5, 5.2), layout="constrained")
         figure.suptitle(result.measurement.name)
-        electrodes = result.calibration.model.electrodes
+        electrodes = result.electrodes
         plot_admittivity(result.mesh, np.asarray(result.change), electrodes, figure=figure)
         return figure
     scale = LOGARITHM if result.iterative else CHANGE
-    electrodes = result.calibration.model.electrodes
+    electrodes = result.electrodes
     if result.mesh.dimension == 3:
         figure = plot_solid(result.mesh, _drawn(result), electrodes, inclusions=result.inclusions, scale=scale)
         figure.suptitle(result.measurement.name)

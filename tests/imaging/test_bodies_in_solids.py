@@ -47,6 +47,11 @@ def test_a_ball_is_fitted_beside_a_smooth_field(monkeypatch):
     assert np.linalg.norm(body.centroid - BALL) < 0.004
     assert low < result.inclusions[0].peak < high
     assert result.settings.method == "shapes"
+    finer = result.shapes.finer
+    assert finer is not None
+    assert result.mesh is finer.model.mesh is not result.calibration.model.mesh
+    assert result.electrodes is finer.model.electrodes
+    assert np.shape(result.change) == (result.mesh.num_cells,)
     in_ball = np.linalg.norm(np.asarray(centroids(result.mesh)) - BALL, axis=1) < 0.5 * RADIUS
     assert np.asarray(result.change)[in_ball].mean() > 0.8 * result.inclusions[0].peak  # the image is of the body
     (deviation,) = result.shapes.contrast_deviations

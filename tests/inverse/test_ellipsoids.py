@@ -234,6 +234,17 @@ def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, ratio):
     # The image holds all of the body, its cells by the share that it covers: harmonic means would lose a tenth of it.
     image = np.log(np.asarray(found.conductivity) / BATH / (1 + found.drift))
     np.testing.assert_allclose(np.asarray(measures(coarse.mesh)) @ image, sign * body.contrast * body.volume, rtol=0.05)
+    # So does that on the finer mesh, on whose cells it ends within fewer.
+    assert found.finer is not None
+    fine, values = found.finer.model.mesh, np.asarray(found.finer.conductivity)
+    assert fine.num_cells == len(values) > coarse.mesh.num_cells
+    sharper = np.log(values / BATH / (1 + found.drift))
+    np.testing.assert_allclose(np.asarray(measures(fine)) @ sharper, sign * body.contrast * body.volume, rtol=0.05)
+    blurred = [
+        np.asarray(measures(mesh))[np.abs(one / body.contrast * sign - 0.5) < 0.45].sum()
+        for mesh, one in ((fine, sharper), (coarse.mesh, image))
+    ]
+    assert blurred[0] < 0.7 * blurred[1]
     assert len(found.doubtful) == 1
 
 

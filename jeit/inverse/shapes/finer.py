@@ -42,8 +42,12 @@ class Finer(NamedTuple):
     def change(self, protocol: Protocol, image: Float[np.ndarray, " f"], field: Any) -> Float[np.ndarray, " M"]:
         """How voltages of a protocol change, volts, by the `image` of bodies and a `field` (m,) or 0, of log σ."""
         model, background = self.problem.model.with_protocol(protocol), self.problem.background
-        after = background * np.exp(image + np.broadcast_to(field, self.cell.max() + 1)[self.cell])
+        after = self.conductivity(image, field)
         return solved_fields(model, after).voltages - solved_fields(model, background).voltages
+
+    def conductivity(self, image: Float[np.ndarray, " f"], field: Any) -> Float[np.ndarray, " f"]:
+        """Of the finer cells, S/m, for the `image` of bodies and a `field` (m,) or 0, of log σ."""
+        return self.problem.background * np.exp(image + np.broadcast_to(field, self.cell.max() + 1)[self.cell])
 
 
 def finer(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) -> Finer:

@@ -46,6 +46,14 @@ _MARGIN = 2.0
 Body = Star | Ellipsoid
 
 
+class FinerImage(eqx.Module):
+    """The `conductivity` (c,), S/m, of the cells of a finer mesh, that of `model`, on which electrodes lie as before;
+    its protocol is another, of independent channels."""
+
+    model: ForwardModel
+    conductivity: Float[Array, " c"]
+
+
 class ShapeReconstruction(eqx.Module):
     """What `reconstruct_shapes` found.
 
@@ -56,7 +64,8 @@ class ShapeReconstruction(eqx.Module):
     were started from and left out again, their `rise` too small; `contrast_deviations`, standard deviation of each
     body's contrast, after the data and as far as noise is all that is wrong, in solids with 0.1 for the mesh besides;
     `alternatives`, each body of a solid as the other kind, ellipsoid or column, where the data do not tell which it is,
-    else None; `alternative_deviations`, of their contrasts, or NaN.
+    else None; `alternative_deviations`, of their contrasts, or NaN; `finer`, of a solid in which there are any, on the
+    last of the meshes that are finer at their surfaces: for pictures.
     """
 
     bodies: tuple[Body, ...]
@@ -68,6 +77,7 @@ class ShapeReconstruction(eqx.Module):
     contrast_deviations: tuple[float, ...]
     alternatives: tuple[Ellipsoid | None, ...]
     alternative_deviations: tuple[float, ...]
+    finer: FinerImage | None = None
 
     @property
     def hyperparameter(self) -> float:
@@ -162,9 +172,10 @@ def reconstruct_shapes(
     solids = isinstance(bodies, Ellipsoids)
     shown = bodies.on(model.mesh).shown(coefficients) if solids else bodies.image(coefficients).image
     conductivity = background * np.exp(shown + field)
-    predicted = np.asarray(model.voltages(conductivity if there is None else background))
+    predicted, image = np.asarray(model.voltages(conductivity if there is None else background)), None
     if there is not None:
         predicted = predicted + there.change(model.protocol, bodies.image(coefficients).image, field)
+        image = FinerImage(there.problem.model, as_array(there.conductivity(bodies.shown(coefficients), field)))
     others = alternatives(setting.problem(level), fitted)
     deviations = contrast_deviations(setting.problem(level), fitted)
     excess = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
@@ -179,6 +190,7 @@ def reconstruct_shapes(
         contrast_deviations=tuple(deviations[k] for k in order),
         alternatives=tuple(others[k][0] for k in order),
         alternative_deviations=tuple(others[k][1] for k in order),
+        finer=image,
     )
 
 
