@@ -139,12 +139,6 @@ def test_the_range_of_bodies_of_one_material_is_of_each_for_itself_too(ellipsoid
     class Told:
         """Each for itself is `worse`, has three times the deviation, and the last twice the contrast."""
 
-        def fit(self, bodies, coefficients, *steps):
-            assert not bodies.alike.any()
-            moved = coefficients.copy()
-            moved[25] = np.log(2) / spread
-            return Fit(bodies, moved, 1.0, ROWS)
-
         def surprise(self, fit):
             return fit.bodies.odds + (0.0 if fit.bodies.alike.any() else worse)
 
@@ -152,7 +146,10 @@ def test_the_range_of_bodies_of_one_material_is_of_each_for_itself_too(ellipsoid
             return np.full(len(fit.coefficients), 0.1 if fit.bodies.alike.any() else 0.3)
 
     problem: Any = Told()
-    found = certainty.contrast_deviations(problem, Fit(same, point, 1.0, ROWS))
+    moved = point.copy()
+    moved[25] = np.log(2) / spread
+    one, each = Fit(same, point, 1.0, ROWS), Fit(ellipsoids, moved, 1.0, ROWS)
+    found = certainty.contrast_deviations(problem, one, each)
     slope = spread * contrast
     wide = [0.3 * slope, 0.3 * slope, contrast + 0.3 * 2 * slope]
     np.testing.assert_allclose(found, np.hypot([0.1 * slope] * 3 if told else wide, 0.1))

@@ -191,6 +191,10 @@ class Bodies(abc.ABC):
         """Of log σ of body k, positive, and its derivative by the coefficient."""
         return self.prior.contrast_of(row[self.dimension + 1], bool(self.other[k]))
 
+    def shown(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+        """log σ/σ₀ (m,) for pictures."""
+        return self.image(coefficients).image
+
     def only(self, some) -> Self:
         """Some of them."""
         some = np.asarray(some, int)

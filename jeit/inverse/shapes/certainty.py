@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from jaxtyping import Float
 
@@ -19,18 +17,14 @@ _UNDECIDED, _STEPS, _ROUGHLY = 4.0, 8, 1e-2
 _BY_THE_MESH = 0.1
 
 
-def contrast_deviations(problem: ShapeProblem, fitted: Fit) -> list[float]:
+def contrast_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> list[float]:
     """Standard deviations of the contrasts of bodies; of those of one material so large that they reach the deviation
-    of each for itself too, where the data do not tell that they are."""
-    bodies = fitted.bodies
+    of `each` for itself too, where the data do not tell that they are."""
     contrast, deviation = _contrasts(problem, fitted)
-    if bodies.alike.any():
-        rows = np.append(fitted.coefficients[0], bodies.rows(fitted.coefficients))
-        each = problem.fit(replace(bodies, alike=np.zeros_like(bodies.alike)), rows, _STEPS, _ROUGHLY)
-        if problem.surprise(each) - each.bodies.odds < problem.surprise(fitted) - bodies.odds + _UNDECIDED:
-            own, its = _contrasts(problem, each)
-            deviation = np.maximum(deviation, np.abs(own - contrast) + its)
-    return [float(one) for one in np.hypot(deviation, _BY_THE_MESH * (bodies.dimension == 3))]
+    if each and problem.surprise(each) - each.bodies.odds < problem.surprise(fitted) - fitted.bodies.odds + _UNDECIDED:
+        own, its = _contrasts(problem, each)
+        deviation = np.maximum(deviation, np.abs(own - contrast) + its)
+    return [float(one) for one in np.hypot(deviation, _BY_THE_MESH * (fitted.bodies.dimension == 3))]
 
 
 def _contrasts(problem: ShapeProblem, fitted: Fit) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:

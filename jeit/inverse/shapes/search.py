@@ -166,18 +166,18 @@ def reconstruct_shapes(
     if solid:
         best, there = _on_finer_meshes(best, least_rise, tell)
         tell("bodies, of which kind")
-    (setting, level, (fitted, rises, doubtful)), beside = best, best.setting.beside
+    (setting, level, (each, rises, doubtful)), beside = best, best.setting.beside
+    problem = setting.problem(level)
+    fitted = _of_one_material(problem, each)
     bodies, coefficients = fitted.bodies, fitted.coefficients
     field = 0.0 if beside is None else beside.estimate(level, fitted)
-    solids = isinstance(bodies, Ellipsoids)
-    shown = bodies.on(model.mesh).shown(coefficients) if solids else bodies.image(coefficients).image
-    conductivity = background * np.exp(shown + field)
+    drawn = bodies.on(model.mesh) if isinstance(bodies, Ellipsoids) else bodies
+    conductivity = background * np.exp(drawn.shown(coefficients) + field)
     predicted, image = np.asarray(model.voltages(conductivity if there is None else background)), None
     if there is not None:
         predicted = predicted + there.change(model.protocol, bodies.image(coefficients).image, field)
         image = FinerImage(there.problem.model, as_array(there.conductivity(bodies.shown(coefficients), field)))
-    others = alternatives(setting.problem(level), fitted)
-    deviations = contrast_deviations(setting.problem(level), fitted)
+    others, deviations = alternatives(problem, fitted), contrast_deviations(problem, fitted, each)
     excess = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
     order = np.argsort(-np.asarray(rises), kind="stable")
     return ShapeReconstruction(
@@ -298,8 +298,6 @@ def _on_finer_meshes(told: _Told, least_rise: float, tell: Callable[[str], None]
         found = _without_ghosts(problem, fit, doubtful, least_rise, missed)
         if again < _MOST_MESHES - 1 and (other := _otherwise(problem, found.fit)):
             found = _without_ghosts(problem, other, found.doubtful, least_rise)
-        if again:
-            found = found._replace(fit=_of_one_material(problem, found.fit))
         told, after = _Told(setting, level, found), found.fit
         if again and not bodies.moved(coefficients, after.bodies, after.coefficients):
             break
