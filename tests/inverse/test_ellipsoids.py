@@ -291,6 +291,25 @@ def test_two_balls_are_of_one_material_unless_the_data_tell_otherwise(coarse, ra
     assert (bodies[0].contrast == bodies[1].contrast) == alike
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kinds", ["ellipsoids", "columns"])
+def test_a_kind_that_is_given_is_kept(coarse, kinds):
+    """Of a column's voltages, from two starts of which one is nothing."""
+    fine, held = sharp(4000, along=2)
+    change = np.asarray(fine.voltages(BATH * np.where(held, 4.0, 1.0))) - np.asarray(fine.voltages(BATH))
+    frame, noise = np.asarray(coarse.voltages(BATH)) + change, 0.03 * np.sqrt(np.mean(change**2))
+    start, prior = [(1, BALL + 0.005, 0.03), (-1, (-0.03, 0.04, 0.03), 0.02)], EllipsoidPrior(kinds=kinds)
+    found = reconstruct_shapes(coarse, frame, BATH, start=start, noise=noise, prior=prior)
+    body, *others = found.bodies
+    assert all(one.column == (kinds == "columns") for one in (body, *others, *found.doubtful))
+    assert all(one is None for one in found.alternatives)
+    assert np.linalg.norm((body.centroid - BALL)[:2]) < 0.003
+    if kinds == "columns":
+        assert not others
+        strength = body.volume * np.tanh(body.contrast / 2)
+        np.testing.assert_allclose(strength, np.pi * RADIUS**2 * SIZE[2] * 3 / 5, rtol=0.15)
+
+
 def test_what_is_shown_is_half_of_a_body_on_its_surface(coarse):
     """Cells that are covered by half, whatever the contrast: a surface drawn there is the body's."""
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
