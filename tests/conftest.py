@@ -41,7 +41,7 @@ def _compiled_code_goes_before_memory_maps_do():
     A module takes up to some 6,000 (thrice that where it is slow); forgetting after each compiles the same again.
     """
     yield
-    if not MAPS.exists() or MAPS.read_bytes().count(b"\n") > 30_000:
+    if not MAPS.exists() or MAPS.read_bytes().count(b"\n") > 20_000:
         jax.clear_caches()
 
 
