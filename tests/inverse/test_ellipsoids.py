@@ -137,7 +137,7 @@ def test_a_ball_over_the_wall_ends_there(coarse):
     np.testing.assert_allclose(body.centroid, [0.05 - 3 / 8 * 0.03, 0, 0.05], atol=5e-4)
 
 
-@pytest.mark.parametrize("ratio", [4.0, 0.2])
+@pytest.mark.parametrize("ratio", [4.0, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, ratio):
     fine, held = sharp(6000)
     rest, there = np.asarray(fine.voltages(BATH)), np.asarray(fine.voltages(BATH * np.where(held, ratio, 1.0)))
