@@ -38,7 +38,7 @@ def _shared(variable: str, folder: str) -> Path | None:
 def _compiled_code_goes_before_memory_maps_do():
     """Linux gives a process 65,530 memory maps; compiled code takes several a program, and XLA crashes at the end.
 
-    A module takes up to some 6,000 (thrice that where it is slow); forgetting after each compiles the same again.
+    A quick module takes up to 5,000 of them; to forget after each compiled the same small programs in the next.
     """
     yield
     if not MAPS.exists() or MAPS.read_bytes().count(b"\n") > 20_000:
