@@ -16,7 +16,15 @@ from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import boundary_loops, facet_measures
 from jeit.mesh.loops import along
 from jeit.mesh.outline import polyline
-from jeit_solvers.engines import either_engine, has_values, namespace, on_host, sum_into, undifferentiated
+from jeit_solvers.engines import (
+    either_engine,
+    has_values,
+    namespace,
+    on_host,
+    sum_into,
+    undifferentiated,
+    values_at_once,
+)
 
 
 class BoundaryElectrodes(AbstractMovableElectrodes):
@@ -74,6 +82,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         """The boundary edges of `mesh`."""
         return (mesh.facets,)
 
+    @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the boundary edges of `mesh`, exact for P1 basis functions."""
         xp = namespace(self, mesh)

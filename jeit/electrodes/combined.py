@@ -15,7 +15,7 @@ from jeit.electrodes.electrodes import (
     as_electrode_values,
 )
 from jeit.mesh import Body, Mesh, Refine
-from jeit_solvers.engines import namespace
+from jeit_solvers.engines import namespace, values_at_once
 
 
 class CombinedElectrodes(AbstractCompleteElectrodes):
@@ -68,6 +68,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         """The facets and cells of all parts."""
         return tuple(nodes for part in self.parts for nodes in part.contact_nodes(mesh))
 
+    @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals of all parts, side by side."""
         contacts = [part.contact(mesh) for part in self.parts]

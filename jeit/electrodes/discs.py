@@ -18,7 +18,7 @@ from jeit.electrodes.electrodes import (
 from jeit.electrodes.window import EDGE, nearest_electrodes, smooth_step, triangle_quadrature, window_contact
 from jeit.mesh import Body, Mesh, Refine, measures
 from jeit.mesh.geometry import facet_measures
-from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated
+from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated, values_at_once
 
 
 class AbstractDiscs(AbstractPlacedElectrodes):
@@ -70,6 +70,7 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
         """The cells of `mesh`."""
         return (mesh.cells,)
 
+    @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the cells, by quadrature of the windows."""
         xp = namespace(self, mesh)
@@ -113,6 +114,7 @@ class FaceDiscs(AbstractDiscs):
         """The boundary triangles of `mesh`."""
         return (mesh.facets,)
 
+    @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the boundary triangles, by quadrature of the windows."""
         xp = namespace(self, mesh)

@@ -16,7 +16,7 @@ from jeit.electrodes.electrodes import (
 )
 from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import facet_measures
-from jeit_solvers.engines import has_values, namespace, sum_into
+from jeit_solvers.engines import has_values, namespace, sum_into, values_at_once
 
 
 class FacetElectrodes(AbstractCompleteElectrodes):
@@ -81,6 +81,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         """The boundary facets of `mesh`."""
         return (mesh.facets,)
 
+    @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over whole facets: ∫φ_i = |f| / d, ∫φ_iφ_j = |f| (1 + δ_ij) / (d (d + 1))."""
         xp = namespace(self, mesh)

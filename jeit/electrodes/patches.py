@@ -20,7 +20,7 @@ from jeit.electrodes.electrodes import (
 from jeit.electrodes.placing import check_apart, check_placed
 from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import facet_measures
-from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undifferentiated
+from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undifferentiated, values_at_once
 
 # Patches that do not overlap and can reach one triangle that is not larger than they are.
 _MOST_AT_ONCE = 8
@@ -75,6 +75,7 @@ class FacePatches(AbstractPlacedElectrodes):
         """The boundary triangles of `mesh`."""
         return (mesh.facets,)
 
+    @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over what the patches cover of boundary triangles, seen along their normals: exact."""
         xp = namespace(self, mesh)

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from jeit.electrodes.electrodes import AbstractPointElectrodes, Contact, ElectrodePen, as_positions
 from jeit.mesh import Body, Mesh, Refine, gradients, measures, normals
-from jeit_solvers.engines import either_engine, has_values, namespace, sum_into, undifferentiated
+from jeit_solvers.engines import either_engine, has_values, namespace, sum_into, undifferentiated, values_at_once
 
 
 class PointElectrodes(AbstractPointElectrodes):
@@ -43,6 +43,7 @@ class PointElectrodes(AbstractPointElectrodes):
         """Half the size of cells at their places, seen from above."""
         return (Refine(np.asarray(self.position)[:, :2], factor=2.0),)
 
+    @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """`load` (n, L): values of the basis functions at the electrodes; no mass."""
         cell, weights, _ = _locate(self.position, mesh)
@@ -114,6 +115,7 @@ class NodeElectrodes(AbstractPointElectrodes):
         """None: they have a mesh."""
         return ()
 
+    @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """`load` (n, L): one at each electrode's node; no mass."""
         ones = namespace(self, mesh).ones(self.num_electrodes, mesh.points.dtype)

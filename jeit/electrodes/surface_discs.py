@@ -9,7 +9,7 @@ from jeit.electrodes.electrodes import Contact
 from jeit.electrodes.window import EDGE, nearest_electrodes, triangle_quadrature, window_contact
 from jeit.mesh import Body, Mesh, Refine, measures, normals
 from jeit.mesh.geodesic import Triangles, unfold
-from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated
+from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated, values_at_once
 
 # Cosine of the angle between normals: a disc as large as the surface's radius of curvature turns by one radian.
 _FACING = float(np.cos(1.0))
@@ -44,6 +44,7 @@ class SurfaceDiscs(AbstractDiscs):
         """The triangles of `mesh`."""
         return (mesh.cells,)
 
+    @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the triangles, by quadrature of the windows."""
         xp = namespace(self, mesh)

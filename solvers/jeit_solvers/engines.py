@@ -99,6 +99,23 @@ def either_engine(function: _Function) -> _Function:
     return call  # pyright: ignore[reportReturnType]
 
 
+def values_at_once(function: _Function) -> _Function:
+    """`function` of arrays: in NumPy, at once, where all have values; as it is where any is traced.
+
+    For what must see some values even where others are traced, which `either_engine` does not let it. What it returns
+    are JAX's arrays, unless all it was given are NumPy's.
+    """
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        given = arguments, named
+        if namespace(given) is np or not has_values(given):
+            return function(*arguments, **named)
+        return on_device(at_once(function, *arguments, **named))
+
+    return call  # pyright: ignore[reportReturnType]
+
+
 class Recent:
     """Keeps the last few results of a function of pytrees, known again by the identity of the arrays they came of."""
 

@@ -176,7 +176,7 @@ def test_electrodes_by_position(described, tmp_path):
         ("inner-8", "grid-4x2", r"electrodes\.layouts: 'grid-4x2': a curved skin has inner-N.*or a \.csv file"),
         ("inner-8", "no.csv", r"electrodes\.layouts: 'no\.csv': .*no file"),
         ("inner-8", "flat.csv", r"electrodes\.layouts: 'flat\.csv': .*there is no column z_mm"),
-        ("inner-8", "inner-900", r"electrodes\.layouts: 'inner-900': .*overlap|no room"),
+        ("inner-8", "inner-250", r"electrodes\.layouts: 'inner-250': .*overlap|no room"),
     ],
 )
 @pytest.mark.parametrize("kind", ["layout", "layouts"])

@@ -103,6 +103,26 @@ def test_mass_and_load_add_up_to_area_over_impedance(electrodes, mesh, area):
     assert total == pytest.approx(per_electrode.sum(), rel=1e-12)
 
 
+@pytest.mark.parametrize("kind", ["arcs", "sheet discs", "face discs", "patches", "points", "combined"])
+def test_contact_of_values_equals_that_of_traced_arrays(kind):
+    """NumPy works out the one, and JAX the other; what is asked of JAX's arrays is JAX's."""
+    mesh = box(0.06, 0.06, 0.01, num_points=300) if kind in ("face discs", "patches") else disk(0.05, num_points=200)
+    electrodes = {
+        "arcs": lambda: BoundaryElectrodes(ring(0.05, 4), 0.02, [1.0, 2.0, 3.0, 4.0]),
+        "sheet discs": lambda: SheetDiscs(0.02 * ring(1.0, 4), 0.008, 2.0),
+        "face discs": lambda: FaceDiscs([[0.01, 0.0, 0.01], [-0.01, 0.01, 0.0]], 0.009, 2.0),
+        "patches": lambda: FacePatches([[0.01, 0.0, 0.01], [-0.01, 0.01, 0.0]], 0.011, 0.013, 2.0),
+        "points": lambda: PointElectrodes([[0.013, 0.021], [-0.02, 0.01]]),
+        "combined": lambda: CombinedElectrodes(
+            BoundaryElectrodes(ring(0.05, 3), 0.02, 1.0), SheetDiscs([[0, 0]], 0.01, 3.0)
+        ),
+    }[kind]()
+    values, traced = electrodes.contact(mesh), jax.jit(lambda one, on: one.contact(on))(electrodes, mesh)
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(values))
+    for one, other in zip(jax.tree.leaves(values), jax.tree.leaves(traced), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-14 * np.asarray(values.load).max())
+
+
 def test_window_area_converges_to_the_disc():
     errors = []
     for cell_size in (0.008, 0.004, 0.002):
@@ -174,6 +194,7 @@ def test_position_gradient_where_an_electrode_slides_over_corners(offset):
     position = ring(0.1, 4, start_angle=offset / 0.1)
     weight = jax.random.normal(jax.random.key(0), (mesh.num_points, 4))
 
+    @jax.jit
     def total(position):
         return jnp.sum(BoundaryElectrodes(position, 0.03, 1.0).contact(mesh).load * weight)
 

@@ -74,6 +74,7 @@ def test_places_along_the_surface_by_taylor(kind):
     mesh = skin(0.005, 0.04)
     along = np.array([-np.sin(ANGLE), np.cos(ANGLE), 0.6])
 
+    @jax.jit
     def moment(step):
         place = (spot(height=0.04) + 1e-3 * step * along)[None]
         made = FaceDiscs(place, 0.012, 1.0) if kind == "disc" else FacePatches(place, 0.02, 0.015, 1.0)
@@ -97,4 +98,5 @@ def test_batches_and_compiled_calls():
 
     each = np.array([float(area(radius)) for radius in radii])
     np.testing.assert_allclose(jax.vmap(area)(radii), each, rtol=1e-12)
-    np.testing.assert_allclose([float(jax.jit(area)(radius)) for radius in radii], each, rtol=1e-12)
+    compiled = jax.jit(area)
+    np.testing.assert_allclose([float(compiled(radius)) for radius in radii], each, rtol=1e-12)

@@ -98,9 +98,9 @@ def test_voltages_and_jacobian_of_a_plate_in_space():
 
 
 def test_derivatives_along_the_surface_by_taylor():
-    points, cells = ball(300)
+    points, cells = ball(120)
     mesh = Mesh.create(points, cells)
-    number = [3, 50, 100, 150, 200, 250]
+    number = [3, 20, 40, 60, 80, 100]
     pattern = protocol.adjacent(6)
     model = ForwardModel(mesh, NodeElectrodes(number), pattern)
     spot = ForwardModel(mesh, PointElectrodes(np.asarray(centroids(mesh))[number]), pattern)
@@ -121,7 +121,7 @@ def test_derivatives_along_the_surface_by_taylor():
         (placed, 1e-3 * rng.normal(size=(6, 3))),
     ]
     for function, way in cases:
-        base, slope = jax.jvp(function, (jnp.zeros_like(way),), (jnp.asarray(way),))
+        base, slope = jax.jit(lambda way, of=function: jax.jvp(of, (jnp.zeros_like(way),), (way,)))(way)
         rest = [float(jnp.abs(function(e * way) - base - e * slope).max()) for e in (1e-2, 5e-3)]
         assert rest[0] / rest[1] == pytest.approx(4, rel=0.1)
 

@@ -1,6 +1,6 @@
 """Sparse symmetric positive definite systems of many shapes, and their dense twins, for the solver tests."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from scipy.spatial import Delaunay
 
@@ -39,7 +39,13 @@ def element_matrices(num_elements, nodes, seed=0):
 
 def from_cells(points, cells, seed=0):
     pattern = SparsityPattern.from_elements([cells], len(points))
-    return pattern, pattern.assemble(jnp.asarray(element_matrices(*cells.shape, seed))), points
+    # In NumPy: of JAX's arrays, each operation would be compiled for each problem.
+    return pattern, jax.device_put(pattern.assemble(element_matrices(*cells.shape, seed))), points
+
+
+def dense(pattern, values):
+    """The matrix as NumPy's array, which takes no program compiled for each size."""
+    return pattern.to_scipy(values).toarray()
 
 
 def _from_dense(matrix):

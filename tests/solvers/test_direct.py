@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import sparse_problems
 from scipy.sparse.linalg import splu
+from sparse_problems import dense
 
 from jeit_solvers import (
     ConjugateGradient,
@@ -60,12 +61,12 @@ def test_solves_every_problem_to_roundoff(case, dtype):
     pattern, values, coordinates = case()
     values = as_type(values, dtype)
     plan = analyse(pattern, coordinates)
-    vectors = jax.random.normal(jax.random.key(0), (pattern.size, 5)).astype(dtype)
+    vectors = jax.device_put(np.random.default_rng(0).normal(size=(pattern.size, 5)).astype(dtype))
     positive_definite, solution, form, half = everything(plan, values, vectors)
     assert positive_definite
     assert solution.dtype == values.dtype
-    dense = np.asarray(pattern.to_dense(values))
-    residual = np.linalg.norm(dense @ solution - vectors) / np.linalg.norm(dense) / np.linalg.norm(solution)
+    matrix, solution, form, half, vectors = map(np.asarray, (dense(pattern, values), solution, form, half, vectors))
+    residual = np.linalg.norm(matrix @ solution - vectors) / np.linalg.norm(matrix) / np.linalg.norm(solution)
     assert residual < TOLERANCE[dtype]
     # Forward errors may be larger, by the condition numbers, which are below 1e3.
     loose = 1e3 * TOLERANCE[dtype]
@@ -73,27 +74,32 @@ def test_solves_every_problem_to_roundoff(case, dtype):
     np.testing.assert_allclose(half.T @ half, form, rtol=0, atol=loose * abs(form).max())
 
 
+def entries_and_root(plan, values, rows):
+    factor = factorise(plan, values)
+    return inverse_entries(plan, factor), inverse_root(plan, factor, rows)
+
+
 @pytest.mark.parametrize("engine", [on_host, on_device], ids=["numpy", "jax"])
 @pytest.mark.parametrize("case", sparse_problems.PROBLEMS, ids=lambda case: case.__name__)
 def test_entries_and_root_of_the_inverse_are_those_of_the_dense_one(case, engine):
     pattern, values, coordinates = case()
-    inverse = np.linalg.inv(np.asarray(pattern.to_dense(values)))
+    inverse = np.linalg.inv(dense(pattern, values))
     pattern, plan, values = engine((pattern, analyse(pattern, coordinates), values))
-    factor = factorise(plan, values)
-    entries = inverse_entries(plan, factor)
+    work = entries_and_root if engine is on_host else jax.jit(entries_and_root)
+    entries, root = work(plan, values, engine(np.eye(plan.num_pivots)))
     assert isinstance(entries, np.ndarray) == (engine is on_host)
     least = 1e-12 * abs(inverse).max()
     np.testing.assert_allclose(
         entries, inverse[np.asarray(pattern.rows), np.asarray(pattern.columns)], rtol=0, atol=least
     )
-    root = inverse_root(plan, factor, engine(np.eye(plan.num_pivots)))
+    root = np.asarray(root)
     np.testing.assert_allclose(root @ root.T, inverse, rtol=0, atol=least)
 
 
 def test_the_inverse_has_entries_where_elements_have_nodes():
     points, cells = sparse_problems.disk_cells(30)
     pattern, values, _ = sparse_problems.from_cells(points, cells)
-    inverse = np.linalg.inv(np.asarray(pattern.to_dense(values)))
+    inverse = np.linalg.inv(dense(pattern, values))
     plan = analyse(pattern, points)
     between = pattern.entries_between(inverse_entries(plan, factorise(plan, values)))
     row, column = np.tril_indices(3)
@@ -244,7 +250,7 @@ def test_a_plan_serves_all_that_have_its_tree_while_any_uses_it():
     assert kept() is None
     plan = analyse(pattern, coordinates)
     vector = np.arange(1.0, pattern.size + 1)
-    expected = np.linalg.solve(np.asarray(pattern.to_dense(values)), vector)
+    expected = np.linalg.solve(dense(pattern, values), vector)
     np.testing.assert_allclose(solve(plan, factorise(plan, values), jnp.asarray(vector)), expected, rtol=1e-12)
 
 

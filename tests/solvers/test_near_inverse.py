@@ -1,9 +1,9 @@
 """Entries of the inverse near its diagonal, beside the dense inverse."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
-from sparse_problems import box_cells, disk_cells, element_matrices, from_cells
+from sparse_problems import box_cells, dense, disk_cells, element_matrices, from_cells
 
 from jeit_solvers import SparseSymmetric, SparsityPattern, Strips, near_inverse
 
@@ -19,7 +19,7 @@ def three_disks():
 def one_row():
     cells = np.stack([np.arange(20), np.arange(1, 21)], axis=1)
     pattern = SparsityPattern.from_elements([cells], 21)
-    return pattern, pattern.assemble(jnp.asarray(element_matrices(20, 2))), np.arange(21.0)[:, None]
+    return pattern, jax.device_put(pattern.assemble(element_matrices(20, 2))), np.arange(21.0)[:, None]
 
 
 PROBLEMS = {
@@ -30,12 +30,17 @@ PROBLEMS = {
 }
 
 
+@jax.jit
+def blocks(inverse, places):
+    return inverse.blocks(places)
+
+
 def all_pairs(strips, inverse, wanted, reach):
     """Pairs of wanted unknowns that lie near enough, and G between them."""
     place = strips.place[wanted]
     strip = place // strips.wanted
     first, second = np.nonzero(np.abs(strip[:, None] - strip) <= reach)
-    found = inverse.blocks(jnp.asarray(np.stack([place[first], place[second]], axis=1)))
+    found = blocks(inverse, np.stack([place[first], place[second]], axis=1))
     return wanted[first], wanted[second], np.asarray(found)[:, 0, 1]
 
 
@@ -47,7 +52,7 @@ def test_entries_are_those_of_the_dense_inverse(name, reach, share):
     chosen = np.random.default_rng(0).random(pattern.size) < share
     strips = Strips.create(pattern, coordinates, chosen)
     found = near_inverse(strips, SparseSymmetric(values, pattern), reach)
-    expected = np.linalg.inv(np.asarray(pattern.to_dense(values)))
+    expected = np.linalg.inv(dense(pattern, values))
     rows, columns, entries = all_pairs(strips, found, np.flatnonzero(chosen), reach)
     assert len(rows) > chosen.sum()
     np.testing.assert_allclose(entries, expected[rows, columns], rtol=0, atol=1e-13 * np.abs(expected).max())
@@ -70,8 +75,8 @@ def test_products_are_added():
     left = np.random.default_rng(1).normal(size=(pattern.size, 4))
     weights = np.diag([1.0, 2.0, 3.0, 4.0])
     inverse = near_inverse(strips, SparseSymmetric(values, pattern), 2)
-    more = inverse.add(strips.spread(jnp.asarray(left)), strips.spread(jnp.asarray(left @ weights)))
-    expected = np.linalg.inv(np.asarray(pattern.to_dense(values))) + left @ weights @ left.T
+    more = inverse.add(strips.spread(jax.device_put(left)), strips.spread(jax.device_put(left @ weights)))
+    expected = np.linalg.inv(dense(pattern, values)) + left @ weights @ left.T
     rows, columns, entries = all_pairs(strips, more, np.flatnonzero(chosen), 2)
     np.testing.assert_allclose(entries, expected[rows, columns], rtol=0, atol=1e-12 * np.abs(expected).max())
 

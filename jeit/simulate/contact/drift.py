@@ -1,8 +1,17 @@
 """What changes on a skin that nobody touches: its conductivity, its contacts, and every reading."""
 
+import math
+
 import jax
 import numpy as np
 from jaxtyping import Array, Float
+
+
+def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    """The draws of `jax.random.normal`: the first of a power of two of them, of which fewer programs are compiled than
+    there are records of different length."""
+    number = math.prod(shape)
+    return np.asarray(jax.random.normal(key, (1 << max(number - 1, 0).bit_length(),)))[:number].reshape(shape)
 
 
 def walk(
@@ -11,15 +20,15 @@ def walk(
     """Logarithms (T, k) of k quantities that drift from 0 at time 0: `trend` per second, the same for all, and a random
     walk of `deviation` per root of a second for each; `seconds` (T,) do not fall."""
     steps = np.diff(seconds, prepend=0.0)
-    normal = np.asarray(jax.random.normal(key, (len(steps), number)))
+    normal = standard_normal(key, (len(steps), number))
     return trend * np.asarray(seconds)[:, None] + deviation * np.cumsum(np.sqrt(steps)[:, None] * normal, axis=0)
 
 
 def gains(key: Array, spread: float, number: int) -> Float[np.ndarray, " M"]:
     """Of `number` channels: log-normal round 1, `spread` the deviation of the logarithm."""
-    return np.exp(spread * np.asarray(jax.random.normal(key, (number,))))
+    return np.exp(spread * standard_normal(key, (number,)))
 
 
 def white_noise(key: Array, deviation: float, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     """Independent and normal, volts."""
-    return deviation * np.asarray(jax.random.normal(key, shape))
+    return deviation * standard_normal(key, shape)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jeit.simulate.contact import Foundation, Material, material
-from jeit.simulate.contact.drift import gains, walk, white_noise
+from jeit.simulate.contact.drift import gains, standard_normal, walk, white_noise
 from jeit.simulate.contact.materials import MATERIALS
 from jeit.simulate.contact.response import advance, held_pressure, unstrained
 
@@ -126,3 +126,10 @@ def test_materials_have_what_their_sources_print():
 def test_impossible_materials_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (5, 7), (2, 3, 11), (0, 4)])
+def test_draws_are_those_of_jax_whatever_their_number(shape):
+    drawn = standard_normal(KEY, shape)
+    assert drawn.shape == shape
+    np.testing.assert_allclose(drawn, jax.random.normal(KEY, shape), rtol=1e-14)
