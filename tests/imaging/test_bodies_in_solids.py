@@ -115,7 +115,7 @@ def test_a_prior_that_is_asked_for_is_that_of_the_image(monkeypatch, prior, faul
     data.difference = change
     monkeypatch.setattr(automatic, "unsound", lambda *_: fault)
     monkeypatch.setattr(automatic, "Reconstruction", SimpleNamespace)
-    monkeypatch.setattr(automatic, "_shapes", lambda *_: SimpleNamespace(conductivity=change))
+    monkeypatch.setattr(automatic, "_shapes", lambda *_: SimpleNamespace(conductivity=change, finer=None))
     for name in ("one-step", "gauss-newton"):
         made = SimpleNamespace(image=lambda *_: (SimpleNamespace(), change), hyperparameter=5.0)
         monkeypatch.setitem(automatic.METHODS, name, made)
@@ -132,7 +132,7 @@ def test_what_is_fitted_is_named_for_the_body(monkeypatch, dimension, edges, str
     data.mask = np.ones(2, bool)
     monkeypatch.setattr(automatic, "unsound", lambda *_: "it is strong" if strongest == 1 else "")
     monkeypatch.setattr(automatic, "Reconstruction", SimpleNamespace)
-    monkeypatch.setattr(automatic, "_shapes", lambda *_: SimpleNamespace(conductivity=change))
+    monkeypatch.setattr(automatic, "_shapes", lambda *_: SimpleNamespace(conductivity=change, finer=None))
     for name in ("one-step", "gauss-newton"):
         made = SimpleNamespace(image=lambda *_: (SimpleNamespace(), change), hyperparameter=5.0)
         monkeypatch.setitem(automatic.METHODS, name, made)
