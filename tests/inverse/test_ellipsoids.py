@@ -92,6 +92,7 @@ def test_bodies_of_one_material_have_the_contrast_of_the_first(ellipsoids, coars
     moved = point + rng.normal(size=31)
     bodies = [same.body(k, moved) for k in range(3)]
     assert bodies[0].contrast == bodies[2].contrast != bodies[1].contrast
+    assert same.on(coarse.mesh).body(2, moved).contrast == bodies[0].contrast
     np.testing.assert_allclose(same.odds, -np.log(EllipsoidPrior().odds_for_one_material))
     alone, rest = same.without(0, moved)
     assert not alone.body(1, rest).alike
