@@ -18,6 +18,8 @@ Importing jeit turns on JAX's 64-bit mode, unless JAX_ENABLE_X64 is set, and kee
 folder, unless JAX has been told of another or JEIT_COMPILATION_CACHE is "off". Rooms are imported when first used.
 """
 
+from __future__ import annotations
+
 import importlib
 from typing import TYPE_CHECKING
 

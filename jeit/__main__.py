@@ -1,5 +1,7 @@
 """`python -m jeit` is the `jeit` command."""
 
+from __future__ import annotations
+
 import sys
 
 from jeit.cli import main

@@ -9,6 +9,8 @@ maps, two sources). Beside them: `decay`, the decay models; `microphones`, the a
 sources are; `noise`; `track`, places in time; `touches`, all of it in one call.
 """
 
+from __future__ import annotations
+
 from jeit.acoustic.calibration.calibrate import calibrate_microphones
 from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.localisation.cramer_rao import cramer_rao

@@ -4,6 +4,8 @@ A source of strength I₀ at distance r is received with intensity I₀ f_i(r). 
 the logarithms of its parameters, which keeps them positive.
 """
 
+from __future__ import annotations
+
 import abc
 import math
 from typing import ClassVar, Self

@@ -1,5 +1,7 @@
 """An array of microphones: where they are, what each receives of a source, and how well that is known."""
 
+from __future__ import annotations
+
 import functools
 import operator
 

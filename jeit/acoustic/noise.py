@@ -11,6 +11,8 @@ the logarithm of intensity, whose errors are those of gains; where S ≪ N it sa
 it is nearly normal in both.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float

@@ -1,5 +1,7 @@
 """From a recording to touches in one call: intensities, the place of every frame, and the track of every touch."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import equinox as eqx

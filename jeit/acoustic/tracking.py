@@ -5,6 +5,8 @@ filtered forwards by Kalman's filter and smoothed backwards after Rauch, Tung an
 passed over, and one too far from where the touch can be is not believed. q is the likeliest of a range.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import numpy as np

@@ -5,6 +5,8 @@ One sentence each, before anything is compiled: which argument, what was given, 
 light: nothing of the library is imported here.
 """
 
+from __future__ import annotations
+
 from jeit.arguments.arrays import real_array
 from jeit.arguments.counts import counted, percent
 from jeit.arguments.instrument import readings

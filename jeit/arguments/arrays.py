@@ -1,5 +1,7 @@
 """Arrays of numbers."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

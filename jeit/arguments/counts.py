@@ -1,5 +1,7 @@
 """How many of a thing, and what share of it, in words."""
 
+from __future__ import annotations
+
 import math
 
 # Below it nobody cares how little it is.

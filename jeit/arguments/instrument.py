@@ -1,5 +1,7 @@
 """Numbers that an instrument gave."""
 
+from __future__ import annotations
+
 import numpy as np
 
 # No instrument reads more, in volts or any part of them; the squares of such numbers are still of use.

@@ -1,5 +1,7 @@
 """Random keys."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import jax

@@ -1,5 +1,7 @@
 """Things of another kind than is asked for."""
 
+from __future__ import annotations
+
 import math
 from numbers import Real
 from typing import Any

@@ -1,5 +1,7 @@
 """Lengths, which are in metres."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

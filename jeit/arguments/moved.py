@@ -4,6 +4,8 @@ Every room that names have left calls `tell_old_names`. Whoever asks for one, be
 `jeit.Mesh`, is told where it is.
 """
 
+from __future__ import annotations
+
 import sys
 from typing import NoReturn
 

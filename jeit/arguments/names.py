@@ -1,5 +1,7 @@
 """Names of what there is, and which of them was meant."""
 
+from __future__ import annotations
+
 import difflib
 from collections.abc import Iterable
 from typing import Any

@@ -1,5 +1,7 @@
 """Arguments inside JAX's transformations, which have no values yet where values are needed."""
 
+from __future__ import annotations
+
 from typing import Any
 
 from jeit_solvers.engines import has_values

@@ -3,6 +3,8 @@
 The commands import what they need when they run, so that `jeit --help` answers at once.
 """
 
+from __future__ import annotations
+
 from jeit.cli.app import main
 
 __all__ = [

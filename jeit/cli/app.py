@@ -1,5 +1,7 @@
 """The command line's frame: its commands and its errors."""
 
+from __future__ import annotations
+
 import gc
 import io
 import logging

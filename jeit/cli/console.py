@@ -1,5 +1,7 @@
 """What the commands print: steps as they go, and tables of results."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Frames of standard input, and the seconds they come at: by a rate, or by the clock."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Iterator
 

@@ -1,5 +1,7 @@
 """Frames imaged by a network on the command line: what `reconstruct` and `stream` share of it."""
 
+from __future__ import annotations
+
 import sys
 from collections.abc import Iterable
 from pathlib import Path

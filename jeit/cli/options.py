@@ -1,5 +1,7 @@
 """Options and arguments that several commands share."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress

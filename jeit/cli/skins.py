@@ -1,5 +1,7 @@
 """Flat skins on the command line: the options that describe them, and a layout of electrodes with its skin."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 

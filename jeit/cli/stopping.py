@@ -1,5 +1,7 @@
 """Ctrl-C and SIGTERM while frames are streamed: what has come is written, and the exit status says what ended it."""
 
+from __future__ import annotations
+
 import signal
 import sys
 import threading

@@ -4,6 +4,8 @@
 whether a frame can be imaged against a reference.
 """
 
+from __future__ import annotations
+
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.data.description import load_description
 from jeit.data.export import write_table

@@ -4,6 +4,8 @@ Format 5 ("MAT-File Format" by The MathWorks) is read here, arrays of numbers al
 than the file says before, and SciPy's reader can be brought down by files that are made for it.
 """
 
+from __future__ import annotations
+
 import math
 import struct
 import zlib

@@ -1,5 +1,7 @@
 """The tables of a description, key by key: what each may hold, from where to where, in which unit."""
 
+from __future__ import annotations
+
 import math
 from typing import Annotated, Literal
 

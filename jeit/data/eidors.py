@@ -5,6 +5,8 @@ for the latter: EIDORS drives -I at the first electrode of a pair and +I at the 
 minus second, so that adjacent data come out positive; say `polarity = "reversed"`.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 

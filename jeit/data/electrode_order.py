@@ -4,6 +4,8 @@ A layout may be numbered in any order. But two rows of a table of positions exch
 image, and are noticed by nobody; so it is said, and what the voltages say of it, whose signs hang on the order.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Int
 

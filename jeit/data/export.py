@@ -1,5 +1,7 @@
 """Write a measurement as NPZ with a TOML description beside it, for other tools and for `read`."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 from typing import Any

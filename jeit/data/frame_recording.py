@@ -1,5 +1,7 @@
 """Frames of a skin as they were recorded, with the times they came at: an NPZ file, or any table that is described."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 

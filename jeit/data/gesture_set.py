@@ -1,5 +1,7 @@
 """Recordings of gestures, one after the other, and as a file: simulated ones, and those of one's own skin."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 

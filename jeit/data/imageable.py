@@ -1,5 +1,7 @@
 """May this frame be imaged against this reference? The same set-up, and more signal than noise."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Reader of the KIT4 tank archive (University of Eastern Finland, doi 10.5281/zenodo.1203914)."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from jeit.data import _matlab

@@ -1,5 +1,7 @@
 """Reader of the Kuopio Tomography Challenge 2023 (doi 10.5281/zenodo.8252370)."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,7 @@
 """A measurement: frames of voltages, with all that is needed to make sense of them."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Whether described electrodes lie on the solid that is described with them, and are no larger than it."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 

@@ -3,6 +3,8 @@
 Everything here works on one measurement alone; no model of the body is needed.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """One door for all files: `read` finds the format from the content, or takes it from you."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,5 +1,7 @@
 """From raw voltages to a `Measurement`: what is unusable is masked, and said."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

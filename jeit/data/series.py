@@ -1,5 +1,7 @@
 """A series of measurements of one set-up as one: of instruments that write a file for every frame."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

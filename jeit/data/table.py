@@ -1,5 +1,7 @@
 """Reader of plain tables: CSV, text, NPY and NPZ with a TOML description."""
 
+from __future__ import annotations
+
 import re
 from array import array
 from collections.abc import Iterator

@@ -4,6 +4,8 @@ L electrodes have a symmetric Z (L, L) with rows that sum to zero: L (L - 1) / 2
 determines it, L - 1 independent currents on all electrodes say, tells what every other set would read.
 """
 
+from __future__ import annotations
+
 import numpy as np
 import scipy.linalg
 from jaxtyping import Inexact

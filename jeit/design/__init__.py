@@ -8,6 +8,8 @@ found, is in the modules.
 Names are imported when first used: the command line shows defaults (`jeit.design.defaults`) without waiting.
 """
 
+from __future__ import annotations
+
 import importlib
 from typing import TYPE_CHECKING
 

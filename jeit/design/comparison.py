@@ -1,5 +1,7 @@
 """Two layouts of a skin side by side, as in text S4 of Park et al. 2022: sensitivity, blind spots, virtual taxels."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import equinox as eqx

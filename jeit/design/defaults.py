@@ -5,6 +5,8 @@ The skin and its touches are those of Park et al., Science Robotics 7, eabm7187 
 
 # The hydrogel: a square, where no layout says its outline. Thickness and conductivity scale all voltages, and no
 # ratio of them but those that contact impedances have a part in.
+from __future__ import annotations
+
 SIDE = 0.2  # m
 THICKNESS = 10e-3  # m
 CONDUCTIVITY = 1.0  # S/m

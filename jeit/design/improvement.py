@@ -1,5 +1,7 @@
 """A better layout for a sheet: optimised on a coarse mesh, and judged with the one given on a finer one."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

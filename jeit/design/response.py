@@ -1,5 +1,7 @@
 """What a skin of one layout feels, as in text S4 of Park et al. 2022: sensitivity and virtual taxels."""
 
+from __future__ import annotations
+
 import equinox as eqx
 from jaxtyping import Array
 

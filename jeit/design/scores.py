@@ -13,6 +13,8 @@ Atkinson, Donev and Tobias, Optimum Experimental Designs (Oxford, 2007), chapter
 Signal Processing: Estimation Theory (1993), chapter 3.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """Sensitivity maps: how much the voltages of a skin change where it is touched."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float

@@ -1,5 +1,7 @@
 """Virtual taxels: the parts of a skin whose touches look alike in the voltages (Park et al. 2022, text S4)."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import equinox as eqx

@@ -12,6 +12,8 @@
 Where to put them: `jeit.layout`.
 """
 
+from __future__ import annotations
+
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.electrodes.boundary import BoundaryElectrodes
 from jeit.electrodes.combined import CombinedElectrodes

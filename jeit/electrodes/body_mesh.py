@@ -1,5 +1,7 @@
 """The mesh of a body for electrodes on it, fine where they end: there the current density is without bound."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 

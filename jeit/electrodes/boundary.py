@@ -1,5 +1,7 @@
 """Electrodes on the edge of a sheet: arcs of the boundary of a 2-D mesh, integrated exactly."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike

@@ -5,6 +5,8 @@ of its edges stays closed, and goes round the part within once and along the sid
 every triangle becomes a polygon of as many corners, in one array, whose integrals follow from its corners.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Array, Float
 

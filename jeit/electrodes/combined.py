@@ -1,5 +1,7 @@
 """Electrodes of several kinds on one mesh, such as arcs round the edge of a sheet and a disc in its centre."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import jax.numpy as jnp

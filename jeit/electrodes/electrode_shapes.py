@@ -1,5 +1,7 @@
 """Electrodes as what they are: discs, patches, facets and arcs as polygons on the surface, in their places."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

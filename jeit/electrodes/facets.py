@@ -1,5 +1,7 @@
 """Electrodes given as groups of boundary facets of a mesh, as imported models and plates have them."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import jax.numpy as jnp

@@ -1,5 +1,7 @@
 """Rectangular electrodes on the surface of a 3-D body, such as the plates round a tank."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import jax

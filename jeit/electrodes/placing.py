@@ -1,5 +1,7 @@
 """What is said of patches that lie off a body's surface, at one place, or are larger than the body (NumPy)."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import numpy as np

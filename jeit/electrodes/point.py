@@ -1,5 +1,7 @@
 """Point electrodes: the zero-size limit, without contact impedance."""
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int

@@ -1,5 +1,7 @@
 """Electrodes whose contact integrals are worked out: for models that are evaluated again and again as they stand."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """Round electrodes in a sheet that is curved: discs on a surface of triangles in space."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike

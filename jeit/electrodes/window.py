@@ -1,5 +1,7 @@
 """Contact integrals of electrodes whose edge cuts through cells: a smooth window on a fixed quadrature."""
 
+from __future__ import annotations
+
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Int

@@ -4,6 +4,8 @@ Nothing that a file holds is executed, and nothing in it decides how much memory
 looked at: see `jeit/files/limits.py` for how much, and how to allow more.
 """
 
+from __future__ import annotations
+
 from jeit.files.foreign import read_as, reason
 from jeit.files.limits import MOST_ELECTRODES, check_electrodes, check_memory
 from jeit.files.npz_file import check_archive, need, npy_array, npz_arrays

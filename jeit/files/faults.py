@@ -1,5 +1,7 @@
 """Several faults of a file in one message: those there is room for as sentences, others by their keys."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 KEY = 40

@@ -1,5 +1,7 @@
 """What other packages raise on files that are damaged: one error of ours."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,5 +1,7 @@
 """How much a file may ask for before anything is made of it."""
 
+from __future__ import annotations
+
 import os
 
 MOST_ELECTRODES = 1024

@@ -1,5 +1,7 @@
 """The arrays of NPZ and NPY files: plain numbers and text, nothing that would be executed, of no more than they say."""
 
+from __future__ import annotations
+
 import math
 import struct
 import sys

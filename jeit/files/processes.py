@@ -1,5 +1,7 @@
 """Which processes live: of this machine alone it can be told."""
 
+from __future__ import annotations
+
 import os
 from pathlib import Path
 

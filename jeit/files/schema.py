@@ -11,6 +11,8 @@ and `validated` makes one of what TOML or JSON hold. This module brings pydantic
 read, not before.
 """
 
+from __future__ import annotations
+
 import itertools
 import math
 import re

@@ -1,5 +1,7 @@
 """Text that a person wrote or another program: of a size that such files have, in UTF-8, as TOML or JSON."""
 
+from __future__ import annotations
+
 import json
 import tomllib
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Files that are written whole or not at all: beside what was there, and put in its place when all is on the disk."""
 
+from __future__ import annotations
+
 import os
 import re
 import secrets

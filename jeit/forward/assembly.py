@@ -1,5 +1,7 @@
 """P1 finite elements: conductivity per cell, element stiffness, and gradients of nodal fields."""
 
+from __future__ import annotations
+
 import functools
 import operator
 from typing import Any

@@ -1,5 +1,7 @@
 """Derivatives of the voltages along changes of the conductivity that reach few cells, with no Jacobian of them all."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple

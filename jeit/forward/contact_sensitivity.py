@@ -6,6 +6,8 @@ At fixed fields F the energy of electrode l is E_l(F, F) = (1/z_l) ∫_l (F - Z_
     ∂Z / ∂ log z_l = E_l(F, F).
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

@@ -1,5 +1,7 @@
 """A forward model whose contact integrals are worked out: for calls in which its electrodes stay what they are."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import jax

@@ -1,5 +1,7 @@
 """`ForwardModel`: conductivity in, electrode voltages and their Jacobian out."""
 
+from __future__ import annotations
+
 import functools
 import operator
 from collections.abc import Callable, Iterator

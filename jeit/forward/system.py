@@ -1,5 +1,7 @@
 """The linear system of one mesh and kind of electrode: its sparsity pattern and the solver chosen for it."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import lineax as lx

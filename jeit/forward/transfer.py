@@ -11,6 +11,8 @@ point electrodes the load depends on their position, and 2 ∂_θ⟨load, F⟩ d
 SIAM Review 41 (1999) 85-101; Polydorides and Lionheart, Meas. Sci. Technol. 13 (2002) 1871-1883.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """Images: rasters of what lives on a mesh, planes and surfaces through a solid, inclusions, and regions over time."""
 
+from __future__ import annotations
+
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.image.image_series import ImageSeries
 from jeit.image.inclusions import Inclusion, find_inclusions

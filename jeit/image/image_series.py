@@ -1,5 +1,7 @@
 """Images of one body at many times: what a region does over time, and where anything happens at all."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

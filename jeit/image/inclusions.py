@@ -1,5 +1,7 @@
 """Inclusions: where an image departs from its background, as regions with sign, centroid, and area or volume."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float

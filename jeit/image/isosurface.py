@@ -1,5 +1,7 @@
 """Surfaces on which an image of a solid has one value, closed by the wall where they meet it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

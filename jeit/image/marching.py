@@ -4,6 +4,8 @@ What is cut out of a simplex is a triangle or a quadrilateral, so four corners h
 triangle. Doi and Koide, IEICE Trans. E74 (1991) 214-224, for tetrahedra; all at once, without a loop over cells.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

@@ -4,6 +4,8 @@ Adler et al., "GREIT: a unified approach to 2D linear EIT reconstruction of lung
 S35-S55.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

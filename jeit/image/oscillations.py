@@ -9,6 +9,8 @@ other it has neither its leak from the mean, nor from the drift, nor from -f. Fr
 resolution, 1 / T without a window and 2 / T with Hann's, T the time measured, are not told apart.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any, Literal
 

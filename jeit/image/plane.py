@@ -1,5 +1,7 @@
 """Planes through a solid, and what they cut it into: exactly, cell by cell, with no raster."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 

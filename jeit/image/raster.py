@@ -1,5 +1,7 @@
 """Rasters: an image on the cells of a mesh, sampled on a grid of pixels."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Int

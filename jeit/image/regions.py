@@ -1,5 +1,7 @@
 """Regions of interest: which cells of a mesh lie in a ball, a box, or on one side of a plane."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike

@@ -1,5 +1,7 @@
 """The score of the Kuopio Tomography Challenge 2023 for an image cut up into classes."""
 
+from __future__ import annotations
+
 import functools
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Segmentation: an image cut up into background, resistive and conductive regions."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float, UInt8
 from scipy import ndimage

@@ -1,5 +1,7 @@
 """What a body in a solid was fitted as, an ellipsoid or a column, and the surface that pictures draw of it."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 

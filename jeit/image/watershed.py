@@ -1,5 +1,7 @@
 """Watersheds: the cells of a mesh divided among the peaks of an image."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float, Int
 

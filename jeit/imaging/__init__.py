@@ -6,6 +6,8 @@
 `touch_images`, `gesture_learning`, `touch_watch`; `health_learning`, what it is like while it is healthy.
 """
 
+from __future__ import annotations
+
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.imaging.compared_rules import ComparedRules, RuleOutcome, compare_on_data
 from jeit.imaging.difference import ImagedDifference, image_difference

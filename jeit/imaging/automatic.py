@@ -1,5 +1,7 @@
 """Linear or not: one step where that is sound, Gauss-Newton and shapes of strong bodies where it is not; and why."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Which of a file's frames is imaged, and errors that say which."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from contextlib import contextmanager
 

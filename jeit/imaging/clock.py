@@ -1,5 +1,7 @@
 """Says what is being done, and keeps how long it took."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable
 from contextlib import contextmanager

@@ -3,6 +3,8 @@
 This is what `jeit choose` runs, as one function; on simulated data use `jeit.inverse.compare_rules`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -4,6 +4,8 @@ This is what `jeit reconstruct` runs, as one function. Its steps are the public 
 `jeit.imaging.preparation`, `jeit.inverse` and `jeit.image`; take them from there for anything out of the ordinary.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 

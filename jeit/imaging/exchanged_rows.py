@@ -4,6 +4,8 @@ Where every drive is read by every measurement, a frame is a matrix F (drives, m
 With two drives exchanged two of its rows are; that breaks reciprocity, as noise does, or not, and no image explains it.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float, Inexact
 

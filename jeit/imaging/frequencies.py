@@ -7,6 +7,8 @@ gives zero. Seo, Lee, Kim, Zribi and Woo, Physiol. Meas. 29 (2008) 755-769; Jun,
 Physiol. Meas. 30 (2009) 1087-1099.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,5 +1,7 @@
 """From recorded gestures of a skin to a model that tells them: imaged, cut into touches, learnt."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice

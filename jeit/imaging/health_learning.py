@@ -1,5 +1,7 @@
 """What a skin is like while it is healthy, from a recording of it: on frames alone, or with a calibrated model."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Methods of imaging by name: what each makes of a prepared difference, what it takes, and its λ unless given."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial

@@ -1,5 +1,7 @@
 """What comes before any image of measured data: two frames checked, a mesh, and a model calibrated on the reference."""
 
+from __future__ import annotations
+
 import functools
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """Every frame of a measurement against one reference, in one factorisation: a series of linear images."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 

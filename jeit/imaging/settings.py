@@ -1,5 +1,7 @@
 """How to image: the method, the prior, λ, the mesh. The defaults here are jeit's, for Python and command line alike."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from numbers import Integral
 

@@ -1,5 +1,7 @@
 """Frame after frame to images: an imager for a measured sensor, and frames as they come from a file or a pipe."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 

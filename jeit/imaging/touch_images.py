@@ -4,6 +4,8 @@ One linear step on a coarse mesh, with the prior that Silvera Tawil et al. (2011
 otherwise. Frames are looked after as in every stream: bad ones are refused, a dead electrode's channels left out.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 

@@ -5,6 +5,8 @@ has been over for the `gap`. Where nobody touches, what the untouched skin reads
 touches; what lasts longer than the `patience` is told as held, and is from then on how the skin is.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace

@@ -5,6 +5,8 @@ each of a few contact impedances; with electrode k standing where p(k) should, i
 compared by how well they explain the frame, whatever its size.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import combinations

@@ -4,6 +4,8 @@ Solvers, links and further unknowns are in `jeit.inverse.nonlinear`; the classes
 compute them.
 """
 
+from __future__ import annotations
+
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.inverse.calibration import calibrate
 from jeit.inverse.channel_weights import relative_noise

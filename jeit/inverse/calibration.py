@@ -1,5 +1,7 @@
 """Calibration: the background conductivity and contact impedance that explain a frame of the empty tank."""
 
+from __future__ import annotations
+
 from functools import partial
 from typing import Any
 

@@ -1,5 +1,7 @@
 """How much each channel is to be trusted."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Array, Bool, Float
 

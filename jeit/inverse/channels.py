@@ -10,6 +10,8 @@ as good as their r best estimates,
 and least squares on those cost a fraction: the work grows with the square of the number of channels.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 import equinox as eqx

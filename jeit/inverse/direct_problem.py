@@ -6,6 +6,8 @@ derivative, but the images made of them have. In the notation of `jeit.inverse.s
     R_λ = ΓJᵀK⁻¹(1 - BGᵀ) + NGᵀ,   G = K⁻¹B(BᵀK⁻¹B)⁻¹,   K = JΓJᵀ + λ²,   B = JN.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Inexact

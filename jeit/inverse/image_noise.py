@@ -1,5 +1,7 @@
 """How much of an iterative image the noise of the data would make by itself: what tells a body from a ghost."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 

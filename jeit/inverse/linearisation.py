@@ -1,5 +1,7 @@
 """The linearised problem of difference imaging: checked, whitened and decomposed, ready for any hyperparameter."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from typing import Any
 

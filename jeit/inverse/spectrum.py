@@ -14,6 +14,8 @@ What data can show of a body is often of far fewer dimensions than there are cha
 in D (M, r), and G (r, m) and its product ΓGᵀ are all that is kept of the size of the image.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float

@@ -1,6 +1,8 @@
 """The fit of a calibration where anything of it is traced: the same parameters and objective, compiled, and its result
 a function of the voltages and of the model that has derivatives."""
 
+from __future__ import annotations
+
 from functools import partial
 from typing import Any, NamedTuple
 

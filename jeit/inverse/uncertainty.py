@@ -16,6 +16,8 @@ about: conditional on the edges found. Where an edge lies the energy itself bend
 well explained by an edge elsewhere: there the truth is spread wider.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -5,6 +5,8 @@ Layouts: `named_layout`, or from and to a CSV, DXF or SVG file (`read_layout`, `
 curved skins, from a CSV file by `read_surface_layout`.
 """
 
+from __future__ import annotations
+
 from jeit.layout.arrangements import grid, perimeter, quasi_uniform, ring, ring_and_centre
 from jeit.layout.even_spread import spread
 from jeit.layout.files import read_layout, write_layout

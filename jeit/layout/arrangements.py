@@ -1,5 +1,7 @@
 """Layouts: positions for electrodes of any kind, as arrays (L, d) in metres."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Layouts as CSV: one electrode a line, the unit in the name of the column."""
 
+from __future__ import annotations
+
 import csv
 import io
 import math

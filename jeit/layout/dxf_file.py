@@ -1,5 +1,7 @@
 """Layouts as DXF drawings, through ezdxf."""
 
+from __future__ import annotations
+
 import importlib
 import io
 from collections.abc import Callable

@@ -1,5 +1,7 @@
 """Places spread evenly over a surface in space, by ways along it."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree

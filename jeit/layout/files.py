@@ -6,6 +6,8 @@
 | `.dxf`, `.svg` | yes | yes | no | yes |
 """
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from jeit.files import written_whole

@@ -1,5 +1,7 @@
 """Names of electrodes."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 

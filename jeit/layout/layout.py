@@ -1,5 +1,7 @@
 """`Layout`: where round electrodes sit on a flat skin."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import equinox as eqx

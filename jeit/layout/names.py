@@ -1,5 +1,7 @@
 """The layouts that have a name: two of the literature's, and regular ones made for any skin."""
 
+from __future__ import annotations
+
 import math
 import re
 from functools import lru_cache

@@ -1,5 +1,7 @@
 """Layouts of curved skins as CSV: one electrode a line, its place in space."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,7 @@
 """`SurfaceLayout`: where round electrodes sit on a curved skin."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import equinox as eqx

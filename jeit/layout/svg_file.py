@@ -1,5 +1,7 @@
 """Layouts as SVG drawings: written with one user unit a millimetre, read as drawn by hand too."""
 
+from __future__ import annotations
+
 import math
 import re
 import xml.etree.ElementTree as ElementTree

@@ -1,5 +1,7 @@
 """Shapes of an SVG drawing as numbers: transforms, circles, and closed loops of straight sides."""
 
+from __future__ import annotations
+
 import math
 import re
 import xml.etree.ElementTree as ElementTree

@@ -6,6 +6,8 @@ and `surface_of` a solid, and what has a thickness on them, a `shell`. From else
 `from_gmsh`. What was measured on, any of these: a `Body`, which is an outline, a `Solid` or an `OwnMesh`.
 """
 
+from __future__ import annotations
+
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.mesh.bisection import bisect, cut
 from jeit.mesh.body import Body

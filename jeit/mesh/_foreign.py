@@ -1,5 +1,7 @@
 """Mesh files from anywhere, before meshio opens them: which lead to no other file, and do not grow beyond memory."""
 
+from __future__ import annotations
+
 import lzma
 import math
 import re

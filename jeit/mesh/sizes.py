@@ -1,5 +1,7 @@
 """Sizes of more than ten metres, nearly always of another unit: they are told of once, where they are given."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager

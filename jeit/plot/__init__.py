@@ -5,6 +5,8 @@ Every function takes `ax`, makes a figure of its own where none is given, and re
 in metres in the arguments and in millimetres in the pictures.
 """
 
+from __future__ import annotations
+
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.plot.acoustic.localisation_error import plot_error_curve, plot_pairs
 from jeit.plot.acoustic.loss_map import Marks, plot_loss_map

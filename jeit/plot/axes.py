@@ -1,5 +1,7 @@
 """Axes: of plane pictures, no ticks but a scale bar and a colour bar; of graphs, no more lines than needed."""
 
+from __future__ import annotations
+
 import math
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Colour scales: which values get which colours, and what the colour bar says of them."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from matplotlib.axes import Axes

@@ -1,5 +1,7 @@
 """Protocols: which currents are driven and which voltages are read, as matrices with names and units."""
 
+from __future__ import annotations
+
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.protocol.all_at_once import haar, optimal, trigonometric
 from jeit.protocol.matrices import from_channels, from_matrices

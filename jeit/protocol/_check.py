@@ -1,5 +1,7 @@
 """Checks of patterns, with errors that say what to do."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from jeit.arguments import did_you_mean

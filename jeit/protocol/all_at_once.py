@@ -5,6 +5,8 @@ ring, or as a solid's electrodes are numbered: any L - 1 independent patterns de
 it what every other protocol would read (`jeit.data.driven_by`).
 """
 
+from __future__ import annotations
+
 import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike

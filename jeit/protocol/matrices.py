@@ -1,5 +1,7 @@
 """Protocols from matrices: of one's own design, or as found in a data file."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Pairs of electrodes: as patterns, round a ring, and drive pairs crossed with measurement pairs."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Literal
 

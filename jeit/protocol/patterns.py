@@ -4,6 +4,8 @@ All count electrodes from 0, drive `+current` into the first electrode of a pair
 second, and measure the first minus the second.
 """
 
+from __future__ import annotations
+
 from typing import Literal
 
 import numpy as np

@@ -1,5 +1,7 @@
 """What is made of the potentials of all electrodes, where an instrument reads them all at once."""
 
+from __future__ import annotations
+
 from typing import Literal
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The protocol: which currents are driven, and which voltages are read, as matrices."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import equinox as eqx

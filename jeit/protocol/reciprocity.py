@@ -5,6 +5,8 @@ So two channels (d, m) and (d', m') with d' = a m and m' = b d have voltages v' 
 1972.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Bool, Float, Inexact, Int
 

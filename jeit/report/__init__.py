@@ -1,6 +1,8 @@
 """What is told of results, and all that is written to a folder: measurements, images, streams, compared rules,
 calibrations of microphones, tracks, layouts, studies, learnt skins, gestures, watched skins, networks that image."""
 
+from __future__ import annotations
+
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.report.calibration import draw_calibration, write_calibration
 from jeit.report.compared_rules import draw_choice, report_choice, write_choice

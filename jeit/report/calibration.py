@@ -1,5 +1,7 @@
 """What is left of a calibration of microphones on disk: the calibration, and a picture of how well it fits."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from jeit.acoustic.calibration.calibrate import CalibrationFit

@@ -1,5 +1,7 @@
 """What every rule for the hyperparameter chose on a measured difference, on disk: a picture and a report."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Measurements, outlines, electrodes and numbers as JSON has them."""
 
+from __future__ import annotations
+
 import math
 from importlib import metadata
 from typing import Any

@@ -1,5 +1,7 @@
 """A stream as a film: a small GIF, or an MP4 where ffmpeg is installed."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """The folder that results are written to, all of them or none."""
 
+from __future__ import annotations
+
 import csv
 import json
 import tempfile

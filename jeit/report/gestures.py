@@ -1,5 +1,7 @@
 """What is left of learnt gestures in a folder: the model, a report, and a picture of what was taken for what."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

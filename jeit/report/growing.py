@@ -1,5 +1,7 @@
 """What a stream of any length leaves on disk while it goes on, in memory that does not grow with it."""
 
+from __future__ import annotations
+
 import contextlib
 import csv
 import io

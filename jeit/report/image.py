@@ -1,5 +1,7 @@
 """What is left of an imaged difference on disk: a picture, arrays, and a report."""
 
+from __future__ import annotations
+
 import math
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """What is left of learning to image, and of the frames that a network imaged, in folders."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,5 +1,7 @@
 """A better layout on disk: for the laser cutter, as a picture of how it came about, and a report."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

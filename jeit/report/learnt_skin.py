@@ -1,5 +1,7 @@
 """What is left of a learnt skin, and of what it said of frames, in folders."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,7 @@
 """What is left of a listener, and of what it heard in a recording, in folders."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Any
 

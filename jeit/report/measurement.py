@@ -1,5 +1,7 @@
 """What a measured file holds, and how good it is, as plain numbers and words."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

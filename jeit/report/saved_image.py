@@ -1,5 +1,7 @@
 """An image on disk, `image.npz`: what is kept of it, and how it is had back to be looked at."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 

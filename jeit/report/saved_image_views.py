@@ -1,5 +1,7 @@
 """Pictures of an image on disk: of a solid from several sides and cut in slices, of a surface from several sides."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,5 +1,7 @@
 """What is left of a series of images on disk: curves of regions, maps of amplitude and phase, a picture and a film."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """What became of a watched skin, in a folder: its events, a report, and a picture of them in time and on the skin."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """What is left of a stream on disk: a line and an image for every frame as it comes, and at the end pictures."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path

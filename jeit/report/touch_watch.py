@@ -1,5 +1,7 @@
 """What was told of a watched skin, in a folder: touches as they end, their paths, a report, a picture."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path

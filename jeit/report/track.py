@@ -1,5 +1,7 @@
 """What is left of a located recording on disk: a table of its frames, a report, and a picture."""
 
+from __future__ import annotations
+
 import math
 from pathlib import Path
 from typing import Any

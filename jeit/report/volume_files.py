@@ -1,5 +1,7 @@
 """Images for other programs to look into: VTU, a series of them in time (PVD), and XDMF."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -5,6 +5,8 @@ The physics of pressing is in `jeit.simulate.contact`; what a sounding skin is m
 readout), in `jeit.simulate.acoustic`; how people touch, in `jeit.simulate.people` and `jeit.simulate.acoustic.people`.
 """
 
+from __future__ import annotations
+
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.simulate.acoustic.bursts import Burst
 from jeit.simulate.acoustic.calibration_taps import calibration_taps

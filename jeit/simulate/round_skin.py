@@ -3,6 +3,8 @@
 No openly licensed measurement of a tactile skin exists; this stands in where one is needed, and says so in its notes.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import numpy as np

@@ -1,6 +1,8 @@
 """What importing jeit sets up in JAX: double precision, a place where compiled code is kept between runs, and what
 happens in forked processes."""
 
+from __future__ import annotations
+
 from jeit.start.compiled_code import discarded_damaged, keep_compiled_code
 from jeit.start.forks import refuse_compiled_code_in_forks
 from jeit.start.precision import take_double_precision

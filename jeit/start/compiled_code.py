@@ -1,5 +1,7 @@
 """A place where compiled code is kept between runs: which, for whom, and how much."""
 
+from __future__ import annotations
+
 import contextlib
 import glob
 import hashlib

@@ -1,5 +1,7 @@
 """Processes forked from one that has used JAX: compiled code is refused there, for it would wait for ever."""
 
+from __future__ import annotations
+
 import os
 
 import jax

@@ -1,5 +1,7 @@
 """Double precision, as far as the user has not decided."""
 
+from __future__ import annotations
+
 import os
 import warnings
 

@@ -8,6 +8,8 @@ networks, and their files), `networks` (that image).
 `LogitBoostClassifier` is imported when it is first used, and scikit-learn with it.
 """
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING
 
 from jeit.touch.attributes import TouchAttributes, touch_attributes

@@ -1,5 +1,7 @@
 """What skins that learn need besides jeit's own dependencies."""
 
+from __future__ import annotations
+
 from importlib.util import find_spec
 
 _PACKAGES = {"sklearn": "scikit-learn", "skops": "skops", "optax": "optax", "networkx": "networkx"}

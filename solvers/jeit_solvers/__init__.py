@@ -9,6 +9,8 @@
 - `kmeans`; `over_cores`, `on_cores` and `in_turn`, which share work out.
 """
 
+from __future__ import annotations
+
 from jeit_solvers.batching import in_turn
 from jeit_solvers.clustering import KMeans, kmeans
 from jeit_solvers.cores import number_of_cores, on_cores, over_cores

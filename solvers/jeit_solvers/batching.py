@@ -4,6 +4,8 @@ A batch of factorisations side by side streams all of the batch through memory a
 twice as long per matrix as one that stays in the cache. Accelerators do get the whole batch at once.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial
 from typing import Any

@@ -5,6 +5,8 @@ clusters come to rest; everything else is small beside it. Points are centred fi
 ‖x‖² - 2 x·c + ‖c‖² keep their digits however far the points lie from the origin.
 """
 
+from __future__ import annotations
+
 from functools import partial
 from typing import Any
 

@@ -5,6 +5,8 @@ on one; two loops side by side, each on a thread of its own, keep two cores busy
 are spread by its BLAS: threads of ours and of the BLAS's own would wait for each other, and it is kept to one.
 """
 
+from __future__ import annotations
+
 import contextlib
 import functools
 import itertools

@@ -6,6 +6,8 @@ compiled program; a formula written with the functions below, and with what `num
 through both.
 """
 
+from __future__ import annotations
+
 import functools
 import os
 from collections.abc import Callable

@@ -4,6 +4,8 @@ Robust least squares fit them. Of the decay models there are, that one is taken 
 fitted to. Taps that no microphone agrees with are left out, and said.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 

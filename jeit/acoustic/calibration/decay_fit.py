@@ -7,6 +7,8 @@ but the first scatter about what the array has in common, by a `spread` that cos
 the mean that costs least. All of it is NumPy's, for a calibration is made once.
 """
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 import numpy as np

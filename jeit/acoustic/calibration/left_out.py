@@ -4,6 +4,8 @@ The places that were tapped are dealt to a few parts; where the taps of each par
 taps of the others. Taps at one place stay together, or the model would have seen them.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 from typing import NamedTuple

@@ -5,6 +5,8 @@ far as its taps say and as shapes of the array scatter. Between, what the residu
 until nothing changes. Every step takes a `TapFit` and returns another.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import equinox as eqx

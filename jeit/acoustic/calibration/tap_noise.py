@@ -3,6 +3,8 @@
 Arrays are (M, T): M microphones, T taps. Residuals are of levels, log(power + floor).
 """
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Bool, Float
 

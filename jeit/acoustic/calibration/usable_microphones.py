@@ -1,5 +1,7 @@
 """Which microphones of an array a fit is good for, and why others are not."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Bool, Float
 

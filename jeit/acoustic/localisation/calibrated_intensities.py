@@ -1,5 +1,7 @@
 """Intensities of a recording as its calibration took the taps', above its own noise floor or that of silence."""
 
+from __future__ import annotations
+
 import dataclasses
 
 import numpy as np

@@ -8,6 +8,8 @@ It knows nothing of noise: far microphones count as much as near ones, multiplie
 axis of all arrays here, microphones the first; intensities are taken relative to the loudest.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, Int
 

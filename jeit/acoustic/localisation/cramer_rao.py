@@ -1,5 +1,7 @@
 """The Cramér-Rao bound: how well any unbiased localiser can do."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike

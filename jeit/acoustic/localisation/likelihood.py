@@ -10,6 +10,8 @@ over the microphones in use; steps are Fisher's scoring, whose matrix Σ ∇m �
 the Cramér-Rao bound.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
 

@@ -5,6 +5,8 @@ to the best place on the outline. All of it is one program, compiled unless it i
 implicit function theorem in the intensities, the microphones' positions and the decay models.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

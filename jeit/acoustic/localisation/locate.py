@@ -1,5 +1,7 @@
 """From a recording to places: which frames hold a touch, where it is, and what is wrong with the others."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from scipy.special import chdtrc, chdtri

@@ -1,5 +1,7 @@
 """What is found of the frames of a recording: places, and what each frame is."""
 
+from __future__ import annotations
+
 from enum import StrEnum
 
 import equinox as eqx

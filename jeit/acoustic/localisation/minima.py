@@ -4,6 +4,8 @@ An objective has `microphone_array`, `frames` (all that differs from frame to fr
 `features` and `screen` for candidate places: `Likelihood` and `Consistency` do.
 """
 
+from __future__ import annotations
+
 import jax
 import numpy as np
 from jaxtyping import Array

@@ -1,5 +1,7 @@
 """Overlays: maps of many frames in one picture, the older the fainter (Park 2022, Fig. 3C)."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike

@@ -1,5 +1,7 @@
 """Rasters over a skin, and the valleys of maps on them."""
 
+from __future__ import annotations
+
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
 

@@ -1,5 +1,7 @@
 """What has changed since the calibration: plugs exchanged, a microphone with another gain; found by the misfit."""
 
+from __future__ import annotations
+
 from itertools import combinations
 from typing import NamedTuple
 

@@ -1,5 +1,7 @@
 """Two sources at once: where both are, for frames that one source does not explain."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

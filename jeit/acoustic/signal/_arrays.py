@@ -1,5 +1,7 @@
 """Checks of what recordings and taps are made of."""
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.spatial import KDTree
 

@@ -13,6 +13,8 @@ P is a quadratic form xᵀAx. For white noise its mean is σ² tr A and its vari
 nearly as mean · χ²_ν / ν, with ν = (tr A)² / tr A² degrees of freedom.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

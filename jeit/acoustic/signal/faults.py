@@ -5,6 +5,8 @@ of its range (clipping), and samples that are no numbers. What looks like one of
 that holds each value for several samples, a quiet channel of a few steps of its converter, one loud peak.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,6 +4,8 @@ A sine of amplitude A within the band has the intensity A²/2, white noise of va
 is of 0 to half the rate. How that is done, and how noise scatters, is in `jeit.acoustic.signal._band_power`.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import equinox as eqx

@@ -5,6 +5,8 @@ metres and hertz. What a broken microphone writes (NaN, zeros, flat tops) is let
 it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """Sound files: WAV by SciPy, and FLAC, Ogg, AIFF and others by `soundfile`, where that is installed."""
 
+from __future__ import annotations
+
 import warnings
 from importlib.util import find_spec
 from pathlib import Path

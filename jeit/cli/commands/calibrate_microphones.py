@@ -1,5 +1,7 @@
 """`jeit calibrate-microphones`: taps at known places in, the decay model of every microphone out."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 

@@ -1,5 +1,7 @@
 """`jeit choose`: what every rule for the hyperparameter chooses on a measured file, and what comes of it."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 

@@ -1,5 +1,7 @@
 """`jeit demo`: a press on a simulated skin, imaged; needs no data."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
 

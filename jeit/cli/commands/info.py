@@ -1,5 +1,7 @@
 """`jeit info`: what a file holds, and how good it is."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated, Any
 

@@ -1,5 +1,7 @@
 """`jeit layout`: layouts of electrodes compared and improved, before any material is cut."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 

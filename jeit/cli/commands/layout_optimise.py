@@ -1,5 +1,7 @@
 """`jeit layout optimise`: move the electrodes of a layout to where the skin feels its worst place best."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 

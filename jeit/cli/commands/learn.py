@@ -1,5 +1,7 @@
 """`jeit learn`: networks that learn from simulated touches."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
 

@@ -1,5 +1,7 @@
 """`jeit listen`: what is heard in a recording; and `jeit listen fit`, which learns from labelled clips."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 

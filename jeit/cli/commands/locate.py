@@ -1,5 +1,7 @@
 """`jeit locate`: a recording of a calibrated array of microphones in; where and when it was touched out."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

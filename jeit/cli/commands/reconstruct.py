@@ -1,5 +1,7 @@
 """`jeit reconstruct`: a measured file in; a picture, arrays and a report out."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 

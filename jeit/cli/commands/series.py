@@ -1,5 +1,7 @@
 """`jeit series`: every frame of a recording at once; what regions do over time, and what oscillates where."""
 
+from __future__ import annotations
+
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

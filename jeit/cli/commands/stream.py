@@ -1,5 +1,7 @@
 """`jeit stream`: frame after frame to images, from a file or from standard input."""
 
+from __future__ import annotations
+
 import sys
 from pathlib import Path
 from typing import Annotated

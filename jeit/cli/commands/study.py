@@ -1,5 +1,7 @@
 """`jeit study`: a sweep over layouts from a TOML file, which can be stopped at any moment and goes on."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 

@@ -1,5 +1,7 @@
 """`jeit touch`: skins that learn from recorded presses, what they then say of frames, and gestures."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
 

@@ -1,5 +1,7 @@
 """`jeit touch health`: whether a skin is still what it was: cuts, electrodes that fail, repair."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
 

@@ -1,5 +1,7 @@
 """`jeit touch gestures` and `jeit touch watch`: gestures learnt from recordings, and named as they end."""
 
+from __future__ import annotations
+
 import signal
 import sys
 from pathlib import Path

@@ -1,5 +1,7 @@
 """`jeit view`: look at an image that jeit wrote, turned and cut with the mouse, or in pictures from several sides."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
 

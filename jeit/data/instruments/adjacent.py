@@ -4,6 +4,8 @@ Drive 1-2 is read at 3-4, 4-5, … 15-16; drive 2-3 at 4-5, … 16-1; and so on.
 them positive on every body: the opposite of `jeit.protocol.adjacent`'s.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 

@@ -6,6 +6,8 @@ items. Type 3 holds a frame of 256 numbers of four bytes, of which those from th
 type 7 an image of 912; others are waves.
 """
 
+from __future__ import annotations
+
 import re
 from pathlib import Path
 

@@ -6,6 +6,8 @@ it begins with 600 numbers of eight bytes, of which the first 208 and those from
 adjacent voltages. Their weights are no more than estimated, by users.
 """
 
+from __future__ import annotations
+
 import re
 from pathlib import Path
 

@@ -6,6 +6,8 @@ lines. A system that leaves out what reciprocity repeats writes zeros there. The
 same name with the ending .prl, says the frame rate, as "Framerate = 13 per second".
 """
 
+from __future__ import annotations
+
 import re
 from pathlib import Path
 

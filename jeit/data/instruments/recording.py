@@ -1,5 +1,7 @@
 """From what an instrument's file holds, and a description of the body if there is one, to a measurement."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -8,6 +8,8 @@ real and imaginary part of the potential at every channel. Whether currents are 
 not say.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass

@@ -6,6 +6,8 @@ microseconds, 12 bytes, 64 integers of the electrodes' impedances, and 2,048: re
 voltages, drive by drive. Other kinds are events. Formats 1 to 3 differ, and are not known well enough.
 """
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import numpy as np

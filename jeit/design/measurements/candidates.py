@@ -5,6 +5,8 @@ The conductivity is x = x₀ + S c with independent coefficients c of unit varia
 noise.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

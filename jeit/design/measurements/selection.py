@@ -10,6 +10,8 @@ Atkinson, Donev and Tobias, Optimum Experimental Designs (Oxford, 2007), chapter
 J. Mach. Learn. Res. 9 (2008) 235-284.
 """
 
+from __future__ import annotations
+
 from functools import partial
 from typing import Literal
 

@@ -1,5 +1,7 @@
 """What a layout that can be made must satisfy: electrodes inside an outline, apart, and off regions kept free."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np

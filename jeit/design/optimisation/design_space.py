@@ -1,5 +1,7 @@
 """Which layouts a search may take: where electrodes may be, and what of them is varied besides their places."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import equinox as eqx

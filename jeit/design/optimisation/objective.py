@@ -1,5 +1,7 @@
 """What a search makes large: a score of a sheet's layout."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import equinox as eqx

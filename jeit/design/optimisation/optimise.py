@@ -5,6 +5,8 @@ stage to stage (the quadratic penalty method: Nocedal and Wright, Numerical Opti
 constraints is still missing then is made up by the nearest descent of the penalty alone.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial
 

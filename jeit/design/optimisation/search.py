@@ -1,5 +1,7 @@
 """Bounded descent from several starts at once, step by step on record."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import jax.numpy as jnp

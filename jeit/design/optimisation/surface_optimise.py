@@ -5,6 +5,8 @@ nearest point of the surface, which is where the way along it leads, to second o
 brings electrodes too close to each other or to the edge, is halved.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import equinox as eqx

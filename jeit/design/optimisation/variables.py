@@ -1,5 +1,7 @@
 """The variables of a layout to be optimised: numbers between 0 and 1, and the electrodes that they stand for."""
 
+from __future__ import annotations
+
 from typing import Literal, NamedTuple
 
 import equinox as eqx

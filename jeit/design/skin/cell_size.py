@@ -1,5 +1,7 @@
 """How fine the mesh of a skin can be, and how coarse."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

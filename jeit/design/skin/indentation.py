@@ -1,5 +1,7 @@
 """Touch as an indentation of a skin's surface: how deep it goes, as a function of the distance from its middle."""
 
+from __future__ import annotations
+
 import abc
 
 import equinox as eqx

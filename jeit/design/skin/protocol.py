@@ -1,5 +1,7 @@
 """What is measured of a skin."""
 
+from __future__ import annotations
+
 from typing import Literal
 
 import numpy as np

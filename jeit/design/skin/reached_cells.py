@@ -1,5 +1,7 @@
 """Which cells of a skin a touch may reach: how far along its surface, and how deep below it (NumPy)."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

@@ -1,5 +1,7 @@
 """`RestingSkin`: what exact changes by touches need of a skin at rest, worked out once for any number of touches."""
 
+from __future__ import annotations
+
 from functools import partial
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """Touches of a sheet whose voltage changes have derivatives in the places touched."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

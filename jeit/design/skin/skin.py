@@ -1,5 +1,7 @@
 """`Skin`: a layout of electrodes in a sheet, or on the bottom of a layer, flat or curved; checked, meshed, touched."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """The table of a curved skin's surface, by its kind: what each key may hold, from where to where, in which unit."""
 
+from __future__ import annotations
+
 from typing import Annotated, Any, Literal
 
 from jeit.files.schema import Number, Numbers, OneOf, Table, Word, fault

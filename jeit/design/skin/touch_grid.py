@@ -1,5 +1,7 @@
 """Where a skin is touched: the middles of equal rectangles over it."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float

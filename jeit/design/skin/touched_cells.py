@@ -1,5 +1,7 @@
 """What touches do to a mesh: the few cells that each of them changes, and by how much."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np

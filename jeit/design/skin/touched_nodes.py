@@ -1,5 +1,7 @@
 """The nodes whose rows of the system matrix touches change, numbered touch by touch (NumPy)."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Int

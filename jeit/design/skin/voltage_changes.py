@@ -11,6 +11,8 @@ touch cuts off make the matrix singular, but nothing flows there. With the resid
 Rᵀ (G⁻¹ + D)⁻¹ R, and Rᵀ G R is most of that. G is needed only between nodes of one touch, which lie near each other.
 """
 
+from __future__ import annotations
+
 from functools import partial
 
 import jax

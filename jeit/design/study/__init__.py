@@ -4,6 +4,8 @@
 `jeit.report.write_study_report` makes one page of it. Needs the extra `cluster`: zarr, xarray and dask.distributed.
 """
 
+from __future__ import annotations
+
 from jeit.arguments.moved import tell_old_names as _tell_old_names
 from jeit.design.study.progress import Progress
 from jeit.design.study.run import run_study, study_progress

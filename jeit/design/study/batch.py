@@ -1,5 +1,7 @@
 """The points of a chunk in one jitted batch, or one by one: sensitivity maps, and the scores made of them."""
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial

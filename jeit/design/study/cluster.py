@@ -1,5 +1,7 @@
 """Chunks of work on the workers of a cluster."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar

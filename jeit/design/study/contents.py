@@ -1,5 +1,7 @@
 """What is in a store: the arrays of a study, and their names, units and meanings."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 

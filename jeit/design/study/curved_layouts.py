@@ -1,5 +1,7 @@
 """The layouts that a study of curved skins names: spread over its surface, or read from tables."""
 
+from __future__ import annotations
+
 import math
 import re
 from pathlib import Path

@@ -1,5 +1,7 @@
 """The layouts that a study file names: those that `named_layout` knows, made for its skin, or read from files."""
 
+from __future__ import annotations
+
 import math
 from pathlib import Path
 

@@ -1,5 +1,7 @@
 """One process at a time writes a store: a file beside it says which, and is seen through where that process is dead."""
 
+from __future__ import annotations
+
 import contextlib
 import json
 import os

@@ -1,5 +1,7 @@
 """How far work in chunks is, and how long it will take."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

@@ -1,5 +1,7 @@
 """Run a study, chunk by chunk, here or on a cluster, so that it can be stopped at any moment."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,7 @@
 """The scores that a study can give its skins."""
 
+from __future__ import annotations
+
 from typing import Literal
 
 ScoreName = Literal[

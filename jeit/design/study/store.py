@@ -4,6 +4,8 @@ No chunk touches another's files. Which chunks are finished stands, with a check
 of each, in one file that is replaced as a whole, after the chunk's own.
 """
 
+from __future__ import annotations
+
 import contextlib
 import glob
 import hashlib

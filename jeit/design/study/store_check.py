@@ -5,6 +5,8 @@ somebody else is opened only where it is what jeit writes: format 3, the arrays 
 and text, through codecs that only pack bytes, and no links to other places.
 """
 
+from __future__ import annotations
+
 import json
 import math
 import os

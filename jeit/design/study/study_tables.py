@@ -1,5 +1,7 @@
 """The tables of a study's file, key by key: what each may hold, from where to where, in which unit; lists are swept."""
 
+from __future__ import annotations
+
 import math
 from typing import Annotated, Any, Literal
 

@@ -6,6 +6,8 @@ All lengths in metres, currents in amperes, sheet conductivity in siemens, that 
 admittivities and contact impedances may be complex.
 """
 
+from __future__ import annotations
+
 from jeit.forward.exact.arcs import arc_transfer_impedance, logarithm_moments
 from jeit.forward.exact.box import face_patch_impedance, plate_resistance
 from jeit.forward.exact.curved_sheets import sleeve_sheet_impedance, sphere_sheet_impedance

@@ -14,6 +14,8 @@ give electrode potentials to O(p^-6). The logarithm on one and the same arc is i
 and ∫ P_m Q_n = 2/((m−n)(m+n+1)) for m + n odd, DLMF 14.17). All else is smooth and left to Gauss-Legendre.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from jeit.forward.exact.disk import ConductingDisk

@@ -1,5 +1,7 @@
 """A box: between two plates that cover its opposite faces, and fed through patches of its lower and upper face."""
 
+from __future__ import annotations
+
 import numpy as np
 
 

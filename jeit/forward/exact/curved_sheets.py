@@ -14,6 +14,8 @@ and insulated ends at z = 0 and z = H mirror the source, again and again, to 2kH
 a source and an even sink: 1/(2πRσ) [(z² + z'²)/2H − max(z, z')].
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 # Images that are farther off than this many radii are not seen in double precision.

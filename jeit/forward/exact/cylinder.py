@@ -14,6 +14,8 @@ An electrode with a contact impedance z that is large against its size over σ c
 mean potential beneath it, besides the drop z I / area at its own contact.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

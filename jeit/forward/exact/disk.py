@@ -15,6 +15,8 @@ so that the inclusion adds the smooth series −2 Σ_k μρ^{2k}/(1 + μρ^{2k})
 (Isaacson 1986, "Distinguishability of conductivities by electric current computed tomography").
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

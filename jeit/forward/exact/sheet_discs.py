@@ -15,6 +15,8 @@ a linear system whose truncation error falls geometrically with the number of mu
 h satisfies the insulating condition on |w| = a when h(a²/w̄), its image, is added.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.special import ive
 

@@ -10,6 +10,8 @@ the mean of P_n over the cap; by the addition theorem the mean of P_n(cos γ) ov
 between them. What contact impedances do is told in `jeit.forward.exact.cylinder`.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

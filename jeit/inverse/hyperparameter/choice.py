@@ -1,5 +1,7 @@
 """What choosing a hyperparameter leaves behind: the λ chosen, how, and the curve that was looked at."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jax.typing import ArrayLike

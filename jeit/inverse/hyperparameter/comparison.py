@@ -1,5 +1,7 @@
 """Which hyperparameter for these data: what one rule chooses, or what all of them do."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 
 from jaxtyping import Array, Bool, Float

@@ -1,5 +1,7 @@
 """Which λ is taken where none is given; GREIT and filtered back-projection have scales of their own."""
 
+from __future__ import annotations
+
 RULE = "noise-figure"
 """The rule that chooses λ of linear images, and of nonlinear problems linearised at the background."""
 ITERATED = 5.0

@@ -1,5 +1,7 @@
 """How GREIT chooses λ: by the noise figure of a target in the middle of the body."""
 
+from __future__ import annotations
+
 import numpy as np
 import scipy
 

@@ -1,5 +1,7 @@
 """Point spread: how wide the image of a single cell is, and the hyperparameter that makes it narrowest."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike

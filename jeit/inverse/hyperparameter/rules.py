@@ -5,6 +5,8 @@ A rule takes the `Spectrum` of the problem, the whitened data (None if there are
 residual is ‖r‖² = Σ f²c² and the penalty xᵀQx = Σ Λc²/(Λ + λ²)².
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

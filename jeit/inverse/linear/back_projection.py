@@ -1,5 +1,7 @@
 """Back-projection: the change seen by each channel, smeared over the cells that channel looks at."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Array, Bool
 from numpy.typing import ArrayLike

@@ -5,6 +5,8 @@ S35-S55. There the body is a disk; here the targets and their images follow the 
 body they are balls.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from itertools import combinations
 

@@ -1,5 +1,7 @@
 """One-step (linear) difference imaging: a reconstruction matrix, computed once, times a difference of frames."""
 
+from __future__ import annotations
+
 import functools
 from dataclasses import dataclass
 from typing import Any

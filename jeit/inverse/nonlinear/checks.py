@@ -1,5 +1,7 @@
 """What is asked of the arguments of reconstructions, before anything is compiled: errors that say what to give."""
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float

@@ -5,6 +5,8 @@ that are free; those at a bound which the objective pushes outwards go where the
 the same bounds are active. Where one is just reached derivatives hold on one side only.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 import equinox as eqx

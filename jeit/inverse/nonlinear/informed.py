@@ -4,6 +4,8 @@ They are the right singular vectors of the whitened Jacobian at the background, 
 an image by a millionth.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

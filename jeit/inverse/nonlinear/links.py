@@ -1,5 +1,7 @@
 """Links: the scale on which conductivity is estimated, x for σ = link(x), cell by cell."""
 
+from __future__ import annotations
+
 import abc
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """What of a model and its voltages is used: the channels that a mask leaves, and of those the independent ones."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Array, Bool, Float
 

@@ -1,5 +1,7 @@
 """Parametrisation: what is estimated, on which scale and within which limits."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import equinox as eqx

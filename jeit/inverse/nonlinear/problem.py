@@ -1,5 +1,7 @@
 """The nonlinear inverse problem as all solvers see it: coefficients in, misfit, Jacobian and cost out."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import numpy as np

@@ -1,5 +1,7 @@
 """`reconstruct`: the conductivity that explains a frame of voltages, by nonlinear least squares."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import equinox as eqx

@@ -3,6 +3,8 @@
 `SOLVERS` has them by name, and `as_solver` is where a name becomes an object.
 """
 
+from __future__ import annotations
+
 import abc
 from typing import Any, ClassVar, NamedTuple, TypeVar
 

@@ -4,6 +4,8 @@ With covariance Γ = S Sᵀ the prior energy (x - x₀)ᵀ Γ⁻¹ (x - x₀) is
 narrow one (a covariance of low rank) keeps what the prior holds possible and leaves out the rest.
 """
 
+from __future__ import annotations
+
 import abc
 import functools
 import operator

@@ -1,5 +1,7 @@
 """What is asked of a prior."""
 
+from __future__ import annotations
+
 from typing import Any
 
 from jeit.arguments import check_kind

@@ -1,5 +1,7 @@
 """Which prior is taken where none is given, and the quadratic priors by the names of the command line."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 from jeit.inverse.prior.matern import Matern

@@ -5,6 +5,8 @@ along y and one along z and is applied axis by axis; P is cubic interpolation fr
 which is off by some thousandths at that spacing.
 """
 
+from __future__ import annotations
+
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float

@@ -4,6 +4,8 @@ One column after the other, where the diagonal of Γ - S Sᵀ is largest, until 
 Harbrecht, Peters and Schneider, Appl. Numer. Math. 62 (2012) 428-440.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import jax

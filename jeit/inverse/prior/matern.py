@@ -10,6 +10,8 @@ covariance itself would be a matrix of all pairs of cells. Lindgren, Rue and Lin
 of that off (Roininen, Huttunen and Lasanen, Inverse Probl. Imaging 8 (2014) 561-586), and what is left is divided out.
 """
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 import numpy as np

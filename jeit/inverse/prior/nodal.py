@@ -1,5 +1,7 @@
 """Matrices between the nodes of a mesh, solved by the direct solver, and images of cells as means over their nodes."""
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple

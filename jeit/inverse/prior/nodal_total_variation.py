@@ -5,6 +5,8 @@ The energy λ ∫ √(|∇x|² + (β/h)²) dV, h the cell's size and lengths in 
 form that touches it is a stiffness matrix of the nodes.
 """
 
+from __future__ import annotations
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int

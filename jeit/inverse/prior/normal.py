@@ -4,6 +4,8 @@ A penalty that is, or from above touches, ½ cᵀQc up to what is linear in c st
 Q. Its covariance Q⁻¹ is never there as a matrix.
 """
 
+from __future__ import annotations
+
 import abc
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """Penalties: what an image costs apart from its misfit, as a function of the coefficients it is made of."""
 
+from __future__ import annotations
+
 import abc
 
 import equinox as eqx

@@ -5,6 +5,8 @@ from products of the prior covariance Γ = Q⁻¹ with Jᵀ alone; where Q has a
 any generalised inverse and the null space is estimated from the data without penalty.
 """
 
+from __future__ import annotations
+
 import abc
 from collections.abc import Callable
 from functools import partial

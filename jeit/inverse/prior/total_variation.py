@@ -7,6 +7,8 @@ a smooth prior's, and lowers the true cost. Vogel and Oman, SIAM J. Sci. Comput.
 Graham, Adler and Lionheart, IEEE Trans. Med. Imaging 29 (2010) 44-54.
 """
 
+from __future__ import annotations
+
 from typing import NoReturn
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """Which frames are imaged, which in part, and which are refused."""
 
+from __future__ import annotations
+
 from enum import StrEnum
 
 import numpy as np

@@ -6,6 +6,8 @@ data can tell of at all, some dozens. Array shapes never change, so nothing is c
 keeps its place, and gets a variance so large that it does not count.
 """
 
+from __future__ import annotations
+
 import functools
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """`stream`: frames one by one, from anywhere, to images; a bad frame is said to be bad, and the stream goes on."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Iterable, Iterator
 

@@ -1,5 +1,7 @@
 """Fewer nodes than a mesh needs: said of the number that was asked for, of a sheet or of the solid above it."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 

@@ -10,6 +10,8 @@ that curvature does. Each length only ever falls, and lengths too large give len
 worked on in any order: those that changed, of all sources together, until none does.
 """
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 import equinox as eqx

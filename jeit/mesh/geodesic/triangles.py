@@ -1,5 +1,7 @@
 """`Triangles`: a triangulated surface in space as arrays, with the point of it that is nearest to any other (NumPy)."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int

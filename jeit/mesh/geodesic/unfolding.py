@@ -6,6 +6,8 @@ straight lines there are the shortest ways on the surface: exactly, on its trian
 so that it is told where that is. Arrays of either engine, differentiated and batched.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

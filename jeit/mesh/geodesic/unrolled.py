@@ -7,6 +7,8 @@ SIGGRAPH 2002). A closed sleeve is cut along a shortest way from edge to edge, a
 other.
 """
 
+from __future__ import annotations
+
 import itertools
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """Outlines in metres, without a mesh: `Domain`, which says what every outline can do, and one file for each."""
 
+from __future__ import annotations
+
 from jeit.mesh.outline.disk import Disk
 from jeit.mesh.outline.domain import Domain, Pen
 from jeit.mesh.outline.polygon import Polygon

@@ -1,5 +1,7 @@
 """Surfaces in space, and shells: sleeves, spheres, bent sheets, and what has a thickness above any of them."""
 
+from __future__ import annotations
+
 from jeit.mesh.surface.bending import bend
 from jeit.mesh.surface.boundary import surface_of
 from jeit.mesh.surface.shells import shell

@@ -1,5 +1,7 @@
 """How far off places are: pairs of true and estimated ones on the skin, and errors against what they depend on."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The map of one touch: how well every place explains what the microphones received."""
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 import numpy as np

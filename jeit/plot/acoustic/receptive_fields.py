@@ -1,5 +1,7 @@
 """Receptive fields: what each microphone receives of taps, against their distance."""
 
+from __future__ import annotations
+
 import textwrap
 from typing import Any
 

@@ -1,5 +1,7 @@
 """What pictures of touches share: the surface seen from above, its microphones, where a touch is and how surely."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Touches in time: where each began, went and ended, over the fading overlay of what was heard."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Sensitivity maps of a skin, and the histograms of several."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Virtual taxels: where they are and how large, their areas' histogram, and what each is sensitive to."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 
 import numpy as np

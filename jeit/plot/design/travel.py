@@ -1,5 +1,7 @@
 """Where electrodes travelled while a layout was optimised, from start to end."""
 
+from __future__ import annotations
+
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes

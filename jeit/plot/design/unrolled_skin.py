@@ -1,5 +1,7 @@
 """Images of curved skins, unrolled: laid flat, as seen from outside, true to scale."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Images of complex admittivity: both parts side by side, each on its own scale."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

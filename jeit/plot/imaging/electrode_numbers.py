@@ -1,5 +1,7 @@
 """Numbers beside electrodes: outside the outline where there is room, so that neither metal nor image is covered."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes

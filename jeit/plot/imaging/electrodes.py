@@ -1,5 +1,7 @@
 """Electrodes, drawn where they are and as wide as they are, with their numbers."""
 
+from __future__ import annotations
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PatchCollection

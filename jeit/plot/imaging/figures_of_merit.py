@@ -1,5 +1,7 @@
 """Figures of merit of reconstructions, side by side, against the target's distance from the centre."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np

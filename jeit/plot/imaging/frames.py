@@ -3,6 +3,8 @@
 A frame that was refused has no image: its body is grey, and says so.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,5 +1,7 @@
 """Parameter choice: the curves that rules for the hyperparameter look at, and the points they choose."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Images: conductivity, or its change, on the mesh or on a raster."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import jax.numpy as jnp

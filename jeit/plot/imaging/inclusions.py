@@ -1,5 +1,7 @@
 """Inclusions found in an image, marked: a cross at the centroid in a circle of the same area, or a ball's volume."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 from matplotlib.axes import Axes

@@ -1,5 +1,7 @@
 """Outlines of what is resistive and what is conductive: of labelled pixels, and of bodies fitted as shapes."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Meshes: their cells, their outline, their electrodes."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes

@@ -1,5 +1,7 @@
 """Sensitivity: where on a body a change of conductivity shows in the voltages."""
 
+from __future__ import annotations
+
 import numpy as np
 from matplotlib.axes import Axes
 

@@ -1,5 +1,7 @@
 """What happens over time: the functional image, maps of amplitude and phase, and curves and spectra of regions."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 
 import numpy as np

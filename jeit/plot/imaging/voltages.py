@@ -1,5 +1,7 @@
 """Voltages, measured against modelled."""
 
+from __future__ import annotations
+
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike

@@ -1,5 +1,7 @@
 """What stands round an image in space: the body's hull, translucent, and electrodes on it, numbered."""
 
+from __future__ import annotations
+
 from collections import Counter
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Where a picture in space is seen from, and the light on what is seen."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

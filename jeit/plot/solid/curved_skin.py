@@ -1,5 +1,7 @@
 """Curved skins as they are in space, with values on them and electrodes as discs."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,5 +1,7 @@
 """A solid image, or one on a surface, to turn round and cut with the mouse: through PyVista, where it is installed."""
 
+from __future__ import annotations
+
 import os
 import socket
 import sys

@@ -1,5 +1,7 @@
 """A solid image in space: surfaces of equal change inside the body, its electrodes on it."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Inclusions in pictures of solids, dashed: of bodies that were fitted their own outline, of others a ball's."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes

@@ -1,5 +1,7 @@
 """What one wants to see of a solid image first: where things are in space, and cut through the strongest change."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

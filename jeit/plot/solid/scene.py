@@ -4,6 +4,8 @@ matplotlib's own axes in space sort whole objects, so that electrodes show throu
 among all others, and seen along parallel rays, so that the picture has a true scale.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes

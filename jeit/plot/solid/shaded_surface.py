@@ -1,5 +1,7 @@
 """Surfaces of triangles in space, with values on them, in light and shade from any side."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib import colormaps

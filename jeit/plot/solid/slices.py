@@ -1,5 +1,7 @@
 """Slices through a solid image: one at any plane, or a grid of them along an axis."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Every step from image to contacts, beside each other."""
 
+from __future__ import annotations
+
 import numpy as np
 from matplotlib.axes import Axes
 

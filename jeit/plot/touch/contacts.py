@@ -1,5 +1,7 @@
 """Contacts over the image that they were found in."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Maps of how deep a skin is indented; and how a training went."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,5 +1,7 @@
 """A skin and what happened to it: cuts as lines, electrodes that fail as crosses, over an image or the bare skin."""
 
+from __future__ import annotations
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke

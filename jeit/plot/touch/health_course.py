@@ -1,5 +1,7 @@
 """A skin's change from how it was when healthy, in time, and what was told of it when."""
 
+from __future__ import annotations
+
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike

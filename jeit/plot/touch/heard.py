@@ -1,5 +1,7 @@
 """What was heard in time: how probable each name is, and which one is told."""
 
+from __future__ import annotations
+
 import numpy as np
 from matplotlib.axes import Axes
 

@@ -1,5 +1,7 @@
 """A self-organising map: its net of neurons, and what each of them says."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,5 +1,7 @@
 """How well a skin learnt: errors of presses held out, over the skin, against force, between labels, and of keys."""
 
+from __future__ import annotations
+
 import numpy as np
 from matplotlib.axes import Axes
 

@@ -1,5 +1,7 @@
 """Named touches in time, a lane for each gesture beneath the change that they made; and their paths on the skin."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,5 +1,7 @@
 """What a learnt skin said of frames: places over the skin, with how sure they are."""
 
+from __future__ import annotations
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection

@@ -1,5 +1,7 @@
 """Pictures of a study's results, for its report."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from jeit.design.skin.touch_grid import TouchGrid

@@ -1,5 +1,7 @@
 """A study as one HTML page that needs nothing else: its pictures, its table, and the exact configuration."""
 
+from __future__ import annotations
+
 import base64
 import contextlib
 import io

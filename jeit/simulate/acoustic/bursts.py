@@ -1,5 +1,7 @@
 """Bursts: how loud a tap is in time."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float

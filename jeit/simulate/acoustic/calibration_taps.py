@@ -1,5 +1,7 @@
 """Taps at known places of a simulated skin, as a calibration needs them: many at once."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from functools import partial
 

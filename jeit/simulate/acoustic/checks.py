@@ -1,5 +1,7 @@
 """Checks of the numbers that a simulated acoustic skin and its touches are given."""
 
+from __future__ import annotations
+
 from jeit.arguments import is_number, told
 
 

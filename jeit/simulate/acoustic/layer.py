@@ -1,5 +1,7 @@
 """The soft layer that carries the sound: its material, with speed and loss, and its shape, with spreading and edges."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np

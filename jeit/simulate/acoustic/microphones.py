@@ -1,5 +1,7 @@
 """The microphones of a simulated skin: where they are, what they are like, and how they are read."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 

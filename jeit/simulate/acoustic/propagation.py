@@ -3,6 +3,8 @@
 Sound is propagated frequency by frequency; powers are integrals over frequency with no random numbers in them.
 """
 
+from __future__ import annotations
+
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -4,6 +4,8 @@ A touch of envelope e(t) at one place is received, on average over keys, with th
 but for what rings on beyond the recording's ends.
 """
 
+from __future__ import annotations
+
 from functools import partial
 
 import equinox as eqx

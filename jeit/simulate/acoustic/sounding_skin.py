@@ -6,6 +6,8 @@ frequency by frequency, with spreading, viscoelastic loss, delays and echoes of 
 eabm7187 (2022). The physics is in `jeit.simulate.acoustic.propagation`, touches in `jeit.simulate.acoustic.touches`.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -4,6 +4,8 @@ A touch of soft rubber is random noise in a band, in bursts or steadily. White n
 frequency after. Every function takes an explicit key: the same key, the same samples.
 """
 
+from __future__ import annotations
+
 from functools import partial
 
 import jax

@@ -3,6 +3,8 @@
 Every function takes an explicit key: the same key, the same samples.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import jax

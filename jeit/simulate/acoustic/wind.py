@@ -1,5 +1,7 @@
 """Air in motion: a jet that blows on a simulated skin, and the sound of the room that it is in."""
 
+from __future__ import annotations
+
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -4,6 +4,8 @@ An indenter says how far its surface is above its lowest point, and a support ho
 Arrays are NumPy's: what touches what is no smooth function of anything.
 """
 
+from __future__ import annotations
+
 from jeit.simulate.contact.foundation import Foundation
 from jeit.simulate.contact.half_space import HalfSpace
 from jeit.simulate.contact.indent_sets import IndentSet

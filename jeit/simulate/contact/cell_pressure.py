@@ -1,5 +1,7 @@
 """Pressure on the cells of a mesh, at a few samples of each, which a load is balanced on."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 

@@ -1,5 +1,7 @@
 """What changes on a skin that nobody touches: its conductivity, its contacts, and every reading."""
 
+from __future__ import annotations
+
 import math
 
 import jax

@@ -1,5 +1,7 @@
 """A thin soft layer on a rigid back: pressure at a place follows from how far the layer is pressed in there alone."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 

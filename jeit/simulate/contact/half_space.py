@@ -7,6 +7,8 @@ conjugate gradients along the contact, pixels leaving where pressure would be ne
 is seen.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.spatial import KDTree
 

@@ -1,5 +1,7 @@
 """Sets of drawn indents, with what a skin reads of them and their depth maps: in chunks, as sets of presses are."""
 
+from __future__ import annotations
+
 import hashlib
 from functools import cached_property, lru_cache
 from threading import Lock

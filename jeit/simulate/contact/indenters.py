@@ -1,5 +1,7 @@
 """Rigid indenters: how far the surface that comes down on a skin is above its lowest point."""
 
+from __future__ import annotations
+
 import abc
 
 import equinox as eqx

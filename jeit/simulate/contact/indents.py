@@ -1,5 +1,7 @@
 """Rigid bodies held at a depth in a skin, whatever load that takes: depth maps, and what such touches read."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import equinox as eqx

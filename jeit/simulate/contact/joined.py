@@ -1,5 +1,7 @@
 """Indenters moved and turned in their frame, and several that are one rigid body."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike

@@ -1,5 +1,7 @@
 """Materials of skins: how conductivity follows pressure, in time, and what else a reading of them holds."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import equinox as eqx

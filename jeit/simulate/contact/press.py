@@ -1,5 +1,7 @@
 """Presses: an indenter, its load and its place; still, or moving."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float

@@ -1,5 +1,7 @@
 """Presses drawn at random: what is pressed, how hard, where, and how many at once."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import equinox as eqx

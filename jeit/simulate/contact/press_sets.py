@@ -3,6 +3,8 @@
 The store, and what a chunk is to it, is that of the studies of `jeit.design`. Needs the extra `cluster`.
 """
 
+from __future__ import annotations
+
 import hashlib
 from collections.abc import Callable, Iterator
 from functools import cached_property

@@ -1,5 +1,7 @@
 """`PressedSkin`: a skin of some material, and what it reads while it is pressed."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from functools import cached_property
 

@@ -1,5 +1,7 @@
 """Pressure beneath a rigid indenter under a given load."""
 
+from __future__ import annotations
+
 import abc
 
 import equinox as eqx

@@ -11,6 +11,8 @@ matters; both curves end at zero, and their greatest difference after a load of 
 solved exactly for w that is linear between two times.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Places on the cells of a skin that pressure is worked out at, as a press sees them."""
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -10,6 +10,8 @@ to σ₁ + 2σ₂ (u = w on a disc in an unbounded sheet has the dipole σ₂/(�
 `Material` whose `saturation` is σ₂/σ₁, or twice that, is the short form.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float

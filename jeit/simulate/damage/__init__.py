@@ -4,6 +4,8 @@ Voltages are solved anew on the damaged conductivity, whose mesh is fine along t
 and noise of the material, and go on through the damage.
 """
 
+from __future__ import annotations
+
 from jeit.simulate.damage.cut import Cut, draw_cut
 from jeit.simulate.damage.electrode_fault import FAULTS, ElectrodeFault
 from jeit.simulate.damage.recording import Mishap, record_mishaps

@@ -1,5 +1,7 @@
 """`Cut`: a slit along a path, through the whole skin or a part of its depth, and what conducts there afterwards."""
 
+from __future__ import annotations
+
 import itertools
 
 import equinox as eqx

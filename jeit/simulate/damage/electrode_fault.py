@@ -1,5 +1,7 @@
 """`ElectrodeFault`: an electrode that has died, hangs loose, or whose wire is torn off, and what channels then read."""
 
+from __future__ import annotations
+
 from typing import Literal
 
 import equinox as eqx

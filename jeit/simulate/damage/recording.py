@@ -1,5 +1,7 @@
 """Frames of a skin through its mishaps: whole, then cut, then mended, and with electrodes that fail."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """Repair: a cut that conducts again, about as well as before, in a material that lags behind its load more."""
 
+from __future__ import annotations
+
 import dataclasses
 
 import numpy as np

@@ -1,5 +1,7 @@
 """A gesture as a press that moves: its load, place and angle, frame by frame."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 

@@ -1,5 +1,7 @@
 """One long recording of gestures, one after another with pauses between, as a skin in use reads them."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 

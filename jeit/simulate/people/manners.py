@@ -8,6 +8,8 @@ to person. For in-plane displacement there is only yes: fingers stroke at some 0
 scratch to and fro, faster and less far.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """People: each makes each gesture in a way of their own, and never twice the same."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import numpy as np

@@ -1,5 +1,7 @@
 """Gestures of many people on a simulated skin, as it reads them."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 
 import jax

@@ -4,6 +4,8 @@ Each is measured from what was recorded on a skin; `touch_attributes` asks for a
 or of a simulated skin, and measures them all.
 """
 
+from __future__ import annotations
+
 from jeit.touch.attributes.measures import (
     ContactArea,
     Localisation,

@@ -1,5 +1,7 @@
 """Attributes of touch, each from what was recorded: loads and responses, places, separations, areas, times."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

@@ -1,5 +1,7 @@
 """All attributes of touch of one skin: the trials, whoever presses in them, and what they say."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 

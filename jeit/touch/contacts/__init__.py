@@ -1,5 +1,7 @@
 """Contacts found in images of change, followed from frame to frame, and what load each carries."""
 
+from __future__ import annotations
+
 from jeit.touch.contacts.cell_finder import CellFinder
 from jeit.touch.contacts.contact import Contact
 from jeit.touch.contacts.finder import find_contacts

@@ -1,5 +1,7 @@
 """Contacts on the mesh itself: a watershed parts the peaks, a share of each peak bounds its region."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse

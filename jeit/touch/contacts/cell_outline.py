@@ -1,5 +1,7 @@
 """Outlines of sets of cells."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float, Int
 

@@ -1,5 +1,7 @@
 """`Contact`: one region of an image where something touches the skin."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float

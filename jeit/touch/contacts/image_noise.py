@@ -1,5 +1,7 @@
 """Noise of linear images: how far each cell strays while nothing touches, and how cells stray together."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import numpy as np

@@ -6,6 +6,8 @@ rises with the load F and saturates, as conductivity under pressure does, and is
 are. It is for one indenter, or those much alike: a wider contact under the same load has another peak.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import equinox as eqx

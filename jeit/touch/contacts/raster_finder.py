@@ -5,6 +5,8 @@ The steps of Chen et al., "New flexible tactile sensor based on electrical imped
 smoothing, on simulated skins (`python -m benchmarks contacts`).
 """
 
+from __future__ import annotations
+
 import importlib
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Smoothing of images on a mesh: back-projected ones have an edge along every band, and each edge has peaks."""
 
+from __future__ import annotations
+
 import numpy as np
 from scipy import sparse
 from scipy.spatial import KDTree

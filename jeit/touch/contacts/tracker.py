@@ -1,5 +1,7 @@
 """Contacts followed from frame to frame: which is which, when each begins and ends, and where it went."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 
 import equinox as eqx

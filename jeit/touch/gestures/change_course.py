@@ -1,5 +1,7 @@
 """What is kept of an image of change: a few numbers a frame, from which touches are told apart and described."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float

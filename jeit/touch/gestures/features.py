@@ -1,5 +1,7 @@
 """What is measured of a touch: the seven features of Silvera Tawil et al. (2011), table II, and more of its course."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Classifiers of gestures by name, and how right each is of touches that are held out."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,5 +1,7 @@
 """`GestureModel`: which of the gestures that it learnt a touch is, how probable, and whether it is like any of them."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path

@@ -1,5 +1,7 @@
 """LogitBoost: additive logistic regression by stumps, as scikit-learn's estimators are used."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from numbers import Integral, Real
 from typing import Any

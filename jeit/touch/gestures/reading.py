@@ -1,5 +1,7 @@
 """`Reading`: how a skin was read whose touches gestures were learnt from, and what another reading must share."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 from jeit.arguments import is_number, told

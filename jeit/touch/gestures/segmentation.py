@@ -5,6 +5,8 @@ on. Frames with NaN or infinite values, and such as have the time of the one bef
 Where no frame came for so long that a touch might have ended in between, it is cut off there.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import equinox as eqx

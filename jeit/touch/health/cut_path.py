@@ -7,6 +7,8 @@ voltages solved anew in every step. A round spot is fitted too, which is what a 
 what it is.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

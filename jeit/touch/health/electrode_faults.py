@@ -1,5 +1,7 @@
 """Which electrodes are behind a change: those in whose channels nearly all of it is."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Bool, Float
 

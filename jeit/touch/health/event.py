@@ -1,5 +1,7 @@
 """`HealthEvent`: one thing that happened to a skin, when, where, and how far it may be believed."""
 
+from __future__ import annotations
+
 from enum import StrEnum
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """What a lasting change is: of an electrode, a cut, something unlike a touch, or what a touch may be too."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,6 +4,8 @@ Rivara's closure: a triangle of which any edge is halved has its longest halved 
 than half of what it was, and no node hangs.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Bool, Int
 

@@ -1,5 +1,7 @@
 """`Healthy`: what a recording of a healthy skin says of how frames differ that mean no harm."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """`ImagedSkin`: a skin's model, tied to its readings, for images that go on with what is left and for paths of cuts."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -5,6 +5,8 @@ window as between two; what is left is a step. How far windows of healthy frames
 scale for all.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,6 +6,8 @@ and G = A⁻¹ between the nodes t. G is found once for all nodes of the region;
 unknowns as it has nodes.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,7 @@
 """`SkinHealth`: whether a skin is still what it was, followed from frame to frame."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -441,9 +443,7 @@ class SkinHealth:
         return trusted
 
 
-def watch(
-    health: SkinHealth, frames: Float[ArrayLike, "F M"], times: Float[ArrayLike, " F"] | None = None
-) -> SkinHealth:
+def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None) -> SkinHealth:
     """What is known after a recording (F, M), the same as following it frame by frame; `times` (F,), seconds, or
     frames counted on. Raises `ValueError` as `SkinHealth.follow` does, and for another number of times."""
     check_kind("health", health, SkinHealth, "a SkinHealth, as of SkinHealth.fit(healthy)")

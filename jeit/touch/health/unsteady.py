@@ -5,6 +5,8 @@ hardly know of, and that of all, which hears jumps. Each is compared with what h
 follow each other, and with the other channels now: where many do it at once, it is a touch, not they.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -3,6 +3,8 @@
 Rooms beside it: `jeit.touch.learnt` has it as a method, "som", of `jeit touch fit`.
 """
 
+from __future__ import annotations
+
 from jeit.touch.kohonen.drawing import drawn_map
 from jeit.touch.kohonen.map_file import read_map, write_map
 from jeit.touch.kohonen.placed_map import PlacedMap

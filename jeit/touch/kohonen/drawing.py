@@ -1,5 +1,7 @@
 """The topology of a map, drawn: neurons as masses, neighbours held by springs."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Array, Float, Int
 

@@ -1,5 +1,7 @@
 """Maps as files: arrays alone."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import numpy as np

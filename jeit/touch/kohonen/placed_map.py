@@ -1,5 +1,7 @@
 """`PlacedMap`: what a self-organising map says of places, once some presses have told where its neurons lie."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple

@@ -1,5 +1,7 @@
 """How well a map keeps the order of its frames, in the field's measures."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """`SelfOrganisingMap`: neurons on a grid, each with a frame of its own, neighbours with frames that are alike."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

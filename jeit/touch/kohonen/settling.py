@@ -1,5 +1,7 @@
 """How a map's mean weight settles: its learning curves, and their time constants."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np

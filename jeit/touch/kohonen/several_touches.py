@@ -1,5 +1,7 @@
 """Several touches at once, told by a map that has learnt of one at a time."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

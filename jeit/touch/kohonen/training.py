@@ -15,6 +15,8 @@ far from y, whichever that is (Stewart's theorem). So weights are multiplied wit
 after them: in between, distances alone change, in the tuning phase those of the winner alone.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -1,5 +1,7 @@
 """All that presses say, learnt from their changes: places, forces, labels and keys, and how well each is told."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 

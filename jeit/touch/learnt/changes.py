@@ -1,5 +1,7 @@
 """From frames to changes: less the untouched skin's reference, by session where sessions differ."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Bool, Float
 

@@ -1,5 +1,7 @@
 """The few channels that tell most of what is asked."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float, Int
 

@@ -6,6 +6,8 @@ be within so many deviations, and it is not. What it would have read is told fro
 knows more than the patterns do: that reciprocal channels read the same, say.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 

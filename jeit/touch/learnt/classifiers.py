@@ -1,5 +1,7 @@
 """The nine classifiers that Russo et al. (2017) compare, as scikit-learn has them, and the probabilities of each."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,5 +1,7 @@
 """What a method learns from: changes of the channels in one of several forms, as scores of principal components."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,5 +1,7 @@
 """Learnt skins as files: arrays and scikit-learn's estimators as skops keeps them, never a pickle."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Folds of cross-validation for skins that drift: stretches of time, groups and repeated frames never split."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree

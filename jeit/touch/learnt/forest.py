@@ -1,5 +1,7 @@
 """Decision trees as arrays, all walked down side by side, where scikit-learn takes milliseconds for one frame."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,5 +1,7 @@
 """Gaussian-process regression: smooth functions of the features, by few centres where presses are many."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

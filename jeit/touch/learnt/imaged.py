@@ -1,5 +1,7 @@
 """What the model of a skin makes of changes of its voltages: a linear image, and the strongest contact in it."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Which keys are pressed, several at once: a classifier for each key, the one that errs least on presses held out."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

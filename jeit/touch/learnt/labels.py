@@ -1,5 +1,7 @@
 """Labels learnt from frames: the classifier that is right most often on presses held out."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

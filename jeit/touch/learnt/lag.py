@@ -1,5 +1,7 @@
 """Whether frames were recorded some rows before or after the presses that they are of."""
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.spatial import KDTree
 

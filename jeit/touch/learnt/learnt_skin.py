@@ -1,5 +1,7 @@
 """A skin that has learnt, from recorded presses, to tell where, how hard and by what it is touched."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any

@@ -1,6 +1,8 @@
 """Support vector machines as arrays: a border for each pair of classes, whose sums are taken class by class, as
 thousands of pairs would take scikit-learn a hundredth of a second for one frame."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

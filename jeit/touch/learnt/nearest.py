@@ -1,5 +1,7 @@
 """Nearest presses by plain products: for one frame, threads of a library wait longer for each other than they work."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,6 +1,8 @@
 """How far a frame is from all that were learnt from: two touches at once, or one of the other sign, are made of the
 same patterns, but like no press that was recorded."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,5 +1,7 @@
 """Recorded presses: frames of a skin, and what touched it in each; checked, and read from NPZ files."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace

@@ -3,6 +3,8 @@
 Each takes features (N, k) and standardised targets (N, d), and gives what has `predict(features)`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

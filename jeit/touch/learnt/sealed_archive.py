@@ -4,6 +4,8 @@ skops numbers objects by where they happen to lie in memory, and dates its membe
 order, without dates. The seal, a checksum, tells a file that was changed from one that jeit wrote; it is no secret.
 """
 
+from __future__ import annotations
+
 import hashlib
 import io
 import re

@@ -1,5 +1,7 @@
 """Standard deviations of what is learnt: errors of presses held out that were like it, made to hold as they say."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -4,6 +4,8 @@ Trained with equinox and optax, a few at once from different starts, whose proba
 where a touch takes a fraction of a millisecond.
 """
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """What a learnt skin says of frames."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

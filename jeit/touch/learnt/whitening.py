@@ -1,5 +1,7 @@
 """Changes in units of what varies between frames of one and the same press: noise, drift, and what is not asked."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

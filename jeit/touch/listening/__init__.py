@@ -5,6 +5,8 @@ features or by a linear discriminant, whichever is right most often of what is h
 recording is made of. Beneath: `sound_images`, feature images as Park et al. (2022) have them, and `sound_features`.
 """
 
+from __future__ import annotations
+
 from jeit.touch.listening.feature_images import SoundImages, sound_images
 from jeit.touch.listening.heard import Event, Heard
 from jeit.touch.listening.labelled_clips import LabelledClips, read_clips

@@ -9,6 +9,8 @@ At any other rate frames are as long in time, and bands are made of bins by thei
 stays as wide, and each is wider than the one below it by one and the same factor.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,5 +1,7 @@
 """Which clips are held out together: never windows of one clip on both sides, nor clips of one person where known."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Int
 

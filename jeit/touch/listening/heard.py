@@ -1,5 +1,7 @@
 """What was heard in a recording: a name for every tenth of a second, and the events that follow each other."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Labelled clips of sound: a folder for each class, and what is read of them."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -4,6 +4,8 @@ with the spectrum in all its bands.
 Each is a class with `learn`, `log_odds` of the classes 0 … C − 1, and arrays that a file keeps.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

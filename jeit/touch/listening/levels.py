@@ -1,5 +1,7 @@
 """Powers as levels on a common scale: what a network is shown."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """`Listener`: learns to name sounds from labelled clips, and says every 0.1 s of a recording what is heard."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -6,6 +6,8 @@ held-out loss looked at every 50 batches, and an end after 20 looks without a de
 convolution and of the pools, 3 × 3 and 2 × 2, is this library's choice; so is the noise that images are augmented by.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce

@@ -1,5 +1,7 @@
 """Hand-made features of a window of sound: its loudness and rhythm, its colour, and how microphones share it."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 

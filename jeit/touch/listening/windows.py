@@ -3,6 +3,8 @@
 A long recording, many taps one after the other, counts as many clips: it is cut into pieces where it is quiet.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -5,6 +5,8 @@
 trained through the skin's forward model.
 """
 
+from __future__ import annotations
+
 from jeit.touch.networks.image_network import DESIGNS, ImageNetwork, read_network, write_network
 from jeit.touch.networks.learn import PRESETS, ImageStanding, LearntImages, Preset, learn_images
 from jeit.touch.networks.measured import FrameDepth, resting_frame, stream_depths

@@ -1,5 +1,7 @@
 """Touches that networks learn from: in memory, or in the store of a set that may be larger."""
 
+from __future__ import annotations
+
 import hashlib
 from pathlib import Path
 from typing import NamedTuple, Protocol

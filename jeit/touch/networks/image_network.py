@@ -1,5 +1,7 @@
 """`ImageNetwork`: voltages of a skin to maps of how deep it is indented, by a network that learnt it; and its file."""
 
+from __future__ import annotations
+
 import functools
 import hashlib
 import os

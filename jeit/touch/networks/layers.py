@@ -1,5 +1,7 @@
 """Layers of networks that image, for batches: dense ones, and convolutions of images (b, rows, columns, channels)."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from itertools import pairwise
 

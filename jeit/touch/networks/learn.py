@@ -1,5 +1,7 @@
 """`learn_images`: from a skin's description to a network that images its touches; its data, trainings and standing."""
 
+from __future__ import annotations
+
 import dataclasses
 import time
 from collections.abc import Callable

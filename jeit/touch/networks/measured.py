@@ -1,5 +1,7 @@
 """Measured frames imaged by a network: one after the other, each as soon as it has come."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple

@@ -1,5 +1,7 @@
 """Channels that a frame has no reading of, told by those that it has."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 

@@ -1,5 +1,7 @@
 """Where a map of depth says that a skin is touched."""
 
+from __future__ import annotations
+
 import numpy as np
 from jaxtyping import Float
 

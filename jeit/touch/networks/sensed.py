@@ -1,6 +1,8 @@
 """What a skin's channels feel of a depth map, by its forward model: linear in a function of depth, and what misplaced
 electrodes and drifting contacts add."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import jax.numpy as jnp

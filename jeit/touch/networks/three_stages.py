@@ -4,6 +4,8 @@ What the paper does not print is chosen: hidden layers of 256 between 94 channel
 16, 32 and 64 channels.
 """
 
+from __future__ import annotations
+
 from itertools import pairwise
 
 import equinox as eqx

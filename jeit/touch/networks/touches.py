@@ -1,5 +1,7 @@
 """What image networks learn from: bodies pressed into a skin, and the noise of its readings."""
 
+from __future__ import annotations
+
 import numpy as np
 
 from jeit.design import Bell, Skin, touches_away_from_the_edge

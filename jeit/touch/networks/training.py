@@ -1,5 +1,7 @@
 """How the two designs are trained, on touches simulated."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple

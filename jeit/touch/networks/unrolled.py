@@ -5,6 +5,8 @@ with the noise alone and with drifting contacts besides), and a small convolutio
 adds to the map. Trained with the misfit of the voltages that the model gives its maps.
 """
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

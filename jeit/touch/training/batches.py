@@ -1,5 +1,7 @@
 """Rows to train on, in memory or chunk by chunk, and which of them make up each batch."""
 
+from __future__ import annotations
+
 import hashlib
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol

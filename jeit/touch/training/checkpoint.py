@@ -1,5 +1,7 @@
 """Where a training is, on the disk: what was killed goes on from there."""
 
+from __future__ import annotations
+
 import json
 from pathlib import Path
 from typing import Any, NamedTuple

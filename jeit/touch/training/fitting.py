@@ -1,5 +1,7 @@
 """`fit`: a network trained by Adam until rows held out get no better, in a way that goes on where it was killed."""
 
+from __future__ import annotations
+
 import dataclasses
 import time
 from collections.abc import Callable

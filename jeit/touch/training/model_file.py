@@ -1,5 +1,7 @@
 """Networks as files: a head of JSON, which says what they are, and their arrays; never a pickle."""
 
+from __future__ import annotations
+
 import json
 import math
 import os

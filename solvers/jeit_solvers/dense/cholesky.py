@@ -6,6 +6,8 @@ LAPACK calls that run side by side in one program can wait for each other for ev
 as two. Matrix products have none of these troubles, and the same code serves complex symmetric matrices.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 import jax

@@ -5,6 +5,8 @@ the space of the parameters or of the data, whichever is smaller, where a genera
 residual and ridge stacked on each other: 50 times the work for 200 data and 2,000 parameters.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

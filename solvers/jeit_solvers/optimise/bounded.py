@@ -3,6 +3,8 @@
 jaxopt is not developed further. It is imported here and nowhere else, so that what replaces it has one place to go.
 """
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Callable
 from typing import Any

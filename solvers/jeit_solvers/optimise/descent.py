@@ -4,6 +4,8 @@ A Gauss-Newton or Levenberg-Marquardt step is the minimum of a quadratic model o
 find depends on the problem's structure, which the caller knows and a general least-squares solver does not.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

@@ -9,6 +9,8 @@ a model of it, such as Gauss-Newton's, for a preconditioner. Krantz and Parks, T
 Blondel et al., NeurIPS 35 (2022) 5230-5242.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

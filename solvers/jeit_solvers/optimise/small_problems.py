@@ -4,6 +4,8 @@ The batch is the last axis of every array, so that each operation runs along it;
 systems are solved by formulas written out.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial

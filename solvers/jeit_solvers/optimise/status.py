@@ -1,5 +1,7 @@
 """How a minimisation ended, in one word: the same words for every solver."""
 
+from __future__ import annotations
+
 from enum import StrEnum
 from typing import Any
 

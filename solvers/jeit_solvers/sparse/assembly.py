@@ -1,5 +1,7 @@
 """Summing element matrices into matrix entries."""
 
+from __future__ import annotations
+
 import math
 from typing import NamedTuple
 

@@ -1,5 +1,7 @@
 """Direct or iterative: the choice, from what a factorisation would cost."""
 
+from __future__ import annotations
+
 from typing import Any
 
 from jeit_solvers.sparse.conjugate_gradient import ConjugateGradient

@@ -1,5 +1,7 @@
 """Preconditioned conjugate gradients, for systems whose direct factor would be too large."""
 
+from __future__ import annotations
+
 from typing import Any, NamedTuple
 
 import equinox as eqx

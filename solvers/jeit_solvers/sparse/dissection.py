@@ -10,6 +10,8 @@ possible separator by a maximum matching of the cut edges (König's theorem; Pot
 1990).
 """
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_bipartite_matching

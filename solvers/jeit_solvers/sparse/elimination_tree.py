@@ -5,6 +5,8 @@ their elimination touches (multifrontal method; Duff and Reid, ACM Trans. Math. 
 height of the tree form a *stage*: they are padded to one shape and go through JAX as one batch.
 """
 
+from __future__ import annotations
+
 import numpy as np
 from scipy.sparse import csr_array
 

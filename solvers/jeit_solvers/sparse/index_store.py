@@ -5,6 +5,8 @@ dozens of index arrays, and a small factorisation takes half a millisecond. So p
 indices in one int32 array, and what a slice of it means in a static, hashable description.
 """
 
+from __future__ import annotations
+
 import math
 from typing import Any, NamedTuple
 

@@ -3,6 +3,8 @@
 In NumPy at once where the matrix is NumPy's, else in compiled programs.
 """
 
+from __future__ import annotations
+
 import functools
 import operator
 from functools import partial

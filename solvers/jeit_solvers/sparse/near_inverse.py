@@ -12,6 +12,8 @@ and then, from the last strip back, G = A⁻¹ has the blocks (Takahashi, Fagan 
 Only j up to i + `reach` are worked out: the work is that of products of a few large matrices.
 """
 
+from __future__ import annotations
+
 from functools import partial
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """Sparse symmetric matrices as lineax operators."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -1,5 +1,7 @@
 """Sparsity patterns of symmetric matrices, and fast assembly of element matrices into them."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any, Self
 

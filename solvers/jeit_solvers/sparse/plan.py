@@ -1,5 +1,7 @@
 """The symbolic half of the direct solver: where every number goes, found once for a sparsity pattern, in NumPy."""
 
+from __future__ import annotations
+
 import hashlib
 from typing import Any, NamedTuple
 from weakref import WeakValueDictionary

@@ -1,5 +1,7 @@
 """The direct solver, behind lineax's interface."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import equinox as eqx

@@ -1,5 +1,7 @@
 """Clips of many people on a skin with microphones, one after the other: what it hears, and who did what."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

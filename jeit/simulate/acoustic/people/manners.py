@@ -7,6 +7,8 @@ of `jeit.simulate.pat`, `tickle` and `stroke`, and of wind that of a stroke. Eac
 power density falls with frequency: what is soft and firm sounds duller than what is light, rubbing brightest.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 from jeit.simulate.acoustic.wind import TURBULENCE

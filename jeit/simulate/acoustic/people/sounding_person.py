@@ -1,5 +1,7 @@
 """People on a skin with microphones: each pats, tickles, strokes and blows in a way of their own, never twice alike."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
