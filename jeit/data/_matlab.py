@@ -64,7 +64,7 @@ def load(path: Path, *wanted: str) -> dict[str, np.ndarray]:
     """
     if _is_format_4(path):
         with read_as(_unreadable(path)):  # never compressed: of no more numbers than bytes
-            read = scipy.io.loadmat(str(path), variable_names=list(wanted))
+            read = scipy.io.loadmat(str(path), variable_names=list(wanted), spmatrix=False)
         return {"": np.array(sorted(variable_names(path)), dtype=str)} | _plain(read, wanted)
     held = _variables(path)
     asked = [one for one in held if one.name in wanted and one.kind in (_SPARSE, *_NUMERIC)]

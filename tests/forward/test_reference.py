@@ -39,7 +39,7 @@ SOLVE = 1e-11
 def load(path: Path) -> dict:
     """The arrays of one reference file, dense, column vectors flat."""
     arrays = {}
-    for key, value in scipy.io.loadmat(path).items():
+    for key, value in scipy.io.loadmat(path, spmatrix=False).items():
         if not key.startswith("__"):
             dense = value.toarray() if scipy.sparse.issparse(value) else value
             arrays[key] = dense.ravel() if dense.ndim == 2 and dense.shape[1] == 1 else dense
