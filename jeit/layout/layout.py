@@ -116,7 +116,7 @@ def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain 
     gap = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
     np.fill_diagonal(gap, np.inf)
     if gap.min() < -_ROUNDING:
-        first, second = np.unravel_index(gap.argmin(), gap.shape)
+        first, second = map(int, np.unravel_index(gap.argmin(), gap.shape))
         same = np.linalg.norm(centres[first] - centres[second]) < _ROUNDING
         how = "are at the same place" if same else f"overlap by {-1e3 * gap.min():.3g} mm"
         raise ValueError(f"centres: {called[first]} and {called[second]} {how}; remove one or move them apart.")

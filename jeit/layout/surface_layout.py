@@ -134,7 +134,7 @@ def _check_apart(centres: np.ndarray, diameters: np.ndarray, labels: Sequence[st
     gap = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
     np.fill_diagonal(gap, np.inf)
     if gap.min() < -_ROUNDING:
-        first, second = np.unravel_index(gap.argmin(), gap.shape)
+        first, second = map(int, np.unravel_index(gap.argmin(), gap.shape))
         raise ValueError(
             f"centres: electrode {first + 1} ('{labels[first]}') and electrode {second + 1} ('{labels[second]}') "
             f"overlap by {-1e3 * gap.min():.3g} mm; remove one or move them apart."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.design.defaults import BALL_DIAMETER, DEPTH, DEVIATION
@@ -16,7 +17,7 @@ class AbstractIndentation(eqx.Module):
     """Depth of an indentation. Add another by writing one class."""
 
     @abc.abstractmethod
-    def depth_at(self, distance: Float[Array, "..."]) -> Float[Array, "..."]:
+    def depth_at(self, distance: Float[Array | np.ndarray, "..."]) -> Float[Array | np.ndarray, "..."]:
         """Depth in metres at horizontal distances (metres) from the middle."""
 
     @property

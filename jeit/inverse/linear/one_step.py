@@ -114,7 +114,7 @@ class LinearReconstruction:
         full = full.at[self.second].add(self.ratio[:, None] * weights)
         return full.at[self.first].add(weights).T
 
-    def image(self, difference: Inexact[Array, "*frames M"]) -> Inexact[Array, "*frames m"]:
+    def image(self, difference: Inexact[Array | np.ndarray, "*frames M"]) -> Inexact[Array, "*frames m"]:
         """Change of conductivity in every cell, for one difference of frames (M,) in volts or many (F, M).
 
         Raises `ValueError` for another number of channels.

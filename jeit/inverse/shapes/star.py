@@ -207,7 +207,8 @@ class Stars(Bodies):
     def _wave(self, waves, direction):
         """Σ aₙ cos nθ + bₙ sin nθ and its slope, for directions exp iθ; and the powers exp inθ, n = 2 … N."""
         number = np.arange(2, self.prior.modes + 1)
-        powers = np.cumprod(np.broadcast_to(direction, (self.prior.modes, *direction.shape)), axis=0)[1:]
+        repeated = np.broadcast_to(direction, (self.prior.modes, *direction.shape))
+        powers = np.cumprod(repeated, axis=0, dtype=complex)[1:]
         sums = np.tensordot(np.stack([waves, 1j * number * waves]), powers, 1)
         return sums[0].real, sums[1].real, powers
 

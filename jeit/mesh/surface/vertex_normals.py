@@ -46,7 +46,8 @@ def _slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tuple[
     count = len(points)
     pairs = np.concatenate([cells[:, [a, b]] for a in range(3) for b in range(3)])
     near = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)).tocsr()
-    one, other = (near @ near).nonzero()
+    within_two = coo_array(near @ near)
+    one, other = within_two.row, within_two.col
     apart = one != other
     one, other = one[apart], other[apart]
     helper = np.eye(3)[np.abs(normal).argmin(axis=1)]
