@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from jeit.arguments import listed
+from jeit.arguments.extras import optional
 from jeit.files import check_electrodes, check_size, read_as
 from jeit.layout.csv_file import MOST_BYTES
 from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Polygon
 
+# What needs the extra, and what does not.
+_DRAWINGS = ("a DXF drawing", "CSV and SVG files need nothing more.")
 _OUTLINE, _ELECTRODES, _LABELS = "OUTLINE", "ELECTRODES", "LABELS"
 # AutoCAD's colour numbers: laser cutters tell lines to cut from lines to engrave by their colour.
 _COLOURS = {_OUTLINE: 1, _ELECTRODES: 5, _LABELS: 8}
@@ -27,7 +28,7 @@ def write_dxf(layout: Layout, file: BinaryIO) -> None:
 
     Raises `ImportError` where the extra `cad` is not installed.
     """
-    ezdxf = _import()
+    ezdxf = optional("ezdxf", *_DRAWINGS)
     drawing = ezdxf.new("R2007")
     drawing.units = ezdxf.units.MM
     for name, colour in _COLOURS.items():
@@ -74,7 +75,7 @@ class _Entity(NamedTuple):
 
 def read_dxf(path: Path, outline: Domain | None) -> Layout:
     """Read what `write_dxf` wrote, or a CAD program with the same layers. Raises `ValueError`."""
-    ezdxf = _import()
+    ezdxf = optional("ezdxf", *_DRAWINGS)
     check_size(path, MOST_BYTES)
     with read_as("this is not a DXF drawing that is read"):
         drawing = ezdxf.readfile(path)
@@ -154,12 +155,3 @@ def _loop(entity: _Entity) -> np.ndarray:
     if not (entity.closed or closes):
         raise ValueError(f"there is an open polyline {advice}")
     return loop[:-1] if closes else loop
-
-
-def _import() -> ModuleType:
-    try:
-        return importlib.import_module("ezdxf")
-    except ImportError as error:
-        raise ImportError(
-            'DXF drawings need the ezdxf package: pip install "jeit[cad]". CSV and SVG files need nothing more.'
-        ) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import shutil
 import tempfile
 from pathlib import Path
@@ -10,6 +9,7 @@ from types import ModuleType
 
 import numpy as np
 
+from jeit.arguments.extras import optional
 from jeit.mesh.files import read
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Domain
@@ -44,7 +44,12 @@ def from_gmsh(
             f"source: {Path(source).name[:80]} may be a script of Gmsh's, which can run any command. Give a file of "
             f"{', '.join(_PLAIN)}; or scripts=True, where it is your own."
         )
-    gmsh = _import()
+    gmsh = optional(
+        "gmsh",
+        "from_gmsh",
+        "On Linux it needs libraries of the system too, such as libGLU. Discs, rectangles, polygons, layers, boxes and "
+        "cylinders need no Gmsh: see jeit.mesh.",
+    )
     if cell_size is not None and not (np.isfinite(cell_size) and cell_size > 0):
         raise ValueError(f"cell_size: expected a positive length, got {cell_size!r}.")
     if dimension not in (None, 2, 3):
@@ -74,17 +79,6 @@ def from_gmsh(
         gmsh.option.setNumber("General.Terminal", quiet)
         if own:
             gmsh.finalize()
-
-
-def _import() -> ModuleType:
-    try:
-        return importlib.import_module("gmsh")
-    except (ImportError, OSError) as error:
-        raise ImportError(
-            'from_gmsh needs the gmsh package: pip install "jeit[mesh]" (on Linux also the system libraries it names, '
-            f"such as libGLU). It could not be loaded: {error}. Discs, rectangles, polygons, layers, boxes and "
-            "cylinders need no Gmsh: see jeit.mesh."
-        ) from error
 
 
 def _write(

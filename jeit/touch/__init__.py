@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 
 def __getattr__(name: str):
     if name == "LogitBoostClassifier":
-        from jeit.touch.needed import need_learning
+        from jeit.arguments.extras import need_extra
 
-        need_learning()
+        need_extra("learn", "LogitBoostClassifier")
         from jeit.touch.gestures.logit_boost import LogitBoostClassifier
 
         return LogitBoostClassifier

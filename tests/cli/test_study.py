@@ -129,7 +129,7 @@ def test_faults_are_said_before_anything_runs(file, run):
 
 def test_a_missing_package_is_said_with_its_extra(file, run, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
-    assert "Studies and sets of touches need zarr: pip install 'jeit[cluster]'" in failed(run("study", "run", file))
+    assert "a study needs zarr: pip install 'jeit[cluster]'" in failed(run("study", "run", file))
 
 
 def test_help_without_a_command(run):

@@ -133,7 +133,7 @@ def test_a_cad_file_without_gmsh_says_what_to_install(described, tmp_path, monke
     (tmp_path / "part.STEP").write_text("ISO-10303-21;")
     monkeypatch.setitem(sys.modules, "gmsh", None)
     read = read_described_skin if kind == "layout" else read_study
-    with pytest.raises(ImportError, match=r'pip install "jeit\[mesh\]"'):
+    with pytest.raises(ImportError, match=r"pip install 'jeit\[mesh\]'"):
         described(SKIN.replace(TUBE, STEP).replace("layout =", f"{kind} ="), read)
 
 

@@ -346,7 +346,7 @@ class TestDrawings:
 
     def test_without_ezdxf_the_extra_is_named(self, monkeypatch, tmp_path):
         monkeypatch.setitem(__import__("sys").modules, "ezdxf", None)
-        with pytest.raises(ImportError, match=r'pip install "jeit\[cad\]"'):
+        with pytest.raises(ImportError, match=r"pip install 'jeit\[cad\]'"):
             write_layout(SKIN, tmp_path / "skin.dxf")
 
 

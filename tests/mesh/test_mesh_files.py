@@ -93,7 +93,7 @@ def test_unwritable_requests(tmp_path):
 
 @pytest.mark.skipif(importlib.util.find_spec("gmsh") is not None, reason="gmsh is installed")
 def test_without_gmsh_the_error_says_what_to_install():
-    with pytest.raises(ImportError, match=r"pip install \"jeit\[mesh\]\""):
+    with pytest.raises(ImportError, match=r"pip install 'jeit\[mesh\]'"):
         from_gmsh(Disk(0.1))
 
 

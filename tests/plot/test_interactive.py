@@ -34,7 +34,7 @@ def pyvista():
 
 def test_without_pyvista_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    with pytest.raises(ImportError, match=r'pip install "jeit\[view\]"'):
+    with pytest.raises(ImportError, match=r"pip install 'jeit\[view\]'"):
         view_solid(TANK, IMAGE)
 
 

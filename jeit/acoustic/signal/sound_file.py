@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import scipy.io.wavfile
 
+from jeit.arguments.extras import optional
 from jeit.files import check_memory, read_as, reason
 
 # Bytes of memory for each of a file of eight bits a sample.
@@ -70,10 +71,10 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
 
 
 def _read_other(path: Path) -> tuple[np.ndarray, float, float | None]:
-    if find_spec("soundfile") is None:
-        raise ValueError("this format needs soundfile: pip install 'jeit[sound]', or convert it to plain WAV.")
-    import soundfile  # pyright: ignore[reportMissingImports]
-
+    try:
+        soundfile: Any = optional("soundfile", "a format that is not plain WAV", "Or convert it to plain WAV.")
+    except ImportError as error:
+        raise ValueError(str(error)) from None  # of this file, as other faults are: further files may be read
     unread = "not a sound file that soundfile reads"
     with read_as(unread):
         file = soundfile.SoundFile(path)

@@ -53,12 +53,15 @@ def image(
     """
     from contextlib import ExitStack
 
+    from jeit.arguments.extras import need_extra
     from jeit.cli.commands.study import connected
     from jeit.cli.console import Steps, pairs, plain_console, say_written
     from jeit.design import read_described_skin
     from jeit.report.image_network import LEARNT_FILES, write_learnt_images
     from jeit.touch.networks import learn_images
 
+    need_extra("learn", "a network that images touches")
+    need_extra("cluster", "a store of simulated touches")
     make_folder(output, LEARNT_FILES)
     console = plain_console()
     with ExitStack() as stack:

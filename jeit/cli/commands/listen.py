@@ -145,11 +145,13 @@ def fit(
     import jax
 
     from jeit.arguments import counted
+    from jeit.arguments.extras import need_extra
     from jeit.cli.console import Steps, pairs, plain_console, say_written
     from jeit.report.listener import LISTENER_FILES, summary, write_listener
     from jeit.touch.listening import Listener, read_clips
     from jeit.touch.listening.learners import BATCHES
 
+    need_extra("learn", "learning what is heard")
     if loudness not in _LOUDNESS:
         raise ValueError(f"--loudness must be one of {', '.join(_LOUDNESS)}; it is '{loudness}'.")
     check_at_least({"--batches": (batches, 1), "--seed": (seed, 0)})

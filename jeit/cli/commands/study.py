@@ -113,14 +113,13 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
+    from jeit.arguments.extras import need_extra
     from jeit.cli.console import plain_console, say_written
     from jeit.design.study import run_study
-    from jeit.design.study.store import require
     from jeit.report.study import write_study_report
 
     where = _page(file, store, page)
-    for package in ("zarr", "xarray"):
-        require(package)  # before a bar says that it has begun
+    need_extra("cluster", "a study")  # before a bar says that it has begun
     console = plain_console()
     done, left = (TextColumn(f"{{{said}}}", markup=False) for said in ("task.description", "task.fields[left]"))
     columns = (done, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), left)
@@ -147,10 +146,10 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
 
 def connected(scheduler: str):
     """A client of the dask scheduler at this address. Raises `ValueError` where none answers."""
-    from jeit.design.study.store import require
+    from jeit.arguments.extras import optional
 
     try:
-        return require("distributed").Client(scheduler, timeout=10)
+        return optional("distributed", "a cluster").Client(scheduler, timeout=10)
     except (OSError, ValueError) as error:
         raise ValueError(f"--scheduler {scheduler} does not answer: {error}") from None
 

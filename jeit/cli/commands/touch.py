@@ -72,12 +72,14 @@ def fit(
 
     Writes skin.skops, report.json and learning.png, a picture of the errors, to the folder SKIN.
     """
+    from jeit.arguments.extras import need_extra
     from jeit.cli.console import Steps, pairs, plain_console, say_written
     from jeit.data import load_description
     from jeit.mesh import OwnMesh
     from jeit.report.learnt_skin import SKIN_FILES, summary, write_learnt_skin
     from jeit.touch import LearntSkin, read_presses
 
+    need_extra("learn", "learning a skin")
     make_folder(output, SKIN_FILES)
     console = plain_console()
     with Steps(console, quiet=quiet) as step:

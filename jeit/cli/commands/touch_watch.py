@@ -46,11 +46,13 @@ def gestures(
 
     Writes gestures.skops, report.json and gestures.png, what was taken for what, to the folder MODEL.
     """
+    from jeit.arguments.extras import need_extra
     from jeit.cli.console import Steps, pairs, plain_console, say_written
     from jeit.data import GestureSet, load_description
     from jeit.imaging import learn_gestures
     from jeit.report.gestures import GESTURE_FILES, write_gestures
 
+    need_extra("learn", "learning gestures")
     make_folder(output, GESTURE_FILES)
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
@@ -122,6 +124,7 @@ def watch(
     """
     from dataclasses import replace
 
+    from jeit.arguments.extras import need_extra
     from jeit.cli.console import Steps, plain_console
     from jeit.cli.live_frames import LiveFrames
     from jeit.cli.stopping import Stopping
@@ -132,6 +135,7 @@ def watch(
     from jeit.report.touch_watch import WATCH_FILES, write_watch
     from jeit.touch import GestureModel
 
+    need_extra("learn", "naming gestures")
     check_positive({"--untouched": untouched, "--patience": patience} | ({} if rate is None else {"--rate": rate}))
     console = plain_console()
     with Stopping() as stopping:

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
-from jeit.design.study.store import require
+from jeit.arguments.extras import optional
 
 _Result = TypeVar("_Result")
 
@@ -16,7 +16,7 @@ def over_cluster(
 ) -> Iterator[tuple[int, _Result]]:
     """Numbers of chunks with what `solve(work, number)` returns, as they are solved by the workers of a
     `dask.distributed.Client`; those of a worker that is lost are solved again."""
-    distributed = require("distributed")
+    distributed = optional("distributed", "a cluster")
     # The work is sent once, as a task: where the only worker that has it is lost, it is sent again. Scattered, it would
     # be lost; with every chunk, a layer of 70 MB would go out a thousand times.
     with warnings.catch_warnings():

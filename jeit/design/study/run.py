@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from jeit.arguments.extras import need_extra
 from jeit.design.study.batch import check_points, solve_chunk
 from jeit.design.study.cluster import over_cluster
 from jeit.design.study.progress import Progress, Teller
 from jeit.design.study.spec import Study
-from jeit.design.study.store import Store, open_results, require, writing
+from jeit.design.study.store import Store, open_results, writing
 
 
 def run_study(
@@ -32,7 +33,7 @@ def run_study(
     anything runs, `ImportError` without the extra `cluster`, and `OSError` where the store cannot be written, such as
     on a full disk: finished chunks are kept.
     """
-    require("xarray")
+    need_extra("cluster", "a study")
     check_points(study)
     with writing(study, path) as store:
         done = set(store.sound())

@@ -21,12 +21,14 @@ from types import ModuleType
 import numpy as np
 
 from jeit.arguments import check_kind
+from jeit.arguments.extras import optional
 from jeit.design.study.contents import Contents, study_contents
 from jeit.design.study.lock import locked
 from jeit.design.study.spec import Study
 from jeit.design.study.store_check import ArrayShape, damage, danger
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
+_TASK = "a store of results"
 _A_PATH = "that of the store, such as 'results.zarr'"
 
 
@@ -42,7 +44,7 @@ class Store:
         """Raises `FileNotFoundError` if there is no store and none is to be made, `ValueError` if there is something
         else, or another study's, or if it is damaged, or might run code when it is opened, `ImportError` without the
         extra `cluster`, and `OSError` if it cannot be written."""
-        zarr = require("zarr")
+        zarr = optional("zarr", _TASK)
         self.contents = work if isinstance(work, Contents) else study_contents(work)
         check_kind("path", path, (str, os.PathLike), _A_PATH)
         self.path, kind = Path(path), self.contents.kind
@@ -134,7 +136,7 @@ class Store:
 
     def open_dataset(self):
         """The whole store as an `xarray.Dataset`, read when it is asked for."""
-        return require("xarray").open_zarr(str(self.path), chunks=None, zarr_format=3)
+        return optional("xarray", _TASK).open_zarr(str(self.path), chunks=None, zarr_format=3)
 
     def _check(self, expected: Mapping[str, ArrayShape]) -> None:
         """Before Zarr looks at any of it."""
@@ -199,7 +201,7 @@ def open_results(study: Study, path: str | Path):
     `xarray.open_zarr(path)` opens the same store, but cannot tell what an interrupted run left half-written, nor what
     somebody else's may run. Raises as `Store` does.
     """
-    xarray = require("xarray")
+    xarray = optional("xarray", _TASK)
     store = Store(study, path, create=False)
     done = np.zeros(len(study.points), bool)
     for number in store.sound():
@@ -212,18 +214,6 @@ def open_results(study: Study, path: str | Path):
             variables[name] = (variable.dims, values, variable.attrs)
         coordinates = {name: coordinate.load() for name, coordinate in found.coords.items()}
         return xarray.Dataset(variables, {**coordinates, "finished": ("point", done)}, found.attrs)
-
-
-def require(name: str) -> ModuleType:
-    """A package of the extra `cluster`. Raises `ImportError` that says so."""
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise ImportError(
-            f"Studies and sets of touches need {name}: pip install 'jeit[cluster]', or in a clone '.[cluster]'."
-        ) from None
 
 
 def _shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:

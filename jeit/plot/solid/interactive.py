@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jeit.arguments.extras import how_to_install, optional
 from jeit.electrodes import AbstractElectrodes, ElectrodeShapes, shapes_of
 from jeit.image import Inclusion
 from jeit.mesh import Mesh
@@ -38,7 +39,7 @@ def view_solid(
     inclusions: Sequence[Inclusion] = (),
     scale: ColourScale = CHANGE,
     off_screen: bool = False,
-) -> "pyvista.Plotter":
+) -> pyvista.Plotter:
     """A scene of a solid image: hull, isosurfaces, electrodes with their numbers, a plane to drag through the body and
     a colour bar; arguments as for `plot_isosurfaces`. Call `show()` of what is returned, or, made `off_screen`,
     `screenshot("view.png")`.
@@ -47,7 +48,7 @@ def view_solid(
     """
     check_drawn(mesh, electrodes, scale)
     surfaces = level_surfaces(mesh, values, levels, both=scale.difference)
-    pv = _pyvista()
+    pv: Any = optional("pyvista", "the interactive view", "Pictures without it: jeit.plot.plot_solid.")
     fitted = scale.of(np.asarray(values), "S/m")
     look: dict[str, Any] = {
         "cmap": fitted.keywords["cmap"],
@@ -94,7 +95,7 @@ def view_solid(
 def can_view() -> str:
     """Why an interactive view cannot be opened here; nothing where it can."""
     if find_spec("pyvista") is None:
-        return 'PyVista is not installed: pip install "jeit[view]"'
+        return f"PyVista is not installed: {how_to_install('view')}"
     if sys.platform in ("darwin", "win32") or os.environ.get("WAYLAND_DISPLAY"):
         return ""
     if not (display := os.environ.get("DISPLAY", "")):
@@ -119,18 +120,7 @@ def _answers(display: str) -> bool:
     return False
 
 
-def _pyvista() -> Any:
-    try:
-        import pyvista  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError(
-            f'the interactive view needs PyVista, which cannot be imported ({error}): pip install "jeit[view]". '
-            "Pictures without it: jeit.plot.plot_solid."
-        ) from None
-    return pyvista
-
-
-def _add_electrodes(plotter: "pyvista.Plotter", pv: Any, shapes: ElectrodeShapes) -> None:
+def _add_electrodes(plotter: pyvista.Plotter, pv: Any, shapes: ElectrodeShapes) -> None:
     """Electrodes as polygons of metal, dots as balls, with their numbers."""
     size = 1e3 * float(np.ptp(shapes.corners, axis=0).max())
     pieces = []

@@ -15,10 +15,11 @@ import jax
 import numpy as np
 
 from jeit.arguments import check_kind, told
+from jeit.arguments.extras import need_extra
 from jeit.design.study.cluster import over_cluster
 from jeit.design.study.contents import Contents
 from jeit.design.study.progress import Progress, Teller
-from jeit.design.study.store import Store, require, writing
+from jeit.design.study.store import Store, writing
 from jeit.simulate.contact.indent_sets import IndentSet
 from jeit.simulate.contact.press import Press
 from jeit.simulate.contact.press_draws import PressDraws
@@ -144,7 +145,7 @@ def simulate_presses(
     that another process writes, and as `PressedSkin.frames` does, `ImportError` without the extra `cluster`, and
     `OSError` where the store cannot be written.
     """
-    require("xarray")
+    need_extra("cluster", "a set of touches")
     check_kind("presses", presses, (PressSet, IndentSet), "a PressSet(skin, draws, number), or an IndentSet")
     with writing(presses.contents(), path) as store:
         done = set(store.sound())
@@ -160,7 +161,7 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
     """The set in a store as an `xarray.Dataset` with dimensions touch, channel and press (row and column of indents),
     read when it is asked for; `finished` (touch,) says which touches are. Raises as `jeit.design.study.store.Store`
     does."""
-    require("xarray")
+    need_extra("cluster", "a set of touches")
     store = Store(presses.contents(), path, create=False)
     finished = np.zeros(presses.number, bool)
     for number in store.sound():

@@ -7,7 +7,6 @@ smoothing, on simulated skins (`python -m benchmarks contacts`).
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 import equinox as eqx
@@ -17,6 +16,7 @@ from scipy import sparse
 from scipy.special import ndtr
 
 from jeit.arguments import is_number, told
+from jeit.arguments.extras import optional
 from jeit.image import Raster
 from jeit.mesh import Mesh
 from jeit.touch.contacts.contact import Contact
@@ -79,7 +79,7 @@ class RasterFinder(AbstractFinder):
         Raises `ImportError` without OpenCV, and `ValueError` for a mesh of three dimensions and sizes that are no odd
         numbers of pixels.
         """
-        import_opencv()
+        _opencv()
         check_finder(mesh, sign, floor)
         for name, value, least in (("block", block, 3), ("opening", opening, 1)):
             if not (isinstance(value, int) and value >= least and value % 2):
@@ -107,7 +107,7 @@ class RasterFinder(AbstractFinder):
 
     def _stages(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> RasterStages:
         """Those of a change that was turned so that contacts are positive."""
-        opencv = import_opencv()
+        opencv = _opencv()
         cell = np.asarray(self.raster.cell)
         inside = cell >= 0
         change, clear = self.above_noise(change, noise)
@@ -186,11 +186,5 @@ class RasterFinder(AbstractFinder):
         return density / deviation, np.sqrt(np.maximum(chance * (1 - chance) - density**2, 0.0))
 
 
-def import_opencv() -> Any:
-    """OpenCV. Raises `ImportError`, which says what to install, where it is missing."""
-    try:
-        return importlib.import_module("cv2")
-    except ImportError as error:
-        raise ImportError(
-            'Contacts on a raster need OpenCV: pip install "jeit[vision]". CellFinder needs nothing more.'
-        ) from error
+def _opencv() -> Any:
+    return optional("cv2", "RasterFinder", "CellFinder needs nothing more.")

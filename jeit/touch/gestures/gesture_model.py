@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, check_name
+from jeit.arguments.extras import need_extra
 from jeit.touch.gestures.features import course_features
 from jeit.touch.gestures.gesture_classifiers import (
     FORMS,
@@ -28,7 +29,6 @@ from jeit.touch.learnt.answers import Standing
 from jeit.touch.learnt.classifiers import log_odds, probabilities, sharpness_of
 from jeit.touch.learnt.extras import in_parts
 from jeit.touch.learnt.file import read_plain, write_plain
-from jeit.touch.needed import need_learning
 
 METHODS = ("auto", *GESTURE_CLASSIFIERS)
 # Folds that a method is chosen on, at most; and of touches that are like those learnt, the share that passes for such.
@@ -105,7 +105,7 @@ class GestureModel:
         tried. Raises `ValueError` for labels and people that are not as many, gestures of fewer than two touches, fewer
         than two gestures, and names of methods and forms that there are not; `ImportError` without the extra `learn`.
         """
-        need_learning()
+        need_extra("learn", "learning gestures")
         check_name("method", method, METHODS)
         check_name("form", form, ("auto", *FORMS))
         named, people_of = _checked(touches, labels, people)

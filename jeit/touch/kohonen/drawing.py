@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.arguments import check_key, check_kind
+from jeit.arguments.extras import need_extra
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
-from jeit.touch.needed import need_learning
 
 # Steps of the springs, and a distance of neighbours, of the usual one, below which springs grow no stronger.
 _STEPS, _LEAST = 60, 1e-2
@@ -20,7 +20,7 @@ def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2
     each other. They start from their places on the grid, moved a little at random by `key`: which way round the drawing
     comes out says nothing. Raises `ValueError` for what is no map, and no key.
     """
-    need_learning()
+    need_extra("learn", "drawing a map as a graph")
     import jax
     import networkx
 

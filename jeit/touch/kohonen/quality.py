@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
+from jeit.arguments.extras import need_extra
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
-from jeit.touch.needed import need_learning
 
 # Frames of which all pairs are compared, and neighbours of each.
 _COMPARED, _NEIGHBOURS = 2000, 12
@@ -32,7 +32,7 @@ def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
 
     Raises `ValueError` for what is no map, fewer than 25 frames, another number of channels, and NaN.
     """
-    need_learning()
+    need_extra("learn", "the trustworthiness of a map")
     from sklearn.manifold import trustworthiness
 
     check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jeit.arguments import listed, told
+from jeit.arguments.extras import need_extra
 from jeit.files import check_archive, reason, written_whole
 from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
@@ -29,7 +30,6 @@ from jeit.touch.learnt.sealed_archive import check_seal, write_sealed
 from jeit.touch.learnt.spread import Spread
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 from jeit.touch.learnt.whitening import Whitened
-from jeit.touch.needed import need_learning
 
 _KIND, _VERSION = "a jeit learnt skin", 2
 _OURS = {
@@ -84,7 +84,7 @@ def read_skin(path: str | Path) -> LearntSkin:
 def write_plain(path: str | Path, kind: str, version: int, own: dict[str, Any], example: str) -> None:
     """Write what an object holds, by name, to one file: arrays, estimators, and objects of this room's classifiers.
     Raises `ValueError` for a folder; `example`: a file's name, that is told then."""
-    need_learning()
+    need_extra("learn", "a file of a learnt skin")
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / example}.")
     with written_whole(path) as file:
@@ -94,9 +94,9 @@ def write_plain(path: str | Path, kind: str, version: int, own: dict[str, Any], 
 def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[dict[str, Any]], Any]) -> Any:
     """Undo `write_plain`: what `make` makes of it. Nothing in the file is executed. Raises `ValueError`, which says
     that it is no such thing as is `said`, for files of another kind, and such as hold anything else."""
+    need_extra("learn", "a file of a learnt skin")
     from skops.io import get_untrusted_types, load
 
-    need_learning()
     try:
         check_archive(path)
         strange = sorted(get_untrusted_types(file=path))

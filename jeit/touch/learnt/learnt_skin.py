@@ -11,6 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind, check_name, counted
+from jeit.arguments.extras import need_extra
 from jeit.forward import ForwardModel
 from jeit.touch.learnt import labels as label_methods
 from jeit.touch.learnt import numbers as number_methods
@@ -26,7 +27,6 @@ from jeit.touch.learnt.lag import lag_of, shifted
 from jeit.touch.learnt.numbers import LearntNumbers
 from jeit.touch.learnt.presses import NO_TOUCH, Presses, check_frames, check_reference
 from jeit.touch.learnt.touches import Touches
-from jeit.touch.needed import need_learning
 
 # A frame is unlike any learnt from beyond so many times the novelty of the farthest of them, or with fewer channels.
 _UNLIKE, _FEWEST = 2.0, 0.66
@@ -260,7 +260,7 @@ class LearntSkin:
 
 
 def _check_fit(presses: Presses, method: str, model, num_channels: int | None, per_session: bool) -> None:
-    need_learning()
+    need_extra("learn", "learning a skin")
     check_kind("presses", presses, Presses, "Presses, as of read_presses(path)")
     check_name("method", method, METHODS)
     numbers = presses.positions is not None or presses.force is not None

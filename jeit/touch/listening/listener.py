@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from jeit.acoustic import Calibration, Recording, locate_touches
 from jeit.arguments import check_key, check_kind, check_name, counted
+from jeit.arguments.extras import need_extra
 from jeit.files import reason
 from jeit.touch.learnt.answers import Standing
 from jeit.touch.learnt.classifiers import probabilities, sharpness_of
@@ -22,7 +23,6 @@ from jeit.touch.listening.heard import Heard
 from jeit.touch.listening.labelled_clips import LabelledClips, mixed
 from jeit.touch.listening.learners import BATCHES, LEARNERS
 from jeit.touch.listening.windows import LOUD, Windows
-from jeit.touch.needed import need_learning
 from jeit.touch.training import read_model, write_model
 
 METHODS = ("auto", *LEARNERS)
@@ -85,7 +85,7 @@ class Listener:
         most; `folder`: where trainings are kept, so that one that was killed goes on. `progress` is called with how far
         it is. Raises `ValueError` for what are no clips, key, or method; `ImportError` without the extra `learn`.
         """
-        need_learning()
+        need_extra("learn", "learning what is heard")
         check_kind("clips", clips, LabelledClips, "clips as of read_clips(folder)")
         check_name("method", method, METHODS)
         key = jax.random.key(0) if key is None else key

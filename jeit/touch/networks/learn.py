@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.arguments import check_kind, check_name, told
+from jeit.arguments.extras import need_extra
 from jeit.design import Skin, touches_away_from_the_edge
-from jeit.design.study.store import OtherContents, require
+from jeit.design.study.store import OtherContents
 from jeit.layout import Layout
 from jeit.simulate import Indent, IndentSet, ball, relative_changes, simulate_presses
 from jeit.simulate.contact.indent_sets import image_places
-from jeit.touch.needed import need_learning
 from jeit.touch.networks.examples import Examples, StoredTouches
 from jeit.touch.networks.image_network import DESIGNS, FILE, ImageNetwork, write_network
 from jeit.touch.networks.places import centroids_of, errors
@@ -109,9 +109,8 @@ def learn_images(
     `progress` is called with how far it is. Raises `ValueError` for curved skins, names that there are not, no number,
     and a folder of another skin's work; `ImportError` without the extras `learn` and `cluster`.
     """
-    need_learning()
-    for package in ("xarray", "zarr"):
-        require(package)
+    need_extra("learn", "a network that images touches")
+    need_extra("cluster", "a store of simulated touches")
     check_kind("skin", skin, Skin, "a Skin, as of read_described_skin('skin.toml')")
     if not isinstance(skin.layout, Layout):
         raise ValueError(

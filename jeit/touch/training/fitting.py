@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.arguments import check_key, check_kind, is_number, told
-from jeit.touch.needed import need_learning
+from jeit.arguments.extras import need_extra
 from jeit.touch.training.batches import ArrayRows, Order
 from jeit.touch.training.checkpoint import Checkpoint, Course, State
 
@@ -97,7 +97,7 @@ def fit(
     fit, a checkpoint of another training, and losses that are not finite from the first look on; `ImportError` without
     the extra `learn`.
     """
-    need_learning()
+    need_extra("learn", "training")
     check_key(key)
     check_kind("objective", objective, Objective, "an Objective(loss, held_out)")
     plan = Plan() if plan is None else plan

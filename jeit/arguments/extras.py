@@ -1,0 +1,54 @@
+"""Packages that only a part of jeit needs: the extras of pyproject.toml, and the error where one is not installed."""
+
+from __future__ import annotations
+
+import importlib
+from importlib.util import find_spec
+from types import ModuleType
+
+# Of each extra: what is imported, and the package that it comes in.
+EXTRAS = {
+    "mesh": {"gmsh": "gmsh"},
+    "cad": {"ezdxf": "ezdxf"},
+    "learn": {"sklearn": "scikit-learn", "skops": "skops", "optax": "optax", "networkx": "networkx"},
+    "sound": {"soundfile": "soundfile"},
+    "vision": {"cv2": "opencv-python-headless"},
+    "view": {"pyvista": "pyvista"},
+    "cluster": {"dask": "dask", "distributed": "distributed", "zarr": "zarr", "xarray": "xarray"},
+}
+
+
+def need_extra(extra: str, task: str) -> None:
+    """Raise `ImportError`, naming what to install, where a package of `extra`, which `task` needs, is missing."""
+    missing = [package for module, package in EXTRAS[extra].items() if _is_missing(module)]
+    if missing:
+        names = " and ".join(", ".join(missing).rsplit(", ", 1))
+        raise ImportError(f"{task} needs {names}: {how_to_install(extra)}.")
+
+
+def optional(module: str, task: str, otherwise: str = "") -> ModuleType:
+    """Import a module of an extra, which `task` needs.
+
+    Raises `ImportError` where it cannot be imported: why, what to install, and what to do `otherwise`.
+    """
+    try:
+        return importlib.import_module(module)
+    except (ImportError, OSError) as error:  # OSError: a library of the system that it loads
+        extra = next(extra for extra, held in EXTRAS.items() if module.partition(".")[0] in held)
+        package = EXTRAS[extra][module.partition(".")[0]]
+        why = "" if _is_missing(module.partition(".")[0]) else f", which cannot be imported ({error})"
+        raise ImportError(
+            f"{task} needs {package}{why}: {how_to_install(extra)}.{otherwise and f' {otherwise}'}"
+        ) from error
+
+
+def how_to_install(extra: str) -> str:
+    """The command that installs jeit with an extra."""
+    return f"pip install 'jeit[{extra}]', or in a clone '.[{extra}]'"
+
+
+def _is_missing(module: str) -> bool:
+    try:
+        return find_spec(module) is None
+    except ValueError:  # it is there without a specification, as of a test's
+        return False
