@@ -24,6 +24,13 @@ ROOMS = sorted({".".join(name.split(".")[:2]) for name in MODULES})
 OPTIONAL = ("pyvista",)
 
 
+class Absent:
+    """A package that is not installed: whatever a hint takes from it is any type."""
+
+    def __getattr__(self, name: str):
+        return typing.Any
+
+
 def own_functions(module) -> Iterator[tuple[str, object]]:
     """Functions and classes that a module defines, and the methods of its classes, by name."""
     for name, thing in list(vars(module).items()):
@@ -46,7 +53,7 @@ def named_for_checkers(source: str) -> dict[str, object]:
     for block in ast.parse(source).body:
         for line in block.body if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING" else ():
             if isinstance(line, ast.Import) and line.names[0].name in OPTIONAL and not find_spec(line.names[0].name):
-                names[line.names[0].name] = typing.Any
+                names[line.names[0].name] = Absent()
             else:
                 exec(ast.unparse(line), names)
     return names

@@ -34,7 +34,7 @@ from jeit.cli.options import (
     remove_empty_folders,
     telling_when_stopped,
 )
-from jeit.start import discarded_damaged
+from jeit.start import discarded_damaged, quick_compilation
 
 # Commands that run one program again and again: a frame in a third of the time.
 _REPEATING = (
@@ -47,6 +47,9 @@ _REPEATING = (
     "learn",
     "listen fit",
 )
+
+# Of use to those who write programs, and noise to those who run one: what a package that jeit uses will change.
+_FOR_PROGRAMMERS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning)
 
 # Letters of what is said of an error.
 _LONGEST = 390
@@ -176,6 +179,8 @@ def _shown_once() -> Callable[..., None]:
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
         said = str(message)
+        if issubclass(category, _FOR_PROGRAMMERS) and not os.environ.get("JEIT_DEBUG"):
+            return
         if said not in shown and not discarded_damaged(said):
             shown.add(said)
             print(f"jeit: warning: {_told(said)}", file=sys.stderr)
@@ -184,10 +189,10 @@ def _shown_once() -> Callable[..., None]:
 
 
 def _start(*, quickly: bool) -> None:
-    """Set up one process; `quickly` for one that runs no program many times: code without optimisation takes a quarter
-    of the time to compile, which would be most of its time. A user who has set XLA_FLAGS has decided already."""
+    """Set up one process; `quickly` for one that runs no program many times: compilation would be most of its time. A
+    user who has set XLA_FLAGS has decided already."""
     if quickly:
-        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false")
+        os.environ.setdefault("XLA_FLAGS", quick_compilation())
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of folders that it cannot write to, and fonts
     # What is imported and traced are many small objects, which Python would look through for rubbish again and again.
     gc.set_threshold(100_000, 20, 50)

@@ -59,7 +59,7 @@ def write_svg(layout: Layout, file: BinaryIO) -> None:
     for centre, diameter, label in zip(layout.centres, layout.diameters, layout.labels, strict=True):
         circle = _circle(centre, diameter)
         _add(group, "circle", **circle)
-        place = {"x": circle["cx"], "y": circle["cy"], "font-size": str(millimetres(diameter / 3))}
+        place = {"x": circle["cx"], "y": circle["cy"], "font-size": str(millimetres(float(diameter) / 3))}
         _add(names, "text", **place).text = label
     ElementTree.indent(root)
     ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)

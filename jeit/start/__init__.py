@@ -1,15 +1,17 @@
-"""What importing jeit sets up in JAX: double precision, a place where compiled code is kept between runs, and what
-happens in forked processes."""
+"""What importing jeit sets up in JAX: double precision, a place where compiled code is kept between runs, flags of
+its compiler, and what happens in forked processes."""
 
 from __future__ import annotations
 
 from jeit.start.compiled_code import discarded_damaged, keep_compiled_code
+from jeit.start.compiler_flags import quick_compilation
 from jeit.start.forks import refuse_compiled_code_in_forks
 from jeit.start.precision import take_double_precision
 
 __all__ = [
     "discarded_damaged",
     "keep_compiled_code",
+    "quick_compilation",
     "refuse_compiled_code_in_forks",
     "take_double_precision",
 ]

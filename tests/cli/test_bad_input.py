@@ -335,7 +335,7 @@ COMMANDS = {
     "mesh of a word": (lambda t: good(t, "--num-points", "many"), "Invalid value for '--num-points'"),
     "no such frame": (lambda t: good(t, "--frame", "7"), "no frame 7"),
     "no such named frame": (lambda t: good(t, "--frame", "press"), "no frame named 'press'"),
-    "unknown option": (lambda t: good(t, "--colour", "red"), "No such option: --colour"),
+    "unknown option": (lambda t: good(t, "--colour", "red"), "--colour"),
     "no data named": (lambda t: ["reconstruct"], "Missing argument"),
     "unknown command": (lambda t: ["image"], "No such command 'image'"),
     "press beyond the edge": (lambda t: ["demo", "--x", "20"], "--x and --y: a press at (20"),
