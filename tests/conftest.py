@@ -4,18 +4,15 @@ import gc
 import os
 from pathlib import Path
 
-# Most of a test's time is compilation: compile quickly, run a little slower; XLA_FLAGS="" tests what users run. Before
-# JAX starts, which reads it once.
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
-)
-
 # Two workers with two threads each would wait for each other: small products are tens of times slower then.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import pytest
+
+# What other packages deprecate ends a test where CI asks for it, and a module of ours called it.
+DEPRECATIONS = ("DeprecationWarning", "PendingDeprecationWarning", "FutureWarning")
+OWN_MODULES = (r"jeit(_solvers)?(\..*)?$", r"(test_|conftest|benchmarks).*")
 
 ROOT = Path(__file__).resolve().parents[1]
 MAPS = Path("/proc/self/maps")
@@ -26,6 +23,19 @@ gc.set_threshold(100_000, 20, 50)
 # The same shapes come back run after run.
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".jax_cache"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+# Most of a test's time is compilation: compile quickly, run a little slower; XLA_FLAGS="" tests what users run.
+from jeit.start import quick_compilation  # noqa: E402, after JAX was told where to keep code
+
+os.environ.setdefault("XLA_FLAGS", f"{quick_compilation()} --xla_cpu_parallel_codegen_split_count=1")
+
+
+def pytest_configure(config):
+    """Let deprecations be errors in CI: there a release of another package is noticed, and not by users."""
+    if os.environ.get("JEIT_DEPRECATIONS") == "error":
+        for module in OWN_MODULES:
+            for category in DEPRECATIONS:
+                config.addinivalue_line("filterwarnings", f"error::{category}:{module}")
 
 
 def _shared(variable: str, folder: str) -> Path | None:
