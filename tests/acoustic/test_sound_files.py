@@ -81,9 +81,7 @@ def test_what_is_cut_off_is_told(kind, tmp_path):
 def test_without_soundfile_it_is_asked_for(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "soundfile", None)
     (tmp_path / "one.flac").write_bytes(b"fLaC and more")
-    with pytest.raises(
-        ValueError, match=r"one\.flac: a format .* needs soundfile: pip install 'jeit\[sound\]'"
-    ):
+    with pytest.raises(ValueError, match=r"one\.flac: a format .* needs soundfile: pip install 'jeit\[sound\]'"):
         read_recording(tmp_path / "one.flac")
     wavfile.write(tmp_path / "law.wav", 8000, np.zeros(100, np.int16))
     plain = bytearray((tmp_path / "law.wav").read_bytes())

@@ -196,9 +196,7 @@ def test_work_of_another_set_is_refused(small_skin, learnt):
 def test_without_the_extra(small_skin, tmp_path, monkeypatch, package):
     """Said before anything is simulated."""
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(
-        ImportError, match=rf"touches needs {package}: pip install 'jeit\[cluster\]'"
-    ):
+    with pytest.raises(ImportError, match=rf"touches needs {package}: pip install 'jeit\[cluster\]'"):
         learn_images(small_skin, tmp_path)
     assert not any(tmp_path.iterdir())
 

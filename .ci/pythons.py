@@ -1,0 +1,162 @@
+"""Install jeit on every Python at hand, newest packages and least, run its main command and tests, and print a table.
+
+    python .ci/pythons.py                         # every Python, and the oldest with the least versions: what CI runs
+    python .ci/pythons.py --whole 3.13 least-3.11 # the README's tests, whole, on some of them
+
+Each row is a virtual environment of its own, into which the built wheel goes: bare, where the main command runs and
+every module is imported, then with all extras at once, where tests run; and each extra alone, in one more. Versions of
+`least` are those that uv finds for the lower bounds of pyproject.toml. A Python is looked for on the PATH and under
+pyenv; one that is missing is a row that says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+PYTHONS = [one.rpartition(" ")[2] for one in PROJECT["classifiers"] if re.search(r":: 3\.\d+$", one)]
+EXTRAS = list(PROJECT["optional-dependencies"])
+SELECTION = (ROOT / "tests" / "selection.txt").read_text("utf-8").split()
+
+# Every module of both packages, with no extra installed; whichever says that it needs one is not counted as a fault.
+IMPORT_ALL = """
+import importlib, pkgutil, jeit, jeit_solvers
+from jeit.arguments.extras import EXTRAS
+optional = {module for held in EXTRAS.values() for module in held}
+names = [one.name for top in (jeit, jeit_solvers) for one in pkgutil.walk_packages(top.__path__, top.__name__ + ".")]
+for name in names:
+    try:
+        importlib.import_module(name)
+    except ImportError as error:
+        if (error.name or "").partition(".")[0] not in optional:
+            raise
+print(len(names), "modules")
+"""
+IMPORT_EXTRA = """
+import importlib.util, sys
+from jeit.arguments.extras import EXTRAS
+sys.exit([one for one in EXTRAS.get(sys.argv[1], ()) if importlib.util.find_spec(one) is None] or 0)
+"""
+COUNTS = r"\d+ (?:passed|failed|errors?|skipped)"
+
+
+def interpreter(version: str) -> str | None:
+    """The path of a Python of this version, such as "3.12", that runs; None where there is none."""
+    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
+    under_pyenv = sorted(pyenv.glob(f"{version}.*/bin/python"), key=lambda path: int(path.parts[-3].split(".")[2]))
+    for one in (shutil.which(f"python{version}"), *reversed(under_pyenv)):
+        asked = [str(one), "-c", "import sys, venv, ensurepip; print(sys.executable)"]
+        if one and not (done := subprocess.run(asked, capture_output=True, text=True)).returncode:
+            return done.stdout.strip()
+    return None
+
+
+class Row:
+    """One environment: what is done in it, and the seconds that each step took, as cells of a table."""
+
+    def __init__(self, name: str, folder: Path):
+        self.name, self.folder, self.python = name, folder, folder / ".venv" / "bin" / "python"
+        self.cells: list[str] = []
+
+    def step(self, title: str, *commands: tuple, found: str = "", where: Path | None = None) -> None:
+        """Run commands, and add a cell: the seconds, and what of the output's lines `found` finds."""
+        print(f"== {self.name}: {title}", flush=True)
+        start, lines = time.monotonic(), ""
+        for command in commands:
+            words = [str(one) for one in command]
+            to_one = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+            done = subprocess.run(words, cwd=where or self.folder, check=False, **to_one)
+            lines += done.stdout
+            if done.returncode:
+                raise SystemExit(
+                    f"{done.stdout[-6000:]}\n{self.name}, {title}: {words[0]} ended with {done.returncode}"
+                )
+        seconds = f"{time.monotonic() - start:.0f} s"
+        self.cells.append(", ".join([*(re.findall(found, lines) if found else ()), seconds]))
+
+    def installing(self, *what: str | Path) -> tuple:
+        """The command that installs something here."""
+        return (self.python, "-m", "pip", "install", "--quiet", *what)
+
+
+def least(uv: Path, python: str, folder: Path) -> Path:
+    """A file of constraints: every package that pyproject.toml names, at the least version that has a wheel."""
+    made = folder / "least.txt"
+    # MiniSom has no wheels, and needs none.
+    wheels = ("--only-binary", ":all:", "--no-binary", "minisom")
+    resolve = ("pip", "compile", "--quiet", "--resolution", "lowest-direct", "--all-extras", "--python", python)
+    subprocess.run([uv, *resolve, *wheels, ROOT / "pyproject.toml", "-o", made], check=True, stdout=subprocess.DEVNULL)
+    return made
+
+
+def row(name: str, wheel: Path, uv: Path, whole: bool, folder: Path) -> Row:
+    """Everything of one environment: "3.12" or "least-3.11"."""
+    made = Row(name, folder)
+    version = name.removeprefix("least-")
+    python = interpreter(version)
+    if python is None:
+        made.cells = [f"skipped: there is no Python {version} here"]
+        return made
+    constraints = ("-c", least(uv, python, folder)) if name != version else ()
+    made.step("install", (python, "-m", "venv", ".venv"), made.installing(*constraints, wheel))
+    made.step("main command", (made.python.with_name("jeit"), "demo", "--output", "out"))
+    if not (folder / "out" / "image.png").stat().st_size:
+        raise SystemExit(f"{name}: the main command made no picture")
+    made.step("import every module", (made.python, "-c", IMPORT_ALL), found=r"\d+ modules")
+    # The linters and the documentation's tools are no part of what old versions are tried with.
+    together = ",".join(one for one in EXTRAS if not constraints or one not in ("docs", "dev"))
+    made.step("install all extras", made.installing(*constraints, f"{wheel}[{together}]"))
+    tests = ("-m", "not slow", *(() if whole else SELECTION))
+    made.step("tests", (made.python.with_name("pytest"), "-n", "2", "-q", *tests), found=COUNTS, where=ROOT)
+    if not constraints:
+        made.step("each extra alone", *(one for extra in EXTRAS for one in alone(extra, wheel, uv, python)))
+    return made
+
+
+def alone(extra: str, wheel: Path, uv: Path, python: str) -> list[tuple]:
+    """The commands that install one extra into an environment of its own, and look whether its packages are there."""
+    its_own = Path("alone") / "bin" / "python"
+    return [
+        (uv, "venv", "--quiet", "--clear", "--python", python, "alone"),
+        (uv, "pip", "install", "--quiet", "--python", its_own, f"{wheel}[{extra}]"),
+        (uv, "pip", "check", "--quiet", "--python", its_own),
+        (its_own, "-c", IMPORT_EXTRA, extra),
+    ]
+
+
+def main() -> int:
+    """Build a wheel through the source distribution, make the rows, print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    every = [*PYTHONS, f"least-{PYTHONS[0]}"]
+    parser.add_argument("names", nargs="*", default=every, help="such as 3.12, or least-3.11")
+    parser.add_argument("--whole", action="store_true", help="all quick tests, not those of tests/selection.txt alone")
+    parser.add_argument("--newest", action="store_true", help="print the path of the newest Python here, and end")
+    asked = parser.parse_args()
+    if asked.newest:
+        print(next(filter(None, map(interpreter, reversed(PYTHONS)))))
+        return 0
+    rows = []
+    with tempfile.TemporaryDirectory() as kept:
+        subprocess.run([sys.executable, "-m", "build", "--outdir", kept, ROOT], check=True, stdout=subprocess.DEVNULL)
+        wheel, uv = next(Path(kept).glob("*.whl")), Path(sys.executable).with_name("uv")
+        for name in asked.names:
+            with tempfile.TemporaryDirectory() as folder:
+                rows.append(row(name, wheel, uv, asked.whole, Path(folder)))
+    heading = ["Python", "install", "main command", "import", "install extras", "tests", "each extra alone"]
+    for line in (heading, ["---"] * len(heading), *([one.name, *one.cells] for one in rows)):
+        print(f"| {' | '.join(line)} |")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
