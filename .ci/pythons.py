@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,6 +48,7 @@ import importlib.util, sys
 from jeit.arguments.extras import EXTRAS
 sys.exit([one for one in EXTRAS.get(sys.argv[1], ()) if importlib.util.find_spec(one) is None] or 0)
 """
+HEADING = ["Python", "install", "main command", "import", "install extras", "tests", "each extra alone"]
 COUNTS = r"\d+ (?:passed|failed|errors?|skipped)"
 
 
@@ -99,14 +101,14 @@ def least(uv: Path, python: str, folder: Path) -> Path:
     return made
 
 
-def row(name: str, wheel: Path, uv: Path, whole: bool, folder: Path) -> Row:
-    """Everything of one environment: "3.12" or "least-3.11"."""
-    made = Row(name, folder)
+def fill(made: Row, wheel: Path, uv: Path, whole: bool) -> None:
+    """Do everything in one environment: "3.12" or "least-3.11"."""
+    name, folder = made.name, made.folder
     version = name.removeprefix("least-")
     python = interpreter(version)
     if python is None:
         made.cells = [f"skipped: there is no Python {version} here"]
-        return made
+        return
     constraints = ("-c", least(uv, python, folder)) if name != version else ()
     made.step("install", (python, "-m", "venv", ".venv"), made.installing(*constraints, wheel))
     made.step("main command", (made.python.with_name("jeit"), "demo", "--output", "out"))
@@ -120,7 +122,6 @@ def row(name: str, wheel: Path, uv: Path, whole: bool, folder: Path) -> Row:
     made.step("tests", (made.python.with_name("pytest"), "-n", "2", "-q", *tests), found=COUNTS, where=ROOT)
     if not constraints:
         made.step("each extra alone", *(one for extra in EXTRAS for one in alone(extra, wheel, uv, python)))
-    return made
 
 
 def alone(extra: str, wheel: Path, uv: Path, python: str) -> list[tuple]:
@@ -143,18 +144,28 @@ def main() -> int:
     parser.add_argument("--newest", action="store_true", help="print the path of the newest Python here, and end")
     asked = parser.parse_args()
     if asked.newest:
-        print(next(filter(None, map(interpreter, reversed(PYTHONS)))))
-        return 0
-    rows = []
-    with tempfile.TemporaryDirectory() as kept:
-        subprocess.run([sys.executable, "-m", "build", "--outdir", kept, ROOT], check=True, stdout=subprocess.DEVNULL)
-        wheel, uv = next(Path(kept).glob("*.whl")), Path(sys.executable).with_name("uv")
-        for name in asked.names:
-            with tempfile.TemporaryDirectory() as folder:
-                rows.append(row(name, wheel, uv, asked.whole, Path(folder)))
-    heading = ["Python", "install", "main command", "import", "install extras", "tests", "each extra alone"]
-    for line in (heading, ["---"] * len(heading), *([one.name, *one.cells] for one in rows)):
-        print(f"| {' | '.join(line)} |")
+        newest = next(filter(None, map(interpreter, reversed(PYTHONS))), None)
+        print(newest or f"no Python of {', '.join(PYTHONS)} here", file=sys.stdout if newest else sys.stderr)
+        return 0 if newest else 1
+    known = [*PYTHONS, *(f"least-{one}" for one in PYTHONS)]
+    if strange := [one for one in asked.names if one not in known]:
+        parser.error(f"{', '.join(strange)}: give some of {', '.join(known)}")
+    uv = shutil.which("uv", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
+    if uv is None or find_spec("build") is None:
+        parser.error("uv and build are needed: pip install '.[dev]'")
+    rows: list[Row] = []
+    try:
+        with tempfile.TemporaryDirectory() as kept:
+            building = [sys.executable, "-m", "build", "--outdir", kept, str(ROOT)]
+            subprocess.run(building, check=True, stdout=subprocess.DEVNULL)
+            wheel = next(Path(kept).glob("*.whl"))
+            for name in asked.names:
+                with tempfile.TemporaryDirectory() as folder:
+                    rows.append(Row(name, Path(folder)))
+                    fill(rows[-1], wheel, Path(uv), asked.whole)
+    finally:
+        for line in (HEADING, ["---"] * len(HEADING), *([one.name, *one.cells] for one in rows)):
+            print(f"| {' | '.join([*line, *[''] * (len(HEADING) - len(line))])} |")
     return 0
 
 

@@ -17,6 +17,9 @@ EXTRAS = {
     "cluster": {"dask": "dask", "distributed": "distributed", "zarr": "zarr", "xarray": "xarray"},
 }
 
+# Letters of why a package cannot be imported: what to install stands behind them.
+_REASON = 120
+
 
 def need_extra(extra: str, task: str) -> None:
     """Raise `ImportError`, naming what to install, where a package of `extra`, which `task` needs, is missing."""
@@ -36,7 +39,7 @@ def optional(module: str, task: str, otherwise: str = "") -> ModuleType:
     except (ImportError, OSError) as error:  # OSError: a library of the system that it loads
         extra = next(extra for extra, held in EXTRAS.items() if module.partition(".")[0] in held)
         package = EXTRAS[extra][module.partition(".")[0]]
-        why = "" if _is_missing(module.partition(".")[0]) else f", which cannot be imported ({error})"
+        why = "" if _is_missing(module.partition(".")[0]) else f", which cannot be imported ({str(error)[:_REASON]})"
         raise ImportError(
             f"{task} needs {package}{why}: {how_to_install(extra)}.{otherwise and f' {otherwise}'}"
         ) from error

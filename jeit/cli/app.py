@@ -149,13 +149,15 @@ def _explain(error: Exception) -> int:
         return _fail("stopped.", 130)
     if isinstance(error, ValueError) or (isinstance(error, ImportError) and "pip install" in str(error)):
         return _fail(str(error), 1)
+    if isinstance(error, ImportError):
+        return _fail(f"a package that this command needs cannot be imported ({error}); install it anew.", 1)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return _fail(f"{where}{str(error.strerror or error).rstrip('.')}.", 1)
     if isinstance(error, MemoryError):
         return _fail("there is not enough memory; ask for fewer --num-points.", 1)
     return _fail(
-        f"this should not have happened: {type(error).__name__}: {error} "
+        f"this should not have happened: {type(error).__name__}: {error}. "
         "Run again with JEIT_DEBUG=1 for the traceback, and report it.",
         1,
     )

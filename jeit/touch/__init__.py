@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 
 def __getattr__(name: str):
     if name == "LogitBoostClassifier":
-        from jeit.arguments.extras import need_extra
+        from jeit.arguments.extras import optional
 
-        need_extra("learn", "LogitBoostClassifier")
+        optional("sklearn", "LogitBoostClassifier")
         from jeit.touch.gestures.logit_boost import LogitBoostClassifier
 
         return LogitBoostClassifier

@@ -104,6 +104,23 @@ def test_the_extra_is_named(folder, run, monkeypatch, command, extra, arguments)
     assert sorted(folder.rglob("*")) == before
 
 
+@pytest.mark.parametrize(
+    ("package", "arguments"),
+    [("ezdxf", "layout compare skin.dxf ring-16 -o out"), ("sklearn", "touch fit presses.npz -o out")],
+)
+def test_a_package_that_is_broken(folder, run, monkeypatch, tmp_path, package, arguments):
+    """It is there, and cannot be imported: said in a line, with the reason."""
+    (tmp_path / f"{package}.py").write_text("raise ImportError('libnothing.so: no such file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.chdir(folder)
+    status, _, error = run(*arguments.split())
+    assert status == 1
+    assert "cannot be imported (libnothing.so: no such file)" in error
+    assert "should not have happened" not in error
+
+
 def test_extras_are_those_of_the_project():
     """Of its file: the same names, and the same packages in each."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]

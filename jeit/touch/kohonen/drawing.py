@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.arguments import check_key, check_kind
-from jeit.arguments.extras import need_extra
+from jeit.arguments.extras import optional
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
 # Steps of the springs, and a distance of neighbours, of the usual one, below which springs grow no stronger.
@@ -20,9 +20,8 @@ def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2
     each other. They start from their places on the grid, moved a little at random by `key`: which way round the drawing
     comes out says nothing. Raises `ValueError` for what is no map, and no key.
     """
-    need_extra("learn", "drawing a map as a graph")
+    networkx = optional("networkx", "a map drawn as a graph")
     import jax
-    import networkx
 
     check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
     check_key(key)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
-from jeit.arguments.extras import need_extra
+from jeit.arguments.extras import optional
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
 # Frames of which all pairs are compared, and neighbours of each.
@@ -32,8 +32,7 @@ def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
 
     Raises `ValueError` for what is no map, fewer than 25 frames, another number of channels, and NaN.
     """
-    need_extra("learn", "the trustworthiness of a map")
-    from sklearn.manifold import trustworthiness
+    trustworthiness = optional("sklearn.manifold", "the trustworthiness of a map").trustworthiness
 
     check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
     frames = learnt.checked(frames)
