@@ -12,5 +12,6 @@ def test_files_are_there_once():
 
 def test_every_room_is_in_it():
     rooms = {path.name for path in (ROOT / "tests").iterdir() if any(path.rglob("test_*.py"))}
-    assert {one.split("/")[1] for one in LISTED} >= rooms
+    beside_the_wheel = {"benchmarks"}  # tests run on what is installed
+    assert {one.split("/")[1] for one in LISTED} >= rooms - beside_the_wheel
     assert rooms >= set(ROOMS) - {"start"}
