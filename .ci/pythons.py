@@ -141,12 +141,13 @@ def main() -> int:
     every = [*PYTHONS, f"least-{PYTHONS[0]}"]
     parser.add_argument("names", nargs="*", default=every, help="such as 3.12, or least-3.11")
     parser.add_argument("--whole", action="store_true", help="all quick tests, not those of tests/selection.txt alone")
-    parser.add_argument("--newest", action="store_true", help="print the path of the newest Python here, and end")
+    parser.add_argument("--find", choices=("newest", "oldest"), help="print the path of such a Python here, and end")
     asked = parser.parse_args()
-    if asked.newest:
-        newest = next(filter(None, map(interpreter, reversed(PYTHONS))), None)
-        print(newest or f"no Python of {', '.join(PYTHONS)} here", file=sys.stdout if newest else sys.stderr)
-        return 0 if newest else 1
+    if asked.find:
+        order = PYTHONS[::-1] if asked.find == "newest" else PYTHONS
+        found = next(filter(None, map(interpreter, order)), None)
+        print(found or f"no Python of {', '.join(PYTHONS)} here", file=sys.stdout if found else sys.stderr)
+        return 0 if found else 1
     known = [*PYTHONS, *(f"least-{one}" for one in PYTHONS)]
     if strange := [one for one in asked.names if one not in known]:
         parser.error(f"{', '.join(strange)}: give some of {', '.join(known)}")
