@@ -61,7 +61,7 @@ def test_two_sources(touched):
     at_once = locate_two(microphone_array, both)
     compiled = locate_two(microphone_array, both, compiled=True)
     traced = jax.jit(lambda power: locate_two(microphone_array, power))(both)
-    # Two programs, which jax 0.12 compiles to other roundings: a nanometre apart where steps creep.
+    # Two programs, which jax 0.12 compiles to other roundings: 0.6 nm apart where steps creep.
     np.testing.assert_allclose(traced.position, compiled.position, rtol=0, atol=1e-8)
     np.testing.assert_array_equal(at_once.freedom, compiled.freedom)
     np.testing.assert_allclose(at_once.misfit, compiled.misfit, rtol=1e-5)
