@@ -288,7 +288,7 @@ def test_two_balls_are_of_one_material_unless_the_data_tell_otherwise(coarse, ra
     assert [body.alike for body in bodies] == [alike, alike]
     off = np.abs([body.contrast for body in bodies] - np.log(ratios))
     assert np.all(off < deviations)
-    assert np.all(off < 0.15)  # 15 %
+    assert np.all(off < 0.2)  # as far as the better known of both is known
     assert (bodies[0].contrast == bodies[1].contrast) == alike
 
 

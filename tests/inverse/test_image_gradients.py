@@ -139,7 +139,7 @@ def test_nonlinear_images_of_smooth_priors(prior):
 
     def image(theta):
         chosen = Gaussian(theta["length"]) if isinstance(prior, Gaussian) else prior
-        return image_of(solved(theta, chosen, LevenbergMarquardt(max_steps=100, rtol=1e-14)))
+        return image_of(solved(theta, chosen, LevenbergMarquardt(max_steps=100, rtol=1e-17)))
 
     assert_gradient(image, THETA | settings)
 

@@ -240,13 +240,16 @@ class _Setting(NamedTuple):
             level, coefficients = likeliest, fit.coefficients
 
 
-def _told_one_by_one(setting: _Setting, bodies: Bodies, coefficients) -> tuple[float, Fit, list[int]]:
+def _told_one_by_one(setting: _Setting, bodies: Bodies, coefficients, sure: int = 0) -> tuple[float, Fit, list[int]]:
     """The level of a smooth field, the bodies that data ask for besides, each after those before it, and which they
-    are."""
-    chosen, refused, rows = [], 0, bodies.rows(coefficients)
-    level, fit, least = setting.settled(bodies.only([]), coefficients[:1], 1.0, _FIRST_STEPS)
-    for k, row in enumerate(rows):
-        start = np.append(fit.coefficients, row)
+    are. The first `sure` are beyond doubt and fitted together: one of two that is fitted alone moves between them, and
+    does not come back."""
+    rows = bodies.rows(coefficients)
+    chosen, refused = list(range(sure)), 0
+    start = np.append(coefficients[0], rows[:sure])
+    level, fit, least = setting.settled(bodies.only(chosen), start, 1.0, _FIRST_STEPS)
+    for k in range(sure, len(rows)):
+        start = np.append(fit.coefficients, rows[k])
         tried, one, surprise = setting.settled(bodies.only([*chosen, k]), start, level, _FIRST_STEPS)
         if surprise + _MARGIN <= least:
             level, fit, least, chosen, refused = tried, one, surprise, [*chosen, k], 0
@@ -288,7 +291,8 @@ def _on_finer_meshes(told: _Told, least_rise: float, tell: Callable[[str], None]
         else:
             order = np.argsort(-missed)
             start = np.append(coefficients[0], bodies.rows(coefficients)[order])
-            level, fit, some = _told_one_by_one(setting, bodies.only(order), start)
+            sure = int((missed > _SURELY * before.cost).sum())
+            level, fit, some = _told_one_by_one(setting, bodies.only(order), start, sure)
             left = np.setdiff1d(np.arange(len(order)), some)
             doubtful = (*doubtful, *(bodies.body(k, coefficients, rises[k]) for k in order[left]))
             missed = missed[order[some]]
