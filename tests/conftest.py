@@ -2,7 +2,13 @@
 
 import gc
 import os
+import signal
 from pathlib import Path
+
+# A job in the background starts with Ctrl-C ignored, and so do its children, some of which tests stop by it.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
 
 # Two workers with two threads each would wait for each other: small products are tens of times slower then.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
