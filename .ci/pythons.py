@@ -4,9 +4,9 @@
     python .ci/pythons.py --whole 3.13 least-3.11 # the README's tests, whole, on some of them
 
 Each row is a virtual environment of its own, into which the built wheel goes: bare, where the main command runs and
-every module is imported, then with all extras at once, where tests run; and each extra alone, in one more. Versions of
-`least` are those that uv finds for the lower bounds of pyproject.toml. A Python is looked for on the PATH and under
-pyenv; one that is missing is a row that says so.
+every module is imported, then with all extras at once, where tests run; on the newest Python, each extra alone, too.
+Versions of `least` are those that uv finds for the lower bounds of pyproject.toml. A Python is looked for on the PATH
+and under pyenv; one that is missing is a row that says so.
 """
 
 from __future__ import annotations
@@ -61,6 +61,11 @@ def interpreter(version: str) -> str | None:
         if one and not (done := subprocess.run(asked, capture_output=True, text=True)).returncode:
             return done.stdout.strip()
     return None
+
+
+def first(versions: list[str]) -> str | None:
+    """The path of the first of these that is at hand."""
+    return next(filter(None, map(interpreter, versions)), None)
 
 
 class Row:
@@ -120,7 +125,7 @@ def fill(made: Row, wheel: Path, uv: Path, whole: bool) -> None:
     made.step("install all extras", made.installing(*constraints, f"{wheel}[{together}]"))
     tests = ("-m", "not slow", *(() if whole else SELECTION))
     made.step("tests", (made.python.with_name("pytest"), "-n", "2", "-q", *tests), found=COUNTS, where=ROOT)
-    if not constraints:
+    if python == first(PYTHONS[::-1]) and not constraints:
         made.step("each extra alone", *(one for extra in EXTRAS for one in alone(extra, wheel, uv, python)))
 
 
@@ -144,8 +149,7 @@ def main() -> int:
     parser.add_argument("--find", choices=("newest", "oldest"), help="print the path of such a Python here, and end")
     asked = parser.parse_args()
     if asked.find:
-        order = PYTHONS[::-1] if asked.find == "newest" else PYTHONS
-        found = next(filter(None, map(interpreter, order)), None)
+        found = first(PYTHONS[::-1] if asked.find == "newest" else PYTHONS)
         print(found or f"no Python of {', '.join(PYTHONS)} here", file=sys.stdout if found else sys.stderr)
         return 0 if found else 1
     known = [*PYTHONS, *(f"least-{one}" for one in PYTHONS)]
