@@ -5,11 +5,6 @@ import os
 import signal
 from pathlib import Path
 
-# A job in the background starts with Ctrl-C ignored, and so do its children, some of which tests stop by it.
-for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
-    if signal.getsignal(number) is signal.SIG_IGN:
-        signal.signal(number, handler)
-
 # Two workers with two threads each would wait for each other: small products are tens of times slower then.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -22,6 +17,11 @@ OWN_MODULES = (r"jeit(_solvers)?(\..*)?$", r"(test_|conftest|benchmarks).*")
 
 ROOT = Path(__file__).resolve().parents[1]
 MAPS = Path("/proc/self/maps")
+
+# A job in the background starts with Ctrl-C ignored, and so do its children, some of which tests stop by it.
+for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL)):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, handler)
 
 # Programs being traced are many small objects, which Python would look through for rubbish again and again.
 gc.set_threshold(100_000, 20, 50)
