@@ -115,7 +115,7 @@ def test_linear_images():
             for number, prior in enumerate(priors)
         )
 
-    assert_gradient(image, VARIED | {"level 0": 3.0, "level 1": 1e4, "level 2": 2.0, "length": 0.03})
+    assert_gradient(image, VARIED | {"level 0": 3.0, "level 1": 1e4, "level 2": 1e3, "length": 0.03})
 
 
 def test_linear_images_where_electrodes_are():
