@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from jeit.electrodes import BoundaryElectrodes, FacePatches
-from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
 from jeit.inverse import Parametrisation, TotalVariation, posterior, reconstruct
 from jeit.inverse.nonlinear import Background, GaussNewton, LevenbergMarquardt
 from jeit.layout import ring
-from jeit.mesh import Disk, Rectangle, Solid, centroids, gradients, measures
+from jeit.mesh import Disk, box, centroids, gradients, measures
 from jeit.protocol import adjacent
 from jeit_solvers.engines import on_host
 
@@ -25,7 +24,7 @@ def sheet():
 def solid():
     sides = (1, 0), (0, 1), (-1, 0), (0, -1)
     plates = FacePatches(np.array([(0.1 * x, 0.1 * y, z) for z in (0.06, 0.14) for x, y in sides]), 0.06, 0.06, 1e-2)
-    return ForwardModel(body_mesh(Solid(Rectangle(0.2, 0.2), 0.2), plates, 120), plates, adjacent(8))
+    return ForwardModel(box(0.2, 0.2, 0.2, num_points=120), plates, adjacent(8))
 
 
 @pytest.fixture(scope="module", params=[sheet, solid], ids=["sheet", "solid"])
