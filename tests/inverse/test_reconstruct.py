@@ -132,7 +132,9 @@ def test_solvers_of_optimistix_find_the_same(model, frame):
 def test_solvers_of_optimistix_that_stand_still_for_rounding_have_converged():
     """Tolerances at the root of a number's precision are reached or not by luck; one step is no such luck. The image is
     that of Gauss-Newton."""
-    model = ForwardModel(Disk(RADIUS).mesh(num_points=16), BoundaryElectrodes(ring(RADIUS, 5), 0.012, 1e-3), adjacent(5))
+    model = ForwardModel(
+        Disk(RADIUS).mesh(num_points=16), BoundaryElectrodes(ring(RADIUS, 5), 0.012, 1e-3), adjacent(5)
+    )
     voltages = np.asarray(model.voltages(np.where(np.asarray(centroids(model.mesh))[:, 0] > 0.03, 2.0, 1.0)))
     options = {"prior": Gaussian(0.05), "noise": 1e-3 * np.abs(voltages), "hyperparameter": 100.0}
     solver = optx.LevenbergMarquardt(1e-9, 1e-9)
