@@ -217,8 +217,18 @@ def test_a_ball_over_the_wall_ends_there(coarse):
     np.testing.assert_allclose(body.centroid, [0.05 - 3 / 8 * 0.03, 0, 0.05], atol=5e-4)
 
 
-@pytest.mark.parametrize("ratio", [4.0, pytest.param(0.2, marks=pytest.mark.slow)])
-def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, fine, ratio):
+@pytest.mark.parametrize(
+    ("ratio", "meshes", "edges"),
+    [
+        (4.0, 2, ((0.7,), (0.5,))),  # a mesh fewer, and coarser, than by default
+        pytest.param(4.0, None, None, marks=pytest.mark.slow),
+        pytest.param(0.2, None, None, marks=pytest.mark.slow),
+    ],
+)
+def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, fine, ratio, meshes, edges, monkeypatch):
+    if meshes:
+        monkeypatch.setattr(search, "_MOST_MESHES", meshes)
+        monkeypatch.setattr(search, "_EDGES", edges)
     cut_along, held, rest = fine
     change = np.asarray(cut_along.voltages(BATH * np.where(held, ratio, 1.0))) - rest
     noise = 0.03 * np.sqrt(np.mean(change**2))
@@ -446,7 +456,7 @@ def test_cut_cells_are_harmonic_means_of_conductive_bodies_and_gentler_ones_of_r
 
 def test_finer_cells_know_which_they_come_from(coarse):
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
-    there = finer(shape_problem(coarse), Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), (0.3,))
+    there = finer(shape_problem(coarse), Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), (0.5,))
     volume = np.asarray(measures(there.problem.model.mesh))
     np.testing.assert_allclose(np.bincount(there.cell, volume), np.asarray(measures(coarse.mesh)), rtol=1e-9)
 
@@ -455,10 +465,10 @@ def test_the_first_edges_that_make_a_mesh_grow_little_are_taken():
     coarse = model(400)
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
     fit, problem = Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), shape_problem(coarse)
-    few, many = (finer(problem, fit, (edge,)).problem.model.mesh.num_points for edge in (1.0, 0.2))
+    few, many = (finer(problem, fit, (edge,)).problem.model.mesh.num_points for edge in (1.0, 0.3))
     assert few < 1.5 * coarse.mesh.num_points < many
-    assert finer(problem, fit, (0.2, 1.0)).problem.model.mesh.num_points == few
-    assert finer(problem, fit, (1.0, 0.2)).problem.model.mesh.num_points == few
+    assert finer(problem, fit, (0.3, 1.0)).problem.model.mesh.num_points == few
+    assert finer(problem, fit, (1.0, 0.3)).problem.model.mesh.num_points == few
 
 
 def test_bodies_have_moved_once_their_surfaces_have(ellipsoids):
