@@ -229,14 +229,14 @@ def test_a_memory_takes_noise_out_and_leaves_the_press(method, small, noisy):
 def test_a_memory_is_the_same_to_gauss_newton_where_all_is_linear(small, noisy):
     """Changes a hundred times smaller, and noise too: one step from the expected image is the filter's update."""
     rest, (frames, noise) = pressed(small, 1.0), noisy
-    options = {"prior": Gaussian(0.02), "noise": noise / 100, "hyperparameter": 200.0, "memory": MEMORY}
+    options = {"prior": Gaussian(0.02), "noise": noise / 100, "hyperparameter": 2000.0, "memory": MEMORY}
     options["parametrisation"] = Parametrisation(informative=1e-6)
-    faint = rest + (frames[:6] - rest) / 100
+    faint = rest + (frames - rest) / 100
     linear, iterated = (
         list(stream(Imager.create(small, 1.0, solver=method, **options), faint))[-1].conductivity - 1
         for method in ("one-step", "gauss-newton")
     )
-    np.testing.assert_allclose(iterated, linear, atol=0.01 * np.abs(linear).max())
+    np.testing.assert_allclose(iterated, linear, atol=0.002 * np.abs(linear).max())
 
 
 def spoil(frames, fault):
