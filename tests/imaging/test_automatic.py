@@ -1,5 +1,7 @@
 """The default method: linear where that is sound, solved for conductivity itself where it is not; and what it finds."""
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -19,11 +21,12 @@ from jeit.protocol import adjacent
 from jeit.report.image import report_image
 
 RADIUS = 0.05
-TRUTH = ForwardModel(Disk(RADIUS).mesh(num_points=2500), BoundaryElectrodes(ring(RADIUS, 16), 0.01, 0.05), adjacent(16))
+TRUTH = ForwardModel(Disk(RADIUS).mesh(num_points=2000), BoundaryElectrodes(ring(RADIUS, 16), 0.01, 0.05), adjacent(16))
 CENTRES = np.asarray(centroids(TRUTH.mesh))
-FEW = {"num_points": 700}
+FEW = {"num_points": 450}
 
 
+@functools.cache
 def frame(factor: float = 1.0, *, noise: float = 1e-4, seed: int = 0) -> Measurement:
     """A disk of a third of the tank's radius, so many times as conductive as the rest."""
     inside = np.linalg.norm(CENTRES - [0.02, 0.01], axis=1) < RADIUS / 3
@@ -39,7 +42,9 @@ def frame(factor: float = 1.0, *, noise: float = 1e-4, seed: int = 0) -> Measure
     )
 
 
+@functools.cache
 def image(factor: float, **settings):
+    """The same settings are imaged once; no test changes what it gets."""
     return image_difference(frame(factor, seed=1), frame(), ImagingSettings(**{**FEW, **settings}))
 
 
@@ -115,8 +120,8 @@ def test_noise_damps_images_and_bodies_are_then_solved_for():
 
 
 def test_sharp_outlines_are_asked_less_of_where_the_model_is_at_fault():
-    exact = prepare_difference(frame(20.0, seed=1), frame(), num_points=700)
-    noisy = prepare_difference(frame(20.0, noise=0.1, seed=1), frame(), num_points=700)
+    exact = prepare_difference(frame(20.0, seed=1), frame(), num_points=450)
+    noisy = prepare_difference(frame(20.0, noise=0.1, seed=1), frame(), num_points=450)
     for one in (exact, noisy):
         model = np.sqrt(np.asarray(one.modelled_noise) ** 2 - (one.noise * np.asarray(one.relative_noise)) ** 2)
         expected = np.hypot(one.noise * np.asarray(one.relative_noise), 3 * model)
@@ -143,7 +148,7 @@ def test_shapes_that_do_not_explain_the_voltages_are_not_shown():
         one = frame()
         return Measurement(voltages, one.mask, one.protocol, electrodes=one.electrodes, domain=one.domain)
 
-    result = image_difference(sloped(1.2, 1), sloped(0.0, 0), ImagingSettings(**FEW))
+    result = image_difference(sloped(1.2, 1), sloped(0.0, 0), ImagingSettings(num_points=700))
     assert result.settings.method == "gauss-newton"
     assert result.shapes is None
 
@@ -170,14 +175,15 @@ def test_one_step_is_kept_where_gauss_newton_finds_nothing(monkeypatch):
         raise ValueError("it fails.")
 
     monkeypatch.setitem(METHODS, "gauss-newton", METHODS["gauss-newton"].__class__(fails, takes_prior=True))
-    result = image(20.0)
+    result = image.__wrapped__(20.0)
     assert result.settings.method == "one-step"
     assert "Gauss-Newton found no image. it fails." in result.why
 
 
 def test_the_noise_of_an_image_is_what_noise_makes_of_images():
     """Repeated frames of a small change: images scatter by what is foretold of one of them."""
-    model = ForwardModel(Disk(RADIUS).mesh(num_points=400), TRUTH.electrodes, TRUTH.protocol)
+    electrodes = BoundaryElectrodes(ring(RADIUS, 8), 0.01, 0.05)
+    model = ForwardModel(Disk(RADIUS).mesh(num_points=120), electrodes, adjacent(8))
     clean, rng = np.asarray(model.voltages(0.02)), np.random.default_rng(0)
     noise = 0.01 * np.abs(clean)
     found = [
@@ -225,10 +231,10 @@ def test_what_a_model_misses_is_noise_to_those_who_solve_with_it():
     assert 0.008 < exact.noise < 0.02
 
 
-@pytest.mark.parametrize("seed", [2, 6, 31])
+@pytest.mark.parametrize("seed", [2, *(pytest.param(one, marks=pytest.mark.slow) for one in (6, 31))])
 def test_metal_and_plastic_in_one_tank_are_all_found_and_nothing_else(seed):
     tank = draw(seed)
-    result = image_difference(tank.frame, tank.reference, ImagingSettings(num_points=1200))
+    result = image_difference(tank.frame, tank.reference, ImagingSettings(num_points=900))
     distances, spurious = matched(tank, result.inclusions)
     assert distances.max() < 0.12
     assert spurious == 0
@@ -243,6 +249,7 @@ def test_neighbours_of_one_kind_are_told_apart():
     assert spurious == 0
 
 
+@pytest.mark.slow
 def test_frames_of_mixed_tanks_are_those_of_a_model_on_a_fine_mesh():
     """The problem itself: SciPy's voltages of the empty tank are those of a model on a fine mesh."""
     tank = draw(0, noise=0.0)

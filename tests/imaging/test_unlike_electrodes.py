@@ -17,8 +17,8 @@ from jeit.protocol import adjacent
 from jeit.report.image import report_image
 
 RADIUS, LOOSE = 0.05, 6
-TRUTH = ForwardModel(Disk(RADIUS).mesh(num_points=2500), BoundaryElectrodes(ring(RADIUS, 16), 0.01, 0.05), adjacent(16))
-FEW = {"num_points": 700}
+TRUTH = ForwardModel(Disk(RADIUS).mesh(num_points=2000), BoundaryElectrodes(ring(RADIUS, 16), 0.01, 0.05), adjacent(16))
+FEW = {"num_points": 450}
 
 
 def frame(factor: float = 1.0, gain: float = 1.0, seed: int = 0) -> Measurement:
@@ -76,13 +76,13 @@ def test_the_challenges_tank_has_one_between_its_last_electrodes(data_folder):
     reference = read(folder / "ref.mat")
     for gone in ((), range(6)):
         frames = (without(one, gone) for one in (read(folder / "data1.mat"), reference))
-        assert set(prepare_difference(*frames, num_points=900).unlike_electrodes) == {29, 30, 31}
+        assert set(prepare_difference(*frames, num_points=600).unlike_electrodes) == {29, 30, 31}
 
 
-@pytest.mark.parametrize("seed", [1000, 1009])
+@pytest.mark.parametrize("seed", [1000, pytest.param(1009, marks=pytest.mark.slow)])
 def test_bodies_are_segmented_though_electrodes_are_gone(seed):
     tank = draw(seed).without(6)
-    result = image_difference(tank.frame, tank.reference, ImagingSettings(segment=True, num_points=1200))
+    result = image_difference(tank.frame, tank.reference, ImagingSettings(segment=True, num_points=700))
     assert result.shapes is not None
     assert result.labels is not None
     assert challenge_score(result.labels, tank.truth) > 0.7

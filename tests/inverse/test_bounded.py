@@ -22,19 +22,15 @@ from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
 
 
-def disk(num_points):
-    electrodes = BoundaryElectrodes(ring(0.1, 16), 0.012, 1e-3)
-    return ForwardModel(Disk(0.1).mesh(num_points=num_points), electrodes, adjacent(16))
-
-
 @pytest.fixture(scope="module")
 def model():
-    return disk(300)
+    """Of six electrodes and 25 nodes: what keeps bounds is compiled for seconds."""
+    return ForwardModel(Disk(0.1).mesh(num_points=25), BoundaryElectrodes(ring(0.1, 6), 0.012, 1e-3), adjacent(6))
 
 
 @pytest.fixture(scope="module")
 def frame(model):
-    inside = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.03, 0.02], axis=1) < 0.03
+    inside = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.03, 0.02], axis=1) < 0.05
     voltages = model.voltages(jnp.where(inside, 3.0, 1.0))
     return voltages, 1e-2 * jnp.abs(voltages)
 
@@ -117,7 +113,21 @@ def test_bad_input(change, message, model, frame):
         reconstruct(model, frame[0], 1.0, parametrisation=Parametrisation(**own), **arguments)
 
 
-@pytest.mark.parametrize("link", [Linear(), pytest.param(Log(), marks=pytest.mark.slow)], ids=["linear", "log"])
+@pytest.mark.parametrize(("link", "ends"), [(Linear(), (0.0, 1.5)), (Log(), (-np.inf, np.log(1.5)))])
+def test_bounds_on_the_link_s_scale(link, ends):
+    """Zero is outside what the logarithm can take, and no bound at all there; conductivity itself stays above it."""
+    background = np.array([0.5, 1.0])
+    lower, upper = (
+        np.asarray(end) + np.asarray(link.estimate(background))
+        for end in Parametrisation(bounds=(0.0, 1.5), link=link).box(background)
+    )
+    np.testing.assert_allclose(upper, ends[1], rtol=1e-12)
+    np.testing.assert_allclose(lower, ends[0], atol=1e-5)
+    assert (lower > 0).all() == isinstance(link, Linear)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("link", [Linear(), Log()], ids=["linear", "log"])
 def test_lower_bound_of_zero(link, model, frame):
     """Zero is outside what the logarithm can take, and no bound at all there."""
     result = reconstruct(

@@ -54,7 +54,7 @@ def model():
 @pytest.fixture(scope="module")
 def frame():
     """Voltages of a disk with an inclusion of thrice its conductivity, and their noise of 0.1 %."""
-    fine = model_of(4000)
+    fine = model_of(2500)
     inside = np.linalg.norm(centroids(fine.mesh) - CENTRE, axis=1) < INCLUSION
     voltages = fine.voltages(jnp.where(inside, 3.0, 1.0))
     noise = 1e-3 * jnp.abs(voltages)
@@ -104,14 +104,18 @@ def test_derivative_of_the_misfit(model, frame):
     voltages, noise = frame
     solver = GaussNewton(max_steps=1)
     inversion = reconstruct(model, voltages, 1.0, prior=Gaussian(0.03), noise=noise, solver=solver).inversion
-    point = 0.01 * jax.random.normal(jax.random.key(1), (inversion.basis.num_coefficients,))
-    direction = jax.random.normal(jax.random.key(2), point.shape)
-    misfit, jacobian = inversion.linearise(point)
+    random = np.random.default_rng(1)
+    point = 0.01 * random.normal(size=inversion.basis.num_coefficients)
+    direction = random.normal(size=point.shape)
+    misfit, jacobian = (np.asarray(part) for part in inversion.linearise(point))
     np.testing.assert_allclose(misfit, inversion.residual(point), rtol=1e-9, atol=1e-9)
-    _, tangent = jax.jvp(inversion.residual, (point,), (direction,))
+    residual, tangent = jax.jit(lambda at: jax.jvp(inversion.residual, (at,), (direction,)))(point)
+    np.testing.assert_allclose(residual, misfit, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(jacobian @ direction, tangent, rtol=1e-8, atol=1e-8 * np.abs(tangent).max())
     steps = 1e-2 * 0.5 ** np.arange(4)
-    errors = [np.linalg.norm(inversion.residual(point + h * direction) - misfit - h * tangent) for h in steps]
+    errors = [
+        np.linalg.norm(np.asarray(inversion.residual(point + h * direction)) - misfit - h * tangent) for h in steps
+    ]
     assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2, abs=0.1)
 
 
@@ -125,14 +129,20 @@ def test_solvers_of_optimistix_find_the_same(model, frame):
     np.testing.assert_allclose(theirs.conductivity, ours.conductivity, rtol=1e-3)
 
 
-@pytest.mark.parametrize("rounding", [0, 1, 2, 3])
-def test_solvers_of_optimistix_that_stand_still_for_rounding_have_converged(rounding, model, frame):
-    """Tolerances at the root of a number's precision are reached or not by luck; one step is no such luck."""
-    voltages, noise = frame
-    options = {"prior": Gaussian(0.05), "noise": noise, "hyperparameter": 100.0}
+def test_solvers_of_optimistix_that_stand_still_for_rounding_have_converged():
+    """Tolerances at the root of a number's precision are reached or not by luck; one step is no such luck. The image is
+    that of Gauss-Newton."""
+    model = ForwardModel(
+        Disk(RADIUS).mesh(num_points=16), BoundaryElectrodes(ring(RADIUS, 5), 0.012, 1e-3), adjacent(5)
+    )
+    voltages = np.asarray(model.voltages(np.where(np.asarray(centroids(model.mesh))[:, 0] > 0.03, 2.0, 1.0)))
+    options = {"prior": Gaussian(0.05), "noise": 1e-3 * np.abs(voltages), "hyperparameter": 100.0}
     solver = optx.LevenbergMarquardt(1e-9, 1e-9)
-    result = reconstruct(model, voltages * (1 + rounding * 1e-15), 1.0, solver=solver, **options)
-    assert result.status == "converged"
+    ours = reconstruct(model, voltages, 1.0, solver=GaussNewton(rtol=1e-12), **options)
+    for rounding in range(4):
+        result = reconstruct(model, voltages * (1 + rounding * 1e-15), 1.0, solver=solver, **options)
+        assert result.status == "converged"
+        np.testing.assert_allclose(result.conductivity, ours.conductivity, rtol=1e-3)
     short = reconstruct(model, voltages, 1.0, solver=LeastSquares(solver, max_steps=2), **options)
     assert short.status == "step limit"
 

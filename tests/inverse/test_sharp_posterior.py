@@ -7,30 +7,35 @@ import numpy as np
 import pytest
 
 from jeit.electrodes import BoundaryElectrodes, FacePatches
-from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
 from jeit.inverse import Parametrisation, TotalVariation, posterior, reconstruct
 from jeit.inverse.nonlinear import Background, GaussNewton, LevenbergMarquardt
 from jeit.layout import ring
-from jeit.mesh import Disk, Rectangle, Solid, centroids, gradients, measures
+from jeit.mesh import Disk, box, centroids, gradients, measures
 from jeit.protocol import adjacent
 from jeit_solvers.engines import on_host
 
 
 def sheet():
     electrodes = BoundaryElectrodes(ring(0.1, 8), 0.012, 1e-3)
-    return ForwardModel(Disk(0.1).mesh(num_points=150), electrodes, adjacent(8))
+    return ForwardModel(Disk(0.1).mesh(num_points=80), electrodes, adjacent(8))
 
 
 def solid():
     sides = (1, 0), (0, 1), (-1, 0), (0, -1)
     plates = FacePatches(np.array([(0.1 * x, 0.1 * y, z) for z in (0.06, 0.14) for x, y in sides]), 0.06, 0.06, 1e-2)
-    return ForwardModel(body_mesh(Solid(Rectangle(0.2, 0.2), 0.2), plates, 250), plates, adjacent(8))
+    return ForwardModel(box(0.2, 0.2, 0.2, num_points=120), plates, adjacent(8))
 
 
 @pytest.fixture(scope="module", params=[sheet, solid], ids=["sheet", "solid"])
 def model(request):
     return request.param()
+
+
+@pytest.fixture(scope="module")
+def image(model):
+    """By total variation."""
+    return sharp(model)
 
 
 def inside(model):
@@ -134,8 +139,8 @@ def test_data_narrow_every_bar_and_intervals_hold_the_image(model):
     assert ((lower < found.conductivity) & (found.conductivity < upper)).all()
 
 
-def test_samples_spread_as_the_whole_matrix_inverted_says(model):
-    found = sharp(model)
+def test_samples_spread_as_the_whole_matrix_inverted_says(model, image):
+    found = image
     inverse, shapes = covariance(found)
     drawn = np.log(np.asarray(posterior(found).sample(jax.random.key(0), 1500))) - np.log(found.conductivity)
     assert drawn.shape == (1500, model.mesh.num_cells)
@@ -146,9 +151,9 @@ def test_samples_spread_as_the_whole_matrix_inverted_says(model):
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.7])
-def test_steps_are_those_of_the_whole_matrix(damping, model):
+def test_steps_are_those_of_the_whole_matrix(damping, image):
     """To the minimum of the misfit linearised and of the form that touches the energy, weighted with 1 + damping."""
-    inversion, point = on_host((sharp(model).inversion, sharp(model).coefficients))
+    inversion, point = on_host((image.inversion, image.coefficients))
     point = point + 0.05 * np.random.default_rng(0).normal(size=point.shape)
     residual, jacobian = inversion.linearise(point)
     form, gradient = precision(inversion, point)[0], np.asarray(jax.grad(inversion.penalty.cost)(jnp.asarray(point)))

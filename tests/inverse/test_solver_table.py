@@ -70,10 +70,10 @@ OWN, TWO = ("gauss-newton", "levenberg-marquardt"), ("conductive in a disk", "re
 
 
 def cases():
-    """The pairs to try; the quick suite takes the solvers that compile quickly once."""
+    """The pairs to try; the quick suite takes the solvers that need no compilation (others: test_reconstruct.py)."""
     for problem, solver in itertools.product(PROBLEMS, SOLVERS):
         if solver in OWN or problem in TWO:
-            quick = problem == "conductive in a disk" and solver not in ("l-bfgs-b", "projected-gradient")
+            quick = problem == "conductive in a disk" and solver in OWN
             yield pytest.param(problem, solver, marks=() if quick else pytest.mark.slow)
 
 
