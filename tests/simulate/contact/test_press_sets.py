@@ -54,7 +54,7 @@ simulate_presses(small_set(), sys.argv[2])
 
 
 def small_set(**options) -> PressSet:
-    model = ForwardModel(Disk(0.05).mesh(num_points=300), BoundaryElectrodes(ring(0.05, 8), 0.008, 0.2), adjacent(8))
+    model = ForwardModel(Disk(0.05).mesh(num_points=150), BoundaryElectrodes(ring(0.05, 8), 0.008, 0.2), adjacent(8))
     draws = PressDraws([ball(0.02), Bar(0.03, 0.01)], Disk(0.05), (0.5, 5.0), margin=0.01, at_once=2)
     return PressSet(PressedSkin(KEY, model, material("velostat")), draws, 50, chunk=20, **options)
 

@@ -10,7 +10,7 @@ from jeit.design import Skin
 from jeit.electrodes import BoundaryElectrodes, PointElectrodes
 from jeit.forward import ForwardModel
 from jeit.layout import named_layout, ring
-from jeit.mesh import Disk
+from jeit.mesh import Disk, Rectangle
 from jeit.protocol import adjacent
 from jeit.simulate.contact import (
     Bar,
@@ -133,9 +133,9 @@ def test_frames_are_those_of_the_model_solved_anew(skin):
 
 
 def test_a_layer_is_pressed_too():
-    layer = Skin.create(named_layout("grid-3x3"), num_layers=2, cell_size=0.009)
+    layer = Skin.create(named_layout("grid-3x3", Rectangle(0.08, 0.08)), num_layers=1, cell_size=0.008)
     skin = PressedSkin(KEY, layer.model, dataclasses.replace(material("hydrogel"), noise=0.0, gain_spread=0.0))
-    presses = [Press(ball(0.04), 3.0, (0.03, 0.02)), Press(Disc(0.03), 3.0, (-0.03, 0.0))]
+    presses = [Press(ball(0.04), 3.0, (0.015, 0.01)), Press(Disc(0.03), 3.0, (-0.015, 0.0))]
     samples = Samples.of(layer.model.mesh)
     cells, pressure = pressed_cells(samples, skin.material.support, [(press,) for press in presses])
     np.testing.assert_allclose(np.einsum("ncs,nc->n", pressure, samples.area[cells]), 3.0, rtol=1e-12)
