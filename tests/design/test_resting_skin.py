@@ -1,4 +1,4 @@
-"""A skin at rest whose touches are worked out in many calls, against changes of each call's own."""
+"""A skin at rest whose touches are worked out in many calls, against changes of each call's own, and the model anew."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def made(num_layers: int) -> Skin:
     return Skin.create(named_layout("grid-3x3", Rectangle(0.06, 0.06)), num_layers=num_layers, cell_size=8e-3)
 
 
-@pytest.fixture(scope="module", params=[0, 4])
+@pytest.fixture(scope="module", params=[0, pytest.param(4, marks=pytest.mark.slow)])
 def skin(request):
     return made(request.param)
 
@@ -53,6 +53,11 @@ def test_a_layer_knows_the_nodes_that_are_reached():
     found = shallow.changes(touched)
     assert np.abs(found - deep.changes(touched)).max() < 1e-12 * np.abs(found).max()
     assert not found[1].any()
+    conductivity = np.full(layer.model.mesh.num_cells, float(layer.model_conductivity))
+    rest = np.asarray(layer.model.voltages(conductivity))
+    np.add.at(conductivity, touched.cells[0], conductivity[0] * np.asarray(touched.change[0]))
+    anew = np.asarray(layer.model.voltages(np.maximum(conductivity, 1e-9))) - rest
+    assert np.abs(found[0] - anew).max() < 1e-7 * np.abs(anew).max()
 
 
 def test_no_more_than_fits():

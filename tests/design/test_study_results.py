@@ -127,7 +127,7 @@ def test_exact_maps_of_layers_are_those_of_a_comparison(results):
         np.testing.assert_allclose(values, response.sensitivity.values, rtol=1e-8)
 
 
-@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize("exact", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_conducting_touches_of_a_sheet(results, exact):
     for point, values in results(measurement=NEAREST, touch=f"contrast = 5\nexact = {str(exact).lower()}"):
         touched = touched_cells(MESH, Bell(), GRID.places, thickness=point.thickness, contrast=5.0)
@@ -153,16 +153,17 @@ def test_a_place_that_cannot_be_told_is_infinite_and_counted(study, store_path, 
     assert (data.localisation_lost == 1).all()
 
 
-def test_a_batch_factorises_once_and_calls_no_library(study):
+def test_a_batch_factorises_once_and_calls_no_library(study, tmp_path):
     """With the loops of all scores there are fewer than twice those of maps alone."""
-    shared, skin = batch._shared(study, study.points[0].shape), batch._varied(study.points[0], study.current)
-    skins = batch._stacked([skin] * 2)
-    options = {"num_taxels": study.num_taxels, "threshold": study.threshold, "num_devices": 1}
+    (tmp_path / "maps.toml").write_text(changed(measurement=NEAREST), "utf-8")
 
-    def compiled(scores):
-        return batch._batch.lower(shared, skins, scores=scores, **options).compile().as_text() or ""
+    def compiled(study):
+        shared, skin = batch._shared(study, study.points[0].shape), batch._varied(study.points[0], study.current)
+        options = {"num_taxels": study.num_taxels, "threshold": study.threshold, "num_devices": 1}
+        lowered = batch._batch.lower(shared, batch._stacked([skin] * 2), scores=study.scores, **options)
+        return lowered.compile().as_text() or ""
 
-    maps, every = compiled(()), compiled(study.scores)
+    maps, every = compiled(read_study(tmp_path / "maps.toml")), compiled(study)
     assert "lapack" not in every
     assert 1 < maps.count(" while(") < every.count(" while(") < 2 * maps.count(" while(")
 
