@@ -214,7 +214,9 @@ def test_gaps_are_along_the_surface(described):
 def test_a_study_is_run_and_drawn_unrolled(described, tmp_path, exact):
     pytest.importorskip("xarray")
     coarse = STUDY.replace("inner-8", "inner-4").replace("diameter_mm = 10", "diameter_mm = 24")
-    coarse = coarse.replace("cell_mm = 8", "cell_mm = 12").replace("rows = 4", f"rows = 4\nexact = {str(exact).lower()}")
+    coarse = coarse.replace("cell_mm = 8", "cell_mm = 12").replace(
+        "rows = 4", f"rows = 4\nexact = {str(exact).lower()}"
+    )
     study = described(coarse, read_study)
     with run_study(study, tmp_path / "study.zarr") as data:
         assert data.sensitivity.shape == (2, 16)
