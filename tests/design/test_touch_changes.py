@@ -59,7 +59,7 @@ BALL = Hemisphere(depth=3e-3, diameter=20e-3)
     [
         ("sheet", Bell(), SHEET),
         pytest.param("sheet", BALL, SHEET, marks=pytest.mark.slow),
-        ("points", Bell(), SHEET),
+        pytest.param("points", Bell(), SHEET, marks=pytest.mark.slow),
         ("layer", BALL, {}),
         pytest.param("layer", Bell(), {}, marks=pytest.mark.slow),
         pytest.param("layer", BALL, {"edge": 1e-3}, marks=pytest.mark.slow),
