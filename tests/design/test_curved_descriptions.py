@@ -176,7 +176,11 @@ def test_electrodes_by_position(described, tmp_path):
         ("inner-8", "grid-4x2", r"electrodes\.layouts: 'grid-4x2': a curved skin has inner-N.*or a \.csv file"),
         ("inner-8", "no.csv", r"electrodes\.layouts: 'no\.csv': .*no file"),
         ("inner-8", "flat.csv", r"electrodes\.layouts: 'flat\.csv': .*there is no column z_mm"),
-        ("inner-8", "inner-250", r"electrodes\.layouts: 'inner-250': .*overlap|no room"),
+        (
+            'inner-8"\ndiameter_mm = 10',
+            'inner-20"\ndiameter_mm = 40',
+            r"electrodes\.layouts: 'inner-20': .*overlap|no room",
+        ),
     ],
 )
 @pytest.mark.parametrize("kind", ["layout", "layouts"])
@@ -206,9 +210,14 @@ def test_gaps_are_along_the_surface(described):
         described(narrow, read_study)
 
 
-def test_a_study_is_run_and_drawn_unrolled(described, tmp_path):
+@pytest.mark.parametrize("exact", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["exact", "linear"])
+def test_a_study_is_run_and_drawn_unrolled(described, tmp_path, exact):
     pytest.importorskip("xarray")
-    study = described(STUDY, read_study)
+    coarse = STUDY.replace("inner-8", "inner-4").replace("diameter_mm = 10", "diameter_mm = 24")
+    coarse = coarse.replace("cell_mm = 8", "cell_mm = 12").replace(
+        "rows = 4", f"rows = 4\nexact = {str(exact).lower()}"
+    )
+    study = described(coarse, read_study)
     with run_study(study, tmp_path / "study.zarr") as data:
         assert data.sensitivity.shape == (2, 16)
         radius = np.hypot(data.x_mm, data.y_mm)
@@ -216,7 +225,7 @@ def test_a_study_is_run_and_drawn_unrolled(described, tmp_path):
         assert float(data.z_mm.min()) > 0
     layout = study.points[0].layout
     skin = Skin.create(layout, thickness=5e-3, num_layers=0, protocol=study.points[0].measured(study.current))
-    changes = skin.voltage_changes(skin.touched_cells(touch_grid(skin.outline, 4, 4).places), linear=True)
+    changes = skin.voltage_changes(skin.touched_cells(touch_grid(skin.outline, 4, 4).places), linear=not exact)
     with open_results(study, tmp_path / "study.zarr") as data:
         np.testing.assert_allclose(data.sensitivity[0], np.linalg.norm(changes, axis=1), rtol=1e-9)
         figure = draw_maps(study, data)

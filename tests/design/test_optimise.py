@@ -51,9 +51,9 @@ def optimise(layout=START, *, model=MODEL, steps=100, starts=1, key=None, callba
     )
 
 
-def optimise_from_three(**options):
+def optimise_from_three(steps=14, **options):
     limits = {"minimum_spacing": SPACING, "keep_out": (KEEP_OUT,)}
-    return optimise(starts=3, key=jax.random.key(1), steps=14, **limits, **options)
+    return optimise(starts=3, key=jax.random.key(1), steps=steps, **limits, **options)
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +102,30 @@ def test_same_arguments_same_layout(found):
     assert [step for step, _ in heard] == list(range(len(heard)))
 
 
+def test_symmetric_layouts_of_sizes_within_limits_are_what_is_searched():
+    """Whatever the variables are, quarters of the skin are alike; and those of a layout that is so, give it back."""
+    ring = Layout(perimeter(Rectangle(0.08, 0.08), NUMBER, start=0.005), 8e-3, outline=SKIN)
+    skin = Skin(ring, MODEL, thickness=0.01, conductivity=0.2)
+    space = DesignSpace(symmetry="rotate-4", sizes=(6e-3, 12e-3))
+    variables = space.variables(skin, space.constraints(skin), TOUCHES.depth)
+    start = variables.varied(jnp.asarray(variables.start))
+    np.testing.assert_allclose(nearest(start.centres, ring.centres), 0, atol=1e-9)
+    np.testing.assert_allclose(start.radii, 4e-3, rtol=1e-9)
+    for values in np.random.default_rng(0).uniform(size=(3, len(variables.start))):
+        centres, radii, *_ = (np.asarray(part) for part in variables.varied(jnp.asarray(values)))
+        assert np.abs(centres).max() <= 0.05
+        match = np.linalg.norm(centres[:, None] - centres @ np.array([[0, 1], [-1, 0]]), axis=-1)
+        np.testing.assert_allclose(match.min(axis=1), 0, atol=1e-9)
+        np.testing.assert_allclose(radii[match.argmin(axis=0)], radii, rtol=1e-9)
+        assert 3e-3 <= radii.min() < radii.max() <= 6e-3
+
+
+def nearest(places, others):
+    """From each place to the nearest of others."""
+    return np.linalg.norm(np.asarray(places)[:, None] - np.asarray(others), axis=-1).min(axis=1)
+
+
+@pytest.mark.slow
 def test_symmetry_and_sizes():
     # A shift along the edge keeps electrodes off the axes and the symmetry of the quarters.
     track = Rectangle(0.08, 0.08)
@@ -258,6 +282,23 @@ def test_errors_teach():
         optimise_layout(Skin.create(START, cell_size=0.012), Objective(TOUCHES, **SETTING))
 
 
+def test_starts_that_end_outside_the_constraints_are_reported(monkeypatch):
+    """As where descent of the penalty leads all to a layout that is too close: the layout given is kept."""
+
+    def descent(variables, constraints, values):
+        return jnp.broadcast_to(variables.start, values.shape)
+
+    monkeypatch.setattr("jeit.design.optimisation.optimise._feasible", descent)
+    crowded = Layout(0.4 * START.centres, 8e-3, outline=SKIN, name="low")  # for the program of the others
+    found = optimise_from_three(layout=crowded, steps=1)
+    assert (found.status, found.best) == ("infeasible", None)
+    assert (found.shortfall > 1e-3).all()
+    assert found.reason.startswith("no start satisfies the constraints: minimum_spacing= lacks 10.4 mm")
+    assert found.layout is crowded
+    assert found.value == found.start_value
+
+
+@pytest.mark.slow
 def test_constraints_that_cannot_be_met_are_reported():
     found = optimise(keep_out=(Rectangle(0.096, 0.096),), steps=1)
     assert found.status == "infeasible"

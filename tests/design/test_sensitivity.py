@@ -13,7 +13,7 @@ from jeit.protocol import adjacent
 
 @pytest.fixture(scope="module")
 def theta():
-    mesh = rectangle(0.1, 0.1, cell_size=0.006)
+    mesh = rectangle(0.1, 0.1, cell_size=0.008)
     model = ForwardModel(mesh, SheetDiscs(grid(0.07, 0.07, 2, 2)[[0, 1, 3, 2]], 0.008, 1e-4), adjacent(4))
     return sensitivity_map(model, 1.0, touch_grid(Rectangle(0.1, 0.1), 8, 6), thickness=0.01)
 

@@ -27,7 +27,7 @@ from jeit.mesh import Polygon, Rectangle
 
 OUTLINE = Rectangle(0.06, 0.05)
 LAYOUT = Layout(grid(0.04, 0.03, 3, 2), 8e-3, outline=OUTLINE, name="six")
-GRID = touches_away_from_the_edge(OUTLINE, 5e-3, 10, 10)
+GRID = touches_away_from_the_edge(OUTLINE, 5e-3, 6, 6)
 OPTIONS = {"num_layers": 4, "cell_size": 6e-3}
 
 

@@ -4,6 +4,7 @@ import base64
 import re
 from html.parser import HTMLParser
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from studies import SMALL
@@ -128,7 +129,9 @@ def test_titles_tell_what_differs(tmp_path):
 
 
 @pytest.mark.parametrize("where", ["none/page.html", "file/page.html", "folder"])
-def test_a_page_that_cannot_be_written(folder, tmp_path, where):
+def test_a_page_that_cannot_be_written(folder, tmp_path, monkeypatch, where):
+    for draw in ("draw_maps", "draw_scatter", "draw_scores"):
+        monkeypatch.setattr(f"jeit.report.study.report.{draw}", lambda *_: plt.figure(figsize=(1, 1)))
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "folder").mkdir()
     study = read_study(folder / "study.toml")

@@ -2,10 +2,11 @@
 
 import os
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from studies import changed, in_another_process
+from studies import changed, in_another_process, linear_changes
 
 from jeit.design import (
     Bell,
@@ -18,9 +19,13 @@ from jeit.design import (
     touch_grid,
 )
 from jeit.design.measurements.selection import nearest_pairs
+from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.protocol import skin_protocol
 from jeit.design.skin.sheet_touches import sheet_touches
+from jeit.design.skin.touched_cells import touched_cells
+from jeit.design.skin.voltage_changes import touch_changes
 from jeit.design.study import batch, open_results, read_study, run_study
+from jeit.design.study.spec import Point
 from jeit.electrodes import FaceDiscs, SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.mesh import Rectangle, layer, rectangle
@@ -38,9 +43,9 @@ def test_results_are_those_of_one_map_at_a_time(study, whole_store):
     for number, point in enumerate(study.points):
         electrodes = SheetDiscs(point.layout.centres, 5e-3, 1e-3)
         model = ForwardModel(MESH, electrodes, adjacent(8, current=1e-3))
-        found = sensitivity_map(model, 0.5 * point.thickness, GRID, thickness=point.thickness, linear=True)
-        taxels = find_taxels(found.changes, GRID.places, GRID.cell_area, num_taxels=5, key=jax.random.key(0))
         touches = sheet_touches(MESH, Bell(), GRID.places, thickness=point.thickness)
+        found = SensitivityMap(GRID, linear_changes(model, 0.5 * point.thickness, touches.touched))
+        taxels = find_taxels(found.changes, GRID.places, GRID.cell_area, num_taxels=5, key=jax.random.key(0))
         scores = layout_scores(model, 0.5 * point.thickness, touches, prior=prior, noise=1e-3)
         expected = {
             "sensitivity": found.values,
@@ -86,13 +91,16 @@ def model_of(point, *, number=None) -> ForwardModel:
     return ForwardModel(layer(MESH, point.thickness, point.layers), FaceDiscs(bottom, 5e-3, 1e-3), protocol)
 
 
+NEAREST = 'protocol = "two-terminal"\npairs = 10'
+
+
 def test_the_nearest_pairs_of_each_layout_are_measured(results):
-    found = results(measurement='protocol = "two-terminal"\npairs = [10, 28]')
-    assert len(found) == 8
+    found = results(measurement=NEAREST)
+    assert len(found) == 4
     for point, values in found:
-        model = model_of(point, number=point.pairs)
-        theta = sensitivity_map(model, 0.5 * point.thickness, GRID, thickness=point.thickness, linear=True)
-        np.testing.assert_allclose(values, theta.values, rtol=1e-9)
+        touched = touched_cells(MESH, Bell(), GRID.places, thickness=point.thickness)
+        changes = linear_changes(model_of(point, number=10), 0.5 * point.thickness, touched)
+        np.testing.assert_allclose(values, np.linalg.norm(changes, axis=1), rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -119,34 +127,45 @@ def test_exact_maps_of_layers_are_those_of_a_comparison(results):
         np.testing.assert_allclose(values, response.sensitivity.values, rtol=1e-8)
 
 
-@pytest.mark.parametrize("exact", [True, False])
+@pytest.mark.parametrize("exact", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_conducting_touches_of_a_sheet(results, exact):
-    for point, values in results(touch=f"contrast = 5\nexact = {str(exact).lower()}"):
-        conductance, thickness = 0.5 * point.thickness, point.thickness
-        options = {"thickness": thickness, "contrast": 5.0, "linear": not exact}
-        theta = sensitivity_map(model_of(point), conductance, GRID, **options)
-        np.testing.assert_allclose(values, theta.values, rtol=1e-8)
+    for point, values in results(measurement=NEAREST, touch=f"contrast = 5\nexact = {str(exact).lower()}"):
+        touched = touched_cells(MESH, Bell(), GRID.places, thickness=point.thickness, contrast=5.0)
+        changes = touch_changes if exact else linear_changes
+        found = changes(model_of(point, number=10), 0.5 * point.thickness, touched)
+        np.testing.assert_allclose(values, np.linalg.norm(found, axis=1), rtol=1e-8)
 
 
-def test_a_place_that_cannot_be_told_is_infinite_and_counted(tmp_path, store_path):
-    lines = {"measurement": 'protocol = "two-terminal"\npairs = 2'}  # two voltages for a place and an amplitude
-    (tmp_path / "two.toml").write_text(changed(**lines) + '[scores]\nwanted = "localisation_error"', "utf-8")
-    data = run_study(read_study(tmp_path / "two.toml"), store_path)
+def test_a_place_that_cannot_be_told_is_infinite_and_counted(study, store_path, monkeypatch):
+    """Two voltages, measured again and again, for a place and an amplitude."""
+    measured = Point.measured
+
+    def two(point, current):
+        protocol = measured(point, current)
+        rows = np.arange(protocol.num_measurements) % 2
+        parts = protocol.drive_index[rows], protocol.measurement_index[rows]
+        return eqx.tree_at(lambda one: (one.drive_index, one.measurement_index), protocol, parts)
+
+    monkeypatch.setattr(Point, "measured", two)
+    data = run_study(study, store_path)
     assert np.isposinf(data.localisation_error_mean).all()
     assert np.isposinf(data.localisation_error_max).all()
     assert (data.localisation_lost == 1).all()
 
 
-def test_a_batch_factorises_once_and_calls_no_library(study):
-    shared, skin = batch._shared(study, study.points[0].shape), batch._varied(study.points[0], study.current)
-    skins, options = batch._stacked([skin] * 2), {"num_taxels": 5, "threshold": 0.7, "num_devices": 1}
+def test_a_batch_factorises_once_and_calls_no_library(study, tmp_path):
+    """With the loops of all scores there are fewer than twice those of maps alone."""
+    (tmp_path / "maps.toml").write_text(changed(measurement=NEAREST), "utf-8")
 
-    def compiled(*scores):
-        return batch._batch.lower(shared, skins, scores=scores, **options).compile().as_text() or ""
+    def compiled(study):
+        shared, skin = batch._shared(study, study.points[0].shape), batch._varied(study.points[0], study.current)
+        options = {"num_taxels": study.num_taxels, "threshold": study.threshold, "num_devices": 1}
+        lowered = batch._batch.lower(shared, batch._stacked([skin] * 2), scores=study.scores, **options)
+        return lowered.compile().as_text() or ""
 
-    maps, both = compiled("taxels"), compiled("taxels", "information")
-    assert "lapack" not in both
-    assert maps.count(" while(") < both.count(" while(") < 2 * maps.count(" while(")
+    maps, every = compiled(read_study(tmp_path / "maps.toml")), compiled(study)
+    assert "lapack" not in every
+    assert 1 < maps.count(" while(") < every.count(" while(") < 2 * maps.count(" while(")
 
 
 TWO_DEVICES = """

@@ -1,5 +1,7 @@
 """Virtual taxels: against angles worked out by hand, sums in NumPy, and what inner electrodes must do for a skin."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -151,7 +153,7 @@ def test_a_batch_of_layouts_gives_what_a_loop_gives(layouts, found):
     def find(changes, key):
         return find_taxels(changes, PLACES, CELL, num_taxels=20, key=key)
 
-    together = jax.vmap(find)(jnp.asarray(layouts), keys)
+    together = jax.tree.map(np.asarray, jax.jit(jax.vmap(find))(layouts, keys))
     for index, alone in enumerate(found):
         np.testing.assert_array_equal(together.labels[index], alone.labels)
         np.testing.assert_allclose(together.similarity[index], alone.similarity, rtol=1e-10)
@@ -163,20 +165,24 @@ def test_a_batch_of_layouts_gives_what_a_loop_gives(layouts, found):
 
 def test_similarity_has_a_derivative(layouts):
     """Along the gradient against a central difference, clusters held; a silent place, which has no direction, too."""
-    changes = jnp.asarray(1e6 * layouts[0]).at[5].set(0)
+    changes = 1e6 * layouts[0]
+    changes[5] = 0
 
+    @jax.jit
+    @partial(jax.value_and_grad, has_aux=True)
     def mean_square(changes):
         taxels = find_taxels(changes, PLACES, CELL, num_taxels=20, key=jax.random.key(0))
         return jnp.mean(taxels.similarity**2), taxels.labels
 
-    slope, labels = jax.jit(jax.grad(mean_square, has_aux=True))(changes)
+    (_, labels), slope = mean_square(changes)
     # The direction of a silent place is not continuous.
-    steepest = slope.at[5].set(0) / jnp.linalg.norm(slope)
+    steepest = np.array(slope) / np.linalg.norm(slope)
+    steepest[5] = 0
     step = 1e-3
-    (above, one), (below, other) = (mean_square(changes + sign * step * steepest) for sign in (1, -1))
+    (above, one), (below, other) = (mean_square(changes + sign * step * steepest)[0] for sign in (1, -1))
     np.testing.assert_array_equal(one, labels)
     np.testing.assert_array_equal(other, labels)
-    assert float(jnp.sum(slope * steepest)) == pytest.approx(float(above - below) / (2 * step), rel=1e-6)
+    assert np.sum(slope * steepest) == pytest.approx((float(above) - float(below)) / (2 * step), rel=1e-6)
 
 
 @pytest.mark.parametrize(

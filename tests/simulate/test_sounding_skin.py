@@ -150,12 +150,12 @@ def test_pieces_of_a_calibration_do_not_show(small, monkeypatch):
     np.testing.assert_allclose(parts.samples, whole.samples, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("multiplexed", [True, False])
+@pytest.mark.parametrize("multiplexed", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_blocks_add_up_to_the_transfer_function(multiplexed):
     # Whatever the source's spectrum was, two channels differ by the ratio of their transfer functions.
     made = SoundingSkin(KEY, microphone_grid(2), readout=Readout(multiplexed=multiplexed))
     place = (0.03, -0.06)
-    recording = tap(made, KEY, place, repeats=2, duration=0.5, noise=False)
+    recording = tap(made, KEY, place, repeats=2, duration=1.0, noise=False)
     spectrum = np.fft.rfft(recording.samples)
     frequencies = np.fft.rfftfreq(recording.samples.shape[1], 1 / recording.rate)
     inside = (frequencies > 80) & (frequencies < 900)

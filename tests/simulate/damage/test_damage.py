@@ -4,7 +4,6 @@ import dataclasses
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -31,12 +30,17 @@ def disk_model(cut: Cut, num_points: int = 900) -> ForwardModel:
     return ForwardModel(mesh, BoundaryElectrodes(ring(0.05, 16), 0.008, 1e-3), adjacent(16, current=1e-3))
 
 
+@pytest.fixture(scope="module")
+def slit() -> ForwardModel:
+    return disk_model(Cut([(-0.01, 0.0), (0.01, 0.0)]), 400)
+
+
 def test_a_cut_right_through_lets_nothing_pass():
     cut = Cut([(0.003, -HEIGHT), (0.003, HEIGHT)])
     model = strip(cut)
     before, after = (
         float(model.voltages(values)[0])
-        for values in (jnp.ones(model.mesh.num_cells), cut.conductivity(model.mesh, 1.0))
+        for values in (np.ones(model.mesh.num_cells), cut.conductivity(model.mesh, 1.0))
     )
     assert before == pytest.approx(WIDTH / HEIGHT, rel=0.02)
     # Next to nothing conducts, over a band of one or two cells' width.
@@ -49,7 +53,7 @@ def test_a_slit_half_way_across_resists_as_the_formula_says():
     model = strip(cut, 4000)
     before, after = (
         float(model.voltages(values)[0])
-        for values in (jnp.ones(model.mesh.num_cells), cut.conductivity(model.mesh, 1.0))
+        for values in (np.ones(model.mesh.num_cells), cut.conductivity(model.mesh, 1.0))
     )
     assert (after - before) * HEIGHT == pytest.approx(
         4 * HEIGHT / np.pi * np.log(np.sqrt(2)), rel=0.12
@@ -80,9 +84,8 @@ def test_cuts_lie_within_and_are_as_long_as_asked():
 
 
 @pytest.mark.parametrize("kind", FAULTS)
-def test_a_fault_is_in_the_channels_of_its_electrode(kind):
-    cut = Cut([(-0.01, 0.0), (0.01, 0.0)])
-    model = disk_model(cut, 600).with_protocol(two_terminal(16, current=1e-3))
+def test_a_fault_is_in_the_channels_of_its_electrode(slit, kind):
+    model = slit.with_protocol(two_terminal(16, current=1e-3))
     change = ElectrodeFault(5, kind).changes(jax.random.key(0), model, 1e-2, np.arange(30) / 10)
     rest = np.asarray(model.voltages(1e-2))
     own = model.protocol.channels_touching(5)
@@ -92,18 +95,17 @@ def test_a_fault_is_in_the_channels_of_its_electrode(kind):
         assert (change[:, own].std(axis=0) > 0.1 * np.abs(rest[own])).all()
 
 
-def test_a_torn_wire_may_read_a_rail():
-    model = disk_model(Cut([(-0.01, 0.0), (0.01, 0.0)]), 600)
-    rest = np.asarray(model.voltages(1e-2))
-    read = rest + ElectrodeFault(2, "torn", rail=4.0).changes(jax.random.key(0), model, 1e-2, np.arange(3.0))
-    own = model.protocol.channels_touching(2)
+def test_a_torn_wire_may_read_a_rail(slit):
+    rest = np.asarray(slit.voltages(1e-2))
+    read = rest + ElectrodeFault(2, "torn", rail=4.0).changes(jax.random.key(0), slit, 1e-2, np.arange(3.0))
+    own = slit.protocol.channels_touching(2)
     np.testing.assert_allclose(read[:, own], 4.0)
     np.testing.assert_allclose(read[:, ~own], np.tile(rest[~own], (3, 1)))
 
 
 def test_a_recording_goes_on_through_its_mishaps():
     cut = Cut([(-0.012, 0.01), (0.012, 0.016)])
-    model, film = disk_model(cut, 600), dataclasses.replace(material("velostat"), noise=0.0)
+    model, film = disk_model(cut, 400), dataclasses.replace(material("velostat"), noise=0.0)
     skin = PressedSkin(jax.random.key(0), model, film)
     damaged = eqx.tree_at(lambda one: one.conductivity, skin, cut.conductivity(model.mesh, skin.conductivity))
     values, glued = mended(model.mesh, skin.conductivity, cut, film, 1.05)

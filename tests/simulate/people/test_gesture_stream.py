@@ -3,15 +3,27 @@
 import jax
 import numpy as np
 import pytest
-from gesture_skin import RATE, SHEET, gestures_and_stream
+from gesture_skin import PLACES, RATE, SHEET
 
-from jeit.simulate import Person, simulate_gesture_stream
+from jeit.electrodes import PointElectrodes
+from jeit.forward import ForwardModel
+from jeit.protocol import reference_electrode
+from jeit.simulate import Person, PressedSkin, material, simulate_gesture_stream
+
+KEY = jax.random.key(0)
 
 
-def test_the_skin_changes_where_it_is_touched():
-    _, stream = gestures_and_stream()
+@pytest.fixture(scope="module")
+def skin() -> PressedSkin:
+    model = ForwardModel(SHEET.mesh(num_points=100), PointElectrodes(PLACES), reference_electrode(8, current=1.8e-3))
+    return PressedSkin(KEY, model, material("conductive fabric"))
+
+
+def test_the_skin_changes_where_it_is_touched(skin):
+    people = [Person.draw(key) for key in jax.random.split(jax.random.key(1), 2)]
+    stream = simulate_gesture_stream(jax.random.key(3), skin, SHEET, people, 3)
     assert stream.voltages.shape == (len(stream.seconds), 48)
-    assert len(stream.gesture) == len(stream.person) == len(stream.onset) == len(stream.offset) == 6
+    assert len(stream.gesture) == len(stream.person) == len(stream.onset) == len(stream.offset) == 3
     np.testing.assert_allclose(np.diff(stream.seconds), 1 / RATE)
     assert stream.onset[0] >= 2.0
     assert (stream.onset[1:] - stream.offset[:-1] >= 1.0).all()
@@ -31,18 +43,8 @@ def test_the_skin_changes_where_it_is_touched():
         ({"pause": -1.0}, "pause must be"),
     ],
 )
-def test_what_cannot_be_is_said(change, said):
-    key = jax.random.key(0)
-    given = {"key": key, "skin": None, "people": [Person.draw(key)], "number": 2, "pause": 1.0} | change
-    if "skin" not in change:
-        from jeit.electrodes import PointElectrodes
-        from jeit.forward import ForwardModel
-        from jeit.protocol import adjacent
-        from jeit.simulate import PressedSkin, material
-
-        places = [[0.1, 0.0], [0.0, 0.05], [-0.1, 0.0], [0.0, -0.05]]
-        model = ForwardModel(SHEET.mesh(num_points=60), PointElectrodes(np.array(places)), adjacent(4))
-        given["skin"] = PressedSkin(key, model, material("conductive fabric"))
+def test_what_cannot_be_is_said(skin, change, said):
+    given = {"key": KEY, "skin": skin, "people": [Person.draw(KEY)], "number": 2, "pause": 1.0} | change
     with pytest.raises(ValueError, match=said):
         simulate_gesture_stream(
             given["key"], given["skin"], SHEET, given["people"], given["number"], pause=given["pause"]

@@ -1,6 +1,7 @@
 """People who touch: each in a way of their own, as Table I has it; sets of what the skin reads, made and kept."""
 
 from dataclasses import replace
+from functools import cache
 
 import jax
 import numpy as np
@@ -27,6 +28,12 @@ def skin(own=STILL):
     places = np.vstack([perimeter(Rectangle(0.3, 0.18), 8, start=0.06), [[0.0, 0.0]]])
     electrodes = PointElectrodes(places)
     return PressedSkin(KEY, ForwardModel(SHEET.mesh(num_points=250), electrodes, reference_electrode(8)), own)
+
+
+@cache
+def still_skin():
+    """One for all that do not change it."""
+    return skin()
 
 
 def motions(gesture, number=40):
@@ -96,7 +103,7 @@ def test_the_same_key_is_the_same_touch():
 
 def test_recordings_together_are_those_of_each():
     """Without noise and drift, which have keys of their own."""
-    still = skin()
+    still = still_skin()
     seconds = np.arange(6) / 60
     press = MovingPress(Disc(0.03), [0, 1, 2, 2, 1, 0], (0.05, 0.02))
     two = [press, MovingPress(Disc(0.02), [0, 0, 1, 1, 0, 0], (-0.06, 0.0))]
@@ -137,11 +144,14 @@ def test_a_set_is_made_and_kept(tmp_path):
         (lambda: Person.draw(KEY).touch(KEY, "tap", Disk(0.02)), "60 mm wide"),
         (lambda: Person.draw(KEY).touch(KEY, "tap", SHEET, rate=0), "rate must be"),
         (lambda: simulate_gestures(KEY, None, SHEET, [Person.draw(KEY)], 1), "skin must be"),
-        (lambda: simulate_gestures(KEY, skin(), SHEET, [], 1), "people: give one"),
-        (lambda: simulate_gestures(KEY, skin(), SHEET, [Person.draw(KEY)], 0), "each must be"),
-        (lambda: simulate_gestures(KEY, skin(), SHEET, [Person.draw(KEY)], 1, gestures=["poke"]), r"gestures\[0\]"),
-        (lambda: simulate_gestures(KEY, skin(), SHEET, [None], 1), r"people\[0\] must be"),
-        (lambda: skin().record_each(KEY, [1]), r"recordings\[0\]"),
+        (lambda: simulate_gestures(KEY, still_skin(), SHEET, [], 1), "people: give one"),
+        (lambda: simulate_gestures(KEY, still_skin(), SHEET, [Person.draw(KEY)], 0), "each must be"),
+        (
+            lambda: simulate_gestures(KEY, still_skin(), SHEET, [Person.draw(KEY)], 1, gestures=["poke"]),
+            r"gestures\[0\]",
+        ),
+        (lambda: simulate_gestures(KEY, still_skin(), SHEET, [None], 1), r"people\[0\] must be"),
+        (lambda: still_skin().record_each(KEY, [1]), r"recordings\[0\]"),
     ],
 )
 def test_what_cannot_be_is_said(action, said):
