@@ -170,6 +170,7 @@ def test_touches_are_exact_whatever_the_contacts(touches, contacts):
     assert max(map(miss, found, changes_of(model, touched))) < 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contacts", ["tight", "open", "unlike"])
 def test_touches_of_a_known_skin_are_exact_whatever_the_contacts(touches, contacts):
     """With a model in NumPy, whose every operation would be compiled for itself otherwise."""
