@@ -11,21 +11,21 @@ from jeit.protocol import adjacent
 
 def _boundary(unit: float) -> ForwardModel:
     electrodes = BoundaryElectrodes(unit * ring(0.1, 8, start_angle=0.3), 0.03 * unit, 0.01 * unit * UNLIKE)
-    return ForwardModel(disk(0.1 * unit, num_points=90), electrodes, adjacent(8, current=1e-3))
+    return ForwardModel(disk(0.1 * unit, num_points=60), electrodes, adjacent(8, current=1e-3))
 
 
 def _inside(unit: float) -> ForwardModel:
     electrodes = SheetDiscs(0.6 * unit * ring(0.1, 6), 0.02 * unit, 1e-4 * unit**2 * UNLIKE[:6])
-    return ForwardModel(disk(0.1 * unit, num_points=120), electrodes, adjacent(6, current=1e-3))
+    return ForwardModel(disk(0.1 * unit, num_points=90), electrodes, adjacent(6, current=1e-3))
 
 
 def _point(unit: float) -> ForwardModel:
     position = 0.9 * ring(0.1, 8, start_angle=0.2) + [1.3e-3, 0.7e-3]
-    return ForwardModel(disk(0.1 * unit, num_points=90), PointElectrodes(unit * position), adjacent(8, current=1e-3))
+    return ForwardModel(disk(0.1 * unit, num_points=60), PointElectrodes(unit * position), adjacent(8, current=1e-3))
 
 
 def _face(unit: float) -> ForwardModel:
-    mesh = layer(rectangle(0.1 * unit, 0.08 * unit, num_points=60), 0.01 * unit, 1)
+    mesh = layer(rectangle(0.1 * unit, 0.08 * unit, num_points=40), 0.01 * unit, 1)
     position = [[x, y, 0.01] for x in (-0.03, 0.0, 0.03) for y in (-0.02, 0.02)]
     electrodes = FaceDiscs(unit * np.array(position), 0.012 * unit, 0.01 * unit * UNLIKE[:6])
     return ForwardModel(mesh, electrodes, adjacent(6, current=1e-3))

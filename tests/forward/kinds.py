@@ -19,7 +19,7 @@ from jeit.protocol import adjacent, trigonometric
 
 
 def _sheet():
-    return disk(0.1, num_points=250)
+    return disk(0.1, num_points=60)
 
 
 def _boundary():
@@ -50,7 +50,7 @@ def _point():
 
 
 def _node():
-    mesh = rectangle(0.2, 0.1, num_points=200)
+    mesh = rectangle(0.2, 0.1, num_points=60)
     corners = np.asarray(mesh.facets[:, 0])
     return ForwardModel(mesh, NodeElectrodes(corners[:: len(corners) // 8][:8]), adjacent(8, current=1e-3))
 
@@ -62,7 +62,7 @@ def _facet():
 
 
 def _face():
-    mesh = layer(rectangle(0.1, 0.08, num_points=150), 0.01, 2)
+    mesh = layer(rectangle(0.1, 0.08, num_points=60), 0.01, 1)
     corners = [[x, y, float(mesh.points[:, 2].max())] for x in (-0.03, 0.0, 0.03) for y in (-0.02, 0.02)]
     centre = np.asarray(mesh.points[:, :2].mean(axis=0))
     position = np.array(corners) + np.array([*centre, 0])
@@ -72,7 +72,8 @@ def _face():
 def _patch():
     mesh = cylinder(0.1, 0.08, num_points=500)
     middle = float(mesh.points[:, 2].mean())
-    electrodes = FacePatches(ring(0.1, 6, height=middle), 0.04, 0.04, 1e-3)
+    # Not at the angles of nodes: the wall's normal there is that of one facet beside it or of the other.
+    electrodes = FacePatches(ring(0.1, 6, height=middle, start_angle=0.03), 0.04, 0.04, 1e-3)
     return ForwardModel(mesh, electrodes, adjacent(6, current=1e-3))
 
 

@@ -1,11 +1,14 @@
-"""Two engines, one formula: what NumPy answers at once is what the compiled program answers, to rounding."""
+"""Two engines, one formula: what NumPy answers at once is what the compiled program answers, to rounding.
+
+For conductivities of every shape and type, whose Jacobians are beside those of plain autodiff; alone and in batches.
+"""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from kinds import MODELS, QUICK
+from kinds import MODELS
 
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
@@ -17,47 +20,92 @@ from jeit_solvers import ConjugateGradient
 QUANTITIES = ("voltages", "transfer_impedance", "potentials", "fields", "voltages_and_jacobian")
 
 
-@pytest.fixture(
-    params=[name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in MODELS], scope="module"
-)
+def models(*quick):
+    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in MODELS]
+
+
+# Of other kinds, test_derivatives has the compiled voltages beside NumPy's.
+@pytest.fixture(params=models("boundary", "point"), scope="module")
 def model(request):
     return MODELS[request.param]()
 
 
-def conductivities(model):
-    """Per cell, per node, complex, and tensors."""
-    random = np.random.default_rng(3)
-    cells, nodes, axes = model.mesh.num_cells, model.mesh.num_points, model.mesh.dimension
-    skewed = 0.2 * random.normal(size=(cells, axes, axes))
-    return {
-        "cells": np.exp(0.5 * random.normal(size=cells)),
-        "nodes": np.exp(0.5 * random.normal(size=nodes)),
-        "complex": np.exp(0.3 * random.normal(size=cells)) * (1 + 0.4j),
-        "tensors": np.eye(axes) + skewed @ np.swapaxes(skewed, 1, 2),
-    }
+@pytest.fixture(params=models("boundary"), scope="module")
+def known(request):
+    """A model for programs in which its electrodes have values: there one kind stands for the others."""
+    return MODELS[request.param]()
 
 
-@eqx.filter_jit
-def compiled(model, quantity, conductivity):
-    return getattr(model, quantity)(conductivity)
+def uneven(size):
+    return np.exp(0.5 * np.random.default_rng(3).normal(size=size))
 
 
-@pytest.mark.parametrize("kind", ["cells", "nodes", "complex", "tensors"])
-def test_numpy_and_compiled_code_agree(model, kind):
-    conductivity = conductivities(model)[kind]
-    quantities = QUANTITIES[:-1] if kind == "tensors" else QUANTITIES
-    for quantity in quantities if kind == "cells" else quantities[-1:]:
-        at_once = getattr(model, quantity)(conductivity)
-        expected = jax.tree.leaves(compiled(model, quantity, conductivity))
-        for one, other in zip(jax.tree.leaves(at_once), expected, strict=True):
-            assert isinstance(one, jax.Array)
-            assert one.dtype == other.dtype
-            np.testing.assert_allclose(one, other, rtol=0, atol=1e-12 * np.abs(other).max())
+def assert_same(found, expected, tolerance=1e-12):
+    """To so much of the largest number of each array."""
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        assert isinstance(one, jax.Array)
+        assert one.dtype == other.dtype
+        np.testing.assert_allclose(one, other, rtol=0, atol=tolerance * np.abs(other).max())
+
+
+def test_numpy_and_compiled_code_agree(model):
+    """One at a time, and in a batch: one program for all quantities."""
+    batch = uneven(model.mesh.num_cells) * np.array([[0.5], [1.0], [2.0]])
+
+    def everything(conductivity):
+        return [getattr(model, quantity)(conductivity) for quantity in QUANTITIES]
+
+    in_batches = not model.electrodes.is_point
+    together = jax.jit(jax.vmap(everything))(batch) if in_batches else jax.jit(everything)(batch[0])
+    for k, one in enumerate(batch if in_batches else batch[:1]):
+        expected = jax.tree.map(lambda part, k=k: np.asarray(part)[k], together) if in_batches else together
+        assert_same(everything(one), expected)
+
+
+@pytest.mark.slow
+def test_compiled_code_equals_code_that_jax_runs_step_by_step(model):
+    conductivity = jnp.asarray(uneven(model.mesh.num_cells))
+    with jax.disable_jit():
+        eager = model.voltages(conductivity)
+    assert_same(model.voltages(conductivity), eager)
+
+
+def test_one_number_per_node(known):
+    nodal = uneven(known.mesh.num_points)
+    found = known.voltages_and_jacobian(nodal)
+    of_cells = np.asarray(known.voltages(nodal[np.asarray(known.mesh.cells)].mean(axis=1)))
+    assert_same(found[0], of_cells, 1e-13)
+    both = jax.jit(lambda at: (known.voltages_and_jacobian(at), jax.jacrev(known.voltages)(at)))
+    together, plain = both(nodal)
+    assert_same(found, together)
+    assert_same(found[1], plain)
+
+
+def test_complex_numbers(known):
+    admittivity = uneven(known.mesh.num_cells) * np.exp(0.4j * np.linspace(0, 1, known.mesh.num_cells))
+    both = jax.jit(lambda at: (known.voltages_and_jacobian(at), jax.jacfwd(known.voltages, holomorphic=True)(at)))
+    found, (together, plain) = known.voltages_and_jacobian(admittivity), both(admittivity)
+    assert_same(found, together)
+    assert_same(found[1], plain)
+
+
+def test_tensors(known):
+    axes, cells = known.mesh.dimension, known.mesh.num_cells
+    equal = uneven(cells)
+    assert_same(known.voltages(equal[:, None, None] * np.eye(axes)), np.asarray(known.voltages(equal)), 1e-13)
+    skewed, direction = 0.2 * np.random.default_rng(4).normal(size=(2, cells, axes, axes))
+    tensors, direction = np.eye(axes) + skewed @ np.swapaxes(skewed, 1, 2), direction @ np.swapaxes(direction, 1, 2)
+    voltages, derivative = jax.jit(lambda at: jax.jvp(known.voltages, (at,), (direction,)))(tensors)
+    assert_same(known.voltages(tensors), voltages)
+    ahead, behind = (np.asarray(known.voltages(tensors + step * direction)) for step in (1e-4, -1e-4))
+    np.testing.assert_allclose((ahead - behind) / 2e-4, derivative, rtol=0, atol=1e-7 * np.abs(derivative).max())
+    with pytest.raises(ValueError, match="for tensors use"):
+        known.jacobian(tensors)
 
 
 @pytest.fixture(scope="module")
 def parts():
-    return Disk(0.1).mesh(num_points=200), BoundaryElectrodes(ring(0.1, 8), 0.02, 1e-3), adjacent(8)
+    return Disk(0.1).mesh(num_points=60), BoundaryElectrodes(ring(0.1, 8), 0.02, 1e-3), adjacent(8)
 
 
 def test_what_has_values_is_not_compiled(parts, caplog):
@@ -67,8 +115,8 @@ def test_what_has_values_is_not_compiled(parts, caplog):
         model.with_electrodes(parts[1].with_contact_impedance(2e-3)).voltages(np.full(model.mesh.num_cells, 2.0))
     assert "Compiling" not in caplog.text
     with jax.log_compiles(), caplog.at_level("WARNING"):
-        jax.jit(lambda s: model.voltages(s))(1.0)
-    assert "Compiling" in caplog.text
+        jax.jit(lambda number: number + 1)(1.0)
+    assert "Compiling" in caplog.text, "what is compiled is in the log"
 
 
 def test_a_solver_that_is_asked_for_is_used(parts):
@@ -92,20 +140,10 @@ def test_other_electrodes_are_not_taken_for_the_same(parts):
 def test_integrals_that_a_program_asked_for_first_serve_outside_it(parts):
     """Of electrodes with values they are worked out once, in NumPy, and belong to no program."""
     model = ForwardModel(*parts, solver="cholesky")
-    conductivity = jnp.linspace(1.0, 2.0, model.mesh.num_cells)
-    inside = jax.jit(lambda values: model.voltages_and_jacobian(values))(conductivity)
-    traced = compiled(model, "voltages_and_jacobian", conductivity)
-    for results in (model.voltages_and_jacobian(conductivity), traced):
-        for one, other in zip(results, inside, strict=True):
-            np.testing.assert_allclose(one, other, rtol=0, atol=1e-13 * np.abs(other).max())
-
-
-def test_derivatives_go_through_the_compiled_engine(parts):
-    model = ForwardModel(*parts)
-    conductivity = jnp.linspace(1.0, 2.0, model.mesh.num_cells)
-    _, jacobian = model.voltages_and_jacobian(conductivity)
-    reverse = jax.jacrev(model.voltages)(conductivity)
-    np.testing.assert_allclose(jacobian, reverse, rtol=0, atol=1e-11 * np.abs(reverse).max())
+    conductivity = np.linspace(1.0, 2.0, model.mesh.num_cells)
+    assert jax.eval_shape(lambda values: model.voltages(values), conductivity).shape == (40,)
+    expected = ForwardModel(*parts).voltages(conductivity)
+    assert_same(model.voltages(conductivity), expected)
 
 
 class InJaxAlone(BoundaryElectrodes):

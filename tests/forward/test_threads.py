@@ -18,7 +18,7 @@ THREADS = 8
 
 @eqx.filter_jit
 def compiled(model, conductivity):
-    return model.voltages(conductivity), model.jacobian(conductivity)
+    return model.voltages_and_jacobian(conductivity)
 
 
 def assert_as_alone(shared: Callable[[int], Any], alone: Callable[[int], Any], turns: int = THREADS) -> None:
@@ -37,7 +37,7 @@ def assert_as_alone(shared: Callable[[int], Any], alone: Callable[[int], Any], t
         assert jax.tree.all(jax.tree.map(np.array_equal, one, expected[number]))
 
 
-@pytest.fixture(params=["boundary", "face"], scope="module")
+@pytest.fixture(params=["boundary", pytest.param("face", marks=pytest.mark.slow)], scope="module")
 def make(request):
     return lambda: KINDS[request.param](1.0)
 

@@ -49,8 +49,10 @@ def dense(pattern, values):
 
 
 def _from_dense(matrix):
-    pattern, values = SparsityPattern.from_matrix(matrix)
-    return pattern, values, None
+    """As of `SparsityPattern.from_matrix`, but added up in NumPy."""
+    rows, columns = np.nonzero(np.tril(matrix))
+    pattern = SparsityPattern.from_entries(rows, columns, len(matrix))
+    return pattern, jax.device_put(pattern.assemble(matrix[rows, columns])), None
 
 
 def disk():
@@ -80,7 +82,7 @@ def diagonal():
 
 
 def disconnected():
-    blocks = [np.asarray(case()[0].to_dense(case()[1])) for case in (chain, small_dense, single_node, chain)]
+    blocks = [dense(*case()[:2]) for case in (chain, small_dense, single_node, chain)]
     n = sum(len(block) for block in blocks)
     whole, start = np.zeros((n, n)), 0
     for block in blocks:

@@ -7,11 +7,15 @@ import pytest
 
 from jeit_solvers.dense.cholesky import inverse_cholesky
 
+# Row by row; in halves, unrolled; in halves, row by row; halves of halves; block rows of either width, with padding.
+ROUTES = [(1, 1), (3, 7), (20, 13), (2, 29), (1, 70), (1, 130), (1, 300)]
+QUICK = [*((route, np.float64) for route in ROUTES), ((2, 29), np.complex128), ((20, 13), np.float32)]
+SLOW = [(route, dtype) for route in ROUTES for dtype in (np.float32, np.complex128) if (route, dtype) not in QUICK]
 
-# Row by row; unrolled; unrolled halves; block rows with padding; block rows in block rows, with padding.
-@pytest.mark.parametrize(("batch", "size"), [(1, 1), (3, 7), (20, 13), (2, 29), (1, 70)])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.complex128])
-def test_inverse_factor(batch, size, dtype):
+
+@pytest.mark.parametrize(("route", "dtype"), [*QUICK, *(pytest.param(*one, marks=pytest.mark.slow) for one in SLOW)])
+def test_inverse_factor(route, dtype):
+    batch, size = route
     rng = np.random.default_rng(size)
     square = rng.standard_normal((batch, size, size))
     matrices = square @ square.transpose(0, 2, 1) + size * np.eye(size)
@@ -27,8 +31,15 @@ def test_inverse_factor(batch, size, dtype):
     np.testing.assert_allclose(unity, np.broadcast_to(np.eye(size), unity.shape), rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize(("batch", "size"), [(20, 12), (2, 13)])
-@pytest.mark.parametrize("dtype", [np.float64, np.complex128])
+@pytest.mark.parametrize(
+    ("batch", "size", "dtype"),
+    [
+        (20, 12, np.float64),
+        (2, 13, np.complex128),
+        pytest.param(20, 12, np.complex128, marks=pytest.mark.slow),
+        pytest.param(2, 13, np.float64, marks=pytest.mark.slow),
+    ],
+)
 def test_indefinite_matrices_give_nan_and_leave_the_others_alone(batch, size, dtype):
     matrices = np.broadcast_to(np.eye(size, dtype=dtype), (batch, size, size)).copy()
     matrices[1, -1, -1] = -1

@@ -40,96 +40,108 @@ def as_type(values, dtype):
     return values.astype(dtype)
 
 
-ALL_TYPES = ("disk",)
-SOLVED = [
-    (case, dtype)
-    for case in sparse_problems.PROBLEMS
-    for dtype in TOLERANCE
-    if dtype == "float64" or case.__name__ in ALL_TYPES
+# Compiled, problems take a second each: quick ones have fronts in stages, of all sizes, one alone, and parts apart.
+QUICK = (sparse_problems.disk, sparse_problems.disconnected, sparse_problems.diagonal)
+COMPILED = [
+    pytest.param(case, "float64", marks=() if case in QUICK else pytest.mark.slow) for case in sparse_problems.PROBLEMS
 ]
+COMPILED += [(sparse_problems.disk, "float32"), (sparse_problems.disk, "complex128")]
+
+
+def name_of(value):
+    return getattr(value, "__name__", value)
+
+
+def everything(plan, values, vectors, rows):
+    """Of one factorisation: itself, solutions, bᵀA⁻¹b, half-solutions, entries and a root of the inverse."""
+    factor = factorise(plan, values)
+    form, half = quadratic_form(plan, factor, vectors), half_solve(plan, factor, vectors)
+    inverse = inverse_entries(plan, factor), inverse_root(plan, factor, rows)
+    return factor, solve(plan, factor, vectors), form, half, *inverse
 
 
 @jax.jit
-def everything(plan, values, vectors):
-    factor = factorise(plan, values)
-    form, half = quadratic_form(plan, factor, vectors), half_solve(plan, factor, vectors)
-    return factor.positive_definite, solve(plan, factor, vectors), form, half
+def compiled(*arguments):
+    factor, *found = everything(*arguments)
+    return factor.positive_definite, *found
 
 
-@pytest.mark.parametrize(("case", "dtype"), SOLVED, ids=lambda value: getattr(value, "__name__", value))
-def test_solves_every_problem_to_roundoff(case, dtype):
+def assert_solves_to_roundoff(case, dtype, engine):
     pattern, values, coordinates = case()
-    values = as_type(values, dtype)
+    values = as_type(np.asarray(values), dtype)
     plan = analyse(pattern, coordinates)
-    vectors = jax.device_put(np.random.default_rng(0).normal(size=(pattern.size, 5)).astype(dtype))
-    positive_definite, solution, form, half = everything(plan, values, vectors)
-    assert positive_definite
+    vectors = np.random.default_rng(0).normal(size=(pattern.size, 5)).astype(dtype)
+    work = everything if engine is on_host else compiled
+    verdict, *found = work(*engine((plan, values, vectors, np.eye(plan.num_pivots, dtype=values.dtype))))
+    assert engine is on_host or verdict
+    assert all(isinstance(one, np.ndarray) == (engine is on_host) for one in found)
+    solution, form, half, entries, root = map(np.asarray, found)
     assert solution.dtype == values.dtype
-    matrix, solution, form, half, vectors = map(np.asarray, (dense(pattern, values), solution, form, half, vectors))
+    matrix = dense(pattern, values)
     residual = np.linalg.norm(matrix @ solution - vectors) / np.linalg.norm(matrix) / np.linalg.norm(solution)
     assert residual < TOLERANCE[dtype]
     # Forward errors may be larger, by the condition numbers, which are below 1e3.
     loose = 1e3 * TOLERANCE[dtype]
     np.testing.assert_allclose(form, vectors.T @ solution, rtol=0, atol=loose * abs(form).max())
     np.testing.assert_allclose(half.T @ half, form, rtol=0, atol=loose * abs(form).max())
-
-
-def entries_and_root(plan, values, rows):
-    factor = factorise(plan, values)
-    return inverse_entries(plan, factor), inverse_root(plan, factor, rows)
-
-
-@pytest.mark.parametrize("engine", [on_host, on_device], ids=["numpy", "jax"])
-@pytest.mark.parametrize("case", sparse_problems.PROBLEMS, ids=lambda case: case.__name__)
-def test_entries_and_root_of_the_inverse_are_those_of_the_dense_one(case, engine):
-    pattern, values, coordinates = case()
-    inverse = np.linalg.inv(dense(pattern, values))
-    pattern, plan, values = engine((pattern, analyse(pattern, coordinates), values))
-    work = entries_and_root if engine is on_host else jax.jit(entries_and_root)
-    entries, root = work(plan, values, engine(np.eye(plan.num_pivots)))
-    assert isinstance(entries, np.ndarray) == (engine is on_host)
-    least = 1e-12 * abs(inverse).max()
-    np.testing.assert_allclose(
-        entries, inverse[np.asarray(pattern.rows), np.asarray(pattern.columns)], rtol=0, atol=least
-    )
-    root = np.asarray(root)
+    inverse = np.linalg.inv(matrix)
+    least = loose * abs(inverse).max() if dtype == "float32" else 1e-12 * abs(inverse).max()
+    rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
+    np.testing.assert_allclose(entries, inverse[rows, columns], rtol=0, atol=least)
     np.testing.assert_allclose(root @ root.T, inverse, rtol=0, atol=least)
+
+
+@pytest.mark.parametrize("case", sparse_problems.PROBLEMS, ids=name_of)
+def test_numpy_solves_every_problem_to_roundoff(case):
+    assert_solves_to_roundoff(case, "float64", on_host)
+    if case is sparse_problems.disk:
+        assert_solves_to_roundoff(case, "complex128", on_host)
+
+
+@pytest.mark.parametrize(("case", "dtype"), COMPILED, ids=name_of)
+def test_compiled_code_solves_problems_to_roundoff(case, dtype):
+    assert_solves_to_roundoff(case, dtype, on_device)
 
 
 def test_the_inverse_has_entries_where_elements_have_nodes():
     points, cells = sparse_problems.disk_cells(30)
-    pattern, values, _ = sparse_problems.from_cells(points, cells)
+    pattern, values, _ = on_host(sparse_problems.from_cells(points, cells))
     inverse = np.linalg.inv(dense(pattern, values))
-    plan = analyse(pattern, points)
+    plan = on_host(analyse(pattern, points))
     between = pattern.entries_between(inverse_entries(plan, factorise(plan, values)))
     row, column = np.tril_indices(3)
     np.testing.assert_allclose(between, inverse[cells[:, row], cells[:, column]].T, rtol=1e-11)
 
 
 def test_roots_are_refused_of_rows_of_another_order():
-    pattern, values, coordinates = sparse_problems.disk()
-    plan = analyse(pattern, coordinates)
+    pattern, values, coordinates = on_host(sparse_problems.disk())
+    plan = on_host(analyse(pattern, coordinates))
     with pytest.raises(ValueError, match="inverse_root: rows"):
-        inverse_root(plan, factorise(plan, values), jnp.ones((plan.num_pivots + 1, 2)))
+        inverse_root(plan, factorise(plan, values), np.ones((plan.num_pivots + 1, 2)))
 
 
-def test_agrees_with_superlu_on_a_large_disk():
+@pytest.mark.parametrize("engine", [on_host, pytest.param(on_device, marks=pytest.mark.slow)], ids=["numpy", "jax"])
+def test_agrees_with_superlu_on_a_large_disk(engine):
     points, cells = sparse_problems.disk_cells(1500)
     pattern, values, _ = sparse_problems.from_cells(points, cells)
     vectors = np.random.default_rng(0).standard_normal((pattern.size, 3))
     expected = splu(pattern.to_scipy(values).tocsc()).solve(vectors)
-    plan = analyse(pattern, points)
-    solution = jax.jit(lambda p, v, b: solve(p, factorise(p, v), b))(plan, values, jnp.asarray(vectors))
+
+    def solved(plan, values, vectors):
+        return solve(plan, factorise(plan, values), vectors)
+
+    work = solved if engine is on_host else jax.jit(solved)
+    solution = work(*engine((analyse(pattern, points), values, vectors)))
     np.testing.assert_allclose(solution, expected, rtol=0, atol=1e-12 * abs(expected).max())
 
 
 def test_one_vector_is_a_column_and_jit_equals_eager():
     pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
     plan = analyse(pattern, coordinates)
-    vectors = jax.random.normal(jax.random.key(0), (pattern.size, 5))
-    _, solution, _, _ = everything(plan, values, vectors)
-    eager = solve(plan, factorise(plan, values), vectors[:, 0])
-    np.testing.assert_allclose(eager, solution[:, 0], rtol=0, atol=1e-13 * abs(eager).max())
+    vector = np.random.default_rng(0).normal(size=pattern.size)
+    eager = np.asarray(solve(plan, factorise(plan, values), jnp.asarray(vector)))
+    both = jax.jit(lambda plan, values, vectors: solve(plan, factorise(plan, values), vectors))
+    np.testing.assert_allclose(eager, both(plan, values, vector[:, None])[:, 0], rtol=0, atol=1e-13 * abs(eager).max())
 
 
 def test_one_executable_serves_all_values():
@@ -141,32 +153,46 @@ def test_one_executable_serves_all_values():
     assert jitted._cache_size() == 1
 
 
-def test_batches_of_matrices_equal_a_loop():
-    pattern, values, coordinates = sparse_problems.disk()
+def test_a_batch_is_solved_and_tells_which_matrix_failed():
+    pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
     plan = analyse(pattern, coordinates)
-    scales = jnp.asarray(np.random.default_rng(0).uniform(0.5, 2.0, (4, pattern.num_entries)))
-    batch = values * (1 + 0.1 * scales)
-    vectors = jax.random.normal(jax.random.key(1), (pattern.size, 2))
-    both = jax.jit(lambda p, v, b: solve(p, factorise(p, v), b))
-    together = jax.vmap(both, in_axes=(None, 0, None))(plan, batch, vectors)
-    for values_, solution in zip(batch, together, strict=True):
-        np.testing.assert_allclose(solution, both(plan, values_, vectors), rtol=0, atol=1e-12 * abs(solution).max())
+    batch = np.asarray(values) * (1 + 0.1 * np.random.default_rng(0).uniform(0.5, 2.0, (4, pattern.num_entries)))
+    batch[1, 0] = -1.0
+    vectors = np.random.default_rng(1).normal(size=(pattern.size, 2))
+
+    @jax.jit
+    @jax.vmap
+    def both(values):
+        factor = factorise(plan, values)
+        return factor.positive_definite, solve(plan, factor, jnp.asarray(vectors))
+
+    verdict, together = both(batch)
+    assert verdict.tolist() == [True, False, True, True]
+    for k in (0, 2, 3):
+        expected = np.linalg.solve(dense(pattern, batch[k]), vectors)
+        np.testing.assert_allclose(together[k], expected, rtol=0, atol=1e-12 * abs(expected).max())
 
 
-@pytest.mark.parametrize("change", ["negative_pivot", "singular", "nan"])
 @pytest.mark.parametrize("dtype", ["float64", "complex128"])
-def test_matrices_that_are_not_positive_definite_are_refused(change, dtype):
-    pattern, values, points = sparse_problems.disk()
-    index, value = {"negative_pivot": (7, -5.0), "singular": (7, 0.0), "nan": (3, np.nan)}[change]
-    values = as_type(values, dtype).at[index].set(value)
-    plan = analyse(pattern, points)
-    factor = jax.jit(factorise)(plan, values)
-    assert not factor.positive_definite
-    with pytest.raises(ValueError, match=r"not positive definite.*boundary condition"):
-        factor.require_positive_definite()
-    operator, vector = SparseSymmetric(values, pattern), jnp.ones(pattern.size, dtype)
-    solution = lineax.linear_solve(operator, vector, SparseCholesky(plan), throw=False)
-    assert solution.result == lineax.RESULTS.singular
+def test_matrices_that_are_not_positive_definite_are_refused(dtype):
+    """With a negative pivot, singular, and with NaN."""
+    pattern, values, points = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
+    plan, vector = analyse(pattern, points), np.ones(pattern.size, dtype)
+
+    @jax.jit
+    def both(values):
+        operator = SparseSymmetric(values, pattern)
+        solution = lineax.linear_solve(operator, jnp.asarray(vector), SparseCholesky(plan), throw=False)
+        return factorise(plan, values), solution.result == lineax.RESULTS.singular
+
+    for index, value in ((7, -5.0), (7, 0.0), (3, np.nan)):
+        bad = np.array(as_type(np.asarray(values), dtype))
+        bad[index] = value
+        factor, singular = both(bad)
+        assert singular
+        assert not factor.positive_definite
+        with pytest.raises(ValueError, match=r"not positive definite.*boundary condition"):
+            factor.require_positive_definite()
 
 
 def test_lineax_throws_on_an_indefinite_matrix():
@@ -176,18 +202,9 @@ def test_lineax_throws_on_an_indefinite_matrix():
         lineax.linear_solve(SparseSymmetric(-values, pattern), jnp.ones(pattern.size), solver)
 
 
-def test_batch_tells_which_matrix_failed():
-    pattern, values, coordinates = sparse_problems.disk()
-    plan = analyse(pattern, coordinates)
-    batch = jnp.stack([values, values.at[0].set(-1.0), 2 * values])
-    factors = jax.jit(jax.vmap(factorise, in_axes=(None, 0)))(plan, batch)
-    verdict = jax.vmap(lambda factor: factor.positive_definite)(factors)
-    assert verdict.tolist() == [True, False, True]
-
-
 def test_choice_follows_the_limits_and_says_why():
     pattern, values, coordinates = sparse_problems.box()
-    vector = jnp.ones(pattern.size)
+    vector = np.arange(1.0, pattern.size + 1)
     direct = choose_solver(pattern, coordinates)
     assert isinstance(direct, SparseCholesky)
     assert direct.reason.startswith("direct: ")
@@ -197,31 +214,29 @@ def test_choice_follows_the_limits_and_says_why():
     little_time = choose_solver(pattern, coordinates, operations_limit=1e3)
     assert isinstance(little_time, ConjugateGradient)
     assert "operations allowed" in little_time.reason
-    operator = SparseSymmetric(values, pattern)
-    expected = lineax.linear_solve(operator, vector, direct).value
-    np.testing.assert_allclose(lineax.linear_solve(operator, vector, little_time).value, expected, rtol=1e-7)
+    found = lineax.linear_solve(SparseSymmetric(values, pattern), jnp.asarray(vector), little_time).value
+    expected = np.linalg.solve(dense(pattern, values), vector)
+    np.testing.assert_allclose(found, expected, rtol=1e-7)
 
 
 def test_nested_batches_and_gradients_of_batches():
+    """The energy bᵀA⁻¹b falls by x_i x_j with entry (i, j), and by as much with (j, i), x being the solution."""
     pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
     plan = analyse(pattern, coordinates)
-    batch = values * jnp.linspace(1.0, 2.0, 6).reshape(2, 3, 1)
-    vectors = jax.random.normal(jax.random.key(2), (4, pattern.size))
+    batch = np.asarray(values) * np.linspace(1.0, 2.0, 6).reshape(2, 3, 1)
+    vectors = np.random.default_rng(2).normal(size=(4, pattern.size))
 
     def energy(values, vector):
         return vector @ solve(plan, factorise(plan, values), vector)
 
-    def dense_energy(values, vector):
-        return vector @ jnp.linalg.solve(pattern.to_dense(values), vector)
-
-    def everywhere(function):
-        over_vectors = jax.vmap(function, in_axes=(None, 0))
-        return jax.jit(jax.vmap(jax.vmap(over_vectors, in_axes=(0, None)), in_axes=(0, None)))(batch, vectors)
-
-    np.testing.assert_allclose(everywhere(energy), everywhere(dense_energy), rtol=1e-11)
-    np.testing.assert_allclose(
-        everywhere(jax.grad(energy)), everywhere(jax.grad(dense_energy)), rtol=0, atol=1e-9 * abs(vectors).max() ** 2
-    )
+    over_vectors = jax.vmap(jax.value_and_grad(energy), in_axes=(None, 0))
+    everywhere = jax.jit(jax.vmap(jax.vmap(over_vectors, in_axes=(0, None)), in_axes=(0, None)))
+    found, slope = everywhere(batch, vectors)
+    solutions = np.stack([[np.linalg.solve(dense(pattern, one), vectors.T).T for one in some] for some in batch])
+    np.testing.assert_allclose(found, (solutions * vectors).sum(axis=-1), rtol=1e-11)
+    rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
+    expected = -solutions[..., rows] * solutions[..., columns] * np.where(rows == columns, 1, 2)
+    np.testing.assert_allclose(slope, expected, rtol=0, atol=1e-9 * abs(vectors).max() ** 2)
 
 
 def test_the_order_of_elimination_hangs_neither_on_size_nor_place():
@@ -248,10 +263,10 @@ def test_a_plan_serves_all_that_have_its_tree_while_any_uses_it():
     del plan, shared
     gc.collect()
     assert kept() is None
-    plan = analyse(pattern, coordinates)
+    plan, values = on_host((analyse(pattern, coordinates), values))
     vector = np.arange(1.0, pattern.size + 1)
     expected = np.linalg.solve(dense(pattern, values), vector)
-    np.testing.assert_allclose(solve(plan, factorise(plan, values), jnp.asarray(vector)), expected, rtol=1e-12)
+    np.testing.assert_allclose(solve(plan, factorise(plan, values), vector), expected, rtol=1e-12)
 
 
 def test_patterns_of_one_tree_but_other_entries_share_no_plan():
@@ -265,5 +280,6 @@ def test_patterns_of_one_tree_but_other_entries_share_no_plan():
         matrix += matrix.T + 2 * size * np.eye(size)
         pattern, values = SparsityPattern.from_matrix(matrix)
         kept.append(analyse(pattern, np.arange(size, dtype=float)[:, None]))
-        solution = solve(kept[-1], factorise(kept[-1], values), jnp.arange(1.0, size + 1))
+        plan, values = on_host((kept[-1], values))
+        solution = solve(plan, factorise(plan, values), np.arange(1.0, size + 1))
         np.testing.assert_allclose(matrix @ solution, np.arange(1.0, size + 1), rtol=1e-12)

@@ -1,4 +1,6 @@
-"""Patterns, assembly and the lineax operator."""
+"""Patterns, assembly and the lineax operator: against matrices added up entry by entry, and bad input explained."""
+
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -29,78 +31,108 @@ def groups():
 
 @pytest.mark.parametrize("imaginary", [0.0, 1.0])
 def test_assembly_adds_up_groups(groups, imaginary):
+    """In NumPy, and in compiled code."""
     matrices = [sparse_problems.element_matrices(*group.shape) * (1 + 1j * imaginary) for group in groups]
     if not imaginary:
         matrices = [matrix.real for matrix in matrices]
     pattern = SparsityPattern.from_elements(groups, 80)
-    values = jax.jit(lambda p, *m: p.assemble(*m))(pattern, *map(jnp.asarray, matrices))
+    packed = [np.stack([m[:, i, j] for i, j in zip(*np.tril_indices(m.shape[1]), strict=True)]) for m in matrices]
+
+    @jax.jit
+    def assembled(whole, packed):
+        values = pattern.assemble(*whole)
+        others = pattern.assemble(*packed), pattern.assemble(whole[0], None)
+        return values, *others, pattern.to_dense(values), pattern.diagonal(values)
+
+    values, of_packed, only_first, matrix, diagonal = map(np.asarray, assembled(matrices, packed))
     expected = added_up(groups, matrices, 80)
-    np.testing.assert_allclose(pattern.to_dense(values), expected, rtol=0, atol=1e-14 * abs(expected).max())
-    np.testing.assert_allclose(pattern.to_scipy(values).toarray(), expected, rtol=0, atol=1e-14 * abs(expected).max())
-    np.testing.assert_array_equal(pattern.diagonal(values), np.diag(pattern.to_dense(values)))
-    packed = [jnp.stack([m[:, i, j] for i, j in zip(*np.tril_indices(m.shape[1]), strict=True)]) for m in matrices]
-    np.testing.assert_array_equal(pattern.assemble(*packed), values)
-    only_first = pattern.assemble(jnp.asarray(matrices[0]), None)
-    np.testing.assert_allclose(pattern.to_dense(only_first), added_up(groups[:1], matrices[:1], 80), atol=1e-13)
+    least = 1e-14 * abs(expected).max()
+    np.testing.assert_allclose(matrix, expected, rtol=0, atol=least)
+    np.testing.assert_allclose(pattern.to_scipy(values).toarray(), expected, rtol=0, atol=least)
+    np.testing.assert_array_equal(diagonal, np.diag(matrix))
+    np.testing.assert_array_equal(of_packed, values)
+    first = added_up(groups[:1], matrices[:1], 80)
+    np.testing.assert_allclose(pattern.to_scipy(only_first).toarray(), first, atol=1e-13)
+    for given in (matrices, packed):
+        np.testing.assert_allclose(pattern.assemble(*given), values, rtol=0, atol=least)
 
 
 def test_assembly_is_linear_under_vmap_and_vjp(groups):
     pattern = SparsityPattern.from_elements(groups, 80)
-    matrices = [jnp.asarray(sparse_problems.element_matrices(*group.shape)) for group in groups]
-    batch = [jnp.stack([m, 2 * m, -m]) for m in matrices]
-    together = jax.vmap(pattern.assemble)(*batch)
+    matrices = [sparse_problems.element_matrices(*group.shape) for group in groups]
+    batch = [np.stack([m, 2 * m, -m]) for m in matrices]
+    weights = np.random.default_rng(0).normal(size=pattern.num_entries)
+
+    @jax.jit
+    def both(batch, matrices):
+        return jax.vmap(pattern.assemble)(*batch), jax.vjp(pattern.assemble, *matrices)[1](weights)
+
+    together, pulled = jax.tree.map(np.asarray, both(batch, matrices))
+    np.testing.assert_allclose(together[0], pattern.assemble(*matrices), rtol=1e-13)
     np.testing.assert_allclose(together[1], 2 * together[0], rtol=1e-14)
-    weights = jax.random.normal(jax.random.key(0), (pattern.num_entries,))
-    pulled = jax.vjp(pattern.assemble, *matrices)[1](weights)
-    inner = sum(jnp.vdot(p, m) for p, m in zip(pulled, matrices, strict=True))
+    inner = sum(np.vdot(p, m) for p, m in zip(pulled, matrices, strict=True))
     np.testing.assert_allclose(inner, weights @ together[0], rtol=1e-12)
 
 
 def test_operator_agrees_with_its_dense_matrix():
     pattern, values, _ = sparse_problems.disk()
-    operator = SparseSymmetric(values, pattern)
-    dense = operator.as_matrix()
-    vector = jax.random.normal(jax.random.key(0), (pattern.size,))
-    np.testing.assert_allclose(operator.mv(vector), dense @ vector, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(dense, dense.T)
-    np.testing.assert_array_equal(lineax.diagonal(operator), jnp.diagonal(dense))
+    vector = np.random.default_rng(0).normal(size=pattern.size)
+    operator, complex_operator = SparseSymmetric(values, pattern), SparseSymmetric(1j * np.asarray(values), pattern)
     assert lineax.is_symmetric(operator)
     assert lineax.is_positive_semidefinite(operator)
-    complex_operator = SparseSymmetric(values * 1j, pattern)
     assert not lineax.is_positive_semidefinite(complex_operator)
-    np.testing.assert_array_equal(lineax.conj(complex_operator).as_matrix(), -1j * dense)
+
+    @jax.jit
+    def all_of(operator, complex_operator):
+        conjugate = lineax.conj(complex_operator).as_matrix()
+        return operator.as_matrix(), operator.mv(jnp.asarray(vector)), lineax.diagonal(operator), conjugate
+
+    dense, product, diagonal, conjugate = map(np.asarray, all_of(operator, complex_operator))
+    np.testing.assert_array_equal(dense, sparse_problems.dense(pattern, values))
+    np.testing.assert_allclose(product, dense @ vector, rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(dense, dense.T)
+    np.testing.assert_array_equal(diagonal, np.diagonal(dense))
+    np.testing.assert_array_equal(conjugate, -1j * dense)
 
 
 def test_conjugate_solves_the_conjugate_system():
     pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
-    values, vector = values * (1 + 0.4j), jnp.arange(1.0, pattern.size + 1) + 0j
+    values, vector = np.asarray(values) * (1 + 0.4j), np.arange(1.0, pattern.size + 1) + 0j
     for solver in (SparseCholesky(analyse(pattern, coordinates)), ConjugateGradient(1e-13)):
-        operator = SparseSymmetric(values, pattern)
-        state, _ = solver.conj(jax.jit(lambda v, s=solver: s.init(SparseSymmetric(v, pattern), {}))(values), {})
-        solution, _, _ = solver.compute(state, vector, {})
-        residual = lineax.conj(operator).mv(solution) - vector
-        assert jnp.linalg.norm(residual) < 1e-11 * jnp.linalg.norm(vector)
+
+        @jax.jit
+        def solution(values, vector, solver=solver):
+            state, _ = solver.conj(solver.init(SparseSymmetric(values, pattern), {}), {})
+            return solver.compute(state, vector, {})[0]
+
+        residual = sparse_problems.dense(pattern, values.conj()) @ solution(values, vector) - vector
+        assert np.linalg.norm(residual) < 1e-11 * np.linalg.norm(vector)
 
 
 def test_from_entries_keeps_the_callers_order_and_adds_duplicates():
     pattern = SparsityPattern.from_entries([0, 2, 1, 0, 2, 1], [0, 2, 1, 1, 0, 1], 3)
-    values = pattern.assemble(jnp.asarray([4.0, 5.0, 6.0, 0.1, 0.2, 0.5]))
-    np.testing.assert_allclose(pattern.to_dense(values), [[4, 0.1, 0.2], [0.1, 6.5, 0], [0.2, 0, 5]], rtol=1e-15)
+    values = pattern.assemble(np.array([4.0, 5.0, 6.0, 0.1, 0.2, 0.5]))
+    np.testing.assert_allclose(
+        pattern.to_scipy(values).toarray(), [[4, 0.1, 0.2], [0.1, 6.5, 0], [0.2, 0, 5]], rtol=1e-15
+    )
 
 
 def test_iterative_solver_reports_its_failures():
     pattern, values, _ = sparse_problems.disk()
-    vector = jnp.ones(pattern.size)
-    hurried = lineax.linear_solve(
-        SparseSymmetric(values, pattern), vector, ConjugateGradient(1e-12, max_steps=3), throw=False
-    )
+
+    @partial(jax.jit, static_argnames="max_steps")
+    def solved(values, vector, max_steps=None):
+        solver = ConjugateGradient(1e-12) if max_steps is None else ConjugateGradient(1e-12, max_steps=max_steps)
+        return lineax.linear_solve(SparseSymmetric(values, pattern), vector, solver, throw=False)
+
+    vector, indefinite = np.ones(pattern.size), np.array(values)
+    hurried = solved(values, vector, max_steps=3)
     assert hurried.result == lineax.RESULTS.max_steps_reached
     assert hurried.stats["num_steps"] == 3
-    indefinite = lineax.linear_solve(
-        SparseSymmetric(values.at[5].set(-100.0), pattern), vector, ConjugateGradient(1e-12), throw=False
-    )
-    assert indefinite.result == lineax.RESULTS.breakdown
-    zero = lineax.linear_solve(SparseSymmetric(values, pattern), 0 * vector, ConjugateGradient(1e-12))
+    indefinite[5] = -100.0
+    assert solved(indefinite, vector).result == lineax.RESULTS.breakdown
+    zero = solved(values, 0 * vector)
+    assert zero.result == lineax.RESULTS.successful
     np.testing.assert_array_equal(zero.value, 0 * vector)
 
 

@@ -1,4 +1,8 @@
-"""Both solvers through lineax, transform by transform, against dense algebra."""
+"""Both solvers through lineax, transform by transform, against the derivatives of A⁻¹b in closed form.
+
+With x = A⁻¹b: dx = A⁻¹(db − dA x), and for weights w of x and λ = A⁻¹w, entry (i, j) has the derivative
+−(λ_i x_j + λ_j x_i), a diagonal one −λ_i x_i, and b has λ. Without conjugation: so it is for complex numbers, too.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -17,30 +21,45 @@ CASES = [
 ]
 
 
-@pytest.fixture(params=CASES, ids="-".join)
-def functions(request):
-    """Sparse and dense versions of x(values, vector), a point, and a direction."""
+@pytest.fixture(params=CASES, ids="-".join, scope="module")
+def case(request):
+    """x(values, vector), the pattern, a point, and a direction."""
     route, dtype = request.param
     # Two stages of fronts: as small as a system can be that exercises everything.
     pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
+    values, random = np.asarray(values), np.random.default_rng(0)
     if dtype == "complex128":
         values = values * (1 + 0.3j)
     solver = SparseCholesky(analyse(pattern, coordinates)) if route == "direct" else ConjugateGradient(1e-14)
 
-    @jax.jit
-    def sparse(values, vector):
+    def solution(values, vector):
         return lineax.linear_solve(SparseSymmetric(values, pattern), vector, solver).value
 
-    def dense(values, vector):
-        return jnp.linalg.solve(pattern.to_dense(values), vector)
+    def normal(size):
+        drawn = random.normal(size=(2, size))
+        return drawn[0] + 1j * drawn[1] if dtype == "complex128" else drawn[0]
 
-    keys = jax.random.split(jax.random.key(0), 4)
-    point = values, jax.random.normal(keys[0], (pattern.size,), dtype)
-    direction = (
-        0.1 * values * jax.random.normal(keys[1], values.shape),
-        jax.random.normal(keys[2], (pattern.size,), dtype),
-    )
-    return sparse, dense, point, direction
+    point = values, normal(pattern.size)
+    return solution, pattern, point, (0.1 * values * random.normal(size=values.shape), normal(pattern.size))
+
+
+def closed_form(pattern, point, direction):
+    """x, dx, and a function of weights and their change: the derivative of values and vector, and its change."""
+    rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
+    matrix, change = (sparse_problems.dense(pattern, one[0]) for one in (point, direction))
+    x = np.linalg.solve(matrix, point[1])
+    dx = np.linalg.solve(matrix, direction[1] - change @ x)
+    share = np.where(rows == columns, 0.5, 1.0)
+
+    def between(one, other):
+        return -(one[rows] * other[columns] + one[columns] * other[rows]) * share
+
+    def pulled(weights, changed):
+        dual = np.linalg.solve(matrix, weights)
+        turned = np.linalg.solve(matrix, changed - change @ dual)
+        return (between(dual, x), dual), (between(turned, x) + between(dual, dx), turned)
+
+    return x, dx, pulled
 
 
 def assert_close(actual, expected, tolerance=1e-9):
@@ -49,63 +68,74 @@ def assert_close(actual, expected, tolerance=1e-9):
         np.testing.assert_allclose(a, e, rtol=0, atol=tolerance * abs(e).max())
 
 
-def test_value_and_jvp(functions):
-    sparse, dense, point, direction = functions
-    assert_close(jax.jvp(sparse, point, direction), jax.jvp(dense, point, direction))
-
-
-def test_vjp_and_adjointness(functions):
-    sparse, dense, point, direction = functions
+def test_derivatives_in_forward_and_reverse_mode_and_of_a_gradient(case):
+    """The value, its derivative in a direction, weighted ones, and a product with the Hessian: one program."""
+    solution, pattern, point, direction = case
+    x, dx, pulled = closed_form(pattern, point, direction)
     weights = direction[1]
-    pulled = jax.vjp(sparse, *point)[1](weights)
-    assert_close(pulled, jax.vjp(dense, *point)[1](weights))
-    forward = weights @ jax.jvp(sparse, point, direction)[1]
-    backward = sum(c @ d for c, d in zip(pulled, direction, strict=True))
+
+    def gradient(*point):
+        return jax.grad(lambda *xs: jnp.sum(jnp.sin(solution(*xs))).real, argnums=(0, 1))(*point)
+
+    @jax.jit
+    def everything(point, direction):
+        value, pull = jax.vjp(solution, *point)
+        pushed = jax.jvp(solution, point, direction)
+        return value, pushed, pull(weights), jax.jvp(gradient, point, direction)
+
+    value, pushed, back, (slope, curved) = everything(point, direction)
+    assert_close(value, x)
+    assert_close(pushed, (x, dx))
+    assert_close(back, pulled(weights, 0 * weights)[0])
+    forward, backward = (
+        weights @ np.asarray(pushed[1]),
+        sum(np.asarray(c) @ d for c, d in zip(back, direction, strict=True)),
+    )
     assert abs(forward - backward) < 1e-12 * max(1.0, abs(forward))
+    expected = pulled(np.cos(x), -np.sin(x) * dx)
+    assert_close(slope, expected[0])
+    assert_close(curved, expected[1], 1e-8)
 
 
-def test_hessian_product(functions):
-    sparse, dense, point, direction = functions
+def test_batches_of_matrices_right_hand_sides_and_directions(case):
+    solution, pattern, (values, vector), (other_values, other_vector) = case
+    matrices, vectors = np.stack([values, values + other_values]), np.stack([vector, other_vector])
+    ways = [(by * other_values, by * other_vector) for by in (1.0, -2.0)] + [(other_values**2, other_vector**2)]
+    stacked = tuple(np.stack(parts) for parts in zip(*ways, strict=True))
 
-    def gradient(function):
-        return jax.grad(lambda *xs: jnp.sum(jnp.sin(function(*xs))).real, argnums=(0, 1))
+    @jax.jit
+    def everything(matrices, vectors, ways):
+        pushed = jax.vmap(lambda way: jax.jvp(solution, (values, vector), way)[1])(ways)
+        return *(
+            jax.vmap(solution, axes)(*of)
+            for axes, of in (((0, None), (matrices, vector)), ((None, 0), (values, vectors)))
+        ), pushed
 
-    assert_close(jax.jvp(gradient(sparse), point, direction)[1], jax.jvp(gradient(dense), point, direction)[1], 1e-8)
-
-
-def test_vmap_over_matrices_and_right_hand_sides(functions):
-    sparse, dense, (values, vector), (other_values, other_vector) = functions
-    matrices, vectors = jnp.stack([values, values + other_values]), jnp.stack([vector, other_vector])
-    for axes in ((0, None), (None, 0)):
-        arguments = (matrices if axes[0] == 0 else values, vectors if axes[1] == 0 else vector)
-        assert_close(jax.vmap(sparse, axes)(*arguments), jax.vmap(dense, axes)(*arguments))
-
-
-def test_vmap_of_jvp(functions):
-    sparse, dense, point, direction = functions
-    directions = jax.tree.map(lambda d: jnp.stack([d, -2 * d, d**2]), direction)
-
-    def pushforwards(function):
-        return jax.vmap(lambda d: jax.jvp(function, point, d)[1])(directions)
-
-    assert_close(pushforwards(sparse), pushforwards(dense))
+    of_matrices, of_vectors, pushed = everything(matrices, vectors, stacked)
+    assert_close(
+        of_matrices, np.stack([np.linalg.solve(sparse_problems.dense(pattern, one), vector) for one in matrices])
+    )
+    assert_close(of_vectors, np.linalg.solve(sparse_problems.dense(pattern, values), vectors.T).T)
+    assert_close(pushed, np.stack([closed_form(pattern, (values, vector), way)[1] for way in ways]))
 
 
 def test_factorisation_itself_is_differentiable():
+    """The sum of the squares of X = A⁻¹B and of the entries of BᵀX, in a direction dA: dX = −A⁻¹ dA X."""
     points, cells = sparse_problems.disk_cells(30)
     pattern, values, _ = sparse_problems.from_cells(points, cells)
-    plan = analyse(pattern, points)
-    vectors = jax.random.normal(jax.random.key(0), (pattern.size, 2))
+    plan, random = analyse(pattern, points), np.random.default_rng(0)
+    vectors, direction = random.normal(size=(pattern.size, 2)), random.normal(size=values.shape)
 
-    def sparse(values):
+    def total(values):
         factor = factorise(plan, values)
-        return jnp.sum(solve(plan, factor, vectors) ** 2) + jnp.sum(quadratic_form(plan, factor, vectors))
+        form = quadratic_form(plan, factor, jnp.asarray(vectors))
+        return jnp.sum(solve(plan, factor, jnp.asarray(vectors)) ** 2) + jnp.sum(form)
 
-    def dense(values):
-        solution = jnp.linalg.solve(pattern.to_dense(values), vectors)
-        return jnp.sum(solution**2) + jnp.sum(vectors.T @ solution)
-
-    assert_close(jax.jit(jax.grad(sparse))(values), jax.grad(dense)(values))
+    matrix, change = (sparse_problems.dense(pattern, one) for one in (values, direction))
+    solution = np.linalg.solve(matrix, vectors)
+    turned = -np.linalg.solve(matrix, change @ solution)
+    expected = 2 * np.sum(solution * turned) + np.sum(vectors.T @ turned)
+    assert np.asarray(jax.jit(jax.grad(total))(values)) @ direction == pytest.approx(expected, rel=1e-9)
 
 
 def test_state_is_reused():
