@@ -40,9 +40,9 @@ def folder(tmp_path_factory):
     """Taps and recordings, as intensities and as samples."""
     folder = tmp_path_factory.mktemp("hearing")
     random = np.random.default_rng(1)
-    places = grid(0.16, 0.16, 7, 7)
+    places = grid(0.16, 0.16, 5, 5)
     geometry = {"microphones": MICROPHONES, "outline": OUTLINE, "positions": places}
-    np.savez(folder / "taps.npz", **geometry, intensity=received(places, np.exp(random.standard_normal(49))))
+    np.savez(folder / "taps.npz", **geometry, intensity=received(places, np.exp(random.standard_normal(25))))
     times = 0.05 * np.arange(40)
     path = np.stack([0.07 * np.cos(3 * times), 0.06 * np.sin(3 * times)], axis=1)
     intensity = received(path)
@@ -76,7 +76,7 @@ def test_a_large_error_of_the_models_is_noted(folder, tmp_path, capsys):
     random = np.random.default_rng(3)
     with np.load(folder / "taps.npz") as file:
         taps = {name: file[name] for name in file.files}
-    uneven = taps.pop("intensity") * np.exp(0.33 * random.normal(size=(49, 9)))
+    uneven = taps.pop("intensity") * np.exp(0.33 * random.normal(size=(25, 9)))
     np.savez(tmp_path / "off.npz", **taps, intensity=uneven)
     told = {}
     for name, path in (("exact", folder / "taps.npz"), ("off", tmp_path / "off.npz")):
@@ -256,7 +256,7 @@ def _bad_files(folder):
     np.savez(
         folder / "two.npz", **{**taps, "microphones": taps["microphones"][:2], "intensity": taps["intensity"][:, :2]}
     )
-    np.savez(folder / "deaf.npz", **{**taps, "intensity": np.ones((49, 9))})
+    np.savez(folder / "deaf.npz", **{**taps, "intensity": np.ones((25, 9))})
     np.savez(
         folder / "three_taps.npz", **{**taps, "positions": taps["positions"][:3], "intensity": taps["intensity"][:3]}
     )
