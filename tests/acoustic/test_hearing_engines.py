@@ -1,10 +1,13 @@
-"""Two engines, one formula: touches that NumPy locates at once are those that the compiled program locates."""
+"""Two engines, one formula: touches that NumPy locates at once are those that the compiled program locates.
+
+Of one source they are compared in `test_localiser_gradients`, whose program is there anyway.
+"""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from microphone_arrays import array, hear, inside, noisy, quick_likelihood
+from microphone_arrays import array, assert_same, both, hear, inside, noisy, quick_likelihood
 
 from jeit.acoustic import Localiser, cramer_rao, track, tracking
 from jeit.acoustic.decay import DECAYS
@@ -27,20 +30,18 @@ def touched():
     return microphone_array, power
 
 
-def assert_same(one, other, tolerance=1e-7):
-    """All arrays agree to a part of their size, and NaN where the other is."""
-    for mine, theirs in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        mine, theirs = np.asarray(mine, float), np.asarray(theirs, float)
-        size = np.abs(theirs[np.isfinite(theirs)]).max(initial=1e-300)
-        np.testing.assert_allclose(mine, theirs, rtol=tolerance, atol=tolerance * size)
-
-
-@quick_likelihood
-def test_places_and_maps(method, touched):
+@pytest.mark.slow
+@both
+def test_places(method, touched):
     microphone_array, power = touched
     at_once, compiled = (Localiser.create(microphone_array, method=method, compiled=one) for one in (False, True))
     assert_same(at_once(power), compiled(power))
     assert isinstance(at_once(power).position, jax.Array)
+
+
+@quick_likelihood
+def test_maps(method, touched):
+    microphone_array, power = touched
     at_once, compiled = (
         Localiser.create(microphone_array, method=method, compiled=one, map_shape=(30, 40)) for one in (False, True)
     )
@@ -119,4 +120,4 @@ def test_slopes_of_decay_models(name):
     def of(squared):
         return lambda values: DECAYS[name].from_logarithms(values).log_response(squared)
 
-    assert_same(slopes(of(squared), values), slopes(of(jnp.asarray(squared)), jnp.asarray(values)), 1e-13)
+    assert_same(slopes(of(squared), values), jax.jit(lambda values: slopes(of(jnp.asarray(squared)), values))(values), 1e-13)

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from microphone_arrays import array, both, hear, inside, noisy
+from microphone_arrays import array, assert_same, both, hear, inside, noisy
 
 from jeit.acoustic import Localiser
 from jeit.acoustic.localisation.localiser import METHODS
@@ -23,7 +23,7 @@ def moving():
         microphone_array.microphones,
         jnp.asarray(np.log(microphone_array.decay.a)),
         jnp.asarray(np.log(microphone_array.decay.b)),
-        jnp.asarray(power),
+        power,
     )
     direction = (
         0.01 * rng.normal(size=(9, 2)),
@@ -31,6 +31,9 @@ def moving():
         rng.normal(size=9),
         power * rng.normal(size=power.shape),
     )
+    # Two readings are missing.
+    power[[3, 9], [1, 4]] = np.nan
+    point = (*point[:3], jnp.asarray(power))
 
     # In NumPy, unless it is differentiated.
     made = {method: Localiser.create(microphone_array, method=method, compiled=False) for method in METHODS}
@@ -41,7 +44,8 @@ def moving():
             made[method],
             (microphones, *(exponential(one) for one in (log_a, log_b))),
         )
-        return moved(power)
+        found = moved(power)
+        return found.position, found
 
     return point, tuple(jnp.asarray(part) for part in direction), located
 
@@ -62,18 +66,19 @@ PARTS = {"microphones": [0], "a": [1], "b": [2], "power": [3], "all": [0, 1, 2, 
     [("likelihood", False)] + [pytest.param(one, True, marks=pytest.mark.slow) for one in METHODS],
 )
 def test_gradients(method, reversed_too, moving):
-    """Forward mode and central differences agree, in each of what positions depend on.
+    """What is compiled is what NumPy finds; its forward mode is what central differences are, in each of what
+    positions depend on.
 
     So does reverse mode, which JAX makes of forward mode: that it can is proved quickly, its numbers by a program more.
     """
     point, direction, located = moving
-    found = located(method, *point)
+    _, found = located(method, *point)
     # What needs more steps is said not to have converged, and its slopes are as far off as its place.
     done = np.asarray(found.converged)
     assert done.mean() > 0.9
     weight = np.where(done[:, None], np.random.default_rng(2).normal(size=(28, 2)), 0.0)
-    forward = jax.jit(lambda tangent: jax.jvp(lambda *x: located(method, *x).position, point, tangent)[1])
-    gradient = jax.jit(jax.grad(lambda x: jnp.sum(weight * located(method, *x).position)))
+    forward = jax.jit(lambda tangent: jax.jvp(lambda *x: located(method, *x), point, tangent, has_aux=True)[1:])
+    gradient = jax.jit(jax.grad(lambda x: jnp.sum(weight * located(method, *x)[0])))
     assert [part.shape for part in jax.eval_shape(gradient, tuple(point))] == [part.shape for part in point]
     reverse = gradient(tuple(point)) if reversed_too else None
     # Frames on a side of the outline move along it, those in a corner stay in it.
@@ -84,15 +89,17 @@ def test_gradients(method, reversed_too, moving):
     assert corner.any() or method == "consistency"
     for parts in PARTS.values():
         mine = tuple(jnp.asarray(by if k in parts else np.zeros_like(by)) for k, by in enumerate(direction))
-        slope = np.asarray(forward(mine))
+        slope, compiled = forward(mine)
+        slope = np.asarray(slope)
         step = 3e-6
-        ahead, behind = (np.asarray(located(method, *stepped(point, mine, sign * step)).position) for sign in (1, -1))
+        ahead, behind = (np.asarray(located(method, *stepped(point, mine, sign * step))[0]) for sign in (1, -1))
         difference = (ahead - behind) / (2 * step)
         size = np.linalg.norm(difference, axis=1)
         assert (size[done & ~corner] > 1e-6).all()
         error = np.linalg.norm(slope - difference, axis=1) / np.where(corner, 1.0, size)
         assert error[done].max() < 1e-5, (np.flatnonzero(done & (error > 1e-5)), error[done].max())
         np.testing.assert_allclose(slope[on], 0, atol=1e-12)
+        assert_same(found, compiled)
         if reverse is not None:
             product = sum(float(np.sum(by * part)) for by, part in zip(mine, map(np.asarray, reverse), strict=True))
             # Two programs, whose descents end where rounding lets them.
