@@ -61,6 +61,17 @@ def exponential(values):
 PARTS = {"microphones": [0], "a": [1], "b": [2], "power": [3], "all": [0, 1, 2, 3]}
 
 
+def gradient_of(weight, method, located):
+    return jax.grad(lambda x: jnp.sum(weight * located(method, *x)[0]))
+
+
+@both
+def test_forward_mode_can_be_reversed(method, moving):
+    point, _, located = moving
+    gradient = jax.eval_shape(gradient_of(np.ones((28, 2)), method, located), tuple(point))
+    assert [part.shape for part in gradient] == [part.shape for part in point]
+
+
 @pytest.mark.parametrize(
     ("method", "reversed_too"),
     [("likelihood", False)] + [pytest.param(one, True, marks=pytest.mark.slow) for one in METHODS],
@@ -69,7 +80,7 @@ def test_gradients(method, reversed_too, moving):
     """What is compiled is what NumPy finds; its forward mode is what central differences are, in each of what
     positions depend on.
 
-    So does reverse mode, which JAX makes of forward mode: that it can is proved quickly, its numbers by a program more.
+    So is reverse mode, which takes a program more.
     """
     point, direction, located = moving
     _, found = located(method, *point)
@@ -78,9 +89,7 @@ def test_gradients(method, reversed_too, moving):
     assert done.mean() > 0.9
     weight = np.where(done[:, None], np.random.default_rng(2).normal(size=(28, 2)), 0.0)
     forward = jax.jit(lambda tangent: jax.jvp(lambda *x: located(method, *x), point, tangent, has_aux=True)[1:])
-    gradient = jax.jit(jax.grad(lambda x: jnp.sum(weight * located(method, *x)[0])))
-    assert [part.shape for part in jax.eval_shape(gradient, tuple(point))] == [part.shape for part in point]
-    reverse = gradient(tuple(point)) if reversed_too else None
+    reverse = jax.jit(gradient_of(weight, method, located))(tuple(point)) if reversed_too else None
     # Frames on a side of the outline move along it, those in a corner stay in it.
     on = np.abs(np.abs(np.asarray(found.position)) - 0.1) < 1e-9
     corner = on.all(axis=1)
