@@ -103,7 +103,7 @@ def rows_of(folder):
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("method", ["one-step", "gauss-newton"])
+@pytest.mark.parametrize("method", ["one-step", pytest.param("gauss-newton", marks=pytest.mark.slow)])
 def test_a_stream_from_a_file(method, tank, run, tmp_path):
     bad = tank.touched.copy()
     bad[3] = np.nan
@@ -134,7 +134,7 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(f"{good}\n\nrubbish\n{good.replace(' ', ',')}\n1 2 3\n{gap}\n"))
     status, _, error = run(
         "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "one-step",
-        "--quiet", *FEW,
+        "--quiet", "--film", "none", *FEW,
     )  # fmt: skip
     assert (status, error) == (0, "")
     assert [row["status"] for row in rows_of(tmp_path / "out")] == [
@@ -144,7 +144,7 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO("1 2 3\nrubbish\n"))
     status, _, error = run(
         "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "one-step",
-        "--quiet", *FEW,
+        "--quiet", "--film", "none", *FEW,
     )  # fmt: skip
     assert (status, error.count("\n")) == (1, 1)
     assert "2 frames, and none could be imaged" in error
@@ -155,7 +155,7 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
     assert (tmp_path / "out" / "images.npz").exists()
     status, _, error = run(
         "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "one-step",
-        "--quiet", *FEW,
+        "--quiet", "--film", "none", *FEW,
     )  # fmt: skip
     assert (status, "no frame" in error) == (1, True)
     assert not (tmp_path / "out" / "images.npz").exists()
