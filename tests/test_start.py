@@ -119,7 +119,10 @@ def test_double_precision_unless_told_otherwise():
 
 @pytest.mark.parametrize(
     ("told", "said"),
-    [("0", True), *(pytest.param(*one, marks=pytest.mark.slow) for one in (("false", True), ("1", False), (None, False)))],
+    [
+        ("0", True),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("false", True), ("1", False), (None, False))),
+    ],
 )
 def test_single_precision_is_warned_of(told, said):
     environment = {name: value for name, value in os.environ.items() if name != "JAX_ENABLE_X64"}

@@ -55,7 +55,8 @@ def test_logarithms_there_and_back(name):
 
 @every
 def test_the_first_parameter_scales(name):
-    shifted = DECAYS[name].from_logarithms(model(name).logarithms() + np.array([[np.log(3.0)]] + [[0.0]] * (len(FORMULAS[name][0]) - 1)))
+    factor = np.eye(len(FORMULAS[name][0]))[:, :1] * np.log(3.0)
+    shifted = DECAYS[name].from_logarithms(model(name).logarithms() + factor)
     squared = np.asarray(DISTANCE**2)
     difference = shifted.log_response(squared) - model(name).log_response(squared)
     np.testing.assert_allclose(difference, np.log(3.0), rtol=1e-12)

@@ -120,4 +120,6 @@ def test_slopes_of_decay_models(name):
     def of(squared):
         return lambda values: DECAYS[name].from_logarithms(values).log_response(squared)
 
-    assert_same(slopes(of(squared), values), jax.jit(lambda values: slopes(of(jnp.asarray(squared)), values))(values), 1e-13)
+    assert_same(
+        slopes(of(squared), values), jax.jit(lambda values: slopes(of(jnp.asarray(squared)), values))(values), 1e-13
+    )

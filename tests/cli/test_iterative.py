@@ -78,26 +78,6 @@ def test_segmentation(tank, run, tmp_path):
     assert report["prior"] == "total variation"
 
 
-def test_segmentation_by_default_is_that_of_the_outlines(tank, run, tmp_path):
-    status, told, error = run(
-        "reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv",
-        "--output", tmp_path / "out", "--segment", *FEW,
-    )  # fmt: skip
-    assert (status, error) == (0, "")
-    assert "outline" in told
-    labels = arrays_of(tmp_path / "out" / "image.npz")["labels"]
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["reconstruction"]["method"] == "gauss-newton"
-    bodies = report["shapes"]["bodies"]
-    assert len(bodies) == len(report["inclusions"]) > 0
-    for body, listed in zip(bodies, report["inclusions"], strict=True):
-        assert body["centroid"] == listed["centroid"]
-        assert (body["conductivity_over_background"] > 1) == (listed["sign"] > 0)
-    pixel = (0.2 / 256) ** 2
-    area = sum(body["area"] for body in bodies)
-    assert (labels > 0).sum() * pixel == pytest.approx(area, rel=0.1)
-
-
 def rows_of(folder):
     with open(folder / "frames.csv", newline="") as file:
         return list(csv.DictReader(file))

@@ -39,7 +39,20 @@ positions = {[[0.049 * float(f(k)) for f in (np.cos, np.sin)] for k in np.arange
 
 NODES = {"solid": {"num_points": 1500}, "mesh": {}}
 # Bodies in solids are sought in tests of imaging.
-OPTIONS = {"solid": ["--num-points", 600, "--method", "one-step"], "mesh": []}
+OPTIONS = {"solid": ["--num-points", 600, "--method", "one-step"], "mesh": ["--segment"]}
+
+
+def check_segments_of_outlines(folder, report, side):
+    """Bodies that were sought by their outlines are those listed, and those whose labels were kept."""
+    assert report["reconstruction"]["method"] == "gauss-newton"
+    bodies = report["shapes"]["bodies"]
+    assert len(bodies) == len(report["inclusions"]) > 0
+    for body, listed in zip(bodies, report["inclusions"], strict=True):
+        assert body["centroid"] == listed["centroid"]
+        assert (body["conductivity_over_background"] > 1) == (listed["sign"] > 0)
+    with np.load(folder / "image.npz") as content:
+        labelled = (content["labels"] > 0).sum() * (side / 256) ** 2
+    assert labelled == pytest.approx(sum(body["area"] for body in bodies), rel=0.1)
 
 
 @pytest.mark.parametrize("body", BODIES)
@@ -59,6 +72,7 @@ def test_from_description_to_picture(body, run, tmp_path):
     assert (status, error) == (0, "")
     assert ("volume" in told) == (body == "solid")
     assert ("area / mm²" in told) == (body == "mesh")
+    assert ("outline" in told) == (body == "mesh")
     assert "peak change" in told
     assert "of back-" in told
     assert (tmp_path / "out" / "image.png").stat().st_size > 10_000
@@ -75,6 +89,7 @@ def test_from_description_to_picture(body, run, tmp_path):
         assert report["geometry"]["thickness"] == 0.04
     else:
         assert report["geometry"]["mesh"]["points"] == model.mesh.num_points
+        check_segments_of_outlines(tmp_path / "out", report, side=0.1)
 
 
 @pytest.mark.parametrize("command", [["reconstruct"], ["stream"], ["choose"]])
