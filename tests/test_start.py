@@ -117,13 +117,10 @@ def test_double_precision_unless_told_otherwise():
     assert jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
 
-@pytest.mark.parametrize(
-    ("told", "said"),
-    [
-        ("0", True),
-        *(pytest.param(*one, marks=pytest.mark.slow) for one in (("false", True), ("1", False), (None, False))),
-    ],
-)
+OTHERS = [pytest.param(*one, marks=pytest.mark.slow) for one in (("false", True), ("1", False), (None, False))]
+
+
+@pytest.mark.parametrize(("told", "said"), [("0", True), *OTHERS])
 def test_single_precision_is_warned_of(told, said):
     environment = {name: value for name, value in os.environ.items() if name != "JAX_ENABLE_X64"}
     environment |= {} if told is None else {"JAX_ENABLE_X64": told}

@@ -104,7 +104,7 @@ def cut(tmp_path_factory):
     sound, hurt = seen(whole), seen(torn)
 
     def recorded(at):
-        frames = np.where((SECONDS < at)[:, None], sound[number], hurt[number])
+        frames = np.where((at > SECONDS)[:, None], sound[number], hurt[number])
         return frames + 1e-4 * np.abs(frames).mean() * rng.normal(size=frames.shape)
 
     np.savez(folder / "healthy.npz", frames=recorded(np.inf), seconds=SECONDS)
