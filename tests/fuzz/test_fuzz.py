@@ -1,4 +1,4 @@
-"""Two thousand files made wrong at random, half of them quickly: each is taken or refused clearly, and leaves nothing."""
+"""Two thousand files made wrong at random, half of them quickly: each is taken, or refused clearly; nothing is left."""
 
 import pytest
 from commands import COMMANDS, READERS
