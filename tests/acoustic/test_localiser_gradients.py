@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from microphone_arrays import array, both, hear, inside, noisy, quick_likelihood
+from microphone_arrays import array, assert_same, both, hear, inside, noisy
 
 from jeit.acoustic import Localiser
 from jeit.acoustic.localisation.localiser import METHODS
@@ -21,9 +21,9 @@ def moving():
     power = noisy(microphone_array.noise, hear(microphone_array, places, np.exp(rng.normal(size=len(places)))), rng)
     point = (
         microphone_array.microphones,
-        jnp.log(microphone_array.decay.a),
-        jnp.log(microphone_array.decay.b),
-        jnp.asarray(power),
+        jnp.asarray(np.log(microphone_array.decay.a)),
+        jnp.asarray(np.log(microphone_array.decay.b)),
+        power,
     )
     direction = (
         0.01 * rng.normal(size=(9, 2)),
@@ -31,38 +31,65 @@ def moving():
         rng.normal(size=9),
         power * rng.normal(size=power.shape),
     )
+    # Two readings are missing.
+    power[[3, 9], [1, 4]] = np.nan
+    point = (*point[:3], jnp.asarray(power))
 
-    made = {method: Localiser.create(microphone_array, method=method) for method in METHODS}
+    # In NumPy, unless it is differentiated.
+    made = {method: Localiser.create(microphone_array, method=method, compiled=False) for method in METHODS}
 
     def located(method, microphones, log_a, log_b, power):
         moved = eqx.tree_at(
             lambda one: (one.microphone_array.microphones, one.microphone_array.decay.a, one.microphone_array.decay.b),
             made[method],
-            (microphones, jnp.exp(log_a), jnp.exp(log_b)),
+            (microphones, *(exponential(one) for one in (log_a, log_b))),
         )
-        return moved(power)
+        found = moved(power)
+        return found.position, found
 
     return point, tuple(jnp.asarray(part) for part in direction), located
 
 
 def stepped(point, direction, step):
-    return [at + step * by for at, by in zip(point, direction, strict=True)]
+    return [jnp.asarray(np.asarray(at) + step * np.asarray(by)) for at, by in zip(point, direction, strict=True)]
+
+
+def exponential(values):
+    return jnp.exp(values) if isinstance(values, jax.core.Tracer) else jnp.asarray(np.exp(values))
 
 
 PARTS = {"microphones": [0], "a": [1], "b": [2], "power": [3], "all": [0, 1, 2, 3]}
 
 
-@quick_likelihood
-def test_gradients(method, moving):
-    """Forward mode, reverse mode and central differences agree, in each of what positions depend on."""
+def gradient_of(weight, method, located):
+    return jax.grad(lambda x: jnp.sum(weight * located(method, *x)[0]))
+
+
+@both
+def test_forward_mode_can_be_reversed(method, moving):
+    point, _, located = moving
+    gradient = jax.eval_shape(gradient_of(np.ones((28, 2)), method, located), tuple(point))
+    assert [part.shape for part in gradient] == [part.shape for part in point]
+
+
+@pytest.mark.parametrize(
+    ("method", "reversed_too"),
+    [("likelihood", False)] + [pytest.param(one, True, marks=pytest.mark.slow) for one in METHODS],
+)
+def test_gradients(method, reversed_too, moving):
+    """What is compiled is what NumPy finds; its forward mode is what central differences are, in each of what
+    positions depend on.
+
+    So is reverse mode, which takes a program more.
+    """
     point, direction, located = moving
-    found = located(method, *point)
+    _, found = located(method, *point)
     # What needs more steps is said not to have converged, and its slopes are as far off as its place.
     done = np.asarray(found.converged)
     assert done.mean() > 0.9
-    weight = jnp.asarray(np.where(done[:, None], np.random.default_rng(2).normal(size=(28, 2)), 0.0))
-    forward = jax.jit(lambda tangent: jax.jvp(lambda *x: located(method, *x).position, point, tangent)[1])
-    reverse = jax.jit(jax.grad(lambda x: jnp.sum(weight * located(method, *x).position)))(tuple(point))
+    weight = np.where(done[:, None], np.random.default_rng(2).normal(size=(28, 2)), 0.0)
+    forward = jax.jit(lambda tangent: jax.jvp(lambda *x: located(method, *x), point, tangent, has_aux=True)[1:])
+    reverse = jax.jit(gradient_of(weight, method, located))(tuple(point)) if reversed_too else None
     # Frames on a side of the outline move along it, those in a corner stay in it.
     on = np.abs(np.abs(np.asarray(found.position)) - 0.1) < 1e-9
     corner = on.all(axis=1)
@@ -70,19 +97,22 @@ def test_gradients(method, moving):
     assert (on.sum(axis=1) == 1).sum() >= 2
     assert corner.any() or method == "consistency"
     for parts in PARTS.values():
-        mine = tuple(by if k in parts else jnp.zeros_like(by) for k, by in enumerate(direction))
-        slope = np.asarray(forward(mine))
+        mine = tuple(jnp.asarray(by if k in parts else np.zeros_like(by)) for k, by in enumerate(direction))
+        slope, compiled = forward(mine)
+        slope = np.asarray(slope)
         step = 3e-6
-        ahead, behind = (np.asarray(located(method, *stepped(point, mine, sign * step)).position) for sign in (1, -1))
+        ahead, behind = (np.asarray(located(method, *stepped(point, mine, sign * step))[0]) for sign in (1, -1))
         difference = (ahead - behind) / (2 * step)
         size = np.linalg.norm(difference, axis=1)
         assert (size[done & ~corner] > 1e-6).all()
         error = np.linalg.norm(slope - difference, axis=1) / np.where(corner, 1.0, size)
         assert error[done].max() < 1e-5, (np.flatnonzero(done & (error > 1e-5)), error[done].max())
         np.testing.assert_allclose(slope[on], 0, atol=1e-12)
-        product = sum(float(jnp.sum(by * gradient)) for by, gradient in zip(mine, reverse, strict=True))
-        # Two programs, whose descents end where rounding lets them.
-        assert product == pytest.approx(float(np.sum(np.asarray(weight) * slope)), rel=1e-6)
+        assert_same(found, compiled)
+        if reverse is not None:
+            product = sum(float(np.sum(by * part)) for by, part in zip(mine, map(np.asarray, reverse), strict=True))
+            # Two programs, whose descents end where rounding lets them.
+            assert product == pytest.approx(float(np.sum(weight * slope)), rel=1e-6)
 
 
 @pytest.mark.slow

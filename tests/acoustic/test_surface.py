@@ -1,11 +1,11 @@
 """Surfaces: charts of planes and of curved skins, against a cylinder that is known exactly."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from microphone_arrays import OUTLINE
 
+from jeit.acoustic import surface as surfaces
 from jeit.acoustic.surface import (
     CurvedSurface,
     Plane,
@@ -13,12 +13,17 @@ from jeit.acoustic.surface import (
     chart_grid,
     in_space,
     longer_side,
-    make_surface,
     outline_sides,
 )
 from jeit.mesh import Disk, Polygon, Rectangle
+from jeit_solvers.engines import on_device, on_host
 
 RADIUS = 0.15
+
+
+def make_surface(outline, points=None):
+    """In NumPy, which need not compile."""
+    return on_host(surfaces.make_surface(outline, points))
 
 
 def on_cylinder(chart):
@@ -57,7 +62,7 @@ def skin():
 
 def middle(number=200):
     """Places in the chart, which for this cylinder is (x, y) in space, about the middle of the points."""
-    return jnp.asarray(np.random.default_rng(0).uniform(-0.08, 0.08, (2, number)))
+    return np.asarray(np.random.default_rng(0).uniform(-0.08, 0.08, (2, number)))
 
 
 @pytest.mark.parametrize("outline", [OUTLINE, Rectangle(0.2, 0.2), Polygon(OUTLINE)])
@@ -93,7 +98,7 @@ def test_sides_are_those_of_the_outline_and_of_its_holes():
     start, end = outline_sides(make_surface(Polygon(OUTLINE, [hole])))
     assert start.shape == end.shape == (2, 7)
     legs = 0.07 + 0.1 + np.hypot(0.1, 0.07)
-    assert float(jnp.linalg.norm(end - start, axis=0).sum()) == pytest.approx(0.8 + legs, rel=1e-12)
+    assert float(np.linalg.norm(end - start, axis=0).sum()) == pytest.approx(0.8 + legs, rel=1e-12)
     # Every corner is where one side ends and one begins.
     assert {tuple(p) for p in np.asarray(start).T} == {tuple(p) for p in np.asarray(end).T}
 
@@ -103,7 +108,7 @@ def test_a_curved_surface_passes_through_its_points():
     skin, known = make_surface(rim, taps), np.vstack([rim, taps])
     assert isinstance(skin, CurvedSurface)
     assert skin.dimension == 3
-    again = np.asarray(skin.place(skin.project(jnp.asarray(known.T)))).T
+    again = np.asarray(skin.place(skin.project(np.asarray(known.T)))).T
     # A little smoothing, 1e-9 of the size squared, is let in: less than a micrometre, of 0.2 m.
     assert np.linalg.norm(again - known, axis=1).max() < 1e-6
 
@@ -114,7 +119,7 @@ def test_a_surface_that_leans():
     corners = np.array([[0.0, 0.0], [0.2, 0.0], [0.2, 0.2], [0.0, 0.2]])
     rim, taps = (np.column_stack([part, 4 * part[:, 0] ** 3 + part[:, 0] * part[:, 1]]) for part in (corners, along))
     surface, known = make_surface(rim, taps), np.vstack([rim, taps])
-    again = np.asarray(surface.place(surface.project(jnp.asarray(known.T)))).T
+    again = np.asarray(surface.place(surface.project(np.asarray(known.T)))).T
     assert np.linalg.norm(again - known, axis=1).max() < 1e-6
 
 
@@ -135,7 +140,7 @@ def test_many_points_are_thinned_out():
     dense, known = make_surface(rim, taps), np.vstack([rim, taps])
     assert len(dense.knots) == 300
     assert off_cylinder(np.asarray(dense.place(middle())).T).max() < 2e-4
-    again = np.asarray(dense.place(dense.project(jnp.asarray(known.T)))).T
+    again = np.asarray(dense.place(dense.project(np.asarray(known.T)))).T
     assert np.linalg.norm(again - known, axis=1).max() < 5e-4
 
 
@@ -144,7 +149,7 @@ def test_the_surface_does_not_depend_on_axes():
     rim, taps = cylinder(9)
     plain, moved = make_surface(rim, taps), make_surface(turned(rim), turned(taps))
     place = np.asarray(plain.place(middle())).T
-    back = np.asarray(moved.place(moved.project(jnp.asarray(turned(place).T)))).T
+    back = np.asarray(moved.place(moved.project(np.asarray(turned(place).T)))).T
     np.testing.assert_allclose(back, turned(place), atol=1e-8)
     np.testing.assert_allclose(moved.axes.T @ moved.axes, np.eye(2), atol=1e-14)
     np.testing.assert_allclose(moved.normal @ moved.axes, 0, atol=1e-14)
@@ -163,10 +168,19 @@ def test_a_plane_in_space_is_a_plane():
 
 def test_slopes_of_a_curved_surface(skin):
     """Second order of the Taylor remainder, on a knot too, and nothing undefined there."""
-    at = jnp.concatenate([middle(5), skin.knots[:3].T], axis=1)
-    direction = jnp.asarray(np.random.default_rng(1).normal(size=at.shape))
-    place, slope = jax.jvp(skin.place, (at,), (direction,))
-    rest = [jnp.abs(skin.place(at + h * direction) - place - h * slope).max() for h in (1e-3, 1e-4)]
+    at = np.concatenate([middle(5), skin.knots[:3].T], axis=1)
+    direction = np.random.default_rng(1).normal(size=at.shape)
+    covariance = np.broadcast_to(1e-6 * np.eye(2)[..., None], (2, 2, at.shape[1]))
+
+    @jax.jit
+    def compiled(at):
+        made = on_device(skin)
+        return jax.jvp(made.place, (at,), (direction,)), in_space(made, at, covariance)
+
+    (place, slope), spread = compiled(at)
+    for mine, theirs in zip((place, *spread), (skin.place(at), *in_space(skin, at, covariance)), strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-15)
+    rest = [np.abs(skin.place(at + h * direction) - place - h * slope).max() for h in (1e-3, 1e-4)]
     assert np.log10(float(rest[0] / rest[1])) > 1.8
     assert np.isfinite(slope).all()
 
@@ -176,12 +190,13 @@ def test_covariance_in_space(skin):
     chart = middle(4)
     root = np.random.default_rng(2).normal(size=(4, 2, 2)) * 1e-3
     covariance = root @ root.transpose(0, 2, 1)
-    place, found = in_space(skin, chart, jnp.asarray(covariance.transpose(1, 2, 0)))
-    np.testing.assert_array_equal(place, skin.place(chart).T)
+    place, found = in_space(skin, chart, np.asarray(covariance.transpose(1, 2, 0)))
+    # In another order of sums.
+    np.testing.assert_allclose(place, skin.place(chart).T, atol=1e-15)
     step = 1e-6
     columns = [
         (skin.place(chart + step * one[:, None]) - skin.place(chart - step * one[:, None])) / (2 * step)
-        for one in jnp.eye(2)
+        for one in np.eye(2)
     ]
     jacobian = np.stack(columns, axis=1).transpose(2, 0, 1)
     expected = jacobian @ covariance @ jacobian.transpose(0, 2, 1)

@@ -45,7 +45,7 @@ def test_the_fit_says_which_law_and_why(steep):
     assert fit.evidence.startswith(said)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(one, marks=pytest.mark.slow) for one in (2, 3))])
 def test_arrays_drawn_at_random(seed):
     """None is refused; auto is no worse than the best law by much; its ellipses hold most; silence is silence."""
     found = located_by_each(draw_array(replace(DEVELOPMENT, **FEW), seed, touches=30))

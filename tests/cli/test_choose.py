@@ -12,7 +12,7 @@ from jeit.imaging import ImagingSettings, compare_on_data
 from jeit.inverse import RULES
 from jeit.report import draw_choice, report_choice
 
-SMALL = ("--num-points", 300, "--contact", "fixed")
+SMALL = ("--num-points", 250, "--contact", "fixed")
 
 
 def choose(run, folder, *options):
@@ -55,7 +55,7 @@ def test_every_rule_in_table_picture_and_report(tank, run, tmp_path):
 
 def test_every_image_has_a_scale_and_few_marks(tank):
     """A bar each, from end to end of its own values, in a unit; and no marks where they would lie over each other."""
-    settings = ImagingSettings(num_points=300, contact="fixed")
+    settings = ImagingSettings(num_points=250, contact="fixed")
     result = compare_on_data(read(tank.folder / "touched.csv"), read(tank.folder / "rest.csv"), settings)
     figure = draw_choice(result)
     figure.draw_without_rendering()
@@ -101,7 +101,7 @@ def test_a_rule_that_cannot_choose_is_refused_and_the_others_are_not(tank, capsy
     usable = np.ones(40, bool)
     usable[np.asarray(pairs)[:, 1]] = False
     touched, rest = (read(tank.folder / f"{name}.csv").masked(usable, "half") for name in ("touched", "rest"))
-    settings = ImagingSettings(num_points=300, contact="fixed")
+    settings = ImagingSettings(num_points=250, contact="fixed")
     result = compare_on_data(touched, rest, settings, rules=["discrepancy", "gcv"])
     assert list(result.outcomes) == ["gcv"]
     assert "needs to know the noise" in result.refused["discrepancy"]

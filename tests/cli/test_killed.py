@@ -38,9 +38,8 @@ STREAM = {
 }
 
 
-@pytest.mark.parametrize(
-    "moment", [pytest.param(one, marks=() if one == "its images" else pytest.mark.slow) for one in STREAM]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", STREAM)
 def test_a_stream(moment, tank, run, tmp_path):
     module, owner, method, calls, left = STREAM[moment]
     data = tank.write("many", np.stack([tank.touched, tank.rest, 1.02 * tank.touched, tank.touched]))

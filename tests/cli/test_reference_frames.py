@@ -38,7 +38,7 @@ def test_an_image_by_own_frames_is_that_by_a_file_of_them(tank, recording, run, 
     found = []
     for name, given in (("own", ("--reference-frames", "0-1")), ("file", ("--reference", tank.folder / "rest.csv"))):
         folder = tmp_path / name
-        asked = ("--frame", 2, "--num-points", 300, "--method", "one-step", "--hyperparameter", 1.0, "--output", folder)
+        asked = ("--frame", 2, "--num-points", 250, "--method", "one-step", "--hyperparameter", 1.0, "--output", folder)
         status, _, error = run("reconstruct", recording, *given, *asked)
         assert (status, error) == (0, "")
         found.append(json.loads((folder / "report.json").read_text())["inclusions"])
@@ -51,6 +51,6 @@ def test_other_commands_take_frames_too(recording, run, tmp_path, command):
     status, _, error = run(command, recording, "--reference-frames", "5", "--output", tmp_path / "out")
     assert status != 0
     assert "--reference-frames: give FIRST-LAST" in error
-    asked = ("--num-points", 300, "--output", tmp_path, *(("--rate", 10) if command == "series" else ()))
+    asked = ("--num-points", 250, "--output", tmp_path, *(("--rate", 10) if command == "series" else ("--rule", "gcv")))
     status, _, error = run(command, recording, "--reference-frames", "0-1", *asked)
     assert (status, error) == (0, "")

@@ -29,7 +29,7 @@ def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tank")
     (folder / "description.toml").write_text(DESCRIBED + "[data]\nframe_rate = 10\n")
     (folder / "untimed.toml").write_text(DESCRIBED)
-    model = load_description(folder / "description.toml").model("a.csv", num_points=300)
+    model = load_description(folder / "description.toml").model("a.csv", num_points=250)
     rest, away = np.asarray(model.voltages(0.1)), np.ones(model.mesh.num_cells)
     away[:40] = 1.5
     change = np.asarray(model.voltages(0.1 * away)) - rest
@@ -41,7 +41,7 @@ def recording(tmp_path_factory):
 
 
 def test_what_is_written(recording, tmp_path, capsys):
-    given = ["series", str(recording / "frames.csv"), "-o", str(tmp_path), "--num-points", "300"]
+    given = ["series", str(recording / "frames.csv"), "-o", str(tmp_path), "--num-points", "250"]
     asked = ["--frequency", "0.5-3", "--region", "half:1,0", "--region", "box:-0.09,-0.09,0,0.09", "--film", "a.gif"]
     assert main([*given, *asked]) == 0
     report = json.loads((tmp_path / "report.json").read_text())
@@ -77,7 +77,7 @@ def test_what_is_written(recording, tmp_path, capsys):
 )
 def test_what_is_refused(recording, tmp_path, capsys, monkeypatch, options, message):
     monkeypatch.chdir(recording)
-    assert main(["series", "frames.csv", "-o", str(tmp_path / "out"), "--num-points", "300", *options]) == 1
+    assert main(["series", "frames.csv", "-o", str(tmp_path / "out"), "--num-points", "250", *options]) == 1
     assert message in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
 
@@ -97,7 +97,7 @@ def test_a_region_that_is_none_of_the_mesh_is_refused_before_any_image(
     begun, told = [], Steps.__call__
     monkeypatch.setattr(Steps, "__call__", lambda self, name: (begun.append(name), told(self, name)))
     monkeypatch.chdir(recording)
-    output = ["-o", str(tmp_path / "out"), "--num-points", "300"]
+    output = ["-o", str(tmp_path / "out"), "--num-points", "250"]
     assert main(["series", "frames.csv", *output, "--region", "half:1,0", "--region", region]) == 1
     assert "--region" in capsys.readouterr().err
     assert "mesh" in begun

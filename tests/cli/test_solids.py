@@ -37,12 +37,27 @@ positions = {[[0.049 * float(f(k)) for f in (np.cos, np.sin)] for k in np.arange
 }
 
 
-NODES = {"solid": {"num_points": 4000}, "mesh": {}}
+NODES = {"solid": {"num_points": 1500}, "mesh": {}}
+# Bodies in solids are sought in tests of imaging.
+OPTIONS = {"solid": ["--num-points", 600, "--method", "one-step"], "mesh": ["--segment"]}
+
+
+def check_segments_of_outlines(folder, report, side):
+    """Bodies that were sought by their outlines are those listed, and those whose labels were kept."""
+    assert report["reconstruction"]["method"] == "gauss-newton"
+    bodies = report["shapes"]["bodies"]
+    assert len(bodies) == len(report["inclusions"]) > 0
+    for body, listed in zip(bodies, report["inclusions"], strict=True):
+        assert body["centroid"] == listed["centroid"]
+        assert (body["conductivity_over_background"] > 1) == (listed["sign"] > 0)
+    with np.load(folder / "image.npz") as content:
+        labelled = (content["labels"] > 0).sum() * (side / 256) ** 2
+    assert labelled == pytest.approx(sum(body["area"] for body in bodies), rel=0.1)
 
 
 @pytest.mark.parametrize("body", BODIES)
 def test_from_description_to_picture(body, run, tmp_path):
-    write(Disk(0.05).mesh(num_points=400), tmp_path / "tank.vtu")
+    write(Disk(0.05).mesh(num_points=250), tmp_path / "tank.vtu")
     (tmp_path / "full.toml").write_text(BODIES[body] + PROTOCOL)
     model = load_description(tmp_path / "full.toml").model(tmp_path / "full.csv", **NODES[body])
     where = np.asarray(centroids(model.mesh)) - np.array([0.02, 0.0, 0.02])[: model.mesh.dimension]
@@ -52,11 +67,12 @@ def test_from_description_to_picture(body, run, tmp_path):
     status, told, error = run(
         "reconstruct", tmp_path / "full.csv", "--reference", tmp_path / "empty.csv",
         "--description", tmp_path / "full.toml", "--output", tmp_path / "out",
-        *(["--num-points", 1200] if NODES[body] else []),
+        *OPTIONS[body],
     )  # fmt: skip
     assert (status, error) == (0, "")
     assert ("volume" in told) == (body == "solid")
     assert ("area / mm²" in told) == (body == "mesh")
+    assert ("outline" in told) == (body == "mesh")
     assert "peak change" in told
     assert "of back-" in told
     assert (tmp_path / "out" / "image.png").stat().st_size > 10_000
@@ -73,11 +89,12 @@ def test_from_description_to_picture(body, run, tmp_path):
         assert report["geometry"]["thickness"] == 0.04
     else:
         assert report["geometry"]["mesh"]["points"] == model.mesh.num_points
+        check_segments_of_outlines(tmp_path / "out", report, side=0.1)
 
 
 @pytest.mark.parametrize("command", [["reconstruct"], ["stream"], ["choose"]])
 def test_nodes_of_a_mesh_that_is_there_are_refused(command, run, tmp_path):
-    write(Disk(0.05).mesh(num_points=400), tmp_path / "tank.vtu")
+    write(Disk(0.05).mesh(num_points=250), tmp_path / "tank.vtu")
     (tmp_path / "full.toml").write_text(BODIES["mesh"] + PROTOCOL)
     model = load_description(tmp_path / "full.toml").model(tmp_path / "full.csv")
     np.savetxt(tmp_path / "full.csv", np.asarray(model.voltages(1.0))[None], delimiter=",")
@@ -92,8 +109,8 @@ def test_nodes_of_a_mesh_that_is_there_are_refused(command, run, tmp_path):
 
 
 def test_nodes_of_a_model(tmp_path):
-    write(Disk(0.05).mesh(num_points=400), tmp_path / "tank.vtu")
-    for body, number, said in (("mesh", 400, "num_points has no effect"), ("solid", None, "num_points is missing")):
+    write(Disk(0.05).mesh(num_points=250), tmp_path / "tank.vtu")
+    for body, number, said in (("mesh", 250, "num_points has no effect"), ("solid", None, "num_points is missing")):
         (tmp_path / "tank.toml").write_text(BODIES[body] + PROTOCOL)
         with pytest.raises(ValueError, match=said):
             load_description(tmp_path / "tank.toml").model("full.csv", num_points=number)

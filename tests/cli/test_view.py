@@ -12,7 +12,7 @@ from jeit.mesh import Mesh, box, centroids, disk, rectangle
 from jeit.plot.solid import interactive
 from jeit.report.saved_image import saved_extras
 
-TANK = box(0.1, 0.08, 0.06, num_points=400)
+TANK = box(0.1, 0.08, 0.06, num_points=200)
 PATCHES = FacePatches([[0.05, 0.0, 0.03], [-0.05, 0.0, 0.03]], 0.04, 0.04, 1e-3)
 BALL = Inclusion(1, (0.02, 0.0, 0.03), 1e-5, 1e-3)
 

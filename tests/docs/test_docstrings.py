@@ -116,8 +116,14 @@ def test_a_silent_docstring_is_found(tmp_path, text, fault):
     assert fault in " ".join(faults(tmp_path / "silent.py"))
 
 
+@pytest.fixture(scope="module")
+def pages() -> dict[str, str]:
+    """The text of each page of the reference."""
+    return {one.path: reference.page(one) for one in reference.packages()}
+
+
 @pytest.mark.parametrize("room", [one for one in reference.packages() if one.exports], ids=lambda one: one.path)
-def test_the_reference_has_every_public_name(room):
+def test_the_reference_has_every_public_name(room, pages):
     """Whatever a room shows when it is imported is described, once, on the page that the reference says."""
     module = importlib.import_module(room.path)
     shown = set(getattr(module, "__all__", ())) or {
@@ -126,10 +132,10 @@ def test_the_reference_has_every_public_name(room):
         if not name.startswith("_") and (getattr(thing, "__module__", None) or "").split(".")[0] in reference.TOPS
     }
     assert shown <= set(room.exports)
-    pages = {one.path: reference.page(one) for one in reference.packages()}
+    described = reference.described()
     for name in shown:
         home = room.exports[name].home
         assert f"[`{name}`][{home}]" in pages[room.path]
         assert sum(f"::: {home}\n" in text for text in pages.values()) == 1, home
-        assert f"::: {home}\n" in pages[reference.described()[home]]
+        assert f"::: {home}\n" in pages[described[home]]
         assert room.exports[name].summary or not callable(getattr(module, name)), f"{home} has no docstring"

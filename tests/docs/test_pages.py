@@ -223,9 +223,10 @@ def test_every_command_is_told_of():
     """Every command stands in the README or a guide, and its own page says every option."""
     told = " ".join(line for page in PAGES for line in commands(page))
     assert [path for path in COMMANDS if " ".join(path[:2]) not in told] == []
+    page = command_line.page()
     for function in COMMANDS.values():
         for option in command_line.parameters(function)[0]:
-            assert f"`{option}" in command_line.page(), f"{option} of {function.__name__}"
+            assert f"`{option}" in page, f"{option} of {function.__name__}"
         assert inspect.getdoc(function)
 
 

@@ -262,7 +262,7 @@ def jsoned(value):
     return f"1{'0' * 5000}" if isinstance(value, bytes) else json.dumps(value)
 
 
-quick = settings(max_examples=200, deadline=None, derandomize=True, database=None, suppress_health_check=[*HealthCheck])
+quick = settings(max_examples=100, deadline=None, derandomize=True, database=None, suppress_health_check=[*HealthCheck])
 
 
 @pytest.fixture(scope="module")
@@ -289,7 +289,7 @@ def test_studies(file, case):
 
 
 @given(case=changed([SKIN]))
-@settings(quick, max_examples=120)
+@settings(quick, max_examples=60)
 def test_skins(file, case):
     write(file, case[0])
     check(told(lambda: read_described_skin(file)), case[1])

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from readers import READERS
 
+# Commands that take seconds, and read nothing but what other readers do.
+READ_ANYWAY = ("jeit study status", "jeit touch predict")
 KEPT = sorted(name for name, one in READERS.items() if one.main.endswith(".npz"))
 
 
@@ -41,7 +43,9 @@ def test_the_payload_would_run(ran):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(one, marks=pytest.mark.slow) if one in READ_ANYWAY else one for one in READERS]
+)
 def test_a_pickle_in_its_place(name, tmp_path, ran):
     """Of every file of the kind in turn, under its name."""
     reader = READERS[name]

@@ -3,7 +3,6 @@
 import tracemalloc
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -28,7 +27,7 @@ def test_area_by_counting_points(domain):
 @pytest.mark.parametrize("domain", DOMAINS, ids=NAMES)
 def test_boundary_runs_counter_clockwise_at_unit_speed_and_wraps(domain):
     perimeter = float(domain.perimeter)
-    arc = jnp.linspace(0, perimeter, 4001)
+    arc = np.linspace(0, perimeter, 4001)
     points = np.asarray(domain.boundary(arc))
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).sum() == pytest.approx(perimeter, rel=1e-5)
     x, y = points[:-1].T
@@ -43,20 +42,20 @@ def test_where_the_boundary_starts():
     np.testing.assert_allclose(Disk(0.1, (1.0, 2.0)).boundary(0.0), [1.1, 2.0])
     np.testing.assert_allclose(Disk(0.1).boundary(0.1 * np.pi / 2), [0.0, 0.1], atol=1e-15)
     np.testing.assert_allclose(
-        Rectangle(0.2, 0.1).boundary(jnp.array([0.0, 0.2, 0.25])), [[-0.1, -0.05], [0.1, -0.05], [0.1, 0.0]], atol=1e-15
+        Rectangle(0.2, 0.1).boundary(np.array([0.0, 0.2, 0.25])), [[-0.1, -0.05], [0.1, -0.05], [0.1, 0.0]], atol=1e-15
     )
     clockwise = Polygon([[0, 0], [0, 1], [1, 1], [1, 0]])
-    np.testing.assert_allclose(clockwise.boundary(jnp.array([0.0, 0.5])), [[0, 0], [0.5, 0]])
+    np.testing.assert_allclose(clockwise.boundary(np.array([0.0, 0.5])), [[0, 0], [0.5, 0]])
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=NAMES)
 def test_boundary_derivative_is_the_unit_tangent(domain):
-    tangent = jax.jacfwd(domain.boundary)(0.123 * float(domain.perimeter))
-    assert float(jnp.linalg.norm(tangent)) == pytest.approx(1.0, rel=1e-12)
+    tangent = jax.jit(jax.jacfwd(domain.boundary))(0.123 * float(domain.perimeter))
+    assert float(np.linalg.norm(tangent)) == pytest.approx(1.0, rel=1e-12)
 
 
 def test_the_radius_can_be_differentiated():
-    slope = jax.grad(lambda radius: Disk(radius).boundary(0.0)[0])(0.1)
+    slope = jax.jit(jax.grad(lambda radius: Disk(radius).boundary(0.0)[0]))(0.1)
     assert float(slope) == pytest.approx(1.0)
 
 

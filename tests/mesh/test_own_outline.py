@@ -2,7 +2,6 @@
 
 import xml.etree.ElementTree as ElementTree
 
-import jax.numpy as jnp
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
@@ -21,6 +20,7 @@ from jeit.plot import plot_mesh
 from jeit.plot.design.travel import outline_path
 from jeit.protocol import adjacent
 from jeit.report.describe import describe_domain
+from jeit_solvers.engines import namespace
 
 matplotlib.use("Agg")
 
@@ -44,26 +44,30 @@ class Stadium(Domain):
         return (-self.half - self.radius, self.half + self.radius, -self.radius, self.radius)
 
     def boundary(self, arc_length):
+        xp = namespace(arc_length)
         side, turn = 2 * self.half, np.pi * self.radius
-        arc = jnp.mod(jnp.asarray(arc_length), self.perimeter)
-        along = jnp.clip(arc - turn, 0, side) - jnp.clip(arc - 2 * turn - side, 0, side)
-        angle = (jnp.clip(arc, 0, turn) + jnp.clip(arc - turn - side, 0, turn)) / self.radius - np.pi / 2
-        middle = jnp.stack([self.half - along, jnp.zeros_like(along)], axis=-1)
-        return middle + self.radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+        arc = xp.mod(xp.asarray(arc_length), self.perimeter)
+        along = xp.clip(arc - turn, 0, side) - xp.clip(arc - 2 * turn - side, 0, side)
+        angle = (xp.clip(arc, 0, turn) + xp.clip(arc - turn - side, 0, turn)) / self.radius - np.pi / 2
+        middle = xp.stack([self.half - along, xp.zeros_like(along)], axis=-1)
+        return middle + self.radius * xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1)
 
     def loops(self, num_chords=120):
-        return (self.boundary(self.perimeter * jnp.arange(num_chords) / num_chords),)
+        return (self.boundary(self.perimeter * np.arange(num_chords) / num_chords),)
 
     def contains(self, points):
-        return jnp.linalg.norm(self._from_line(points), axis=-1) <= self.radius
+        xp = namespace(points)
+        return xp.linalg.norm(self._from_line(points), axis=-1) <= self.radius
 
     def signed_distance(self, points):
-        return self.radius - jnp.linalg.norm(self._from_line(points), axis=-1)
+        xp = namespace(points)
+        return self.radius - xp.linalg.norm(self._from_line(points), axis=-1)
 
     def nearest(self, points):
+        xp = namespace(points)
         offset = self._from_line(points)
-        distance = jnp.linalg.norm(offset, axis=-1, keepdims=True)
-        return jnp.asarray(points) - offset * jnp.maximum(0, 1 - self.radius / distance)
+        distance = xp.linalg.norm(offset, axis=-1, keepdims=True)
+        return xp.asarray(points) - offset * xp.maximum(0, 1 - self.radius / distance)
 
     def describe(self):
         return {"shape": "stadium", "half": self.half, "radius": self.radius}
@@ -76,8 +80,9 @@ class Stadium(Domain):
         return mesh_within([edge], self.area, Target.create(num_points, cell_size), refine)
 
     def _from_line(self, points):
-        points = jnp.asarray(points)
-        return points - jnp.stack([jnp.clip(points[..., 0], -self.half, self.half), 0 * points[..., 1]], axis=-1)
+        xp = namespace(points)
+        points = xp.asarray(points)
+        return points - xp.stack([xp.clip(points[..., 0], -self.half, self.half), 0 * points[..., 1]], axis=-1)
 
 
 STADIUM = Stadium(0.05, 0.04)

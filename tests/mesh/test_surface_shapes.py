@@ -33,10 +33,10 @@ SHEET = rectangle(0.2, 0.1, num_points=300)
 
 
 def area(mesh):
-    return float(measures(mesh).sum())
+    return float(np.asarray(measures(mesh)).sum())
 
 
-def order(make, exact, numbers=(200, 800, 3200)):
+def order(make, exact, numbers=(100, 400, 1600)):
     """The order in the edge's length at which areas or volumes converge, and the last relative error."""
     meshes = [make(number) for number in numbers]
     errors = [abs(area(mesh) / exact - 1) for mesh in meshes]
@@ -96,9 +96,12 @@ def test_creases_keep_the_mean_of_their_sides():
     np.testing.assert_allclose(normal[corner], np.ones(3) / np.sqrt(3), atol=1e-12)
 
 
-@pytest.mark.parametrize(("axis", "mesh"), [("x", SHEET), ("y", SHEET), ("y", disk(0.1, num_points=200))])
-@pytest.mark.parametrize("radius", [0.05, -0.05])
-def test_bending_changes_no_length_and_no_voltage(axis, mesh, radius):
+@pytest.mark.parametrize(
+    ("radius", "axis", "mesh"),
+    [(0.05, "x", SHEET), (-0.05, "y", SHEET), (0.05, "y", disk(0.1, num_points=200))],
+    ids=["along x", "along y, upwards", "a disk"],
+)
+def test_bending_changes_no_length_and_no_voltage(radius, axis, mesh):
     flat, bent = bend(mesh, np.inf, axis=axis), bend(mesh, radius, axis=axis)
     np.testing.assert_array_equal(flat.cells, bent.cells)
     np.testing.assert_allclose(measures(bent), measures(flat), rtol=1e-9)
@@ -106,8 +109,8 @@ def test_bending_changes_no_length_and_no_voltage(axis, mesh, radius):
     np.testing.assert_allclose(facet_measures(bent), facet_measures(flat), rtol=1e-9)
     assert set(bent.tags) == set(mesh.tags)
     for name, index in mesh.tags.items():
-        length = facet_measures(mesh)[index].sum()
-        np.testing.assert_allclose(facet_measures(bent)[bent.tags[name]].sum(), length, rtol=1e-12)
+        length = np.asarray(facet_measures(mesh))[index].sum()
+        np.testing.assert_allclose(np.asarray(facet_measures(bent))[bent.tags[name]].sum(), length, rtol=1e-12)
     # The upper side is the outer one of a sheet that was bent down.
     up = np.asarray(normals(bent))[np.abs(np.asarray(centroids(bent))[:, :2]).sum(axis=1).argmin()]
     assert up[2] > 0.9
@@ -181,7 +184,7 @@ SHELLS = {
 @pytest.mark.parametrize("name", SHELLS)
 def test_volumes_of_shells_converge(name):
     make, exact = SHELLS[name]
-    found, error = order(make, exact)
+    found, error = order(make, exact, (200, 800, 3200))
     assert found == pytest.approx(2, abs=0.2)
     assert error < 3e-3
     mesh = make(200)
@@ -297,9 +300,9 @@ def test_shells_carry_voltages_that_have_derivatives():
     way = 1e-3 * np.random.default_rng(2).normal(size=mesh.points.shape)
 
     def moved(step):
-        return eqx.tree_at(lambda m: m.mesh.points, model, mesh.points + step).voltages(1.0)
+        return eqx.tree_at(lambda m: m.mesh.points, model, np.asarray(mesh.points) + step).voltages(1.0)
 
-    base, slope = jax.jvp(moved, (np.zeros_like(way),), (way,))
-    rest = [float(np.abs(moved(e * way) - base - e * slope).max()) for e in (1e-2, 5e-3)]
+    base, slope = map(np.asarray, jax.jit(lambda way: jax.jvp(lambda size: moved(size * way), (0.0,), (1.0,)))(way))
+    rest = [float(np.abs(np.asarray(moved(e * way)) - base - e * slope).max()) for e in (1e-2, 5e-3)]
     assert rest[0] / rest[1] == pytest.approx(4, rel=0.1)
     assert isinstance(mesh, Mesh)
