@@ -21,6 +21,12 @@ def small_skin():
 
 
 @pytest.fixture(scope="session")
+def layer():
+    """A skin that is solved in three dimensions."""
+    return Skin.create(named_layout("grid-3x3", Rectangle(0.06, 0.06)), num_layers=3, cell_size=7e-3)
+
+
+@pytest.fixture(scope="session")
 def learnt(small_skin, tmp_path_factory):
     folder = tmp_path_factory.mktemp("learnt")
     with small_maps():

@@ -5,9 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.design import Skin
-from jeit.layout import named_layout
-from jeit.mesh import Rectangle
 from jeit.simulate import Disc, Indent, depth_maps, relative_changes
 from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.networks.sensed import Sensed, depth_of, strength
@@ -63,10 +60,8 @@ def test_strength():
     assert np.isfinite(slopes).all()
 
 
-def test_a_layer_feels_less_of_the_same_indent():
+def test_a_layer_feels_less_of_the_same_indent(layer):
     """Its electrodes are below, and what is taken is above."""
-    layout = named_layout("grid-3x3", Rectangle(0.06, 0.06))
-    layer = Skin.create(layout, num_layers=4, cell_size=6e-3)
     own = Sensed.of(layer, (24, 24))
     touches = [[Indent(Disc(0.02), 2.5e-3, (0.002, 0.004))]]
     maps = depth_maps(touches, image_places(layer, 24, 24)) / float(layer.thickness)
