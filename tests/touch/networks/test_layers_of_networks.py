@@ -15,17 +15,15 @@ def test_a_convolution_of_a_doubled_image():
     layer = eqx.tree_at(lambda one: one.bias, layer, np.arange(4, dtype=np.float32))
     image = random.normal(size=(3, 6, 7, 5)).astype(np.float32)
 
-    def both(layer, image, way):
-        answer = way(layer, image)
-        return jnp.sum(answer**3), answer
+    def of_way(way):
+        def both(layer, image):
+            answer = way(layer, image)
+            return jnp.sum(answer**3), answer
 
-    @jax.jit
-    def found(layer, image):
-        ways = Convolution.of_doubled, lambda layer, image: layer(doubled(image))
-        return [
-            jax.value_and_grad(lambda *at: both(*at, way), argnums=(0, 1), has_aux=True)(layer, image) for way in ways
-        ]
+        return jax.value_and_grad(both, argnums=(0, 1), has_aux=True)
 
+    ways = Convolution.of_doubled, lambda layer, image: layer(doubled(image))
+    found = jax.jit(lambda *at: [of_way(way)(*at) for way in ways])
     ((_, one), slopes), ((_, other), right) = found(layer, image)
     np.testing.assert_allclose(one, other, atol=1e-5)
     for slope, own in zip(*map(jax.tree.leaves, (slopes, right)), strict=True):
