@@ -1,10 +1,14 @@
 """A small skin and little to learn, for networks that image, and the bits of what was learnt."""
 
+from contextlib import contextmanager
+
 import equinox as eqx
 import jax
 import numpy as np
+import pytest
 
-from jeit.touch.networks import Preset
+from jeit.simulate import Bar, Disc
+from jeit.touch.networks import Preset, learn, touches
 from jeit.touch.training import Plan
 
 SKIN = """
@@ -14,9 +18,22 @@ height_mm = 100
 [electrodes]
 layout = "grid-4x4"
 [mesh]
-cell_mm = 6
+cell_mm = 8
 """
-PRESET = Preset(200, 50, Plan(rate=2e-3, batch=25, epochs=15, patience=15, decay=0.9, seconds=0.0))
+PRESET = Preset(100, 30, Plan(rate=2e-3, batch=25, epochs=10, patience=10, decay=0.9, seconds=0.0))
+SHAPE = (24, 24)
+
+
+@contextmanager
+def small_maps():
+    """Of half as many rows and columns as else; one body of two kinds at once, of few sizes that JAX compiles for."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learn, "SHAPE", SHAPE)
+        patch.setattr(learn, "_PLACES", 5)
+        patch.setattr(touches, "_PLACES", 5)
+        patch.setattr(touches, "_AT_ONCE", 1)
+        patch.setattr(touches, "bodies", lambda: [Disc(0.02), Bar(0.02, 0.015)])
+        yield
 
 
 def bits(tree):

@@ -20,7 +20,7 @@ from jeit.touch.contacts import ImageNoise
 def skin():
     """Frames of two contacts, of one in the middle, and of none: readings, images, and what is known of the noise."""
     electrodes = BoundaryElectrodes(ring(0.05, 16), 0.008, 300.0)
-    fine, coarse = (ForwardModel(Disk(0.05).mesh(num_points=n), electrodes, adjacent(16)) for n in (2500, 700))
+    fine, coarse = (ForwardModel(Disk(0.05).mesh(num_points=n), electrodes, adjacent(16)) for n in (1200, 700))
     pressed = PressedSkin(jax.random.key(0), fine, material("velostat"))
     empty = pressed.frames(jax.random.key(1), [()] * 1100)
     before, reference = empty[1000:], empty[1000:].mean(axis=0)

@@ -42,6 +42,13 @@ def test_what_is_no_gesture_is_unlike_any(model):
     assert model.predict([touch("push", rng)]).unlike.tolist() == [False]
 
 
+@pytest.fixture
+def quick_network(monkeypatch):
+    """A linear discriminant of whole courses in place of the network, which `test_temporal_network` has."""
+    monkeypatch.setitem(GESTURE_CLASSIFIERS, "temporal-network", GESTURE_CLASSIFIERS["linear-discriminant"])
+
+
+@pytest.mark.usefixtures("quick_network")
 def test_the_best_on_people_held_out_is_taken():
     made, labels, people = touches(people=3, each=4)
     model = GestureModel.fit(made, labels, people=people)
@@ -60,6 +67,7 @@ def test_of_one_person_it_says_so():
     assert "not on people" in note
 
 
+@pytest.mark.usefixtures("quick_network")
 def test_a_class_that_somebody_never_made():
     """Folds that lack it do not fail, and a class that never occurs is never told."""
     made, labels, people = touches(people=3, each=4)

@@ -59,21 +59,26 @@ def test_what_jax_trains_is_what_numpy_asks():
     rng = np.random.default_rng(0)
     features, label = rng.normal(size=(70, 3 + 8 * 2)), rng.integers(0, 3, 70)
     network = TemporalNetwork.fit(features, label, whole=3, values=2)
-    first, second = network.first[0], network.second[0]
-    kernel = jnp.asarray(first.reshape(len(first), 5, 2).transpose(0, 2, 1))  # outputs, values, places
-    course = jnp.asarray(features[:, 3:].reshape(70, 8, 2).transpose(0, 2, 1))
-    hidden = jax.nn.relu(jax.lax.conv(course, kernel, (1,), "SAME") + network.first_bias[0][:, None])
-    kernel = jnp.asarray(second.reshape(len(second), 5, -1).transpose(0, 2, 1))
-    hidden = jax.nn.relu(jax.lax.conv(hidden, kernel, (1,), "SAME") + network.second_bias[0][:, None])
-    pooled = jnp.hstack([features[:, :3], hidden.mean(axis=2), hidden.max(axis=2)])
-    odds = jax.nn.relu(pooled @ network.dense[0].T + network.dense_bias[0]) @ network.last[0].T + network.last_bias[0]
+
+    @jax.jit
+    def probabilities(features, first, second):
+        kernel = first.reshape(len(first), 5, 2).transpose(0, 2, 1)  # outputs, values, places
+        course = features[:, 3:].reshape(70, 8, 2).transpose(0, 2, 1)
+        hidden = jax.nn.relu(jax.lax.conv(course, kernel, (1,), "SAME") + network.first_bias[0][:, None])
+        kernel = second.reshape(len(second), 5, -1).transpose(0, 2, 1)
+        hidden = jax.nn.relu(jax.lax.conv(hidden, kernel, (1,), "SAME") + network.second_bias[0][:, None])
+        pooled = jnp.hstack([features[:, :3], hidden.mean(axis=2), hidden.max(axis=2)])
+        dense = jax.nn.relu(pooled @ network.dense[0].T + network.dense_bias[0])
+        return jax.nn.softmax(dense @ network.last[0].T + network.last_bias[0])
+
     alone = TemporalNetwork(
         *(getattr(network, name)[:1] for name in ("first", "first_bias", "second", "second_bias")),
         *(getattr(network, name)[:1] for name in ("dense", "dense_bias", "last", "last_bias")),
         whole=3,
         classes_=network.classes_,
     )
-    np.testing.assert_allclose(alone.predict_proba(features), jax.nn.softmax(odds), atol=1e-12)
+    right = probabilities(features, network.first[0], network.second[0])
+    np.testing.assert_allclose(alone.predict_proba(features), right, atol=1e-12)
 
 
 def test_a_model_of_it_is_kept(tmp_path):

@@ -1,5 +1,7 @@
 """Cuts fitted on a mesh made finer: that mesh, the update of one solve, its derivatives, and paths found in noise."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -89,6 +91,7 @@ SHEET = 2e-3
 _HALF = "half of the sheet reads as a shorter cut through all of it: a third of the length"
 
 
+@cache
 def line_of_a_cut(depth):
     """A cut, the line and the spot that are fitted to what another mesh says of it."""
     cut = Cut([(0.0, 0.008), (0.016, 0.02)], depth)

@@ -1,10 +1,15 @@
-"""A skin that has learnt: how far off it is, how sure it says it is, and what it does where it cannot know."""
+"""A skin that has learnt: how far off it is, how sure it says it is, and what it does where it cannot know.
+
+Against places, forces, labels and keys of fresh presses on a made-up skin, that it never saw.
+"""
 
 import numpy as np
 import pytest
 from made_skins import CHANNELS, off, record
 
 from jeit.touch import LearntSkin, Presses
+from jeit.touch.learnt import keys
+from jeit.touch.learnt.regressors import REGRESSORS
 
 FRESH = record(120, seed=1)
 ASK = {key: FRESH[key] for key in ("frames", "reference")}
@@ -18,10 +23,36 @@ def test_places_and_forces_of_fresh_presses(skin):
     assert told.alive.mean() > 0.999
 
 
+@pytest.mark.usefixtures("few_seconds_for_all_methods")
+def test_a_blend_says_the_mean_of_what_errs_least():
+    recorded = {**record(80), "force": None}
+    skin = LearntSkin.fit(Presses.create(**recorded), method="blend")
+    standing, place = skin.standing["place"], skin.place
+    assert standing.method.startswith("blend: gaussian-process on ")
+    assert standing.tried[0][0] == standing.method
+    assert len(place.members) == standing.method.count(" on ") >= 2
+    changes = FRESH["frames"] - FRESH["reference"]
+    each = [model.predict(features(changes, FRESH["reference"])) for features, model in place.members]
+    said = place.mean + place.scale * np.mean(each, axis=0)
+    np.testing.assert_allclose(skin.predict(**ASK).position, said, atol=1e-9)
+    assert off(skin.predict(**ASK), FRESH["positions"]).mean() < 4e-3
+
+
+@pytest.mark.slow
+def test_places_by_every_method_as_it_is():
+    """None of which says the mean."""
+    skin = LearntSkin.fit(Presses.create(**{**record(100), "force": None}))
+    assert off(skin.predict(**ASK), FRESH["positions"]).mean() < 4e-3
+    place = skin.standing["place"]
+    spread = np.linalg.norm(place.right - place.right.mean(axis=0), axis=1).mean()
+    assert all(error < 0.7 * spread for _, error in place.tried)
+
+
 def test_the_best_method_is_taken(skin):
-    """Better than lines by far, where nothing is linear."""
+    """Of all that there are; better than lines by far, where nothing is linear."""
     place = skin.standing["place"]
     errors = dict(place.tried)
+    assert {name.partition(" on ")[0] for name in errors} >= set(REGRESSORS)
     assert place.method == min(errors, key=errors.get)
     assert errors[place.method] < 0.5 * errors["ridge on differences"]
     assert place.held_out.shape == (200, 2)
@@ -62,10 +93,15 @@ def few_channels(number, seed):
     return near * (force / (force + 2))[:, None] + 2e-3 * rng.normal(size=near.shape), place
 
 
-@pytest.mark.parametrize("dead", [[2], [1, 6]])
-def test_deviations_hold_where_channels_are_dead(dead):
+@pytest.fixture(scope="module")
+def skin_of_few_channels():
     changes, place = few_channels(300, 0)
-    skin = LearntSkin.fit(Presses.create(changes, positions=place), method="gaussian-process")
+    return LearntSkin.fit(Presses.create(changes, positions=place), method="gaussian-process")
+
+
+@pytest.mark.parametrize("dead", [[2], [1, 6]])
+def test_deviations_hold_where_channels_are_dead(skin_of_few_channels, dead):
+    skin = skin_of_few_channels
     fresh, right = few_channels(300, 1)
     sound = skin.predict(fresh)
     fresh[:, dead] = np.nan
@@ -180,6 +216,13 @@ def test_labels_and_no_touch():
     assert len(skin.standing["label"].tried) >= 9
 
 
+@pytest.fixture
+def few_trees(monkeypatch):
+    """Fifteen a key, where a hundred and fifty take ten times as long."""
+    monkeypatch.setattr(keys, "_TREES", 15)
+
+
+@pytest.mark.usefixtures("few_trees")
 def test_keys_pressed_together():
     """Six keys, each with a pattern of its own, that saturate together."""
     rng = np.random.default_rng(0)
@@ -199,6 +242,7 @@ def test_keys_pressed_together():
     assert np.mean((told.key_probability > 0.5) == told.touched) == 1
 
 
+@pytest.mark.usefixtures("few_trees")
 @pytest.mark.parametrize("group", [None, np.repeat(np.arange(4), 20)])
 def test_keys_pressed_in_turn(group):
     """Where each person pressed one only, what is held out has a key that nothing else tells of."""

@@ -1,13 +1,17 @@
 """Learnt skins as files: as they were, and nothing else than skins."""
 
 import zipfile
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from made_skins import record
 
-from jeit.touch import LearntSkin, Presses, read_skin, write_skin
+from jeit.touch import LearntSkin, PlacedMap, Presses, SelfOrganisingMap, read_skin, write_skin
 from jeit.touch.learnt.forest import Forest
+from jeit.touch.learnt.network import Network
+from jeit.touch.learnt.regressors import REGRESSORS
 
 FRESH = record(30, seed=1)
 
@@ -22,32 +26,60 @@ def same(one, other):
 def test_what_is_read_says_the_same(skin, tmp_path):
     write_skin(skin, tmp_path / "skin.skops")
     again = read_skin(tmp_path)  # the folder of it
-    asked = FRESH["frames"], FRESH["reference"]
-    np.testing.assert_array_equal(again.predict(*asked).position, skin.predict(*asked).position)
+    same(again, skin)
     assert again.notes == skin.notes
 
 
-@pytest.mark.parametrize("method", ["ridge", "trees", "network", "gaussian-process", "blend"])
-def test_every_method_of_places(method, tmp_path, recorded):
-    presses = Presses.create(**recorded)
-    skin = LearntSkin.fit(presses.rows(slice(60)), method=method)
-    write_skin(skin, tmp_path / "one.skops")
-    again = read_skin(tmp_path / "one.skops")
-    asked = FRESH["frames"], FRESH["reference"]
-    np.testing.assert_array_equal(again.predict(*asked).position, skin.predict(*asked).position)
+def drawn_network(features, targets):
+    """Of the kind that `Network.train` makes, its weights drawn."""
+    rng, sizes = np.random.default_rng(0), (features.shape[1], 5, targets.shape[1])
+    weights = [rng.normal(size=(after, before)) for before, after in pairwise(sizes)]
+    return Network(weights, [rng.normal(size=len(one)) for one in weights], features.std(axis=0))
+
+
+def coarse_map(features, targets):
+    """A placed map, of which each press is a neuron."""
+    return PlacedMap.learn(SelfOrganisingMap(features[None], 1.0), features, targets)
+
+
+MODELS = [*(REGRESSORS[name] for name in ("ridge", "neighbours", "gaussian-process", "forest", "trees"))]
+
+
+def test_models_of_every_kind_tell_the_same_places(quick, tmp_path, recorded):
+    """One file of a skin that takes the mean of seven models, as blends are kept."""
+    changes = recorded["frames"] - recorded["reference"]
+    place = quick.place
+    (features, _), *_ = place.members
+    values, targets = (
+        features(changes, recorded["reference"])[:60],
+        (recorded["positions"][:60] - place.mean) / place.scale,
+    )
+    members = [(features, learn(values, targets)) for learn in (*MODELS, drawn_network, coarse_map)]
+    assert {type(model).__name__ for _, model in members} == {
+        "RidgeCV",
+        "Nearest",
+        "GaussianProcess",
+        "Forest",
+        "Network",
+        "PlacedMap",
+    }
+    write_skin(replace(quick, place=replace(place, members=members)), tmp_path / "one.skops")
+    again = read_skin(tmp_path / "one.skops").place.members
+    for (ours, model), (theirs, other) in zip(members, again, strict=True):
+        asked = [one(FRESH["frames"] - FRESH["reference"], FRESH["reference"]) for one in (ours, theirs)]
+        np.testing.assert_array_equal(other.predict(asked[1]), model.predict(asked[0]))
 
 
 @pytest.mark.parametrize("method", ["quadratic-discriminant", "quadratic-svm", "bagged-trees", "nearest"])
 def test_classifiers(method, tmp_path, recorded):
     label = np.where(recorded["positions"][:, 0] > 0, "right", "left")
-    skin = LearntSkin.fit(
-        Presses.create(recorded["frames"], reference=recorded["reference"], label=label), method=method
-    )
+    presses = Presses.create(recorded["frames"], reference=recorded["reference"], label=label)
+    skin = LearntSkin.fit(presses.rows(slice(60)), method=method)
     write_skin(skin, tmp_path / "one.skops")
     asked = FRESH["frames"], FRESH["reference"]
-    np.testing.assert_array_equal(
-        read_skin(tmp_path / "one.skops").predict(*asked).probability, skin.predict(*asked).probability
-    )
+    said = skin.predict(*asked)
+    assert np.isfinite(said.probability).any()
+    np.testing.assert_array_equal(read_skin(tmp_path / "one.skops").predict(*asked).probability, said.probability)
 
 
 class Payload:

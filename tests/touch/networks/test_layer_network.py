@@ -4,20 +4,12 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.design import Skin
-from jeit.layout import named_layout
-from jeit.mesh import Rectangle
 from jeit.simulate import Disc, Indent, IndentSet, indented_cells, relative_changes
 from jeit.touch.networks import Preset, learn_images, read_network
 from jeit.touch.networks.touches import touch_draws
 from jeit.touch.training import Plan
 
 PRESET = Preset(150, 30, Plan(rate=2e-3, batch=25, epochs=10, patience=10, decay=0.9))
-
-
-@pytest.fixture(scope="module")
-def layer():
-    return Skin.create(named_layout("grid-3x3", Rectangle(0.06, 0.06)), num_layers=3, cell_size=6e-3)
 
 
 def test_touches_of_a_set_are_those_of_solving_anew(layer):
@@ -34,6 +26,7 @@ def test_touches_of_a_set_are_those_of_solving_anew(layer):
     assert np.asarray(cells.change).min() == -1
 
 
+@pytest.mark.slow
 def test_it_learns(layer, tmp_path):
     """It explains 0.54 of squared depth; linear images, which an untrained network of this design is, 0.42."""
     learnt = learn_images(layer, tmp_path, preset=PRESET)

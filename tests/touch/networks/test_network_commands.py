@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 import pytest
-from small_networks import SKIN
+from small_networks import SHAPE, SKIN
 
 from jeit.cli import main
 from jeit.data import Measurement, screen
@@ -55,7 +55,7 @@ def test_reconstruct(learnt, recorded, run, tmp_path):
     assert "1 frame imaged" in out
     assert np.linalg.norm(told(tmp_path)[1:3] - PLACES[1]) < 0.015
     with np.load(tmp_path / "depth.npz") as written:
-        assert written["depth"].shape == (1, 48, 48)
+        assert written["depth"].shape == (1, *SHAPE)
     assert json.loads((tmp_path / "report.json").read_text())["design"] == "unrolled"
     assert (tmp_path / "depth.png").stat().st_size > 5000
 

@@ -5,12 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.design import Skin
-from jeit.layout import named_layout
-from jeit.mesh import Rectangle
 from jeit.simulate import Disc, Indent, depth_maps, relative_changes
 from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.networks.sensed import Sensed, depth_of, strength
+from jeit.touch.networks.touches import bodies
 
 
 @pytest.fixture(scope="module")
@@ -62,11 +60,18 @@ def test_strength():
     assert np.isfinite(slopes).all()
 
 
-def test_a_layer_feels_less_of_the_same_indent():
+def test_a_layer_feels_less_of_the_same_indent(layer):
     """Its electrodes are below, and what is taken is above."""
-    layout = named_layout("grid-3x3", Rectangle(0.06, 0.06))
-    layer = Skin.create(layout, num_layers=4, cell_size=6e-3)
     own = Sensed.of(layer, (24, 24))
     touches = [[Indent(Disc(0.02), 2.5e-3, (0.002, 0.004))]]
     maps = depth_maps(touches, image_places(layer, 24, 24)) / float(layer.thickness)
     assert missed(felt(own, maps), relative_changes(layer, touches)) < 0.6
+
+
+def test_bodies_that_are_pressed_in():
+    """All reach the depth that they are pressed to, near their origin; the largest is the wrench, 100 mm long."""
+    places = np.stack(np.meshgrid(np.linspace(-0.07, 0.07, 141), np.linspace(-0.03, 0.03, 61)), axis=-1)
+    maps = depth_maps([[Indent(one, 2e-3)] for one in bodies()], places)
+    assert np.allclose(maps.max(axis=(1, 2)), 2e-3, rtol=0.1)
+    length = [np.ptp(places[one > 0][:, 0]) for one in maps]
+    assert length[-1] == max(length) == pytest.approx(0.1, abs=3e-3)

@@ -1,20 +1,19 @@
 """Touches read from a store, some of its chunks at a time, and trained on."""
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
 from small_networks import bits
 
 from jeit.simulate import IndentSet, simulate_presses
+from jeit.touch.networks import ImageNetwork
 from jeit.touch.networks.examples import Examples, StoredTouches
-from jeit.touch.networks.sensed import Sensed
-from jeit.touch.networks.three_stages import ThreeStages
 from jeit.touch.networks.touches import touch_draws
-from jeit.touch.networks.training import Runs, mean_and_deviation, train_three_stages, train_unrolled
-from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.networks.training import Runs, mean_and_deviation, shuffled, train_three_stages
 from jeit.touch.training import MappedRows, Plan
 
-PLAN = Plan(rate=2e-3, batch=20, epochs=2, seconds=0.0)
+PLAN = Plan(rate=2e-3, batch=20, epochs=3, seconds=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -22,6 +21,13 @@ def stored(small_skin, tmp_path_factory):
     indents = IndentSet(small_skin, touch_draws(small_skin), 110, shape=(16, 16), chunk=20)
     path = tmp_path_factory.mktemp("stored") / "touches.zarr"
     return indents, path, simulate_presses(indents, path)
+
+
+@pytest.fixture(scope="module")
+def other(small_skin):
+    """Touches that nothing is learnt from."""
+    solved = IndentSet(small_skin, touch_draws(small_skin), 40, seed=2, shape=(16, 16), chunk=40).solve(0)
+    return Examples(solved["change"], solved["depth"])
 
 
 def test_as_many_chunks_as_are_in_memory_at_once(stored):
@@ -77,53 +83,129 @@ def test_mean_and_deviation(stored):
     assert np.allclose(deviation, change.std(axis=0), rtol=1e-12)
 
 
+def test_chunks_are_read_as_arrays_are_given(stored):
+    """Of one chunk: the same bits in the same order, so that trainings have the same rows."""
+    indents, path, found = stored
+    arrays, touches = Examples(found["change"].to_numpy(), found["depth"].to_numpy()), StoredTouches(indents, path)
+    for names in (("change",), ("change", "depth")):
+        given, read = arrays.rows(*names), touches.rows(*names)
+        assert given.sizes == read.sizes
+        assert bits(given.chunk(0)) == bits(read.chunk(0))
+
+
 class Stopped(Exception):
     pass
 
 
-@pytest.mark.parametrize("design", ["three-stages", "unrolled"])
-def test_a_set_larger_than_memory(design, stored, small_skin, tmp_path):
-    """Both designs are trained on three chunks, and go on amid them to the same bits."""
-    indents, path, found = stored
-    held = Examples(found["change"].to_numpy()[:30], found["depth"].to_numpy()[:30])
-    channels = held.change.shape[1]
-    loaded = []
+class Until(Runs):
+    """Trainings up to the one that begins with `unwanted`."""
 
-    def train(folder, progress=None):
-        touches = StoredTouches(indents, path, at_once=50)
-        read = touches.read
-        touches.read = lambda name, number: loaded.append((name, number)) or read(name, number)
-        runs = Runs(PLAN, jax.random.key(0), folder, progress)
-        if design == "three-stages":
-            return train_three_stages(touches, held, 1e-3, runs)
-        start = Unrolled(channels, (16, 16), key=jax.random.key(1))
-        sensed = Sensed(np.zeros((channels, 256)), np.zeros((16, channels)), (16, 16))
-        return train_unrolled(start, sensed, touches, held, 1e-3, runs)
+    unwanted = ""
 
-    whole = train(None)
-    assert {number for _, number in loaded} == {0, 1, 2}
-    trainings = 3 if design == "three-stages" else 1
-    assert all(len(one.course.steps) == 2 and one.course.steps[-1] == 10 for one in whole.courses.values())
-    assert len(whole.courses) == trainings
+    def run(self, name, network, objective, training, validation):
+        if name == self.unwanted:
+            raise Stopped
+        return super().run(name, network, objective, training, validation)
+
+
+@pytest.fixture(scope="module")
+def three_stages(stored, other, tmp_path_factory):
+    """Trains the paper's network on three chunks, up to one of its trainings, in one folder; and the chunks read."""
+    indents, path, _ = stored
+    folder, loaded = tmp_path_factory.mktemp("trained"), []
+    touches = StoredTouches(indents, path, at_once=50)
+    read = touches.read
+    touches.read = lambda name, number: loaded.append((name, number)) or read(name, number)
+
+    def train(unwanted=""):
+        loaded.clear()
+        runs = Until(PLAN, jax.random.key(0), folder)
+        runs.unwanted = unwanted
+        return train_three_stages(touches, other, 1e-3, runs), loaded
+
+    return train, folder
+
+
+@pytest.fixture(scope="module")
+def voltages(three_stages):
+    train, folder = three_stages
+    with pytest.raises(Stopped):
+        train("maps")
+    return {one.name for one in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def maps(three_stages, voltages):
+    train, folder = three_stages
+    with pytest.raises(Stopped):
+        train("projection")
+    return {one.name for one in folder.iterdir()} - voltages
+
+
+@pytest.fixture(scope="module")
+def paper(three_stages, maps):
+    train, _ = three_stages
+    found, loaded = train()
+    return found, list(loaded)
+
+
+def test_a_training_s_state_is_kept_by_its_name(voltages):
+    assert voltages == {"voltages.training"}
+
+
+def test_what_is_trained_after_another_has_its_own_state(maps):
+    assert maps == {"maps.training"}
+
+
+def test_three_trainings_of_the_paper_s_network(paper, small_skin):
+    """On a set larger than memory, whose three chunks are read one by one; the last leads from the first's ends."""
+    found, loaded = paper
+    assert set(found.courses) == {"voltages", "maps", "projection"}
+    # What is kept of the two before is not trained again; their mean is that of all chunks.
+    assert {name for name, _ in loaded} == {"change", "depth"}
+    assert {number for name, number in loaded if name == "depth"} == {0, 1, 2}
+    assert len([number for name, number in loaded if name == "depth"]) <= 3 * PLAN.epochs
+    an_epoch = 2 + 2 + 1
+    assert all(one.course.steps == [an_epoch * (1 + k) for k in range(PLAN.epochs)] for one in found.courses.values())
+    assert all(one.course.validation[-1] < 0.9 * one.course.validation[0] for one in found.courses.values())
+    assert eqx.tree_equal(found.network.decoder, found.courses["maps"].network.decoder)
+    assert eqx.tree_equal(found.network.encoder, found.courses["voltages"].network.encoder)
+    assert ImageNetwork.of_skin(found.network, small_skin, 1e-3, (16, 16)).design == "three-stages"
+
+
+@pytest.mark.slow
+def test_the_paper_s_network_learns_from_voltages(stored, other):
+    """Taught other touches' maps it learns none of them."""
+    found = stored[2]
+    right = Examples(found["change"].to_numpy(), found["depth"].to_numpy())
+    runs = Runs(Plan(rate=3e-3, batch=20, epochs=40, patience=40), jax.random.key(1))
+    own, lost = (
+        train_three_stages(taught, other, 1e-3, runs).courses["projection"].course
+        for taught in (right, shuffled(right))
+    )
+    assert min(own.validation) < min(lost.validation)
+
+
+def test_shuffled_maps_are_another_s(other):
+    lost = shuffled(other)
+    assert np.array_equal(lost.change, other.change)
+    assert not np.array_equal(lost.depth, other.depth)
+    assert np.array_equal(np.sort(lost.depth.sum(axis=(1, 2))), np.sort(other.depth.sum(axis=(1, 2))))
+
+
+@pytest.mark.slow
+def test_stopped_amid_chunks_it_goes_on_to_the_same_bits(paper, stored, other, tmp_path):
     told = []
 
     def stop(said):
         told.append(said)
-        if len(told) == 2 * trainings - 1:
+        if len(told) == 2 * PLAN.epochs + 1:
             raise Stopped
 
+    def train():
+        touches = StoredTouches(stored[0], stored[1], at_once=50)
+        return train_three_stages(touches, other, 1e-3, Runs(PLAN, jax.random.key(0), tmp_path, stop))
+
     with pytest.raises(Stopped):
-        train(tmp_path, stop)
-    again = train(tmp_path, stop)
-    assert bits(again.network) == bits(whole.network)
-
-
-def test_chunks_are_learnt_from_as_arrays_are(stored):
-    """Of one chunk: the same bits, whether it is read from a store or given."""
-    indents, path, found = stored
-    held = Examples(found["change"].to_numpy()[:30], found["depth"].to_numpy()[:30])
-    arrays = Examples(found["change"].to_numpy(), found["depth"].to_numpy())
-    runs = Runs(PLAN, jax.random.key(0))
-    one, other = (train_three_stages(rows, held, 1e-3, runs) for rows in (arrays, StoredTouches(indents, path)))
-    assert bits(one.network) == bits(other.network)
-    assert isinstance(one.network, ThreeStages)
+        train()
+    assert bits(train().network) == bits(paper[0].network)
