@@ -46,7 +46,7 @@ def chest():
 
 
 def test_breathing_is_told_by_frequency_amplitude_and_phase(chest):
-    found = image_sequence(chest, settings=ImagingSettings(num_points=900))
+    found = image_sequence(chest, settings=ImagingSettings(num_points=500))
     series, mesh = found.series, found.series.mesh
     left, right, heart = (
         ball_region(mesh, at, size) for at, size in (([-0.07, 0], 0.03), ([0.07, 0], 0.03), ([0, 0.08], 0.025))

@@ -1,6 +1,7 @@
 """Error bars of a solid imaged by total variation from two measurements."""
 
 import numpy as np
+import pytest
 
 from jeit import image_difference
 from jeit.data import Measurement
@@ -17,6 +18,7 @@ SIDES = [(a, s * 0.07, z) for s in (-1, 1) for z in (0.03, 0.07) for a in (-0.02
 SIDES += [(s * 0.05, b, z) for s in (-1, 1) for z in (0.03, 0.07) for b in (-0.035, 0.035)]
 
 
+@pytest.mark.slow
 def test_a_solid_imaged_by_total_variation_has_error_bars():
     plates = FacePatches(np.array(SIDES), 0.03, 0.03, 1e-3)
     model = ForwardModel(body_mesh(BOX, plates, 1500), plates, opposite(16, current=1e-3))

@@ -1,0 +1,25 @@
+"""Meshes of the room, each made once: the same disk is imaged in most tests."""
+
+import pickle
+
+import pytest
+
+from jeit.imaging import preparation
+
+MADE = {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def meshes_made_once():
+    """No test changes one: meshes are values."""
+    make = preparation.body_mesh
+
+    def made_once(*described, **named):
+        key = pickle.dumps((described, named))
+        if key not in MADE:
+            MADE[key] = make(*described, **named)
+        return MADE[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(preparation, "body_mesh", made_once)
+        yield
