@@ -211,6 +211,7 @@ def test_iterative_methods_refuse_complex_voltages(frames):
         image_difference(measured(frames[1]), measured(frames[0]), ImagingSettings(method="gauss-newton"))
 
 
+@pytest.mark.slow
 def test_a_measured_tank_holds_no_contrast_of_susceptivity(data_folder, tmp_path):
     """The small tank's imaginary part is a phase that all voltages have alike, of the instrument: relative to the
     background, the change is real but for a fifth, and rods are where they are in the real part alone."""

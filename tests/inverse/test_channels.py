@@ -17,6 +17,11 @@ PROTOCOLS = {
 }
 
 
+def _chosen(*quick):
+    """All protocols, of which the quick suite takes these."""
+    return [pytest.param(name, marks=() if name in quick else pytest.mark.slow) for name in PROTOCOLS]
+
+
 def voltages_of_a_body(protocol, key=0):
     """Of a random symmetric transfer impedance whose rows sum to zero: all that any body can be."""
     root = jax.random.normal(jax.random.key(key), (protocol.num_electrodes, protocol.num_electrodes))
@@ -26,7 +31,7 @@ def voltages_of_a_body(protocol, key=0):
     return jnp.einsum("ki,ij,kj->k", protocol.channel_measurement, impedance, protocol.channel_drive)
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", _chosen("with driven electrodes", "against a centre", "two-terminal"))
 def test_all_channels_from_the_independent_ones(name):
     protocol, number = PROTOCOLS[name]
     channels = IndependentChannels.create(protocol)
@@ -37,7 +42,7 @@ def test_all_channels_from_the_independent_ones(name):
     assert number is None or rank == number
 
 
-@pytest.mark.parametrize("name", PROTOCOLS)
+@pytest.mark.parametrize("name", _chosen("adjacent", "with driven electrodes"))
 def test_least_squares_on_them_is_that_on_all(name):
     """½‖(Tu - y)/noise‖² = ½(u - ŷ)ᵀG(u - ŷ) + rest/2 at any u."""
     protocol, _ = PROTOCOLS[name]

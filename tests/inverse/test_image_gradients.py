@@ -118,6 +118,7 @@ def test_linear_images():
     assert_gradient(image, VARIED | {"level 0": 3.0, "level 1": 1e4, "level 2": 1e3, "length": 0.03})
 
 
+@pytest.mark.slow
 def test_linear_images_where_electrodes_are():
     def image(theta):
         return linear_image(THETA | {"hyperparameter": 10.0} | theta, Tikhonov())
@@ -397,6 +398,7 @@ def whole(model, solver):
     return reconstruct(model, FRAME, 1e-3, hyperparameter=10.0, noise=0.01 * np.abs(EMPTY), solver=solver)
 
 
+@pytest.mark.slow
 def test_a_whole_model_may_be_traced():
     """Protocol and cells included: reciprocal channels are then not combined, and the image is the same."""
 

@@ -32,7 +32,11 @@ def press(model):
     return model.voltages(jnp.where(inside, 0.6, 1.0))
 
 
-@pytest.mark.parametrize("prior", [Gaussian(LENGTH), Laplace(), Noser()], ids=["gaussian", "laplace", "noser"])
+@pytest.mark.parametrize(
+    "prior",
+    [pytest.param(Gaussian(LENGTH), marks=pytest.mark.slow), pytest.param(Laplace(), marks=pytest.mark.slow), Noser()],
+    ids=["gaussian", "laplace", "noser"],
+)
 def test_against_dense_algebra(prior, model, noise):
     result = reconstruct(model, press(model), 1.0, prior=prior, noise=noise, hyperparameter=2.0)
     found = posterior(result)

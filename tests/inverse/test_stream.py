@@ -157,6 +157,7 @@ def test_frames_of_nothing_but_noise_are_said_to_be_unchanged(model, linear):
     assert quiet.imaged
 
 
+@pytest.mark.slow
 def test_total_variation_streams_too():
     """A frame that stays ends where `reconstruct` does; of five electrodes, for compilation."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 5), 0.012, 1e-3)
@@ -169,6 +170,7 @@ def test_total_variation_streams_too():
     assert np.ptp(best) > 0.2
 
 
+@pytest.mark.slow
 def test_both_descents_end_at_the_same_image(few, imager, damped):
     """On a frame that stays, for each starts from the last image."""
     images = [list(stream(one, [few[0]] * 6))[-1] for one in (imager, damped)]
@@ -210,7 +212,7 @@ def test_a_memory_is_the_kalman_filter(memory, small, noisy):
     np.testing.assert_allclose(image - 1, shapes @ state, atol=1e-3 * np.abs(shapes @ state).max())
 
 
-@pytest.mark.parametrize("method", ["one-step", "gauss-newton"])
+@pytest.mark.parametrize("method", ["one-step", pytest.param("gauss-newton", marks=pytest.mark.slow)])
 def test_a_memory_takes_noise_out_and_leaves_the_press(method, small, noisy):
     """Where a frame alone tells little: a prior of 5 % and much noise."""
     frames, noise = noisy
@@ -401,7 +403,7 @@ def test_an_undisturbed_frame_may_be_reached_by_the_last_step(small, imager):
         assert image.iterations == 4
 
 
-@pytest.mark.parametrize("kind", ["imager", "damped"])
+@pytest.mark.parametrize("kind", ["imager", pytest.param("damped", marks=pytest.mark.slow)])
 def test_an_undisturbed_frame_is_at_its_minimum(kind, small, few, request):
     """Its objective goes to nothing, so that no step is small beside it."""
     rest = pressed(small, 1.0)
@@ -411,7 +413,7 @@ def test_an_undisturbed_frame_is_at_its_minimum(kind, small, few, request):
         np.testing.assert_allclose(one.conductivity, 1.0, atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["imager", "damped"])
+@pytest.mark.parametrize("kind", ["imager", pytest.param("damped", marks=pytest.mark.slow)])
 def test_a_change_far_below_the_noise_is_still_imaged(kind, small, request):
     """What ends the iteration does not keep it from its first step."""
     much, little = (

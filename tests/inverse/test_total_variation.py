@@ -92,7 +92,13 @@ def small_penalty(mesh):
     return TotalVariation(0.05).penalty(mesh, reference, 20.0)[1]
 
 
-@pytest.mark.parametrize("mesh", [OUTLINE.mesh(num_points=150), box(0.1, 0.1, 0.05, cell_size=0.03)], ids=["2d", "3d"])
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        pytest.param(OUTLINE.mesh(num_points=150), id="2d", marks=pytest.mark.slow),
+        pytest.param(box(0.1, 0.1, 0.05, cell_size=0.05), id="3d"),
+    ],
+)
 def test_the_quadratic_model_touches_the_energy_from_above(mesh):
     """Slope along any step is the energy's; for a linear misfit the true cost never exceeds the model's."""
     penalty = small_penalty(mesh)
