@@ -91,7 +91,14 @@ def test_images_show_a_body_where_it_is(model):
 
 
 # All shapes of a Gaussian leave a thousandth of its variance out, which is a fifth of the narrowest bars.
-@pytest.mark.parametrize(("prior", "least"), [(Gaussian(0.02), 0.25), (Matern(0.02), 0.05)])
+@pytest.mark.parametrize(
+    ("prior", "least"),
+    [
+        (Gaussian(0.02), None),
+        pytest.param(Gaussian(0.02), 0.25, marks=pytest.mark.slow),
+        (Matern(0.02), 0.05),
+    ],
+)
 def test_of_many_cells_fewer_shapes_make_the_same_image(prior, least, monkeypatch):
     """Images within 3 % of those of all shapes, and error bars: what data do not tell of keeps its variance."""
     model = ForwardModel(disk(0.1, num_points=120), BoundaryElectrodes(ring(0.1, 8), 0.012, 1e-3), adjacent(8))
@@ -100,14 +107,15 @@ def test_of_many_cells_fewer_shapes_make_the_same_image(prior, least, monkeypatc
     def found():
         noise = 1e-3 * np.abs(before).max()
         one = reconstruct(model, after, 1.0, prior=prior, hyperparameter=1.0, noise=noise)
-        return np.asarray(one.conductivity) - 1, np.asarray(posterior(one).standard_deviation())
+        bars = 1.0 if least is None else posterior(one).standard_deviation()  # which are compiled for seconds
+        return np.asarray(one.conductivity) - 1, np.asarray(bars)
 
     image, deviation = found()
     monkeypatch.setattr(priors, "_MANY", 10)
     monkeypatch.setattr(GriddedGaussian, "suits", staticmethod(lambda places, length: True))
     few, bars = found()
     assert np.abs(few - image).max() < 0.03 * np.abs(image).max()
-    assert np.abs(bars / deviation - 1).max() < least
+    assert np.abs(bars / deviation - 1).max() < (least or 1.0)
 
 
 def test_gaussian_by_way_of_a_grid():
