@@ -151,6 +151,7 @@ def test_noise_unknown_is_taken_from_the_image(skin):
     assert np.linalg.norm(found[0].centroid - [0.01, 0.005]) < 0.003
 
 
+@pytest.mark.slow
 def test_large_artefacts_are_no_noise():
     """Two touches on eight electrodes leave artefacts all over; the median distance from the median hid both."""
     electrodes = BoundaryElectrodes(ring(0.05, 8), 0.008, 300.0)

@@ -73,6 +73,7 @@ def test_curves_settle_without_overshoot_the_slower_the_smaller_the_rate():
     np.testing.assert_allclose(curves[:2, -1], 2.0, atol=0.01)
 
 
+@pytest.mark.slow
 def test_a_phase_may_end_anywhere_in_what_is_shown_at_once():
     """Frames are shown some at once, and the last of them are filled up: of those nothing is seen."""
     random = np.random.default_rng(5)

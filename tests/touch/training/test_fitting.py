@@ -108,6 +108,7 @@ def test_what_was_stopped_goes_on_to_the_same_bits(tmp_path):
     assert bits(fit(*given, key=KEY, checkpoint=tmp_path / "state").network) == bits(whole.network)
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment(tmp_path, trained):
     """By kill -9, after its first looks; its successor ends as one that was never killed."""
     script = tmp_path / "train.py"
