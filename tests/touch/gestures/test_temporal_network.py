@@ -52,13 +52,16 @@ def test_an_order_in_time_is_learnt():
     np.testing.assert_array_equal(network.last, again.last)
 
 
-def test_what_jax_trains_is_what_numpy_asks():
+def test_what_numpy_asks_is_convolved_as_by_jax():
     import jax
     import jax.numpy as jnp
 
     rng = np.random.default_rng(0)
-    features, label = rng.normal(size=(70, 3 + 8 * 2)), rng.integers(0, 3, 70)
-    network = TemporalNetwork.fit(features, label, whole=3, values=2)
+    features = rng.normal(size=(70, 3 + 8 * 2))
+    sizes = {"first": (4, 10), "second": (4, 20), "dense": (6, 11), "last": (3, 6)}
+    weights = {name: rng.normal(size=(1, *size)) for name, size in sizes.items()}
+    weights |= {f"{name}_bias": rng.normal(size=(1, size[0])) for name, size in sizes.items()}
+    network = TemporalNetwork(**weights, whole=3, classes_=np.arange(3))
 
     @jax.jit
     def probabilities(features, first, second):
@@ -71,14 +74,8 @@ def test_what_jax_trains_is_what_numpy_asks():
         dense = jax.nn.relu(pooled @ network.dense[0].T + network.dense_bias[0])
         return jax.nn.softmax(dense @ network.last[0].T + network.last_bias[0])
 
-    alone = TemporalNetwork(
-        *(getattr(network, name)[:1] for name in ("first", "first_bias", "second", "second_bias")),
-        *(getattr(network, name)[:1] for name in ("dense", "dense_bias", "last", "last_bias")),
-        whole=3,
-        classes_=network.classes_,
-    )
     right = probabilities(features, network.first[0], network.second[0])
-    np.testing.assert_allclose(alone.predict_proba(features), right, atol=1e-12)
+    np.testing.assert_allclose(network.predict_proba(features), right, atol=1e-12)
 
 
 def test_a_model_of_it_is_kept(tmp_path):
