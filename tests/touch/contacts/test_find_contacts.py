@@ -81,7 +81,9 @@ def test_no_contact_in_a_thousand_empty_frames(skin, finder):
     assert sum(bool(find_contacts(eager, image, skin.noise)) for image in skin.empty[:12]) > 6
 
 
-@pytest.mark.parametrize(("finder", "times", "draws", "within"), [(CellFinder, 50, 50, 0.2), (RasterFinder, 10, 20, 0.5)])
+@pytest.mark.parametrize(
+    ("finder", "times", "draws", "within"), [(CellFinder, 50, 50, 0.2), (RasterFinder, 10, 20, 0.5)]
+)
 def test_deviation_is_how_far_the_centroid_strays(skin, finder, times, draws, within):
     """Against draws of noise many times that of the readings, whose own error is 7 % of 50, 11 % of 20; a contour
     steps by cells."""

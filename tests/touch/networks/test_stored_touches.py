@@ -121,7 +121,9 @@ class Looked(NamedTuple):
     def run(self, name, network, objective, training, validation):
         batch = jax.tree.map(lambda one: jnp.asarray(one[:20]), training.chunk(2))
         batch = batch[0] if len(batch) == 1 and not isinstance(validation, tuple) else batch
-        asked = jax.jit(lambda batch, held: (objective.loss(network, batch, self.key)[0], objective.held_out(network, held)))
+        asked = jax.jit(
+            lambda batch, held: (objective.loss(network, batch, self.key)[0], objective.held_out(network, held))
+        )
         loss, held = asked(batch, jax.tree.map(jnp.asarray, validation))
         self.losses[name] = float(loss), np.asarray(held), objective.trained
         return Trained(network, Course([1], [float(loss)], [float(held.mean())]), "done")
