@@ -9,7 +9,6 @@ from jeit.mesh import centroids, disk
 from jeit.plot import plot_contact_stages, plot_contacts
 from jeit.touch.contacts import CellFinder, ImageNoise, RasterFinder, find_contacts
 
-
 MESH = disk(0.05, num_points=700)
 QUIET = ImageNoise(np.full(MESH.num_cells, 1e-9))
 

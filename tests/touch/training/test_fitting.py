@@ -160,12 +160,19 @@ class Chunks:
         return tuple(one[first : first + self.sizes[number]] for one in self.arrays)
 
 
-def test_chunks(tmp_path):
-    """A set larger than memory is learnt as well, chunk by chunk, and goes on amid an epoch."""
+def test_chunks():
+    """A set larger than memory is learnt as well, chunk by chunk."""
     chunks = Chunks(rows(500), (200, 200, 100))
     found = fit(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY)
     assert found.course.validation[found.course.best] < 0.02 / 9
     assert len(chunks.loaded) <= 3 * PLAN.epochs
+
+
+@pytest.mark.slow
+def test_what_was_stopped_amid_chunks_goes_on(tmp_path):
+    """Amid an epoch."""
+    chunks = Chunks(rows(500), (200, 200, 100))
+    found = fit(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY)
     given = network(), OBJECTIVE, Chunks(rows(500), (200, 200, 100)), rows(100, 1), PLAN
     given[2].chunk = lambda number, whole=given[2].chunk: whole(number) if len(given[2].loaded) < 7 else stop()
 
