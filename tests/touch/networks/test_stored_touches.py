@@ -1,6 +1,6 @@
 """Touches read from a store, some of its chunks at a time, and trained on."""
 
-from typing import NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -112,11 +112,10 @@ class Until(Runs):
         return super().run(name, network, objective, training, validation)
 
 
-class Looked(NamedTuple):
+class Looked(Runs):
     """Trainings that are not done: what their objectives give of some rows, of the first in numbers, else in shape."""
 
-    key: jax.Array
-    losses: dict
+    losses: dict[str, Any]
 
     def run(self, name, network, objective, training, validation):
         batch = jax.tree.map(lambda one: jnp.asarray(one[:20]), training.chunk(2))
@@ -138,7 +137,8 @@ def test_what_the_three_stages_are_taught(stored, other, small_skin, monkeypatch
         lambda key, shape, inputs: jnp.asarray(random.normal(size=shape) * np.sqrt(2 / inputs), jnp.float32),
     )
     indents, path, _ = stored
-    runs = Looked(jax.random.key(0), {})
+    runs = Looked(PLAN, jax.random.key(0))
+    runs.losses = {}
     found = train_three_stages(StoredTouches(indents, path, at_once=50), other, 1e-3, runs)
     assert list(runs.losses) == list(found.courses) == ["voltages", "maps", "projection"]
     assert all(loss.shape == () and held.shape == (40,) for loss, held, _ in runs.losses.values())
