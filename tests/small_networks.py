@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.simulate import Bar, Disc
+from jeit.simulate import Disc
 from jeit.touch.networks import Preset, learn, touches
 from jeit.touch.training import Plan
 
@@ -26,13 +26,13 @@ SHAPE = (24, 24)
 
 @contextmanager
 def small_maps():
-    """Of half as many rows and columns as else; one body of two kinds at once, of few sizes that JAX compiles for."""
+    """Of half as many rows and columns as else; one body of one kind, of few sizes that JAX compiles for."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learn, "SHAPE", SHAPE)
         patch.setattr(learn, "_PLACES", 5)
         patch.setattr(touches, "_PLACES", 5)
         patch.setattr(touches, "_AT_ONCE", 1)
-        patch.setattr(touches, "bodies", lambda: [Disc(0.02), Bar(0.02, 0.015)])
+        patch.setattr(touches, "bodies", lambda: [Disc(0.02)])
         yield
 
 

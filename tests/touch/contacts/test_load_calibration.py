@@ -62,6 +62,7 @@ def test_what_was_not_calibrated_is_refused():
         calibration.load(contact(5.0, 0.047))
 
 
+@pytest.mark.slow
 def test_a_skin_is_calibrated_over_its_radius(skin):
     """Loads at places and of sizes that were not calibrated, to 15 %, near the edge as in the middle."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 16), 0.008, 300.0)

@@ -5,13 +5,24 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
+from jeit.mesh import centroids, disk
 from jeit.plot import plot_contact_stages, plot_contacts
-from jeit.touch.contacts import CellFinder, RasterFinder, find_contacts
+from jeit.touch.contacts import CellFinder, ImageNoise, RasterFinder, find_contacts
+
+MESH = disk(0.05, num_points=700)
+QUIET = ImageNoise(np.full(MESH.num_cells, 1e-9))
 
 
-def test_contacts_are_drawn_where_they_are(skin):
-    found = find_contacts(CellFinder(skin.mesh), skin.two, skin.noise)
-    ax = plot_contacts(skin.mesh, skin.two, found, ax=Figure().subplots())
+@pytest.fixture(scope="module")
+def image():
+    """Of two contacts, on a disk."""
+    near = [np.linalg.norm(np.asarray(centroids(MESH)) - place, axis=1) for place in ((0.025, 0.0), (-0.02, 0.01))]
+    return 1e-6 * sum(height * np.exp(-((one / 0.01) ** 2)) for height, one in zip((1.0, 2.0), near, strict=True))
+
+
+def test_contacts_are_drawn_where_they_are(image):
+    found = find_contacts(CellFinder(MESH), image, QUIET)
+    ax = plot_contacts(MESH, image, found, ax=Figure().subplots())
     outlines = [one.get_xy()[:-1] for one in ax.patches if isinstance(one, Polygon)]
     assert len(outlines) == 2
     for outline, contact in zip(outlines, found, strict=True):
@@ -21,8 +32,8 @@ def test_contacts_are_drawn_where_they_are(skin):
     assert f"({1e3 * found[0].centroid[0]:+.1f}".replace("-", "−") in " ".join(texts)
 
 
-def test_every_stage_has_its_axes(skin):
-    stages = RasterFinder(skin.mesh).stages(skin.two, skin.noise)
+def test_every_stage_has_its_axes(image):
+    stages = RasterFinder(MESH).stages(image, QUIET)
     axes = plot_contact_stages(stages, axes=Figure(layout="constrained").subplots(2, 3))
     titles = [ax.get_title() for ax in axes]
     assert titles == ["region of interest", "grey", "adaptive threshold", "opened", "contours", "centroids"]
@@ -36,13 +47,13 @@ def test_every_stage_has_its_axes(skin):
     assert "µS)" in bar.get_ylabel() or "nS)" in bar.get_ylabel()
 
 
-def test_things_of_another_kind(skin):
+def test_things_of_another_kind(image):
     with pytest.raises(ValueError, match="contacts must be"):
-        plot_contacts(skin.mesh, skin.two, 3)
+        plot_contacts(MESH, image, 3)
     with pytest.raises(ValueError, match=r"contacts\[0\] must be"):
-        plot_contacts(skin.mesh, skin.two, [3])
+        plot_contacts(MESH, image, [3])
     with pytest.raises(ValueError, match="stages must be"):
-        plot_contact_stages(skin.two)
-    stages = RasterFinder(skin.mesh).stages(skin.two, skin.noise)
+        plot_contact_stages(image)
+    stages = RasterFinder(MESH).stages(image, QUIET)
     with pytest.raises(ValueError, match="axes: give six"):
         plot_contact_stages(stages, axes=Figure().subplots(1, 2))

@@ -37,6 +37,7 @@ def recorded():
     return level, seconds, *(np.asarray(linear.image(one - reference)) for one in (film, dead))
 
 
+@pytest.mark.slow
 def test_a_push_is_one_touch_that_ends(recorded):
     level, seconds, images, _ = recorded
     (touch,) = find_touches(level, seconds, images)
@@ -45,6 +46,7 @@ def test_a_push_is_one_touch_that_ends(recorded):
     assert 0.35 < touch.offset < 0.9
 
 
+@pytest.mark.slow
 def test_with_an_electrode_dying_it_does_not_end(recorded):
     level, seconds, images, dead = recorded
     whole, broken = (find_touches(level, seconds, one)[-1] for one in (images, dead))

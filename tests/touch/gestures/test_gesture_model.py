@@ -50,7 +50,7 @@ def quick_network(monkeypatch):
 
 @pytest.mark.usefixtures("quick_network")
 def test_the_best_on_people_held_out_is_taken():
-    made, labels, people = touches(people=3, each=4)
+    made, labels, people = touches(people=2, each=3)
     model = GestureModel.fit(made, labels, people=people)
     assert model.standing is not None
     errors = [error for _, error in model.standing.tried]
@@ -70,7 +70,7 @@ def test_of_one_person_it_says_so():
 @pytest.mark.usefixtures("quick_network")
 def test_a_class_that_somebody_never_made():
     """Folds that lack it do not fail, and a class that never occurs is never told."""
-    made, labels, people = touches(people=3, each=4)
+    made, labels, people = touches(people=3, each=2)
     kept = (labels != "slap") | (people == 0)
     some = [one for one, there in zip(made, kept, strict=True) if there]
     for method in GESTURE_CLASSIFIERS:

@@ -79,7 +79,7 @@ def test_responses_are_clipped():
     assert np.maximum(model.above_, model.below_).max() == pytest.approx(3 * 5 / 6)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(
     seed=st.integers(0, 10_000),
     number=st.integers(6, 40),

@@ -107,7 +107,7 @@ def test_frames_of_no_use_are_left_out_and_counted():
     assert (touch.lost, touch.course.peak.max()) == (1, pytest.approx(1.9))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_frame_by_frame_is_at_once(data):
     number = data.draw(st.integers(1, 40))

@@ -106,6 +106,7 @@ def line_of_a_cut(depth):
     return cut, fit.line([np.array([0.01, 0.01])]), fit.spot(np.array([0.01, 0.01]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [1.0, 0.5])
 def test_a_path_is_found_in_a_change_that_another_mesh_made(depth):
     cut, line, spot = line_of_a_cut(depth)
@@ -118,6 +119,7 @@ def test_a_path_is_found_in_a_change_that_another_mesh_made(depth):
     assert line.conductivity.min() < 0.8 * SHEET
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "depth",
     [1.0, pytest.param(0.5, marks=pytest.mark.xfail(raises=AssertionError, reason=_HALF))],

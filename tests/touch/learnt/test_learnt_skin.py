@@ -233,9 +233,9 @@ def test_keys_pressed_together():
         touched = rng.random((number, 6)) < 0.5
         return np.tanh(touched @ patterns / 3) + 0.08 * rng.normal(size=(number, CHANNELS)), touched
 
-    frames, touched = press(250, 1)
+    frames, touched = press(150, 1)
     skin = LearntSkin.fit(Presses.create(frames, touched=touched))
-    fresh, right = press(300, 2)
+    fresh, right = press(200, 2)
     told = skin.predict(fresh)
     assert np.mean(told.touched == right) > 0.97
     assert np.mean((told.touched == right).all(axis=1)) > 0.85

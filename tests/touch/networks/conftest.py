@@ -1,12 +1,16 @@
 """A small skin, and a network that learnt it."""
 
+import jax
 import pytest
-from small_networks import PRESET, small_maps
+from small_networks import PRESET, SHAPE, small_maps
 
 from jeit.design import Skin
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
-from jeit.touch.networks import learn_images
+from jeit.simulate.contact.indent_sets import image_places
+from jeit.touch.networks import ImageNetwork, learn_images, write_network
+from jeit.touch.networks.sensed import Sensed
+from jeit.touch.networks.unrolled import Unrolled
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -24,6 +28,18 @@ def small_skin():
 def layer():
     """A skin that is solved in three dimensions."""
     return Skin.create(named_layout("grid-3x3", Rectangle(0.06, 0.06)), num_layers=3, cell_size=7e-3)
+
+
+@pytest.fixture(scope="session")
+def imaging(small_skin, tmp_path_factory):
+    """A folder with a network that is not trained, whose maps are linear images; and the network."""
+    folder, noise = tmp_path_factory.mktemp("imaging"), 1.5e-3
+    network = Unrolled(small_skin.model.protocol.num_measurements, SHAPE, key=jax.random.key(0))
+    places = image_places(small_skin, SHAPE[1], SHAPE[0])
+    network = network.of_skin(Sensed.of(small_skin, SHAPE), places, small_skin.layout.centres, noise)
+    network = ImageNetwork.of_skin(network, small_skin, noise, SHAPE)
+    write_network(network, folder / "network.jeit")
+    return folder, network
 
 
 @pytest.fixture(scope="session")

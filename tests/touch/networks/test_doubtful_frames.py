@@ -30,9 +30,9 @@ def test_missing_channels_are_what_is_expected_of_them():
         np.testing.assert_allclose(whole[lost] @ row, 0, atol=1e-9)
 
 
-def test_an_electrode_that_says_nothing(small_skin, learnt, change):
+def test_an_electrode_that_says_nothing(small_skin, imaging, change):
     """All channels of one electrode lost: the touch stays where it is, where zeros move it."""
-    network, protocol = learnt[1].network, small_skin.model.protocol
+    network, protocol = imaging[1], small_skin.model.protocol
     drive, measured = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     for electrode in (5, 10):
         lost = (drive[:, electrode] != 0) | (measured[:, electrode] != 0)
@@ -43,9 +43,9 @@ def test_an_electrode_that_says_nothing(small_skin, learnt, change):
         assert np.linalg.norm(without - whole) < 0.7 * np.linalg.norm(zeros - whole)
 
 
-def test_what_no_touch_makes(learnt, change):
+def test_what_no_touch_makes(imaging, change):
     """Signs turned round, and other units, are told; a touch is not doubted, nor what is not touched."""
-    network = learnt[1].network
+    network = imaging[1]
 
     def doubted(frames):
         return network.doubts(frames, network.share(frames))
@@ -57,8 +57,8 @@ def test_what_no_touch_makes(learnt, change):
         network.depth(1e3 * np.ones(94), np.ones(94))
 
 
-def test_noise_alone_is_not_deep(learnt, change):
-    network = learnt[1].network
+def test_noise_alone_is_not_deep(imaging, change):
+    network = imaging[1]
     noise = network.noise * np.random.default_rng(3).normal(size=(20, 94))
     assert network.thickness * network.share(noise).max() < 1.5 * network.floor
     assert network.thickness * network.share(change).max() > 3 * network.floor

@@ -12,6 +12,7 @@ from jeit.touch.training import Plan
 PRESET = Preset(150, 30, Plan(rate=2e-3, batch=25, epochs=10, patience=10, decay=0.9))
 
 
+@pytest.mark.slow
 def test_touches_of_a_set_are_those_of_solving_anew(layer):
     """To a millionth, of the least that is left to conduct where nothing does."""
     indents = IndentSet(layer, touch_draws(layer), 3, seed=4, chunk=3)

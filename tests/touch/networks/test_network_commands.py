@@ -46,10 +46,10 @@ def told(folder):
     return np.genfromtxt(folder / "frames.csv", delimiter=",", skip_header=1)
 
 
-def test_reconstruct(learnt, recorded, run, tmp_path):
+def test_reconstruct(imaging, recorded, run, tmp_path):
     status, out, error = run(
         "reconstruct", recorded / "touched.npz", "--reference", recorded / "rest.npz", "--frame", 1,
-        "--method", "network", "--model", learnt[0], "--output", tmp_path,
+        "--method", "network", "--model", imaging[0], "--output", tmp_path,
     )  # fmt: skip
     assert (status, error) == (0, "")
     assert "1 frame imaged" in out
@@ -60,14 +60,14 @@ def test_reconstruct(learnt, recorded, run, tmp_path):
     assert (tmp_path / "depth.png").stat().st_size > 5000
 
 
-def test_stream(learnt, recorded, run, tmp_path):
+def test_stream(imaging, recorded, run, tmp_path):
     """A frame without one of its channels is imaged; one of signs turned round is not."""
     with np.load(recorded / "touched.npz") as one:
         arrays = dict(one)
     with np.load(recorded / "rest.npz") as one:
         arrays["voltages"][2] = 2 * one["voltages"][0] - arrays["voltages"][2]
     np.savez(tmp_path / "touched.npz", frames=np.where(arrays["mask"], arrays["voltages"], np.nan))
-    given = "--reference", recorded / "rest.npz", "--method", "network", "--model", learnt[0], "--output", tmp_path
+    given = "--reference", recorded / "rest.npz", "--method", "network", "--model", imaging[0], "--output", tmp_path
     status, out, error = run("stream", recorded / "touched.npz", *given)
     assert (status, error) == (0, "")
     assert "3 frames imaged" in out
@@ -79,13 +79,13 @@ def test_stream(learnt, recorded, run, tmp_path):
     assert json.loads((tmp_path / "report.json").read_text())["refused"] == [2]
 
 
-def test_a_table_that_nothing_describes(learnt, recorded, run, tmp_path):
+def test_a_table_that_nothing_describes(imaging, recorded, run, tmp_path):
     """The network knows what its channels are; the file that the skin is described by is a description too."""
     for name in ("rest", "touched"):
         with np.load(recorded / f"{name}.npz") as one:
             np.savez(tmp_path / f"{name}.npz", frames=one["voltages"])
     (tmp_path / "skin.toml").write_text(SKIN)
-    given = "--reference", tmp_path / "rest.npz", "--method", "network", "--model", learnt[0], "--output", tmp_path
+    given = "--reference", tmp_path / "rest.npz", "--method", "network", "--model", imaging[0], "--output", tmp_path
     for more in ((), ("--description", tmp_path / "skin.toml")):
         status, out, error = run("reconstruct", tmp_path / "touched.npz", *given, "--frame", -2, *more)
         assert (status, error) == (0, "")
@@ -103,29 +103,29 @@ def test_a_table_that_nothing_describes(learnt, recorded, run, tmp_path):
     assert "has 5 channels, and the network was trained for 94" in error
 
 
-def test_an_untouched_skin(learnt, recorded, run, tmp_path):
+def test_an_untouched_skin(imaging, recorded, run, tmp_path):
     """Nothing is said to be touched."""
-    given = "--reference", recorded / "rest.npz", "--method", "network", "--model", learnt[0], "--output", tmp_path
+    given = "--reference", recorded / "rest.npz", "--method", "network", "--model", imaging[0], "--output", tmp_path
     status, out, _ = run("stream", recorded / "rest.npz", *given)
     assert status == 0
     assert "untouched: nothing is deeper than noise makes it" in out
     assert np.isnan(told(tmp_path)[1:3]).all()
 
 
-def test_nothing_is_left_of_what_fails(learnt, recorded, run, tmp_path):
+def test_nothing_is_left_of_what_fails(imaging, recorded, run, tmp_path):
     """No empty folder, and those above it stay away too."""
-    given = "--method", "network", "--model", learnt[0], "--output", tmp_path / "new" / "out"
+    given = "--method", "network", "--model", imaging[0], "--output", tmp_path / "new" / "out"
     status, _, error = run("reconstruct", recorded / "touched.npz", *given)
     assert status == 1
     assert "--reference" in error
     assert not (tmp_path / "new").exists()
 
 
-def test_stream_from_standard_input(learnt, recorded, run, tmp_path, monkeypatch):
+def test_stream_from_standard_input(imaging, recorded, run, tmp_path, monkeypatch):
     with np.load(recorded / "touched.npz") as one:
         text = " ".join(map(repr, one["voltages"][0].tolist())) + "\n1 2 3\n"
     monkeypatch.setattr("sys.stdin", io.StringIO(text))
-    given = "--reference", recorded / "rest.npz", "--method", "network", "--model", learnt[0], "--output", tmp_path
+    given = "--reference", recorded / "rest.npz", "--method", "network", "--model", imaging[0], "--output", tmp_path
     status, out, _ = run("stream", "-", *given)
     assert status == 0
     assert "1 frame imaged" in out
@@ -140,20 +140,20 @@ def test_stream_from_standard_input(learnt, recorded, run, tmp_path, monkeypatch
         (("--method", "network", "--model", "nowhere"), "there is no such file"),
     ],
 )
-def test_what_does_not_go_together(learnt, recorded, run, tmp_path, options, said):
-    options = [learnt[0] if one == "MODEL" else one for one in options]
+def test_what_does_not_go_together(imaging, recorded, run, tmp_path, options, said):
+    options = [imaging[0] if one == "MODEL" else one for one in options]
     given = recorded / "touched.npz", "--reference", recorded / "rest.npz", "--output", tmp_path, *options
     status, _, error = run("reconstruct", *given)
     assert status == 1
     assert said in error
 
 
-def test_another_protocol_is_refused(small_skin, learnt, recorded, run, tmp_path):
+def test_another_protocol_is_refused(small_skin, imaging, recorded, run, tmp_path):
     other = screen(
         np.linspace(1, 2, 208)[None], adjacent(16), electrodes=small_skin.model.electrodes, domain=small_skin.outline
     )
     write_table(other, tmp_path / "other.npz")
-    given = "--method", "network", "--model", learnt[0], "--output", tmp_path
+    given = "--method", "network", "--model", imaging[0], "--output", tmp_path
     status, _, error = run("reconstruct", tmp_path / "other.npz", "--reference", tmp_path / "other.npz", *given)
     assert status == 1
     assert "its channels is 94, and here it is 208" in error

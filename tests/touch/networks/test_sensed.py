@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.simulate import Disc, Indent, depth_maps, relative_changes
+from jeit.simulate import Disc, Indent, depth_maps, indented_cells, relative_changes
 from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.networks.sensed import Sensed, depth_of, strength
 from jeit.touch.networks.touches import bodies
@@ -65,7 +65,13 @@ def test_a_layer_feels_less_of_the_same_indent(layer):
     own = Sensed.of(layer, (24, 24))
     touches = [[Indent(Disc(0.02), 2.5e-3, (0.002, 0.004))]]
     maps = depth_maps(touches, image_places(layer, 24, 24)) / float(layer.thickness)
-    assert missed(felt(own, maps), relative_changes(layer, touches)) < 0.6
+    touched, conductivity = (
+        indented_cells(layer, touches),
+        np.full(layer.model.mesh.num_cells, float(layer.conductivity)),
+    )
+    rest = np.asarray(layer.model.voltages(conductivity))
+    np.multiply.at(conductivity, np.asarray(touched.cells)[0], np.maximum(1 + np.asarray(touched.change)[0], 1e-9))
+    assert missed(felt(own, maps), (np.asarray(layer.model.voltages(conductivity)) / rest - 1)[None]) < 0.6
 
 
 def test_bodies_that_are_pressed_in():

@@ -1,7 +1,10 @@
 """Touches read from a store, some of its chunks at a time, and trained on."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_networks import bits
@@ -11,7 +14,8 @@ from jeit.touch.networks import ImageNetwork
 from jeit.touch.networks.examples import Examples, StoredTouches
 from jeit.touch.networks.touches import touch_draws
 from jeit.touch.networks.training import Runs, mean_and_deviation, shuffled, train_three_stages
-from jeit.touch.training import MappedRows, Plan
+from jeit.touch.training import MappedRows, Plan, Trained
+from jeit.touch.training.checkpoint import Course
 
 PLAN = Plan(rate=2e-3, batch=20, epochs=3, seconds=0.0)
 
@@ -108,6 +112,47 @@ class Until(Runs):
         return super().run(name, network, objective, training, validation)
 
 
+class Looked(Runs):
+    """Trainings that are not done: what their objectives give of some rows, of the first in numbers, else in shape."""
+
+    losses: dict[str, Any]
+
+    def run(self, name, network, objective, training, validation):
+        batch = jax.tree.map(lambda one: jnp.asarray(one[:20]), training.chunk(2))
+        given = batch, jax.tree.map(jnp.asarray, validation)
+
+        def asked(batch, held):
+            return objective.loss(network, batch, self.key)[0], objective.held_out(network, held)
+
+        found = jax.jit(asked)(*given) if name == "voltages" else jax.eval_shape(asked, *given)
+        self.losses[name] = *found, objective.trained
+        return Trained(network, Course([1], [1.0], [1.0]), "done")
+
+
+def test_what_the_three_stages_are_taught(stored, other, small_skin, monkeypatch):
+    """Untrained, the first misses all that it is to redraw; the last leads from the first's ends, which stay."""
+    random = np.random.default_rng(0)
+    monkeypatch.setattr(
+        "jeit.touch.networks.layers._start",
+        lambda key, shape, inputs: jnp.asarray(random.normal(size=shape) * np.sqrt(2 / inputs), jnp.float32),
+    )
+    indents, path, _ = stored
+    runs = Looked(PLAN, jax.random.key(0))
+    runs.losses = {}
+    found = train_three_stages(StoredTouches(indents, path, at_once=50), other, 1e-3, runs)
+    assert list(runs.losses) == list(found.courses) == ["voltages", "maps", "projection"]
+    assert all(loss.shape == () and held.shape == (40,) for loss, held, _ in runs.losses.values())
+    # Standardised changes have a mean square of about one, and so has what an untrained network misses of them.
+    assert 0.5 < runs.losses["voltages"][0] < 5
+    assert runs.losses["voltages"][1].min() > 0
+    trained = runs.losses["projection"][2]
+    assert any(jax.tree.leaves(trained.projection))
+    assert not any(jax.tree.leaves((trained.mean, trained.deviation, trained.encoder, trained.decoder)))
+    assert eqx.tree_equal(found.network.decoder, found.courses["maps"].network.decoder)
+    assert eqx.tree_equal(found.network.encoder, found.courses["voltages"].network.encoder)
+    assert ImageNetwork.of_skin(found.network, small_skin, 1e-3, (16, 16)).design == "three-stages"
+
+
 @pytest.fixture(scope="module")
 def three_stages(stored, other, tmp_path_factory):
     """Trains the paper's network on three chunks, up to one of its trainings, in one folder; and the chunks read."""
@@ -149,14 +194,17 @@ def paper(three_stages, maps):
     return found, list(loaded)
 
 
+@pytest.mark.slow
 def test_a_training_s_state_is_kept_by_its_name(voltages):
     assert voltages == {"voltages.training"}
 
 
+@pytest.mark.slow
 def test_what_is_trained_after_another_has_its_own_state(maps):
     assert maps == {"maps.training"}
 
 
+@pytest.mark.slow
 def test_three_trainings_of_the_paper_s_network(paper, small_skin):
     """On a set larger than memory, whose three chunks are read one by one; the last leads from the first's ends."""
     found, loaded = paper

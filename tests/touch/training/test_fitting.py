@@ -86,14 +86,14 @@ class Stopped(Exception):
 
 def test_what_was_stopped_goes_on_to_the_same_bits(tmp_path):
     """Also amid epochs, with rates that fall."""
-    plan = Plan(rate=1e-2, batch=32, epochs=6, look_every=4, seconds=0.0, decay=0.5, decay_epochs=2)
+    plan = Plan(rate=1e-2, batch=32, epochs=3, look_every=4, seconds=0.0, decay=0.5, decay_epochs=1)
     given = network(), OBJECTIVE, rows(500), rows(100, 1), plan
     whole = fit(*given, key=KEY)
     told = []
 
     def stop(said):
         told.append(said)
-        if len(told) % 3 == 0:
+        if len(told) in (3, 7):
             raise Stopped
 
     for _ in range(20):
@@ -108,6 +108,7 @@ def test_what_was_stopped_goes_on_to_the_same_bits(tmp_path):
     assert bits(fit(*given, key=KEY, checkpoint=tmp_path / "state").network) == bits(whole.network)
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment(tmp_path, trained):
     """By kill -9, after its first looks; its successor ends as one that was never killed."""
     script = tmp_path / "train.py"
@@ -159,12 +160,19 @@ class Chunks:
         return tuple(one[first : first + self.sizes[number]] for one in self.arrays)
 
 
-def test_chunks(tmp_path):
-    """A set larger than memory is learnt as well, chunk by chunk, and goes on amid an epoch."""
+def test_chunks():
+    """A set larger than memory is learnt as well, chunk by chunk."""
     chunks = Chunks(rows(500), (200, 200, 100))
     found = fit(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY)
     assert found.course.validation[found.course.best] < 0.02 / 9
     assert len(chunks.loaded) <= 3 * PLAN.epochs
+
+
+@pytest.mark.slow
+def test_what_was_stopped_amid_chunks_goes_on(tmp_path):
+    """Amid an epoch."""
+    chunks = Chunks(rows(500), (200, 200, 100))
+    found = fit(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY)
     given = network(), OBJECTIVE, Chunks(rows(500), (200, 200, 100)), rows(100, 1), PLAN
     given[2].chunk = lambda number, whole=given[2].chunk: whole(number) if len(given[2].loaded) < 7 else stop()
 
