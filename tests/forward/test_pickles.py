@@ -6,11 +6,10 @@ import subprocess
 import sys
 
 import cloudpickle
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from extremes import KINDS, uneven
+from extremes import KINDS, compiled, uneven
 
 from jeit.design import Skin
 from jeit.forward import ForwardModel
@@ -24,11 +23,6 @@ WAYS = {
     "deep copy": copy.deepcopy,
     "copy": copy.copy,
 }
-
-
-@eqx.filter_jit
-def compiled(model, conductivity):
-    return model.voltages(conductivity)
 
 
 def assert_same_bits(original, use):

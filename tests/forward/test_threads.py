@@ -5,20 +5,14 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from extremes import KINDS, uneven
+from extremes import KINDS, compiled, uneven
 
 from jeit.inverse import Imager, one_step
 
 THREADS = 8
-
-
-@eqx.filter_jit
-def compiled(model, conductivity):
-    return model.voltages_and_jacobian(conductivity)
 
 
 def assert_as_alone(shared: Callable[[int], Any], alone: Callable[[int], Any], turns: int = THREADS) -> None:
