@@ -108,18 +108,12 @@ GRADED = {
 
 
 # The steepest of all refinements stand for gentle ones.
-SLOW = (
-    "electrode edges, gentle",
-    "electrode edges, steep",
-    "boundary nodes",
-    "two refinements",
-    "jumping size function",
-)
+GENTLE = {"electrode edges, gentle", "electrode edges, steep"}
+SLOW = GENTLE | {"boundary nodes", "two refinements", "jumping size function"}
+CASES = [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in GRADED]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in GRADED]
-)
+@pytest.mark.parametrize("name", CASES)
 def test_graded_disks(name):
     options = GRADED[name]
     mesh = disk(0.1, **options)
