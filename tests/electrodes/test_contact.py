@@ -103,7 +103,13 @@ def test_mass_and_load_add_up_to_area_over_impedance(electrodes, mesh, area):
     assert total == pytest.approx(per_electrode.sum(), rel=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["arcs", "sheet discs", "face discs", "patches", "points", "combined"])
+# Discs and patches on faces: tests/electrodes/test_curved_faces.py. What is combined is made of its parts.
+SLOW = ("face discs", "patches", "combined")
+
+
+@pytest.mark.parametrize(
+    "kind", ["arcs", "sheet discs", "points", *(pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW)]
+)
 def test_contact_of_values_equals_that_of_traced_arrays(kind):
     """NumPy works out the one, and JAX the other; what is asked of JAX's arrays is JAX's."""
     mesh = box(0.06, 0.06, 0.01, num_points=300) if kind in ("face discs", "patches") else disk(0.05, num_points=200)

@@ -1,5 +1,7 @@
 """Small models of every kind of electrode, in any unit of length, for arithmetic in which nothing is rounded."""
 
+import equinox as eqx
+import jax
 import numpy as np
 
 from jeit.electrodes import BoundaryElectrodes, FaceDiscs, FacePatches, PointElectrodes, SheetDiscs
@@ -36,6 +38,13 @@ def _patch(unit: float) -> ForwardModel:
     position = unit * ring(0.1, 6, height=float(mesh.points[:, 2].mean()) / unit)
     electrodes = FacePatches(position, 0.045 * unit, 0.045 * unit, 0.01 * unit * UNLIKE[:6])
     return ForwardModel(mesh, electrodes, adjacent(6, current=1e-3))
+
+
+@eqx.filter_jit
+def compiled(model, conductivity):
+    """Voltages, and their Jacobian: from the fields, and by the derivative rule. One program for all test files."""
+    jacobian = model.voltages_and_jacobian(conductivity)[1]
+    return model.voltages(conductivity), jacobian, jax.jacrev(model.voltages)(conductivity)
 
 
 UNLIKE = np.geomspace(1.0, 3.0, 8)

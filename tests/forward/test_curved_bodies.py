@@ -213,6 +213,7 @@ def along(of_steps):
 WAYS = pytest.mark.parametrize(("name", "size"), [("places", 1e-3), ("conductivity", 1.0), ("nodes", 2e-4)])
 
 
+@pytest.mark.slow
 @WAYS
 def test_derivatives_on_a_shell_by_taylor(skin, of_steps, along, name, size):
     still = of_steps[1]

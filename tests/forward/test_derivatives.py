@@ -25,7 +25,7 @@ def model(request):
     return MODELS[request.param]()
 
 
-@pytest.fixture(params=models(["boundary", "point"]), scope="module")
+@pytest.fixture(params=models(["boundary"]), scope="module")
 def known(request):
     """A model for programs in which its electrodes have values: there one kind with contacts stands for the others."""
     return MODELS[request.param]()
@@ -152,6 +152,8 @@ def test_reciprocity(model):
 FIELDS = ("position", "width", "radius", "height", "contact_impedance")
 
 
+# Of arcs and points, the quick suite has derivatives in tests/electrodes/test_contact.py and on surfaces.
+@pytest.mark.parametrize("model", models(["inside"]), indirect=True, scope="module")
 def test_gradients_of_electrodes_and_nodes_against_central_differences(model):
     """In every field of the electrodes, and in the mesh's nodes, one after the other.
 

@@ -25,7 +25,7 @@ def models(*quick):
 
 
 # Of other kinds, test_derivatives has the compiled voltages beside NumPy's.
-@pytest.fixture(params=models("boundary", "point"), scope="module")
+@pytest.fixture(params=models("boundary"), scope="module")
 def model(request):
     return MODELS[request.param]()
 
@@ -75,6 +75,12 @@ def test_one_number_per_node(known):
     found = known.voltages_and_jacobian(nodal)
     of_cells = np.asarray(known.voltages(nodal[np.asarray(known.mesh.cells)].mean(axis=1)))
     assert_same(found[0], of_cells, 1e-13)
+
+
+@pytest.mark.slow
+def test_one_number_per_node_in_compiled_code(known):
+    nodal = uneven(known.mesh.num_points)
+    found = known.voltages_and_jacobian(nodal)
     both = jax.jit(lambda at: (known.voltages_and_jacobian(at), jax.jacrev(known.voltages)(at)))
     together, plain = both(nodal)
     assert_same(found, together)
@@ -185,6 +191,7 @@ def test_numbers_of_any_kind_are_conductivities(parts, kind):
         model.voltages(values.astype(object))
 
 
+@pytest.mark.slow
 def test_a_model_may_be_made_inside_jit_of_a_known_mesh(parts):
     mesh, electrodes, protocol = parts
 
@@ -196,3 +203,12 @@ def test_a_model_may_be_made_inside_jit_of_a_known_mesh(parts):
     np.testing.assert_allclose(
         impedance(electrodes.position), expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max()
     )
+
+
+def test_a_model_may_be_made_while_jit_traces(parts):
+    mesh, electrodes, protocol = parts
+    found = jax.eval_shape(
+        lambda position: ForwardModel(mesh, BoundaryElectrodes(position, 0.02, 1e-3), protocol).transfer_impedance(1.0),
+        electrodes.position,
+    )
+    assert found.shape == (8, 8)

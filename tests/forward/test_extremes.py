@@ -3,13 +3,11 @@
 from contextlib import nullcontext
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from exact_arithmetic import exact, exact_change
-from extremes import CONTACTS, KINDS, middles, miss, uneven, with_contacts
+from extremes import CONTACTS, KINDS, compiled, middles, miss, uneven, with_contacts
 
 from jeit.design.skin.resting_skin import RestingSkin
 from jeit.design.skin.touched_cells import TouchedCells
@@ -19,13 +17,6 @@ from jeit.inverse import calibrate, one_step
 from jeit_solvers.engines import on_device, on_host
 
 UNITS = {"micrometres": 1e-5, "a power of two": 2.0**-17, "kilometres": 1e4}
-
-
-@eqx.filter_jit
-def compiled(model, conductivity):
-    """Voltages, and their Jacobian: from the fields, and by the derivative rule."""
-    jacobian = model.voltages_and_jacobian(conductivity)[1]
-    return model.voltages(conductivity), jacobian, jax.jacrev(model.voltages)(conductivity)
 
 
 class Case(NamedTuple):

@@ -6,11 +6,10 @@ import subprocess
 import sys
 
 import cloudpickle
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from extremes import KINDS, uneven
+from extremes import KINDS, compiled, uneven
 
 from jeit.design import Skin
 from jeit.forward import ForwardModel
@@ -24,11 +23,6 @@ WAYS = {
     "deep copy": copy.deepcopy,
     "copy": copy.copy,
 }
-
-
-@eqx.filter_jit
-def compiled(model, conductivity):
-    return model.voltages(conductivity)
 
 
 def assert_same_bits(original, use):
@@ -48,21 +42,38 @@ def test_models(kind):
         assert_same_bits(model, lambda one: compiled(one, conductivity))
 
 
+def assert_equal(original):
+    """All that it holds, without its being used."""
+    for change in WAYS.values():
+        again = change(original)
+        assert jax.tree.structure(again) == jax.tree.structure(original), "and compiled code takes it for the same"
+        assert jax.tree.all(jax.tree.map(np.array_equal, again, original))
+
+
 def test_a_model_with_conjugate_gradients():
     model = KINDS["boundary"](1.0)
-    model = ForwardModel(model.mesh, model.electrodes, model.protocol, solver="cg")
-    for change in WAYS.values():
-        again = change(model)
-        assert jax.tree.structure(again) == jax.tree.structure(model), "and compiled code takes it for the same"
-        assert jax.tree.all(jax.tree.map(np.array_equal, again, model))
+    assert_equal(ForwardModel(model.mesh, model.electrodes, model.protocol, solver="cg"))
 
 
-def test_reconstructions_and_imagers():
+def test_reconstructions():
     model = KINDS["boundary"](1.0)
     frame, rest = (np.asarray(model.voltages(one)) for one in (uneven(model), 1.0))
     assert_same_bits(one_step(model, 1.0), lambda one: one.image(frame - rest))
-    usable = np.ones(len(rest), bool)
-    imager = Imager.create(model, 1.0, noise=1e-6)
+
+
+@pytest.fixture(scope="module")
+def imager():
+    return Imager.create(KINDS["boundary"](1.0), 1.0, noise=1e-6)
+
+
+def test_imagers(imager):
+    assert_equal(imager)
+
+
+@pytest.mark.slow
+def test_imagers_in_use(imager):
+    frame = np.asarray(KINDS["boundary"](1.0).voltages(uneven(KINDS["boundary"](1.0))))
+    usable = np.ones(len(frame), bool)
     assert_same_bits(imager, lambda one: one.estimate(frame, one.weighing(usable), one.start))
 
 

@@ -125,11 +125,7 @@ def test_jacobian(reference, state):
     assert relative(model.jacobian(arrays[f"sigma_{state}"]), arrays[f"J_{state}"]) < SOLVE
 
 
-@pytest.mark.parametrize(
-    "reference",
-    ["circ2d_cem_576", *(pytest.param(case, marks=pytest.mark.slow) for case in ["cyl3d_pem_768", *SLOW])],
-    indirect=True,
-)
+@pytest.mark.slow
 def test_jacobian_of_electrodes_that_move_with_their_nodes(reference):
     """`J_movement_h`, all x then all y: each electrode shifts the nodes it stands on, and the mesh with them.
 

@@ -5,20 +5,14 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from extremes import KINDS, uneven
+from extremes import KINDS, compiled, uneven
 
 from jeit.inverse import Imager, one_step
 
 THREADS = 8
-
-
-@eqx.filter_jit
-def compiled(model, conductivity):
-    return model.voltages_and_jacobian(conductivity)
 
 
 def assert_as_alone(shared: Callable[[int], Any], alone: Callable[[int], Any], turns: int = THREADS) -> None:
@@ -67,14 +61,19 @@ def test_models_made_and_imaged_in_threads(make, conductivities):
     assert_as_alone(image, image, turns=1)
 
 
-def test_one_reconstruction_and_one_imager(conductivities, make):
+def test_one_reconstruction(conductivities, make):
     model = make()
     frames = [np.asarray(model.voltages(one)) for one in conductivities]
     rest = np.asarray(model.voltages(1.0))
     shared, alone = (one_step(make(), 1.0) for _ in range(2))
     assert_as_alone(lambda k: shared.image(frames[k] - rest), lambda k: alone.image(frames[k] - rest))
+
+
+@pytest.mark.slow
+def test_one_imager(conductivities, make):
+    frames = [np.asarray(make().voltages(one)) for one in conductivities]
     imagers = [Imager.create(make(), 1.0, noise=1e-6) for _ in range(2)]
-    usable = np.ones(len(rest), bool)
+    usable = np.ones(len(frames[0]), bool)
 
     def estimate(imager, number):
         return imager.estimate(frames[number], imager.weighing(usable), imager.start)

@@ -50,7 +50,7 @@ def area(mesh, index):
     return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
 
 
-@pytest.mark.parametrize("name", MESHES)
+@pytest.mark.parametrize("name", ["disk", pytest.param("box", marks=pytest.mark.slow)])
 def test_a_cut_mesh_has_the_surface_on_sides_of_cells(name):
     mesh = MESHES[name]
     centre, radius = np.asarray(centroids(mesh)).mean(axis=0) + 0.03, 0.3

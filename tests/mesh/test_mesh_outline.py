@@ -101,6 +101,7 @@ def test_what_it_is_described_by_makes_it_again(domain):
         np.testing.assert_array_equal(loop, wanted)
 
 
+@pytest.mark.slow
 def test_many_vertices_are_compared_some_at_a_time():
     """A circle, a comb and a path through random points, as they are or turned on themselves; in little memory."""
     angle = np.linspace(0, 2 * np.pi, 2000, endpoint=False)

@@ -115,6 +115,7 @@ def test_derivatives_along_the_surface_by_taylor():
         assert rest[0] / rest[1] == pytest.approx(4, rel=0.1)
 
 
+@pytest.mark.slow
 def test_batches_of_surfaces_are_loops():
     model = ForwardModel(Mesh.create(*ball(120)), NodeElectrodes([3, 40, 60, 90]), protocol.adjacent(4))
     steps = 1e-3 * np.random.default_rng(4).normal(size=(3, 120, 3))
@@ -233,6 +234,7 @@ def test_millimetres_and_inches_are_noticed():
         Mesh.create(1000 * TETRAHEDRON, OUTWARD)
 
 
+@pytest.mark.slow
 def test_twenty_thousand_triangles_are_checked_in_seconds():
     points, cells = ball(10_000)
     begun = time.process_time()

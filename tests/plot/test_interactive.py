@@ -19,7 +19,14 @@ from jeit.plot.solid.interactive import can_view
 TANK = box(0.17, 0.255, 0.17, num_points=600)
 IMAGE = 1e-3 * np.exp(-np.sum((np.asarray(centroids(TANK)) - [0.03, -0.05, 0.1]) ** 2, axis=1) / 0.04**2)
 PATCHES = FacePatches([[0.085, 0.0, 0.085], [-0.085, 0.0, 0.085]], 0.06, 0.06, 1e-3)
-_DRAWS = "import pyvista; p = pyvista.Plotter(off_screen=True); p.add_mesh(pyvista.Sphere()); p.screenshot()"
+_DRAWS = """
+import vtkmodules.vtkRenderingOpenGL2
+from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow
+window = vtkRenderWindow()
+window.SetOffScreenRendering(1)
+window.AddRenderer(vtkRenderer())
+window.Render()
+"""
 
 
 @pytest.fixture(scope="module")

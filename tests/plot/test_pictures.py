@@ -147,7 +147,13 @@ def test_rings_round_a_tank_share_the_places_of_their_numbers(ax):
     assert not [c for c in ax.collections if isinstance(c, PatchCollection)]
 
 
-@pytest.mark.parametrize(("outline", "inches"), [(Disk(RADIUS), (5.0, 4.4)), (Rectangle(0.15, 0.2), (4.0, 3.6))])
+@pytest.mark.parametrize(
+    ("outline", "inches"),
+    [
+        pytest.param(Disk(RADIUS), (5.0, 4.4), id="disk", marks=pytest.mark.slow),
+        pytest.param(Rectangle(0.15, 0.2), (4.0, 3.6), id="rectangle"),
+    ],
+)
 def test_numbers_of_rings_lie_beside_their_electrodes(outline, inches, ax):
     tank = Solid(outline, 0.04).mesh(num_points=600)
     level = ring(RADIUS, 16)

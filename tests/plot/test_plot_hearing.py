@@ -148,7 +148,7 @@ def test_taps_left_out_are_red_and_useless_microphones_say_why(ax):
     assert not dead.lines[0].get_xdata().size
 
 
-@pytest.mark.parametrize(("number", "columns"), [(3, 3), (7, 3), (25, 5), (64, 8)])
+@pytest.mark.parametrize(("number", "columns"), [(3, 3), (7, 3), (25, 5), pytest.param(64, 8, marks=pytest.mark.slow)])
 def test_axis_labels_stand_at_the_border_only(number, columns, ax):
     plot_receptive_fields(fitted(number), ax=ax)
     ax.figure.canvas.draw()

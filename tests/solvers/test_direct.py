@@ -40,10 +40,10 @@ def as_type(values, dtype):
     return values.astype(dtype)
 
 
-# Compiled, problems take a second each: quick ones have fronts in stages, of all sizes, one alone, and parts apart.
-QUICK = (sparse_problems.disk, sparse_problems.disconnected, sparse_problems.diagonal)
+# Compiled, problems take a second each: the quick ones have fronts in stages, of all sizes, and one alone.
 COMPILED = [
-    pytest.param(case, "float64", marks=() if case in QUICK else pytest.mark.slow) for case in sparse_problems.PROBLEMS
+    pytest.param(case, "float64", marks=() if case is sparse_problems.diagonal else pytest.mark.slow)
+    for case in sparse_problems.PROBLEMS
 ]
 COMPILED += [(sparse_problems.disk, "float32"), (sparse_problems.disk, "complex128")]
 
@@ -135,6 +135,7 @@ def test_agrees_with_superlu_on_a_large_disk(engine):
     np.testing.assert_allclose(solution, expected, rtol=0, atol=1e-12 * abs(expected).max())
 
 
+@pytest.mark.slow
 def test_one_vector_is_a_column_and_jit_equals_eager():
     pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
     plan = analyse(pattern, coordinates)
@@ -173,7 +174,7 @@ def test_a_batch_is_solved_and_tells_which_matrix_failed():
         np.testing.assert_allclose(together[k], expected, rtol=0, atol=1e-12 * abs(expected).max())
 
 
-@pytest.mark.parametrize("dtype", ["float64", "complex128"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("complex128", marks=pytest.mark.slow)])
 def test_matrices_that_are_not_positive_definite_are_refused(dtype):
     """With a negative pivot, singular, and with NaN."""
     pattern, values, points = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
@@ -219,6 +220,7 @@ def test_choice_follows_the_limits_and_says_why():
     np.testing.assert_allclose(found, expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_nested_batches_and_gradients_of_batches():
     """The energy bᵀA⁻¹b falls by x_i x_j with entry (i, j), and by as much with (j, i), x being the solution."""
     pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
@@ -253,6 +255,7 @@ def test_the_order_of_elimination_hangs_neither_on_size_nor_place():
 
 
 def test_a_plan_serves_all_that_have_its_tree_while_any_uses_it():
+    gc.freeze()  # what was there before has no part in it, and takes long to look through
     pattern, values, coordinates = sparse_problems.box()
     plan = analyse(pattern, coordinates)
     again = SparsityPattern.from_elements([np.stack([pattern.rows, pattern.columns], 1)[pattern.size :]], pattern.size)
@@ -262,6 +265,7 @@ def test_a_plan_serves_all_that_have_its_tree_while_any_uses_it():
     kept = weakref.ref(plan.indices)
     del plan, shared
     gc.collect()
+    gc.unfreeze()
     assert kept() is None
     plan, values = on_host((analyse(pattern, coordinates), values))
     vector = np.arange(1.0, pattern.size + 1)

@@ -58,6 +58,21 @@ def found():
     return kmeans(skin(), 30, jax.random.key(0))
 
 
+SETS, KEYS = np.stack([skin(seed=seed) for seed in (1, 2, 3)]), (0, 6, 7)
+
+
+@pytest.fixture(scope="module")
+def together():
+    """Clusters of three sets in a batch, and the derivatives of their inertias: one program, which takes long."""
+
+    def inertia(points, key):
+        found = kmeans(points, 30, key)
+        return found.inertia, found
+
+    both = jax.jit(jax.vmap(jax.grad(inertia, has_aux=True)))
+    return jax.tree.map(np.asarray, both(SETS, jnp.stack([jax.random.key(seed) for seed in KEYS])))
+
+
 @pytest.mark.parametrize("steps", [1, 2, 5, 9])
 def test_every_step_is_lloyds(steps):
     """Also of the later steps, in which only the centres that moved are looked at again."""
@@ -157,20 +172,14 @@ def test_the_key_decides():
     assert first.inertia != other.inertia
 
 
-def test_a_batch_gives_what_a_loop_gives():
-    sets = np.stack([skin(seed=seed) for seed in range(3)])
-    keys = [jax.random.key(seed) for seed in (5, 6, 7)]
-
-    def cluster(points, key):
-        return kmeans(points, 30, key)
-
-    together = jax.jit(jax.vmap(cluster))(sets, jnp.stack(keys))
-    for index, key in enumerate(keys):
-        alone = cluster(sets[index], key)
-        np.testing.assert_array_equal(together.labels[index], alone.labels)
-        np.testing.assert_allclose(together.centres[index], alone.centres, rtol=1e-12, atol=1e-15)
-        assert together.steps[index] == alone.steps
-        assert bool(together.converged[index]) == bool(alone.converged)
+def test_a_batch_gives_what_a_loop_gives(together):
+    _, batch = together
+    for index, seed in enumerate(KEYS):
+        alone = kmeans(SETS[index], 30, jax.random.key(seed))
+        np.testing.assert_array_equal(batch.labels[index], alone.labels)
+        np.testing.assert_allclose(batch.centres[index], alone.centres, rtol=1e-12, atol=1e-15)
+        assert batch.steps[index] == alone.steps
+        assert bool(batch.converged[index]) == bool(alone.converged)
 
 
 def test_the_tolerance_stops_it_sooner():
@@ -189,6 +198,11 @@ def test_as_many_clusters_as_points():
     found = kmeans(points, 16, jax.random.key(7), restarts=1)
     assert sorted(np.asarray(found.labels)) == list(range(16))
     assert float(found.inertia) == pytest.approx(0, abs=1e-20)
+
+
+@pytest.mark.slow
+def test_one_cluster_lies_at_the_mean():
+    points = skin(side=4)
     one = kmeans(points, 1, jax.random.key(7), restarts=1)
     np.testing.assert_allclose(one.centres[0], points.mean(axis=0))
 
@@ -202,12 +216,11 @@ def test_more_clusters_than_points_that_differ():
     assert float(found.inertia) == pytest.approx(0, abs=1e-20)
 
 
-def test_inertia_has_a_derivative(found):
+def test_inertia_has_a_derivative(together):
     """dI/dx = 2 (x - c): means are where it does not depend on the centres."""
-    points = skin()
-    slope = jax.jit(jax.grad(lambda points: kmeans(points, 30, jax.random.key(0)).inertia))(points)
-    nearest = np.asarray(found.centres)[np.asarray(found.labels)]
-    np.testing.assert_allclose(slope, 2 * (points - nearest), rtol=1e-10, atol=1e-12)
+    slopes, found = together
+    nearest = np.stack([centres[labels] for centres, labels in zip(found.centres, found.labels, strict=True)])
+    np.testing.assert_allclose(slopes, 2 * (SETS - nearest), rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize(

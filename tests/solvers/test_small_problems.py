@@ -21,7 +21,7 @@ def solved_and_inverted(matrices, right):
     return solve_small(matrices, right), inverse_small(matrices)
 
 
-@pytest.mark.parametrize("number", range(1, 7))
+@pytest.mark.parametrize("number", [1, 2, 3, 4, pytest.param(5, marks=pytest.mark.slow), 6])
 def test_systems_are_solved(number):
     matrices = definite(number, 20)
     right = np.random.default_rng(1).normal(size=(20, number))
@@ -93,7 +93,7 @@ expanded = jax.jit(expand)
 
 
 @jax.jit
-def descend(start, problems, skip=None, max_steps=100):
+def descended(start, problems, skip, max_steps):
     return minimise_small(
         expand,
         start,
@@ -107,6 +107,11 @@ def descend(start, problems, skip=None, max_steps=100):
     )
 
 
+def descend(start, problems, skip=None, max_steps=100):
+    """By one program for all that is skipped and any number of steps."""
+    return descended(start, problems, np.zeros(start.shape[1], bool) if skip is None else skip, max_steps)
+
+
 @pytest.fixture(scope="module")
 def found(problems):
     start = np.random.default_rng(3).uniform(LOW[:, None], HIGH[:, None], (NUMBER, BATCH))
@@ -117,7 +122,7 @@ def test_same_minimum_as_scipy(problems, found):
     """Inside the box, on its sides and in its corners: the problems hold all of them."""
     x = np.asarray(found[1].x).T
     assert found[1].converged.all()
-    for k in range(60):
+    for k in range(30):
         mine, matrix, centre, value = x[k], problems[0][..., k], problems[1][:, k], found[1].value[k]
         theirs = minimize(
             value_of,

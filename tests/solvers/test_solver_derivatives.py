@@ -13,15 +13,16 @@ import sparse_problems
 
 from jeit_solvers import ConjugateGradient, SparseCholesky, SparseSymmetric, analyse, factorise, quadratic_form, solve
 
+# Each solver and each kind of number once; the other pairs are slow.
 CASES = [
-    ("direct", "float64"),
-    ("direct", "complex128"),
-    ("iterative", "float64"),
-    ("iterative", "complex128"),
+    pytest.param(("direct", "float64"), id="direct-float64"),
+    pytest.param(("direct", "complex128"), id="direct-complex128", marks=pytest.mark.slow),
+    pytest.param(("iterative", "float64"), id="iterative-float64", marks=pytest.mark.slow),
+    pytest.param(("iterative", "complex128"), id="iterative-complex128"),
 ]
 
 
-@pytest.fixture(params=CASES, ids="-".join, scope="module")
+@pytest.fixture(params=CASES, scope="module")
 def case(request):
     """x(values, vector), the pattern, a point, and a direction."""
     route, dtype = request.param
