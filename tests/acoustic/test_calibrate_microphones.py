@@ -174,6 +174,7 @@ def test_relative_noise_is_found(exact):
     assert np.max(additive) < 0.05 * np.median(exact[2])
 
 
+@pytest.mark.slow
 def test_errors_shrink_with_the_noise(exact):
     """In proportion: the same draw, ten times smaller, so that what is not linear is a hundredth of the error."""
     values, _, power = exact

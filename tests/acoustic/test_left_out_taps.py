@@ -34,7 +34,10 @@ def fitted(law):
     return calibrate_each(taps(LAWS[law]))
 
 
-@pytest.mark.parametrize("law", LAWS)
+# A steep array is said to be attenuated in `test_untuned_arrays`.
+@pytest.mark.parametrize(
+    "law", [pytest.param(one, marks=pytest.mark.slow if one == "attenuated" else []) for one in LAWS]
+)
 def test_auto_takes_the_law_that_taps_were_made_by(law):
     fit = choose(*fitted(law))
     assert fit.calibration.microphone_array.decay.name == law
