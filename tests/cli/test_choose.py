@@ -76,6 +76,7 @@ def test_every_image_has_a_scale_and_few_marks(tank):
         assert len(ax.patches) == (number if number <= 8 else 0)
 
 
+@pytest.mark.slow
 def test_one_rule_and_quiet(tank, run, tmp_path):
     options = ("--rule", "l-curve", "--rule", "gcv", "--quiet", *SMALL)
     output, written = choose(
