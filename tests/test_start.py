@@ -35,7 +35,11 @@ def test_the_next_process_finds_what_this_one_compiled(tmp_path):
     assert folder.startswith(str(tmp_path))
     assert hits == 0
     assert run(tmp_path)[1] > 0
-    # A file cut short is compiled anew.
+
+
+@pytest.mark.slow
+def test_a_file_cut_short_is_compiled_anew(tmp_path):
+    run(tmp_path)
     entries = list(tmp_path.rglob("*-cache"))
     assert entries
     for entry in entries:
@@ -50,9 +54,15 @@ def test_it_can_be_switched_off(tmp_path, word):
 
 def test_what_the_user_has_told_jax_is_left_alone(tmp_path):
     mine = str(tmp_path / "mine")
-    assert run(tmp_path / "home", JAX_COMPILATION_CACHE_DIR=mine)[0] == mine
     told = f"import jax; jax.config.update('jax_compilation_cache_dir', {mine!r})"
     assert run(tmp_path / "home", told + PROGRAM)[0] == mine
+
+
+@pytest.mark.slow
+def test_a_folder_that_the_environment_names_is_left_alone(tmp_path):
+    """JAX takes it for its own before jeit is imported."""
+    mine = str(tmp_path / "mine")
+    assert run(tmp_path / "home", JAX_COMPILATION_CACHE_DIR=mine)[0] == mine
 
 
 def test_where_nothing_can_be_written_nothing_is_kept(tmp_path):

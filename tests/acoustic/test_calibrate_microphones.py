@@ -163,7 +163,7 @@ def test_standard_errors_are_the_errors(exact):
 def test_relative_noise_is_found(exact):
     """And hardly any additive noise where there is none: in few microphones, and little."""
     additive = []
-    for fit in drawn(exact[2], 2):
+    for fit in drawn(exact[2], 1):
         relative = np.asarray(fit.calibration.microphone_array.noise.relative)
         # Of 169 taps: good to 5.5 % each.
         assert np.mean(relative) == pytest.approx(0.05, rel=0.05)
@@ -174,6 +174,7 @@ def test_relative_noise_is_found(exact):
     assert np.max(additive) < 0.05 * np.median(exact[2])
 
 
+@pytest.mark.slow
 def test_errors_shrink_with_the_noise(exact):
     """In proportion: the same draw, ten times smaller, so that what is not linear is a hundredth of the error."""
     values, _, power = exact

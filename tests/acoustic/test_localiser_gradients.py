@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from microphone_arrays import array, assert_same, both, hear, inside, noisy
+from microphone_arrays import array, assert_same, both, hear, inside, noisy, quick_likelihood
 
 from jeit.acoustic import Localiser
 from jeit.acoustic.localisation.localiser import METHODS
@@ -65,7 +65,7 @@ def gradient_of(weight, method, located):
     return jax.grad(lambda x: jnp.sum(weight * located(method, *x)[0]))
 
 
-@both
+@quick_likelihood
 def test_forward_mode_can_be_reversed(method, moving):
     point, _, located = moving
     gradient = jax.eval_shape(gradient_of(np.ones((28, 2)), method, located), tuple(point))

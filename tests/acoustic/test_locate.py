@@ -10,7 +10,7 @@ from microphone_arrays import array, hear, inside, noisy
 from jeit.acoustic import Calibration, Intensities, Localiser, cramer_rao, locate
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
 
-FRAMES = 64
+FRAMES, PAIRS = 64, 24
 FLOOR, FREEDOM = 0.01, 50.0
 
 
@@ -32,7 +32,8 @@ def known(microphone_array):
 
 @pytest.fixture
 def in_numpy(monkeypatch):
-    """Exchanges are sought in NumPy: programs for all their frames take seconds to compile."""
+    """Exchanges are sought in NumPy, in a third as many frames: programs for all of them take seconds to compile."""
+    monkeypatch.setattr("jeit.acoustic.localisation.setup_changes._FRAMES", 8)
     create = Localiser.create
     fixed = SimpleNamespace(create=lambda array: create(array, compiled=False))
     monkeypatch.setattr("jeit.acoustic.localisation.setup_changes.Localiser", fixed)
@@ -136,8 +137,9 @@ def test_nothing_but_zeros(known):
         locate(heard(np.zeros((10, 9)), floor=0), known)
 
 
-def test_outside(known, microphone_array, in_numpy):
+def test_outside(known, microphone_array, in_numpy, monkeypatch):
     """Two to five centimetres beyond: flagged, and held on the outline, on the near side."""
+    monkeypatch.setattr("jeit.acoustic.localisation.setup_changes._FRAMES", 24)
     along = np.linspace(-0.08, 0.08, 16)
     beyond = np.concatenate(
         [np.stack([along, np.full(16, sign * 0.14)], axis=1)[:, ::step] for sign in (1, -1) for step in (1, -1)]
@@ -156,7 +158,7 @@ def test_outside(known, microphone_array, in_numpy):
 def pair_of_places():
     """On either side of the middle, some 10 cm apart."""
     aside = np.array([0.04, 0.03])
-    return inside(FRAMES, seed=4, reach=0.3) - aside, inside(FRAMES, seed=5, reach=0.3) + aside
+    return inside(PAIRS, seed=4, reach=0.3) - aside, inside(PAIRS, seed=5, reach=0.3) + aside
 
 
 def test_two_touches(known, microphone_array, in_numpy):
@@ -166,7 +168,7 @@ def test_two_touches(known, microphone_array, in_numpy):
     power = hear(microphone_array, first, 8.0) + hear(microphone_array, second, 5.0)
     found = locate(heard(noisy(microphone_array.noise, power, rng)), known)
     both = found.status == "two touches"
-    assert both.sum() > 0.7 * FRAMES
+    assert both.sum() > 0.7 * PAIRS
     error = np.stack([found.position - first, found.second - second], axis=1)[both]
     crossed = np.stack([found.position - second, found.second - first], axis=1)[both]
     best = np.minimum(np.linalg.norm(error, axis=-1).max(axis=1), np.linalg.norm(crossed, axis=-1).max(axis=1))
@@ -207,7 +209,7 @@ def test_ambiguous():
 
 def test_misfit(known, in_numpy):
     """Intensities at random are no source: said, and the covariance is as much wider."""
-    power = np.exp(np.random.default_rng(8).normal(size=(FRAMES, 9)))
+    power = np.exp(np.random.default_rng(8).normal(size=(PAIRS, 9)))
     found = locate(heard(power), known)
     assert np.isin(found.status, ["misfit", "outside", "two touches"]).all()
     wrong = found.status == "misfit"

@@ -119,7 +119,9 @@ def test_smoothing_takes_noise_out():
     assert np.mean(speeds) == pytest.approx(0.2, rel=0.1)
 
 
-@pytest.mark.parametrize("density", [1e-3, 0.1, 3.0])
+@pytest.mark.parametrize(
+    "density", [pytest.param(1e-3, marks=pytest.mark.slow), 0.1, pytest.param(3.0, marks=pytest.mark.slow)]
+)
 def test_covariance_is_honest_for_random_walks(density):
     """Truths drawn from the model itself, its density known or not."""
     rng = np.random.default_rng(2)

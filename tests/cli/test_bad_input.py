@@ -1,6 +1,7 @@
 """Bad input, over the whole library and on the command line: each refused with an error that says what to do."""
 
 import os
+import runpy
 import subprocess
 import sys
 
@@ -424,6 +425,17 @@ def test_a_frame_too_noisy_says_so_in_python_too(tank):
         image_difference(read(noise), read(tank.folder / "rest.csv"), ImagingSettings(num_points=250))
 
 
+def test_the_module_leaves_one_line_and_a_status(tmp_path, monkeypatch, capsys):
+    """What `python -m jeit` runs; a process of its own is for the slow suite."""
+    monkeypatch.setattr("sys.argv", ["jeit", "reconstruct", "absent.mat", "--output", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as left:
+        runpy.run_module("jeit", run_name="__main__")
+    assert left.value.code == 1
+    said = "jeit: DATA: there is no file absent.mat. Check the name and the working directory.\n"
+    assert capsys.readouterr().err == said
+
+
+@pytest.mark.slow
 def test_a_real_process_leaves_one_line_and_a_status(tmp_path):
     command = [sys.executable, "-m", "jeit", "reconstruct", "absent.mat", "--output", "out"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=os.environ, check=False)

@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -74,12 +72,3 @@ def test_contents_page():
     assert jeit.Disk is jeit.mesh.Disk
     with pytest.raises(AttributeError, match="no attribute 'disc'"):
         _ = jeit.disc
-
-
-def test_import_leaves_heavy_things_alone():
-    """That keeps it quick, which is a benchmark."""
-    code = (
-        "import sys, jeit; print([m for m in ('matplotlib', 'optimistix', 'meshio', 'scipy.io') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"

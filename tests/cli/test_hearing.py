@@ -94,6 +94,7 @@ def off(folder, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_large_error_of_the_models_is_noted(folder, off, tmp_path, capsys):
     """Of intensities off by a third; with what it means for a touch, which is told of every calibration."""
     told = {"exact": " ".join((folder / "cal.txt").read_text("utf-8").split())}
@@ -110,9 +111,19 @@ def test_a_large_error_of_the_models_is_noted(folder, off, tmp_path, capsys):
     assert miss > 2
 
 
-def test_another_decay_model_is_advised_where_one_was_asked_for(off, tmp_path, capsys):
+def test_another_decay_model_is_advised_where_one_was_asked_for(folder, off, tmp_path, capsys):
+    """Of intensities off by a third; of exact ones the best law is named, and no error of it."""
     assert main(["calibrate-microphones", str(off), "-o", str(tmp_path / "one.json"), "--decay", "exponential"]) == 0
-    assert "try another --decay, or auto." in " ".join(capsys.readouterr().out.split())
+    spoilt, exact = (
+        " ".join(one.split()) for one in (capsys.readouterr().out, (folder / "cal.txt").read_text("utf-8"))
+    )
+    assert "the models miss what was heard by" in spoilt
+    assert "try another --decay, or auto." in spoilt
+    assert "the models miss" not in exact
+    assert re.search(r"decay model inverse-square: locates taps left out of the fit to 0\.0 mm, median \(", exact)
+    small, large = (float(re.search(r"located to ± ([\d.]+) mm", one)[1]) for one in (exact, spoilt))
+    assert small < 0.2
+    assert large > 2
 
 
 def test_intensities_to_a_track(folder, tmp_path, capsys):
@@ -155,6 +166,7 @@ def test_samples_to_a_track(name, sounded, tmp_path):
         assert (np.abs(off) < 5 * np.array([float(row[f"std_{axis}_m"]) for row in late])).all()
 
 
+@pytest.mark.slow
 def test_python_functions_do_what_the_commands_do(folder, tmp_path):
     """The same files, but for the picture's compression: calibration, table and report."""
     fit = calibrate_microphones(read_taps(folder / "taps.npz"))
@@ -171,11 +183,16 @@ def test_python_functions_do_what_the_commands_do(folder, tmp_path):
     assert rows(tmp_path / "python") == rows(tmp_path)
     reports = [json.loads((place / "report.json").read_text("utf-8")) for place in (tmp_path / "python", tmp_path)]
     assert reports[0] == reports[1]
+
+
+def test_python_functions_refuse_what_does_not_fit(folder):
+    """Gaps that are none, and settings of samples where there are intensities."""
+    recording, known = read_recording(folder / "recording.npz"), Calibration.load(folder / "cal.json")
     for options, message in (({"gap": 0.0}, "gap must be"), ({"gap": 0.01}, "gap: frames are 0.05 s apart")):
         with pytest.raises(ValueError, match=message):
-            locate_touches(found.intensities, fit.calibration, **options)
+            locate_touches(recording, known, **options)
     with pytest.raises(ValueError, match="intensity: band and window are for samples"):
-        locate_touches(found.intensities, fit.calibration, intensity=IntensitySettings())
+        locate_touches(recording, known, intensity=IntensitySettings())
     with pytest.raises(ValueError, match="intensity: band and window are for taps"):
         calibrate_microphones(read_taps(folder / "taps.npz"), intensity=IntensitySettings())
 

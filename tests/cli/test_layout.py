@@ -24,7 +24,7 @@ def layouts(tmp_path):
 def test_two_files_side_by_side(layouts, run, tmp_path):
     folder = tmp_path / "out"
     size = ["--width-mm", 60, "--height-mm", 50]
-    status, output, error = run("layout", "compare", *layouts, "--output", folder, *OPTIONS, *size)
+    status, output, error = run("layout", "compare", *layouts, "--output", folder, *OPTIONS, "--contrast", 5, *size)
     assert (status, error) == (0, "")
     assert "blind spot / % of the area" in output
     assert (folder / "comparison.png").read_bytes().startswith(b"\x89PNG")
@@ -40,6 +40,7 @@ def test_two_files_side_by_side(layouts, run, tmp_path):
     assert inside["taxel_area_cm2"]["mean"] <= inside["taxel_area_cm2"]["max"] < 30
     assert report["options"]["margin_mm"] == 5
     assert report["options"]["pairs"] == 6
+    assert report["options"]["contrast"] == 5
 
 
 def test_a_layout_and_its_file_are_alike(run, tmp_path):
@@ -69,6 +70,7 @@ def test_the_second_layout_is_checked_before_the_first_is_touched(layouts, run, 
     assert touched == []
 
 
+@pytest.mark.slow
 def test_touches_that_conduct(layouts, run, tmp_path):
     for contrast in (0, 5):
         options = ["--output", tmp_path / f"out-{contrast}", *OPTIONS, "--contrast", contrast, "--quiet"]

@@ -36,14 +36,13 @@ def test_descriptions_that_are_wrong(run, tmp_path, text, said):
 
 
 def test_a_described_skin(tmp_path):
-    (tmp_path / "skin.toml").write_text(
-        SKIN.replace("cell_mm = 6", "cell_mm = 6\nlayers = 3\n[measurement]\npairs = 20")
-    )
+    text = SKIN.replace("cell_mm = 8", "cell_mm = 8\nlayers = 3\n[measurement]\npairs = 20")
+    (tmp_path / "skin.toml").write_text(text)
     skin = read_described_skin(tmp_path / "skin.toml")
     assert (skin.num_layers, skin.model.mesh.dimension) == (0, 2)
     assert skin.model.protocol.num_measurements == 20
     assert np.allclose(skin.outline.extent, (-0.05, 0.05, -0.05, 0.05))
-    text = SKIN.replace("[skin]", "[skin]\nmodel = 'layer'").replace("cell_mm = 6", "cell_mm = 8\nlayers = 3")
+    text = SKIN.replace("[skin]", "[skin]\nmodel = 'layer'").replace("cell_mm = 8", "cell_mm = 8\nlayers = 3")
     (tmp_path / "layer.toml").write_text(text)
     assert read_described_skin(tmp_path / "layer.toml").num_layers == 3
 

@@ -22,7 +22,7 @@ def finished(model) -> int:
 def test_killed_with_its_workers(tmp_path):
     distributed = pytest.importorskip("distributed")
     skin = tmp_path / "skin.toml"
-    skin.write_text(SKIN.replace("cell_mm = 6", "cell_mm = 8"))
+    skin.write_text(SKIN)
 
     def start(name, *options):
         command = [sys.executable, "-m", "jeit", "learn", "image", str(skin), "--output", str(tmp_path / name)]

@@ -34,6 +34,7 @@ def test_frames_that_there_are_not_are_refused(recording, frames):
         read_pair(recording, None, frames, None, None)
 
 
+@pytest.mark.slow
 def test_an_image_by_own_frames_is_that_by_a_file_of_them(tank, recording, run, tmp_path):
     found = []
     for name, given in (("own", ("--reference-frames", "0-1")), ("file", ("--reference", tank.folder / "rest.csv"))):
@@ -46,11 +47,12 @@ def test_an_image_by_own_frames_is_that_by_a_file_of_them(tank, recording, run, 
     np.testing.assert_allclose(own, file, rtol=1e-6)
 
 
-@pytest.mark.parametrize("command", ["choose", "series"])
+@pytest.mark.parametrize("command", ["choose", "series", "reconstruct"])
 def test_other_commands_take_frames_too(recording, run, tmp_path, command):
     status, _, error = run(command, recording, "--reference-frames", "5", "--output", tmp_path / "out")
     assert status != 0
     assert "--reference-frames: give FIRST-LAST" in error
-    asked = ("--num-points", 250, "--output", tmp_path, *(("--rate", 10) if command == "series" else ("--rule", "gcv")))
+    own = {"series": ("--rate", 10), "choose": ("--rule", "gcv", "--quiet"), "reconstruct": ("--method", "one-step")}
+    asked = ("--num-points", 250, "--output", tmp_path, *own[command])
     status, _, error = run(command, recording, "--reference-frames", "0-1", *asked)
     assert (status, error) == (0, "")

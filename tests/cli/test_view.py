@@ -50,7 +50,7 @@ def test_a_solid_is_shown_from_several_sides(run, solid, tmp_path):
 
 
 def test_without_a_display_pictures_are_beside_the_image_and_it_says_why(run, solid, tmp_path):
-    status, told, error = run("view", solid)
+    status, told, error = run("view", solid, "--slices", 1)
     assert (status, error) == (0, "")
     assert "pictures, not a window: " in told
     assert (tmp_path / "view" / "overview.png").is_file()
@@ -81,7 +81,7 @@ def test_a_sheet_an_iterative_and_a_complex_image(run, tmp_path):
     log = np.linspace(-1, 1, TANK.num_cells)
     for name, changed, extra in (("log", log, {"departure": log}), ("complex", log * (1 + 1j), {})):
         save(tmp_path / f"{name}.npz", TANK, changed, **extra)
-        assert run("view", tmp_path / f"{name}.npz", "-o", tmp_path / name)[0] == 0
+        assert run("view", tmp_path / f"{name}.npz", "-o", tmp_path / name, "--slices", 1)[0] == 0
         assert (tmp_path / name / "overview.png").stat().st_size > 20_000
 
 
