@@ -105,6 +105,7 @@ def test_power_falls_with_distance():
     np.testing.assert_allclose(power, nominal_power(alike, np.linspace(0, 0.1, 40)), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_library_s_decay_model_does_not_fit_exactly(skin):
     places = microphone_grid(13)
     power = expected_power(skin, places)
@@ -121,6 +122,7 @@ def test_the_library_s_decay_model_does_not_fit_exactly(skin):
     assert max(scatter) < 0.4
 
 
+@pytest.mark.slow
 def test_drawn_bursts_have_the_expected_power(small):
     places, options = np.array([[0.01, 0.02], [0.06, -0.03], [0.095, 0.09]]), {"duration": 0.14, "noise": False}
     taps = calibration_taps(small, KEY, places, repeats=200, strength_spread=0.0, **options)
