@@ -21,6 +21,7 @@ from jeit.simulate import (
     simulate_presses,
 )
 from jeit.simulate.contact.indent_sets import image_places
+from jeit.simulate.contact.indents import resting_skin
 
 
 def made(num_layers: int, cell_size: float = 5e-3) -> Skin:
@@ -111,7 +112,9 @@ def test_a_set_goes_on(sheet, tmp_path):
     assert 0 <= depth.min() <= depth.max() <= 0.6
     assert np.abs(whole["change"].to_numpy()).max(axis=1).min() > 0
     drawn = draws.draw(jax.random.fold_in(jax.random.key(3), 1), 4)
-    assert np.allclose(whole["change"].to_numpy()[4:8], relative_changes(sheet, drawn), rtol=0, atol=1e-12)
+    assert np.allclose(
+        whole["change"].to_numpy()[4:8], relative_changes(sheet, drawn, resting_skin(sheet, 6e-3)), rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize(
