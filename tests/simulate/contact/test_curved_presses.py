@@ -155,6 +155,7 @@ def test_a_press_on_a_tube_is_imaged_where_it_was():
         assert errors.max() < most
 
 
+@pytest.mark.slow
 def test_a_moving_press_is_its_presses():
     arm = forearm(0.12, (0.03, 0.022), 0.04, num_points=300)
     layout = SurfaceLayout.spread(arm, 8, 12e-3, contact_impedance=1e-4)
