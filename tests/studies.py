@@ -42,7 +42,8 @@ layouts = ["grid-4x2", "perimeter-8", "inner-8"]
 diameter_mm = 10
 contact_impedance_ohm_m2 = 1e-3
 [measurement]
-protocol = "adjacent"
+protocol = "two-terminal"
+pairs = 10
 noise_V = 1e-3
 [touch]
 columns = 6
@@ -64,7 +65,7 @@ def changed(**lines: str) -> str:
     text = SWEEP.replace('"grid-4x2", "perimeter-8", "inner-8"', '"grid-4x2", "perimeter-8"')
     text = text[: text.index("[scores]")].replace("noise_V = 1e-3\n", "")
     if "protocol" in lines.get("measurement", ""):
-        text = text.replace('protocol = "adjacent"\n', "")
+        text = text.replace('protocol = "two-terminal"\npairs = 10\n', "")
     for section, more in lines.items():
         text = text.replace(f"[{section}]\n", f"[{section}]\n{more}\n")
     return text

@@ -19,6 +19,7 @@ from jeit.design import (
     touches_away_from_the_edge,
 )
 from jeit.design.optimisation.surface_optimise import surface_scores
+from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.protocol import skin_protocol
 from jeit.electrodes import FaceDiscs, SurfaceDiscs
 from jeit.forward import ForwardModel
@@ -36,22 +37,22 @@ def raised(points) -> np.ndarray:
 
 
 def test_places_are_spread_by_ways_along_the_surface():
-    mesh = forearm(0.2, 0.025, 0.045, num_points=1500)
-    places = spread(mesh, 32, margin=0.01)
+    mesh = forearm(0.2, 0.025, 0.045, num_points=500)
+    places = spread(mesh, 20, margin=0.01)
     ways = Geodesics.create(mesh)
     apart = ways.between(places)
     np.fill_diagonal(apart, np.inf)
     area = float(Triangles.of(mesh).areas.sum())
-    pitch = np.sqrt(2 / np.sqrt(3) * area / 32)
+    pitch = np.sqrt(2 / np.sqrt(3) * area / 20)
     assert apart.min() > 0.65 * pitch
     assert ways.surface.distance_to_border(places).min() >= 0.0099
-    np.testing.assert_array_equal(places, spread(mesh, 32, margin=0.01))
+    np.testing.assert_array_equal(places, spread(mesh, 20, margin=0.01))
     with pytest.raises(ValueError, match="leaves no room"):
-        spread(mesh, 32, margin=0.15)
+        spread(mesh, 20, margin=0.15)
 
 
 def test_94_nearest_pairs_are_nearest_along_the_surface():
-    layout = SurfaceLayout.spread(tube(0.015, 0.15, num_points=900), 32, 5e-3)
+    layout = SurfaceLayout.spread(tube(0.015, 0.15, num_points=500), 32, 5e-3)
     protocol = skin_protocol(layout)
     assert protocol.num_measurements == 94
     lengths = layout.lengths()
@@ -117,7 +118,7 @@ def unbent(surface: Mesh, radius: float) -> np.ndarray:
 
 def test_a_bent_sheet_without_thickness_is_the_flat_sheet():
     """`bend` keeps all lengths on the sheet, and discs are measured along it."""
-    fine = SHEET.mesh(num_points=900)
+    fine = SHEET.mesh(num_points=400)
     surface, flat = bend(fine, 0.03), bend(fine, np.inf)
     centres = grid(0.08, 0.08, 3, 3)
     at = Triangles.of(flat).nearest(raised(centres))
@@ -129,28 +130,38 @@ def test_a_bent_sheet_without_thickness_is_the_flat_sheet():
     np.testing.assert_allclose(voltages[1], voltages[0], rtol=1e-10)
 
 
-def test_the_same_calls_as_on_flat_skins():
+@pytest.fixture(scope="module")
+def around() -> Skin:
+    """A sheet about a tube."""
     layout = SurfaceLayout.spread(tube(0.03, 0.1, num_points=200), 8, 12e-3, contact_impedance=1e-4)
-    skin = Skin.create(layout, num_layers=0)
-    places = touches_away_from_the_edge(skin.outline, 0.015, 4, 4)
+    return Skin.create(layout, num_layers=0)
+
+
+def test_places_are_on_the_surface(around):
+    places = touches_away_from_the_edge(around.outline, 0.015, 4, 4)
     assert places.places.shape == (16, 3)
+    with pytest.raises(ValueError, match="no raster"):
+        SensitivityMap(places, np.ones((16, 3))).image()
+    with pytest.raises(ValueError, match="lie off the skin's surface"):
+        around.touched_cells([[0.0, 0.0, 0.05]])
+    with pytest.raises(ValueError, match=r"places must be \(n, 3\)"):
+        around.touched_cells([[0.0, 0.0]])
+
+
+@pytest.mark.slow
+def test_the_same_calls_as_on_flat_skins(around):
+    skin, places = around, touches_away_from_the_edge(around.outline, 0.015, 4, 4)
     mapped = sensitivity_map(skin.model, skin.model_conductivity, places, thickness=skin.thickness)
     assert float(mapped.minimum) > 0
     assert float(mapped.uniformity) > 0.5
-    with pytest.raises(ValueError, match="no raster"):
-        mapped.image()
     response = skin_response(skin, places, key=jax.random.key(0), num_taxels=4)
     assert response.taxels.positions.shape == (4, 3)
     assert float(response.taxels.areas.sum()) > 0
-    with pytest.raises(ValueError, match="lie off the skin's surface"):
-        skin.touched_cells([[0.0, 0.0, 0.05]])
-    with pytest.raises(ValueError, match=r"places must be \(n, 3\)"):
-        skin.touched_cells([[0.0, 0.0]])
 
 
 def test_touches_are_where_ways_along_the_surface_say_and_below_it():
-    core = tube(0.03, 0.1, num_points=900)
-    skin = Skin.create(SurfaceLayout.spread(core, 8, 8e-3), thickness=8e-3, num_layers=6)
+    core = tube(0.03, 0.1, num_points=700)
+    skin = Skin.create(SurfaceLayout.spread(core, 8, 8e-3), thickness=8e-3, num_layers=5)
     place = np.array([[0.038, 0.0, 0.05]])
     touched = skin.touched_cells(place, Bell(4e-3, 8e-3))
     changed = np.unique(np.asarray(touched.cells)[np.asarray(touched.change) != 0])
@@ -170,7 +181,8 @@ def tangential(layout: SurfaceLayout, surface: Mesh) -> np.ndarray:
     return step - (step * normal).sum(axis=1, keepdims=True) * normal
 
 
-@pytest.mark.parametrize("num_layers", [0, pytest.param(1, marks=pytest.mark.slow)], ids=["sheet", "layer"])
+@pytest.mark.slow
+@pytest.mark.parametrize("num_layers", [0, 1], ids=["sheet", "layer"])
 def test_positions_along_the_surface_have_gradients(num_layers):
     """Of weighted sums of the voltages, those of central differences."""
     surface = tube(0.03, 0.08, num_points=100)
@@ -190,11 +202,12 @@ def test_positions_along_the_surface_have_gradients(num_layers):
             assert np.abs(weights @ change - slope) < 1e-4 * np.linalg.norm(weights) * np.linalg.norm(change)
 
 
-def test_positions_on_a_layer_have_gradients():
+@pytest.mark.parametrize("num_layers", [0, 1], ids=["sheet", "layer"])
+def test_loads_of_electrodes_along_the_surface_have_gradients(num_layers):
     """Of the electrodes' loads, through which alone the voltages know of them, those of central differences."""
     surface = tube(0.03, 0.08, num_points=100)
     layout = SurfaceLayout.spread(surface, 4, 20e-3, contact_impedance=1e-4)
-    model, step = Skin.create(layout, num_layers=1, thickness=6e-3).model, tangential(layout, surface)
+    model, step = Skin.create(layout, num_layers=num_layers, thickness=6e-3).model, tangential(layout, surface)
 
     def loads(position):
         return eqx.tree_at(lambda each: each.position, model.electrodes, position).contact(model.mesh).load

@@ -21,6 +21,7 @@ from jeit.design import (
 )
 from jeit.design.optimisation.constraints import Constraints
 from jeit.design.optimisation.objective import balanced
+from jeit.design.optimisation.search import descend
 from jeit.design.optimisation.variables import Variables, Varied
 from jeit.design.skin.sheet_touches import sheet_touches
 from jeit.electrodes import PointElectrodes
@@ -74,6 +75,26 @@ def test_optimised_layout_is_better_by_far(found):
     assert found.scores.mean_variance < 0.7 * before.mean_variance
     assert found.status in ("converged", "step limit")
     assert "satisfied by 3" in found.reason
+
+
+def test_the_costs_that_are_descended_have_their_gradients(monkeypatch):
+    """Of all starts, along a direction, central differences of score and penalty."""
+    asked = []
+
+    def stay(cost, variables, steps, record, **options):
+        if options:  # to where the constraints are satisfied
+            return descend(cost, variables, steps, record, **options)
+        asked.append((cost, np.asarray(variables)))
+        return variables, "step limit"
+
+    monkeypatch.setattr("jeit.design.optimisation.optimise.descend", stay)
+    optimise_from_three()
+    cost, variables = asked[0]
+    direction = np.random.default_rng(0).normal(size=variables.shape)
+    slope = np.sum(np.asarray(cost(variables)[2]) * direction, axis=1)
+    step = 1e-6
+    above, below = (np.asarray(cost(variables + sign * step * direction)[0]) for sign in (1, -1))
+    np.testing.assert_allclose(slope, (above - below) / (2 * step), rtol=1e-4)
 
 
 def test_all_starts_satisfy_all_constraints(found):

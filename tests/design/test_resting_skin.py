@@ -38,10 +38,28 @@ def test_changes_are_those_of_each_call(skin):
     found = resting.changes(touched)
     assert np.abs(found - right).max() < 1e-12 * np.abs(right).max()
     assert np.allclose(resting.rest, skin.model.voltages(skin.model_conductivity), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_changes_are_those_of_another_call(skin):
+    resting = resting_skin(skin, 8e-3)
+    assert resting is not None
+    found = resting.changes(indented_cells(skin, TOUCHES))
     again = resting.changes(indented_cells(skin, TOUCHES[1:2]))
-    assert np.abs(again[0] - right[1]).max() < 1e-12 * np.abs(right).max()
+    assert np.abs(again[0] - found[1]).max() < 1e-12 * np.abs(found).max()
 
 
+def test_a_layer_is_to_know_the_nodes_that_are_reached(monkeypatch):
+    """Of four layers of cells in 10 mm, those of the upper one, or of all."""
+    monkeypatch.setattr(RestingSkin, "create", lambda model, conductivity, touchable: touchable)
+    layer = made(4)
+    shallow, deep = (np.asarray(resting_skin(layer, depth)) for depth in (2e-3, 8e-3))
+    np.testing.assert_array_equal(shallow, np.asarray(layer.model.mesh.points)[:, 2] > 7.4e-3)
+    assert 0 < shallow.sum() < len(shallow)
+    assert deep.all()
+
+
+@pytest.mark.slow
 def test_a_layer_knows_the_nodes_that_are_reached():
     """Those of the upper cells, where less is touched; 0 where nothing is."""
     layer = made(4)

@@ -116,6 +116,7 @@ def test_estimates_of_a_place_scatter_as_the_bound_says(scores):
     np.testing.assert_allclose(error, scores.localisation_error[k], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_central_differences():
     random, unit = np.random.default_rng(0), np.eye(len(NAMES))
     slopes = [jax.tree.map(np.asarray, figures_and_gradient(DISCS, one)[1]) for one in unit]

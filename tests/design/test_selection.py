@@ -46,7 +46,9 @@ each_case = pytest.mark.parametrize("case", CASES, ids=range(len(CASES)))
 each_criterion = pytest.mark.parametrize("criterion", ["D", "A"])
 
 
-@pytest.mark.parametrize(("shapes", "criterion"), [(3, "D"), (20, "A"), pytest.param(20, "D", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("shapes", "criterion"), [(3, "D"), *(pytest.param(20, each, marks=pytest.mark.slow) for each in "AD")]
+)
 def test_information_is_that_of_dense_matrices(shapes, criterion):
     case = Case(11, shapes)
     wanted = [case.information(chosen, criterion) for chosen in SETS]

@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+from studies import linear_changes
 
-from jeit.design import Bell, Hemisphere, sensitivity_map, touch_grid
+from jeit.design import Bell, Hemisphere, touch_grid
+from jeit.design.sensitivity import SensitivityMap
+from jeit.design.skin.touched_cells import touched_cells
 from jeit.electrodes import SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.layout import grid
@@ -15,7 +18,9 @@ from jeit.protocol import adjacent
 def theta():
     mesh = rectangle(0.1, 0.1, cell_size=0.008)
     model = ForwardModel(mesh, SheetDiscs(grid(0.07, 0.07, 2, 2)[[0, 1, 3, 2]], 0.008, 1e-4), adjacent(4))
-    return sensitivity_map(model, 1.0, touch_grid(Rectangle(0.1, 0.1), 8, 6), thickness=0.01)
+    places = touch_grid(Rectangle(0.1, 0.1), 8, 6)
+    touched = touched_cells(mesh, Bell(), places.places, thickness=0.01)
+    return SensitivityMap(places, linear_changes(model, 1.0, touched))
 
 
 def test_values_are_norms_of_the_changes(theta):

@@ -47,6 +47,7 @@ run_study(study, sys.argv[2])
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
+@pytest.mark.slow
 def test_killed_in_the_middle_of_a_chunk_and_resumed_the_store_is_the_same(
     study, study_file, whole_store, store_path, watch_chunks
 ):
@@ -100,6 +101,7 @@ def test_stopped_about_the_mark(study, whole_store, store_path, monkeypatch, whe
     assert contents(store_path) == contents(whole_store)
 
 
+@pytest.mark.slow
 def test_a_full_disk_keeps_finished_chunks(study, whole_store, store_path, monkeypatch, watch_chunks):
     write = Store.write_array
 

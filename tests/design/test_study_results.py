@@ -29,7 +29,7 @@ from jeit.design.study.spec import Point
 from jeit.electrodes import FaceDiscs, SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.mesh import Rectangle, layer, rectangle
-from jeit.protocol import adjacent, two_terminal
+from jeit.protocol import two_terminal
 
 pytest.importorskip("xarray")
 pytest.importorskip("zarr")
@@ -38,11 +38,11 @@ MESH, GRID = rectangle(0.1, 0.08, cell_size=8e-3), touch_grid(Rectangle(0.1, 0.0
 
 
 def test_results_are_those_of_one_map_at_a_time(study, whole_store):
+    """Of the nearest pairs of each layout."""
     data = open_results(study, whole_store)
     prior = TouchPrior.create(GRID.places, correlation=20e-3)
     for number, point in enumerate(study.points):
-        electrodes = SheetDiscs(point.layout.centres, 5e-3, 1e-3)
-        model = ForwardModel(MESH, electrodes, adjacent(8, current=1e-3))
+        model = model_of(point)
         touches = sheet_touches(MESH, Bell(), GRID.places, thickness=point.thickness)
         found = SensitivityMap(GRID, linear_changes(model, 0.5 * point.thickness, touches.touched))
         taxels = find_taxels(found.changes, GRID.places, GRID.cell_area, num_taxels=5, key=jax.random.key(0))
@@ -81,26 +81,14 @@ def results(tmp_path):
     return call
 
 
-def model_of(point, *, number=None) -> ForwardModel:
-    """Of a skin as a sheet, or a layer, and its nearest `number` pairs."""
+def model_of(point) -> ForwardModel:
+    """Of a skin as a sheet, or a layer, and its ten nearest pairs."""
     centres = point.layout.centres
-    protocol = adjacent(8) if number is None else two_terminal(8).subset(np.sort(nearest_pairs(centres, number)))
+    protocol = two_terminal(8).subset(np.sort(nearest_pairs(centres, 10)))
     if not point.layers:
         return ForwardModel(MESH, SheetDiscs(centres, 5e-3, 1e-3), protocol)
     bottom = np.column_stack([centres, np.zeros(8)])
     return ForwardModel(layer(MESH, point.thickness, point.layers), FaceDiscs(bottom, 5e-3, 1e-3), protocol)
-
-
-NEAREST = 'protocol = "two-terminal"\npairs = 10'
-
-
-def test_the_nearest_pairs_of_each_layout_are_measured(results):
-    found = results(measurement=NEAREST)
-    assert len(found) == 4
-    for point, values in found:
-        touched = touched_cells(MESH, Bell(), GRID.places, thickness=point.thickness)
-        changes = linear_changes(model_of(point, number=10), 0.5 * point.thickness, touched)
-        np.testing.assert_allclose(values, np.linalg.norm(changes, axis=1), rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -114,7 +102,7 @@ def test_a_layer_is_touched_on_its_top(results):
 @pytest.mark.slow
 def test_exact_maps_of_layers_are_those_of_a_comparison(results):
     lines = {"skin": 'model = "layer"', "mesh": "layers = 3", "touch": "exact = true"}
-    for point, values in results(measurement='protocol = "two-terminal"\npairs = 10', **lines):
+    for point, values in results(**lines):
         skin = Skin.create(
             point.layout,
             thickness=point.thickness,
@@ -127,12 +115,13 @@ def test_exact_maps_of_layers_are_those_of_a_comparison(results):
         np.testing.assert_allclose(values, response.sensitivity.values, rtol=1e-8)
 
 
-@pytest.mark.parametrize("exact", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("exact", [True, False])
 def test_conducting_touches_of_a_sheet(results, exact):
-    for point, values in results(measurement=NEAREST, touch=f"contrast = 5\nexact = {str(exact).lower()}"):
+    for point, values in results(touch=f"contrast = 5\nexact = {str(exact).lower()}"):
         touched = touched_cells(MESH, Bell(), GRID.places, thickness=point.thickness, contrast=5.0)
         changes = touch_changes if exact else linear_changes
-        found = changes(model_of(point, number=10), 0.5 * point.thickness, touched)
+        found = changes(model_of(point), 0.5 * point.thickness, touched)
         np.testing.assert_allclose(values, np.linalg.norm(found, axis=1), rtol=1e-8)
 
 
@@ -153,18 +142,23 @@ def test_a_place_that_cannot_be_told_is_infinite_and_counted(study, store_path, 
     assert (data.localisation_lost == 1).all()
 
 
-def test_a_batch_factorises_once_and_calls_no_library(study, tmp_path):
+def compiled(study) -> str:
+    """The program of two points of a study."""
+    shared, skin = batch._shared(study, study.points[0].shape), batch._varied(study.points[0], study.current)
+    options = {"num_taxels": study.num_taxels, "threshold": study.threshold, "num_devices": 1}
+    lowered = batch._batch.lower(shared, batch._stacked([skin] * 2), scores=study.scores, **options)
+    return lowered.compile().as_text() or ""
+
+
+def test_a_batch_calls_no_library(study):
+    assert "lapack" not in compiled(study)
+
+
+@pytest.mark.slow
+def test_a_batch_factorises_once(study, tmp_path):
     """With the loops of all scores there are fewer than twice those of maps alone."""
-    (tmp_path / "maps.toml").write_text(changed(measurement=NEAREST), "utf-8")
-
-    def compiled(study):
-        shared, skin = batch._shared(study, study.points[0].shape), batch._varied(study.points[0], study.current)
-        options = {"num_taxels": study.num_taxels, "threshold": study.threshold, "num_devices": 1}
-        lowered = batch._batch.lower(shared, batch._stacked([skin] * 2), scores=study.scores, **options)
-        return lowered.compile().as_text() or ""
-
+    (tmp_path / "maps.toml").write_text(changed(), "utf-8")
     maps, every = compiled(read_study(tmp_path / "maps.toml")), compiled(study)
-    assert "lapack" not in every
     assert 1 < maps.count(" while(") < every.count(" while(") < 2 * maps.count(" while(")
 
 

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from studies import CHUNKS, SWEEP, changed, contents
 
+from jeit.design import Bell, touch_grid
+from jeit.design.skin.touched_cells import touched_cells
+from jeit.design.skin.voltage_changes import touch_changes
 from jeit.design.study import open_results, read_study, run_study, study_progress
+from jeit.electrodes import SheetDiscs
+from jeit.forward import ForwardModel
+from jeit.mesh import Rectangle, rectangle
 
 xarray = pytest.importorskip("xarray")
 pytest.importorskip("zarr")
@@ -46,10 +52,17 @@ def test_progress_counts_up_and_says_the_time_left(study, store_path):
 
 
 def test_exact_maps_are_told_one_by_one_and_resumed_to_the_same_store(tmp_path, store_path, watch_chunks):
-    text = changed(touch="exact = true") + '[scores]\nwanted = "mean"'
+    """Of touches that conduct; one map against a model of its own."""
+    text = changed(touch="exact = true\ncontrast = 5") + '[scores]\nwanted = "mean"'
     (tmp_path / "exact.toml").write_text(text, "utf-8")
     study, told = read_study(tmp_path / "exact.toml"), []
-    run_study(study, store_path, progress=told.append)
+    found = run_study(study, store_path, progress=told.append)
+    point, plane = study.points[1], rectangle(0.1, 0.08, cell_size=8e-3)
+    model = ForwardModel(plane, SheetDiscs(point.layout.centres, 5e-3, 1e-3), point.measured(study.current))
+    places = touch_grid(Rectangle(0.1, 0.08), 6, 5).places
+    touched = touched_cells(plane, Bell(), places, thickness=point.thickness, contrast=5.0)
+    exact = touch_changes(model, 0.5 * point.thickness, touched)
+    np.testing.assert_allclose(found.sensitivity[1], np.linalg.norm(exact, axis=1), rtol=1e-8)
     assert [(now.points, now.chunks) for now in told] == [(0, 0), (1, 0), (2, 1), (3, 1), (4, 2)]
 
     def stop(now):

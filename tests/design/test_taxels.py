@@ -147,6 +147,7 @@ def test_silent_places_are_in_no_taxel(layouts):
     np.testing.assert_array_equal(taxels.coverage[np.array([5, 200])], 0)
 
 
+@pytest.mark.slow
 def test_a_batch_of_layouts_gives_what_a_loop_gives(layouts, found):
     keys = jnp.stack([jax.random.key(0)] * 2)
 

@@ -35,7 +35,7 @@ def test_wind_has_the_power_of_its_places(skin):
 
 
 def test_wind_is_incoherent_and_a_stroke_is_not(skin):
-    blown = wind(skin, KEY, (0.0, 0.0), duration=4.0, noise=False)
+    blown = wind(skin, KEY, (0.0, 0.0), duration=8.0, noise=False)
     rubbed = stroke(skin, KEY, [(-0.01, 0.0), (0.01, 0.0)], duration=4.0, noise=False)
     assert coherence(blown.samples) < 0.05
     assert coherence(rubbed.samples) > 0.5

@@ -97,6 +97,7 @@ def test_a_microphone_hears_as_far_as_its_reach():
     np.testing.assert_allclose(noise_power(alike) / noise_power(louder), 10, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_power_falls_with_distance():
     alike = SoundingSkin(KEY, CENTRE, layer=UNBOUNDED, **ALIKE)
     power = expected_power(alike, np.stack([np.linspace(0, 0.1, 40), np.zeros(40)], axis=-1))[:, 0]
@@ -105,6 +106,7 @@ def test_power_falls_with_distance():
     np.testing.assert_allclose(power, nominal_power(alike, np.linspace(0, 0.1, 40)), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_library_s_decay_model_does_not_fit_exactly(skin):
     places = microphone_grid(13)
     power = expected_power(skin, places)
@@ -121,6 +123,7 @@ def test_the_library_s_decay_model_does_not_fit_exactly(skin):
     assert max(scatter) < 0.4
 
 
+@pytest.mark.slow
 def test_drawn_bursts_have_the_expected_power(small):
     places, options = np.array([[0.01, 0.02], [0.06, -0.03], [0.095, 0.09]]), {"duration": 0.14, "noise": False}
     taps = calibration_taps(small, KEY, places, repeats=200, strength_spread=0.0, **options)
@@ -258,6 +261,7 @@ def test_touches_add_and_noise_is_added_once(small):
         superpose(small, KEY, one, tap(small, KEY, (0.0, 0.0), repeats=4, noise=False))
 
 
+@pytest.mark.slow
 def test_the_loudest_microphone_follows_a_stroke():
     clear = SoundingSkin(KEY, **ALIKE | {"microphone_model": MicrophoneModel(snr_db=20.0, **SPREADS)})
     recording = stroke(clear, KEY, [(-0.09, -0.04), (0.0, -0.04), (0.0, 0.09)])

@@ -129,6 +129,7 @@ def test_a_weight_on_a_tube_rests_along_it():
     assert np.ptp(level[:, 2]) < 0.004
 
 
+@pytest.mark.slow
 def test_a_press_on_a_tube_is_imaged_where_it_was():
     """Of 40 mm radius, all round it: to half the electrodes' pitch of 40 mm with room to spare, 3 mm on average."""
     fine, coarse = (tube(0.04, 0.1, cell_size=size) for size in (4e-3, 5e-3))
@@ -154,6 +155,7 @@ def test_a_press_on_a_tube_is_imaged_where_it_was():
         assert errors.max() < most
 
 
+@pytest.mark.slow
 def test_a_moving_press_is_its_presses():
     arm = forearm(0.12, (0.03, 0.022), 0.04, num_points=300)
     layout = SurfaceLayout.spread(arm, 8, 12e-3, contact_impedance=1e-4)

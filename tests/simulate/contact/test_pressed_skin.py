@@ -157,6 +157,7 @@ def test_several_at_once_press_as_their_sum(skin):
     np.testing.assert_allclose(spread, total, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_record_of_a_press_that_stays_is_its_frames(model):
     creeping = dataclasses.replace(STILL, creep=VELOSTAT.creep, hysteresis=VELOSTAT.hysteresis)
     skin, press = PressedSkin(KEY, model, creeping), PRESSES[1]

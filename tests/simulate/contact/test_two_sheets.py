@@ -74,7 +74,7 @@ class CoupledDisk(ConductingDisk):
         return series / (np.pi * self.conductivity)
 
 
-@pytest.mark.parametrize("strength", [3.0, 100.0])
+@pytest.mark.parametrize("strength", [3.0, pytest.param(100.0, marks=pytest.mark.slow)])
 def test_evenly_coupled_disks(strength):
     """`strength`: g a² / σ₁."""
     conductance = strength * LOWER / RADIUS**2
