@@ -152,8 +152,7 @@ def test_reciprocity(model):
 FIELDS = ("position", "width", "radius", "height", "contact_impedance")
 
 
-# Of arcs and points, the quick suite has derivatives in tests/electrodes/test_contact.py and on surfaces.
-@pytest.mark.parametrize("model", models(["inside"]), indirect=True, scope="module")
+@pytest.mark.parametrize("model", models(["boundary", "inside"]), indirect=True, scope="module")
 def test_gradients_of_electrodes_and_nodes_against_central_differences(model):
     """In every field of the electrodes, and in the mesh's nodes, one after the other.
 
