@@ -17,19 +17,12 @@ from jeit.inverse import (
     Noser,
     Parametrisation,
     Tikhonov,
-    TotalVariation,
     calibrate,
     one_step,
-    posterior,
     reconstruct,
 )
 from jeit.inverse.nonlinear import (
-    LBFGSB,
-    ContactImpedance,
-    ElectrodePosition,
     GaussNewton,
-    LevenbergMarquardt,
-    Scale,
 )
 from jeit.inverse.nonlinear.implicit import as_solution
 from jeit.inverse.nonlinear.solvers import AbstractSolver, Solved
@@ -118,14 +111,6 @@ def test_linear_images():
     assert_gradient(image, VARIED | {"level 0": 3.0, "level 1": 1e4, "level 2": 1e3, "length": 0.03})
 
 
-@pytest.mark.slow
-def test_linear_images_where_electrodes_are():
-    def image(theta):
-        return linear_image(THETA | {"hyperparameter": 10.0} | theta, Tikhonov())
-
-    assert_gradient(image, {"position": THETA["position"]})
-
-
 def test_the_gaussian_prior_where_points_are():
     rows = RANDOM.normal(size=(2, MESH.num_cells))
 
@@ -134,15 +119,6 @@ def test_the_gaussian_prior_where_points_are():
         return WEIGHT @ Gaussian(0.03).covariance_product(mesh, rows) @ np.array([1.0, 2.0])
 
     assert_gradient(product, {"points": THETA["points"]})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("prior", [Laplace(), Gaussian(0.03)], ids=lambda p: type(p).__name__)
-def test_linear_images_where_points_are(prior):
-    def image(theta):
-        return linear_image(THETA | {"hyperparameter": 3.0} | theta, prior)
-
-    assert_gradient(image, {"points": THETA["points"]})
 
 
 def solved(theta, prior, solver, parametrisation=None):
@@ -222,86 +198,6 @@ def test_the_loop_is_not_differentiated():
     assert gradient.protocol.drive.shape == MODEL.protocol.drive.shape
 
 
-@pytest.mark.slow
-def test_nonlinear_image_where_everything_is():
-    assert_gradient(lambda theta: image_of(solved(theta, Noser(), TIGHT)), THETA | {"hyperparameter": 10.0})
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("prior", [Gaussian(0.03), Laplace()], ids=lambda p: type(p).__name__)
-def test_nonlinear_images_of_smooth_priors(prior):
-    settings = {"hyperparameter": 3.0} | ({"length": 0.03} if isinstance(prior, Gaussian) else {})
-
-    def image(theta):
-        chosen = Gaussian(theta["length"]) if isinstance(prior, Gaussian) else prior
-        return image_of(solved(theta, chosen, LevenbergMarquardt(max_steps=100, rtol=1e-17)))
-
-    assert_gradient(image, THETA | settings)
-
-
-@pytest.mark.slow
-def test_images_of_total_variation():
-    """The smoothed energy's own optimality condition, not the forms that touch it. The background all but drops out."""
-    assert_gradient(
-        lambda theta: image_of(solved(theta, TotalVariation(0.3), GaussNewton(max_steps=1000, rtol=1e-16))),
-        {name: value for name, value in THETA.items() if name != "background"} | {"hyperparameter": 3.0},
-    )
-
-
-@pytest.mark.slow
-def test_images_between_bounds():
-    """Cells at a bound stay there, and move with it."""
-
-    def found(theta):
-        within = Parametrisation(bounds=(0.9e-3, theta["upper"]))
-        return solved(theta, Noser(), LBFGSB(max_steps=5000, tolerance=1e-13), within)
-
-    theta = THETA | {"hyperparameter": 3.0, "upper": 1.25e-3}
-    conductivity = np.asarray(found(theta).conductivity)
-    at_bound = np.isclose(conductivity, 1.25e-3, rtol=1e-9) | np.isclose(conductivity, 0.9e-3, rtol=1e-9)
-    assert 1 <= at_bound.sum() <= len(conductivity) - 3
-    assert_gradient(lambda theta: 1e3 * WEIGHT @ found(theta).conductivity, theta)
-
-
-@pytest.mark.slow
-def test_images_with_further_unknowns():
-    unknowns = [ContactImpedance(MODEL, 0.1), ElectrodePosition(MODEL, 3e-4), Scale(0.03)]
-
-    def image(theta):
-        found = solved(theta, Noser(), TIGHT, Parametrisation(unknowns=unknowns))
-        return image_of(found) + 1e3 * jnp.sum(found.model.electrodes.contact_impedance)
-
-    assert_gradient(image, THETA | {"hyperparameter": 10.0})
-
-
-@pytest.mark.slow
-def test_uncertainties():
-    def deviation(theta):
-        around = posterior(solved(theta, Noser(), TIGHT))
-        return 1e3 * WEIGHT @ around.standard_deviation() + 1e3 * around.region(np.flatnonzero(INSIDE))[1]
-
-    theta = THETA | {"hyperparameter": 10.0}
-    assert_gradient(deviation, theta)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("contact", ["common", "each"])
-def test_calibrations(contact):
-    apart = ELECTRODES.with_contact_impedance(np.linspace(0.2, 0.5, 5))
-    wide = MODEL.with_electrodes(ELECTRODES.with_contact_impedance(np.full(5, 0.3)))
-    data = MODEL.with_electrodes(apart).voltages(2e-3) * (1 + 1e-3 * np.random.default_rng(2).normal(size=EMPTY.shape))
-
-    def fitted(theta):
-        moved = wide.with_electrodes(eqx.tree_at(lambda e: e.position, wide.electrodes, theta["position"]))
-        model = eqx.tree_at(lambda m: m.mesh.points, moved, theta["points"])
-        found = calibrate(model, theta["data"], contact=contact)
-        impedance = found.model.electrodes.contact_impedance @ np.arange(1.0, 6.0)
-        return 1e3 * found.conductivity + impedance + 1e2 * found.misfit + found.contact_deviation.sum()
-
-    theta = {name: THETA[name] for name in ("position", "points")} | {"data": data}
-    assert_gradient(fitted, theta, equal=1e-6, compiled=True)  # at once it ends where parameters change by 1e-8
-
-
 def test_batches_of_linear_images():
     frames = np.stack([FRAME, 0.9 * FRAME, 0.5 * (FRAME + EMPTY)])
 
@@ -336,19 +232,6 @@ def test_batches_of_reconstructions_and_how_each_ended():
             np.testing.assert_allclose(traced.misfit, alone.misfit, rtol=1e-8)
     with pytest.raises(ValueError, match="known outside only"):
         jax.jit(lambda frame: found(frame).status == "converged")(FRAME)
-
-
-@pytest.mark.slow
-def test_gradients_of_batches_are_batches_of_gradients():
-    frames = np.stack([FRAME, 1.1 * FRAME])
-
-    def value(frame):
-        found = reconstruct(MODEL, frame, 1e-3, prior=Gaussian(0.04), hyperparameter=3.0, noise=0.01 * np.abs(EMPTY))
-        return 1e3 * WEIGHT @ found.conductivity
-
-    gradient = jax.jit(jax.grad(value))
-    together = jax.jit(jax.vmap(jax.grad(value)))(frames)
-    np.testing.assert_allclose(together, np.stack([gradient(frame) for frame in frames]), rtol=1e-7)
 
 
 REFUSED = {
@@ -396,23 +279,3 @@ def test_what_has_to_be_settled_outside_is_said(name):
 
 def whole(model, solver):
     return reconstruct(model, FRAME, 1e-3, hyperparameter=10.0, noise=0.01 * np.abs(EMPTY), solver=solver)
-
-
-@pytest.mark.slow
-def test_a_whole_model_may_be_traced():
-    """Protocol and cells included: reciprocal channels are then not combined, and the image is the same."""
-
-    def image(model, solver):
-        found = whole(model, solver)
-        return found.coefficients, 1e3 * WEIGHT @ found.conductivity
-
-    coefficients, expected = image(MODEL, TIGHT)
-    value = eqx.filter_jit(lambda model: image(model, Known(coefficients))[1])(MODEL)
-    np.testing.assert_allclose(value, expected, rtol=1e-7)
-
-
-@pytest.mark.slow
-def test_a_whole_model_may_be_differentiated():
-    gradient = eqx.filter_jit(eqx.filter_grad(lambda model: 1e3 * WEIGHT @ whole(model, TIGHT).conductivity))(MODEL)
-    assert np.isfinite(gradient.protocol.drive).all()
-    assert np.isfinite(gradient.electrodes.contact_impedance).all()
