@@ -123,7 +123,7 @@ def fill(made: Row, wheel: Path, uv: Path, whole: bool) -> None:
     # The linters and the documentation's tools are no part of what old versions are tried with.
     together = ",".join(one for one in EXTRAS if not constraints or one not in ("docs", "dev"))
     made.step("install all extras", made.installing(*constraints, f"{wheel}[{together}]"))
-    tests = ("-m", "not slow", *(() if whole else SELECTION))
+    tests = ("-p", "no:randomly", "-m", "not slow", *(() if whole else SELECTION))
     made.step("tests", (made.python.with_name("pytest"), "-n", "2", "-q", *tests), found=COUNTS, where=ROOT)
     if python == first(PYTHONS[::-1]) and not constraints:
         made.step("each extra alone", *(one for extra in EXTRAS for one in alone(extra, wheel, uv, python)))
