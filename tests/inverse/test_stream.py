@@ -1,5 +1,4 @@
-"""Streams: what comes out frame by frame, against `reconstruct` and the textbook's Kalman filter, and what happens to
-frames that are no good."""
+"""Streams: frame by frame against `reconstruct` and the textbook's Kalman filter; and frames that are no good."""
 
 import numpy as np
 import pytest
@@ -26,15 +25,13 @@ def pressed(model, value, place=PLACES[0]):
 
 
 def settings(model):
-    noise = 2e-3 * np.abs(pressed(model, 1.0))
-    return {"prior": Gaussian(0.02), "noise": noise, "hyperparameter": 3.0}
+    return {"prior": Gaussian(0.02), "noise": 2e-3 * np.abs(pressed(model, 1.0)), "hyperparameter": 3.0}
 
 
 def moving(model):
     """A press that moves: half the conductivity within 30 mm, with noise of 0.1 %."""
     clean = np.stack([pressed(model, 0.5, place) for place in PLACES])
-    noise = 1e-3 * np.abs(pressed(model, 1.0))
-    return clean + noise * np.random.default_rng(0).normal(size=clean.shape)
+    return clean + 1e-3 * np.abs(pressed(model, 1.0)) * np.random.default_rng(0).normal(size=clean.shape)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +55,6 @@ def frames(model):
 
 @pytest.fixture(scope="module")
 def few(small):
-    """The same press on the small model."""
     return moving(small)
 
 
@@ -69,7 +65,6 @@ def options(model):
 
 @pytest.fixture(scope="module")
 def rough(small):
-    """Settings for the small model."""
     return settings(small)
 
 
