@@ -8,60 +8,13 @@ import csv
 import io
 import json
 import signal
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from gesture_skin import PLACES, RATE, SHEET, TOML
+from gesture_skin import GESTURES, RATE, TOML, linear_gestures_and_stream
 
 from jeit.cli import main
 from jeit.data import GestureSet
-from jeit.electrodes import PointElectrodes
-from jeit.forward import ForwardModel
-from jeit.mesh import centroids
-from jeit.protocol import reference_electrode
-
-# Seconds, strength and metres that each gesture goes.
-GESTURES = {"tap": (0.15, 0.4, 0.0), "push": (1.0, 0.8, 0.0), "stroke": (0.7, 0.6, 0.14)}
-
-
-def gestures_and_stream():
-    """Four of each gesture by each of two people; and six gestures in a stream, with when each begins."""
-    model = ForwardModel(SHEET.mesh(num_points=150), PointElectrodes(PLACES), reference_electrode(8, current=1.8e-3))
-    rest, jacobian = np.asarray(model.voltages(0.1)), np.asarray(model.jacobian(0.1))
-    cells, rng = np.asarray(centroids(model.mesh)), np.random.default_rng(0)
-
-    def touch(gesture):
-        """Changes of the voltages (T, 48) while a gesture lasts, somewhere."""
-        lasts, strength, way = GESTURES[gesture]
-        share = np.linspace(0, 1, round(lasts * rng.uniform(0.9, 1.1) * RATE))[:, None]
-        place = rng.uniform([-0.06, -0.05], [0.06, 0.05]) + way * (share - 0.5) * [1.0, 0.0]
-        spots = np.exp(-np.sum((cells - place[:, None]) ** 2, axis=-1) / 0.02**2)
-        return 0.1 * strength * rng.uniform(0.8, 1.2) * np.sqrt(np.sin(np.pi * share)) * spots @ jacobian.T
-
-    def recorded(changes):
-        return rest + changes + 1e-4 * np.abs(rest).mean() * rng.normal(size=changes.shape)
-
-    def pause(seconds):
-        return np.zeros((round(seconds * RATE), len(rest)))
-
-    rows = [(gesture, person) for person in range(2) for gesture in GESTURES for _ in range(4)]
-    each = [recorded(np.concatenate([pause(0.3), touch(gesture), pause(0.3)])) for gesture, _ in rows]
-    made = GestureSet(
-        gesture=np.array([gesture for gesture, _ in rows]),
-        person=np.array([person for _, person in rows]),
-        start=np.cumsum([0, *map(len, each)]),
-        seconds=np.concatenate([np.arange(len(one)) / RATE for one in each]),
-        voltages=np.concatenate(each),
-        reference=recorded(pause(1.0)).mean(axis=0),
-        untouched=recorded(pause(3.0)),
-    )
-    parts, onset = [pause(2.0)], []
-    for gesture in 2 * list(GESTURES):
-        onset.append(sum(map(len, parts)) / RATE)
-        parts += [touch(gesture), pause(1.2)]
-    voltages = recorded(np.concatenate(parts))
-    return made, SimpleNamespace(voltages=voltages, seconds=np.arange(len(voltages)) / RATE, onset=np.array(onset))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -75,7 +28,7 @@ def coarse_images():
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("gestures")
-    made, stream = gestures_and_stream()
+    made, stream = linear_gestures_and_stream()
     made.write(folder / "gestures.npz")
     (folder / "skin.toml").write_text(TOML, "utf-8")
     np.savez(folder / "stream.npz", frames=stream.voltages, seconds=stream.seconds)

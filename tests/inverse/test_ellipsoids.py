@@ -2,11 +2,11 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from ball_in_a_box import BALL, BATH, RADIUS, SIZE, discs, model, shape_problem, sharp
 
-from jeit.electrodes import CombinedElectrodes, FaceDiscs, plates
+from jeit.electrodes import CombinedElectrodes, plates
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, TotalVariation, reconstruct
 from jeit.inverse.nonlinear.observed import independent_data
@@ -14,47 +14,11 @@ from jeit.inverse.shapes import EllipsoidPrior, StarPrior, certainty, reconstruc
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
 from jeit.inverse.shapes.finer import finer
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
-from jeit.mesh import bisect, box, centroids, cut, measures
+from jeit.mesh import box, measures
 from jeit.protocol import opposite
 
-SIZE, BATH = (0.1, 0.14, 0.1), 0.02
 # Of fits that are only looked at where they are.
 ROWS: Any = None
-BALL, RADIUS = np.array([0.012, -0.025, 0.055]), 0.022
-
-
-def discs():
-    """Sixteen discs on the four upright walls of the box."""
-    x, y = np.array([-0.025, 0.025]), np.array([-0.035, 0.035])
-    along_x = [(a, side * 0.07, z) for side in (-1, 1) for z in (0.03, 0.07) for a in x]
-    along_y = [(side * 0.05, b, z) for side in (-1, 1) for z in (0.03, 0.07) for b in y]
-    return FaceDiscs(np.array(along_x + along_y), 0.012, 0.01)
-
-
-def model(num_points):
-    return ForwardModel(box(*SIZE, num_points=num_points), discs(), opposite(16, current=1e-3))
-
-
-def sharp(num_points, along=3):
-    """A model whose mesh is cut along the ball, or the column along two axes, and which of its cells lie inside."""
-
-    def outside(points):
-        return np.linalg.norm((points - BALL)[..., :along], axis=-1) - RADIUS
-
-    def edge(corners):
-        on_surface = (outside(corners).min(axis=1) < 0) & (outside(corners).max(axis=1) > 0)
-        return np.where(on_surface, RADIUS / (3 if along == 3 else 2), np.inf)
-
-    mesh = cut(bisect(model(num_points).mesh, edge), outside)
-    return ForwardModel(mesh, discs(), opposite(16, current=1e-3)), outside(np.asarray(centroids(mesh))) < 0
-
-
-def shape_problem(given):
-    """Of the voltages of the bath alone."""
-    number: Any = given.protocol.num_measurements
-    every, noise = jnp.ones(number, bool), jnp.full(number, 1e-6)
-    small, data = independent_data(given, given.voltages(BATH), every, noise, at_once=True)  # pyright: ignore
-    return ShapeProblem(small, data, np.full(given.mesh.num_cells, BATH))
 
 
 @pytest.fixture(scope="module")
@@ -406,3 +370,23 @@ def test_of_many_to_start_from_only_those_that_data_ask_for_are_taken(coarse, fi
     _, fit, chosen = search._told_one_by_one(setting, balls, balls.of_radii([0.025, 0.02]))
     assert chosen == [0]
     assert len(fit.bodies.sign) == 1
+
+
+def test_those_beyond_doubt_are_fitted_together_before_others_are_tried(coarse):
+    """Alone, the first of two would move between them. What is fitted, and from where, is recorded in place of fits."""
+    fitted = []
+
+    class Recorded:
+        def settled(self, bodies, coefficients, level, steps):
+            fitted.append((list(bodies.sign), coefficients))
+            return level, Fit(bodies, coefficients, 1.0, ROWS), 0.0  # no other is likelier
+
+    places = [BALL, [-0.03, 0.04, 0.03], [0.0, 0.0, 0.05]]
+    balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), places, [1, 1, -1])
+    start: Any = balls.of_radii([0.02, 0.02, 0.02])
+    recorded: Any = Recorded()
+    _, _, chosen = search._told_one_by_one(recorded, balls, start, 2)
+    assert chosen == [0, 1]
+    assert [signs for signs, _ in fitted] == [[1, 1], [1, 1, -1]]
+    np.testing.assert_array_equal(fitted[0][1], balls.without(2, start)[1])
+    np.testing.assert_array_equal(fitted[1][1], start)

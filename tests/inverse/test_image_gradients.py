@@ -4,6 +4,7 @@ that has one, batches against loops, compiled code against what NumPy answers at
 from typing import Any
 
 import equinox as eqx
+import image_slopes
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,35 +60,8 @@ def placed(theta):
     return eqx.tree_at(lambda m: m.mesh.points, moved, theta["points"])
 
 
-def assert_gradient(function, theta, *, equal=1e-8, compiled=False):
-    """Reverse mode against differences of what is answered at once, or `compiled`; and the value, which is to be
-    `equal`."""
-    theta = {name: np.asarray(value, float) for name, value in theta.items()}
-    value, gradient = jax.jit(jax.value_and_grad(function))(theta)
-    np.testing.assert_allclose(value, function(theta), rtol=equal)
-    assert_slopes(jax.jit(function) if compiled else function, theta, gradient)
-
-
-def assert_slopes(answer, theta, gradient):
-    """Against central differences of fourth order. Large steps bend and small ones are rounded: one of six has to agree
-    to 1e-5.
-
-    Steps go up wherever they go, each number by a share of its own: along others the parts of a slope may all but
-    cancel, and differences are of rounding."""
-    random = np.random.default_rng(11)
-    for name, at in theta.items():
-        direction = np.abs(random.normal(size=at.shape) * SIZE.get(name, at)) * np.sign(gradient[name])
-        found, errors = float(np.vdot(gradient[name], direction)), []
-        for step in (1e-3, 1e-2, 3e-3, 3e-4, 1e-4, 1e-5):
-
-            def moved(times, name=name, along=step * direction):
-                return float(answer(theta | {name: theta[name] + times * along}))
-
-            near, far = moved(1) - moved(-1), moved(2) - moved(-2)
-            errors.append(abs(found / ((8 * near - far) / (12 * step)) - 1))
-            if errors[-1] <= 1e-5:
-                break
-        assert min(errors) <= 1e-5, (name, found, errors)
+def assert_gradient(function, theta, **settings):
+    image_slopes.assert_gradient(function, theta, SIZE, **settings)
 
 
 def linear_image(theta, prior):
@@ -184,7 +158,7 @@ def test_nonlinear_images():
         np.testing.assert_allclose(value, expected, rtol=1e-8)
         values.append(expected)
         gradients.append(jax.tree.map(np.asarray, gradient))
-    assert_slopes(lambda theta: image(theta, TIGHT)[1], one, gradients[0])
+    image_slopes.assert_slopes(lambda theta: image(theta, TIGHT)[1], one, gradients[0], SIZE)
     assert abs(values[2] / values[1] - 1) > 1e-7
     for name in VARIED:
         late, early = gradients[1][name], gradients[2][name]
