@@ -122,9 +122,12 @@ def fill(made: Row, wheel: Path, uv: Path, whole: bool) -> None:
     made.step("import every module", (made.python, "-c", IMPORT_ALL), found=r"\d+ modules")
     # The linters and the documentation's tools are no part of what old versions are tried with.
     together = ",".join(one for one in EXTRAS if not constraints or one not in ("docs", "dev"))
-    made.step("install all extras", made.installing(*constraints, f"{wheel}[{together}]"))
-    tests = ("-p", "no:randomly", "-m", "not slow", *(() if whole else SELECTION))
-    made.step("tests", (made.python.with_name("pytest"), "-n", "2", "-q", *tests), found=COUNTS, where=ROOT)
+    # The wheel is tested; but all tests need the sources, as the README's command has them: some import the benchmarks.
+    sources = [made.installing(*constraints, "-e", f"{ROOT}[test]")] if whole else []
+    made.step("install all extras", made.installing(*constraints, f"{wheel}[{together}]"), *sources)
+    command = (made.python, "-m", "pytest") if whole else (made.python.with_name("pytest"), *SELECTION)
+    tests = (*command, "-n", "2", "-q", "-p", "no:randomly", "-m", "not slow")
+    made.step("tests", tests, found=COUNTS, where=ROOT)
     if python == first(PYTHONS[::-1]) and not constraints:
         made.step("each extra alone", *(one for extra in EXTRAS for one in alone(extra, wheel, uv, python)))
 
