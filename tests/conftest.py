@@ -3,10 +3,16 @@
 import gc
 import os
 import signal
+import sys
 from pathlib import Path
 
 # Two workers with two threads each would wait for each other: small products are tens of times slower then.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+if "OPENBLAS_NUM_THREADS" not in os.environ:
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    if "numpy" in sys.modules:  # a plugin of another package has loaded it, and the variable comes too late
+        from threadpoolctl import threadpool_limits
+
+        threadpool_limits(1, user_api="blas")
 
 import jax
 import pytest
