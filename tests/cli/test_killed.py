@@ -39,27 +39,28 @@ STREAM = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moment", STREAM)
-def test_a_stream(moment, tank, run, tmp_path):
-    module, owner, method, calls, left = STREAM[moment]
+def test_a_stream(tank, run, tmp_path):
+    """Killed at each moment: whole lines and files are left, and the next run makes what an undisturbed one does."""
     data = tank.write("many", np.stack([tank.touched, tank.rest, 1.02 * tank.touched, tank.touched]))
     given = "stream", data, "--reference", tank.folder / "rest.csv", "--method", "one-step", "--num-points", 250
-    code = KILLED.format(module=module, owner=owner, method=method, calls=calls)
-    ended = in_another_process(code, *given, "--quiet", "--output", tmp_path / "out")
-    assert ended.returncode == -signal.SIGKILL, ended.stderr
-    assert {path.name for path in (tmp_path / "out").iterdir() if path.name[0] != "."} == left
-    lines = (tmp_path / "out" / "frames.csv").read_text().splitlines(keepends=True)
-    assert len(lines) == (3 if moment == "its third line" else 5)
-    assert all(line.endswith("\n") for line in lines)
-    assert {len(row) for row in csv.reader(lines)} == {10}
-    if "images.npz" in left:
-        with np.load(tmp_path / "out" / "images.npz") as held:
-            assert held["conductivity"].shape[0] == 4
-    for folder in ("out", "undisturbed"):
-        assert run(*given, "--quiet", "--output", tmp_path / folder)[0] == 0
-    for name in ("images.npz", "frames.png", "film.gif"):
-        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes()
-    assert sorted(os.listdir(tmp_path / "out")) == sorted(os.listdir(tmp_path / "undisturbed"))
+    assert run(*given, "--quiet", "--output", tmp_path / "undisturbed")[0] == 0
+    for moment, (module, owner, method, calls, left) in STREAM.items():
+        out = tmp_path / moment
+        code = KILLED.format(module=module, owner=owner, method=method, calls=calls)
+        ended = in_another_process(code, *given, "--quiet", "--output", out)
+        assert ended.returncode == -signal.SIGKILL, ended.stderr
+        assert {path.name for path in out.iterdir() if path.name[0] != "."} == left, moment
+        lines = (out / "frames.csv").read_text().splitlines(keepends=True)
+        assert len(lines) == (3 if moment == "its third line" else 5)
+        assert all(line.endswith("\n") for line in lines)
+        assert {len(row) for row in csv.reader(lines)} == {10}
+        if "images.npz" in left:
+            with np.load(out / "images.npz") as held:
+                assert held["conductivity"].shape[0] == 4
+        assert run(*given, "--quiet", "--output", out)[0] == 0
+        for name in ("images.npz", "frames.png", "film.gif"):
+            assert (out / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes(), moment
+        assert sorted(os.listdir(out)) == sorted(os.listdir(tmp_path / "undisturbed"))
 
 
 @pytest.mark.slow
@@ -100,7 +101,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.slow
-def test_while_compiled_code_is_kept(tank, tmp_path):
+def test_while_compiled_code_is_kept(tank, run, tmp_path):
     """Half a program is left; the next run says nothing of it, and keeps it whole."""
     given = ["reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv", "--num-points", 250]
     given = [*map(str, given), "--quiet", "--output"]
@@ -115,8 +116,8 @@ def test_while_compiled_code_is_kept(tank, tmp_path):
     assert ended.returncode == -signal.SIGKILL, ended.stderr
     torn = ended.stdout.strip()
     size = os.path.getsize(torn)
-    for cache, folder in (("cache", "out"), ("another", "undisturbed")):
-        ended = start(cache, "-m", "jeit", *given, tmp_path / folder)
-        assert (ended.returncode, ended.stderr) == (0, "")
+    ended = start("cache", "-m", "jeit", *given, tmp_path / "out")
+    assert (ended.returncode, ended.stderr) == (0, "")
     assert not os.path.exists(torn) or os.path.getsize(torn) > size
+    assert run(*given, tmp_path / "undisturbed")[0] == 0
     assert (tmp_path / "out" / "image.npz").read_bytes() == (tmp_path / "undisturbed" / "image.npz").read_bytes()

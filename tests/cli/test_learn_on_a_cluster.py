@@ -10,6 +10,16 @@ import time
 import pytest
 from small_networks import SKIN
 
+# What is killed here is the making of touches: one epoch of training will do.
+QUICK = """
+import sys
+from jeit.cli import main
+from jeit.touch.networks import PRESETS, Preset
+from jeit.touch.training import Plan
+PRESETS["quick"] = Preset(1000, 250, Plan(rate=2e-3, batch=32, epochs=1))
+sys.exit(main(sys.argv[1:]))
+"""
+
 
 def finished(model) -> int:
     """Chunks of the touches to learn from."""
@@ -25,7 +35,7 @@ def test_killed_with_its_workers(tmp_path):
     skin.write_text(SKIN)
 
     def start(name, *options):
-        command = [sys.executable, "-m", "jeit", "learn", "image", str(skin), "--output", str(tmp_path / name)]
+        command = [sys.executable, "-c", QUICK, "learn", "image", str(skin), "--output", str(tmp_path / name)]
         command += ["--preset", "quick", "--touches", "1500", "--quiet", *options]
         return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
 

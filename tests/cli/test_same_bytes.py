@@ -16,11 +16,12 @@ from jeit.mesh import Rectangle
 
 # Keys of reports, and columns of tables, that say how long it took.
 _TIMES = ("timings", "latency_ms")
+FEW = ("--cell-mm", "8", "--places", "16", "--taxels", "20")
 RUNS = {
     "demo": ["demo", "--output", "out"],
-    "reconstruct": ["reconstruct", "touched.csv", "--reference", "rest.csv", "--output", "out"],
+    "reconstruct": ["reconstruct", "touched.csv", "--reference", "rest.csv", "--output", "out", "--num-points", "300"],
     "stream": ["stream", "touched.csv", "--reference", "rest.csv", "--output", "out", "--num-points", "300"],
-    "layout compare": ["layout", "compare", "grid-4x4.svg", "inner-16.svg", "--output", "out"],
+    "layout compare": ["layout", "compare", "grid-4x4.svg", "inner-16.svg", "--output", "out", *FEW],
     "touch fit": ["touch", "fit", "presses.npz", "--output", "out", "--method", "forest"],
     "study": ["study", "run", "study.toml", "--output", "out.zarr"],
 }
