@@ -76,14 +76,14 @@ def inside(number, seed=0, outline=OUTLINE, reach=1.0):
     return places[np.asarray(contained)][:number]
 
 
-def padded(power, number=1024):
-    """Frames repeated until there are so many: one compiled program serves all."""
+def padded(power, number=1100):
+    """Frames repeated until there are so many, more than are worked on together: one compiled program serves all."""
     return power[np.arange(number) % len(power)]
 
 
-def same_shape(localiser, power, number=1024, **options):
-    """What a localiser finds of frames, by a program of `number` frames."""
-    found = localiser(padded(np.asarray(power), number), **options)
+def same_shape(localiser, power):
+    """What a localiser finds of frames, by the program of all tests."""
+    found = localiser(padded(np.asarray(power)))
     return {key: np.asarray(getattr(found, key))[: len(power)] for key in found.__dataclass_fields__}
 
 

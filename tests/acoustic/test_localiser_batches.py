@@ -3,9 +3,10 @@
 import jax
 import numpy as np
 import pytest
-from microphone_arrays import L_SHAPE, array, both, distance, hear, inside, localise, noisy, same_shape
+from microphone_arrays import L_SHAPE, array, both, distance, hear, inside, localise, noisy, padded, same_shape
 
 from jeit.acoustic import Localiser
+from jeit.acoustic.localisation.localiser import _CHUNK
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def test_no_frames_give_nothing(method, compiled):
 @pytest.mark.slow
 @both
 def test_frames_do_not_see_each_other(method, mixed):
-    """One by one, in another order, or padded with others: the same to rounding."""
+    """One by one, in another order, or in another chunk: the same to rounding."""
     microphone_array, power = mixed
     localiser = Localiser.create(microphone_array, method=method)
     together = same_shape(localiser, power)
@@ -45,15 +46,9 @@ def test_frames_do_not_see_each_other(method, mixed):
     shuffled = same_shape(localiser, power[order])
     for key in ("position", "covariance", "strength", "excess", "misfit"):
         np.testing.assert_allclose(shuffled[key], together[key][order], rtol=1e-9, atol=1e-15)
-
-
-@pytest.mark.slow
-@both
-def test_many_frames_are_worked_on_in_chunks(method, mixed):
-    microphone_array, power = mixed
-    localiser = Localiser.create(microphone_array, method=method)
-    many = localiser(power[np.arange(2500) % 50])
-    np.testing.assert_allclose(many.position, localiser(power).position[np.arange(2500) % 50], rtol=1e-7, atol=1e-10)
+    many = localiser(padded(power)).position
+    assert len(many) > _CHUNK
+    np.testing.assert_allclose(many, padded(together["position"]), rtol=1e-7, atol=1e-10)
 
 
 @pytest.mark.slow
@@ -106,19 +101,22 @@ def test_too_few_readings_give_nan(method, mixed):
 @pytest.mark.slow
 @both
 def test_maps(method):
-    """Least where the source is found, to a pixel; blank beyond the outline; bottom row first."""
+    """Least where the source is found, to a pixel; blank beyond the outline; bottom row first.
+
+    In NumPy; the compiled program's are those of the next test, and of `test_hearing_engines`.
+    """
     microphone_array, places = array(9, outline=L_SHAPE, relative=0.02), inside(20, outline=L_SHAPE, reach=0.9)
-    localiser = Localiser.create(microphone_array, method=method, map_shape=(40, 30))
+    localiser = Localiser.create(microphone_array, method=method, map_shape=(40, 30), compiled=False)
     power = noisy(microphone_array.noise, hear(microphone_array, places), np.random.default_rng(10))
-    found, maps = localiser.with_maps(power[np.arange(32) % 20])
-    assert maps.shape == (32, 40, 30)
+    found, maps = localiser.with_maps(padded(power, 40))
+    assert maps.shape == (40, 40, 30)
     x, y = -0.1 + 0.2 * (np.arange(30) + 0.5) / 30, -0.1 + 0.2 * (np.arange(40) + 0.5) / 40
     np.testing.assert_array_equal(np.isnan(maps[0]), (x > 0) & (y[:, None] > 0.01))
     for one, place in zip(np.asarray(maps), np.asarray(found.position), strict=True):
         row, column = np.unravel_index(np.nanargmin(one), one.shape)
         assert np.hypot(x[column] - place[0], y[row] - place[1]) < 0.009
-    coarse = same_shape(Localiser.create(microphone_array, method=method), power)
-    np.testing.assert_allclose(found.position[:20], coarse["position"], atol=1e-8)
+    coarse = localise(microphone_array, power, method)["position"]
+    np.testing.assert_allclose(found.position, padded(coarse, 40), atol=1e-8)
 
 
 @pytest.mark.slow
