@@ -70,7 +70,7 @@ def _face():
 
 
 def _patch():
-    mesh = cylinder(0.1, 0.08, num_points=500)
+    mesh = cylinder(0.1, 0.08, num_points=250)
     middle = float(mesh.points[:, 2].mean())
     # Not at the angles of nodes: the wall's normal there is that of one facet beside it or of the other.
     electrodes = FacePatches(ring(0.1, 6, height=middle, start_angle=0.03), 0.04, 0.04, 1e-3)

@@ -25,9 +25,11 @@ def model(request):
     return MODELS[request.param]()
 
 
-@pytest.fixture(params=models(["boundary"]), scope="module")
+@pytest.fixture(
+    params=["boundary", *(pytest.param(one, marks=pytest.mark.slow) for one in ("point", "face"))], scope="module"
+)
 def known(request):
-    """A model for programs in which its electrodes have values: there one kind with contacts stands for the others."""
+    """A model for programs that get its electrodes' integrals: with contacts or without, of a sheet or a solid."""
     return MODELS[request.param]()
 
 

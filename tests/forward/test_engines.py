@@ -20,19 +20,12 @@ from jeit_solvers import ConjugateGradient
 QUANTITIES = ("voltages", "transfer_impedance", "potentials", "fields", "voltages_and_jacobian")
 
 
-def models(*quick):
-    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in MODELS]
-
-
-# Of other kinds, test_derivatives has the compiled voltages beside NumPy's.
-@pytest.fixture(params=models("boundary"), scope="module")
+# Programs of known electrodes get their integrals: with contacts or without, of a sheet or a solid, all else is alike.
+# Of other kinds, test_derivatives has the compiled integrals beside NumPy's.
+@pytest.fixture(
+    params=["boundary", *(pytest.param(one, marks=pytest.mark.slow) for one in ("point", "face"))], scope="module"
+)
 def model(request):
-    return MODELS[request.param]()
-
-
-@pytest.fixture(params=models("boundary"), scope="module")
-def known(request):
-    """A model for programs in which its electrodes have values: there one kind stands for the others."""
     return MODELS[request.param]()
 
 
@@ -62,51 +55,43 @@ def test_numpy_and_compiled_code_agree(model):
         assert_same(everything(one), expected)
 
 
-@pytest.mark.slow
-def test_compiled_code_equals_code_that_jax_runs_step_by_step(model):
-    conductivity = jnp.asarray(uneven(model.mesh.num_cells))
-    with jax.disable_jit():
-        eager = model.voltages(conductivity)
-    assert_same(model.voltages(conductivity), eager)
-
-
-def test_one_number_per_node(known):
-    nodal = uneven(known.mesh.num_points)
-    found = known.voltages_and_jacobian(nodal)
-    of_cells = np.asarray(known.voltages(nodal[np.asarray(known.mesh.cells)].mean(axis=1)))
+def test_one_number_per_node(model):
+    nodal = uneven(model.mesh.num_points)
+    found = model.voltages_and_jacobian(nodal)
+    of_cells = np.asarray(model.voltages(nodal[np.asarray(model.mesh.cells)].mean(axis=1)))
     assert_same(found[0], of_cells, 1e-13)
 
 
 @pytest.mark.slow
-def test_one_number_per_node_in_compiled_code(known):
-    nodal = uneven(known.mesh.num_points)
-    found = known.voltages_and_jacobian(nodal)
-    both = jax.jit(lambda at: (known.voltages_and_jacobian(at), jax.jacrev(known.voltages)(at)))
+def test_one_number_per_node_in_compiled_code(model):
+    nodal = uneven(model.mesh.num_points)
+    found = model.voltages_and_jacobian(nodal)
+    both = jax.jit(lambda at: (model.voltages_and_jacobian(at), jax.jacrev(model.voltages)(at)))
     together, plain = both(nodal)
     assert_same(found, together)
     assert_same(found[1], plain)
 
 
-def test_complex_numbers(known):
-    admittivity = uneven(known.mesh.num_cells) * np.exp(0.4j * np.linspace(0, 1, known.mesh.num_cells))
-    both = jax.jit(lambda at: (known.voltages_and_jacobian(at), jax.jacfwd(known.voltages, holomorphic=True)(at)))
-    found, (together, plain) = known.voltages_and_jacobian(admittivity), both(admittivity)
+def test_complex_numbers(model):
+    admittivity = uneven(model.mesh.num_cells) * np.exp(0.4j * np.linspace(0, 1, model.mesh.num_cells))
+    both = jax.jit(lambda at: (model.voltages_and_jacobian(at), jax.jacfwd(model.voltages, holomorphic=True)(at)))
+    found, (together, plain) = model.voltages_and_jacobian(admittivity), both(admittivity)
     assert_same(found, together)
     assert_same(found[1], plain)
 
 
-def test_tensors(known):
-    axes, cells = known.mesh.dimension, known.mesh.num_cells
+def test_tensors(model):
+    axes, cells = model.mesh.dimension, model.mesh.num_cells
     equal = uneven(cells)
-    assert_same(known.voltages(equal[:, None, None] * np.eye(axes)), np.asarray(known.voltages(equal)), 1e-13)
+    assert_same(model.voltages(equal[:, None, None] * np.eye(axes)), np.asarray(model.voltages(equal)), 1e-13)
     skewed, direction = 0.2 * np.random.default_rng(4).normal(size=(2, cells, axes, axes))
     tensors, direction = np.eye(axes) + skewed @ np.swapaxes(skewed, 1, 2), direction @ np.swapaxes(direction, 1, 2)
-    voltages, derivative = jax.jit(lambda at: jax.jvp(known.voltages, (at,), (direction,)))(tensors)
-    assert_same(known.voltages(tensors), voltages)
-    ahead, behind = (np.asarray(known.voltages(tensors + step * direction)) for step in (1e-4, -1e-4))
+    voltages, derivative = jax.jit(lambda at: jax.jvp(model.voltages, (at,), (direction,)))(tensors)
+    assert_same(model.voltages(tensors), voltages)
+    ahead, behind = (np.asarray(model.voltages(tensors + step * direction)) for step in (1e-4, -1e-4))
     np.testing.assert_allclose((ahead - behind) / 2e-4, derivative, rtol=0, atol=1e-7 * np.abs(derivative).max())
     with pytest.raises(ValueError, match="for tensors use"):
-        known.jacobian(tensors)
+        model.jacobian(tensors)
 
 
 @pytest.fixture(scope="module")
