@@ -62,7 +62,7 @@ def exact():
 @pytest.mark.parametrize(
     ("decay", "seed"),
     [("inverse-square", 0), ("attenuated", 0), pytest.param("exponential", 0, marks=pytest.mark.slow)]
-    + [pytest.param(decay, seed, marks=pytest.mark.slow) for decay in DECAYS for seed in (1, 2, 3)],
+    + [pytest.param(decay, seed, marks=pytest.mark.slow) for decay in DECAYS for seed in (1, 2)],
 )
 def test_exact_data_give_the_parameters(decay, seed):
     """To 1e-6, with strengths unknown; all else that the fit tells of is in order too."""
@@ -266,14 +266,14 @@ def test_a_microphone_that_heard_little_is_said_so(exact):
 
 
 @pytest.mark.slow
-def test_order_does_not_matter(exact):
+def test_order_does_not_matter():
     """Of taps and microphones: the same models to rounding."""
-    power = exact[2] * np.exp(0.05 * np.random.default_rng(7).normal(size=exact[2].shape))
-    taps, microphones = np.random.default_rng(8).permutation(NUMBER), np.random.default_rng(9).permutation(COUNT)
-    plain = calibrated(power)
-    mixed = calibrate_microphones(
-        Taps(MICROPHONE[microphones], OUTLINE, PLACES[taps], power=power[taps][:, microphones])
-    )
+    place, places = MICROPHONES[9], PLACES[::2]
+    power = listen(place, *(one[:9] for one in parameters("inverse-square")), places, strengths()[::2])
+    power *= np.exp(0.05 * np.random.default_rng(7).normal(size=power.shape))
+    taps, microphones = np.random.default_rng(8).permutation(len(places)), np.random.default_rng(9).permutation(9)
+    plain = calibrate_microphones(Taps(place, OUTLINE, places, power=power))
+    mixed = calibrate_microphones(Taps(place[microphones], OUTLINE, places[taps], power=power[taps][:, microphones]))
     np.testing.assert_allclose(logarithms_of(mixed), logarithms_of(plain)[:, microphones], atol=1e-6)
 
 
@@ -300,9 +300,9 @@ def test_on_a_curved_skin():
             [(radius - depth) * np.sin(angle), chart[:, 1], (radius - depth) * np.cos(angle) - radius], axis=1
         )
 
-    values = parameters("inverse-square")
-    place, taps = on(MICROPHONE, 0.01), on(PLACES)
-    fit = calibrate_microphones(Taps(place, on(OUTLINE), taps, power=listen(place, *values, taps, strengths())))
+    values = tuple(one[:9] for one in parameters("inverse-square"))
+    place, taps = on(MICROPHONES[9], 0.01), on(PLACES[::2])
+    fit = calibrate_microphones(Taps(place, on(OUTLINE), taps, power=listen(place, *values, taps, strengths()[::2])))
     np.testing.assert_allclose(logarithms_of(fit), scaled("inverse-square", values)[0], atol=1e-6)
     assert fit.calibration.microphone_array.surface.dimension == 3
 

@@ -242,10 +242,10 @@ def test_optimised_skin_beats_the_paper_s_and_a_regular_grid():
         prior = TouchPrior.create(grid.places, correlation=0.015)
         return ForwardModel(mesh, start.sheet_discs(1e-4), protocol), grid, touches, {"prior": prior, "noise": 1e-4}
 
-    model, _, touches, options = setting(1300, 14)
+    model, _, touches, options = setting(700, 14)
     sheet = Skin(start, model, thickness=0.01, conductivity=conductance / 0.01)
-    found = optimise_layout(sheet, Objective(touches, **options), DesignSpace(minimum_spacing=8e-3), steps=25)
-    model, grid, touches, options = setting(6000, 24)
+    found = optimise_layout(sheet, Objective(touches, **options), DesignSpace(minimum_spacing=8e-3), steps=20)
+    model, grid, touches, options = setting(2500, 24)
     worst, variance = {}, {}
     for layout in (found.layout, start, named_layout("park-inner"), named_layout("grid-8x4")):
         moved = model.with_electrodes(layout.sheet_discs(1e-4))

@@ -65,7 +65,7 @@ def test_a_small_training_tells_people_it_never_met():
     out = person == 4
 
     def share(method: str, labels) -> float:
-        lesson = Lesson(images[~out], labels[~out], person[~out], 5, KEY, batches=200)
+        lesson = Lesson(images[~out], labels[~out], person[~out], 5, KEY, batches=100)
         return float(np.mean(LEARNERS[method].learn(lesson).log_odds(images[out]).argmax(axis=1) == right[out]))
 
     shuffled = np.random.default_rng(0).permutation(right)
@@ -73,7 +73,7 @@ def test_a_small_training_tells_people_it_never_met():
     found = {
         "untrained": float(np.mean(untrained.argmax(axis=1) == right)),
         "shuffled": share("network", shuffled),
-        **{method: share(method, right) for method in ("network", "trees", "spectrum", "linear")},
+        **{method: share(method, right) for method in ("network", "trees", "linear")},
     }
     assert max(found["untrained"], found["shuffled"]) < 0.4, found
     assert found["network"] > 0.65, found
