@@ -93,7 +93,7 @@ def model_of(point) -> ForwardModel:
 
 @pytest.mark.slow
 def test_a_layer_is_touched_on_its_top(results):
-    found = results(skin='model = "layer"', mesh="layers = 3")
+    found = results(skin='model = "layer"', mesh="layers = 2")
     for point, values in found:
         theta = sensitivity_map(model_of(point), 0.5, GRID, linear=True)
         np.testing.assert_allclose(values, theta.values, rtol=1e-9)

@@ -226,7 +226,7 @@ def test_the_paper_s_network_learns_from_voltages(stored, other):
     """Taught other touches' maps it learns none of them."""
     found = stored[2]
     right = Examples(found["change"].to_numpy(), found["depth"].to_numpy())
-    runs = Runs(Plan(rate=3e-3, batch=20, epochs=40, patience=40), jax.random.key(1))
+    runs = Runs(Plan(rate=3e-3, batch=20, epochs=12, patience=12), jax.random.key(1))
     own, lost = (
         train_three_stages(taught, other, 1e-3, runs).courses["projection"].course
         for taught in (right, shuffled(right))
