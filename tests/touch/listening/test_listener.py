@@ -65,10 +65,10 @@ def test_the_best_of_clips_held_out_is_taken(learnt, tmp_path, monkeypatch):
             raise Killed
 
     with pytest.raises(Killed):
-        Listener.fit(few, key=KEY, batches=30, folder=tmp_path, progress=kill)
+        Listener.fit(few, key=KEY, batches=10, folder=tmp_path, progress=kill)
     assert sorted(one.name for one in tmp_path.iterdir()) == ["network-0.training", "network-1.training"]
-    on = Listener.fit(few, key=KEY, batches=30, folder=tmp_path)
-    through = Listener.fit(few, key=KEY, batches=30)
+    on = Listener.fit(few, key=KEY, batches=10, folder=tmp_path)
+    through = Listener.fit(few, key=KEY, batches=10)
     assert on.standing is not None
     assert through.standing is not None
     tried = dict(on.standing.tried)
