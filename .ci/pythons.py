@@ -71,8 +71,9 @@ def first(versions: list[str]) -> str | None:
 class Row:
     """One environment: what is done in it, and the seconds that each step took, as cells of a table."""
 
-    def __init__(self, name: str, folder: Path):
+    def __init__(self, name: str, folder: Path, uv: Path):
         self.name, self.folder, self.python = name, folder, folder / ".venv" / "bin" / "python"
+        self.uv = uv
         self.cells: list[str] = []
 
     def step(self, title: str, *commands: tuple, found: str = "", where: Path | None = None) -> None:
@@ -92,8 +93,8 @@ class Row:
         self.cells.append(", ".join([*(re.findall(found, lines) if found else ()), seconds]))
 
     def installing(self, *what: str | Path) -> tuple:
-        """The command that installs something here."""
-        return (self.python, "-m", "pip", "install", "--quiet", *what)
+        """The command that installs something here: by uv, which takes what pip takes, in a fifth of the time."""
+        return (self.uv, "pip", "install", "--quiet", "--python", self.python, *what)
 
 
 def least(uv: Path, python: str, folder: Path) -> Path:
@@ -115,7 +116,7 @@ def fill(made: Row, wheel: Path, uv: Path, whole: bool) -> None:
         made.cells = [f"skipped: there is no Python {version} here"]
         return
     constraints = ("-c", least(uv, python, folder)) if name != version else ()
-    made.step("install", (python, "-m", "venv", ".venv"), made.installing(*constraints, wheel))
+    made.step("install", (uv, "venv", "--quiet", "--python", python, ".venv"), made.installing(*constraints, wheel))
     made.step("main command", (made.python.with_name("jeit"), "demo", "--output", "out"))
     if not (folder / "out" / "image.png").stat().st_size:
         raise SystemExit(f"{name}: the main command made no picture")
@@ -169,7 +170,7 @@ def main() -> int:
             wheel = next(Path(kept).glob("*.whl"))
             for name in asked.names:
                 with tempfile.TemporaryDirectory() as folder:
-                    rows.append(Row(name, Path(folder)))
+                    rows.append(Row(name, Path(folder), Path(uv)))
                     fill(rows[-1], wheel, Path(uv), asked.whole)
     finally:
         for line in (HEADING, ["---"] * len(HEADING), *([one.name, *one.cells] for one in rows)):

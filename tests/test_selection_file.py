@@ -1,13 +1,17 @@
-"""The selection of tests that runs on every Python: a list of files that are there, some of every room."""
+"""The tests that run on every Python, some of every room, and those that run as users' programs are compiled: lists of
+files that are there."""
 
+import pytest
 from test_layers import ROOMS, ROOT
 
 LISTED = (ROOT / "tests" / "selection.txt").read_text("utf-8").split()
+COMPILED = (ROOT / "tests" / "compiled.txt").read_text("utf-8").split()
 
 
-def test_files_are_there_once():
-    assert [one for one in LISTED if not (ROOT / one).is_file()] == []
-    assert len(set(LISTED)) == len(LISTED)
+@pytest.mark.parametrize("listed", [LISTED, COMPILED], ids=["selection", "compiled"])
+def test_files_are_there_once(listed):
+    assert [one for one in listed if not (ROOT / one).exists()] == []
+    assert len(set(listed)) == len(listed)
 
 
 def test_every_room_is_in_it():
