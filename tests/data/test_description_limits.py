@@ -52,12 +52,12 @@ MATRICES = {
 def test_refused_before_it_is_made(protocol, message):
     parse_description({}, "d.toml")  # imports what takes longer than the rest
     tracemalloc.start()
-    start = time.perf_counter()
+    start = time.process_time()
     try:
         with pytest.raises(ValueError, match=f"^d.toml: {message}") as caught:
             parse_description({"protocol": protocol}, "d.toml").protocol("a.csv")
         assert tracemalloc.get_traced_memory()[1] < 50e6
-        assert time.perf_counter() - start < 2
+        assert time.process_time() - start < 2
     finally:
         tracemalloc.stop()
     assert len(str(caught.value)) <= 400
@@ -86,9 +86,9 @@ def test_a_current_in_a_name(pattern, name, number):
 
 
 def test_a_pattern_of_many_parts_takes_no_time():
-    start = time.perf_counter()
+    start = time.process_time()
     assert number_in_name("*a" * 90 + "{current}b", "1" + "a1" * 125) is None
-    assert time.perf_counter() - start < 0.5
+    assert time.process_time() - start < 0.5
 
 
 @pytest.mark.parametrize("pattern", ["([0-9.]+)uA", "(a+)+$", "*uA*", "{current}{current}"])
