@@ -182,7 +182,8 @@ def test_a_ball_over_the_wall_ends_there(coarse):
 
 
 def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, fine, monkeypatch):
-    """On a mesh fewer, and on coarser ones, than by default: with those in test_fitted_ellipsoids.py."""
+    """On a mesh fewer, and on coarser ones, than by default: with those, of a resistive ball, in
+    test_fitted_ellipsoids.py."""
     monkeypatch.setattr(search, "_MOST_MESHES", 2)
     monkeypatch.setattr(search, "_EDGES", ((0.7,), (0.5,)))
     ratio = 4.0
