@@ -10,7 +10,7 @@ import pytest
 
 from jeit.electrodes import BoundaryElectrodes, SheetDiscs
 from jeit.forward import ForwardModel
-from jeit.inverse import Laplace, reconstruct
+from jeit.inverse import Laplace, Parametrisation, reconstruct
 from jeit.inverse.nonlinear import LBFGSB, GaussNewton, LevenbergMarquardt, ProjectedGradient
 from jeit.inverse.nonlinear.solvers import LeastSquares
 from jeit.layout import perimeter, ring, ring_and_centre
@@ -39,6 +39,7 @@ PROBLEMS = {
     "conductive in a disk": (disk, (0.03, 0.02), 0.025, 3.0),
     "resistive in a disk": (disk, (-0.04, 0.0), 0.03, 0.3),
     "resistive in a sheet": (sheet, (0.05, 0.02), 0.035, 0.4),
+    "conductive in a sheet": (sheet, (-0.06, 0.03), 0.03, 2.5),
     "conductive among discs": (centred, (0.02, 0.04), 0.025, 2.5),
 }
 # Solver, and the most iterations it may take on any of the problems: recorded, with a fifth to spare.
@@ -65,14 +66,16 @@ def pose(name):
     return model, voltages, options, best
 
 
-# jeit's own solvers are tried on every problem; those that take minutes for it, on two that differ most.
-OWN, TWO = ("gauss-newton", "levenberg-marquardt"), ("conductive in a disk", "resistive in a sheet")
+# jeit's own solvers are tried on every problem; those that are compiled for each body, on the two problems of one.
+OWN = ("gauss-newton", "levenberg-marquardt")
+BODIES = {"optimistix LM": "disk", "optimistix Dogleg": "sheet", "l-bfgs-b": "disk", "projected-gradient": "sheet"}
+BOUNDED = [(f"conductive in a {BODIES[name]}", name) for name in ("l-bfgs-b", "projected-gradient")]
 
 
 def cases():
     """The pairs to try; the quick suite takes the solvers that need no compilation (others: test_reconstruct.py)."""
     for problem, solver in itertools.product(PROBLEMS, SOLVERS):
-        if solver in OWN or problem in TWO:
+        if solver in OWN or problem.endswith(f"a {BODIES[solver]}"):
             quick = problem == "conductive in a disk" and solver in OWN
             yield pytest.param(problem, solver, marks=() if quick else pytest.mark.slow)
 
@@ -88,3 +91,28 @@ def test_every_solver_on_every_problem(problem, name):
     assert float(result.costs[-1]) < float(result.costs[0])
     largest = np.abs(np.log(best.conductivity)).max()
     assert np.abs(np.log(result.conductivity / best.conductivity)).max() < 0.1 * largest
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("problem", "name"), BOUNDED)
+def test_bounds_that_are_not_reached_change_nothing(problem, name):
+    model, voltages, options, free = pose(problem)
+    within = Parametrisation(bounds=(1e-3, 1e3))
+    result = reconstruct(model, voltages, 1.0, solver=SOLVERS[name][0], parametrisation=within, **options)
+    assert result.status == "converged"
+    assert float(result.costs[-1]) < 1.01 * float(free.costs[-1])
+    np.testing.assert_allclose(result.conductivity, free.conductivity, rtol=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("problem", "name"), BOUNDED)
+def test_bounds_hold_and_are_reached(problem, name):
+    """With other priors: see test_bounded.py."""
+    model, voltages, options, _ = pose(problem)
+    between = Parametrisation(bounds=(0.95, 1.6))
+    result = reconstruct(model, voltages, 1.0, solver=SOLVERS[name][0], parametrisation=between, **options)
+    values = np.asarray(result.conductivity)
+    assert values.min() >= 0.95 * (1 - 1e-12)
+    assert values.max() <= 1.6 * (1 + 1e-12)
+    assert values.max() == pytest.approx(1.6, rel=1e-6)
+    assert result.costs[-1] < result.costs[0]
