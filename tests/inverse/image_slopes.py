@@ -1,16 +1,55 @@
 """Gradients of functions of several arrays by name against finite differences: shared by tests of images."""
 
+from typing import Any
+
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+
+from jeit.inverse.nonlinear.implicit import as_solution
+from jeit.inverse.nonlinear.solvers import AbstractSolver, Solved
+from jeit_solvers import Status
+
+
+class Known(AbstractSolver):
+    """Ends where it is given to end, within bounds if there are any: the derivatives of a reconstruction without the
+    loop that finds it, which takes seconds to compile."""
+
+    name = "known"
+    coefficients: Any
+    between: bool = eqx.field(static=True, default=False)
+
+    @property
+    def keeps_bounds(self):
+        return self.between
+
+    def minimise(self, inversion, start, box):
+        found = as_solution(self.coefficients, inversion, box)
+        costs = jnp.stack([inversion.cost(start), inversion.cost(found)])
+        return Solved(found, 0, costs, Status.CONVERGED.number, "")
 
 
 def assert_gradient(function, theta, size, *, equal=1e-8, compiled=False):
     """Reverse mode against differences of what is answered at once, or `compiled`; and the value, which is to be
-    `equal`."""
+    `equal`, unless that is None: nothing is answered at once then."""
     theta = {name: np.asarray(value, float) for name, value in theta.items()}
-    value, gradient = jax.jit(jax.value_and_grad(function))(theta)
-    np.testing.assert_allclose(value, function(theta), rtol=equal)
-    assert_slopes(jax.jit(function) if compiled else function, theta, gradient, size)
+    program = jax.jit(jax.value_and_grad(function))
+    value, gradient = program(theta)
+    if equal is not None:
+        np.testing.assert_allclose(value, function(theta), rtol=equal)
+    assert_slopes((lambda theta: program(theta)[0]) if compiled else function, theta, gradient, size)
+
+
+def assert_gradient_of_minimum(image, theta, size, solver, *, between=False):
+    """Likewise of a number that `image(theta, solver)` gives beside a reconstruction, without the solver's loop in what
+    is compiled; `between` bounds, if it has any."""
+    theta = {name: np.asarray(value, float) for name, value in theta.items()}
+    found, number = image(theta, solver)
+    program = jax.jit(jax.value_and_grad(lambda theta, ended: image(theta, Known(ended, between))[1]))
+    value, gradient = program(theta, found.coefficients)
+    np.testing.assert_allclose(value, number, rtol=1e-8)
+    assert_slopes(lambda theta: image(theta, solver)[1], theta, gradient, size)
 
 
 def assert_slopes(answer, theta, gradient, size):

@@ -26,10 +26,9 @@ def few():
 
 
 @pytest.fixture
-def few_meshes(monkeypatch):
-    """Finer ones that are fewer and coarser than by default, where what is said does not depend on them."""
-    monkeypatch.setattr(search, "_MOST_MESHES", 2)
-    monkeypatch.setattr(search, "_EDGES", ((0.7,), (0.5,)))
+def one_mesh(monkeypatch):
+    """One finer mesh, where what is said does not depend on them."""
+    monkeypatch.setattr(search, "_MOST_MESHES", 1)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +106,7 @@ def test_two_balls_are_of_one_material_unless_the_data_tell_otherwise(coarse, ba
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kinds", ["ellipsoids", "columns"])
-def test_a_kind_that_is_given_is_kept(few, few_meshes, column, kinds):
+def test_a_kind_that_is_given_is_kept(few, one_mesh, column, kinds):
     """Of a column's voltages, from two starts of which one is nothing."""
     coarse, bath = few
     frame, noise = bath + column, 0.03 * np.sqrt(np.mean(column**2))

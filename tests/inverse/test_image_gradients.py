@@ -22,14 +22,9 @@ from jeit.inverse import (
     one_step,
     reconstruct,
 )
-from jeit.inverse.nonlinear import (
-    GaussNewton,
-)
-from jeit.inverse.nonlinear.implicit import as_solution
-from jeit.inverse.nonlinear.solvers import AbstractSolver, Solved
+from jeit.inverse.nonlinear import LBFGSB, GaussNewton
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
-from jeit_solvers import Status
 
 ANGLE = 2 * np.pi * np.arange(5) / 5 + 0.13  # no end of an electrode on a node, where derivatives jump
 ELECTRODES = BoundaryElectrodes(0.1 * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=1), 0.02, 1e-2)
@@ -117,19 +112,6 @@ def image_of(found):
 TIGHT = GaussNewton(max_steps=100, rtol=1e-16)
 
 
-class Known(AbstractSolver):
-    """Ends where it is given to end: the derivatives of a reconstruction without the loop that finds it, which takes
-    seconds to compile."""
-
-    name = "known"
-    coefficients: Any
-
-    def minimise(self, inversion, start, box):
-        found = as_solution(self.coefficients, inversion)
-        costs = jnp.stack([inversion.cost(start), inversion.cost(found)])
-        return Solved(found, 0, costs, Status.CONVERGED.number, "")
-
-
 def test_nonlinear_images():
     """Against differences; and derivatives of coefficients are the minimum's however early the solver stopped."""
 
@@ -150,7 +132,7 @@ def test_nonlinear_images():
     one = VARIED | {"hyperparameter": np.array(1.0), "share": np.array(1.0)}
     narrow = one | {"share": np.array(0.0)}
     cases = [(one, TIGHT), (narrow, TIGHT), (narrow, GaussNewton(max_steps=2))]
-    compiled = jax.jit(jax.value_and_grad(lambda theta, ended: image(theta, Known(ended))[1]))
+    compiled = jax.jit(jax.value_and_grad(lambda theta, ended: image(theta, image_slopes.Known(ended))[1]))
     gradients, values = [], []
     for theta, solver in cases:
         found, expected = image(theta, solver)
@@ -165,9 +147,10 @@ def test_nonlinear_images():
         np.testing.assert_allclose(early, late, rtol=0, atol=1e-7 * float(abs(late).max()))
 
 
-def test_the_loop_is_not_differentiated():
+@pytest.mark.parametrize("solver", [GaussNewton(), pytest.param(LBFGSB(), marks=pytest.mark.slow)])
+def test_the_loop_is_not_differentiated(solver):
     """Gradients of what it finds can be traced, by all that a model has."""
-    gradient = eqx.filter_eval_shape(eqx.filter_grad(lambda model: image_of(whole(model, GaussNewton()))), MODEL)
+    gradient = eqx.filter_eval_shape(eqx.filter_grad(lambda model: image_of(whole(model, solver))), MODEL)
     assert gradient.mesh.points.shape == MODEL.mesh.points.shape
     assert gradient.protocol.drive.shape == MODEL.protocol.drive.shape
 
