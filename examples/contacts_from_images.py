@@ -12,10 +12,10 @@ from jeit.forward import ForwardModel
 from jeit.inverse import back_projection, one_step
 from jeit.layout import ring
 from jeit.mesh import Disk
-from jeit.plot import plot_contact_stages, plot_contacts
 from jeit.protocol import adjacent
-from jeit.simulate import Disc, MovingPress, Press, PressedSkin, material
 from jeit.touch.contacts import CellFinder, ImageNoise, RasterFinder, find_contacts, track_contacts
+from jeit.touch.plots import plot_contact_stages, plot_contacts
+from jeit.touch.simulate import Disc, MovingPress, Press, PressedSkin, material
 
 GRAMS = np.array([100, 300, 700, 1200, 2000, 3000, 3900])
 

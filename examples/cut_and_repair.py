@@ -11,11 +11,11 @@ import numpy as np
 from jeit.forward import ForwardModel
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
-from jeit.plot import plot_health
 from jeit.protocol import two_terminal
-from jeit.simulate import MovingPress, PressedSkin, ball, material
-from jeit.simulate.damage import Cut, Mishap, mended, record_mishaps
 from jeit.touch import CellFinder, SkinHealth, find_contacts, watch
+from jeit.touch.plots import plot_health
+from jeit.touch.simulate import MovingPress, PressedSkin, ball, material
+from jeit.touch.simulate.damage import Cut, Mishap, mended, record_mishaps
 
 RATE, CUT_AT, MENDED_AT = 5.0, 30.0, 75.0
 

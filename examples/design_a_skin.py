@@ -3,8 +3,8 @@
 from matplotlib.figure import Figure
 
 from jeit.design import Skin, compare_layouts
+from jeit.design.plots import plot_sensitivity_map, plot_taxels
 from jeit.layout import named_layout
-from jeit.plot import plot_sensitivity_map, plot_taxels
 
 
 def main() -> float:

@@ -7,9 +7,9 @@ from matplotlib.figure import Figure
 from jeit.acoustic import Localiser, Recording, Taps, calibrate_microphones, intensities, locate
 from jeit.acoustic import track as follow
 from jeit.acoustic.localisation.overlay import brightness, overlay
+from jeit.acoustic.plots import plot_track
+from jeit.acoustic.simulate import Burst, SoundingSkin, calibration_taps, pat, stroke, tickle
 from jeit.layout import grid
-from jeit.plot import plot_track
-from jeit.simulate import Burst, SoundingSkin, calibration_taps, pat, stroke, tickle
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
 KEYS = jax.random.split(jax.random.key(1), 4)

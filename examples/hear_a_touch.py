@@ -5,9 +5,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jeit.acoustic import Localiser, Recording, Taps, calibrate_microphones, intensities
+from jeit.acoustic.plots import Marks, plot_loss_map
+from jeit.acoustic.simulate import Burst, SoundingSkin, calibration_taps, tap
 from jeit.layout import grid
-from jeit.plot import Marks, plot_loss_map
-from jeit.simulate import Burst, SoundingSkin, calibration_taps, tap
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
 TITLES = {"consistency": "Intensity consistency (Park 2022)", "likelihood": "Likelihood"}

@@ -5,9 +5,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jeit.acoustic import Intensities, Taps, calibrate_microphones, locate, tap_intensities
+from jeit.acoustic.plots import plot_pairs
+from jeit.acoustic.simulate import SoundingSkin, calibration_taps
 from jeit.layout import grid
-from jeit.plot import plot_pairs
-from jeit.simulate import SoundingSkin, calibration_taps
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
 TITLES = {"consistency": "Intensity consistency (Park 2022)", "likelihood": "Likelihood"}

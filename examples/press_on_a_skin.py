@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 import jeit
-from jeit.simulate import RoundSkin, simulate_press
+from jeit.data import RoundSkin, simulate_press
 
 
 def main() -> float:

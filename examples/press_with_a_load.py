@@ -9,7 +9,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.simulate import Bar, Joined, MovingPress, Placed, PressedSkin, ball, material
+from jeit.touch.simulate import Bar, Joined, MovingPress, Placed, PressedSkin, ball, material
 
 
 def main() -> float:

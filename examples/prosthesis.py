@@ -9,11 +9,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from jeit.design import Hemisphere, Skin, touches_away_from_the_edge
+from jeit.design.plots import plot_unrolled
 from jeit.inverse import one_step
 from jeit.layout import SurfaceLayout
 from jeit.mesh import forearm
 from jeit.mesh.geodesic import Geodesics, unroll
-from jeit.plot import Camera, ColourScale, plot_curved_skin, plot_unrolled
+from jeit.plot import Camera, ColourScale, plot_curved_skin
 from jeit.touch.contacts import CellFinder, find_contacts
 
 NOISE = 2e-5  # volts, 80 dB below what is measured

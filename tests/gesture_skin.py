@@ -15,7 +15,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import perimeter
 from jeit.mesh import Rectangle, centroids
 from jeit.protocol import reference_electrode
-from jeit.simulate import Person, PressedSkin, material, simulate_gesture_stream, simulate_gestures
+from jeit.touch.simulate import Person, PressedSkin, material, simulate_gesture_stream, simulate_gestures
 
 SHEET, RATE = Rectangle(0.32, 0.2), 60.0
 PLACES = np.vstack([perimeter(Rectangle(0.3, 0.18), 8, start=0.06), [[0.0, 0.0]]])

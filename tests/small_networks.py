@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.simulate import Disc
 from jeit.touch.networks import Preset, learn, touches
+from jeit.touch.simulate import Disc
 from jeit.touch.training import Plan
 
 SKIN = """

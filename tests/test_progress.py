@@ -8,22 +8,14 @@ import pytest
 
 from jeit import acoustic, design, imaging, inverse, report, simulate, touch
 from jeit.acoustic import Taps, calibrate_microphones
+from jeit.acoustic.simulate import SoundingSkin, calibration_taps, microphone_grid
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import compare_rules
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.simulate import (
-    MovingPress,
-    Press,
-    PressedSkin,
-    SoundingSkin,
-    ball,
-    calibration_taps,
-    material,
-    microphone_grid,
-)
+from jeit.touch.simulate import MovingPress, Press, PressedSkin, ball, material
 
 KEY = jax.random.key(0)
 LONG = [

@@ -19,7 +19,7 @@ def rooms() -> list[str]:
     found = ["jeit", "jeit_solvers"]
     for top in (jeit, jeit_solvers):
         inside = pkgutil.walk_packages(top.__path__, f"{top.__name__}.")
-        found += [one.name for one in inside if one.ispkg and ".cli" not in one.name]
+        found += [one.name for one in inside if one.ispkg and ".cli" not in one.name and one.name != "jeit.simulate"]
     return found
 
 

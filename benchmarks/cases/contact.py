@@ -22,7 +22,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.simulate import Disc, HalfSpace, MovingPress, PressDraws, PressedSkin, Prism, ball, material
+from jeit.touch.simulate import Disc, HalfSpace, MovingPress, PressDraws, PressedSkin, Prism, ball, material
 
 HEADER = ["task", "nodes", "jeit", "touches a second", "SciPy", "times jeit's", "compile", "agreement"]
 KEY = jax.random.key(0)

@@ -13,8 +13,8 @@ from benchmarks.harness.case import Case, Options, Result, Table, judged
 from benchmarks.harness.timing import say
 from benchmarks.problems.contact_frames import RADIUS, SINGLE, ContactFrames, weight
 from jeit.mesh import measures
-from jeit.simulate import Disc, Press
 from jeit.touch.contacts import CellFinder, RasterFinder, find_contacts
+from jeit.touch.simulate import Disc, Press
 
 METHODS = ("one-step", "back-projection")
 # Beyond this a contact found is none of those that are there, metres.

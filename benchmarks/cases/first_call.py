@@ -40,7 +40,7 @@ def image(length):
 _SKIN = """
 import jax
 from jeit.acoustic import Recording, Taps, write_recording, write_taps
-from jeit.simulate import SoundingSkin, calibration_taps, microphone_grid, pat
+from jeit.acoustic.simulate import SoundingSkin, calibration_taps, microphone_grid, pat
 skin, outline = SoundingSkin(jax.random.key(0)), [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
 taps = calibration_taps(skin, jax.random.key(1), microphone_grid(9))
 taps = Taps(skin.microphones, outline, taps.positions, samples=taps.samples, rate=taps.rate)

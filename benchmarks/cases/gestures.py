@@ -1,6 +1,6 @@
 """Six gestures on a sheet told apart, by LogitBoost and by others, beside Silvera Tawil et al. (2011); all simulated.
 
-What is simulated, and how people differ, is in `problems/touching_people.py` and `jeit.simulate.people`. To be
+What is simulated, and how people differ, is in `problems/touching_people.py` and `jeit.touch.simulate.people`. To be
 compared: that one person's gestures are told better than many people's, and which are taken for each other; not per
 cent. The paper's folds are random, so that everybody is learnt from; with people held out nobody is.
 """
@@ -18,9 +18,7 @@ from benchmarks.harness.tables import duration
 from benchmarks.harness.timing import say
 from benchmarks.problems.touching_people import Sheet
 from jeit.data import GestureSet
-from jeit.imaging import TouchImages, TouchWatch, WatchedFrame, learn_gestures
-from jeit.report.touch_watch import WrittenWatch, draw_watch
-from jeit.simulate.people import GESTURES
+from jeit.touch import TouchImages, TouchWatch, WatchedFrame, learn_gestures
 from jeit.touch.gestures import GestureModel, StreamTouch
 from jeit.touch.gestures.gesture_classifiers import (
     FORMS,
@@ -30,6 +28,8 @@ from jeit.touch.gestures.gesture_classifiers import (
     person_folds,
     random_folds,
 )
+from jeit.touch.reports.touch_watch import WrittenWatch, draw_watch
+from jeit.touch.simulate.people import GESTURES
 
 FOLDS = 15
 # The paper's: per cent right of each gesture, of one person and of 35.
@@ -223,7 +223,7 @@ def _draw_timeline(path: Path, watch: TouchWatch, watched: list[WatchedFrame]) -
 
 def _draw(output: Path, many: Experiment, best: tuple[str, str]) -> None:
     """Confusions of many people's gestures, each person held out."""
-    from jeit.plot import plot_confusion
+    from jeit.touch.plots import plot_confusion
 
     labels = np.array(GESTURES)[many.right]
     model = GestureModel.fit(many.touches, labels, people=many.person, method=best[0], form=best[1])

@@ -18,11 +18,11 @@ from benchmarks.opponents.scipy_localiser import PlainLocaliser
 from jeit.acoustic import Localiser, MicrophoneArray, Recording, Taps, calibrate_microphones, locate, track
 from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.simulate import SoundingSkin, calibration_taps, microphone_grid, stroke
+from jeit.acoustic.simulate.microphones import Readout
+from jeit.acoustic.simulate.propagation import expected_power, noise_power
 from jeit.acoustic.surface import make_surface
 from jeit.mesh import Rectangle
-from jeit.simulate import SoundingSkin, calibration_taps, microphone_grid, stroke
-from jeit.simulate.acoustic.microphones import Readout
-from jeit.simulate.acoustic.propagation import expected_power, noise_power
 
 HEADER = ["task", "jeit, a frame", "frames a second", "NumPy and SciPy", "times jeit's", "compile", "agreement"]
 MAPS, PLACES, ALL = "maps, the paper's loss", "map and refined place", "all maps kept, and places"

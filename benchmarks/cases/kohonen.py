@@ -18,7 +18,6 @@ from benchmarks.harness.timing import say
 from benchmarks.problems.weighed_skins import CURRENT, DISC, GRAVITY, WeighedSkin
 from jeit.image import find_inclusions
 from jeit.inverse import Laplace, one_step
-from jeit.simulate import Bar, Disc, Press, Prism, Ring
 from jeit.touch import PlacedMap, SelfOrganisingMap
 from jeit.touch.kohonen import (
     Schedule,
@@ -29,6 +28,7 @@ from jeit.touch.kohonen import (
     time_constant,
     touches_told,
 )
+from jeit.touch.simulate import Bar, Disc, Press, Prism, Ring
 
 LEARNT, JUDGED, TRIALS = 10_000, 1000, 200
 RATES, THEIR_SECONDS = (0.01, 0.005, 0.001), (4.2, 7.7, 19.6)
@@ -306,7 +306,7 @@ def _draw(folder: Path, curves, located, drawings, multi, pressed, sensed) -> No
     """One picture of everything that the paper draws."""
     import matplotlib.pyplot as plt
 
-    from jeit.plot import plot_map
+    from jeit.touch.plots import plot_map
 
     folder.mkdir(parents=True, exist_ok=True)
     placed, images, fresh, right = located

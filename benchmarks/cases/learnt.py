@@ -24,9 +24,9 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.simulate import Disc, Press, PressedSkin, material
 from jeit.touch import LearntSkin, Presses
 from jeit.touch.learnt.numbers import METHODS
+from jeit.touch.simulate import Disc, Press, PressedSkin, material
 
 RADIUS, FINGER, LOADS = 0.05, 0.016, (0.5, 8.0)  # m; a disc's diameter, m; N
 PRESSES, FRAMES, FRESH = 2000, 10_000, 500

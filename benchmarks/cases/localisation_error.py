@@ -18,10 +18,10 @@ from benchmarks.harness.case import Asked, Case, Headline, Options, Result, Tabl
 from benchmarks.harness.timing import say
 from jeit.acoustic import Intensities, Localiser, Taps, calibrate_microphones, cramer_rao, tap_intensities
 from jeit.acoustic.localisation.locate import microphones_in_use
+from jeit.acoustic.simulate import SoundingSkin, calibration_taps, microphone_grid
+from jeit.acoustic.simulate.microphones import MicrophoneModel
+from jeit.acoustic.simulate.propagation import expected_power, noise_power
 from jeit.layout import grid
-from jeit.simulate import SoundingSkin, calibration_taps, microphone_grid
-from jeit.simulate.acoustic.microphones import MicrophoneModel
-from jeit.simulate.acoustic.propagation import expected_power, noise_power
 
 RATIOS = (0, 5, 10, 15, 20, 25, 30, 35, 40)
 # What is asked: mean and standard deviation of the paper's loss, metres, and by how much likelihood must be better.
@@ -128,7 +128,7 @@ def draw(ratios, curve: dict[str, list[float]], bounds: list[float], path: Path)
     """Errors of single taps against the signal-to-noise ratio."""
     from matplotlib.figure import Figure
 
-    from jeit.plot import plot_error_curve
+    from jeit.acoustic.plots import plot_error_curve
 
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
     told = {"quantity": "Signal-to-noise ratio of the loudest microphone (dB)", "statistic": "rms"}

@@ -1,6 +1,6 @@
 """Pats, tickles, strokes, wind and nothing told apart by sound, beside Park et al. (2022); all simulated.
 
-What is simulated, and how people differ, is in `problems/sounding_people.py` and `jeit.simulate.acoustic.people`. The
+What is simulated, and how people differ, is in `problems/sounding_people.py` and `jeit.acoustic.simulate.people`. The
 paper augments first and splits at random after, so that copies of one window, and windows of one recording, are on both
 sides; with recordings held out, and with people, they are not. To be compared: what each split makes of one and the
 same network; not per cent.
@@ -20,7 +20,7 @@ from benchmarks.harness.tables import duration
 from benchmarks.harness.timing import say, timed
 from benchmarks.problems.sounding_people import FEWER, LOUDER, HeardPeople, heard_people
 from jeit.acoustic import Recording
-from jeit.simulate.acoustic.people import MODALITIES
+from jeit.acoustic.simulate.people import MODALITIES
 from jeit.touch.listening import Levels, ModalityNetwork, SoundImages, sound_images
 from jeit.touch.listening.learners import LEARNERS, Lesson, NetworkListener
 from jeit.touch.listening.modality_network import COPIES

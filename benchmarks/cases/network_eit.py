@@ -25,11 +25,11 @@ from jeit.design import Skin
 from jeit.inverse import Gaussian, Laplace, one_step
 from jeit.inverse.streaming.imager import Imager
 from jeit.mesh import centroids
-from jeit.simulate import depth_maps
-from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.networks import DESIGNS, PRESETS, ImageNetwork, learn_images, read_network
 from jeit.touch.networks.places import centroids_of, errors, peaks
 from jeit.touch.networks.touches import detection_noise
+from jeit.touch.simulate import depth_maps
+from jeit.touch.simulate.contact.indent_sets import image_places
 
 SHAPE = (48, 48)
 # Times λ of the noise figure.
@@ -246,7 +246,7 @@ def _shapes(ways, judged_by, noise, places, number, told: Skin, output: Path | N
 def _draw(output: Path, told: Skin, right, drawn, names) -> None:
     from matplotlib.figure import Figure
 
-    from jeit.plot import plot_depth_map
+    from jeit.touch.plots import plot_depth_map
 
     first = [names.index(kind) for kind in dict.fromkeys(names)]
     low_x, high_x, low_y, high_y = map(float, told.outline.extent)

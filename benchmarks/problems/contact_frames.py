@@ -21,8 +21,8 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.simulate import Disc, Press, PressDraws, PressedSkin, ball, material
 from jeit.touch.contacts import ImageNoise
+from jeit.touch.simulate import Disc, Press, PressDraws, PressedSkin, ball, material
 
 RADIUS, GRAVITY, SECONDS = 0.05, 9.81, 20.0
 SINGLE = 0.01

@@ -19,9 +19,9 @@ from jeit.forward import ForwardModel
 from jeit.layout import named_layout, ring
 from jeit.mesh import Disk, Domain, Rectangle
 from jeit.protocol import adjacent
-from jeit.simulate import Disc, Press, PressDraws, PressedSkin, ball, material
-from jeit.simulate.damage import Cut, ElectrodeFault, draw_cut, mended
 from jeit.touch import CellFinder, SkinHealth, find_contacts
+from jeit.touch.simulate import Disc, Press, PressDraws, PressedSkin, ball, material
+from jeit.touch.simulate.damage import Cut, ElectrodeFault, draw_cut, mended
 
 RATE, PATIENCE = 5.0, 30.0
 # Shares of the load while a touch comes and goes; seconds that it lasts, median and spread of the logarithm; and those

@@ -27,8 +27,8 @@ from jeit.forward import ForwardModel
 from jeit.layout import perimeter
 from jeit.mesh import Rectangle
 from jeit.protocol import opposite
-from jeit.simulate import Disc, Press, PressedSkin, material
-from jeit.simulate.contact.indenters import AbstractIndenter
+from jeit.touch.simulate import Disc, Press, PressedSkin, material
+from jeit.touch.simulate.contact.indenters import AbstractIndenter
 
 REPETITIONS, PRESSES, TESTS, DAYS = 6, 20, 20, 5
 SAMPLES, SCAN = 160, 3200  # of a median, and of a scan

@@ -12,8 +12,8 @@ import numpy as np
 
 from jeit.design import Skin, touches_away_from_the_edge
 from jeit.layout import Layout, named_layout
-from jeit.simulate import Bar, DepthMap, Disc, Indent, Joined, Placed, Ring, ball, relative_changes
-from jeit.simulate.contact.indents import relative_to
+from jeit.touch.simulate import Bar, DepthMap, Disc, Indent, Joined, Placed, Ring, ball, relative_changes
+from jeit.touch.simulate.contact.indents import relative_to
 
 CELL, SKINS = 3e-3, 5
 TIP, TIP_DEPTH, PLACES = 0.015, 7.5e-3, 15

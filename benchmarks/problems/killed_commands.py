@@ -205,7 +205,7 @@ def watch(folder: Path) -> Command:
     from jeit.layout import perimeter
     from jeit.mesh import Rectangle
     from jeit.protocol import reference_electrode
-    from jeit.simulate import Person, PressedSkin, material, simulate_gesture_stream, simulate_gestures
+    from jeit.touch.simulate import Person, PressedSkin, material, simulate_gesture_stream, simulate_gestures
 
     sheet, current = Rectangle(0.32, 0.2), 1.8e-3
     places = np.vstack([perimeter(Rectangle(0.3, 0.18), 8, start=0.06), [[0.0, 0.0]]])

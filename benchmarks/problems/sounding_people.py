@@ -1,7 +1,7 @@
 """People on the simulated skin of Park et al. (2022): windows of sound, heard in more noise, by fewer microphones.
 
 25 microphones under 200 × 200 × 10 mm, sampled at 10 kHz. How people differ, and how loud they are beside the noise, is
-in `jeit.simulate.acoustic.people`, fixed before accuracies were looked at.
+in `jeit.acoustic.simulate.people`, fixed before accuracies were looked at.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import jax
 import numpy as np
 
 from jeit.acoustic import Recording
-from jeit.simulate import SoundingPerson, SoundingSkin, sound_clips
-from jeit.simulate.acoustic.people import MODALITIES, SOUND_MANNERS
+from jeit.acoustic.simulate import SoundingPerson, SoundingSkin, sound_clips
+from jeit.acoustic.simulate.people import MODALITIES, SOUND_MANNERS
 from jeit.touch.listening import SoundImages, sound_images
 
 # Decibels of noise more than the skin has; and of its 5 × 5 microphones those that are left: every other one of the

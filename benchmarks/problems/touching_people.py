@@ -2,7 +2,8 @@
 
 320 × 200 mm, 16 electrodes 10 mm from the edge and one in the middle, eyelets of 7 mm, 1.8 mA through neighbours, 224
 potentials against the middle, 60 frames/s. Simulated with complete electrodes on a mesh of some 2,000 nodes, imaged by
-one NOSER step on one of 1,193. How people differ is in `jeit.simulate.people`, fixed before accuracies were looked at.
+one NOSER step on one of 1,193. How people differ is in `jeit.touch.simulate.people`, fixed before accuracies were
+looked at.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from jeit.electrodes import SheetDiscs
 from jeit.layout import perimeter
 from jeit.mesh import Rectangle
 from jeit.protocol import reference_electrode
-from jeit.simulate import PressedSkin, material
-from jeit.simulate.people import MANNERS, GestureStream, Person, simulate_gesture_stream, simulate_gestures
 from jeit.touch.gestures import StreamTouch, TouchLevel, find_touches
+from jeit.touch.simulate import PressedSkin, material
+from jeit.touch.simulate.people import MANNERS, GestureStream, Person, simulate_gesture_stream, simulate_gestures
 
 SIDES, INSET, EYELET, CURRENT, CONTACT = (0.32, 0.2), 0.01, 0.007, 1.8e-3, 1e-3
 NODES, FINE_NODES = 1193, 2000

@@ -17,7 +17,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import perimeter
 from jeit.mesh import Disk, Domain, Rectangle
 from jeit.protocol import adjacent
-from jeit.simulate import Disc, Press, PressDraws, PressedSkin, material
+from jeit.touch.simulate import Disc, Press, PressDraws, PressedSkin, material
 
 RADIUS, DISC, CURRENT, GRAVITY = 0.1, 16.25e-3, 200e-6, 9.81e-3
 GRAMS = 100.0

@@ -65,10 +65,10 @@ def _row(name: str, annotation: Any, default: Any) -> str:
 
 def page() -> str:
     """The page, as Markdown."""
-    from jeit.cli.app import app
+    from jeit.cli.app import application
 
     lines = [_HEAD]
-    for path, function in commands(app):
+    for path, function in commands(application()):
         defaults = inspect.signature(function).parameters
         rows = [_row(name, kind, defaults[name].default) for name, kind in _annotations(function).items()]
         head = ["| argument or option | what it is | default |", "|---|---|---|"]

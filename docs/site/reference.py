@@ -7,6 +7,7 @@ As a hook of mkdocs this adds the pages and their places in the menu; nothing is
 """
 
 import ast
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -15,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 TOPS = {"jeit": ROOT / "jeit", "jeit_solvers": ROOT / "solvers" / "jeit_solvers"}
 # The command line is described command by command, on a page of its own.
-_EXPORTS_ONLY = ("jeit.cli",)
+_COMMANDS = re.compile(r"jeit\.cli|jeit\.\w+\.commands")
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,14 @@ def _defined(path: Path) -> Iterator[tuple[str, str]]:
 
 
 def _imported(path: Path, top: str) -> Iterator[tuple[str, str]]:
-    """(name, module) of all that an `__init__` takes from its own library."""
+    """(name, module) of all that an `__init__`, or the stub beside it, takes from its own library."""
+    stub = path.with_suffix(".pyi")
+    if stub.exists():
+        package = ".".join((top, *path.parent.relative_to(TOPS[top]).parts))
+        for node in ast.parse(stub.read_text("utf-8")).body:
+            if isinstance(node, ast.ImportFrom) and node.module:
+                yield from ((alias.name, f"{package}.{node.module}.{alias.name}") for alias in node.names)
+        return
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == top:
             for alias in node.names:
@@ -111,14 +119,13 @@ def packages() -> tuple[Package, ...]:
             path = ".".join((top, *parts))
             modules = {}
             for file in sorted(init.parent.glob("*.py")):
-                if not file.stem.startswith("_") and path not in _EXPORTS_ONLY:
+                if not file.stem.startswith("_") and not _COMMANDS.match(path):
                     module = f"{path}.{file.stem}"
                     names = [name for name, _ in _defined(file) if not name.isupper()]
                     modules[module] = {name: _home(f"{module}.{name}") for name in names}
             exports = {name: _home(source) for name, source in sorted(_imported(init, top), key=lambda one: one[0])}
             exports |= {name: _home(f"{path}.{name}") for name, _ in _defined(init)}
-            inside_cli = any(path.startswith(f"{room}.") for room in _EXPORTS_ONLY)
-            if not inside_cli:
+            if path == "jeit.cli" or not _COMMANDS.match(path):
                 docstring = ast.get_docstring(ast.parse(init.read_text("utf-8"))) or ""
                 found.append(Package(path, docstring, exports, modules))
     return tuple(found)

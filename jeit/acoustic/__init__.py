@@ -11,46 +11,6 @@ sources are; `noise`; `track`, places in time; `touches`, all of it in one call.
 
 from __future__ import annotations
 
-from jeit.acoustic.calibration.calibrate import calibrate_microphones
-from jeit.acoustic.calibration.calibration import Calibration
-from jeit.acoustic.localisation.cramer_rao import cramer_rao
-from jeit.acoustic.localisation.localiser import Localiser
-from jeit.acoustic.localisation.locate import locate
-from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.signal.intensity import IntensitySettings, intensities, tap_intensities
-from jeit.acoustic.signal.recording import (
-    Intensities,
-    Recording,
-    Taps,
-    read_recording,
-    read_taps,
-    write_recording,
-    write_taps,
-)
-from jeit.acoustic.touches import LocatedTouches, locate_touches
-from jeit.acoustic.tracking import track
-from jeit.arguments.moved import tell_old_names as _tell_old_names
+import lazy_loader
 
-_tell_old_names(__name__)
-
-__all__ = [
-    "Calibration",
-    "Intensities",
-    "IntensitySettings",
-    "Localiser",
-    "LocatedTouches",
-    "MicrophoneArray",
-    "Recording",
-    "Taps",
-    "calibrate_microphones",
-    "cramer_rao",
-    "intensities",
-    "locate",
-    "locate_touches",
-    "read_recording",
-    "read_taps",
-    "tap_intensities",
-    "track",
-    "write_recording",
-    "write_taps",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

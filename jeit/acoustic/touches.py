@@ -40,7 +40,8 @@ def locate_touches(
     silence: Recording | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> LocatedTouches:
-    """Find every touch of a recording, as `jeit locate` does: `jeit.report.write_track` writes what it writes.
+    """Find every touch of a recording, as `jeit locate` does: `jeit.acoustic.reports.write_track` writes what it
+    writes.
 
     `method`: "likelihood", or "consistency" for the paper's loss on a map of 200 × 200 pixels, refined. `gap`: seconds
     without a place that end a touch. `intensity`: band and window, for samples, those of the calibration unless given.

@@ -7,28 +7,6 @@ light: nothing of the library is imported here.
 
 from __future__ import annotations
 
-from jeit.arguments.arrays import real_array
-from jeit.arguments.counts import counted, percent
-from jeit.arguments.instrument import readings
-from jeit.arguments.keys import check_key
-from jeit.arguments.kinds import check_kind, is_number, told
-from jeit.arguments.lengths import IN_MILLIMETRES, check_metres
-from jeit.arguments.names import check_name, did_you_mean, listed
-from jeit.arguments.traced import check_has_values
+import lazy_loader
 
-__all__ = [
-    "IN_MILLIMETRES",
-    "check_has_values",
-    "check_key",
-    "check_kind",
-    "check_metres",
-    "check_name",
-    "counted",
-    "did_you_mean",
-    "is_number",
-    "listed",
-    "percent",
-    "readings",
-    "real_array",
-    "told",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -5,8 +5,6 @@ The commands import what they need when they run, so that `jeit --help` answers 
 
 from __future__ import annotations
 
-from jeit.cli.app import main
+import lazy_loader
 
-__all__ = [
-    "main",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -3,30 +3,18 @@
 from __future__ import annotations
 
 import gc
+import importlib
 import io
 import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Annotated
 
 import typer
 
-from jeit.cli.commands.calibrate_microphones import calibrate_microphones
-from jeit.cli.commands.choose import choose
-from jeit.cli.commands.demo import demo
-from jeit.cli.commands.info import info
-from jeit.cli.commands.layout import layout
-from jeit.cli.commands.learn import learn
-from jeit.cli.commands.listen import listen
-from jeit.cli.commands.locate import locate
-from jeit.cli.commands.reconstruct import reconstruct
-from jeit.cli.commands.series import series
-from jeit.cli.commands.stream import stream
-from jeit.cli.commands.study import study
-from jeit.cli.commands.touch import touch
-from jeit.cli.commands.view import view
+from jeit.cli.applications import COMMANDS
 from jeit.cli.options import (
     StoppedError,
     naming_options,
@@ -54,31 +42,27 @@ _FOR_PROGRAMMERS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning
 # Letters of what is said of an error.
 _LONGEST = 390
 
-app = typer.Typer(
-    name="jeit",
-    add_completion=False,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
-    help="Electrical impedance tomography, from a measured tank or skin to an image; and passive acoustic tomography, "
-    "from a skin's microphones to where it was touched.",
-)
-app.command()(demo)
-app.command()(reconstruct)
-app.command()(view)
-app.command()(stream)
-app.command()(series)
-app.command()(choose)
-app.command()(info)
-app.command()(calibrate_microphones)
-app.command()(locate)
-app.add_typer(listen)
-app.add_typer(layout)
-app.add_typer(study)
-app.add_typer(touch)
-app.add_typer(learn)
+
+def application(commands: Iterable[str] = COMMANDS) -> typer.Typer:
+    """The command line with these of its commands."""
+    app = typer.Typer(
+        name="jeit",
+        add_completion=False,
+        rich_markup_mode="markdown",
+        pretty_exceptions_enable=False,
+        help="Electrical impedance tomography, from a measured tank or skin to an image; and passive acoustic "
+        "tomography, from a skin's microphones to where it was touched.",
+    )
+    app.callback(invoke_without_command=True)(_top)
+    for name in commands:
+        command = getattr(importlib.import_module(COMMANDS[name]), name.replace("-", "_"))
+        if isinstance(command, typer.Typer):
+            app.add_typer(command)
+        else:
+            app.command()(command)
+    return app
 
 
-@app.callback(invoke_without_command=True)
 def _top(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Say which version this is.")] = False,
@@ -100,15 +84,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for output in (sys.stdout, sys.stderr):
         if isinstance(output, io.TextIOWrapper):
             output.reconfigure(errors="replace")  # a terminal that knows no Greek must not end the run
-    command = as_command()
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    command = as_command(given)
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _shown_once()
             if arguments is None:
-                _start(quickly=not " ".join(sys.argv[1:3]).startswith(_REPEATING))
-            status = command.main(
-                args=sys.argv[1:] if arguments is None else list(arguments), prog_name="jeit", standalone_mode=False
-            )
+                _start(quickly=not " ".join(given[:2]).startswith(_REPEATING))
+            status = command.main(args=given, prog_name="jeit", standalone_mode=False)
     except (KeyboardInterrupt, StoppedError) as stopped:
         remove_empty_folders()
         return _fail(str(stopped) or "stopped.", 130)
@@ -120,9 +103,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return status if isinstance(status, int) else 0
 
 
-def as_command():
-    """All of it as one command of click, whose errors speak of options where jeit's speak of arguments."""
-    command = typer.main.get_command(app)
+def as_command(arguments: Sequence[str] = ()):
+    """All of it as one command of click, whose errors name options where jeit's name arguments.
+
+    Where the first of the `arguments` is a command, the others are left out, and not imported.
+    """
+    called = arguments[0] if arguments else None
+    command = typer.main.get_command(application([called] if called in COMMANDS else COMMANDS))
     _name_options(command)
     return command
 

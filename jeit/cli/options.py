@@ -58,17 +58,6 @@ ReferenceFrames = Annotated[
         metavar="FIRST-LAST",
     ),
 ]
-BandLow = Annotated[
-    float | None, typer.Option(help="Lowest frequency of the band, hertz (default 50, or the calibration's).")
-]
-BandHigh = Annotated[
-    float | None, typer.Option(help="Highest frequency of the band, hertz (default 1000, or the calibration's).")
-]
-Window = Annotated[float | None, typer.Option(help="Length of a window, seconds (default 0.05, or the calibration's).")]
-Hop = Annotated[
-    float | None, typer.Option(help="From one window to the next, seconds (default 0.0125, or the calibration's).")
-]
-
 # Folders that make_folder made, the innermost of each first; files that the command under way was given.
 _MADE: list[Path] = []
 _GIVEN: list[Path] = []
@@ -190,17 +179,6 @@ def check_within(name: str, value: float, least: float, most: float, unit: str =
     if not least <= value <= most:
         unit = f" {unit}" if unit else ""
         raise ValueError(f"{name} must be from {least:g} to {most:g}{unit}; it is {value:g}.")
-
-
-def intensity_settings(low: float | None, high: float | None, window: float | None, hop: float | None):
-    """`IntensitySettings` with what was given, None if nothing was."""
-    given = {"low": low, "high": high, "window": window, "hop": hop}
-    given = {name: value for name, value in given.items() if value is not None}
-    if not given:
-        return None
-    from jeit.acoustic import IntensitySettings
-
-    return IntensitySettings(**given)
 
 
 def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json", "image.vtu")) -> None:

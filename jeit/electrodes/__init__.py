@@ -14,32 +14,6 @@ Where to put them: `jeit.layout`.
 
 from __future__ import annotations
 
-from jeit.arguments.moved import tell_old_names as _tell_old_names
-from jeit.electrodes.boundary import BoundaryElectrodes
-from jeit.electrodes.combined import CombinedElectrodes
-from jeit.electrodes.discs import FaceDiscs, SheetDiscs
-from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
-from jeit.electrodes.electrodes import AbstractElectrodes
-from jeit.electrodes.facets import FacetElectrodes, electrodes_from_nodes, plates
-from jeit.electrodes.patches import FacePatches
-from jeit.electrodes.point import NodeElectrodes, PointElectrodes
-from jeit.electrodes.surface_discs import SurfaceDiscs
+import lazy_loader
 
-_tell_old_names(__name__)
-
-__all__ = [
-    "AbstractElectrodes",
-    "BoundaryElectrodes",
-    "CombinedElectrodes",
-    "ElectrodeShapes",
-    "FaceDiscs",
-    "FacePatches",
-    "FacetElectrodes",
-    "NodeElectrodes",
-    "PointElectrodes",
-    "SheetDiscs",
-    "SurfaceDiscs",
-    "electrodes_from_nodes",
-    "plates",
-    "shapes_of",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

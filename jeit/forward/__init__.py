@@ -2,13 +2,6 @@
 
 from __future__ import annotations
 
-from jeit.arguments.moved import tell_old_names as _tell_old_names
-from jeit.forward.model import ForwardModel
-from jeit.forward.transfer import transfer_impedance
+import lazy_loader
 
-_tell_old_names(__name__)
-
-__all__ = [
-    "ForwardModel",
-    "transfer_impedance",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

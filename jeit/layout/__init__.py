@@ -7,26 +7,6 @@ curved skins, from a CSV file by `read_surface_layout`.
 
 from __future__ import annotations
 
-from jeit.layout.arrangements import grid, perimeter, quasi_uniform, ring, ring_and_centre
-from jeit.layout.even_spread import spread
-from jeit.layout.files import read_layout, write_layout
-from jeit.layout.layout import Layout
-from jeit.layout.names import BUILT_IN, named_layout
-from jeit.layout.surface_csv import read_surface_layout
-from jeit.layout.surface_layout import SurfaceLayout
+import lazy_loader
 
-__all__ = [
-    "BUILT_IN",
-    "Layout",
-    "SurfaceLayout",
-    "grid",
-    "named_layout",
-    "perimeter",
-    "quasi_uniform",
-    "read_layout",
-    "read_surface_layout",
-    "ring",
-    "ring_and_centre",
-    "spread",
-    "write_layout",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -8,57 +8,6 @@ and `surface_of` a solid, and what has a thickness on them, a `shell`. From else
 
 from __future__ import annotations
 
-from jeit.arguments.moved import tell_old_names as _tell_old_names
-from jeit.mesh.bisection import bisect, cut
-from jeit.mesh.body import Body
-from jeit.mesh.cell_quality import quality
-from jeit.mesh.files import read, write
-from jeit.mesh.flatness import check_flat
-from jeit.mesh.generate.refine import Refine
-from jeit.mesh.geometry import centroids, gradients, measures, normals
-from jeit.mesh.gmsh import from_gmsh
-from jeit.mesh.mesh import Mesh
-from jeit.mesh.outline import Disk, Domain, Polygon, Rectangle
-from jeit.mesh.shapes import disk, polygon, rectangle
-from jeit.mesh.solid_body import OwnMesh, Solid
-from jeit.mesh.solids import box, cylinder, layer
-from jeit.mesh.surface import bend, cap, forearm, node_normals, shell, sphere, surface_of, tube
+import lazy_loader
 
-_tell_old_names(__name__)
-
-__all__ = [
-    "Body",
-    "Disk",
-    "Domain",
-    "Mesh",
-    "OwnMesh",
-    "Polygon",
-    "Rectangle",
-    "Refine",
-    "Solid",
-    "bend",
-    "bisect",
-    "box",
-    "cap",
-    "centroids",
-    "check_flat",
-    "cut",
-    "cylinder",
-    "disk",
-    "forearm",
-    "from_gmsh",
-    "gradients",
-    "layer",
-    "measures",
-    "node_normals",
-    "normals",
-    "polygon",
-    "quality",
-    "read",
-    "rectangle",
-    "shell",
-    "sphere",
-    "surface_of",
-    "tube",
-    "write",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -10,72 +10,14 @@ networks, and their files), `networks` (that image).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from jeit.touch.attributes import TouchAttributes, touch_attributes
-from jeit.touch.contacts import (
-    CellFinder,
-    Contact,
-    ContactTracker,
-    ImageNoise,
-    LoadCalibration,
-    RasterFinder,
-    find_contacts,
-    track_contacts,
-)
-from jeit.touch.gestures import GestureModel, TouchLevel, TouchStream, find_touches, touch_features
-from jeit.touch.health import HealthEvent, SkinHealth, watch
-from jeit.touch.kohonen import PlacedMap, SelfOrganisingMap
-from jeit.touch.learnt.file import read_skin, write_skin
-from jeit.touch.learnt.learnt_skin import LearntSkin, Standing
-from jeit.touch.learnt.presses import Presses, read_frames, read_presses
-from jeit.touch.learnt.touches import Touches
-
-if TYPE_CHECKING:
-    from jeit.touch.gestures.logit_boost import LogitBoostClassifier as LogitBoostClassifier
+_find, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str):
     if name == "LogitBoostClassifier":
         from jeit.arguments.extras import optional
 
-        optional("sklearn", "LogitBoostClassifier")
-        from jeit.touch.gestures.logit_boost import LogitBoostClassifier
-
-        return LogitBoostClassifier
-    from jeit.arguments.moved import missing
-
-    raise missing(__name__, name)
-
-
-__all__ = [
-    "CellFinder",
-    "Contact",
-    "ContactTracker",
-    "GestureModel",
-    "HealthEvent",
-    "ImageNoise",
-    "LearntSkin",
-    "LoadCalibration",
-    "LogitBoostClassifier",
-    "PlacedMap",
-    "Presses",
-    "RasterFinder",
-    "SelfOrganisingMap",
-    "SkinHealth",
-    "Standing",
-    "TouchAttributes",
-    "TouchLevel",
-    "TouchStream",
-    "Touches",
-    "find_contacts",
-    "find_touches",
-    "read_frames",
-    "read_presses",
-    "read_skin",
-    "touch_attributes",
-    "touch_features",
-    "track_contacts",
-    "watch",
-    "write_skin",
-]
+        optional("sklearn", name)
+    return _find(name)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from jeit.acoustic import Intensities, Taps, calibrate_microphones, locate, tap_intensities
+from jeit.acoustic.simulate import SoundingSkin, calibration_taps
 from jeit.layout import grid
-from jeit.simulate import SoundingSkin, calibration_taps
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
 BURSTS = 10

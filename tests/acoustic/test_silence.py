@@ -11,10 +11,10 @@ from jeit.acoustic import Calibration, IntensitySettings, MicrophoneArray, Recor
 from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
 from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.simulate import SoundingSkin, quiet
+from jeit.acoustic.simulate.propagation import expected_power, transfer
 from jeit.acoustic.surface import make_surface
 from jeit.layout import grid
-from jeit.simulate import SoundingSkin, quiet
-from jeit.simulate.acoustic.propagation import expected_power, transfer
 
 PLACE = np.array([0.02, -0.03])
 

@@ -13,6 +13,7 @@ from jeit import electrodes as el
 from jeit import layout as ly
 from jeit import protocol as pr
 from jeit.data import read
+from jeit.data.round_skin import RoundSkin, simulate_press
 from jeit.forward import ForwardModel
 from jeit.image import Raster, find_inclusions
 from jeit.imaging import ImagingSettings, StreamSettings, compare_on_data, image_difference, prepare_imager
@@ -21,7 +22,6 @@ from jeit.mesh import Disk, Mesh, Polygon, Rectangle, Refine, box, disk
 from jeit.plot import plot_image
 from jeit.plot.imaging.image import plot_raster
 from jeit.plot.imaging.voltages import plot_voltages
-from jeit.simulate.round_skin import RoundSkin, simulate_press
 
 SQUARE = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
 CELLS = np.array([[0, 1, 2], [0, 2, 3]])

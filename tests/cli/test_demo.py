@@ -27,7 +27,7 @@ def test_demo_finds_the_press(run, tmp_path):
 def test_the_same_seed_gives_the_same_press():
     import jax
 
-    from jeit.simulate.round_skin import RoundSkin, simulate_press
+    from jeit.data.round_skin import RoundSkin, simulate_press
 
     skin = RoundSkin(num_points=300)
     frames = [simulate_press(skin, jax.random.key(seed), (0.01, 0.0))[0].voltages for seed in (3, 3, 4)]

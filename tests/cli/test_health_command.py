@@ -11,7 +11,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
-from jeit.simulate.damage import Cut
+from jeit.touch.simulate.damage import Cut
 
 TOML = """
 [geometry]

@@ -20,9 +20,9 @@ from jeit.acoustic import (
     write_recording,
 )
 from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
+from jeit.acoustic.reports import write_calibration, write_track
 from jeit.cli import main
 from jeit.layout import grid
-from jeit.report import write_calibration, write_track
 
 OUTLINE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
 MICROPHONES = grid(0.14, 0.14, 3, 3)

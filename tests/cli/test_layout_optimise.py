@@ -9,8 +9,8 @@ import pytest
 from rich.console import Console
 
 from jeit.cli.app import as_command
-from jeit.cli.commands.layout_optimise import RESULTS, _region
 from jeit.cli.console import Steps
+from jeit.design.commands.layout_optimise import RESULTS, _region
 from jeit.layout import Layout, read_layout, write_layout
 from jeit.mesh import Disk, Rectangle
 

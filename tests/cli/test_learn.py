@@ -9,13 +9,13 @@ import pytest
 from small_networks import SKIN
 
 from jeit.design import read_described_skin
-from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.networks import PRESETS, read_network
 from jeit.touch.networks.learn import stand
 from jeit.touch.networks.sensed import Sensed
 from jeit.touch.networks.three_stages import ThreeStages
 from jeit.touch.networks.training import Examples, Runs, shuffled, train_unrolled
 from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.simulate.contact.indent_sets import image_places
 
 
 @pytest.mark.parametrize(

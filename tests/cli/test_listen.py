@@ -10,8 +10,8 @@ from scipy.io import wavfile
 
 from jeit.acoustic import Calibration, Recording, calibrate_microphones, read_recording, write_recording
 from jeit.acoustic.signal.recording import Taps
+from jeit.acoustic.simulate import SoundingSkin, calibration_taps, microphone_grid, pat, quiet
 from jeit.cli import main
-from jeit.simulate import SoundingSkin, calibration_taps, microphone_grid, pat, quiet
 from jeit.touch.listening import Listener, read_clips
 
 RATE = 16_000

@@ -9,8 +9,8 @@ from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
-from jeit.simulate import Bar, Disc, Indent, indented_cells
-from jeit.simulate.contact.indents import resting_skin
+from jeit.touch.simulate import Bar, Disc, Indent, indented_cells
+from jeit.touch.simulate.contact.indents import resting_skin
 from jeit_solvers.engines import as_array
 
 # One to three contacts, of few cells and many, in a group that one program works on and beyond.

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from studies import SMALL
 
+from jeit.design.reports import study_pictures as pictures
+from jeit.design.reports import write_study_report
 from jeit.design.study import open_results, read_study, run_study
 from jeit.design.study.store import Store
-from jeit.report.study import pictures, write_study_report
 
 pytest.importorskip("xarray")
 
@@ -131,7 +132,7 @@ def test_titles_tell_what_differs(tmp_path):
 @pytest.mark.parametrize("where", ["none/page.html", "file/page.html", "folder"])
 def test_a_page_that_cannot_be_written(folder, tmp_path, monkeypatch, where):
     for draw in ("draw_maps", "draw_scatter", "draw_scores"):
-        monkeypatch.setattr(f"jeit.report.study.report.{draw}", lambda *_: plt.figure(figsize=(1, 1)))
+        monkeypatch.setattr(f"jeit.design.reports.study.{draw}", lambda *_: plt.figure(figsize=(1, 1)))
     (tmp_path / "file").write_text("in the way")
     (tmp_path / "folder").mkdir()
     study = read_study(folder / "study.toml")

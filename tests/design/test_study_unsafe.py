@@ -9,8 +9,8 @@ import shutil
 import numpy as np
 import pytest
 
+from jeit.design.reports import write_study_report
 from jeit.design.study import open_results, run_study, study_progress
-from jeit.report.study import write_study_report
 
 zarr = pytest.importorskip("zarr")
 pytest.importorskip("xarray")

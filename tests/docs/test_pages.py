@@ -14,11 +14,11 @@ from matplotlib import pyplot
 from thread_limits import libraries_found_once
 
 from jeit.cli import main
-from jeit.cli.app import app
+from jeit.cli.app import application
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-COMMANDS = {tuple(path.split()): function for path, function in command_line.commands(app)}
+COMMANDS = {tuple(path.split()): function for path, function in command_line.commands(application())}
 
 
 def blocks(page: Path, *languages: str) -> list[str]:

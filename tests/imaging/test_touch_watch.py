@@ -11,11 +11,10 @@ import pytest
 from gesture_skin import RATE, TOML, gestures_and_stream, linear_gestures_and_stream
 
 from jeit.data.description import parse_description
-from jeit.imaging import TouchImages, TouchWatch, learn_gestures
-from jeit.imaging.touch_images import TOUCH_IMAGES
 from jeit.layout import perimeter
 from jeit.mesh import Rectangle
-from jeit.touch import GestureModel
+from jeit.touch import GestureModel, TouchImages, TouchWatch, learn_gestures
+from jeit.touch.gestures.touch_images import TOUCH_IMAGES
 
 DESCRIPTION = parse_description(tomllib.loads(TOML), "skin.toml")
 

@@ -9,6 +9,7 @@ import pytest
 
 from jeit.acoustic.surface import make_surface
 from jeit.data import Measurement, impossible_signs, write_table
+from jeit.design.plots.travel import outline_path
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.imaging.preparation import imaging_mesh
@@ -17,7 +18,6 @@ from jeit.mesh import Domain, Rectangle, quality
 from jeit.mesh.generate.curve import smooth
 from jeit.mesh.generate.unstructured import Target, mesh_within
 from jeit.plot import plot_mesh
-from jeit.plot.design.travel import outline_path
 from jeit.protocol import adjacent
 from jeit.report.describe import describe_domain
 from jeit_solvers.engines import namespace

@@ -5,23 +5,16 @@ import numpy as np
 import pytest
 from matplotlib import pyplot
 
-from jeit.mesh import Disk, Rectangle
-from jeit.plot import (
-    ColourScale,
-    plot_choice,
-    plot_error_curve,
-    plot_figures_of_merit,
-    plot_image,
-    plot_loss_map,
-    plot_mesh,
-    plot_receptive_fields,
+from jeit.acoustic.plots import plot_error_curve, plot_loss_map, plot_receptive_fields, plot_track
+from jeit.design.plots import (
     plot_sensitivity_histograms,
     plot_sensitivity_map,
     plot_taxel_areas,
     plot_taxels,
-    plot_track,
     plot_travel,
 )
+from jeit.mesh import Disk, Rectangle
+from jeit.plot import ColourScale, plot_choice, plot_figures_of_merit, plot_image, plot_mesh
 from jeit.plot.imaging.image import plot_raster
 
 matplotlib.use("Agg")

@@ -13,11 +13,11 @@ from jeit.acoustic.calibration.calibrate import CalibrationFit
 from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.localisation.locations import Locations
 from jeit.acoustic.noise import IntensityNoise
+from jeit.acoustic.plots import Marks, plot_error_curve, plot_loss_map, plot_pairs, plot_receptive_fields, plot_track
+from jeit.acoustic.plots.surface_view import FOUND
 from jeit.acoustic.surface import make_surface
 from jeit.acoustic.tracking import Touch, Track
 from jeit.layout import grid
-from jeit.plot import Marks, plot_error_curve, plot_loss_map, plot_pairs, plot_receptive_fields, plot_track
-from jeit.plot.acoustic.surface_view import FOUND
 
 OUTLINE = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
 DEAD = "dead: every sample is 0"

@@ -10,12 +10,12 @@ from matplotlib.patches import StepPatch
 from matplotlib.tri import TriContourSet
 
 from jeit.design import touch_grid
+from jeit.design.plots import plot_sensitivity_histograms, plot_taxel_areas, plot_taxels
+from jeit.design.plots.taxels import plot_similarity
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.taxels import Taxels
 from jeit.layout import grid
 from jeit.mesh import Rectangle
-from jeit.plot import plot_sensitivity_histograms, plot_taxel_areas, plot_taxels
-from jeit.plot.design.taxels import plot_similarity
 from jeit_solvers import KMeans
 
 ELECTRODES = grid(0.08, 0.08, 2, 2)
@@ -190,7 +190,7 @@ def test_histograms_share_their_bins(ax):
     ],
 )
 def test_refuses_what_makes_no_sense(match, draw, monkeypatch, ax):
-    monkeypatch.setattr("jeit.plot.design.taxels.axes_or_new", lambda *_: ax)
+    monkeypatch.setattr("jeit.design.plots.taxels.axes_or_new", lambda *_: ax)
     with pytest.raises(ValueError, match=match):
         draw(four())
 

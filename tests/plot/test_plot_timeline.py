@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from jeit.imaging import NamedTouch
 from jeit.mesh import Rectangle
-from jeit.plot import plot_changes, plot_health_course, plot_timeline, plot_touch_paths, plot_tried
-from jeit.touch import SkinHealth, Standing
+from jeit.touch import NamedTouch, SkinHealth, Standing
 from jeit.touch.gestures import ChangeCourse, StreamTouch
+from jeit.touch.plots import plot_changes, plot_health_course, plot_timeline, plot_touch_paths, plot_tried
 
 NAMES = ("pat", "tap")
 

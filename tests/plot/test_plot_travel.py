@@ -7,10 +7,10 @@ from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.figure import Figure
 
 from jeit.design.optimisation.optimise import Optimisation
+from jeit.design.plots import plot_travel
 from jeit.design.scores import Scores
 from jeit.layout import Layout, grid
 from jeit.mesh import Disk, Rectangle
-from jeit.plot import plot_travel
 
 SKIN = Rectangle(0.1, 0.1)
 BEGAN = grid(0.06, 0.06, 2, 2)

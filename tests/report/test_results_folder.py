@@ -2,15 +2,9 @@
 
 import pytest
 
-from jeit.report import (
-    write_calibration,
-    write_choice,
-    write_image,
-    write_improved_layout,
-    write_layout_comparison,
-    write_stream,
-    write_track,
-)
+from jeit.acoustic.reports import write_calibration, write_track
+from jeit.design.reports import write_improved_layout, write_layout_comparison
+from jeit.report import write_choice, write_image, write_stream
 from jeit.report.folder import results_folder
 
 WRITERS = {

@@ -4,9 +4,17 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.simulate import SoundingPerson, SoundingSkin, microphone_grid, room_sound, sound_clips, stroke, wind
-from jeit.simulate.acoustic.people import MODALITIES, SOUND_MANNERS
-from jeit.simulate.acoustic.propagation import expected_power, noise_power
+from jeit.acoustic.simulate import (
+    SoundingPerson,
+    SoundingSkin,
+    microphone_grid,
+    room_sound,
+    sound_clips,
+    stroke,
+    wind,
+)
+from jeit.acoustic.simulate.people import MODALITIES, SOUND_MANNERS
+from jeit.acoustic.simulate.propagation import expected_power, noise_power
 
 KEY = jax.random.key(3)
 WHERE = (0.02, -0.01)

@@ -5,23 +5,22 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from jeit.simulate import (
+from jeit.acoustic.simulate import (
     Burst,
-    RoundSkin,
     SoundingSkin,
     calibration_taps,
     microphone_grid,
     pat,
     quiet,
-    simulate_press,
     stroke,
     tap,
     tickle,
 )
-from jeit.simulate.acoustic.layer import Elastomer, ElastomerLayer
-from jeit.simulate.acoustic.microphones import MicrophoneModel, Readout
-from jeit.simulate.acoustic.propagation import expected_power, noise_power, nominal_power, transfer
-from jeit.simulate.acoustic.sound import superpose
+from jeit.acoustic.simulate.layer import Elastomer, ElastomerLayer
+from jeit.acoustic.simulate.microphones import MicrophoneModel, Readout
+from jeit.acoustic.simulate.propagation import expected_power, noise_power, nominal_power, transfer
+from jeit.acoustic.simulate.sound import superpose
+from jeit.data import RoundSkin, simulate_press
 
 KEY = jax.random.key(0)
 # No spread from microphone to microphone, and no coupling: what is left has closed forms.
@@ -147,7 +146,7 @@ def test_drawn_bursts_have_the_expected_power(small):
 def test_pieces_of_a_calibration_do_not_show(small, monkeypatch):
     places = [(0.0, 0.01), (0.03, 0.02), (-0.08, 0.0)]
     whole = calibration_taps(small, KEY, places, repeats=2, duration=0.1)
-    monkeypatch.setattr("jeit.simulate.acoustic.calibration_taps.PIECE", 12_000)
+    monkeypatch.setattr("jeit.acoustic.simulate.calibration_recording.PIECE", 12_000)
     # Two pieces of two places, the last one twice.
     parts = calibration_taps(small, KEY, places, repeats=2, duration=0.1)
     np.testing.assert_allclose(parts.samples, whole.samples, rtol=1e-9, atol=1e-12)

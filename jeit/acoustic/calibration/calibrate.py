@@ -107,9 +107,9 @@ def calibrate_microphones(
     distance, four parts of the places left out in turn). `intensity`: band and window, for taps that come as samples.
     `progress` is called with the name of each step as it begins.
 
-    What `jeit calibrate-microphones` does; `jeit.report.write_calibration` writes what it writes. Raises `ValueError`
-    where fewer than three microphones can be calibrated, where most do not hear what is said to be tapped, for another
-    `decay`, for `intensity` where the taps are intensities, and for things of another kind.
+    What `jeit calibrate-microphones` does; `jeit.acoustic.reports.write_calibration` writes what it writes. Raises
+    `ValueError` where fewer than three microphones can be calibrated, where most do not hear what is said to be tapped,
+    for another `decay`, for `intensity` where the taps are intensities, and for things of another kind.
     """
     every = isinstance(decay, str) and decay == AUTO
     kinds = () if every else (find_decay(decay),)

@@ -25,9 +25,9 @@ def demo(
     import numpy as np
 
     from jeit.cli.console import Steps, pairs, plain_console, say_written
+    from jeit.data.round_skin import RoundSkin, simulate_press
     from jeit.imaging import image_difference
     from jeit.report import write_image
-    from jeit.simulate.round_skin import RoundSkin, simulate_press
 
     make_folder(output)
     console = plain_console()

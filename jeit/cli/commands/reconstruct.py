@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.networks import NETWORK, check_method, image_by_network
+from jeit.cli.applications import NETWORK, check_method, image_by_network
 from jeit.cli.options import (
     AsIs,
     Contact,

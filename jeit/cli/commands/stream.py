@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.networks import NETWORK, check_method, image_by_network
+from jeit.cli.applications import NETWORK, check_method, image_by_network
 from jeit.cli.options import (
     AsIs,
     Contact,

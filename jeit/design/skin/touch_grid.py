@@ -69,7 +69,7 @@ class SurfaceGrid(TouchGrid):
     def raster(self, values) -> Float[np.ndarray, "rows columns"]:
         """Raises `ValueError`: places on a curved skin are in no rows and columns."""
         raise ValueError(
-            "grid is of a curved skin, whose places are in no raster; draw it with jeit.plot.plot_unrolled."
+            "grid is of a curved skin, whose places are in no raster; draw it with jeit.design.plots.plot_unrolled."
         )
 
 

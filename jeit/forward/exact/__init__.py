@@ -8,30 +8,6 @@ admittivities and contact impedances may be complex.
 
 from __future__ import annotations
 
-from jeit.forward.exact.arcs import arc_transfer_impedance, logarithm_moments
-from jeit.forward.exact.box import face_patch_impedance, plate_resistance
-from jeit.forward.exact.curved_sheets import sleeve_sheet_impedance, sphere_sheet_impedance
-from jeit.forward.exact.cylinder import ConductingCylinder, wall_patch_impedance
-from jeit.forward.exact.disk import ConductingDisk, point_inclusion_effect, point_potentials, point_transfer_impedance
-from jeit.forward.exact.sheet_discs import centre_to_rim_resistance, disc_contact_resistance, disc_transfer_impedance
-from jeit.forward.exact.sphere import ConductingSphere, cap_impedance
+import lazy_loader
 
-__all__ = [
-    "ConductingCylinder",
-    "ConductingDisk",
-    "ConductingSphere",
-    "arc_transfer_impedance",
-    "cap_impedance",
-    "centre_to_rim_resistance",
-    "disc_contact_resistance",
-    "disc_transfer_impedance",
-    "face_patch_impedance",
-    "logarithm_moments",
-    "plate_resistance",
-    "point_inclusion_effect",
-    "point_potentials",
-    "point_transfer_impedance",
-    "sleeve_sheet_impedance",
-    "sphere_sheet_impedance",
-    "wall_patch_impedance",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,13 +2,6 @@
 
 from __future__ import annotations
 
-from jeit.inverse.hyperparameter.point_spread import best_resolution
-from jeit.inverse.hyperparameter.rules import discrepancy, generalised_cross_validation, l_curve, noise_figure
+import lazy_loader
 
-__all__ = [
-    "best_resolution",
-    "discrepancy",
-    "generalised_cross_validation",
-    "l_curve",
-    "noise_figure",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,21 +2,6 @@
 
 from __future__ import annotations
 
-from jeit.inverse.nonlinear.links import Bounded, Linear, Log
-from jeit.inverse.nonlinear.solvers import LBFGSB, GaussNewton, LevenbergMarquardt, OneStep, ProjectedGradient
-from jeit.inverse.nonlinear.unknowns import Background, ContactImpedance, ElectrodePosition, Scale
+import lazy_loader
 
-__all__ = [
-    "LBFGSB",
-    "Background",
-    "Bounded",
-    "ContactImpedance",
-    "ElectrodePosition",
-    "GaussNewton",
-    "LevenbergMarquardt",
-    "Linear",
-    "Log",
-    "OneStep",
-    "ProjectedGradient",
-    "Scale",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,17 +2,6 @@
 
 from __future__ import annotations
 
-from jeit.inverse.shapes.ellipsoid import KINDS, Ellipsoid, EllipsoidPrior
-from jeit.inverse.shapes.search import LEAST_RISE, ShapeReconstruction, reconstruct_shapes
-from jeit.inverse.shapes.star import Star, StarPrior
+import lazy_loader
 
-__all__ = [
-    "KINDS",
-    "LEAST_RISE",
-    "Ellipsoid",
-    "EllipsoidPrior",
-    "ShapeReconstruction",
-    "Star",
-    "StarPrior",
-    "reconstruct_shapes",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

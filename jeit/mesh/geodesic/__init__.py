@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from jeit.mesh.geodesic.geodesics import Geodesics
-from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
-from jeit.mesh.geodesic.unfolding import Unfolding, unfold
-from jeit.mesh.geodesic.unrolled import Unrolled, unroll
+import lazy_loader
 
-__all__ = ["Geodesics", "SurfacePlaces", "Triangles", "Unfolding", "Unrolled", "unfold", "unroll"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-from jeit.mesh.surface.bending import bend
-from jeit.mesh.surface.boundary import surface_of
-from jeit.mesh.surface.shells import shell
-from jeit.mesh.surface.sleeves import forearm, tube
-from jeit.mesh.surface.spheres import cap, sphere
-from jeit.mesh.surface.vertex_normals import node_normals
+import lazy_loader
 
-__all__ = ["bend", "cap", "forearm", "node_normals", "shell", "sphere", "surface_of", "tube"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

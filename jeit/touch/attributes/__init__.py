@@ -6,26 +6,6 @@ or of a simulated skin, and measures them all.
 
 from __future__ import annotations
 
-from jeit.touch.attributes.measures import (
-    ContactArea,
-    Localisation,
-    contact_area,
-    least_told,
-    point_localisation,
-    response_times,
-    weber_ratio,
-)
-from jeit.touch.attributes.trials import DiscTouch, TouchAttributes, touch_attributes
+import lazy_loader
 
-__all__ = [
-    "ContactArea",
-    "DiscTouch",
-    "Localisation",
-    "TouchAttributes",
-    "contact_area",
-    "least_told",
-    "point_localisation",
-    "response_times",
-    "touch_attributes",
-    "weber_ratio",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

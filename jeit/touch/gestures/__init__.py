@@ -2,22 +2,6 @@
 
 from __future__ import annotations
 
-from jeit.touch.gestures.change_course import ChangeCourse, TouchLevel
-from jeit.touch.gestures.features import COURSE_FEATURES, FEATURES, TouchFeatures, course_features, touch_features
-from jeit.touch.gestures.gesture_model import GestureModel, Gestures
-from jeit.touch.gestures.segmentation import StreamTouch, TouchStream, find_touches
+import lazy_loader
 
-__all__ = [
-    "COURSE_FEATURES",
-    "FEATURES",
-    "ChangeCourse",
-    "GestureModel",
-    "Gestures",
-    "StreamTouch",
-    "TouchFeatures",
-    "TouchLevel",
-    "TouchStream",
-    "course_features",
-    "find_touches",
-    "touch_features",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

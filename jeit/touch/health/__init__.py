@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from jeit.touch.health.event import EventKind, EventStatus, HealthEvent
-from jeit.touch.health.skin_health import SkinHealth, WatchStatus, watch
+import lazy_loader
 
-__all__ = ["EventKind", "EventStatus", "HealthEvent", "SkinHealth", "WatchStatus", "watch"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

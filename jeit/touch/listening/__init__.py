@@ -7,24 +7,6 @@ recording is made of. Beneath: `sound_images`, feature images as Park et al. (20
 
 from __future__ import annotations
 
-from jeit.touch.listening.feature_images import SoundImages, sound_images
-from jeit.touch.listening.heard import Event, Heard
-from jeit.touch.listening.labelled_clips import LabelledClips, read_clips
-from jeit.touch.listening.levels import Levels
-from jeit.touch.listening.listener import Listener
-from jeit.touch.listening.modality_network import ModalityNetwork, train_network
-from jeit.touch.listening.window_features import sound_features
+import lazy_loader
 
-__all__ = [
-    "Event",
-    "Heard",
-    "LabelledClips",
-    "Levels",
-    "Listener",
-    "ModalityNetwork",
-    "SoundImages",
-    "read_clips",
-    "sound_features",
-    "sound_images",
-    "train_network",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

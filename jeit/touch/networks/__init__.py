@@ -7,21 +7,6 @@ trained through the skin's forward model.
 
 from __future__ import annotations
 
-from jeit.touch.networks.image_network import DESIGNS, ImageNetwork, read_network, write_network
-from jeit.touch.networks.learn import PRESETS, ImageStanding, LearntImages, Preset, learn_images
-from jeit.touch.networks.measured import FrameDepth, resting_frame, stream_depths
+import lazy_loader
 
-__all__ = [
-    "DESIGNS",
-    "PRESETS",
-    "FrameDepth",
-    "ImageNetwork",
-    "ImageStanding",
-    "LearntImages",
-    "Preset",
-    "learn_images",
-    "read_network",
-    "resting_frame",
-    "stream_depths",
-    "write_network",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

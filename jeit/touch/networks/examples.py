@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.design.study.store import Store
-from jeit.simulate import IndentSet
+from jeit.touch.simulate import IndentSet
 from jeit.touch.training import ArrayRows, Rows
 
 # Touches that are in memory, and mixed, at once, at most: 120 MB of 94 channels and 48 × 48 maps.

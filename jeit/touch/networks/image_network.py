@@ -22,11 +22,11 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, check_name, is_number, real_array, told
 from jeit.design import Skin
 from jeit.protocol import Protocol
-from jeit.simulate.contact.indent_sets import pixel_places
-from jeit.simulate.contact.indents import relative_to
 from jeit.touch.networks.missing import MOST_MISSING, filled
 from jeit.touch.networks.three_stages import ThreeStages
 from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.simulate.contact.indent_sets import pixel_places
+from jeit.touch.simulate.contact.indents import relative_to
 from jeit.touch.training import check_same, read_model, write_model
 
 DESIGNS = ("unrolled", "three-stages")
@@ -162,7 +162,7 @@ class ImageNetwork:
         return jax.jit(lambda maps: network.felt(jnp.asarray(maps, jnp.float32)))
 
     def share(self, change: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n rows columns"]:
-        """Depths over the thickness, of changes relative to a reference, as of `jeit.simulate.relative_changes`."""
+        """Depths over the thickness, of `change` relative to a reference (`jeit.touch.simulate.relative_changes`)."""
         number = len(change)
         if not number:
             return np.zeros((0, *self.shape), np.float32)

@@ -18,8 +18,6 @@ from jeit.arguments.extras import need_extra
 from jeit.design import Skin, touches_away_from_the_edge
 from jeit.design.study.store import OtherContents
 from jeit.layout import Layout
-from jeit.simulate import Indent, IndentSet, ball, relative_changes, simulate_presses
-from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.networks.examples import Examples, StoredTouches
 from jeit.touch.networks.image_network import DESIGNS, FILE, ImageNetwork, write_network
 from jeit.touch.networks.places import centroids_of, errors
@@ -27,6 +25,8 @@ from jeit.touch.networks.sensed import Sensed
 from jeit.touch.networks.touches import detection_noise, touch_draws
 from jeit.touch.networks.training import Runs, train_three_stages, train_unrolled
 from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.simulate import Indent, IndentSet, ball, relative_changes, simulate_presses
+from jeit.touch.simulate.contact.indent_sets import image_places
 from jeit.touch.training import Plan, Trained
 
 SHAPE = (48, 48)

@@ -13,10 +13,10 @@ from scipy.spatial import KDTree
 from jeit.design import Skin
 from jeit.forward.contact_sensitivity import ContactSensitivity
 from jeit.forward.model import select_channels
-from jeit.simulate.contact.indent_sets import image_places
-from jeit.simulate.contact.indents import relative_to
-from jeit.simulate.contact.samples import lattice
 from jeit.touch.networks.touches import DEPTHS
+from jeit.touch.simulate.contact.indent_sets import image_places
+from jeit.touch.simulate.contact.indents import relative_to
+from jeit.touch.simulate.contact.samples import lattice
 
 # Places in each cell, along a side: pixels are smaller than cells.
 _LATTICE = 6

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from jeit.design import Bell, Skin, touches_away_from_the_edge
-from jeit.simulate import Bar, Disc, Indent, IndentDraws, Joined, Placed, Revolved, Ring, ball, material
-from jeit.simulate.contact.indenters import AbstractIndenter
-from jeit.simulate.contact.indents import relative_changes
+from jeit.touch.simulate import Bar, Disc, Indent, IndentDraws, Joined, Placed, Revolved, Ring, ball, material
+from jeit.touch.simulate.contact.indenters import AbstractIndenter
+from jeit.touch.simulate.contact.indents import relative_changes
 
 # Of the skin's thickness: the least and the greatest depth of a touch; Park et al.'s 10 mm, 1 and 8 mm.
 DEPTHS = (0.1, 0.8)

@@ -6,20 +6,6 @@ keep networks as numbers with a JSON head, never a pickle. Training needs the ex
 
 from __future__ import annotations
 
-from jeit.touch.training.batches import ArrayRows, MappedRows, Rows
-from jeit.touch.training.fitting import Objective, Plan, Trained, fit
-from jeit.touch.training.model_file import check_same, read_head, read_model, write_model
+import lazy_loader
 
-__all__ = [
-    "ArrayRows",
-    "MappedRows",
-    "Objective",
-    "Plan",
-    "Rows",
-    "Trained",
-    "check_same",
-    "fit",
-    "read_head",
-    "read_model",
-    "write_model",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -14,10 +14,20 @@ from jeit.layout import SurfaceLayout, spread
 from jeit.mesh import Mesh, Rectangle, forearm, measures, sphere, tube
 from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit.protocol import adjacent, two_terminal
-from jeit.simulate.contact import Bar, Disc, Foundation, HalfSpace, MovingPress, Press, PressedSkin, ball, material
-from jeit.simulate.contact.cell_pressure import pressed_cells
-from jeit.simulate.contact.samples import Samples
 from jeit.touch.contacts import CellFinder, find_contacts
+from jeit.touch.simulate.contact import (
+    Bar,
+    Disc,
+    Foundation,
+    HalfSpace,
+    MovingPress,
+    Press,
+    PressedSkin,
+    ball,
+    material,
+)
+from jeit.touch.simulate.contact.cell_pressure import pressed_cells
+from jeit.touch.simulate.contact.samples import Samples
 
 KEY = jax.random.key(0)
 STILL = dataclasses.replace(

@@ -14,7 +14,7 @@ from jeit.forward import ForwardModel
 from jeit.forward.exact import ConductingDisk, arc_transfer_impedance, point_inclusion_effect
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.simulate.contact import Disc, Press, PressedSkin, material
+from jeit.touch.simulate.contact import Disc, Press, PressedSkin, material
 
 KEY = jax.random.key(0)
 RADIUS, SHEET, PUNCH, LOAD = 0.05, 2e-5, 0.012, 15.0

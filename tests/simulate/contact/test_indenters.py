@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.design import Bell
-from jeit.simulate.contact import Bar, DepthMap, Disc, Joined, Placed, Prism, Revolved, Ring, ball
+from jeit.touch.simulate.contact import Bar, DepthMap, Disc, Joined, Placed, Prism, Revolved, Ring, ball
 
 MIDDLE = np.zeros(2)
 

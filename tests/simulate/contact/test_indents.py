@@ -7,7 +7,7 @@ import pytest
 from jeit.design import Skin
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle, measures
-from jeit.simulate import (
+from jeit.touch.simulate import (
     Bar,
     Disc,
     Indent,
@@ -20,8 +20,8 @@ from jeit.simulate import (
     relative_changes,
     simulate_presses,
 )
-from jeit.simulate.contact.indent_sets import image_places
-from jeit.simulate.contact.indents import resting_skin
+from jeit.touch.simulate.contact.indent_sets import image_places
+from jeit.touch.simulate.contact.indents import resting_skin
 
 
 def made(num_layers: int, cell_size: float = 5e-3) -> Skin:

@@ -17,7 +17,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.simulate.contact import (
+from jeit.touch.simulate.contact import (
     Bar,
     Disc,
     PressDraws,
@@ -40,7 +40,7 @@ import os, signal, sys
 sys.path.insert(0, sys.argv[1])
 from test_press_sets import small_set
 from jeit.design.study.store import Store
-from jeit.simulate.contact import open_presses, press_sets, simulate_presses
+from jeit.touch.simulate.contact import open_presses, press_sets, simulate_presses
 
 presses = small_set()
 data = open_presses(presses, sys.argv[3])  # no need to simulate again what is known

@@ -12,7 +12,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import named_layout, ring
 from jeit.mesh import Disk, Rectangle
 from jeit.protocol import adjacent
-from jeit.simulate.contact import (
+from jeit.touch.simulate.contact import (
     Bar,
     Disc,
     Foundation,
@@ -25,8 +25,8 @@ from jeit.simulate.contact import (
     ball,
     material,
 )
-from jeit.simulate.contact.cell_pressure import pressed_cells
-from jeit.simulate.contact.samples import Samples
+from jeit.touch.simulate.contact.cell_pressure import pressed_cells
+from jeit.touch.simulate.contact.samples import Samples
 
 KEY = jax.random.key(0)
 VELOSTAT = material("velostat")

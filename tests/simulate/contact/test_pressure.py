@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from jeit.simulate.contact import Bar, DepthMap, Disc, Foundation, HalfSpace, Joined, Placed, Prism, Ring, ball
-from jeit.simulate.contact.half_space import sinking
-from jeit.simulate.contact.indenters import AbstractIndenter
-from jeit.simulate.contact.pressure import raster
+from jeit.touch.simulate.contact import Bar, DepthMap, Disc, Foundation, HalfSpace, Joined, Placed, Prism, Ring, ball
+from jeit.touch.simulate.contact.half_space import sinking
+from jeit.touch.simulate.contact.indenters import AbstractIndenter
+from jeit.touch.simulate.contact.pressure import raster
 
 RADIUS, LOAD = 0.01, 0.05
 MIDDLE = np.zeros((1, 2))

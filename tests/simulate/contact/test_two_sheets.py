@@ -12,7 +12,7 @@ from jeit.forward import ForwardModel
 from jeit.forward.exact import ConductingDisk, arc_transfer_impedance
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
-from jeit.simulate.contact import TwoSheets
+from jeit.touch.simulate.contact import TwoSheets
 
 RADIUS, LOWER, UPPER = 0.05, 2e-5, 3e-5
 ANGLES = 2 * np.pi * np.arange(16) / 16

@@ -12,8 +12,8 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk, Rectangle
 from jeit.protocol import adjacent, two_terminal
-from jeit.simulate import Disc, MovingPress, PressedSkin, material
-from jeit.simulate.damage import FAULTS, Cut, ElectrodeFault, Mishap, draw_cut, mended, record_mishaps
+from jeit.touch.simulate import Disc, MovingPress, PressedSkin, material
+from jeit.touch.simulate.damage import FAULTS, Cut, ElectrodeFault, Mishap, draw_cut, mended, record_mishaps
 
 WIDTH, HEIGHT = 0.06, 0.03
 

@@ -8,7 +8,7 @@ from gesture_skin import PLACES, RATE, SHEET
 from jeit.electrodes import PointElectrodes
 from jeit.forward import ForwardModel
 from jeit.protocol import reference_electrode
-from jeit.simulate import Person, PressedSkin, material, simulate_gesture_stream
+from jeit.touch.simulate import Person, PressedSkin, material, simulate_gesture_stream
 
 KEY = jax.random.key(0)
 

@@ -13,8 +13,8 @@ from jeit.forward import ForwardModel
 from jeit.layout import perimeter
 from jeit.mesh import Disk, Rectangle
 from jeit.protocol import reference_electrode
-from jeit.simulate import Disc, MovingPress, PressedSkin, material
-from jeit.simulate.people import GESTURES, MANNERS, TRAITS, Person, simulate_gestures
+from jeit.touch.simulate import Disc, MovingPress, PressedSkin, material
+from jeit.touch.simulate.people import GESTURES, MANNERS, TRAITS, Person, simulate_gestures
 
 KEY = jax.random.key(0)
 SHEET = Rectangle(0.32, 0.2)

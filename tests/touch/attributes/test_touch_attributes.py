@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, one_step, ring
-from jeit.simulate import Disc, MovingPress, Press, PressedSkin, material
 from jeit.touch import CellFinder, touch_attributes
+from jeit.touch.simulate import Disc, MovingPress, Press, PressedSkin, material
 
 KEY = jax.random.key(1)
 

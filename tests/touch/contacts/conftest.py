@@ -12,8 +12,8 @@ from jeit.inverse import one_step
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.simulate import Disc, Press, PressedSkin, material
 from jeit.touch.contacts import ImageNoise
+from jeit.touch.simulate import Disc, Press, PressedSkin, material
 
 
 @pytest.fixture(scope="session")

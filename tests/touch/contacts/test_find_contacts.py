@@ -12,9 +12,9 @@ from jeit.inverse import one_step
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Rectangle, centroids, disk, layer, measures
 from jeit.protocol import adjacent
-from jeit.simulate import Disc, Press, PressedSkin, material
 from jeit.touch.contacts import CellFinder, ImageNoise, RasterFinder, find_contacts
 from jeit.touch.contacts.cell_outline import outline_of_cells
+from jeit.touch.simulate import Disc, Press, PressedSkin, material
 
 FINDERS = [CellFinder, RasterFinder]
 MESH = disk(0.05, num_points=2500)

@@ -11,8 +11,8 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.simulate import Disc, Press, PressedSkin, material
 from jeit.touch.contacts import CellFinder, Contact, LoadCalibration, find_contacts
+from jeit.touch.simulate import Disc, Press, PressedSkin, material
 
 RADIUS = 0.05
 

@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
 from jeit.mesh import centroids, disk
-from jeit.plot import plot_contact_stages, plot_contacts
 from jeit.touch.contacts import CellFinder, ImageNoise, RasterFinder, find_contacts
+from jeit.touch.plots import plot_contact_stages, plot_contacts
 
 MESH = disk(0.05, num_points=700)
 QUIET = ImageNoise(np.full(MESH.num_cells, 1e-9))

@@ -10,8 +10,8 @@ from jeit.inverse import one_step
 from jeit.layout import perimeter
 from jeit.mesh import Rectangle
 from jeit.protocol import reference_electrode
-from jeit.simulate import Disc, MovingPress, PressedSkin, material
 from jeit.touch import TouchLevel, find_touches
+from jeit.touch.simulate import Disc, MovingPress, PressedSkin, material
 
 KEY, FRAMES = jax.random.key(0), 64
 

@@ -10,12 +10,12 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk
-from jeit.plot import plot_health
 from jeit.protocol import adjacent
-from jeit.simulate import Disc, MovingPress, PressedSkin, material
-from jeit.simulate.damage import Cut, Mishap, record_mishaps
 from jeit.touch import CellFinder, SkinHealth, find_contacts, watch
 from jeit.touch.health import EventKind, EventStatus
+from jeit.touch.plots import plot_health
+from jeit.touch.simulate import Disc, MovingPress, PressedSkin, material
+from jeit.touch.simulate.damage import Cut, Mishap, record_mishaps
 
 CUT = Cut([(-0.005, 0.014), (0.02, 0.024)])
 MATERIAL = material("velostat")

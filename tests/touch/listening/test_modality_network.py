@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from jeit.acoustic import Recording
-from jeit.simulate import SoundingPerson, SoundingSkin, microphone_grid, sound_clips
-from jeit.simulate.acoustic.microphones import MicrophoneModel
-from jeit.simulate.acoustic.people import MODALITIES
+from jeit.acoustic.simulate import SoundingPerson, SoundingSkin, microphone_grid, sound_clips
+from jeit.acoustic.simulate.microphones import MicrophoneModel
+from jeit.acoustic.simulate.people import MODALITIES
 from jeit.touch.listening import Levels, Listener, ModalityNetwork, SoundImages, sound_images
 from jeit.touch.listening.learners import LEARNERS, Lesson, NetworkListener
 from jeit.touch.listening.modality_network import NetworkAnswers, paper_plan, plan_of

@@ -7,10 +7,10 @@ from small_networks import PRESET, SHAPE, small_maps
 from jeit.design import Skin
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
-from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.networks import ImageNetwork, learn_images, write_network
 from jeit.touch.networks.sensed import Sensed
 from jeit.touch.networks.unrolled import Unrolled
+from jeit.touch.simulate.contact.indent_sets import image_places
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jeit.simulate import Disc, Indent, relative_changes
 from jeit.touch.networks.missing import filled
+from jeit.touch.simulate import Disc, Indent, relative_changes
 
 PLACE = (0.012, -0.02)
 

@@ -4,9 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.simulate import Disc, Indent, IndentSet, indented_cells, relative_changes
 from jeit.touch.networks import Preset, learn_images, read_network
 from jeit.touch.networks.touches import touch_draws
+from jeit.touch.simulate import Disc, Indent, IndentSet, indented_cells, relative_changes
 from jeit.touch.training import Plan
 
 PRESET = Preset(150, 30, Plan(rate=2e-3, batch=25, epochs=10, patience=10, decay=0.9))

@@ -11,7 +11,7 @@ from jeit.cli import main
 from jeit.data import Measurement, screen
 from jeit.data.export import write_table
 from jeit.protocol import adjacent
-from jeit.simulate import Disc, Indent, relative_changes
+from jeit.touch.simulate import Disc, Indent, relative_changes
 
 PLACES = ((0.01, -0.02), (-0.025, 0.01))
 

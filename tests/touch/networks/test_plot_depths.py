@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from jeit.plot import plot_depth_map, plot_losses
+from jeit.touch.plots import plot_depth_map, plot_losses
 from jeit.touch.training import Trained
 from jeit.touch.training.checkpoint import Course
 

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.simulate import Disc, Indent, depth_maps, indented_cells, relative_changes
-from jeit.simulate.contact.indent_sets import image_places
 from jeit.touch.networks.sensed import Sensed, depth_of, strength
 from jeit.touch.networks.touches import bodies
+from jeit.touch.simulate import Disc, Indent, depth_maps, indented_cells, relative_changes
+from jeit.touch.simulate.contact.indent_sets import image_places
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from small_networks import bits
 
-from jeit.simulate import IndentSet, simulate_presses
 from jeit.touch.networks import ImageNetwork
 from jeit.touch.networks.examples import Examples, StoredTouches
 from jeit.touch.networks.touches import touch_draws
 from jeit.touch.networks.training import Runs, mean_and_deviation, shuffled, train_three_stages
+from jeit.touch.simulate import IndentSet, simulate_presses
 from jeit.touch.training import MappedRows, Plan, Trained
 from jeit.touch.training.checkpoint import Course
 

@@ -1,0 +1,3 @@
+"""Commands of acoustic localisation."""
+
+from __future__ import annotations

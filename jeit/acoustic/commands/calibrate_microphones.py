@@ -1,0 +1,141 @@
+"""`jeit calibrate-microphones`: taps at known places in, the decay model of every microphone out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jeit.acoustic.commands.options import BandHigh, BandLow, Hop, Window, intensity_settings
+from jeit.cli.options import Quiet, in_options, make_folder, naming_options
+
+if TYPE_CHECKING:
+    from jeit.acoustic import Taps
+    from jeit.acoustic.calibration.calibrate import CalibrationFit
+
+_OPTIONS = {"path": "--output", "intensity": "--low, --high, --window and --hop"}
+
+
+def calibrate_microphones(
+    taps: Annotated[
+        Path,
+        typer.Argument(
+            help="NPZ file: microphones (M, d) and outline (K, d) in metres, positions (T, d) of the taps in metres, "
+            "and intensity (T, M), or samples (T, M, S) with rate in hertz.",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", help="Calibration file to write (JSON); a picture goes beside it.", show_default=False
+        ),
+    ],
+    decay: Annotated[
+        str,
+        typer.Option(
+            help="inverse-square, a/(r²+b); exponential; attenuated, the product of both; or auto, that of them which "
+            "best locates taps left out of the fit."
+        ),
+    ] = "auto",
+    low: BandLow = None,
+    high: BandHigh = None,
+    window: Window = None,
+    hop: Hop = None,
+    quiet: Quiet = False,
+) -> None:
+    """Calibrate an array of microphones from taps at known places; writes the calibration and a picture of it."""
+    from jeit.acoustic import calibrate_microphones as calibrate
+    from jeit.acoustic import read_taps
+    from jeit.acoustic.calibration.calibrate import AUTO
+    from jeit.acoustic.decay import find_decay
+    from jeit.acoustic.reports import write_calibration
+    from jeit.acoustic.reports.calibration import calibration_files
+    from jeit.cli.console import Steps, plain_console, say_written
+
+    settings = intensity_settings(low, high, window, hop)
+    console = plain_console()
+    with naming_options(_OPTIONS):
+        kind = decay if decay == AUTO else find_decay(decay)
+        files = calibration_files(output)
+        make_folder(output.parent, tuple(file.name for file in files))
+        with Steps(console, quiet=quiet) as step:
+            step("read")
+            touched = read_taps(taps)
+            fit = calibrate(touched, decay=kind, intensity=settings, progress=step)
+            step("write")
+            write_calibration(fit, output)
+    if not quiet:
+        _show(console, fit, touched)
+        say_written(console, output, files[1].name)
+
+
+def _show(console, fit: "CalibrationFit", taps: "Taps") -> None:
+    import numpy as np
+
+    from jeit.cli.console import pairs
+
+    calibration = fit.calibration
+    usable = calibration.usable
+    rows = [
+        ("microphones", f"{int(usable.sum())} of {len(usable)} usable"),
+        ("taps", f"{len(fit.outlier)}, {int(fit.outlier.sum())} left out as outliers"),
+        ("decay model", f"{calibration.microphone_array.decay.name}: {fit.evidence}"),
+        ("error of the model", f"{100 * fit.error:.1f} % of an intensity, median"),
+        ("so a touch is located", f"to ± {1e3 * _location_error(fit, taps):.1f} mm by one window, median, at best"),
+        *([("note", in_options(fit.note, {"decay": "--decay"}))] if fit.note else []),
+        ("scale", "strength 1 reads 1 at a typical microphone right under the source"),
+    ]
+    if fit.shared.any():
+        which = ", ".join(str(k) for k in np.flatnonzero(fit.shared))
+        rows.append(("tap nearer to", f"{which}: no tap says how their response falls off; it is that of the others"))
+    console.print()
+    console.print(pairs(calibration.name, rows))
+    console.print()
+    console.print(_parameters(fit))
+    refused = [(f"microphone {k}", f"not usable: {why}") for k, why in enumerate(calibration.reasons) if why]
+    if refused:
+        console.print()
+        console.print(pairs("Left out", refused))
+
+
+def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
+    """The Cramér-Rao bound where it was tapped, as loudly: standard deviation along its worst direction, metres."""
+    import numpy as np
+
+    from jeit.acoustic import cramer_rao
+
+    heard, usable = fit.strength > 0, np.asarray(fit.calibration.usable)
+    bound = cramer_rao(fit.calibration.microphone_array, taps.positions[heard], fit.strength[heard], use=usable)
+    return float(np.median(np.sqrt(np.linalg.eigvalsh(bound)[:, -1])))
+
+
+def _parameters(fit: "CalibrationFit"):
+    """A table of the decay models of all usable microphones."""
+    from rich.table import Table
+
+    from jeit_solvers.engines import on_host
+
+    calibration = fit.calibration
+    decay, noise = on_host((calibration.microphone_array.decay, calibration.microphone_array.noise))
+    factors, units = {"a": 1.0, "b": 1e6, "length": 1e3}, {"a": "m²", "b": "mm²", "length": "mm"}
+    if decay.name == "exponential":
+        units["a"] = "1"
+    columns = [text for name in decay.parameters for text in (f"{name} / {units[name]}", "± %")]
+    table = Table("", *columns, "error %", "explained %", box=None, padding=(0, 1))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for k, reason in enumerate(calibration.reasons):
+        if reason:
+            continue
+        cells = []
+        for i, name in enumerate(decay.parameters):
+            error = 100 * calibration.standard_errors[i, k]
+            cells += [
+                f"{factors[name] * float(getattr(decay, name)[k]):.3g}",
+                f"{error:.1f}" if error == error else "–",
+            ]
+        cells += [f"{100 * float(noise.relative[k]):.1f}", f"{100 * float(fit.explained[k]):.1f}"]
+        table.add_row(str(k), *cells)
+    return table

@@ -1,0 +1,143 @@
+"""`jeit locate`: a recording of a calibrated array of microphones in; where and when it was touched out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jeit.acoustic.commands.options import BandHigh, BandLow, Hop, Window, intensity_settings
+from jeit.cli.options import Quiet, in_options, make_folder, naming_options
+
+if TYPE_CHECKING:
+    from jeit.acoustic import LocatedTouches, Recording
+
+_OPTIONS = {"intensity": "--low, --high, --window and --hop"}
+# Of a touch that has moved farther, start and end are printed, not the middle.
+_STROKE = 0.015  # m
+
+
+def locate(
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            help="NPZ file with samples (M, S) and rate in hertz, or intensity (F, M) and times (F,) in seconds; or a "
+            "WAV file with a channel for each microphone.",
+            show_default=False,
+        ),
+    ],
+    calibration: Annotated[
+        Path, typer.Option("--calibration", "-c", help="File of jeit calibrate-microphones.", show_default=False)
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for track.csv, report.json, track.png.", show_default=False)
+    ],
+    method: Annotated[
+        str, typer.Option(help="likelihood, or consistency for the loss of Park 2022 on a 200 × 200 map, refined.")
+    ] = "likelihood",
+    gap: Annotated[float, typer.Option(help="Seconds of silence that end a touch.")] = 0.15,
+    silence: Annotated[
+        Path | None,
+        typer.Option(
+            help="Recording of the untouched array, samples or WAV, for the noise floor: where touches never pause.",
+            show_default=False,
+        ),
+    ] = None,
+    low: BandLow = None,
+    high: BandHigh = None,
+    window: Window = None,
+    hop: Hop = None,
+    quiet: Quiet = False,
+) -> None:
+    """Locate every touch of a recording; writes track.csv, report.json and track.png."""
+    from jeit.acoustic import Calibration, locate_touches, read_recording
+    from jeit.acoustic.localisation.localiser import METHODS
+    from jeit.acoustic.reports import write_track
+    from jeit.arguments import check_name
+    from jeit.cli.console import Steps, plain_console, say_written
+
+    check_name("--method", method, METHODS)
+    if not 0 < gap < float("inf"):
+        raise ValueError(f"--gap must be positive, in seconds; it is {gap}.")
+    settings = intensity_settings(low, high, window, hop)
+    make_folder(output, ("track.csv", "report.json", "track.png"))
+    console = plain_console()
+    with Steps(console, quiet=quiet) as step, naming_options(_OPTIONS):
+        step("read")
+        known = Calibration.load(calibration)
+        sound = read_recording(recording)
+        hush = None if silence is None else _silence(silence, sound)
+        options = {"method": method, "gap": gap, "intensity": settings, "silence": hush}
+        found = locate_touches(sound, known, **options, progress=step)
+        step("write")
+        write_track(found, output)
+    if not quiet:
+        _show(console, found)
+        say_written(console, output / "track.csv", "report.json", "track.png")
+
+
+def _silence(path: Path, sound) -> "Recording":
+    from jeit.acoustic import Recording, read_recording
+
+    hush = read_recording(path)
+    if not (isinstance(sound, Recording) and isinstance(hush, Recording)):
+        raise ValueError("--silence is for samples, and must hold samples: intensities have their floor.")
+    return hush
+
+
+def _show(console, found: "LocatedTouches") -> None:
+    from rich.table import Table
+
+    from jeit.acoustic.signal.faults import describe_faults
+    from jeit.cli.console import pairs
+
+    locations = found.locations
+    counts = ", ".join(f"{number} {status}" for status, number in locations.counts().items())
+    rows = [("frames", f"{len(locations.times)}: {counts}"), ("touches", str(len(found.track.touches)))]
+    rows += [("faults", describe_faults(locations.faults))] * any(locations.faults)
+    rows += [("note", in_options(note, {"silence": "--silence"})) for note in locations.notes]
+    console.print()
+    console.print(pairs(locations.name, rows))
+    if found.track.touches:
+        console.print()
+        names = ("touch", "from / s", "to / s", "x / mm", "y / mm", "± / mm", "path / mm")
+        table = Table(*names, box=None, padding=(0, 1, 0, 0))
+        for column in table.columns:
+            column.justify, column.no_wrap = "right", True
+        table.add_column("frames", justify="right")
+        for row in _rows(found):
+            table.add_row(*row)
+        console.print(table)
+    console.print()
+
+
+def _rows(found: "LocatedTouches") -> Iterator[tuple[str, ...]]:
+    """Of every touch, and of the one beside it where there are two at once."""
+    import numpy as np
+
+    from jeit.acoustic.localisation.locations import LocationStatus
+
+    locations, track = found.locations, found.track
+    for number, touch in enumerate(track.touches, 1):
+        frames = slice(touch.first, touch.last + 1)
+        place = 1e3 * track.position[frames, :2]
+        off = 1e3 * float(np.median(np.sqrt(np.linalg.eigvalsh(track.covariance[frames])[:, -1])))
+        if touch.length > _STROKE:
+            where = [f"{along[0]:z.1f} → {along[-1]:z.1f}" for along in place.T]
+        else:
+            where = [f"{along.mean():z.1f}" for along in place.T]
+        kinds = [kind for kind in locations.status[frames] if kind != LocationStatus.NO_TOUCH]
+        counts = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+        when = (f"{touch.onset:.3f}", f"{touch.offset:.3f}")
+        yield str(number), *when, *where, f"{off:.1f}", f"{1e3 * touch.length:.0f}", counts
+        both = touch.first + np.flatnonzero(locations.status[frames] == LocationStatus.TWO_TOUCHES)
+        if both.size:
+            # Which of the two is the stronger may change: the other is the one farther from the track.
+            pair = np.stack([locations.position[both], locations.second[both]])
+            apart = np.linalg.norm(pair - track.position[both], axis=-1)
+            other = 1e3 * pair[apart.argmax(axis=0), np.arange(both.size), :2].mean(axis=0)
+            when = (f"{locations.times[both[0]]:.3f}", f"{locations.times[both[-1]]:.3f}")
+            beside = f"{both.size} {LocationStatus.TWO_TOUCHES}"
+            yield f"{number}, other", *when, *(f"{along:z.1f}" for along in other), "", "", beside

@@ -1,0 +1,135 @@
+"""How far off places are: pairs of true and estimated ones on the skin, and errors against what they depend on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from numpy.typing import ArrayLike
+
+from jeit.acoustic.plots.surface_view import FOUND, AnySurface, draw_legend, draw_surface, view_of
+from jeit.arguments import check_kind, check_name
+from jeit.plot.axes import INK, SERIES_COLOURS, SERIES_MARKERS, axes_or_new, draw_horizontal_grid, soften_axes
+
+_STATISTICS = {
+    "median": lambda errors: np.nanmedian(errors, axis=1),
+    "mean": lambda errors: np.nanmean(errors, axis=1),
+    "rms": lambda errors: np.sqrt(np.nanmean(errors**2, axis=1)),
+}
+
+
+def plot_pairs(
+    true: ArrayLike,
+    found: ArrayLike,
+    microphones: ArrayLike,
+    surface: AnySurface,
+    *,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw true places (P, d) and those `found` (P, d), pair by pair, over `microphones` (M, d); all in metres.
+
+    `surface`: its outline, a surface, `MicrophoneArray` or a `Calibration`. Places that were not found, NaN, are
+    hollow. The title is mean ± standard deviation of the error unless given. Raises `ValueError` for shapes that
+    disagree.
+    """
+    view = view_of(surface, microphones)
+    place, guess = view.chart(true, "true"), view.chart(found, "found")
+    if place.shape != guess.shape:
+        raise ValueError(f"true has {len(place)} places and found {len(guess)}; give them pair by pair.")
+    there = np.isfinite(guess).all(axis=1)
+    error = 1e3 * np.linalg.norm(np.asarray(found, float) - np.asarray(true, float), axis=1)[there]
+    ax = axes_or_new(ax)
+    handles = draw_surface(ax, view)
+    ax.add_collection(
+        LineCollection(list(np.stack([place, guess], axis=1)[there]), colors=INK, linewidths=0.9, zorder=3)
+    )
+    dot = {"marker": "o", "linestyle": "none", "markersize": 4.2}
+    handles += ax.plot(*place[there].T, color=INK, markeredgewidth=0, zorder=4, label="true", **dot)
+    if not there.all():
+        handles += ax.plot(*place[~there].T, color=INK, fillstyle="none", zorder=4, label="not found", **dot)
+    handles += ax.plot(*guess[there].T, color=FOUND, markeredgewidth=0, zorder=5, label="estimated", **dot)
+    draw_legend(ax, handles)
+    if title is None:
+        title = f"{error.mean():.1f} ± {error.std():.1f} mm" if error.size else "none found"
+    ax.set_title(title)
+    return ax
+
+
+def plot_error_curve(
+    values: ArrayLike,
+    errors: Mapping[str, ArrayLike],
+    *,
+    bound: ArrayLike | None = None,
+    quantity: str = "Signal-to-noise ratio (dB)",
+    statistic: str = "median",
+    logarithmic: bool = False,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw localisation errors of one or several methods against `values` (K,) of a `quantity`.
+
+    `errors`: the name of each method with its errors in metres: (K, N), of N places each, drawn by their `statistic`
+    ("median", "mean" or "rms") over a band from the lower to the upper quartile; or (K,), a line alone. NaN counts for
+    nothing. `bound`: the Cramér-Rao bound, (K,), or (K, N) of which the same statistic is drawn. `logarithmic`: whether
+    `values` are on a logarithmic axis, which suits a number of microphones. Errors always are. Raises `ValueError` for
+    shapes that disagree, no errors, and more than six methods.
+    """
+    x = np.asarray(values, float)
+    if x.ndim != 1 or not x.size or not np.isfinite(x).all() or (logarithmic and not (x > 0).all()):
+        positive = "positive " if logarithmic else ""
+        raise ValueError(f"values has shape {x.shape}; give (K,) finite {positive}numbers, one for each row of errors.")
+    check_kind("errors", errors, Mapping, "{name: errors}")
+    if not 1 <= len(errors) <= len(SERIES_COLOURS):
+        raise ValueError(f"errors has {len(errors)} methods; give 1 to {len(SERIES_COLOURS)}, {{name: errors}}.")
+    check_name("statistic", statistic, _STATISTICS)
+    each = {name: _rows(array, f"errors['{name}']", x.size) for name, array in errors.items()}
+    least = None if bound is None else _STATISTICS[statistic](_rows(bound, "bound", x.size))
+    order = np.argsort(x)
+    ax = axes_or_new(ax, (5.8, 4.2))
+    ax.set_yscale("log")
+    for (name, rows), colour, marker in zip(each.items(), SERIES_COLOURS, SERIES_MARKERS, strict=False):
+        line = {"color": colour, "marker": marker, "markersize": 5, "linewidth": 1.8, "zorder": 3}
+        ax.plot(x[order], _STATISTICS[statistic](rows)[order], label=name, **line)
+        if rows.shape[1] > 1:
+            low, high = np.nanquantile(rows, [0.25, 0.75], axis=1)
+            ax.fill_between(x[order], low[order], high[order], color=colour, alpha=0.18, linewidth=0, zorder=2)
+    if least is not None:
+        style = {"color": INK, "linewidth": 1.4, "linestyle": (0, (4, 3)), "zorder": 4}
+        ax.plot(x[order], least[order], label="Cramér-Rao bound", **style)
+    ax.set_xlabel(quantity, color=INK)
+    ax.set_ylabel({"rms": "RMS error (mm)"}.get(statistic, f"{statistic.capitalize()} error (mm)"), color=INK)
+    ax.set_title(title or "")
+    _mark_axes(ax, x, logarithmic)
+    ax.legend(frameon=False)
+    return ax
+
+
+def _mark_axes(ax: Axes, x: np.ndarray, logarithmic: bool) -> None:
+    """Ticks and lines of a curve of errors against `x`."""
+    if logarithmic:
+        ax.set_xscale("log", base=2)
+        ax.set_xticks(x)
+        ax.minorticks_off()
+        ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    else:
+        ax.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 2.5, 5, 10]))
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    soften_axes(ax)
+    draw_horizontal_grid(ax)
+
+
+def _rows(errors: ArrayLike, name: str, number: int) -> np.ndarray:
+    """Errors (K, N) in millimetres."""
+    array = np.asarray(errors, float)
+    rows = array[:, None] if array.ndim == 1 else array
+    if rows.ndim != 2 or len(rows) != number or not rows.shape[1]:
+        raise ValueError(f"{name} has shape {array.shape}; give ({number},) or ({number}, places), in metres.")
+    if (rows < 0).any() or not np.isfinite(rows).any(axis=1).all():
+        raise ValueError(f"{name}: errors are distances, not negative, and every row needs one that is finite.")
+    return 1e3 * rows

@@ -1,0 +1,7 @@
+"""Simulated sound: a skin that sounds, its microphones and the touches on it."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,108 @@
+"""Taps at known places of a simulated skin, as a calibration needs them: many at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from jeit.acoustic.simulate.bursts import ONSET, VIBRATOR, Burst, check_burst
+from jeit.acoustic.simulate.checks import check_not_negative
+from jeit.acoustic.simulate.propagation import noise_power, transfer
+from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
+from jeit.acoustic.simulate.synthesis import (
+    RINGING,
+    bin_frequencies,
+    filled_bins,
+    noise_spectrum,
+    sample_times,
+    source_spectrum,
+    transform_size,
+)
+
+# How many values of a calibration are made at once: 32 MB.
+PIECE = 2**22
+
+
+class CalibrationTaps(eqx.Module):
+    """Taps at known places: `samples` (T, M, S), `rate`, `positions` (T, 2) metres, `strengths` (T,)."""
+
+    samples: Float[np.ndarray, "T M S"]
+    rate: float
+    positions: Float[np.ndarray, "T 2"]
+    strengths: Float[np.ndarray, " T"]
+
+
+def calibration_taps(
+    skin: SoundingSkin,
+    key: Array,
+    positions: ArrayLike,
+    *,
+    repeats: int = 3,
+    burst: Burst = VIBRATOR,
+    strength_spread: float = 0.3,
+    duration: float = 0.15,
+    noise: bool = True,
+    progress: Callable[[str], None] | None = None,
+) -> CalibrationTaps:
+    """`repeats` taps at each of `positions` (P, 2), metres: T = P · repeats recordings, those of one place together.
+
+    Strengths are log-normal about that of `burst` with standard deviation `strength_spread` in the logarithm, as a
+    hand's or a vibrator's are: whoever calibrates does not know them. `progress` is called with how far it is.
+    Otherwise as `tap`, which says what is raised.
+    """
+    check_skin_and_key(skin, key)
+    places = skin.layer.check_inside("positions", positions)
+    if repeats < 1:
+        raise ValueError(f"repeats: give at least one tap for each position, not {repeats}.")
+    check_not_negative("strength_spread", strength_spread)
+    check_burst(burst, duration)
+    times = sample_times(skin, duration)
+    loudness, rest = jax.random.split(key)
+    strengths = burst.strength * np.exp(
+        strength_spread * np.asarray(jax.random.normal(loudness, (len(places), repeats)))
+    )
+    envelope = burst.envelope(times, np.array([ONSET]), np.array([1.0]))
+    size = transform_size(len(times), skin.layer.longest_delay + RINGING, skin.rate)
+    samples = np.empty((len(places), repeats, skin.num_microphones, len(times)))
+    level = noise_power(skin) if noise else None
+    keys = jax.random.split(rest, len(places))
+    # In pieces of one size, so that next to the result little else takes memory, and one program serves them all.
+    pieces = min(len(places), -(-samples.size // PIECE))
+    for part in np.array_split(np.arange(-(-len(places) // pieces) * pieces), pieces):
+        part = np.minimum(part, len(places) - 1)
+        samples[part] = _still(
+            skin, keys[part], places[part], strengths[part], envelope, level, size, filled_bins(skin, size)
+        )
+        if progress is not None:
+            progress(f"{part[-1] + 1} of {len(places)} places")
+    return CalibrationTaps(
+        samples.reshape(-1, *samples.shape[2:]), skin.rate, np.repeat(places, repeats, axis=0), strengths.ravel()
+    )
+
+
+@partial(jax.jit, static_argnums=(6, 7))
+def _still(skin, keys, places, strengths, envelope, level, size, bins):
+    frequencies = bin_frequencies(skin, size, bins)
+
+    def at(item):
+        key, place, loudness = item
+        sources, own = jax.random.split(key)
+        channels = transfer(skin, frequencies, place)
+
+        def once(key, own, strength):
+            spectrum = strength * source_spectrum(skin, key, envelope, size, bins) * channels
+            if level is not None:
+                spectrum += noise_spectrum(skin, own, level, size, bins)
+            return jnp.fft.irfft(spectrum, size)[:, : len(envelope)]
+
+        repeats = len(loudness)
+        return jax.vmap(once)(jax.random.split(sources, repeats), jax.random.split(own, repeats), loudness)
+
+    return jax.lax.map(at, (keys, places, strengths))

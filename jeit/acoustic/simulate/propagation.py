@@ -1,0 +1,106 @@
+"""How sound gets from a touch to the microphones: spreading, loss, dispersion, edge echoes, and the multiplexer.
+
+Sound is propagated frequency by frequency; powers are integrals over frequency with no random numbers in them.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+
+from jeit.acoustic.simulate.microphones import SLOTS, STEP
+from jeit.acoustic.simulate.sounding_skin import SoundingSkin
+
+
+def band_filter(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
+    """Power response (F,) of the filters: 1 in the band, 1/2 at its ends, nothing from half an octave outside."""
+    octaves = jnp.log2(jnp.maximum(frequencies, 1e-9))
+    low, high = jnp.log2(skin.readout.band[0]), jnp.log2(skin.readout.band[1])
+    rising, falling = jnp.clip(octaves - low + 0.5, 0, 1), jnp.clip(high - octaves + 0.5, 0, 1)
+    return (jnp.sin(jnp.pi / 2 * rising) * jnp.sin(jnp.pi / 2 * falling)) ** 2
+
+
+def source_density(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
+    """Power density (F,), per hertz, of a source of strength 1: it integrates to 1 over the positive frequencies."""
+
+    lowest, highest = skin.readout.band
+
+    def shape(f):
+        return band_filter(skin, f) * (jnp.maximum(f, 1e-9) / lowest) ** -skin.spectral_slope
+
+    # Even in log-frequency, where the filter's two skirts are equally wide: ∫ S df = ∫ S f d(ln f).
+    grid = lowest * jnp.exp(jnp.linspace(-0.35, jnp.log(highest / lowest) + 0.35, 2001))
+    return shape(frequencies) / jnp.trapezoid(shape(grid) * grid, jnp.log(grid))
+
+
+@jax.jit
+def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Float[Array, "2"]) -> Complex[Array, "M F"]:
+    """Transfer functions (M, F) from a source at `position` to each channel: paths, gain, coupling and stagger.
+
+    A path of length ρ, ρ² = (horizontal distance)² + (microphone's depth)², contributes spreading(ρ) times
+    exp(-(loss(f) + i wavenumber(f)) ρ). Paths are the straight one, the echoes of the four edges (images of the source
+    behind each, times `reflection`) and of the four corners (times its square). The faces' echoes are in the spreading.
+    """
+    layer = skin.layer
+    x, y = position
+    width, height = layer.width, layer.height
+    weight = jnp.array([1.0, layer.reflection, layer.reflection])
+    across, along = jnp.array([x, width - x, -width - x]), jnp.array([y, height - y, -height - y])
+    squared = (across[:, None] - skin.microphones[:, 0, None, None]) ** 2
+    squared += (along - skin.microphones[:, 1, None, None]) ** 2
+    length = jnp.sqrt(squared + skin.microphone_depth[:, None, None] ** 2).reshape(-1, 9)
+    amplitude = (
+        jnp.outer(weight, weight).reshape(9) * layer.spreading(length, skin.microphone_model.depth) * skin.gain[:, None]
+    )
+    decay = layer.material.loss(frequencies) + 1j * layer.material.wavenumber(frequencies)
+    received = jnp.sum(amplitude[..., None] * jnp.exp(-length[..., None] * decay), axis=1)
+    if not skin.readout.multiplexed:
+        return received
+    # Microphone i is slot i mod 4 of multiplexer i div 4. What it follows there, 25 µs earlier, may be an open slot.
+    index = np.arange(skin.num_microphones)
+    before = index - index % SLOTS + (index - 1) % SLOTS
+    connected = before < skin.num_microphones
+    leak = jnp.where(connected[:, None], received[np.where(connected, before, 0)], 0)
+    received += skin.readout.coupling * leak * jnp.exp(-2j * jnp.pi * frequencies * STEP)
+    return received * jnp.exp(2j * jnp.pi * frequencies * skin.stagger[:, None])
+
+
+def expected_power(skin: SoundingSkin, positions) -> Float[np.ndarray, "P M"]:
+    """Mean square (P, M) of each channel, noise apart, for a steady source of strength 1 at each of `positions` (P, 2).
+
+    The integral over frequency of the source's density times |transfer|², no random numbers in it; a source of
+    strength s gives s² of it. Raises `ValueError` for positions off the skin.
+    """
+    points = skin.layer.check_inside("positions", positions)
+    # |transfer|² beats between two echoes at most once per 1 / delay; four points a beat make the sum exact, nearly.
+    step = min(1 / (4 * skin.layer.longest_delay), skin.readout.band[0] / 10)
+    frequencies = np.arange(1, np.ceil(np.sqrt(2) * skin.readout.band[1] / step)) * step
+    return np.asarray(_expected_power(skin, jnp.asarray(points), jnp.asarray(frequencies), step))
+
+
+@jax.jit
+def _expected_power(skin, points, frequencies, step):
+    density = source_density(skin, frequencies) * step
+    return jax.lax.map(lambda point: jnp.abs(transfer(skin, frequencies, point)) ** 2 @ density, points)
+
+
+def nominal_power(skin: SoundingSkin, distances) -> Float[np.ndarray, " K"]:
+    """Mean square (K,) that a nominal microphone receives from horizontal `distances` (K,), metres, no edge near."""
+    return np.asarray(_nominal_power(skin, jnp.hypot(jnp.asarray(distances, float), skin.microphone_model.depth)))
+
+
+@jax.jit
+def _nominal_power(skin, length):
+    frequencies = jnp.linspace(skin.readout.band[0] / 1.5, skin.readout.band[1] * 1.5, 2001)
+    decay = jnp.exp(-2 * skin.layer.material.loss(frequencies) * length[..., None])
+    return skin.layer.spreading(length, skin.microphone_model.depth) ** 2 * jnp.trapezoid(
+        source_density(skin, frequencies) * decay, frequencies
+    )
+
+
+def noise_power(skin: SoundingSkin) -> Float[np.ndarray, " M"]:
+    """Mean square (M,) of each channel's own noise, all of it in the band; see `MicrophoneModel`."""
+    nominal = nominal_power(skin, skin.microphone_model.reach) * 10 ** (-skin.microphone_model.snr_db / 10)
+    return nominal * np.asarray(skin.noise_factor)

@@ -1,0 +1,32 @@
+from .description import load_description
+from .export import write_table
+from .frame_recording import FrameRecording, read_frame_recording
+from .gesture_set import GestureSet
+from .imageable import check_imageable
+from .measurement import Measurement
+from .quality import estimate_noise, impossible_signs, reciprocity_error
+from .registry import read
+from .round_skin import RoundSkin, simulate_press
+from .screening import screen
+from .series import join
+from .transfer import driven_by, transfer_impedance
+
+__all__ = [
+    "FrameRecording",
+    "GestureSet",
+    "Measurement",
+    "RoundSkin",
+    "check_imageable",
+    "driven_by",
+    "estimate_noise",
+    "impossible_signs",
+    "join",
+    "load_description",
+    "read",
+    "read_frame_recording",
+    "reciprocity_error",
+    "screen",
+    "simulate_press",
+    "transfer_impedance",
+    "write_table",
+]

@@ -1,0 +1,44 @@
+from .comparison import compare_layouts
+from .improvement import improve_layout
+from .measurements.candidates import Candidates
+from .measurements.selection import information_bound, select_measurements
+from .optimisation.design_space import DesignSpace
+from .optimisation.objective import Objective
+from .optimisation.optimise import optimise_layout
+from .optimisation.surface_optimise import optimise_surface_layout
+from .response import skin_response
+from .scores import TouchPrior, layout_scores
+from .sensitivity import sensitivity_map
+from .skin.indentation import Bell, Hemisphere
+from .skin.skin import Skin
+from .skin.skin_file import describes_skin, read_described_skin
+from .skin.touch_grid import touch_grid, touches_away_from_the_edge
+from .study import open_results, read_study, run_study
+from .taxels import find_taxels
+
+__all__ = [
+    "Bell",
+    "Candidates",
+    "DesignSpace",
+    "Hemisphere",
+    "Objective",
+    "Skin",
+    "TouchPrior",
+    "compare_layouts",
+    "describes_skin",
+    "find_taxels",
+    "improve_layout",
+    "information_bound",
+    "layout_scores",
+    "open_results",
+    "optimise_layout",
+    "optimise_surface_layout",
+    "read_described_skin",
+    "read_study",
+    "run_study",
+    "select_measurements",
+    "sensitivity_map",
+    "skin_response",
+    "touch_grid",
+    "touches_away_from_the_edge",
+]

@@ -1,0 +1,3 @@
+"""Commands of electrode layouts and their studies."""
+
+from __future__ import annotations

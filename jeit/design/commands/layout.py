@@ -1,0 +1,145 @@
+"""`jeit layout`: layouts of electrodes compared and improved, before any material is cut."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jeit.cli.options import Quiet, check_at_least, check_positive, check_within, make_folder, naming_options
+from jeit.design import defaults
+from jeit.design.commands import skins
+from jeit.design.commands.layout_optimise import optimise
+
+if TYPE_CHECKING:
+    from jeit.design.comparison import LayoutComparison
+
+layout = typer.Typer(name="layout", help="Compare and optimise layouts of electrodes.")
+
+layout.command()(optimise)
+
+_FILES = ("report.json", "comparison.png")
+# Along a side: 65,536 touches in all.
+_MOST_PLACES = 256
+# Options by the names that their values have further down.
+_OPTIONS = {
+    "thickness": "--thickness-mm",
+    "cell_size": "--cell-mm",
+    "num_pairs": "--pairs",
+    "num_taxels": "--taxels",
+    "margin": "--margin-mm",
+    "outline": "--width-mm and --height-mm",
+}
+# What is told: its name and unit, its key in the report, and what to multiply by.
+_TOLD = (
+    ("electrodes", "electrodes", 1.0),
+    ("measurements", "measurements", 1.0),
+    ("least sensitivity / mV", "sensitivity_min_V", 1e3),
+    ("mean sensitivity / mV", "sensitivity_mean_V", 1e3),
+    ("uniformity", "sensitivity_uniformity", 1.0),
+    ("blind spot / % of the area", "blind_spot_fraction", 100.0),
+    ("taxels", "taxel_count", 1.0),
+    ("taxels over a place", "taxel_overlap", 1.0),
+    ("two-point estimate / mm", "two_point_mm", 1.0),
+)
+
+
+@layout.callback(invoke_without_command=True)
+def _top(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@layout.command()
+def compare(
+    first: skins.LayoutName,
+    second: skins.LayoutName,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for report.json and comparison.png.", show_default=False)
+    ],
+    thickness: skins.Thickness = 1e3 * defaults.THICKNESS,
+    conductivity: skins.Conductivity = defaults.CONDUCTIVITY,
+    pairs: Annotated[
+        int | None,
+        typer.Option(
+            help="Two-terminal measurements, between nearest electrodes; 0 for all pairs "
+            f"(default {defaults.NUM_PAIRS}, or all)."
+        ),
+    ] = None,
+    taxels: Annotated[
+        int | None, typer.Option(help=f"Virtual taxels to look for (default {defaults.NUM_TAXELS}, or one a place).")
+    ] = None,
+    margin: Annotated[
+        float, typer.Option("--margin-mm", help="Touch no nearer to the edge, where a touch is partly off the skin.")
+    ] = 1e3 * defaults.MARGIN,
+    places: Annotated[int, typer.Option(help="Places touched along a side.")] = defaults.PLACES,
+    contrast: Annotated[
+        float,
+        typer.Option(help="Of the touched part's conductivity: 0 for an insulator, above 1 for a conductor."),
+    ] = defaults.CONTRAST,
+    cell: Annotated[float, typer.Option("--cell-mm", help="Size of the mesh's cells, millimetres.")] = 1e3
+    * defaults.CELL_SIZE,
+    seed: Annotated[int, typer.Option(help="Of the taxels' k-means.")] = 0,
+    width: skins.Width = 1e3 * defaults.SIDE,
+    height: skins.Height = 1e3 * defaults.SIDE,
+    quiet: Quiet = False,
+) -> None:
+    """Touch two layouts all over, and say what each feels: sensitivity, blind spots, virtual taxels."""
+    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.design import compare_layouts
+    from jeit.design.comparison import check_same_outline
+    from jeit.design.reports import write_layout_comparison
+    from jeit.design.skin.protocol import skin_protocol
+    from jeit.design.skin.skin import skins_of
+
+    skins.check_layer(thickness, conductivity)
+    check_positive({"--cell-mm": cell})
+    check_within("--places", places, 2, _MOST_PLACES)
+    check_at_least({"--pairs": (pairs, 0), "--taxels": (taxels, 1), "--seed": (seed, 0)})
+    if not 0 <= margin < float("inf"):
+        raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
+    both = [skins.read_with_outline(name, width, height) for name in (first, second)]
+    make_folder(output, _FILES)
+    console = plain_console()
+    with naming_options(_OPTIONS), Steps(console, quiet=quiet) as step:
+        check_same_outline(*both)
+        step("mesh")
+        protocols = [skin_protocol(one, num_pairs=pairs) for one in both]
+        material = {"thickness": 1e-3 * thickness, "conductivity": conductivity}
+        made = skins_of(both, protocols, **material, cell_size=1e-3 * cell)
+        result = compare_layouts(
+            made[0],
+            made[1],
+            margin=1e-3 * margin,
+            places=places,
+            contrast=contrast,
+            num_taxels=taxels,
+            seed=seed,
+            progress=step,
+        )
+        step("write")
+        write_layout_comparison(result, output)
+    if not quiet:
+        _show(console, result)
+        say_written(console, output / "report.json", "comparison.png")
+
+
+def _show(console, result: "LayoutComparison") -> None:
+    from rich.table import Table
+
+    from jeit.design.reports.layout_comparison import told_apart
+
+    figures = result.figures
+    table = Table("", *told_apart([one["layout"] for one in figures]), box=None, padding=(0, 2, 0, 0))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, key, factor in _TOLD:
+        table.add_row(name, *(f"{factor * one[key]:.3g}" for one in figures))
+        if key == "taxel_count":
+            for part in ("mean", "std", "max"):
+                table.add_row(f"taxel area, {part} / cm²", *(f"{one['taxel_area_cm2'][part]:.3g}" for one in figures))
+    console.print()
+    console.print(table)
+    console.print("blind spot: less sensitive than the other layout's least sensitive place", style="dim")
+    console.print()

@@ -1,0 +1,145 @@
+"""`jeit layout optimise`: move the electrodes of a layout to where the skin feels its worst place best."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from jeit.cli.options import Quiet, check_at_least, check_positive, check_within, make_folder
+from jeit.design import defaults
+from jeit.design.commands import skins
+
+if TYPE_CHECKING:
+    from jeit.design.improvement import ImprovedLayout
+    from jeit.mesh import Disk, Domain, Rectangle
+
+RESULTS = ("layout.csv", "layout.svg", "travel.png", "report.json")
+# Nodes to optimise on: fewest that make cells at all, and as many as there can be four times of.
+_LEAST_NODES, _MOST_NODES = 4, 250_000
+# What is told: its key in the report, its name and unit, and what to multiply by.
+_TOLD = (
+    ("worst_sensitivity_V", "least sensitivity / mV", 1e3),
+    ("mean_sensitivity_V", "mean sensitivity / mV", 1e3),
+    ("uniformity", "uniformity", 1.0),
+    ("mean_variance", "mean variance", 1.0),
+    ("log_information_nats", "log information / nats", 1.0),
+    ("largest_variance", "largest variance", 1.0),
+    ("mean_localisation_error_m", "mean localisation error / mm", 1e3),
+)
+
+
+def optimise(
+    layout: skins.LayoutName,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help=f"Folder for {', '.join(RESULTS)}.", show_default=False)
+    ],
+    minimum_spacing: Annotated[
+        float, typer.Option("--minimum-spacing-mm", help="Of electrodes' centres, millimetres.")
+    ] = 1e3 * defaults.MINIMUM_SPACING,
+    keep_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Where no electrode may be, millimetres: a disc x,y,radius or a rectangle x1,y1,x2,y2. Give it again "
+            "for more."
+        ),
+    ] = None,
+    symmetry: Annotated[
+        Literal["mirror-x", "mirror-y", "rotate-2", "rotate-4"] | None,
+        typer.Option(help="About the middle of the skin's box.", show_default=False),
+    ] = None,
+    sizes: Annotated[bool, typer.Option("--sizes", help="Change sizes too, between half and twice.")] = False,
+    starts: Annotated[int, typer.Option(help="The layout, and random ones.")] = 1,
+    steps: Annotated[int, typer.Option(help="At most.")] = defaults.STEPS,
+    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
+    thickness: skins.Thickness = 1e3 * defaults.THICKNESS,
+    conductivity: skins.Conductivity = defaults.CONDUCTIVITY,
+    contact_impedance: Annotated[
+        float | None, typer.Option(help=f"ohm·m² (the layout's, or {defaults.CONTACT_IMPEDANCE:g}).")
+    ] = None,
+    noise: Annotated[float, typer.Option(help="Standard deviation of a voltage at 1 mA, volts.")] = defaults.NOISE,
+    num_points: Annotated[int, typer.Option(help="Nodes of the mesh to optimise on, about.")] = defaults.NUM_POINTS,
+    width: skins.Width = 1e3 * defaults.SIDE,
+    height: skins.Height = 1e3 * defaults.SIDE,
+    quiet: Quiet = False,
+) -> None:
+    """Move the electrodes of LAYOUT until its worst sensitivity and mean variance are as good as they get.
+
+    All two-terminal pairs are measured, so the order of electrodes does not matter. Figures of both layouts are on a
+    finer mesh than the one optimised on.
+    """
+    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.design import DesignSpace, improve_layout
+    from jeit.design.reports import write_improved_layout
+
+    skins.check_layer(thickness, conductivity)
+    check_positive({"--noise": noise})
+    if contact_impedance is not None:
+        check_positive({"--contact-impedance": contact_impedance})
+    check_at_least({"--starts": (starts, 1), "--steps": (steps, 1), "--seed": (seed, 0)})
+    if not 0 <= minimum_spacing < float("inf"):
+        raise ValueError(f"--minimum-spacing-mm must not be negative; it is {minimum_spacing:g}.")
+    check_within("--num-points", num_points, _LEAST_NODES, _MOST_NODES)
+    start = skins.read_with_outline(layout, width, height)
+    free = [_region(text, start.known_outline) for text in keep_out or ()]
+    make_folder(output, RESULTS)
+    space = DesignSpace(minimum_spacing=1e-3 * minimum_spacing, keep_out=free, symmetry=symmetry, sizes=sizes)
+    search = {"noise": noise, "steps": steps, "starts": starts, "seed": seed, "num_points": num_points}
+    material = {"thickness": 1e-3 * thickness, "conductivity": conductivity, "contact_impedance": contact_impedance}
+    console = plain_console()
+
+    def say(done: int, values) -> None:
+        step.tell(f"step {done} of at most {steps}, best score {values.max():.3f}")
+
+    with Steps(console, quiet=quiet) as step:
+        result = improve_layout(start, space, **search, **material, progress=step, callback=say)
+        step("write")
+        write_improved_layout(result, output)
+    if not quiet:
+        _show(console, result)
+        say_written(console, output / RESULTS[0], *RESULTS[1:])
+
+
+def _show(console, result: "ImprovedLayout") -> None:
+    from jeit.cli.console import pairs
+    from jeit.design.reports import report_improved_layout
+
+    report = report_improved_layout(result)
+    both = [(name, factor, report["start"][key], report["optimised"][key]) for key, name, factor in _TOLD]
+    rows = [
+        (name, f"{factor * before:.3g} → {factor * after:.3g}")
+        for name, factor, before, after in both
+        if before is not None and after is not None
+    ]
+    console.print(pairs(result.start.name, rows))
+    console.print(f"  {report['status']}: {report['reason']}", soft_wrap=True)
+
+
+def _region(text: str, outline: "Domain") -> "Disk | Rectangle":
+    """A disc "x,y,radius" or rectangle "x1,y1,x2,y2" in mm. Raises `ValueError` if it is none or off the skin."""
+    from jeit.mesh import Disk, Rectangle
+
+    try:
+        numbers = [1e-3 * float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (3, 4) or not all(abs(number) < float("inf") for number in numbers):
+        raise ValueError(
+            f"--keep-out is {text!r}; give a disc x,y,radius or a rectangle x1,y1,x2,y2, millimetres, such as 0,0,15."
+        )
+    if len(numbers) == 3:
+        x, y, radius = numbers
+        low_x, high_x, low_y, high_y = x - radius, x + radius, y - radius, y + radius
+    else:
+        (low_x, high_x), (low_y, high_y) = sorted(numbers[0::2]), sorted(numbers[1::2])
+    if not (high_x > low_x and high_y > low_y):
+        raise ValueError(f"--keep-out {text} has no size; give a positive radius, or two opposite corners.")
+    x_min, x_max, y_min, y_max = outline.extent
+    if low_x >= x_max or high_x <= x_min or low_y >= y_max or high_y <= y_min:
+        raise ValueError(
+            f"--keep-out {text} lies off the skin, which spans {1e3 * x_min:g} to {1e3 * x_max:g} mm by "
+            f"{1e3 * y_min:g} to {1e3 * y_max:g} mm."
+        )
+    middle = ((low_x + high_x) / 2, (low_y + high_y) / 2)
+    return Disk(numbers[2], middle) if len(numbers) == 3 else Rectangle(high_x - low_x, high_y - low_y, middle)

@@ -1,0 +1,161 @@
+"""`jeit study`: a sweep over layouts from a TOML file, which can be stopped at any moment and goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jeit.cli.options import Quiet, StoppedError, naming_options
+
+if TYPE_CHECKING:
+    from jeit.design.study import Progress, Study
+
+study = typer.Typer(
+    name="study",
+    help="Sweep over layouts and what surrounds them, as a TOML file says: run, resume, status, report.",
+)
+
+File = Annotated[Path, typer.Argument(metavar="STUDY.toml", help="What to sweep.", show_default=False)]
+Output = Annotated[Path | None, typer.Option("--output", "-o", help="Zarr store (default STUDY.zarr beside the file).")]
+Page = Annotated[Path | None, typer.Option("--page", help="HTML report (default STUDY.html beside the file).")]
+Scheduler = Annotated[
+    str | None, typer.Option(help="Address of a dask scheduler, such as tcp://host:8786; in this process unless given.")
+]
+
+
+@study.callback(invoke_without_command=True)
+def _top(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@study.command()
+def run(
+    file: File, output: Output = None, page: Page = None, scheduler: Scheduler = None, quiet: Quiet = False
+) -> None:
+    """Run a study from its beginning, and report."""
+    from jeit.design.study.lock import locked
+
+    sweep, store = _read(file, output)
+    if store.exists() and not (store / "zarr.json").is_file():
+        raise ValueError(f"--output {store}: there is something else already; choose another name.")
+    if store.exists():
+        with locked(store, "study"):  # or else a process that writes it is told of, before anybody deletes it
+            pass
+        raise ValueError(f"{store} is there already: 'jeit study resume {file}' goes on with it; or delete it.")
+    _run(sweep, file, store, page, scheduler, quiet)
+
+
+@study.command()
+def resume(
+    file: File, output: Output = None, page: Page = None, scheduler: Scheduler = None, quiet: Quiet = False
+) -> None:
+    """Go on with a study that was stopped; finished chunks are not computed again."""
+    from jeit.design.study.store import Store
+
+    sweep, store = _read(file, output)
+    if not store.exists():
+        raise ValueError(f"there is no {store} to go on with: begin with 'jeit study run {file}'.")
+    Store(sweep, store, create=False)  # is it one, and this study's?
+    _run(sweep, file, store, page, scheduler, quiet)
+
+
+@study.command()
+def status(file: File, output: Output = None) -> None:
+    """Say how far a study is."""
+    from jeit.arguments import counted
+    from jeit.design.study import study_progress
+
+    sweep, store = _read(file, output)
+    if not store.exists():
+        points, chunks = counted(len(sweep.points), "point"), counted(len(sweep.chunks), "chunk")
+        typer.echo(f"{sweep.name}: not begun; {points} in {chunks}.")
+        return
+    now = study_progress(sweep, store)
+    typer.echo(
+        f"{sweep.name}: {now.points} of {now.all_points} points finished, in {now.chunks} of {now.all_chunks} chunks."
+    )
+
+
+@study.command()
+def report(file: File, output: Output = None, page: Page = None) -> None:
+    """Write one HTML page of what is finished."""
+    from jeit.design.reports import write_study_report
+
+    sweep, store = _read(file, output)
+    where = _page(file, store, page)
+    write_study_report(sweep, store, where)
+    typer.echo(f"Written: {where}")
+
+
+def _read(file: Path, output: Path | None) -> "tuple[Study, Path]":
+    from jeit.design.study import read_study
+
+    with naming_options({"path": "study"}):
+        return read_study(file), output or file.with_suffix(".zarr")
+
+
+def _page(file: Path, store: Path, page: Path | None) -> Path:
+    """Where the report goes. Raises `ValueError` for a folder that is not there, and where something else would go."""
+    where = page or file.with_suffix(".html")
+    if not where.parent.is_dir():
+        raise ValueError(f"--page {where}: there is no folder {where.parent}; make it first.")
+    if where.resolve() in (file.resolve(), store.resolve()):
+        raise ValueError(f"--page {where}: that is the study itself; choose another name.")
+    return where
+
+
+def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: str | None, quiet: bool) -> None:
+    from contextlib import ExitStack
+
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    from jeit.arguments.extras import need_extra
+    from jeit.cli.console import plain_console, say_written
+    from jeit.design.reports import write_study_report
+    from jeit.design.study import run_study
+
+    where = _page(file, store, page)
+    need_extra("cluster", "a study")  # before a bar says that it has begun
+    console = plain_console()
+    done, left = (TextColumn(f"{{{said}}}", markup=False) for said in ("task.description", "task.fields[left]"))
+    columns = (done, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), left)
+    try:
+        with ExitStack() as stack:
+            client = None if scheduler is None else stack.enter_context(connected(scheduler))
+            bar = stack.enter_context(Bar(*columns, console=console, disable=quiet))
+            task = bar.add_task("points", total=len(sweep.points), left="")
+
+            def show(now: "Progress") -> None:
+                left = "" if now.seconds_left is None else f"{_duration(now.seconds_left)} left"
+                bar.update(task, completed=now.points, left=left)
+
+            run_study(sweep, store, client=client, progress=show)
+        write_study_report(sweep, store, where)
+    except KeyboardInterrupt:
+        if not store.exists():
+            raise
+        other = "" if store == file.with_suffix(".zarr") else f" --output {store}"
+        raise StoppedError(f"stopped; 'jeit study resume {file}{other}' goes on with it.") from None
+    if not quiet:
+        say_written(console, store, str(where))
+
+
+def connected(scheduler: str):
+    """A client of the dask scheduler at this address. Raises `ValueError` where none answers."""
+    from jeit.arguments.extras import optional
+
+    try:
+        return optional("distributed", "a cluster").Client(scheduler, timeout=10)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"--scheduler {scheduler} does not answer: {error}") from None
+
+
+def _duration(seconds: float) -> str:
+    """As hours, minutes and seconds: 1:02:03."""
+    minutes, second = divmod(round(seconds), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours}:{minute:02}:{second:02}" if hours else f"{minute}:{second:02}"

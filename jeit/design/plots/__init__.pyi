@@ -1,0 +1,13 @@
+from .sensitivity_map import plot_sensitivity_histograms, plot_sensitivity_map
+from .taxels import plot_taxel_areas, plot_taxels
+from .travel import plot_travel
+from .unrolled_skin import plot_unrolled
+
+__all__ = [
+    "plot_sensitivity_histograms",
+    "plot_sensitivity_map",
+    "plot_taxel_areas",
+    "plot_taxels",
+    "plot_travel",
+    "plot_unrolled",
+]

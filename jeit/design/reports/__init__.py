@@ -1,0 +1,7 @@
+"""Reports, tables and pictures of electrode layouts and their studies, written to a folder."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,14 @@
+from .progress import Progress
+from .run import run_study, study_progress
+from .spec import Point, Study, read_study
+from .store import open_results
+
+__all__ = [
+    "Point",
+    "Progress",
+    "Study",
+    "open_results",
+    "read_study",
+    "run_study",
+    "study_progress",
+]

@@ -1,0 +1,31 @@
+from .image_series import ImageSeries
+from .inclusions import Inclusion, find_inclusions
+from .isosurface import TriangleSurface, isosurface_of, node_values
+from .merit import figures_of_merit
+from .oscillations import Oscillation, amplitude_spectrum, oscillation
+from .plane import Plane, cut_by_plane
+from .raster import Raster
+from .regions import ball_region, box_region, half_region
+from .segmentation import segment
+from .solid_form import SolidForm
+
+__all__ = [
+    "ImageSeries",
+    "Inclusion",
+    "Oscillation",
+    "Plane",
+    "Raster",
+    "SolidForm",
+    "TriangleSurface",
+    "amplitude_spectrum",
+    "ball_region",
+    "box_region",
+    "cut_by_plane",
+    "figures_of_merit",
+    "find_inclusions",
+    "half_region",
+    "isosurface_of",
+    "node_values",
+    "oscillation",
+    "segment",
+]

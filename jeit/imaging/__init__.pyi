@@ -1,0 +1,32 @@
+from .compared_rules import ComparedRules, RuleOutcome, compare_on_data
+from .difference import ImagedDifference, image_difference
+from .frequencies import ImagedFrequencies, frequency_weight, image_frequencies
+from .method import METHODS
+from .preparation import PreparedDifference, calibrated_model, imaging_mesh, prepare_difference, select_frames
+from .sequence import ImagedSequence, image_sequence
+from .settings import CONTACTS, ImagingSettings
+from .stream_preparation import StreamSettings, frames_of, prepare_imager
+
+__all__ = [
+    "CONTACTS",
+    "METHODS",
+    "ComparedRules",
+    "ImagedDifference",
+    "ImagedFrequencies",
+    "ImagedSequence",
+    "ImagingSettings",
+    "PreparedDifference",
+    "RuleOutcome",
+    "StreamSettings",
+    "calibrated_model",
+    "compare_on_data",
+    "frames_of",
+    "frequency_weight",
+    "image_difference",
+    "image_frequencies",
+    "image_sequence",
+    "imaging_mesh",
+    "prepare_difference",
+    "prepare_imager",
+    "select_frames",
+]

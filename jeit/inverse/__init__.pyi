@@ -1,0 +1,37 @@
+from .calibration import calibrate
+from .channel_weights import relative_noise
+from .hyperparameter.comparison import choose_hyperparameter, compare_rules
+from .hyperparameter.rules import RULES
+from .linear.back_projection import back_projection
+from .linear.greit import greit
+from .linear.one_step import one_step
+from .nonlinear.parametrisation import Parametrisation
+from .nonlinear.reconstruct import reconstruct
+from .prior.matern import Matern
+from .prior.priors import Gaussian, Laplace, Noser, Tikhonov
+from .prior.total_variation import TotalVariation
+from .streaming.imager import Imager
+from .streaming.stream import stream
+from .uncertainty import posterior
+
+__all__ = [
+    "RULES",
+    "Gaussian",
+    "Imager",
+    "Laplace",
+    "Matern",
+    "Noser",
+    "Parametrisation",
+    "Tikhonov",
+    "TotalVariation",
+    "back_projection",
+    "calibrate",
+    "choose_hyperparameter",
+    "compare_rules",
+    "greit",
+    "one_step",
+    "posterior",
+    "reconstruct",
+    "relative_noise",
+    "stream",
+]

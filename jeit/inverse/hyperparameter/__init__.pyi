@@ -1,0 +1,10 @@
+from .point_spread import best_resolution
+from .rules import discrepancy, generalised_cross_validation, l_curve, noise_figure
+
+__all__ = [
+    "best_resolution",
+    "discrepancy",
+    "generalised_cross_validation",
+    "l_curve",
+    "noise_figure",
+]

@@ -1,0 +1,23 @@
+from .arrangements import grid, perimeter, quasi_uniform, ring, ring_and_centre
+from .even_spread import spread
+from .files import read_layout, write_layout
+from .layout import Layout
+from .names import BUILT_IN, named_layout
+from .surface_csv import read_surface_layout
+from .surface_layout import SurfaceLayout
+
+__all__ = [
+    "BUILT_IN",
+    "Layout",
+    "SurfaceLayout",
+    "grid",
+    "named_layout",
+    "perimeter",
+    "quasi_uniform",
+    "read_layout",
+    "read_surface_layout",
+    "ring",
+    "ring_and_centre",
+    "spread",
+    "write_layout",
+]

@@ -1,0 +1,51 @@
+from .bisection import bisect, cut
+from .body import Body
+from .cell_quality import quality
+from .files import read, write
+from .flatness import check_flat
+from .generate.refine import Refine
+from .geometry import centroids, gradients, measures, normals
+from .gmsh import from_gmsh
+from .mesh import Mesh
+from .outline import Disk, Domain, Polygon, Rectangle
+from .shapes import disk, polygon, rectangle
+from .solid_body import OwnMesh, Solid
+from .solids import box, cylinder, layer
+from .surface import bend, cap, forearm, node_normals, shell, sphere, surface_of, tube
+
+__all__ = [
+    "Body",
+    "Disk",
+    "Domain",
+    "Mesh",
+    "OwnMesh",
+    "Polygon",
+    "Rectangle",
+    "Refine",
+    "Solid",
+    "bend",
+    "bisect",
+    "box",
+    "cap",
+    "centroids",
+    "check_flat",
+    "cut",
+    "cylinder",
+    "disk",
+    "forearm",
+    "from_gmsh",
+    "gradients",
+    "layer",
+    "measures",
+    "node_normals",
+    "normals",
+    "polygon",
+    "quality",
+    "read",
+    "rectangle",
+    "shell",
+    "sphere",
+    "surface_of",
+    "tube",
+    "write",
+]

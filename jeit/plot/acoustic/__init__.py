@@ -1,1 +1,0 @@
-"""Pictures of what microphones hear: receptive fields, maps, tracks, errors."""

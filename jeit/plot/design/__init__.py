@@ -1,1 +1,0 @@
-"""Pictures of designs: sensitivity maps, virtual taxels, electrodes on the move."""

@@ -1,1 +1,0 @@
-"""Pictures of contacts in images, and of what learnt skins say and how well they learnt."""

@@ -1,0 +1,221 @@
+"""`jeit listen`: what is heard in a recording; and `jeit listen fit`, which learns from labelled clips."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from jeit.cli.options import Quiet, check_at_least, make_folder, naming_options
+
+if TYPE_CHECKING:
+    from jeit.touch.listening import Heard
+
+
+_LOUDNESS = {"auto": None, "counts": True, "ignored": False}
+
+
+class _ByArguments(TyperCommand):
+    """A command that is called by the name of its group, and says so in its help and its errors."""
+
+    def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
+        return super().make_context(parent.info_name, args, parent=parent.parent, **extra)
+
+
+class _RecordingFirst(TyperGroup):
+    """A group whose first command needs no name: whatever begins with neither another's name nor --help is for it."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if args and args[0] != "--help" and args[0] not in self.commands:
+            args = [next(iter(self.commands)), *args]
+        return super().parse_args(ctx, args)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        next(iter(self.commands.values())).format_help(ctx, formatter)
+
+
+listen = typer.Typer(
+    name="listen",
+    cls=_RecordingFirst,
+    help="Name what is heard in a recording, every 0.1 s; 'listen fit' learns what from labelled clips.",
+)
+
+
+@listen.callback(invoke_without_command=True)
+def _top(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@listen.command("recording", cls=_ByArguments, hidden=True)
+def hear(
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            help="WAV file of one channel or many, or NPZ file with samples (M, S) and rate in hertz; FLAC, Ogg and "
+            "others where soundfile is installed.",
+            show_default=False,
+        ),
+    ],
+    model: Annotated[
+        Path,
+        typer.Option("--model", "-m", help="Folder of 'jeit listen fit', or its listener.jeit.", show_default=False),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Folder for events.csv, report.json, timeline.png.", show_default=False),
+    ],
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            "--calibration", "-c", help="File of jeit calibrate-microphones: places are then told.", show_default=False
+        ),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Name what is heard in a recording, every 0.1 s; writes events.csv, report.json and timeline.png.
+
+    What is named, a MODEL has learnt from labelled clips: see 'jeit listen fit --help'.
+    """
+    from jeit.acoustic import Calibration, Recording, read_recording
+    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.touch.listening import Listener
+    from jeit.touch.reports.listener import HEARD_FILES, write_heard
+
+    make_folder(output, HEARD_FILES)
+    console = plain_console()
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        listener = Listener.read(model)
+        known = None if calibration is None else Calibration.load(calibration)
+        sound = read_recording(recording)
+        if not isinstance(sound, Recording):
+            raise ValueError(f"{recording.name}: it holds intensities; what is heard is told from samples.")
+        step("listen")
+        heard = listener.hear(sound, calibration=known)
+        step("write")
+        write_heard(heard, output, model=str(model))
+    if not quiet:
+        _show(console, heard)
+        say_written(console, output / "events.csv", "report.json", "timeline.png")
+
+
+@listen.command()
+def fit(
+    clips: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER-BY-CLASS",
+            help="Folder with a sub-folder for each class, and clips of it in it: WAV, NPZ, or what soundfile reads. "
+            "Folders within them, such as one for each person, are held out together.",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="MODEL", help="Folder for the model.", show_default=False)
+    ],
+    method: Annotated[
+        str,
+        typer.Option(
+            help="network, paper-network, trees, spectrum or linear; auto: what is right most often of clips held out."
+        ),
+    ] = "auto",
+    loudness: Annotated[
+        str,
+        typer.Option(
+            help="counts, or ignored, so that gain does not matter; auto: counts where more clips held out are then "
+            "named right."
+        ),
+    ] = "auto",
+    batches: Annotated[
+        int | None, typer.Option(help="Batches a network is trained for, at most (default 1500).")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the random numbers that networks are drawn and trained by.")] = 0,
+    quiet: Quiet = False,
+) -> None:
+    """Learn to name sounds from labelled clips; says how well, on clips that were held out.
+
+    Writes listener.jeit, report.json and learning.png, a picture of what was taken for what, to the folder MODEL.
+    Killed and called again, it goes on where it was.
+    """
+    import shutil
+
+    import jax
+
+    from jeit.arguments import counted
+    from jeit.arguments.extras import need_extra
+    from jeit.cli.console import Steps, pairs, plain_console, say_written
+    from jeit.touch.listening import Listener, read_clips
+    from jeit.touch.listening.learners import BATCHES
+    from jeit.touch.reports.listener import LISTENER_FILES, summary, write_listener
+
+    need_extra("learn", "learning what is heard")
+    if loudness not in _LOUDNESS:
+        raise ValueError(f"--loudness must be one of {', '.join(_LOUDNESS)}; it is '{loudness}'.")
+    check_at_least({"--batches": (batches, 1), "--seed": (seed, 0)})
+    if batches is not None and method in ("trees", "spectrum", "linear"):
+        raise ValueError(f"--batches is for networks, and --method {method} has none; leave one out.")
+    if clips.resolve() in output.resolve().parents or clips.resolve() == output.resolve():
+        raise ValueError(f"--output {output} lies in the folder of clips, where it would be a class; give another.")
+    make_folder(output, LISTENER_FILES)
+    console = plain_console()
+    # Trainings on their way; gone when all is done.
+    under_way = output / "training"
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        labelled = read_clips(clips, progress=step.tell)
+        step("learn")
+        with naming_options({"method": "--method", "labels": "FOLDER-BY-CLASS"}):
+            listener = Listener.fit(
+                labelled,
+                method=method,
+                loudness=_LOUDNESS[loudness],
+                key=jax.random.key(seed),
+                batches=batches or BATCHES,
+                folder=under_way,
+                progress=step.tell,
+            )
+        step("write")
+        write_listener(listener, output)
+        shutil.rmtree(under_way, ignore_errors=True)
+    if quiet:
+        return
+    channels = counted(listener.channels, "channel")
+    rows = [
+        ("clips", f"{counted(len(labelled), 'clip')} of {len(listener.names)} classes, {channels}"),
+        ("sound", f"up to {listener.highest:g} Hz"),
+        ("loudness", "counts" if listener.loudness else "ignored"),
+        ("method", listener.method),
+        ("held out", summary(listener)),
+    ]
+    rows += [("note", note) for note in listener.notes]
+    console.print()
+    console.print(pairs(f"Learnt from {listener.name}", rows))
+    say_written(console, output / "listener.jeit", "report.json", "learning.png")
+
+
+def _show(console, heard: "Heard") -> None:
+    """The whole, and a line for each event."""
+    from rich.table import Table
+
+    from jeit.cli.console import pairs
+
+    name, probability = heard.whole
+    said = f"{name}, {100 * probability:.0f} %" if name else "nothing"
+    rows = [("windows", str(len(heard))), ("as a whole", said), *(("note", note) for note in heard.notes)]
+    console.print()
+    console.print(pairs(heard.name, rows))
+    console.print()
+    placed = heard.position is not None
+    names = ("heard", "from / s", "to / s", "sure / %", *(("x / mm", "y / mm") if placed else ()))
+    table = Table(*names, box=None, padding=(0, 2, 0, 0))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for event in heard.events:
+        where = [""] * (2 * placed) if event.place is None else [f"{1e3 * value:z.1f}" for value in event.place[:2]]
+        sure = f"{100 * event.probability:.0f}" if event.name else ""
+        table.add_row(event.name or "quiet", f"{event.start:.2f}", f"{event.end:.2f}", sure, *where)
+    console.print(table)
+    console.print()

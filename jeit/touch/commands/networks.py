@@ -1,0 +1,158 @@
+"""Frames imaged by a network on the command line: what `reconstruct` and `stream` share of it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from jeit.cli.applications import NETWORK
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Float, Int
+
+    from jeit.touch.networks import FrameDepth, ImageNetwork
+
+
+class _Given(NamedTuple):
+    """Frames of a file, volts, NaN where there is no reading, what number each has there, and the reference beside
+    them, if there is one."""
+
+    frames: "Float[np.ndarray, 'F M']"
+    numbers: "Int[np.ndarray, ' F']"
+    reference: "Float[np.ndarray, 'r M'] | None"
+
+
+def image_by_network(
+    model: Path | None,
+    given: tuple[Any, Path | None, str | None, str | None],
+    output: Path,
+    *,
+    method: str | None,
+    unused: dict[str, Any],
+    quiet: bool,
+    frame: int | str | None = None,
+    streamed: bool = False,
+) -> None:
+    """Image a file's frames, all of them where they are `streamed`, or those of standard input, "-".
+
+    `given`: data, reference, format and description: that of the skin which the network learnt, or of a measurement; a
+    table of one frame a row needs neither. `unused`: options that a network has no use for, None where they were not
+    given. Raises `ValueError` where one was, without a model or a reference, for another method, data of another skin
+    or protocol, and where no frame could be imaged.
+    """
+    import numpy as np
+
+    from jeit.arguments import counted
+    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.cli.options import make_folder
+    from jeit.cli.stopping import FramesTold, Stopping
+    from jeit.design import describes_skin, read_described_skin
+    from jeit.imaging.stream_preparation import parse_frames
+    from jeit.report.stream import PICTURES
+    from jeit.touch.networks import read_network, resting_frame, stream_depths
+    from jeit.touch.reports.image_network import DEPTH_FILES, write_depths
+
+    if method != NETWORK:
+        raise ValueError(f"--model is for --method network, not {method or 'the default'}; leave one out.")
+    if model is None:
+        raise ValueError("--method network needs --model, the folder of 'jeit learn image'.")
+    if idle := [name for name, value in unused.items() if value is not None]:
+        raise ValueError(f"--{idle[0]} has no use with --method network; leave it out.")
+    data, reference, kind, description = given
+    console = plain_console()
+    with Stopping() as stopping, Steps(console, quiet=quiet) as step:
+        make_folder(output, DEPTH_FILES)
+        step("read")
+        skin = None
+        if description is not None and describes_skin(description):
+            skin, description = read_described_skin(description), None
+        network = read_network(model, skin=skin)
+        plain = skin is not None
+        base = (
+            None
+            if reference is None
+            else _read("--reference", reference, kind, description, network, None, plain=plain)
+        )
+        still = None if base is None else base.frames
+        if data == "-":
+            frames, numbers = parse_frames(sys.stdin), None
+        else:
+            one = None if streamed else 0 if frame is None else frame
+            measured = _read("DATA", data, kind, description, network, one, plain=plain, like=reference)
+            frames, numbers, still = measured.frames, measured.numbers, measured.reference if still is None else still
+        if still is None:
+            raise ValueError("--reference: give a file of frames of the skin that nobody touches.")
+        rest = resting_frame(still, str(reference or data))
+        step("image")
+        come = FramesTold(step, None if numbers is None else len(numbers))
+
+        def show(one: "FrameDepth") -> None:
+            come.one_more()
+            if one.depth is None and not quiet:
+                console.print(f"  frame {one.number}: refused. {one.reason}", soft_wrap=True)
+
+        found = stream_depths(network, stopping.until(frames), rest)
+        if numbers is not None:
+            found = (one._replace(number=int(numbers[one.number])) for one in found)
+        drawing = stopping.before(PICTURES, step)
+        with stopping.ending(come, "frames.csv", "depth.npz"):
+            written = write_depths(found, network, output, name=str(data), progress=show, drawing=drawing)
+    if quiet:
+        return
+    deepest, latency = written.deepest, 1e3 * np.median(written.latency)
+    console.print(f"\n{counted(written.imaged, 'frame')} imaged, median {latency:.2f} ms each")
+    if deepest.depth > network.floor:
+        x, y = 1e3 * deepest.middle
+        console.print(f"deepest: {1e3 * deepest.depth:.2f} mm at ({x:.1f}, {y:.1f}) mm, in frame {deepest.number}")
+    else:
+        console.print(f"untouched: nothing is deeper than noise makes it, {1e3 * network.floor:.2g} mm")
+    say_written(console, output / "frames.csv", "depth.npz", "depth.png", "report.json")
+
+
+def _read(
+    option: str,
+    path: Path,
+    kind: str | None,
+    description: str | None,
+    network: "ImageNetwork",
+    frame: int | str | None,
+    *,
+    plain: bool,
+    like: Path | None = None,
+) -> _Given:
+    """All frames of a file, or the one asked for. A table that nothing describes has a frame a row, in the network's
+    order of channels, and so has one that is `plain`; its units and columns are those of the file that it is `like`."""
+    import numpy as np
+
+    from jeit.cli.options import read_file
+    from jeit.data import load_description, read_frame_recording, table
+    from jeit.imaging.stream_preparation import frames_of
+    from jeit.touch.networks.measured import check_measured
+
+    described = kind is not None or description is not None or table.find_description(path) is not None
+    if plain or (table.recognises(path) and not described):
+        beside = None if like is None or plain else table.find_description(like)
+        recording = read_frame_recording(path, None if beside is None else load_description(beside))
+        frames, still = recording.frames, recording.reference
+        if frames.shape[1] != network.made_for["channels"]:
+            raise ValueError(
+                f"'{path}' has {frames.shape[1]} channels, and the network was trained for "
+                f"{network.made_for['channels']}; train one for these."
+            )
+        numbers = np.arange(len(frames))
+        if frame is not None:
+            if not (isinstance(frame, int) and -len(frames) <= frame < len(frames)):
+                raise ValueError(f"--frame must be a number from 0 to {len(frames) - 1}; it is {frame!r}.")
+            numbers = numbers[[frame]]
+        return _Given(frames[numbers], numbers, still)
+    measured = read_file(option, path, kind, description)
+    check_measured(network, measured)
+    names, numbers = measured.frame_names, np.arange(measured.num_frames)
+    still = frames_of(measured.frame("reference")) if "reference" in names else None
+    frames = frames_of(measured)
+    if frame is not None:
+        frames = frames_of(measured.frame(frame))
+        numbers = numbers[[names.index(frame) if isinstance(frame, str) else frame]]
+    return _Given(frames, numbers, still)

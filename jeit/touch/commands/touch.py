@@ -1,0 +1,167 @@
+"""`jeit touch`: skins that learn from recorded presses, what they then say of frames, and gestures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jeit.cli.options import Quiet, make_folder, naming_options
+from jeit.touch.commands.touch_health import health
+from jeit.touch.commands.touch_watch import gestures, watch
+
+touch = typer.Typer(
+    name="touch",
+    help="Skins that learn, from recorded presses and without a model, where, how hard and by what they are touched; "
+    "gestures, named as they end; and damage.",
+)
+touch.command()(gestures)
+touch.command()(watch)
+touch.command()(health)
+
+
+# Of the mesh of images: contacts are told between its cells.
+_NODES = 400
+
+
+@touch.callback(invoke_without_command=True)
+def _top(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@touch.command()
+def fit(
+    presses: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PRESSES.npz",
+            help="frames (N, M); reference (M,) or (N, M) of the untouched skin; any of positions (N, 2 or 3) m, force "
+            "(N,) N, label (N,) text, touched (N, K) true for keys pressed; group (N,) (session, person); time (N,) s.",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="SKIN", help="Folder for the learnt skin.", show_default=False)
+    ],
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help="ridge, neighbours, gaussian-process, trees, forest, network, som, blend for places and forces; one "
+            "of the classifiers of labels; auto (default): what errs least on presses held out."
+        ),
+    ] = None,
+    description: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SKIN.toml",
+            help="Geometry, electrodes and protocol of the skin, if they are known: its images are then learnt from "
+            "too, and fewer presses are enough.",
+        ),
+    ] = None,
+    channels: Annotated[
+        int | None, typer.Option(help="Use only so many channels, those that tell most (default: all).")
+    ] = None,
+    per_session: Annotated[
+        bool, typer.Option("--per-session", help="Standardise the changes of each group by themselves, against drift.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Learn a skin from recorded presses; says how well, on presses that were held out, in stretches of time.
+
+    Writes skin.skops, report.json and learning.png, a picture of the errors, to the folder SKIN.
+    """
+    from jeit.arguments.extras import need_extra
+    from jeit.cli.console import Steps, pairs, plain_console, say_written
+    from jeit.data import load_description
+    from jeit.mesh import OwnMesh
+    from jeit.touch import LearntSkin, read_presses
+    from jeit.touch.reports.learnt_skin import SKIN_FILES, summary, write_learnt_skin
+
+    need_extra("learn", "learning a skin")
+    make_folder(output, SKIN_FILES)
+    console = plain_console()
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        recorded = read_presses(presses)
+        model = None
+        if description is not None:
+            described = load_description(description)
+            model = described.model(presses, num_points=None if isinstance(described.domain, OwnMesh) else _NODES)
+        step("learn")
+        with naming_options({"num_channels": "--channels", "per_session": "--per-session", "model": "--description"}):
+            skin = LearntSkin.fit(
+                recorded,
+                method=method or "auto",
+                model=model,
+                num_channels=channels,
+                per_session=per_session,
+                progress=step.tell,
+            )
+        step("write")
+        write_learnt_skin(skin, output)
+    if quiet:
+        return
+    number, width = recorded.frames.shape
+    rows = [("presses", f"{number} of {width} channels")]
+    for name, standing in skin.standing.items():
+        rows += [(f"{name}: method", standing.method), (f"{name}, held out", summary(name, standing))]
+    console.print()
+    console.print(pairs(f"Learnt from {recorded.name}", rows))
+    _print_notes(console, skin.notes)
+    say_written(console, output / "skin.skops", "report.json", "learning.png")
+
+
+@touch.command()
+def predict(
+    skin: Annotated[
+        Path, typer.Argument(metavar="SKIN", help="Folder of 'jeit touch fit', or its skin.skops.", show_default=False)
+    ],
+    frames: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FRAMES.npz",
+            help="frames (n, M); reference (M,) or (n, M) if the presses had one; group (n,) if fitted per session.",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", help="Folder for touches.csv, report.json, touches.png.", show_default=False),
+    ],
+    quiet: Quiet = False,
+) -> None:
+    """Say of each frame where, how hard and by what the skin is touched, and how sure that is."""
+    import numpy as np
+
+    from jeit.arguments import counted
+    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.touch import read_frames, read_skin
+    from jeit.touch.reports.learnt_skin import TOUCH_FILES, write_touches
+
+    make_folder(output, TOUCH_FILES)
+    console = plain_console()
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        learnt, given = read_skin(skin), read_frames(frames)
+        step("predict")
+        touches = learnt.predict(**given)
+        step("write")
+        write_touches(touches, output, skin=str(skin), name=frames.name)
+    if quiet:
+        return
+    said = [counted(len(touches), "frame"), f"{int(touches.unlike.sum())} unlike any learnt from"]
+    if touches.position is not None and touches.position_std is not None:
+        placed = np.isfinite(touches.position).all(axis=1)
+        said.append(f"{int(placed.sum())} with a place")
+        if placed.any():
+            said[-1] += f", standard deviation {1e3 * np.median(touches.position_std[placed]):.3g} mm (median)"
+    console.print("\n" + "; ".join(said))
+    _print_notes(console, touches.notes)
+    say_written(console, output / "touches.csv", "report.json", "touches.png")
+
+
+def _print_notes(console, notes) -> None:
+    for note in notes:
+        console.print(f"  note: {note}", soft_wrap=True)

@@ -1,0 +1,111 @@
+"""`jeit touch health`: whether a skin is still what it was: cuts, electrodes that fail, repair."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jeit.cli.options import Quiet, check_positive, make_folder, naming_options
+
+# Frames watched between two words of how far it is.
+_AT_ONCE = 500
+
+
+def health(
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            help="Frames of the skin to be judged: .npz with frames (F, M) and seconds (F,), or a table of them.",
+            show_default=False,
+        ),
+    ],
+    healthy: Annotated[
+        Path,
+        typer.Option(help="The same of the skin while it was healthy, with touches at best.", show_default=False),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for events.csv and health.png.", show_default=False)
+    ],
+    skin: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SKIN.toml",
+            help="Description of the skin: with its protocol electrodes are named, with geometry and electrodes too "
+            "cuts are drawn.",
+        ),
+    ] = None,
+    lowers: Annotated[
+        bool, typer.Option("--lowers", help="A touch lowers conductivity, as on hydrogel (default: it raises it).")
+    ] = False,
+    rate: Annotated[
+        float | None, typer.Option(help="Frames in a second, where no times say; else frames count.")
+    ] = None,
+    patience: Annotated[
+        float | None,
+        typer.Option(
+            help="Seconds (frames, where there are no times) that no touch is held (default 30 s, or three windows)."
+        ),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Tell cuts, failing electrodes and repair in a recording of a skin, beside one of it while it was healthy.
+
+    Writes events.csv, report.json and health.png. Nothing is asked of the skin: any number of channels, any unit.
+    """
+    import numpy as np
+
+    from jeit.arguments import counted
+    from jeit.cli.console import Steps, plain_console, say_written
+    from jeit.data import load_description, read_frame_recording
+    from jeit.touch import doubts_of, learn_health, watch
+    from jeit.touch.health.health_learning import seconds_of
+    from jeit.touch.reports.skin_health import HEALTH_FILES, write_health
+
+    check_positive(
+        {name: value for name, value in {"--rate": rate, "--patience": patience}.items() if value is not None}
+    )
+    make_folder(output, HEALTH_FILES)
+    console = plain_console()
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        with naming_options({"description": "--skin"}):
+            description = None if skin is None else load_description(skin)
+        known, judged = (read_frame_recording(path, description) for path in (healthy, recording))
+        if judged.frames.shape[1] != known.frames.shape[1]:
+            raise ValueError(
+                f"'{recording}' has {judged.frames.shape[1]} channels, and '{healthy}' {known.frames.shape[1]}: give "
+                "both of one skin."
+            )
+        if (judged.seconds is None) != (known.seconds is None) and rate is None:
+            raise ValueError("--rate: only one of the recordings says when its frames came; give the frames a second.")
+        step("learn")
+        sound = learn_health(
+            known, description, sign=-1 if lowers else 1, rate=rate, patience=patience, progress=step.tell
+        )
+        step("watch")
+        seconds = seconds_of(judged, rate)
+        times = np.arange(len(judged.frames), dtype=float) if seconds is None else seconds
+        with naming_options({"frames": f"'{recording}'"}):
+            doubts = doubts_of(sound, known, judged.frames)
+        now = sound
+        for first in range(0, len(times), _AT_ONCE):
+            step.tell(f"{first:,} of {counted(len(times), 'frame')}")
+            now = watch(now, judged.frames[first : first + _AT_ONCE], times[first : first + _AT_ONCE])
+        step("write")
+        write_health(now, times, judged.frames, output, name=recording.name, timed=seconds is not None, notes=doubts)
+    if quiet:
+        return
+    unit = "frame" if seconds is None else "s"
+    console.print(f"\n{counted(now.frames, 'frame')}: {counted(len(now.events), 'event')}")
+    for note in doubts:
+        console.print(f"  note: {note}", soft_wrap=True)
+    for one in now.events:
+        where = "" if one.electrode is None else f" {one.electrode + 1}"
+        long = "" if one.path is None else f", {1e3 * one.length:.0f} ± {1e3 * one.deviation:.0f} mm long"
+        at = f"{unit} {one.time:.0f}" if seconds is None else f"{one.time:.2f} s"
+        console.print(f"  {at}: {one.kind}{where}{long}, {one.status}. {one.reason}", soft_wrap=True)
+    if (held := now.held) is not None:
+        console.print(f"  held at the end: {held.reason}", soft_wrap=True)
+    say_written(console, output / "events.csv", "report.json", "health.png")

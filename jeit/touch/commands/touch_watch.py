@@ -1,0 +1,229 @@
+"""`jeit touch gestures` and `jeit touch watch`: gestures learnt from recordings, and named as they end."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jeit.cli.options import AsIs, Quiet, check_positive, make_folder, naming_options
+
+Skin = Annotated[
+    Path,
+    typer.Option(metavar="SKIN.toml", help="Geometry, electrodes and protocol of the skin.", show_default=False),
+]
+
+
+def gestures(
+    recordings: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RECORDINGS.npz",
+            help="n recordings, one after the other: voltages (F, M) and seconds (F,) of all frames; start (n + 1,), "
+            "where each begins among them; gesture (n,) text; person (n,), if more than one; reference (M,) and "
+            "untouched (u, M), frames of the untouched skin.",
+            show_default=False,
+        ),
+    ],
+    skin: Skin,
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="MODEL", help="Folder for the learnt gestures.", show_default=False),
+    ],
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help="logit-boost, linear-discriminant, temporal-network or another classifier; auto (default): what is "
+            "right most often of people held out."
+        ),
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Learn gestures from recordings of them; says how often they are told right, of people who were held out.
+
+    Writes gestures.skops, report.json and gestures.png, what was taken for what, to the folder MODEL.
+    """
+    from jeit.arguments.extras import need_extra
+    from jeit.cli.console import Steps, pairs, plain_console, say_written
+    from jeit.data import GestureSet, load_description
+    from jeit.touch import learn_gestures
+    from jeit.touch.reports.gestures import GESTURE_FILES, write_gestures
+
+    need_extra("learn", "learning gestures")
+    make_folder(output, GESTURE_FILES)
+    console = plain_console()
+    with Steps(console, quiet=quiet) as step:
+        step("read")
+        with naming_options({"which": "--skin", "description": "--skin"}):
+            description = load_description(skin)
+        made = GestureSet.read(recordings)
+        step("learn")
+        learnt = learn_gestures(description, made, method=method or "auto", progress=step.tell)
+        step("write")
+        write_gestures(learnt, output, name=recordings.name)
+    if quiet:
+        return
+    model, standing = learnt.model, learnt.model.standing
+    people = len(set(made.person.tolist()))
+    rows = [("recordings", f"{len(made)}, of {people} {'people' if people > 1 else 'person'}")]
+    rows += [("gestures", ", ".join(model.names)), ("classifier", f"{model.method} on {model.form}")]
+    if standing is not None:
+        right = standing.held_out == standing.right
+        by = ", ".join(f"{one} {100 * right[standing.right == one].mean():.0f}" for one in model.names)
+        rows.append(("right, held out", f"{100 * right.mean():.1f} % ({by})"))
+    rows += [("note", note) for note in model.notes]
+    console.print()
+    console.print(pairs(f"Learnt from {recordings.name}", rows))
+    say_written(console, output / "gestures.skops", "report.json", "gestures.png")
+
+
+def watch(
+    stream: Annotated[
+        str,
+        typer.Argument(
+            help="File of frames (.npz with frames and seconds, or a table), or - for standard input: a frame a line, "
+            "its voltages parted by spaces or commas (nan: no reading).",
+            show_default=False,
+        ),
+    ],
+    skin: Skin,
+    gestures: Annotated[
+        Path, typer.Option(metavar="MODEL", help="Folder of 'jeit touch gestures', or its file.", show_default=False)
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for events.csv and timeline.png.", show_default=False)
+    ],
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="File of frames of the untouched skin; else the stream's own, or how it begins."),
+    ] = None,
+    untouched: Annotated[
+        float, typer.Option(help="Seconds at the stream's beginning in which nobody touches the skin.")
+    ] = 1.0,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Frames in a second, where no times say; that of what was learnt unless given. Standard "
+            "input: the clock."
+        ),
+    ] = None,
+    patience: Annotated[
+        float, typer.Option(help="Seconds after which a touch is taken for how the skin is now.")
+    ] = 30.0,
+    quiet: Quiet = False,
+    as_is: AsIs = False,
+) -> None:
+    """Name touches as they end: when, where, which gesture, and how probable that is.
+
+    Writes events.csv and paths.csv line by line, and at the end report.json and timeline.png. Of standard input a line
+    is printed with the first frame after a touch; where that goes on within 100 ms it is named anew. Ctrl-C and
+    SIGTERM end it, and all is written.
+    """
+    from dataclasses import replace
+
+    from jeit.arguments.extras import need_extra
+    from jeit.cli.console import Steps, plain_console
+    from jeit.cli.live_frames import LiveFrames
+    from jeit.cli.stopping import Stopping
+    from jeit.data import load_description, read_frame_recording
+    from jeit.imaging.stream_preparation import parse_frames
+    from jeit.touch import GestureModel, TouchImages, TouchWatch
+    from jeit.touch.gestures.touch_images import TOUCH_IMAGES
+    from jeit.touch.reports.touch_watch import WATCH_FILES, write_watch
+
+    need_extra("learn", "naming gestures")
+    check_positive({"--untouched": untouched, "--patience": patience} | ({} if rate is None else {"--rate": rate}))
+    console = plain_console()
+    with Stopping() as stopping:
+        make_folder(output, WATCH_FILES)
+        with Steps(console, quiet=quiet) as step:
+            step("read")
+            with naming_options({"description": "--skin"}):
+                description = load_description(skin)
+            model = GestureModel.read(gestures)
+            still = None if reference is None else read_frame_recording(reference, description).frames
+            usual = 60.0 if model.reading is None else model.reading.rate
+            live = None
+            if stream == "-":
+                live = LiveFrames(parse_frames(sys.stdin), rate, usual)
+                if still is None:
+                    step(f"untouched, for {untouched:g} s")
+                    still = live.untouched(untouched)
+                frames, own = live, live.rate_seen
+            else:
+                frames, still, own = _recorded(Path(stream), description, still, untouched, rate or usual)
+            step("prepare")
+            images = TouchImages.prepare(description, still, replace(TOUCH_IMAGES, as_is=as_is), progress=step.tell)
+            watch = TouchWatch.create(images, model, still, rate=own, patience=patience)
+        for note in () if quiet else watch.notes:
+            console.print(f"  note: {note}", soft_wrap=True)
+
+        if live is not None and not quiet:
+            console.print("  ready: the skin may be touched")
+
+        def show(one) -> None:
+            if one.note and not quiet:
+                console.print(f"  note: {one.note}", soft_wrap=True)
+            # Live, a touch is named with the first frame that has none; of a file it is told once, as in the end.
+            told = one.ended if stream != "-" else () if one.named is None else (one.named,)
+            for touch in () if quiet else told:
+                console.print(_line(touch))
+
+        written = write_watch(watch.follow(stopping.until(frames)), watch, output, name=stream, progress=show)
+    if not quiet:
+        _say(console, written, live, output)
+    if stopping.signal == signal.SIGTERM:
+        raise typer.Exit(128 + signal.SIGTERM)
+
+
+def _say(console, written, live, output: Path) -> None:
+    """What was told, in sum."""
+    import numpy as np
+
+    from jeit.arguments import counted
+    from jeit.cli.console import say_written
+
+    said = ", ".join(f"{number} {status}" for status, number in sorted(written.counts.items()))
+    unlike = sum(one.unlike for one in written.touches)
+    console.print(f"\n{counted(len(written.seconds), 'frame')}: {said}")
+    console.print(f"{counted(len(written.touches), 'touch')}, {unlike} of them unlike any learnt from")
+    if written.latency.size:
+        middle, high = 1e3 * np.quantile(written.latency, (0.5, 0.99))
+        console.print(f"named within {middle:.1f} ms of the frame after (median), 99 % within {high:.1f} ms")
+    if live is not None and live.left_out:
+        console.print(f"{counted(live.left_out, 'frame')} left out that had come before they could be read")
+    if written.first_reason:
+        console.print(f"first refusal: {written.first_reason}", soft_wrap=True)
+    say_written(console, output / "events.csv", "paths.csv", "report.json", "timeline.png")
+
+
+def _recorded(path: Path, description, still, span: float, rate: float):
+    """Frames of a file with their seconds, those of the untouched skin, and the rate."""
+    import numpy as np
+
+    from jeit.data import read_frame_recording
+    from jeit.touch import untouched_frames
+
+    recording = read_frame_recording(path, description)
+    seconds = recording.seconds
+    if seconds is None:
+        seconds = np.arange(len(recording.frames)) / rate
+    elif len(seconds) > 1 and np.median(np.diff(seconds)) > 0:
+        rate = 1 / float(np.median(np.diff(seconds)))
+    if still is None:
+        with naming_options({"untouched": "--untouched"}):
+            still = untouched_frames(recording, seconds, span)
+    return zip(seconds.tolist(), recording.frames, strict=True), still, rate
+
+
+def _line(one) -> str:
+    course = one.touch.course
+    x, y = 1e3 * course.centroid[int(course.peak.argmax())]
+    name = "unlike any" if one.unlike else f"{one.gesture:<12}{100 * one.probability:3.0f} %"
+    name += ", held" if one.held else ", cut off" if one.touch.cut_off else ""
+    return (
+        f"  {one.touch.onset:8.2f} s  {one.touch.offset - one.touch.onset:5.2f} s  {name:<18} ({x:+.0f}, {y:+.0f}) mm"
+    )

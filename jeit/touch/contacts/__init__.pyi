@@ -1,0 +1,21 @@
+from .cell_finder import CellFinder
+from .contact import Contact
+from .finder import find_contacts
+from .image_noise import ImageNoise
+from .load_calibration import Load, LoadCalibration
+from .raster_finder import RasterFinder, RasterStages
+from .tracker import ContactTracker, TouchPath, track_contacts
+
+__all__ = [
+    "CellFinder",
+    "Contact",
+    "ContactTracker",
+    "ImageNoise",
+    "Load",
+    "LoadCalibration",
+    "RasterFinder",
+    "RasterStages",
+    "TouchPath",
+    "find_contacts",
+    "track_contacts",
+]

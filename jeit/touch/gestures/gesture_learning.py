@@ -1,0 +1,105 @@
+"""From recorded gestures of a skin to a model that tells them: imaged, cut into touches, learnt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.arguments import check_kind, check_name, counted
+from jeit.data import GestureSet
+from jeit.data.description import Description
+from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, find_touches
+from jeit.touch.gestures.gesture_model import METHODS, check_labels
+from jeit.touch.gestures.reading import Reading
+from jeit.touch.gestures.touch_images import TouchImages
+
+# Recordings from which it is told whether touches raise conductivity or lower it, at most.
+_SIGNED = 60
+
+
+@dataclass(frozen=True)
+class LearntGestures:
+    """A `model`, the `images` it was learnt from, and the numbers of the recordings without a touch, `untold`."""
+
+    model: GestureModel
+    images: TouchImages
+    untold: tuple[int, ...]
+
+
+def learn_gestures(
+    description: Description,
+    recordings: GestureSet,
+    *,
+    method: str = "auto",
+    form: str = "auto",
+    progress: Callable[[str], None] | None = None,
+) -> LearntGestures:
+    """Learn the gestures of a described skin from recordings of them. Of each, the touch that lasts longest is taken.
+
+    `method` and `form` as in `GestureModel.fit`; `progress` is called with how far it is. Raises `ValueError` as
+    `TouchImages.prepare` and `GestureModel.fit` do, and where most recordings have no touch.
+    """
+    check_kind("recordings", recordings, GestureSet, "a GestureSet, as of GestureSet.read(path)")
+    tell = progress or (lambda said: None)
+    check_name("method", method, METHODS)
+    check_labels(recordings.gesture)
+    images = TouchImages.prepare(description, recordings.reference[None], progress=tell)
+    still = images.changes(recordings.untouched)
+    level, sign = _level_and_sign(images, still, recordings)
+    touches: list[StreamTouch] = []
+    kept, untold = [], []
+    for number, (seconds, changes) in enumerate(_imaged(images, recordings, range(len(recordings)))):
+        if number % 50 == 0:
+            tell(f"images: recording {number} of {len(recordings)}")
+        found = find_touches(level, seconds, sign * changes) if len(seconds) else []
+        if found:
+            touches.append(max(found, key=lambda one: one.offset - one.onset))
+            kept.append(number)
+        else:
+            untold.append(number)
+    if len(untold) > len(kept):
+        raise ValueError(
+            f"recordings: {len(untold)} of {len(recordings)} have no touch that exceeds the untouched skin's noise and "
+            "drift; touch more firmly, or record the untouched skin just before."
+        )
+    rate = 1 / float(np.median([np.median(np.diff(one.course.seconds)) for one in touches if len(one.course) > 1]))
+    protocol = images.calibration.model.protocol
+    model = GestureModel.fit(
+        touches,
+        recordings.gesture[kept],
+        people=recordings.person[kept],
+        method=method,
+        form=form,
+        reading=Reading(level.level, images.background, sign, rate, images.num_channels, protocol.name),
+        notes=(f"{counted(len(untold), 'recording')} without a touch left out.",) if untold else (),
+        progress=tell,
+    )
+    return LearntGestures(model, images, tuple(untold))
+
+
+def _level_and_sign(images: TouchImages, still: np.ndarray, recordings: GestureSet) -> tuple[TouchLevel, int]:
+    """Whichever sign touches exceed their level with by more, and that level."""
+    some = np.unique(np.linspace(0, len(recordings) - 1, min(_SIGNED, len(recordings))).astype(int))
+    changes = [one for _, one in _imaged(images, recordings, some.tolist())]
+    found = []
+    for sign in (1, -1):
+        level = TouchLevel.of_untouched(images.mesh, sign * still)
+        exceeds = [np.nanmax(sign * one) / level.level for one in changes if np.isfinite(one).any()]
+        found.append((float(np.median(exceeds)) if exceeds else 0.0, level, sign))
+    return max(found, key=lambda one: one[0])[1:]
+
+
+def _imaged(
+    images: TouchImages, recordings: GestureSet, which: Sequence[int]
+) -> Iterator[tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T m"]]]:
+    """Times and changes of these recordings, by one stream."""
+    frames = (frame for one in which for frame in recordings.recording(one)[1])
+    found = images.stream(frames)
+    for one in which:
+        seconds, _ = recordings.recording(one)
+        own = [change for _, change in islice(found, len(seconds))]
+        yield seconds, np.array(own).reshape(len(seconds), images.mesh.num_cells)

@@ -1,0 +1,25 @@
+from .drawing import drawn_map
+from .map_file import read_map, write_map
+from .placed_map import PlacedMap
+from .quality import MapQuality, map_quality
+from .self_organising_map import SelfOrganisingMap, fit_maps
+from .settling import learning_curves, time_constant
+from .several_touches import MapTouch, neuron_shares, touches_told
+from .training import Schedule
+
+__all__ = [
+    "MapQuality",
+    "MapTouch",
+    "PlacedMap",
+    "Schedule",
+    "SelfOrganisingMap",
+    "drawn_map",
+    "fit_maps",
+    "learning_curves",
+    "map_quality",
+    "neuron_shares",
+    "read_map",
+    "time_constant",
+    "touches_told",
+    "write_map",
+]

@@ -1,0 +1,31 @@
+from .contact_stages import plot_contact_stages
+from .contacts import plot_contacts
+from .depth_map import plot_depth_map, plot_losses
+from .health import plot_health
+from .health_course import plot_health_course
+from .heard import plot_heard
+from .kohonen_map import plot_map
+from .learning import plot_confusion, plot_force_errors, plot_key_errors, plot_place_errors, plot_tried
+from .timeline import plot_changes, plot_timeline, plot_touch_paths
+from .touches import plot_answers, plot_places
+
+__all__ = [
+    "plot_answers",
+    "plot_changes",
+    "plot_confusion",
+    "plot_contact_stages",
+    "plot_contacts",
+    "plot_depth_map",
+    "plot_force_errors",
+    "plot_health",
+    "plot_health_course",
+    "plot_heard",
+    "plot_key_errors",
+    "plot_losses",
+    "plot_map",
+    "plot_place_errors",
+    "plot_places",
+    "plot_timeline",
+    "plot_touch_paths",
+    "plot_tried",
+]

@@ -1,0 +1,175 @@
+"""Named touches in time, a lane for each gesture beneath the change that they made; and their paths on the skin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_kind
+from jeit.electrodes import AbstractElectrodes
+from jeit.mesh import Mesh
+from jeit.plot.axes import (
+    INK,
+    SERIES_COLOURS,
+    SOFT,
+    axes_or_new,
+    bare,
+    draw_scale_bar,
+    extent_of,
+    prefixed,
+    soften_axes,
+)
+from jeit.plot.imaging.electrodes import draw_electrodes
+from jeit.plot.imaging.mesh import draw_outline
+from jeit.touch.gestures.touch_watch import NamedTouch
+
+# A curve is broken where nothing came for so many times the usual; points of a curve, at most; the shortest bar, of the
+# whole time; touches that are numbered, at most.
+_UNSEEN, _POINTS, _SHORTEST, _NUMBERED = 10.0, 3000, 0.003, 60
+_UNLIKE = "#b9bdc4"
+
+
+def plot_changes(
+    seconds: ArrayLike,
+    peaks: ArrayLike,
+    level: float,
+    *,
+    unit: str = "S",
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the greatest change (F,) of frames at `seconds` (F,), and the level that a touch exceeds, both in `unit`.
+
+    Frames that were refused, NaN, leave gaps. Raises `ValueError` for shapes that disagree.
+    """
+    when, values = np.asarray(seconds, float), np.asarray(peaks, float)
+    if when.shape != values.shape or when.ndim != 1:
+        raise ValueError(f"peaks have shape {values.shape} and seconds {when.shape}; give one of each for every frame.")
+    ax = axes_or_new(ax, (9.0, 2.6))
+    factor, name = prefixed(float(np.nanmax(values, initial=level)), unit)
+    ax.plot(*_thinned(*_broken(when, factor * values)), color=INK, linewidth=0.8)
+    ax.axhline(factor * level, color=SOFT, linewidth=1, linestyle=(0, (4, 3)))
+    ax.text(1, factor * level, " level", color=SOFT, fontsize=8, va="center", transform=ax.get_yaxis_transform())
+    ax.set_ylabel(f"Greatest change ({name})", color=INK)
+    ax.set_ylim(bottom=min(0.0, factor * float(np.nanmin(values, initial=0.0))))
+    soften_axes(ax)
+    if title is not None:
+        ax.set_title(title)
+    return ax
+
+
+def plot_timeline(
+    touches: Sequence[NamedTouch], names: Sequence[str], *, title: str | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw named touches from onset to end, in the lane of the gesture that each was told to be: the fainter, the less
+    probable; what is unlike any that was learnt in a lane of its own. `names` (C,) of the gestures.
+
+    Raises `ValueError` for what are no named touches.
+    """
+    check_named(touches)
+    ax = axes_or_new(ax, (9.0, 2.6))
+    lanes = [*names, *(["unlike any"] if any(one.unlike for one in touches) else [])]
+    ends = [one.touch.offset for one in touches]
+    span = max(ends, default=1.0) - min((one.touch.onset for one in touches), default=0.0)
+    for one in touches:
+        lane = len(names) if one.unlike else lanes.index(one.gesture)
+        length = max(one.touch.offset - one.touch.onset, _SHORTEST * span)
+        bar = Rectangle(
+            (one.touch.onset, lane - 0.36),
+            length,
+            0.72,
+            color=gesture_colour(one, names),
+            alpha=_alpha(one),
+            linewidth=0,
+        )
+        ax.add_patch(bar)
+        if not one.touch.whole:
+            ax.plot(
+                one.touch.offset if one.touch.cut_off else one.touch.onset, lane, marker="|", color=INK, markersize=14
+            )
+        if len(touches) <= _NUMBERED:
+            where = (one.touch.onset + length / 2, lane - 0.42)
+            ax.annotate(f"{one.number}", where, (0, 1), textcoords="offset points", ha="center", color=INK, fontsize=7)
+    ax.set_yticks(range(len(lanes)), lanes)
+    ax.set_ylim(len(lanes) - 0.4, -0.75)
+    ax.autoscale_view(scaley=False)
+    ax.set_xlabel("Time (s)", color=INK)
+    soften_axes(ax)
+    if title is not None:
+        ax.set_title(title)
+    return ax
+
+
+def plot_touch_paths(
+    mesh: Mesh,
+    touches: Sequence[NamedTouch],
+    names: Sequence[str],
+    electrodes: AbstractElectrodes | None = None,
+    *,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the skin and where touches went, each a line from a dot where it began, in the colour of its gesture, with
+    its number.
+
+    Raises `ValueError` for what are no named touches.
+    """
+    check_named(touches)
+    ax = axes_or_new(ax)
+    extent = extent_of(np.asarray(mesh.points))
+    draw_outline(mesh, ax)
+    if electrodes is not None:
+        draw_electrodes(mesh, electrodes, numbers=False, ax=ax)
+    for one in touches:
+        place = one.touch.course.centroid
+        place = place[np.isfinite(place).all(axis=1)]
+        if len(place):
+            colour = gesture_colour(one, names)
+            ax.plot(*place.T, color=colour, linewidth=1.4, alpha=_alpha(one), zorder=3)
+            ax.plot(*place[0], marker="o", markersize=4.5, color=colour, alpha=_alpha(one), markeredgewidth=0, zorder=4)
+            if len(touches) <= _NUMBERED:
+                ax.annotate(
+                    f"{one.number}", place[0], (4, 2), textcoords="offset points", color=INK, fontsize=7, zorder=5
+                )
+    bare(ax, extent)
+    draw_scale_bar(ax, extent)
+    if title is not None:
+        ax.set_title(title)
+    return ax
+
+
+def gesture_colour(one: NamedTouch, names: Sequence[str]) -> str:
+    """Of its gesture; grey for what is unlike any."""
+    return _UNLIKE if one.unlike else SERIES_COLOURS[list(names).index(one.gesture) % len(SERIES_COLOURS)]
+
+
+def check_named(touches) -> None:
+    """Raises `ValueError` for what are no named touches."""
+    check_kind("touches", touches, (list, tuple), "a list of named touches, as TouchWatch.follow gives them")
+    for number, one in enumerate(touches):
+        check_kind(f"touches[{number}]", one, NamedTouch, "a NamedTouch")
+
+
+def _alpha(one: NamedTouch) -> float:
+    return 1.0 if one.unlike else 0.35 + 0.65 * one.probability
+
+
+def _broken(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """With NaN wherever no frame came for long."""
+    passed = np.diff(when)
+    gaps = 1 + np.flatnonzero(passed > _UNSEEN * np.median(passed)) if passed.size else np.zeros(0, int)
+    return np.insert(when, gaps, when[gaps]), np.insert(values, gaps, np.nan)
+
+
+def _thinned(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A curve of no more points than can be seen, with its extremes."""
+    if len(when) <= _POINTS:
+        return when, values
+    parts = np.array_split(np.arange(len(when)), _POINTS // 2)
+    filled = np.where(np.isfinite(values), values, 0.0)
+    rows = np.unique([part[at] for part in parts for at in (filled[part].argmin(), filled[part].argmax())])
+    return when[rows], values[rows]

@@ -1,0 +1,231 @@
+"""What is left of learning to image, and of the frames that a network imaged, in folders."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jeit.arguments import counted
+from jeit.files import clear_unfinished, written_whole
+from jeit.report.describe import plain, version_of
+from jeit.report.folder import results, results_folder, write_json
+from jeit.report.growing import GrowingRows, GrowingTable, Sample, saying_what_is_left
+from jeit.report.stream import PICTURES
+from jeit.touch.networks import ImageNetwork, LearntImages
+from jeit.touch.networks.measured import FrameDepth
+from jeit.touch.networks.places import centroids_of
+from jeit.touch.simulate.contact.indent_sets import pixel_places
+
+LEARNT_FILES = ("network.jeit", "report.json", "learning.png")
+DEPTH_FILES = ("frames.csv", "depth.npz", "depth.png", "report.json")
+_PACKAGES = ("jeit", "jax", "equinox", "optax", "numpy")
+# Maps that are drawn, at most.
+_DRAWN = 6
+# Numbers of refused frames that a report lists, at most.
+_LISTED = 1000
+
+
+def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
+    """Write `report.json` and the picture `learning.png`, beside the network that `learn_images` wrote.
+
+    Raises `ValueError` for what cannot be a folder.
+    """
+    with results(folder, LEARNT_FILES) as made:
+        write_json(report_learnt_images(learnt), made / "report.json")
+        draw_learnt_images(learnt).savefig(made / "learning.png", dpi=130)
+
+
+def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
+    """How well a network learnt to image, as plain numbers, strings, lists and dictionaries."""
+    network = learnt.network
+    trainings = {
+        name: {
+            "ended": one.reason,
+            "batches": one.course.steps[-1],
+            "best_batches": one.course.steps[one.course.best],
+            "best_loss_held_out": one.course.validation[one.course.best],
+            "loss_held_out": one.course.validation,
+            "loss": one.course.training,
+        }
+        for name, one in learnt.courses.items()
+    }
+    return plain(
+        {
+            "design": network.design,
+            "made_for": network.made_for,
+            "map": {"shape": network.shape, "extent_m": network.extent, "thickness_m": network.thickness},
+            "relative_noise": network.noise,
+            "share_of_squared_depth_explained": learnt.standing.explained,
+            "error_of_a_ball_m": learnt.standing.place,
+            "depth_of_a_ball_told": learnt.standing.deepest,
+            "trainings": trainings,
+            "seconds": learnt.seconds,
+            "versions": {package: version_of(package) for package in _PACKAGES},
+        }
+    )
+
+
+def draw_learnt_images(learnt: LearntImages):
+    """Losses, and maps of touches that nothing was learnt from, right above and told below; a matplotlib `Figure` that
+    needs no display."""
+    from matplotlib.figure import Figure
+
+    from jeit.touch.plots import plot_depth_map, plot_losses
+
+    right, told = learnt.standing.right, learnt.standing.told
+    figure = Figure(figsize=(3 + 2.6 * (len(right) + 1), 5.4), layout="constrained")
+    parts = figure.subfigures(1, 2, width_ratios=(4.4, 2.6 * max(len(right), 1)), squeeze=False)
+    losses, maps = parts[0]
+    plot_losses(learnt.courses, ax=losses.subplots())
+    panels = maps.subplots(2, len(right), squeeze=False)
+    thickness = learnt.network.thickness
+    most = thickness * float(right.max())
+    for row, (name, some) in zip(panels, (("right", right), ("told", told)), strict=True):
+        for ax, one in zip(row, some, strict=True):
+            plot_depth_map(thickness * one, learnt.network.extent, most=most, colour_bar=ax is row[-1], ax=ax)
+        row[0].set_title(name)
+    return figure
+
+
+class DeepestFrame(NamedTuple):
+    """The number of a frame in its file, how deep, metres, and where the middle of that is, (2,) metres, NaN where
+    nothing is deeper than noise makes it."""
+
+    number: int
+    depth: float
+    middle: Float[np.ndarray, "2"]
+
+
+@dataclass(frozen=True)
+class WrittenDepths:
+    """What `write_depths` has written: the `number` of frames, how many were `imaged`, the `deepest`, and the `latency`
+    in seconds of those that were imaged, (K,), of many frames some of them, evenly chosen."""
+
+    number: int
+    imaged: int
+    deepest: DeepestFrame
+    latency: Float[np.ndarray, " K"]
+
+
+def write_depths(
+    found: Iterable[FrameDepth],
+    network: ImageNetwork,
+    folder: str | Path,
+    *,
+    name: str,
+    progress: Callable[[FrameDepth], None] | None = None,
+    drawing: Callable[[str], None] | None = None,
+) -> WrittenDepths:
+    """Write what a network told of the frames `name`: `frames.csv`, a line for each as it comes: `x_m`, `y_m`, the
+    middle of what is deepest, and `depth_m`, how deep; and at the end `depth.npz` with all maps; `depth.png`;
+    `report.json`. There may be any number of frames: their maps grow on the disk, not in memory.
+
+    `found`: those of `stream_depths`. Maps of frames that were refused are NaN; where nothing is deeper than noise
+    makes it, there is no middle. `progress` is called with every frame, and `drawing` as by `write_stream`. Each file
+    is whole, or not there. Raises `ValueError` for what cannot be a folder, and, leaving no file, where no frame was
+    imaged; `OSError` on a full disk.
+    """
+    where = results_folder(folder, DEPTH_FILES)
+    for earlier in DEPTH_FILES[1:]:
+        (where / earlier).unlink(missing_ok=True)  # would not go with these frames
+    clear_unfinished(where)
+    tell = drawing or (lambda said: None)
+    with GrowingRows(where, network.shape) as rows:
+        told = _Told(network)
+        with GrowingTable(where / "frames.csv", ("frame", "x_m", "y_m", "depth_m")) as table:
+            for one in found:
+                line, depth = told.take(one)
+                with saying_what_is_left(rows):
+                    table.write(line)
+                    rows.append(depth)
+                if progress is not None:
+                    progress(one)
+        if not told.imaged:
+            (where / "frames.csv").unlink()
+            reason = told.first_reason or "there is none"
+            raise ValueError(
+                f"'{name}': {counted(rows.number, 'frame')}, and none could be imaged; the first: {reason}"
+            )
+        tell("images")
+        with saying_what_is_left(rows):
+            extent = np.array(network.extent)
+            rows.write_npz(where / "depth.npz", "depth", {"extent": extent}, lambda far: tell(f"images: {far}"))
+        with results(where, ("report.json",)) as made:
+            write_json(told.report(name, rows.number), made / "report.json")
+        tell(PICTURES[0])
+        row, number = told.row.values().astype(int), told.number.values().astype(int)
+        chosen = np.unique(np.linspace(0, len(row) - 1, _DRAWN).round().astype(int))
+        with written_whole(where / "depth.png") as file:
+            _draw_depths(rows.read(row[chosen]), number[chosen], told.deepest.depth, network).savefig(file, dpi=130)
+        return WrittenDepths(rows.number, told.imaged, told.deepest, told.latency.values())
+
+
+class _Told:
+    """What is kept of the frames that a network imaged, whose number may be any."""
+
+    def __init__(self, network: ImageNetwork):
+        self.network, self._places = network, pixel_places(network.extent, network.shape)
+        self._nothing = np.full(network.shape, np.nan)
+        self.imaged, self.number_refused, self.first_reason = 0, 0, ""
+        self.refused: list[int] = []
+        self.row, self.number, self.latency = Sample(), Sample(), Sample()
+        self.deepest = DeepestFrame(-1, -np.inf, np.full(2, np.nan))
+
+    def take(self, one: FrameDepth) -> tuple[list[object], Float[np.ndarray, "rows columns"]]:
+        """The line of a frame in the table, and its map."""
+        if one.depth is None:
+            self.number_refused += 1
+            self.first_reason = self.first_reason or one.reason
+            self.refused += [one.number] if len(self.refused) < _LISTED else []
+            return [one.number, "", "", ""], self._nothing
+        for sample, value in ((self.row, self.imaged + self.number_refused), (self.number, one.number)):
+            sample.append(value)
+        self.latency.append(one.latency)
+        self.imaged += 1
+        depth = float(one.depth.max())
+        middle = centroids_of(one.depth[None], self._places)[0]
+        if not depth > self.network.floor:
+            middle = np.full(2, np.nan)
+        if depth > self.deepest.depth:
+            self.deepest = DeepestFrame(one.number, depth, middle)
+        said = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*middle, depth)]
+        return [one.number, *said], one.depth
+
+    def report(self, name: str, number: int) -> dict[str, Any]:
+        """As plain numbers, strings, lists and dictionaries."""
+        network = self.network
+        return plain(
+            {
+                "frames": name,
+                "number": number,
+                "refused": self.refused,
+                "number_refused": self.number_refused,
+                "design": network.design,
+                "map": {"shape": network.shape, "extent_m": network.extent},
+                "deepest_m": self.deepest.depth,
+                "depth_by_noise_alone_m": network.floor,
+                "units": {"length": "m"},
+                "versions": {package: version_of(package) for package in _PACKAGES},
+            }
+        )
+
+
+def _draw_depths(
+    maps: Float[np.ndarray, "k rows columns"], numbers: Int[np.ndarray, " k"], deepest: float, network: ImageNetwork
+):
+    from matplotlib.figure import Figure
+
+    from jeit.touch.plots import plot_depth_map
+
+    figure = Figure(figsize=(4.2 * len(maps), 4.2), layout="constrained")
+    # What noise alone makes of the untouched skin is not stretched over the colours.
+    most = max(deepest, 4 * network.floor)
+    for ax, one, number in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, numbers, strict=True):
+        last = number == numbers[-1]
+        plot_depth_map(one, network.extent, most=most, colour_bar=last, title=f"frame {number}", ax=ax)
+    return figure

@@ -1,0 +1,162 @@
+"""What is left of a listener, and of what it heard in a recording, in folders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jeit.report.describe import plain, version_of
+from jeit.report.folder import results, write_json, write_rows
+from jeit.touch.listening import Heard, Listener
+from jeit.touch.listening.feature_images import EVERY, LENGTH
+
+LISTENER_FILES = ("listener.jeit", "report.json", "learning.png")
+HEARD_FILES = ("events.csv", "report.json", "timeline.png")
+_PACKAGES = ("jeit", "jax", "numpy", "scipy", "scikit-learn")
+
+
+def write_listener(listener: Listener, folder: str | Path) -> None:
+    """Write `listener.jeit`, `report.json` and the picture `learning.png` into `folder`, made if need be.
+
+    Raises `ValueError` for what cannot be a folder.
+    """
+    with results(folder, LISTENER_FILES) as made:
+        listener.write(made / "listener.jeit")
+        write_json(report_listener(listener), made / "report.json")
+        draw_listener(listener).savefig(made / "learning.png", dpi=150)
+
+
+def write_heard(heard: Heard, folder: str | Path, *, model: str) -> None:
+    """Write `events.csv`, `report.json` and the picture `timeline.png` of what the listener `model` heard into
+    `folder`, made if need be.
+
+    The table has a line for each window, every 0.1 s: `time_s`, its middle; `heard`, the likeliest name, empty where it
+    is quiet; its `probability`, and those of all names, `p_…`; the loudest `microphone`, from 0; and where places were
+    told, `x_m`, `y_m` (`z_m`) and `std_x_m` …, empty where there is none. Raises `ValueError` for what cannot be a
+    folder.
+    """
+    columns = _columns(heard)
+    with results(folder, HEARD_FILES) as made:
+        write_rows(made / "events.csv", list(columns), zip(*columns.values(), strict=True))
+        write_json(report_heard(heard, model=model), made / "report.json")
+        draw_heard(heard).savefig(made / "timeline.png", dpi=150)
+
+
+def report_listener(listener: Listener) -> dict[str, Any]:
+    """How well a listener learnt, as plain numbers, strings, lists and dictionaries."""
+    standing, held_out = listener.standing, None
+    if standing is not None:
+        right = standing.held_out == standing.right
+        held_out = {
+            "clips": len(right),
+            "right": right.mean(),
+            "right_by_chance": 1 / len(listener.names),
+            "right_of_each": {name: right[standing.right == name].mean() for name in np.unique(standing.right)},
+            "tried": [{"method": name, "right": 1 - error} for name, error in standing.tried],
+        }
+    return plain(
+        {
+            "clips": listener.name,
+            "classes": list(listener.names),
+            "method": listener.method,
+            "channels": listener.channels,
+            "highest_frequency_Hz": listener.highest,
+            "loudness_counts": listener.loudness,
+            "held_out": held_out,
+            "notes": list(listener.notes),
+            "versions": {package: version_of(package) for package in _PACKAGES},
+        }
+    )
+
+
+def report_heard(heard: Heard, *, model: str) -> dict[str, Any]:
+    """All that was heard, as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    whole, probability = heard.whole
+    told, counts = np.unique(heard.told, return_counts=True)
+    events = [
+        {
+            "heard": one.name or None,
+            "from_s": one.start,
+            "to_s": one.end,
+            "probability": one.probability if one.name else None,
+            "mean_position_m": one.place,
+        }
+        for one in heard.events
+    ]
+    return plain(
+        {
+            "recording": heard.name,
+            "model": model,
+            "windows": len(heard),
+            "window_s": LENGTH,
+            "every_s": EVERY,
+            "whole": {"heard": whole or None, "probability": probability if whole else None},
+            "windows_of_each": {name or "quiet": count for name, count in zip(told, counts, strict=True)},
+            "events": events,
+            "notes": list(heard.notes),
+            "units": {"length": "m", "time": "s"},
+            "versions": {package: version_of(package) for package in _PACKAGES},
+        }
+    )
+
+
+def summary(listener: Listener) -> str:
+    """How well it learnt, in a line."""
+    standing = listener.standing
+    if standing is None:
+        return "not known: nothing could be held out"
+    right = 100 * np.mean(standing.held_out == standing.right)
+    tried = ", ".join(f"{name} {100 * (1 - error):.1f} %" for name, error in standing.tried)
+    return f"{right:.1f} % of {len(standing.right)} clips right; tried: {tried}"
+
+
+def draw_listener(listener: Listener):
+    """What was taken for what, as a matplotlib `Figure` that needs no display."""
+    from matplotlib.figure import Figure
+
+    from jeit.touch.plots import plot_confusion
+
+    figure = Figure(figsize=(5.8, 5.2), layout="constrained")
+    ax = figure.subplots()
+    if listener.standing is None:
+        ax.set_axis_off()
+        ax.set_title("No clips could be held out")
+        return figure
+    right = 100 * np.mean(listener.standing.held_out == listener.standing.right)
+    number = len(listener.standing.right)
+    plot_confusion(
+        listener.standing, title=f"{listener.method}: {right:.1f} % of {number} clips held out are told right", ax=ax
+    )
+    return figure
+
+
+def draw_heard(heard: Heard):
+    """The timeline, as a matplotlib `Figure` that needs no display."""
+    from matplotlib.figure import Figure
+
+    from jeit.touch.plots import plot_heard
+
+    figure = Figure(figsize=(8.0, max(2.4, 1.4 + 0.28 * len(heard.names))), layout="constrained")
+    plot_heard(heard, ax=figure.subplots())
+    return figure
+
+
+def _columns(heard: Heard) -> dict[str, list]:
+    columns: dict[str, list] = {
+        "time_s": [f"{time:.4f}" for time in heard.times],
+        "heard": heard.told.tolist(),
+        "probability": _texts(heard.probability),
+        **{f"p_{name}": _texts(own) for name, own in zip(heard.names, heard.probabilities.T, strict=True)},
+        "microphone": heard.strongest.tolist(),
+    }
+    if heard.position is not None and heard.position_std is not None:
+        axes = "xyz"[: heard.position.shape[1]]
+        columns |= {f"{axis}_m": _texts(own) for axis, own in zip(axes, heard.position.T, strict=True)}
+        columns |= {f"std_{axis}_m": _texts(own) for axis, own in zip(axes, heard.position_std.T, strict=True)}
+    return columns
+
+
+def _texts(values: np.ndarray) -> list[str]:
+    return [f"{value:.6g}" if np.isfinite(value) else "" for value in values]

@@ -1,0 +1,118 @@
+"""What became of a watched skin, in a folder: its events, a report, and a picture of them in time and on the skin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.report.describe import plain, version_of
+from jeit.report.folder import results, write_json, write_rows
+from jeit.touch.health import HealthEvent, SkinHealth
+
+HEALTH_FILES = ("events.csv", "report.json", "health.png")
+_PACKAGES = ("jeit", "jax", "numpy", "scipy")
+_EVENTS = (
+    "event", "kind", "status", "time", "told", "frame", "electrode", "channels", "strength", "length_m",
+    "length_deviation_m", "path_m", "reason",
+)  # fmt: skip
+
+
+def write_health(
+    health: SkinHealth,
+    times: Float[np.ndarray, " F"],
+    frames: Float[np.ndarray, "F M"],
+    folder: str | Path,
+    *,
+    name: str = "recording",
+    timed: bool = True,
+    notes: Sequence[str] = (),
+) -> None:
+    """Write `events.csv`, `report.json` and the picture `health.png` of what `watch` told of frames (F, M) at `times`
+    (F,) into `folder`; `timed`: whether these are seconds, or numbers of frames; `notes`, what speaks against it.
+
+    A path is written as places x y in metres, parted by semicolons; electrodes are numbered from 1. Raises `ValueError`
+    for what cannot be a folder.
+    """
+    with results(folder, HEALTH_FILES) as made:
+        write_rows(made / "events.csv", _EVENTS, (_row(one) for one in health.events))
+        write_json(report_health(health, name, timed) | {"notes": list(notes)}, made / "report.json")
+        draw_health(health, times, frames, timed).savefig(made / "health.png", dpi=130)
+
+
+def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
+    """What was told, as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    held = health.held
+    return plain(
+        {
+            "recording": name,
+            "frames": health.frames,
+            "events": [
+                {
+                    "event": one.number,
+                    "kind": one.kind,
+                    "status": one.status,
+                    "time": one.time,
+                    "told": one.told,
+                    "frame": one.frame,
+                    "electrode": None if one.electrode is None else one.electrode + 1,
+                    "channels": np.flatnonzero(one.channels),
+                    "strength": one.strength,
+                    "length_m": None if one.path is None else one.length,
+                    "length_deviation_m": None if one.path is None else one.deviation,
+                    "through": one.through,
+                    "path_m": one.path,
+                    "reason": one.reason,
+                }
+                for one in health.events
+            ],
+            "held": None if held is None else {"time": held.time, "kind": held.kind, "reason": held.reason},
+            "trusted_channels": np.flatnonzero(health.trusted),
+            "channels_without_a_reading": np.flatnonzero(~health.healthy.used),
+            "patience": health.patience,
+            "with_a_model": health.skin is not None,
+            "units": {"length": "m", "time": "s" if timed else "frames"},
+            "versions": {package: version_of(package) for package in _PACKAGES},
+        }
+    )
+
+
+def draw_health(health: SkinHealth, times: Float[np.ndarray, " F"], frames: Float[np.ndarray, "F M"], timed: bool):
+    """The picture, as a matplotlib `Figure` that needs no display."""
+    from matplotlib.figure import Figure
+
+    from jeit.touch.plots import plot_health, plot_health_course
+
+    figure = Figure(figsize=(13.0, 4.6) if health.skin is not None else (9.5, 3.6), layout="constrained")
+    if health.skin is not None:
+        ax, beside = figure.subplots(1, 2, width_ratios=(1.7, 1))
+        plot_health(health, title="The skin now", ax=beside)
+    else:
+        ax = figure.subplots()
+    number = len(health.events)
+    said = f"{number} event{'' if number == 1 else 's'} in {len(frames):,} frames"
+    plot_health_course(health, times, frames, title=said, ax=ax)
+    ax.set_xlabel("Time (s)" if timed else "Frame")
+    return figure
+
+
+def _row(one: HealthEvent) -> list[object]:
+    path = "" if one.path is None else "; ".join(f"{x:.5f} {y:.5f}" for x, y in one.path)
+    return [
+        one.number,
+        one.kind,
+        one.status,
+        f"{one.time:.6g}",
+        f"{one.told:.6g}",
+        one.frame,
+        "" if one.electrode is None else one.electrode + 1,
+        int(one.channels.sum()),
+        f"{one.strength:.4g}",
+        "" if one.path is None else f"{one.length:.5f}",
+        "" if one.path is None else f"{one.deviation:.5f}",
+        path,
+        one.reason,
+    ]

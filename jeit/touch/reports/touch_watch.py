@@ -1,0 +1,195 @@
+"""What was told of a watched skin, in a folder: touches as they end, their paths, a report, a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.arguments import counted
+from jeit.report.describe import plain, version_of
+from jeit.report.folder import results, results_folder, write_json
+from jeit.report.growing import GrowingTable
+from jeit.touch import NamedTouch, TouchWatch, WatchedFrame
+
+WATCH_FILES = ("events.csv", "paths.csv", "report.json", "timeline.png")
+_PACKAGES = ("jeit", "jax", "numpy", "scikit-learn")
+_EVENTS = (
+    "touch", "onset_s", "offset_s", "gesture", "probability", "unlike", "x_m", "y_m", "path_length_m",
+    "displacement_m", "peak_S", "area_m2", "begun_before", "cut_off", "held", "lost_frames", "longest_gap_s", "named_s",
+    "latency_ms",
+)  # fmt: skip
+_PATHS = ("touch", "time_s", "x_m", "y_m", "peak_S")
+
+
+@dataclass(frozen=True)
+class WrittenWatch:
+    """What `write_watch` has written: `touches`; of every frame its second and greatest change, `seconds` and `peaks`
+    (F,); `latency` (K,), seconds from a frame to what was told of it, of those that named a touch; `counts` of frames
+    by status, and the `first_reason` of one that was refused, empty if there is none; `notes`, what frames told."""
+
+    touches: tuple[NamedTouch, ...]
+    seconds: Float[np.ndarray, " F"]
+    peaks: Float[np.ndarray, " F"]
+    latency: Float[np.ndarray, " K"]
+    counts: dict[str, int]
+    first_reason: str = ""
+    notes: tuple[str, ...] = ()
+
+
+def write_watch(
+    watched: Iterable[WatchedFrame],
+    watch: TouchWatch,
+    folder: str | Path,
+    *,
+    name: str = "stream",
+    progress: Callable[[WatchedFrame], None] | None = None,
+) -> WrittenWatch:
+    """Write `events.csv`, a line for every touch as it ends, `paths.csv`, where it was in each of its frames, and at
+    the end `report.json` and the picture `timeline.png` into `folder`. A touch unlike any learnt from has no gesture.
+
+    `watched`: what `watch.follow(frames)` gives. Places are in metres, changes in S; `named_s` is the second of the
+    stream at which a touch was named, `latency_ms` how long after that frame. `progress` is called with every frame.
+    Raises `ValueError`, with the `name` of the stream, if no frame came, and for what cannot be a folder.
+    """
+    folder = results_folder(folder, WATCH_FILES)
+    for earlier in WATCH_FILES[2:]:
+        (folder / earlier).unlink(missing_ok=True)  # would not go with these touches
+    touches: list[NamedTouch] = []
+    seconds, peaks, latency, counts, reason, notes = [], [], [], {}, "", []
+    with GrowingTable(folder / "events.csv", _EVENTS) as events, GrowingTable(folder / "paths.csv", _PATHS) as paths:
+        for one in watched:
+            for touch in one.ended:
+                touches.append(touch)
+                events.write(_event(touch))
+                for row in _path(touch):
+                    paths.write(row)
+            if one.image is not None:
+                seconds.append(one.second)
+                peaks.append(one.peak)
+                counts[str(one.image.status)] = counts.get(str(one.image.status), 0) + 1
+                reason = reason or ("" if one.image.imaged else one.image.reason)
+            latency += [one.latency] if one.named is not None else []
+            notes += [one.note] if one.note else []
+            if progress is not None:
+                progress(one)
+    if not seconds:
+        raise ValueError(f"'{name}': there was no frame in it.")
+    written = WrittenWatch(
+        touches=tuple(touches),
+        seconds=np.array(seconds),
+        peaks=np.array(peaks),
+        latency=np.array(latency),
+        counts=counts,
+        first_reason=reason,
+        notes=tuple(notes),
+    )
+    with results(folder, WATCH_FILES[2:]) as made:
+        write_json(report_watch(written, watch, name), made / "report.json")
+        draw_watch(written, watch).savefig(made / "timeline.png", dpi=130)
+    return written
+
+
+def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[str, Any]:
+    """What was told, as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    names, number = np.unique([one.gesture for one in written.touches if not one.unlike], return_counts=True)
+    quick = written.latency
+    return plain(
+        {
+            "stream": name,
+            "frames": len(written.seconds),
+            "duration_s": written.seconds[-1] - written.seconds[0],
+            "status": written.counts,
+            "first_refusal": written.first_reason or None,
+            "touches": len(written.touches),
+            "gestures": dict(zip(names.tolist(), number.tolist(), strict=True)),
+            "unlike_any_learnt": sum(one.unlike for one in written.touches),
+            "cut_off": sum(not one.touch.whole for one in written.touches),
+            "held": sum(one.held for one in written.touches),
+            "gestures_known": list(watch.model.names),
+            "classifier": f"{watch.model.method} on {watch.model.form}",
+            "level_S": watch.level.level,
+            "gap_s": watch.gap,
+            "patience_s": watch.patience,
+            "named_within_s": {"median": np.median(quick), "99_percent": np.quantile(quick, 0.99)}
+            if quick.size
+            else None,
+            "background_S": watch.images.background,
+            "notes": [*watch.notes, *written.notes, *watch.model.notes, *watch.images.reference.notes],
+            "units": {"length": "m", "time": "s", "change": "S"},
+            "versions": {package: version_of(package) for package in _PACKAGES},
+        }
+    )
+
+
+def draw_watch(written: WrittenWatch, watch: TouchWatch):
+    """The picture, as a matplotlib `Figure` that needs no display."""
+    from matplotlib.figure import Figure
+
+    from jeit.touch.plots import plot_changes, plot_timeline, plot_touch_paths
+
+    names = watch.model.names
+    figure = Figure(figsize=(13.0, 2.6 + 0.42 * max(len(names), 5)), layout="constrained")
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.9, 1), height_ratios=(1, 1.25))
+    above = figure.add_subplot(grid[0, 0])
+    lanes = figure.add_subplot(grid[1, 0], sharex=above)
+    refused = int(np.isnan(written.peaks).sum())
+    said = f"{counted(len(written.touches), 'touch')} in {written.seconds[-1] - written.seconds[0]:.4g} s"
+    said += f"; {counted(refused, 'frame')} refused" if refused else ""
+    plot_changes(written.seconds, written.peaks, watch.level.level, title=said, ax=above)
+    plot_timeline(list(written.touches), names, ax=lanes)
+    above.set_xlim(*_ends(written.seconds))
+    above.tick_params(labelbottom=False)
+    model = watch.images.calibration.model
+    plot_touch_paths(
+        model.mesh,
+        list(written.touches),
+        names,
+        model.electrodes,
+        title="Where they went, from the dots on",
+        ax=figure.add_subplot(grid[:, 1]),
+    )
+    return figure
+
+
+def _ends(seconds: np.ndarray) -> tuple[float, float]:
+    return float(seconds[0]), max(float(seconds[-1]), float(seconds[0]) + 1e-3)
+
+
+def _event(one: NamedTouch) -> list[object]:
+    course = one.touch.course
+    at = int(course.peak.argmax())
+    place = course.centroid[np.isfinite(course.centroid).all(axis=1)]
+    length = float(np.linalg.norm(np.diff(place, axis=0), axis=1).sum())
+    return [
+        one.number,
+        f"{one.touch.onset:.4f}",
+        f"{one.touch.offset:.4f}",
+        "" if one.unlike else one.gesture,
+        f"{one.probability:.4f}",
+        int(one.unlike),
+        *(f"{value:.5f}" for value in course.centroid[at]),
+        f"{length:.5f}",
+        f"{np.linalg.norm(place[-1] - place[0]):.5f}",
+        f"{course.peak[at]:.6g}",
+        f"{course.area[at]:.6g}",
+        int(one.touch.begun_before),
+        int(one.touch.cut_off),
+        int(one.held),
+        one.touch.lost,
+        f"{one.touch.longest_gap:.4f}",
+        f"{one.named:.4f}",
+        f"{1e3 * one.latency:.3f}",
+    ]
+
+
+def _path(one: NamedTouch) -> list[list[object]]:
+    course = one.touch.course
+    return [
+        [one.number, f"{second:.4f}", *(f"{value:.5f}" if np.isfinite(value) else "" for value in place), f"{peak:.6g}"]
+        for second, place, peak in zip(course.seconds, course.centroid, course.peak, strict=True)
+    ]

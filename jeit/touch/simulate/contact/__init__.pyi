@@ -1,0 +1,42 @@
+from .foundation import Foundation
+from .half_space import HalfSpace
+from .indent_sets import IndentSet
+from .indenters import Bar, DepthMap, Disc, Prism, Revolved, Ring, ball
+from .indents import Indent, IndentDraws, depth_maps, indented_cells, relative_changes
+from .joined import Joined, Placed
+from .materials import Material, material
+from .press import MovingPress, Press
+from .press_draws import PressDraws
+from .press_sets import PressSet, open_presses, simulate_presses
+from .pressed_skin import PressedSkin
+from .two_sheets import TwoSheets
+
+__all__ = [
+    "Bar",
+    "DepthMap",
+    "Disc",
+    "Foundation",
+    "HalfSpace",
+    "Indent",
+    "IndentDraws",
+    "IndentSet",
+    "Joined",
+    "Material",
+    "MovingPress",
+    "Placed",
+    "Press",
+    "PressDraws",
+    "PressSet",
+    "PressedSkin",
+    "Prism",
+    "Revolved",
+    "Ring",
+    "TwoSheets",
+    "ball",
+    "depth_maps",
+    "indented_cells",
+    "material",
+    "open_presses",
+    "relative_changes",
+    "simulate_presses",
+]

@@ -1,0 +1,184 @@
+"""Pressure on the cells of a mesh, at a few samples of each, which a load is balanced on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+from jeit.design.skin.reached_cells import said
+from jeit.design.skin.touched_cells import padded
+from jeit.touch.simulate.contact.indenters import Disc
+from jeit.touch.simulate.contact.press import Press
+from jeit.touch.simulate.contact.pressure import AbstractSupport
+from jeit.touch.simulate.contact.samples import Samples
+
+# A finer lattice is for contacts on few samples; it finds all that is as wide as this share of a cell.
+_FINE_LATTICE, _FEW, _FOUND = 11, 6, 1 / 6
+# Presses whose pressures are worked out at once: so much memory is in the cache.
+_AT_ONCE = 16
+# How much farther a contact reaches that has about half its area on the skin; Winkler's ball: 2^(1/4).
+_MARGIN = 1.25
+# Of the area within reach of a press that is skin: with less, it may be felt farther than that.
+_ON_SKIN = 0.6
+
+
+class PressedCells(NamedTuple):
+    """`cells` (n, c) under n touches, and the `pressure` (n, c, s) at their samples, pascals; 0 where a touch has
+    fewer."""
+
+    cells: Int[np.ndarray, "n c"]
+    pressure: Float[np.ndarray, "n c s"]
+
+
+def pressed_cells(
+    samples: Samples,
+    support: AbstractSupport,
+    touches: Sequence[tuple[Press, ...]],
+    progress: Callable[[str], None] | None = None,
+) -> PressedCells:
+    """Cells under touches, each of one press or several; what several press, the sum of their pressures does.
+
+    What of an indenter is over the edge of the skin carries nothing. `progress` is told of presses done. Raises
+    `ValueError` for presses off the skin, and as the support does.
+    """
+    presses = [press for touch in touches for press in touch]
+    if not presses:
+        return PressedCells(np.zeros((len(touches), 1), int), np.zeros((len(touches), 1, samples.points.shape[1])))
+    found = _of_each(samples, support, presses, progress)
+    if all(len(touch) == 1 for touch in touches):
+        return found
+    rows, pressures, first = [], [], 0
+    for touch in touches:
+        own = slice(first, first + len(touch))
+        first += len(touch)
+        there = found.pressure[own].any(axis=-1)
+        cells, place = np.unique(found.cells[own][there], return_inverse=True)
+        total = np.zeros((len(cells), found.pressure.shape[-1]))
+        np.add.at(total, place, found.pressure[own][there])
+        rows.append(cells)
+        pressures.append(total)
+    return _joined(rows, pressures)
+
+
+def _of_each(
+    samples: Samples, support: AbstractSupport, presses: Sequence[Press], progress: Callable[[str], None] | None
+) -> PressedCells:
+    samples.check(presses)
+    position = np.array([press.position for press in presses])
+    shapes = _shapes(presses)
+    farthest = samples.chord * np.array([press.indenter.reach for press in presses])
+    # How far a press is felt where the skin is flat says nothing of hollows.
+    reaches = farthest if samples.curved is not None else _reaches(support, presses, shapes)
+    felt = np.minimum(reaches, farthest) + samples.radius
+    tree = KDTree(samples.points.mean(axis=1))
+    near = tree.query_ball_point(position, felt, return_sorted=True)
+    on_skin = samples.points.shape[1] * np.array([samples.area[cells].sum() for cells in near])
+    beyond = np.flatnonzero(on_skin < _ON_SKIN * np.pi * felt**2)
+    near[beyond] = tree.query_ball_point(position[beyond], farthest[beyond] + samples.radius, return_sorted=True)
+    near = samples.near(presses, near)
+    number = np.array([len(cells) for cells in near])
+    empty = np.flatnonzero(number == 0)
+    if empty.size:
+        raise ValueError(
+            f"position: {empty.size} of {len(presses)} presses lie off the skin, the first at "
+            f"{said(position[empty[0]])} mm; places are in metres."
+        )
+    rows: list = [None] * len(presses)
+    pressures: list = [None] * len(presses)
+    done = 0
+    for shape in np.unique(shapes):
+        same = np.flatnonzero(shapes == shape)
+        same = same[np.argsort(number[same], kind="stable")]
+        for some in np.split(same, range(_AT_ONCE, len(same), _AT_ONCE)):
+            cells, there = padded([np.asarray(near[one], int) for one in some])
+            pressure = _alike(samples, support, [presses[one] for one in some], cells, there)
+            for one, own, pressed in zip(some, cells, pressure, strict=True):
+                kept = pressed.any(axis=-1)
+                rows[one], pressures[one] = own[kept], pressed[kept]
+            done += len(some)
+            if progress is not None:
+                progress(f"pressure: {done} of {len(presses)}")
+    return _joined(rows, pressures)
+
+
+def _shapes(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
+    """A number for each indenter, the same for those that are equal."""
+    numbers: dict = {}
+    known: dict[int, int] = {}
+    for press in presses:
+        if id(press.indenter) not in known:
+            leaves, structure = jax.tree.flatten(press.indenter)
+            values = tuple((np.shape(leaf), np.asarray(leaf).tobytes()) for leaf in leaves)
+            known[id(press.indenter)] = numbers.setdefault((structure, values), len(numbers))
+    return np.array([known[id(press.indenter)] for press in presses])
+
+
+def _reaches(support: AbstractSupport, presses: Sequence[Press], shapes) -> Float[np.ndarray, " n"]:
+    """How far from its origin each press is felt, at most, metres: as far as with up to twice its load, and some more
+    where the skin's edge leaves it less area."""
+    known: dict[tuple[int, int], float] = {}
+    doublings = np.ceil(np.log2([press.load for press in presses]))
+    for press, *case in zip(presses, shapes, doublings, strict=True):
+        if tuple(case) not in known:
+            try:
+                felt = _MARGIN * support.pressure(press.indenter, 2.0 ** case[1]).reach
+            except ValueError:  # more than it can carry: that of this press may not be
+                felt = press.indenter.reach
+            known[tuple(case)] = min(felt, press.indenter.reach)
+    return np.array([known[case] for case in zip(shapes, doublings, strict=True)])
+
+
+def _alike(samples: Samples, support: AbstractSupport, presses: Sequence[Press], cells, there):
+    """Pressures (b, c, s) of presses with one and the same indenter at the samples of `cells` (b, c)."""
+    points = samples.points[cells]
+    shape = points.shape[:-1]
+    local, fall, share = samples.seen(presses, cells, points.reshape(len(cells), -1, points.shape[-1]))
+    area = np.broadcast_to((share * samples.area[cells] * there)[..., None], shape).reshape(len(cells), -1)
+    load = np.array([press.load for press in presses])
+    pressure = support.spread(presses[0].indenter, load, local, area, _bulge(samples, fall)) * (area > 0)
+    pressure = pressure.reshape(shape)
+    for one in np.flatnonzero(np.count_nonzero(pressure, axis=(1, 2)) < _FEW).tolist():
+        pressure[one] = _between(samples, support, presses[one], cells[one], there[one])
+    return pressure
+
+
+def _between(samples: Samples, support: AbstractSupport, press: Press, cells, there):
+    """Pressures (c, s) of a press on few samples: means of each of the `cells` (c,) over a finer lattice; all on the
+    nearest sample where that is missed. Raises `ValueError` for one that touches no skin."""
+    points = samples.on(cells, _FINE_LATTICE)
+    fine, coarse = points.shape[1], samples.points.shape[1]
+    local, fall, share = samples.seen([press], cells[None], points.reshape(1, -1, points.shape[-1]))
+    area = np.repeat(share[0] * samples.area[cells] * there * coarse / fine, fine)[None]
+    load = np.array([press.load])
+    pressure = support.spread(press.indenter, load, local, area, _bulge(samples, fall)) * (area > 0)
+    if pressure.any():
+        return np.repeat(pressure.reshape(-1, fine).mean(axis=1, keepdims=True), coarse, axis=1)
+    pressure = np.zeros((len(cells), coarse))
+    distance = np.linalg.norm(local.reshape(-1, fine, 2), axis=-1).min(axis=1)
+    cell = np.where(there, distance, np.inf).argmin()
+    if not (distance[cell] < _FOUND * samples.radius and np.isfinite(press.indenter.gap(np.zeros(2)))):
+        raise ValueError(
+            f"position: the press at {said(press.position)} mm touches no skin, or does with less than a tenth of a "
+            "cell's width; move it, or give a wider indenter or a finer mesh."
+        )
+    nearest = np.linalg.norm(samples.points[cells[cell]] - press.position, axis=-1).argmin()
+    here, small = np.zeros((1, 1, 2)), (share[0, cell] * samples.area[cells[cell]]).reshape(1, 1)
+    pressure[cell, nearest] = support.spread(Disc(samples.radius), load, here, small)[0, 0]
+    return pressure
+
+
+def _bulge(samples: Samples, fall):
+    """None of a flat skin, which falls nowhere."""
+    return None if samples.curved is None else fall
+
+
+def _joined(rows: list, pressures: list) -> PressedCells:
+    cells, there = padded(rows)
+    pressure = np.zeros((*cells.shape, pressures[0].shape[-1]))
+    pressure[there] = np.concatenate(pressures)
+    return PressedCells(cells, pressure)

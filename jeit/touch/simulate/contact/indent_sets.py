@@ -1,0 +1,153 @@
+"""Sets of drawn indents, with what a skin reads of them and their depth maps: in chunks, as sets of presses are."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cached_property, lru_cache
+from threading import Lock
+from typing import Any
+
+import jax
+import numpy as np
+
+from jeit.arguments import check_kind, told
+from jeit.design import Skin
+from jeit.design.skin.resting_skin import RestingSkin
+from jeit.design.study.contents import Contents
+from jeit.touch.simulate.contact.indents import IndentDraws, depth_maps, relative_changes, resting_skin
+
+# Changes with what the same set is simulated to.
+_VERSION = 2
+# Of a worker's threads, one works out what the chunks share, and the others wait for it.
+_ONE = Lock()
+_MEANINGS = {
+    "change": ("1", "change of each channel's voltage, relative to the skin at rest"),
+    "depth": ("1", "depth of the indentation over the thickness of the skin, row 0 at the least y"),
+}
+
+
+class IndentSet:
+    """`number` touches drawn from `draws`, and what `skin` reads of them, exactly; the same for the same `seed`.
+
+    Depths are on a grid of `shape` (rows, columns) over the skin; `chunk`, touches simulated, and written, at once: it
+    decides which are drawn too.
+    """
+
+    def __init__(
+        self,
+        skin: Skin,
+        draws: IndentDraws,
+        number: int,
+        *,
+        seed: int = 0,
+        shape: tuple[int, int] = (48, 48),
+        chunk: int = 1000,
+    ):
+        """Raises `ValueError` for what is no skin, draws or seed, numbers below 1, and depths that the skin has not."""
+        check_kind("skin", skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
+        check_kind("draws", draws, IndentDraws, "IndentDraws([ball(0.015)], skin.flat_outline, (1e-3, 8e-3))")
+        for name, given in (("number", number), ("chunk", chunk)):
+            if not (isinstance(given, int) and given >= 1):
+                raise ValueError(f"{name} must be a whole number, 1 or more; it is {given!r}.")
+        if not (isinstance(seed, int) and 0 <= seed < 2**63):
+            raise ValueError(f"seed must be a whole number, 0 or more; it is {told(seed)}.")
+        if draws.depth[1] >= float(skin.thickness):
+            raise ValueError(
+                f"draws go {1e3 * draws.depth[1]:.3g} mm deep, and the skin is {1e3 * float(skin.thickness):.3g} mm "
+                "thick; draw less depth."
+            )
+        self.skin, self.draws, self.number, self.seed = skin, draws, number, seed
+        self.chunk, self.shape = chunk, (int(shape[0]), int(shape[1]))
+        rows, columns = self.shape
+        self.places = image_places(skin, columns, rows)
+
+    @property
+    def chunks(self) -> list[range]:
+        """Numbers of the touches of each chunk."""
+        return [range(self.number)[start : start + self.chunk] for start in range(0, self.number, self.chunk)]
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of all that decides the results."""
+        model = self.skin.model
+        parts = model.mesh, model.electrodes, model.protocol, self.skin.conductivity, self.skin.thickness, self.draws
+        own = _VERSION, self.number, self.seed, self.chunk, self.shape
+        return _digest(parts, str(own))
+
+    def solve(self, number: int) -> dict[str, np.ndarray]:
+        """Changes (k, M) and depths (k, rows, columns) of one chunk, as they stand in the store."""
+        key = jax.random.fold_in(jax.random.key(self.seed), number)
+        touches = self.draws.draw(key, len(self.chunks[number]))
+        depth = depth_maps(touches, self.places) / float(self.skin.thickness)
+        with _ONE:
+            resting = _resting(_Deep(self.skin, self.draws.depth[1]))
+        return {"change": relative_changes(self.skin, touches, resting), "depth": depth.astype(np.float32)}
+
+    def contents(self) -> Contents:
+        """What its store holds."""
+
+        def fill(group: Any) -> None:
+            channels = self.skin.model.protocol.num_measurements
+            kinds = {
+                "change": ((channels,), ("channel",), "float64"),
+                "depth": (self.shape, ("row", "column"), "float32"),
+            }
+            for name, (shape, dimensions, dtype) in kinds.items():
+                unit, meaning = _MEANINGS[name]
+                group.create_array(
+                    name,
+                    shape=(self.number, *shape),
+                    chunks=(min(self.chunk, self.number), *shape),
+                    dtype=dtype,
+                    fill_value=np.nan,
+                    dimension_names=("touch", *dimensions),
+                    attributes={"units": unit, "long_name": meaning},
+                )
+
+        names = [*_MEANINGS]
+        attributes = {"seed": self.seed}
+        return Contents("indent set", "simulate_presses", self.fingerprint, self.chunks, names, attributes, fill)
+
+
+class _Deep:
+    """A skin that is indented up to a depth, metres; equal to any like it."""
+
+    def __init__(self, skin: Skin, depth: float):
+        self.skin, self.depth = skin, depth
+        model = skin.model
+        self._all = _digest((model.mesh, model.electrodes, model.protocol, skin.model_conductivity), str(depth))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Deep) and other._all == self._all
+
+    def __hash__(self) -> int:
+        return hash(self._all)
+
+
+@lru_cache(maxsize=1)
+def _resting(deep: _Deep) -> RestingSkin | None:
+    """What all chunks share, of all sets of a skin; a gigabyte, of a layer."""
+    return resting_skin(deep.skin, deep.depth)
+
+
+def _digest(parts: Any, text: str) -> str:
+    """SHA-256 of a tree of arrays, and a text."""
+    leaves, structure = jax.tree.flatten(parts)
+    digest = hashlib.sha256(f"{text} {structure}".encode())
+    for leaf in leaves:
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def image_places(skin: Skin, columns: int, rows: int) -> np.ndarray:
+    """Middles (rows, columns, 2) of pixels over the box of a skin, metres, row 0 at the least y."""
+    low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
+    return pixel_places((low_x, high_x, low_y, high_y), (rows, columns))
+
+
+def pixel_places(extent: tuple[float, float, float, float], shape: tuple[int, int]) -> np.ndarray:
+    """Middles (rows, columns, 2) of pixels over a box (x_min, x_max, y_min, y_max), metres, row 0 at the least y."""
+    (low_x, high_x, low_y, high_y), (rows, columns) = extent, shape
+    x = low_x + (high_x - low_x) * (np.arange(columns) + 0.5) / columns
+    y = low_y + (high_y - low_y) * (np.arange(rows) + 0.5) / rows
+    return np.stack(np.meshgrid(x, y), axis=-1)

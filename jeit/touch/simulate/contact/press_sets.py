@@ -1,0 +1,182 @@
+"""Sets of drawn touches and their frames, larger than memory: in chunks, to a Zarr store, here or on a cluster.
+
+The store, and what a chunk is to it, is that of the studies of `jeit.design`. Needs the extra `cluster`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jeit.arguments import check_kind, told
+from jeit.arguments.extras import need_extra
+from jeit.design.study.cluster import over_cluster
+from jeit.design.study.contents import Contents
+from jeit.design.study.progress import Progress, Teller
+from jeit.design.study.store import Store, writing
+from jeit.touch.simulate.contact.indent_sets import IndentSet
+from jeit.touch.simulate.contact.press import Press
+from jeit.touch.simulate.contact.press_draws import PressDraws
+from jeit.touch.simulate.contact.pressed_skin import PressedSkin, check_seconds
+
+# Changes with what the same set is simulated to.
+_VERSION = 1
+_MEANINGS = {
+    "voltages": ("V", "what the channels read"),
+    "position": ("m", "where the presses are, NaN where there are fewer"),
+    "force": ("N", "loads of the presses"),
+    "angle": ("rad", "that the presses are turned by"),
+    "indenter": ("1", "of the presses, its number among those drawn from"),
+}
+
+
+class PressSet:
+    """`number` touches drawn from `draws`, and the frames of `skin` for them; the same for the same `seed`.
+
+    `held` and `elapsed`, seconds, as in `PressedSkin.frames`; `chunk`, touches that are simulated, and written, at
+    once: it decides which are drawn too.
+    """
+
+    def __init__(
+        self,
+        skin: PressedSkin,
+        draws: PressDraws,
+        number: int,
+        *,
+        seed: int = 0,
+        held: float = 1.0,
+        elapsed: float = 0.0,
+        chunk: int = 1000,
+    ):
+        """Raises `ValueError` for what is no skin, draws, seed or time, numbers below 1, and greatest loads that the
+        skin does not carry, each indenter in the middle of it; what hangs over its edge goes deeper."""
+        check_kind("skin", skin, PressedSkin, "a PressedSkin")
+        check_kind("draws", draws, PressDraws, "PressDraws, such as PressDraws([ball(0.015)], Disk(0.05), (0.1, 10.0))")
+        for name, given in (("number", number), ("chunk", chunk)):
+            if not (isinstance(given, int) and given >= 1):
+                raise ValueError(f"{name} must be a whole number, 1 or more; it is {given!r}.")
+        if not (isinstance(seed, int) and 0 <= seed < 2**63):
+            raise ValueError(f"seed must be a whole number, 0 or more; it is {told(seed)}.")
+        check_seconds("held", held)
+        check_seconds("elapsed", elapsed)
+        self.skin, self.draws, self.number, self.seed = skin, draws, number, seed
+        self.held, self.elapsed, self.chunk = held, elapsed, chunk
+        middle = draws.innermost()
+        skin.touched([Press(indenter, draws.load[1], middle) for indenter in draws.indenters])
+
+    @property
+    def chunks(self) -> list[range]:
+        """Numbers of the touches of each chunk."""
+        return [range(self.number)[start : start + self.chunk] for start in range(0, self.number, self.chunk)]
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """SHA-256 of all that decides the results."""
+        model, number = self.skin.model, (_VERSION, self.number, self.seed, self.held, self.elapsed, self.chunk)
+        parts = model.mesh, model.electrodes, model.protocol, self.skin.material, self.skin.conductivity
+        leaves, structure = jax.tree.flatten((parts, self.skin.gain, self.draws))
+        digest = hashlib.sha256(f"{number} {structure}".encode())
+        for leaf in leaves:
+            digest.update(np.asarray(leaf).tobytes())
+        return digest.hexdigest()
+
+    def solve(self, number: int) -> dict[str, np.ndarray]:
+        """Touches and frames of one chunk, as they stand in the store: (k, …), NaN where a touch has fewer presses."""
+        for_draws, for_frames = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), number))
+        touches = self.draws.draw(for_draws, len(self.chunks[number]))
+        results = {name: np.full((len(touches), *shape), np.nan) for name, (shape, _) in self._shapes().items()}
+        results["voltages"] = self.skin.frames(for_frames, touches, held=self.held, elapsed=self.elapsed)
+        kinds = {id(indenter): kind for kind, indenter in enumerate(self.draws.indenters)}
+        for row, touch in enumerate(touches):
+            for column, press in enumerate(touch):
+                results["position"][row, column], results["force"][row, column] = press.position, press.load
+                results["angle"][row, column], results["indenter"][row, column] = press.angle, kinds[id(press.indenter)]
+        return results
+
+    def contents(self) -> Contents:
+        """What its store holds."""
+
+        def fill(group: Any) -> None:
+            for name, (shape, dimensions) in self._shapes().items():
+                unit, meaning = _MEANINGS[name]
+                group.create_array(
+                    name,
+                    shape=(self.number, *shape),
+                    chunks=(min(self.chunk, self.number), *shape),
+                    dtype="float64",
+                    fill_value=np.nan,
+                    dimension_names=("touch", *dimensions),
+                    attributes={"units": unit, "long_name": meaning},
+                )
+
+        attributes = {"seed": self.seed, "held_s": self.held, "elapsed_s": self.elapsed}
+        names = [*self._shapes()]
+        return Contents("press set", "simulate_presses", self.fingerprint, self.chunks, names, attributes, fill)
+
+    def _shapes(self) -> dict[str, tuple[tuple[int, ...], tuple[str, ...]]]:
+        """Of one touch: the shape of each array, and its dimensions."""
+        each = (self.draws.at_once,), ("press",)
+        return {
+            "voltages": ((self.skin.model.protocol.num_measurements,), ("channel",)),
+            "position": ((self.draws.at_once, 2), ("press", "axis")),
+            "force": each,
+            "angle": each,
+            "indenter": each,
+        }
+
+
+def simulate_presses(
+    presses: PressSet | IndentSet,
+    path: str | Path,
+    *,
+    client: Any = None,
+    progress: Callable[[Progress], None] | None = None,
+):
+    """Simulate what is not finished of a set, of presses or indents, and return it, as of `open_presses`.
+
+    Killed at any moment, it goes on from the last finished chunk when run again, to the same store. `path`, `client`
+    and `progress` as in `jeit.design.run_study`. Raises `ValueError` for another set's store, for one
+    that another process writes, and as `PressedSkin.frames` does, `ImportError` without the extra `cluster`, and
+    `OSError` where the store cannot be written.
+    """
+    need_extra("cluster", "a set of touches")
+    check_kind("presses", presses, (PressSet, IndentSet), "a PressSet(skin, draws, number), or an IndentSet")
+    with writing(presses.contents(), path) as store:
+        done = set(store.sound())
+        left = [number for number in range(len(presses.chunks)) if number not in done]
+        tell = Teller(presses.chunks, done, progress)
+        for number, results in _solved(presses, left, client):
+            store.write(number, results)
+            tell.finished(number)
+    return open_presses(presses, path)
+
+
+def open_presses(presses: PressSet | IndentSet, path: str | Path):
+    """The set in a store as an `xarray.Dataset` with dimensions touch, channel and press (row and column of indents),
+    read when it is asked for; `finished` (touch,) says which touches are. Raises as `jeit.design.study.store.Store`
+    does."""
+    need_extra("cluster", "a set of touches")
+    store = Store(presses.contents(), path, create=False)
+    finished = np.zeros(presses.number, bool)
+    for number in store.sound():
+        finished[list(presses.chunks[number])] = True
+    return store.open_dataset().assign_coords(finished=("touch", finished))
+
+
+def solve_presses(presses: PressSet | IndentSet, number: int) -> dict[str, np.ndarray]:
+    """One chunk of a set, as `PressSet.solve`: a function, for workers of a cluster to be sent."""
+    return presses.solve(number)
+
+
+def _solved(
+    presses: PressSet | IndentSet, numbers: list[int], client: Any
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    if client is None:
+        return ((number, solve_presses(presses, number)) for number in numbers)
+    return over_cluster(client, solve_presses, presses, numbers)

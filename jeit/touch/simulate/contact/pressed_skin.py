@@ -1,0 +1,306 @@
+"""`PressedSkin`: a skin of some material, and what it reads while it is pressed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_key, check_kind, check_name, is_number, real_array, told
+from jeit.design.skin.reached_cells import is_curved
+from jeit.design.skin.touched_cells import TouchedCells, padded
+from jeit.design.skin.voltage_changes import touch_changes
+from jeit.forward import ForwardModel
+from jeit.forward.assembly import check_conductivity
+from jeit.forward.contact_sensitivity import ContactSensitivity
+from jeit.forward.model import check_model, select_channels
+from jeit.mesh import Mesh, centroids, measures
+from jeit.touch.simulate.contact.cell_pressure import pressed_cells
+from jeit.touch.simulate.contact.drift import gains, walk, white_noise
+from jeit.touch.simulate.contact.materials import Material
+from jeit.touch.simulate.contact.press import MovingPress, Press, motions_of, touches_of
+from jeit.touch.simulate.contact.response import advance, held_pressure, unstrained
+from jeit.touch.simulate.contact.samples import Samples
+from jeit_solvers.engines import as_array
+
+# Touches worked on at once; their numbers of cells that part them; and their extent over the root of their area, above
+# which their contacts are apart.
+_AT_ONCE, _CELLS, _APART = 1024, (128, 512, 2048), 3.0
+# Of the greatest change of a touch: less is left out.
+_LEAST = 1e-6
+
+
+class PressedSkin(eqx.Module):
+    """A sheet, or a layer, of a material that is pressed; readings are exact, by low-rank changes of one factorisation.
+
+    **Fields**: `model`, any forward model of a sheet, or of a layer whose top is at its greatest z; `material`;
+    `conductivity` at rest, S/m (2-D: S), also tensors, which presses scale; `gain` (M,) of every channel; `face` of a
+    curved layer that is pressed, "outer" or "inner".
+
+    The sheet may be a surface in space, and the layer a shell: presses are then at (x, y, z), and their material's
+    support a `Foundation`.
+    """
+
+    model: ForwardModel
+    material: Material
+    conductivity: Float[np.ndarray, "..."]
+    gain: Float[np.ndarray, " M"]
+    face: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        key: Array,
+        model: ForwardModel,
+        material: Material,
+        *,
+        conductivity: ArrayLike | None = None,
+        face: str = "outer",
+    ):
+        """A skin whose gains are drawn from `key`. `conductivity` at rest, S/m (2-D: S): the material's unless given.
+        `face`: as `jeit.design.Skin.touched_face` says.
+
+        Raises `ValueError` for what is no key, model, material, conductivity or face.
+        """
+        check_key(key)
+        check_model(model)
+        check_kind("material", material, Material, 'a Material, such as material("velostat")')
+        if conductivity is None:
+            conductivity = material.conductivity * (material.thickness if model.mesh.dimension == 2 else 1.0)
+        check_name("face", face, ("outer", "inner"))
+        self.model, self.material, self.face = model, material, face
+        self.conductivity = np.asarray(check_conductivity(model.mesh, conductivity))
+        self.gain = gains(key, material.gain_spread, model.protocol.num_measurements)
+
+    def rest(self) -> Float[np.ndarray, " M"]:
+        """Voltages (M,) of the skin that nobody touches and nothing disturbs, as its channels read them."""
+        return self.gain * self._at_rest
+
+    def frames(
+        self,
+        key: Array,
+        presses: Sequence[Press | Sequence[Press]],
+        *,
+        held: float = 1.0,
+        elapsed: float = 0.0,
+        progress: Callable[[str], None] | None = None,
+    ) -> Float[np.ndarray, "n M"]:
+        """Voltages (n, M) of n touches of a skin that has had no load before: one press each, or a tuple of several at
+        once.
+
+        `held`: seconds that the load has been there. `elapsed`: seconds since the skin was as its model says, over
+        which it drifts, once for all these frames. `progress` is called with how far it is. Raises `ValueError` for
+        presses off the skin or through it, and what is no press or time.
+        """
+        check_key(key)
+        check_seconds("held", held)
+        check_seconds("elapsed", elapsed)
+        exact = self.voltages_under(self.touched(presses, held=held, progress=progress), progress=progress)
+        return self.read(key, exact, np.array([float(elapsed)]))
+
+    def touched(
+        self,
+        presses: Sequence[Press | Sequence[Press]],
+        *,
+        held: float = 1.0,
+        progress: Callable[[str], None] | None = None,
+    ) -> TouchedCells:
+        """The cells whose conductivity n touches change, and by how much; as of `frames`, whose errors it raises."""
+        touches = touches_of(presses)
+        pressed = pressed_cells(Samples.of(self.model.mesh, self.face), self.material.support, touches, progress)
+        change = self.material.change(held_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
+        places = np.array([touch[0].position if touch else np.zeros(self._dimension) for touch in touches])
+        return _touched(places, pressed.cells, change, self.model.mesh.num_cells)
+
+    def record(
+        self,
+        key: Array,
+        motions: MovingPress | Sequence[MovingPress],
+        seconds: Float[np.ndarray, " T"],
+        *,
+        progress: Callable[[str], None] | None = None,
+    ) -> Float[np.ndarray, "T M"]:
+        """Voltages (T, M) at times `seconds` (T,) of a skin under moving presses, a `MovingPress` or several at once,
+        or `[]`: nothing touches it.
+
+        The skin has had no load before the first frame, and drifts from time 0. Raises `ValueError` for times that are
+        negative or fall, motions of other lengths, and as `frames` does. `progress` is called with how far it is.
+        """
+        check_key(key)
+        seconds = _check_times(seconds)
+        exact = self.voltages_under(self.touched_in_time(motions, seconds, progress=progress), progress=progress)
+        return self.read(key, exact, seconds)
+
+    def record_each(
+        self,
+        key: Array,
+        recordings: Sequence[tuple[MovingPress | Sequence[MovingPress], Float[np.ndarray, " T"]]],
+        *,
+        progress: Callable[[str], None] | None = None,
+    ) -> list[Float[np.ndarray, "T M"]]:
+        """Voltages (T, M) of each of several recordings, pairs of motions and times, as of `record`: of this skin each
+        time anew, worked on together, which is quicker by far where there are many.
+
+        Raises `ValueError` for what are no such pairs, and as `record` does.
+        """
+        check_key(key)
+        wanted = "a list of pairs of motions and seconds, one for each recording"
+        check_kind("recordings", recordings, (list, tuple), wanted)
+        for number, pair in enumerate(recordings):
+            if not (isinstance(pair, tuple) and len(pair) == 2):
+                raise ValueError(f"recordings[{number}]: give {wanted}; it is {told(pair)}.")
+        if not recordings:
+            return []
+        times = [_check_times(seconds) for _, seconds in recordings]
+        each = [self.touched_in_time(motions, own) for (motions, _), own in zip(recordings, times, strict=True)]
+        exact = self.voltages_under(_together(each), progress=progress)
+        parts = np.split(exact, np.cumsum([len(own) for own in times])[:-1])
+        keys = jax.random.split(key, len(times))
+        return [self.read(one, part, own) for one, part, own in zip(keys, parts, times, strict=True)]
+
+    def touched_in_time(
+        self,
+        motions: MovingPress | Sequence[MovingPress],
+        seconds: Float[np.ndarray, " T"],
+        *,
+        progress: Callable[[str], None] | None = None,
+    ) -> TouchedCells:
+        """What is changed in each of T frames, also by loads that were there before; as of `record`, whose errors it
+        raises."""
+        seconds = _check_times(seconds)
+        motions = motions_of(motions, len(seconds))
+        found = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
+        touches = [tuple(press for press in some if press is not None) for some in found]
+        pressed = pressed_cells(Samples.of(self.model.mesh, self.face), self.material.support, touches, progress)
+        there = [own.any(axis=-1) for own in pressed.pressure]
+        cells = np.unique(pressed.cells[np.array(there)]) if motions else np.zeros(1, int)
+        place = np.searchsorted(cells, pressed.cells)
+        shape = len(cells), pressed.pressure.shape[-1]
+        strain, before = unstrained(self.material, cells.size * shape[1]), seconds[0]
+        change = np.zeros((len(seconds), len(cells)))
+        for frame, now in enumerate(seconds):
+            pressure = np.zeros(shape)
+            pressure[place[frame][there[frame]]] = pressed.pressure[frame][there[frame]]
+            strain, effective = advance(self.material, strain, pressure.ravel(), now - before)
+            change[frame], before = self.material.change(effective.reshape(shape)).mean(axis=-1), now
+        places = np.array([touch[0].position if touch else np.zeros(self._dimension) for touch in touches])
+        return _touched(places, np.broadcast_to(cells, change.shape), change, self.model.mesh.num_cells)
+
+    def voltages_under(
+        self, touched: TouchedCells, *, progress: Callable[[str], None] | None = None
+    ) -> Float[np.ndarray, "n M"]:
+        """Voltages (n, M) of the model under n touches, undisturbed; `progress` is told of touches done. Raises as
+        `touch_changes` does."""
+        done = 0
+        voltages = np.tile(self._at_rest, (len(touched.places), 1))
+        places, cells, change = (np.asarray(one) for one in (touched.places, touched.cells, touched.change))
+        for alike in _kinds(self.model.mesh, cells, change):
+            for some in np.split(alike, range(_AT_ONCE, len(alike), _AT_ONCE)):
+                even = some[np.minimum(np.arange(_even(len(some))), len(some) - 1)]
+                own = slice(0, _even(int(np.count_nonzero(change[some], axis=1).max())))
+                arrays = as_array(places[even]), as_array(cells[even, own]), as_array(change[even, own])
+                rows = TouchedCells(*arrays, num_cells=touched.num_cells)
+                voltages[some] += np.asarray(touch_changes(self.model, self.conductivity, rows))[: len(some)]
+                done += len(some)
+                if progress is not None:
+                    progress(f"voltages: {done} of {len(voltages)}")
+        return voltages
+
+    def read(
+        self, key: Array, exact: Float[np.ndarray, "n M"], seconds: Float[np.ndarray, " t"]
+    ) -> Float[np.ndarray, "n M"]:
+        """What the channels read of exact voltages at `seconds` (n,), or (1,) for all: drift, gains and noise, volts.
+
+        A sheet of e^d σ with contacts e^c z has the voltages of one of σ with contacts e^(c + d) z, over e^d; what
+        contacts change is linear, that of the skin at rest. Raises `ValueError` for what is no key.
+        """
+        check_key(key)
+        for_conductivity, for_contacts, for_noise = jax.random.split(key, 3)
+        own = self.material
+        drift = walk(for_conductivity, seconds, own.conductivity_trend, own.conductivity_walk, 1)
+        if drift.any() or own.contact_trend or own.contact_walk:
+            number = self.model.electrodes.num_electrodes
+            contacts = walk(for_contacts, seconds, own.contact_trend, own.contact_walk, number)
+            exact = (exact + (contacts + drift) @ self._contact_slope) * np.exp(-drift)
+        deviation = own.noise * float(np.sqrt(np.mean(self._at_rest**2)))
+        return self.gain * (exact + white_noise(for_noise, deviation, exact.shape))
+
+    @property
+    def _dimension(self) -> int:
+        """Of the places of presses."""
+        return 3 if is_curved(self.model.mesh) else 2
+
+    @cached_property
+    def _at_rest(self) -> Float[np.ndarray, " M"]:
+        """Voltages of the model at rest."""
+        return np.asarray(self.model.voltages(self.conductivity))
+
+    @cached_property
+    def _contact_slope(self) -> Float[np.ndarray, "L M"]:
+        """∂v/∂log z (L, M) of the skin at rest, volts; none for points."""
+        electrodes, protocol = self.model.electrodes, self.model.protocol
+        if electrodes.is_point:
+            return np.zeros((electrodes.num_electrodes, protocol.num_measurements))
+        fields, impedance = (np.asarray(one) for one in self.model.fields(self.conductivity))
+        slope = ContactSensitivity(self.model.mesh, electrodes)(fields, impedance, electrodes.contact_impedance)
+        return np.stack([select_channels(protocol, one) for one in slope])
+
+
+def _touched(places, cells, change, number: int) -> TouchedCells:
+    """The changes that count, as of `TouchedCells`, the first of each row."""
+    kept = np.abs(change) > _LEAST * np.abs(change).max(axis=1, keepdims=True)
+    rows, there = padded([row[one] for row, one in zip(cells, kept, strict=True)])
+    wide = _even(rows.shape[1]) - rows.shape[1]
+    changes = np.zeros(rows.shape)
+    changes[there] = change[kept]
+    rows, changes = (np.pad(array, ((0, 0), (0, wide))) for array in (rows, changes))
+    return TouchedCells(as_array(places), as_array(rows), as_array(changes), number)
+
+
+def _together(each: Sequence[TouchedCells]) -> TouchedCells:
+    """Several of one skin as one, with zeros at the ends of their rows."""
+    wide = max(one.cells.shape[1] for one in each)
+
+    def joined(name: str) -> Array:
+        arrays = [np.asarray(getattr(one, name)) for one in each]
+        return as_array(np.concatenate([np.pad(one, ((0, 0), (0, wide - one.shape[1]))) for one in arrays]))
+
+    places = as_array(np.concatenate([np.asarray(one.places) for one in each]))
+    return TouchedCells(places, joined("cells"), joined("change"), each[0].num_cells)
+
+
+def _kinds(mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, "n c"]) -> list[np.ndarray]:
+    """Numbers of the touches that change anything, those together that cost alike: by how many cells they have, and
+    whether these lie together or, of several contacts, apart."""
+    there = change != 0
+    number = there.sum(axis=1)
+    middles = np.asarray(centroids(mesh))[:, : 3 if is_curved(mesh) else 2][cells]
+    low, high = (find(np.where(there[..., None], middles, far), axis=1) for find, far in ((np.min, 1), (np.max, -1)))
+    area = np.sum(np.where(there, np.asarray(measures(mesh))[cells], 0.0), axis=1)
+    apart = np.linalg.norm(high - low, axis=1) > _APART * np.sqrt(area)
+    kinds = np.where(number > 0, 1 + 2 * np.searchsorted(_CELLS, number) + apart, 0)
+    return [np.flatnonzero(kinds == kind) for kind in np.unique(kinds[kinds > 0])]
+
+
+def _even(number: int) -> int:
+    """The least of 16, 32, 64 … that is not less: JAX compiles for every number of touches and of cells."""
+    return 2 ** max(4, (number - 1).bit_length())
+
+
+def check_seconds(name: str, value) -> None:
+    """Raise `ValueError`, about the argument `name`, for what is no time from zero on."""
+    if not (is_number(value) and value >= 0):
+        raise ValueError(f"{name} must be seconds, zero or more; it is {told(value)}.")
+
+
+def _check_times(seconds) -> Float[np.ndarray, " T"]:
+    seconds = real_array("seconds", seconds, "times (T,) of the frames")
+    if seconds.ndim != 1 or not seconds.size or not np.isfinite(seconds).all():
+        raise ValueError(f"seconds must be times (T,) of the frames; they have shape {seconds.shape}.")
+    if seconds[0] < 0 or (np.diff(seconds) < 0).any():
+        raise ValueError("seconds must not be negative, nor fall.")
+    return seconds

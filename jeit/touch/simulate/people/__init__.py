@@ -1,0 +1,7 @@
+"""People who touch a skin: how each of them makes each of six gestures, and what the skin reads."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

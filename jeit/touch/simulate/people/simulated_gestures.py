@@ -1,0 +1,79 @@
+"""Gestures of many people on a simulated skin, as it reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from jeit.arguments import check_key, check_kind, check_name, told
+from jeit.data import GestureSet
+from jeit.mesh import Domain
+from jeit.touch.simulate.contact.pressed_skin import PressedSkin
+from jeit.touch.simulate.people.manners import GESTURES
+from jeit.touch.simulate.people.person import Person
+
+# Seconds since the reference, at most, in which a skin drifts; frames of the reference, and of the untouched skin: each
+# of so many drifts.
+_LATEST, _REFERENCE, _DRIFTS, _FRAMES = 60.0, 60, 40, 16
+# Recordings simulated at once.
+_AT_ONCE = 120
+
+
+def simulate_gestures(
+    key: Array,
+    skin: PressedSkin,
+    outline: Domain,
+    people: Sequence[Person],
+    each: int,
+    *,
+    gestures: Sequence[str] = GESTURES,
+    rate: float = 60.0,
+    progress: Callable[[str], None] | None = None,
+) -> GestureSet:
+    """`each` times each of the `gestures` by each of the `people`, in this order, on a skin of this `outline`.
+
+    The skin has drifted for up to a minute since its reference, and has had no load before. `rate`: frames/s.
+    `progress` is called with how far it is. Raises `ValueError` for what is no key, skin, person, gesture or number, no
+    people, and as `Person.touch` and `PressedSkin.record` do.
+    """
+    check_key(key)
+    check_kind("skin", skin, PressedSkin, "a PressedSkin")
+    check_kind("people", people, (list, tuple), "a list of them, such as [Person.draw(key)]")
+    for number, person in enumerate(people):
+        check_kind(f"people[{number}]", person, Person, "a Person, such as of Person.draw(key)")
+    if not people:
+        raise ValueError("people: give one at least, such as [Person.draw(key)].")
+    check_kind("gestures", gestures, (list, tuple), "a list of names, such as ['tap', 'slap']")
+    for number, gesture in enumerate(gestures):
+        check_name(f"gestures[{number}]", gesture, GESTURES)
+    if not (isinstance(each, int) and each >= 1):
+        raise ValueError(f"each must be a number of touches, 1 or more; it is {told(each)}.")
+    before, quiet, touched, late = jax.random.split(key, 4)
+    reference = skin.record(before, [], np.arange(_REFERENCE) / rate).mean(axis=0)
+    later = np.random.default_rng(np.asarray(jax.random.bits(late, (4,))).tolist())
+    still = [([], np.arange(_FRAMES) / rate + later.uniform(0, _LATEST)) for _ in range(_DRIFTS)]
+    untouched = skin.record_each(quiet, still)
+    rows = [(person, gesture) for person in range(len(people)) for gesture in gestures for _ in range(each)]
+    seconds, voltages = [], []
+    for first in range(0, len(rows), _AT_ONCE):
+        made, keys = [], jax.random.split(jax.random.fold_in(touched, first), _AT_ONCE + 1)
+        for one, (person, gesture) in zip(keys[1:], rows[first : first + _AT_ONCE], strict=False):
+            motion, times = people[person].touch(one, gesture, outline, rate=rate)
+            made.append((motion, times + later.uniform(0, _LATEST)))
+            seconds.append(times)
+        found = skin.record_each(keys[0], made)
+        voltages += [one.astype(np.float32) for one in found]
+        if progress is not None:
+            progress(f"gestures: {len(voltages)} of {len(rows)}")
+    return GestureSet(
+        gesture=np.array([gesture for _, gesture in rows]),
+        person=np.array([person for person, _ in rows]),
+        start=np.concatenate([[0], np.cumsum([len(one) for one in seconds])]),
+        seconds=np.concatenate(seconds),
+        voltages=np.concatenate(voltages),
+        reference=reference,
+        untouched=np.concatenate(untouched),
+    )

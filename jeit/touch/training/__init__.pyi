@@ -1,0 +1,17 @@
+from .batches import ArrayRows, MappedRows, Rows
+from .fitting import Objective, Plan, Trained, fit
+from .model_file import check_same, read_head, read_model, write_model
+
+__all__ = [
+    "ArrayRows",
+    "MappedRows",
+    "Objective",
+    "Plan",
+    "Rows",
+    "Trained",
+    "check_same",
+    "fit",
+    "read_head",
+    "read_model",
+    "write_model",
+]

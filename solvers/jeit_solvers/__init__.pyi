@@ -1,0 +1,77 @@
+from .batching import in_turn
+from .clustering import KMeans, kmeans
+from .cores import number_of_cores, on_cores, over_cores
+from .dense.cholesky import lower_cholesky, symmetric_eigen, symmetric_inverse
+from .dense.ridge import QuadraticModel, ridge_model, ridge_step, solve_definite
+from .optimise.bounded import BoundedMinimum, lbfgsb, projected_gradient, scipy_lbfgsb
+from .optimise.descent import Descent
+from .optimise.implicit import as_minimum
+from .optimise.small_problems import (
+    Minimum,
+    definite_small,
+    gradient_small,
+    hessian_small,
+    inverse_small,
+    minimise_small,
+    solve_small,
+    symmetric_small,
+)
+from .optimise.status import Status, ended, ended_number
+from .sparse.choose import choose_solver
+from .sparse.conjugate_gradient import ConjugateGradient
+from .sparse.multifrontal import Factor, factorise, half_solve, inverse_entries, inverse_root, quadratic_form, solve
+from .sparse.near_inverse import NearInverse, Strips, near_inverse
+from .sparse.operator import SparseSymmetric
+from .sparse.pattern import SparsityPattern
+from .sparse.plan import FactorisationPlan, analyse
+from .sparse.sparse_cholesky import SparseCholesky
+
+__all__ = [
+    "BoundedMinimum",
+    "ConjugateGradient",
+    "Descent",
+    "Factor",
+    "FactorisationPlan",
+    "KMeans",
+    "Minimum",
+    "NearInverse",
+    "QuadraticModel",
+    "SparseCholesky",
+    "SparseSymmetric",
+    "SparsityPattern",
+    "Status",
+    "Strips",
+    "analyse",
+    "as_minimum",
+    "choose_solver",
+    "definite_small",
+    "ended",
+    "ended_number",
+    "factorise",
+    "gradient_small",
+    "half_solve",
+    "hessian_small",
+    "in_turn",
+    "inverse_entries",
+    "inverse_root",
+    "inverse_small",
+    "kmeans",
+    "lbfgsb",
+    "lower_cholesky",
+    "minimise_small",
+    "near_inverse",
+    "number_of_cores",
+    "on_cores",
+    "over_cores",
+    "projected_gradient",
+    "quadratic_form",
+    "ridge_model",
+    "ridge_step",
+    "scipy_lbfgsb",
+    "solve",
+    "solve_definite",
+    "solve_small",
+    "symmetric_eigen",
+    "symmetric_inverse",
+    "symmetric_small",
+]
