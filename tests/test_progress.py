@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from jeit import acoustic, design, imaging, inverse, report, simulate, touch
+from jeit import acoustic, design, imaging, inverse, report, touch
 from jeit.acoustic import Taps, calibrate_microphones
 from jeit.acoustic.simulate import SoundingSkin, calibration_taps, microphone_grid
 from jeit.electrodes import BoundaryElectrodes
@@ -30,10 +30,10 @@ LONG = [
     inverse.compare_rules,
     report.write_film,
     report.write_stream,
-    simulate.PressedSkin.frames,
-    simulate.PressedSkin.record,
-    simulate.calibration_taps,
-    simulate.simulate_presses,
+    touch.simulate.PressedSkin.frames,
+    touch.simulate.PressedSkin.record,
+    acoustic.simulate.calibration_taps,
+    touch.simulate.simulate_presses,
     touch.LearntSkin.fit,
 ]
 

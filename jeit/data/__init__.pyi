@@ -1,6 +1,6 @@
 from .description import load_description
 from .export import write_table
-from .frame_recording import FrameRecording, read_frame_recording
+from .frame_recording import FrameRecording, join, read_frame_recording
 from .gesture_set import GestureSet
 from .imageable import check_imageable
 from .measurement import Measurement
@@ -8,7 +8,6 @@ from .quality import estimate_noise, impossible_signs, reciprocity_error
 from .registry import read
 from .round_skin import RoundSkin, simulate_press
 from .screening import screen
-from .series import join
 from .transfer import driven_by, transfer_impedance
 
 __all__ = [

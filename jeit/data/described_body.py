@@ -1,26 +1,108 @@
-"""The body that `[geometry]` of a description says, and the electrodes that `[electrodes]` puts on it."""
+"""The body and the electrodes that [geometry] and [electrodes] of a description give, checked against each other."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
-from jeit.data.large_body import warn_large_body
-from jeit.data.on_solid import check_on_solid
 from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes, FaceDiscs, FacePatches, PointElectrodes, SheetDiscs
 from jeit.electrodes.facets import plates
+from jeit.electrodes.patches import check_apart, check_on_surface, check_size
 from jeit.files import check_electrodes
 from jeit.layout import perimeter, ring
 from jeit.mesh import Body, Disk, Domain, OwnMesh, Rectangle, Solid
 from jeit.mesh import read as read_mesh
 from jeit.mesh.outline import OUTLINES
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import LARGE, size_told
 
 if TYPE_CHECKING:
     from jeit.data.description_tables import ElectrodesTable, FacetsTable, GeometryTable, MeshTable, PlacedTable
+
+_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
+# How many times a key's length the body is large.
+_ACROSS = {"radius": 2.0, "width": 1.0, "depth": 1.0, "height": 1.0, "thickness": 1.0}
+
+
+def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
+    """Warn, in one sentence, of lengths in `[geometry]` of the file `origin` that look like those of another unit."""
+    from jeit.data.description_tables import PolygonTable  # it was imported when the table was read
+
+    lengths = {key: float(getattr(table, key, None) or 0) for key in _ACROSS}
+    large = {key: length for key, length in lengths.items() if _ACROSS[key] * length > LARGE}
+    if isinstance(body, OwnMesh):
+        place, size = "mesh", _extent(body.given.points)
+        give = {unit: f"scale = {factor * getattr(table, 'scale', 1.0):g}" for unit, factor in _UNITS.items()}
+    elif isinstance(table, PolygonTable) and not large:
+        place, size = "vertices", _extent(table.vertices)
+        give = {unit: f"{factor:g} times those" for unit, factor in _UNITS.items()}
+    else:
+        place, size = ", geometry.".join(large), max((_ACROSS[key] * large[key] for key in large), default=0.0)
+        give = {
+            unit: " and ".join(f"{factor * length:g}" for length in large.values()) for unit, factor in _UNITS.items()
+        }
+    if not size > LARGE:
+        return
+    said = " and ".join(f"{length:g} m" for length in large.values()) or f"{size:.3g} m"
+    warnings.warn(
+        f"{origin}: geometry.{place}: {said} {'are' if len(large) > 1 else 'is'} large for what electrodes are put on. "
+        f"If the lengths are millimetres, give {give['millimetres']}, if centimetres, {give['centimetres']}, if "
+        f"inches, {give['inches']}, and so all other lengths: jeit computes in metres.",
+        UserWarning,
+        stacklevel=5,
+    )
+
+
+def _extent(points) -> float:
+    return float(np.ptp(np.asarray(points), axis=0).max())
+
+
+# Of an electrode's smaller size: how far off the surface it may be, and of its height: how far out above the wall.
+_MOST_OFF = 0.1
+_MOST_OUT = 0.02
+
+
+def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
+    """Raise `ValueError` for the first electrode off the surface, the first two at one place, the first patch wider
+    than the body, and the first partly above or below a wall."""
+    if isinstance(electrodes, FacePatches):
+        height = np.asarray(electrodes.height)
+        smaller = np.minimum(electrodes.width, height)
+    elif isinstance(electrodes, FaceDiscs):
+        smaller, height = 2 * np.asarray(electrodes.radius), np.zeros(electrodes.num_electrodes)
+    else:
+        return
+    place = np.asarray(electrodes.position)
+    check_on_surface(place, _MOST_OFF * smaller, lambda places: _off(body, places)[0])
+    check_apart(place, smaller)
+    if isinstance(electrodes, FacePatches):
+        x_min, x_max, y_min, y_max = body.extent
+        sides = x_max - x_min, y_max - y_min
+        across = max(sides) if isinstance(body.outline, Disk | Rectangle) else float(np.hypot(*sides))
+        check_size("width", np.asarray(electrodes.width), across, "the body")
+    z, top = place[:, 2], body.thickness
+    out, on_wall = np.maximum(height / 2 - z, z + height / 2 - top), _off(body, place)[1]
+    for number in np.flatnonzero(on_wall & (out > _MOST_OUT * height))[:1]:
+        low, high = z[number] - height[number] / 2, z[number] + height[number] / 2
+        key = "height: " if height[number] > top else ""
+        raise ValueError(
+            f"{key}electrode {number + 1} reaches from {low:.4g} to {high:.4g} m, and its wall from 0 to {top:.4g} m: "
+            "give the size of what lies on the wall, and its middle."
+        )
+
+
+def _off(body: Solid, place: Float[np.ndarray, "L 3"]):
+    """How far places are off the surface, metres, and whether its wall is nearer than its lids."""
+    z = place[:, 2]
+    within, between = np.asarray(body.outline.signed_distance(place[:, :2])), np.minimum(z, body.thickness - z)
+    off_wall, off_lid = np.abs(within), np.abs(between)
+    # Outside, beyond the wall and beyond the lid are two sides of a right angle.
+    outside = np.hypot(np.minimum(within, 0), np.minimum(between, 0))
+    return np.where(outside > 0, outside, np.minimum(off_wall, off_lid)), off_wall <= off_lid
 
 
 def _box(width: float, depth: float, height: float) -> Solid:

@@ -1,9 +1,11 @@
-"""Frames of a skin as they were recorded, with the times they came at: an NPZ file, or any table that is described."""
+"""Recorded frames of a skin with their times, and several recordings as one series."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -11,7 +13,36 @@ from jaxtyping import Float
 from jeit.arguments import readings
 from jeit.data import table
 from jeit.data.description import Description, TableLayout
+from jeit.data.measurement import Measurement
 from jeit.files import npz_arrays
+
+
+def join(measurements: Sequence[Measurement]) -> Measurement:
+    """All frames of measurements of one set-up, one after the other, with their times if all have some that rise.
+
+    What is said of the body, and notes, are those of the first. Raises `ValueError` for none, and where two drive or
+    read differently.
+    """
+    if not measurements:
+        raise ValueError("measurements: there is none; give at least one.")
+    first, *others = measurements
+    for one in others:
+        if one.protocol is not first.protocol and not one.protocol.same_patterns(first.protocol):
+            raise ValueError(
+                f"'{one.name}' ({one.protocol.name}) is read otherwise than '{first.name}'; join one set-up's."
+            )
+    names = tuple(name for one in measurements for name in one.frame_names)
+    held: list[Any] = [one.times for one in measurements]
+    times = None if any(one is None for one in held) else np.concatenate([np.asarray(one) for one in held])
+    mask = np.concatenate([np.asarray(one.mask) for one in measurements])
+    return replace(
+        first,
+        voltages=np.concatenate([np.asarray(one.voltages) for one in measurements]),
+        mask=mask,
+        frame_names=names if len(names) == len(mask) else (),
+        times=None if times is None or (np.diff(times) <= 0).any() else times,
+    )
+
 
 _FRAMES, _TIMES = ("voltages", "frames"), ("seconds", "time")
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments.arrays import real_array
+from jeit.arguments.checks import real_array
 from jeit.mesh import Body, Mesh, Refine
 from jeit_solvers.engines import as_array, has_values, namespace
 

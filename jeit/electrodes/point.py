@@ -1,15 +1,27 @@
-"""Point electrodes: the zero-size limit, without contact impedance."""
+"""Point electrodes, and electrodes whose contact integrals are computed in advance."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.electrodes.electrodes import AbstractPointElectrodes, Contact, ElectrodePen, as_positions
+from jeit.electrodes.electrodes import AbstractElectrodes, AbstractPointElectrodes, Contact, ElectrodePen, as_positions
 from jeit.mesh import Body, Mesh, Refine, gradients, measures, normals
-from jeit_solvers.engines import either_engine, has_values, namespace, sum_into, undifferentiated, values_at_once
+from jeit_solvers.engines import (
+    either_engine,
+    has_values,
+    namespace,
+    on_device,
+    on_host,
+    sum_into,
+    undifferentiated,
+    values_at_once,
+)
 
 
 class PointElectrodes(AbstractPointElectrodes):
@@ -152,3 +164,63 @@ def _locate(position, mesh: Mesh):
     cell = xp.argmax(inside, axis=1)
     weights = xp.take_along_axis(barycentric, cell[:, None, None], 1)[:, 0]
     return cell, weights, inside.max(axis=1)
+
+
+class IntegratedElectrodes(AbstractElectrodes):
+    """The contact integrals of other electrodes on one mesh; nothing about the electrodes can be changed any more.
+
+    **Fields**: `integrals`, of the electrodes on the mesh they were made for.
+    """
+
+    integrals: Contact
+    point: bool = eqx.field(static=True)
+
+    def __init__(self, electrodes: AbstractElectrodes, mesh: Mesh):
+        if has_values(electrodes, mesh):
+            integrals = on_host(electrodes).contact(on_host(mesh))
+            self.integrals = integrals if namespace(electrodes, mesh) is np else on_device(integrals)
+        else:
+            self.integrals = electrodes.contact(mesh)
+        self.point = electrodes.is_point
+
+    @property
+    def is_point(self) -> bool:
+        """As the electrodes they were made of."""
+        return self.point
+
+    @property
+    def num_electrodes(self) -> int:
+        """Number of electrodes L."""
+        return self.integrals.load.shape[1]
+
+    @property
+    def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Raises `AttributeError`: it is in the integrals."""
+        raise AttributeError("IntegratedElectrodes hold integrals only; ask the electrodes that they were made of.")
+
+    def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractElectrodes:
+        """Raises `ValueError`: it is in the integrals."""
+        raise ValueError("IntegratedElectrodes cannot be changed; change the electrodes and integrate them anew.")
+
+    def geometry(self) -> dict[str, Any]:
+        """Nothing is known any more."""
+        return {}
+
+    def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
+        """Raises `ValueError`: where they are is not known any more."""
+        raise ValueError("IntegratedElectrodes do not say where they are; draw the electrodes that they were made of.")
+
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
+        """None: they have a mesh."""
+        return ()
+
+    def contact_nodes(self, mesh: Mesh):
+        """As the electrodes they were made of."""
+        return self.integrals.nodes
+
+    def contact(self, mesh: Mesh) -> Contact:
+        """The integrals, as they are."""
+        return self.integrals
+
+    def check(self, mesh: Mesh) -> None:
+        """Was done when they were made."""

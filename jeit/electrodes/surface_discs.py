@@ -6,9 +6,18 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.electrodes.discs import AbstractDiscs, as_discs, check_discs, squared_distances, window_within
+from jeit.electrodes.discs import (
+    EDGE,
+    AbstractDiscs,
+    as_discs,
+    check_discs,
+    nearest_electrodes,
+    squared_distances,
+    triangle_quadrature,
+    window_contact,
+    window_within,
+)
 from jeit.electrodes.electrodes import Contact
-from jeit.electrodes.window import EDGE, nearest_electrodes, triangle_quadrature, window_contact
 from jeit.mesh import Body, Mesh, Refine, measures, normals
 from jeit.mesh.geodesic import Triangles, unfold
 from jeit_solvers.engines import has_values, namespace, on_host, undifferentiated, values_at_once

@@ -1,7 +1,6 @@
-from .foreign import read_as, reason
 from .limits import MOST_ELECTRODES, check_electrodes, check_memory
 from .npz_file import check_archive, need, npy_array, npz_arrays
-from .text import check_size, parsed_toml, read_json, read_text, read_toml
+from .text import check_size, parsed_toml, read_as, read_json, read_text, read_toml, reason
 from .whole import clear_unfinished, whole_files, written_whole
 
 __all__ = [

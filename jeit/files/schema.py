@@ -27,7 +27,7 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field, GetCoreSchemaHandle
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
 
 from jeit.arguments import IN_MILLIMETRES, did_you_mean, told
-from jeit.files.faults import ALL, KEY, cut, told_faults
+from jeit.files.limits import ALL, KEY, cut, told_faults
 
 # Characters of names listed in a message, at most.
 _NAMES = 160

@@ -1,14 +1,42 @@
-"""Text that a person wrote or another program: of a size that such files have, in UTF-8, as TOML or JSON."""
+"""Text files, TOML and JSON: read within limits, with errors that name the file."""
 
 from __future__ import annotations
 
 import json
 import tomllib
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from jeit.files.foreign import reason
 from jeit.files.limits import check_memory
+
+_LONGEST = 120
+
+
+@contextmanager
+def read_as(said: str) -> Iterator[None]:
+    """Within it only other packages read: whatever they raise becomes a `ValueError`, `said` (such as "not a readable
+    WAV file") with their reason in brackets; that there is no such file, or that it may not be read, stays as it is.
+
+    What they print as warnings is not shown: a file that is read is as it should be.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except Exception as error:  # of any kind: packages that read formats raise what they stumble over
+        if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError):
+            raise
+        raise ValueError(f"{said} ({reason(error)}).") from None
+
+
+def reason(error: Exception) -> str:
+    """What an error says, in one short line: its kind where it says nothing."""
+    text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
+
 
 # Bytes of a file that a person writes, at most; bytes of memory for each of a text's.
 _LONGEST, _TEXT = 2**22, 4

@@ -12,7 +12,27 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from jeit.files.processes import boot, is_alive
+
+def boot() -> str:
+    """Which run of the system this is: containers with names of their own share it; "" where it is not known."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""
+
+
+def is_alive(pid: object) -> bool:
+    """Whether a process of this machine lives; True where that is not known."""
+    if os.name != "posix" or not isinstance(pid, int) or isinstance(pid, bool) or pid <= 0:
+        return True
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
+
 
 _UNFINISHED = re.compile(r"\.jeit-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.part")
 

@@ -1,11 +1,11 @@
-"""`ForwardModel`: conductivity in, electrode voltages and their Jacobian out."""
+"""ForwardModel: conductivity in, electrode voltages and their Jacobian out."""
 
 from __future__ import annotations
 
 import functools
 import operator
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,14 +16,14 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
+from jeit.electrodes.point import IntegratedElectrodes
 from jeit.forward.assembly import check_conductivity, field_gradients
-from jeit.forward.integrated import IntegratedModel, host_model, integrated_model
 from jeit.forward.system import System
 from jeit.forward.transfer import ElectrodeImpedance, electrode_fields, impedance_parts, solved_system
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 from jeit_solvers import SparseCholesky, in_turn
-from jeit_solvers.engines import gather, has_values, host, namespace, on_device, on_host, sum_into
+from jeit_solvers.engines import Recent, gather, has_values, host, namespace, on_device, on_host, sum_into
 
 # Numbers of a Jacobian at a time, where it is made in pieces: so many stay in a core's cache.
 _BLOCK = 250_000
@@ -296,3 +296,29 @@ _COMPILED = {
     potentials_of: jax.jit(potentials_of),
     voltages_and_jacobian_of: jax.jit(in_turn(voltages_and_jacobian_of)),
 }
+
+
+class IntegratedModel(NamedTuple):
+    """What a forward model is made of, the integrals in place of the electrodes."""
+
+    mesh: Mesh
+    electrodes: IntegratedElectrodes
+    protocol: Protocol
+    system: System
+
+
+def _integrated(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol, system: System) -> IntegratedModel:
+    with jax.ensure_compile_time_eval():  # or what is kept would belong to the program that is being traced
+        return IntegratedModel(mesh, IntegratedElectrodes(electrodes, mesh), protocol, system)
+
+
+def _on_host(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol, system: System) -> IntegratedModel:
+    # Electrodes of a user's own may work their integrals out in JAX.
+    return on_host(_integrated(*on_host((mesh, electrodes, protocol, system))))
+
+
+# A model is asked for one thing after another, and its electrodes may change while its mesh stays.
+integrated_model = Recent(_integrated)
+"""The `IntegratedModel` of a mesh, electrodes, a protocol and a system that all have values."""
+host_model = Recent(_on_host)
+"""The same in NumPy, for what is asked outside compiled code: no call waits for a compiler."""

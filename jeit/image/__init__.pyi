@@ -1,12 +1,10 @@
 from .image_series import ImageSeries
 from .inclusions import Inclusion, find_inclusions
-from .isosurface import TriangleSurface, isosurface_of, node_values
 from .merit import figures_of_merit
 from .oscillations import Oscillation, amplitude_spectrum, oscillation
-from .plane import Plane, cut_by_plane
+from .plane import Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
 from .raster import Raster
-from .regions import ball_region, box_region, half_region
-from .segmentation import segment
+from .segmentation import ball_region, box_region, half_region, segment
 from .solid_form import SolidForm
 
 __all__ = [

@@ -6,8 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jeit.image.segmentation import basins, shared_facets
 from jeit.image.solid_form import SolidForm
-from jeit.image.watershed import basins, shared_facets
 from jeit.mesh import Mesh, centroids, measures
 
 # Share of a sheet, and of a solid, whose images are of coarser grain: a disc of a fourteenth of its width, and a ball

@@ -5,7 +5,7 @@ from __future__ import annotations
 import equinox as eqx
 import numpy as np
 
-from jeit.image.isosurface import TriangleSurface
+from jeit.image.plane import TriangleSurface
 
 _ROUND, _UP = 48, 24
 

@@ -19,7 +19,7 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
-from jeit.image.score import CONDUCTIVE, RESISTIVE
+from jeit.image.merit import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
 from jeit.imaging.clock import Clock
 from jeit.imaging.method import METHODS, Asked

@@ -1,8 +1,10 @@
-"""What comes before any image of measured data: two frames checked, a mesh, and a model calibrated on the reference."""
+"""Preparation of two measured frames for imaging: checks, a mesh, and a model calibrated on the reference."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import jax
@@ -16,15 +18,34 @@ from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
-from jeit.imaging.chosen_frame import chosen_frame, naming_frame
 from jeit.imaging.clock import Clock
-from jeit.imaging.exchanged_rows import told_exchanges
-from jeit.imaging.wiring import Wiring, find_wiring
+from jeit.imaging.wiring import Wiring, find_wiring, told_exchanges
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
-from jeit.inverse.channel_weights import electrode_misfits
+from jeit.inverse.channels import electrode_misfits
 from jeit.mesh import Body, Mesh, OwnMesh, Solid
 from jeit_solvers.engines import as_array
+
+
+def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> int:
+    """The number, from 0, of the frame to image: the one asked for, by number or name, or the first that is not the
+    file's own reference. Raises `ValueError` for a frame that there is not."""
+    if frame is not None:
+        return measurement.frame_number(frame)
+    return int(measurement.num_frames > 1 and measurement.frame_names[:1] == ("reference",))
+
+
+@contextmanager
+def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
+    """A `ValueError` that names the measurement and is raised within names the frame too, where there are several."""
+    try:
+        yield
+    except ValueError as error:
+        name = f"'{measurement.name}'"
+        if measurement.num_frames < 2 or name not in str(error):
+            raise
+        raise ValueError(str(error).replace(name, f"{name}, frame {number}", 1)) from error
+
 
 # Nodes unless asked for, of a solid body and of a sheet.
 SOLID_POINTS, SHEET_POINTS = 10_000, 2000

@@ -1,5 +1,5 @@
 from .calibration import calibrate
-from .channel_weights import relative_noise
+from .channels import relative_noise
 from .hyperparameter.comparison import choose_hyperparameter, compare_rules
 from .hyperparameter.rules import RULES
 from .linear.back_projection import back_projection

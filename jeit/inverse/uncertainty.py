@@ -29,7 +29,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jeit.arguments import check_has_values, check_key, check_kind
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
-from jeit.inverse.prior.normal import AbstractNormal
+from jeit.inverse.prior.penalties import AbstractNormal
 from jeit.mesh import measures
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host

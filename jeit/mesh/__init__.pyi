@@ -2,9 +2,8 @@ from .bisection import bisect, cut
 from .body import Body
 from .cell_quality import quality
 from .files import read, write
-from .flatness import check_flat
 from .generate.refine import Refine
-from .geometry import centroids, gradients, measures, normals
+from .geometry import centroids, check_flat, gradients, measures, normals
 from .gmsh import from_gmsh
 from .mesh import Mesh
 from .outline import Disk, Domain, Polygon, Rectangle

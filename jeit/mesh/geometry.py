@@ -13,6 +13,15 @@ from jeit.mesh.mesh import Mesh
 from jeit_solvers.engines import either_engine, has_values, namespace
 
 
+def check_flat(mesh: Mesh, what: str) -> None:
+    """Raise `ValueError` for a surface in space: `what`, a plural such as "rasters", are of flat sheets and solids."""
+    if mesh.is_surface:
+        raise ValueError(
+            f"mesh is a surface in space, and {what} are of flat sheets and solids; take the flat sheet that it was "
+            "bent from, or a shell of it (jeit.mesh.shell)."
+        )
+
+
 @either_engine
 def measures(mesh: Mesh) -> Float[Array, " m"]:
     """Area in m² (2-D) or volume in m³ (3-D) of every cell, (m,), positive for a valid mesh."""

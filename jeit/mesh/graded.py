@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import brentq
 
-from jeit.mesh.generate.few_nodes import nodes_of_solid
-from jeit.mesh.generate.refine import Refine
+from jeit.mesh.generate.refine import Refine, nodes_of_solid
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Disk, Domain, Rectangle
 from jeit.mesh.solids import layer

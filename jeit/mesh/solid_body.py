@@ -9,8 +9,7 @@ from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind
 from jeit.mesh.body import Body
-from jeit.mesh.generate.few_nodes import nodes_of_solid
-from jeit.mesh.generate.refine import Refinement
+from jeit.mesh.generate.refine import Refinement, nodes_of_solid
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Domain
 from jeit.mesh.outline.domain import check_length

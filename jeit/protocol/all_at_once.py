@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import counted
 from jeit.protocol._check import check_amplitude, check_count, check_current
 from jeit.protocol.matrices import from_matrices
-from jeit.protocol.pairs import Current
+from jeit.protocol.patterns import Current
 from jeit.protocol.potentials import Reading, measurement_patterns
 from jeit.protocol.protocol import Protocol
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from jeit.protocol._check import check_choice, check_count, electrode_indices
-from jeit.protocol.pairs import pair_patterns, ring_pairs
+from jeit.protocol.patterns import pair_patterns, ring_pairs
 
 Reading = Literal["adjacent", "mean", "mean-removed", "against"]
 READINGS = ("adjacent", "mean", "mean-removed", "against")

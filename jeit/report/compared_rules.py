@@ -11,8 +11,7 @@ import numpy as np
 from jeit.arguments import counted
 from jeit.imaging.compared_rules import ComparedRules, RuleOutcome
 from jeit.mesh import Mesh
-from jeit.report.describe import describe_measurement, plain
-from jeit.report.folder import results, write_json
+from jeit.report.folder import describe_measurement, plain, results, write_json
 
 # Inclusions in one image of the picture; more lie over each other.
 _MOST_MARKED = 8

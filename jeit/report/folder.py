@@ -1,16 +1,23 @@
-"""The folder that results are written to, all of them or none."""
+"""Folders of results, and descriptions of a mesh and its electrodes for reports."""
 
 from __future__ import annotations
 
 import csv
 import json
+import math
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from jeit.data import Measurement
+from jeit.electrodes import AbstractElectrodes
 from jeit.files import whole_files
+from jeit.mesh import Body
 
 # Names of files may hold what is no letter in any script.
 _UNSAID = "backslashreplace"
@@ -54,3 +61,52 @@ def results_folder(folder: str | Path, names: tuple[str, ...]) -> Path:
     if taken:
         raise ValueError(f"folder {path}: there is a folder named {taken[0]} in it; give another.")
     return path
+
+
+def describe_measurement(measurement: Measurement) -> dict[str, Any]:
+    """Name, source, channels and notes of a measurement."""
+    mask = np.asarray(measurement.mask)
+    return {
+        "name": measurement.name,
+        "source": measurement.source,
+        "frame": measurement.frame_names[0] if len(measurement.frame_names) == 1 else None,
+        "channels": measurement.num_channels,
+        "masked": int((~mask).sum()),
+        "notes": list(measurement.notes),
+    }
+
+
+def describe_domain(domain: Body | None) -> dict[str, Any]:
+    """Shape and size in metres of a body."""
+    return {"shape": "not known"} if domain is None else {**domain.describe(), "unit": "m"}
+
+
+def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]:
+    """Kind, number, place and size in metres of electrodes."""
+    if electrodes is None:
+        return {"kind": "at places not known"}
+    return plain(electrodes.describe())
+
+
+def version_of(package: str) -> str | None:
+    """The version of an installed package; None if it is not."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def plain(value: Any) -> Any:
+    """Arrays as lists, complex numbers by their parts, and None for numbers that JSON does not know (NaN,
+    infinity)."""
+    if isinstance(value, dict):
+        return {key: plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(entry) for entry in value]
+    if hasattr(value, "tolist"):
+        return plain(np.asarray(value).tolist())
+    if isinstance(value, complex):
+        return {"real": plain(value.real), "imaginary": plain(value.imag)}
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

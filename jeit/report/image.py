@@ -15,8 +15,15 @@ from jeit.imaging.settings import ImagingSettings
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import Ellipsoid, Star
 from jeit.protocol import Protocol
-from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain, version_of
-from jeit.report.folder import results, write_json
+from jeit.report.folder import (
+    describe_domain,
+    describe_electrodes,
+    describe_measurement,
+    plain,
+    results,
+    version_of,
+    write_json,
+)
 from jeit.report.saved_image import saved_extras
 from jeit.report.volume_files import draft_vtu
 
@@ -75,8 +82,8 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
 
     from jeit.plot.colour_scale import CHANGE
     from jeit.plot.imaging.admittivity import plot_admittivity
+    from jeit.plot.imaging.electrodes import draw_labels, draw_outlines
     from jeit.plot.imaging.image import plot_image
-    from jeit.plot.imaging.labels import draw_labels, draw_outlines
     from jeit.plot.solid.overview import LOGARITHM, plot_solid
 
     if result.is_complex:

@@ -12,7 +12,7 @@ from jeit.data.imageable import MOST_DIFFERENCE_RECIPROCITY_ERROR
 from jeit.forward import ForwardModel
 from jeit.imaging import imaging_mesh
 from jeit.imaging.wiring import MOST_MISFIT, find_wiring
-from jeit.report.describe import describe_domain, describe_electrodes, describe_measurement, plain
+from jeit.report.folder import describe_domain, describe_electrodes, describe_measurement, plain
 
 # Of the mesh on which wirings are compared.
 _NODES = 1000

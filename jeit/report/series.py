@@ -11,9 +11,8 @@ from jaxtyping import Bool
 
 from jeit.image import Oscillation, oscillation
 from jeit.imaging.sequence import ImagedSequence
-from jeit.report.describe import describe_measurement, plain
 from jeit.report.film import check_film, write_film
-from jeit.report.folder import results, write_json, write_rows
+from jeit.report.folder import describe_measurement, plain, results, write_json, write_rows
 
 SERIES_FILES = ("series.png", "series.npz", "regions.csv", "report.json")
 

@@ -4,9 +4,7 @@ its compiler, and what happens in forked processes."""
 from __future__ import annotations
 
 from jeit.start.compiled_code import discarded_damaged, keep_compiled_code
-from jeit.start.compiler_flags import quick_compilation
-from jeit.start.forks import refuse_compiled_code_in_forks
-from jeit.start.precision import take_double_precision
+from jeit.start.jax_setup import quick_compilation, refuse_compiled_code_in_forks, take_double_precision
 
 __all__ = [
     "discarded_damaged",

@@ -70,5 +70,5 @@ def test_contents_page():
     for name in dir(jeit):
         assert getattr(jeit, name) is not None
     assert jeit.Disk is jeit.mesh.Disk
-    with pytest.raises(AttributeError, match="no attribute 'disc'"):
+    with pytest.raises(AttributeError, match="attribute disc"):
         _ = jeit.disc

@@ -5,7 +5,7 @@ import pytest
 
 from jeit.electrodes import FacePatches
 from jeit.electrodes.body_mesh import body_mesh
-from jeit.electrodes.clipping import covered_moments
+from jeit.electrodes.facets import covered_moments
 from jeit.forward import ForwardModel
 from jeit.mesh import Disk, Rectangle, Solid, layer, measures, rectangle
 from jeit.protocol import adjacent

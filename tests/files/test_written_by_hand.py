@@ -22,7 +22,7 @@ from jeit.data import description_tables, load_description
 from jeit.data.described_body import ELECTRODES, SHAPES
 from jeit.design import read_described_skin
 from jeit.design.study import read_study
-from jeit.files.faults import told_faults
+from jeit.files.limits import told_faults
 from jeit.files.schema import Number, Table, validated
 
 DESCRIPTIONS = {
@@ -386,7 +386,8 @@ def test_heavy_things_are_imported_where_they_are_used():
         "print([m for m in ('matplotlib', 'optimistix', 'meshio', 'scipy.io') if m in sys.modules])\n"
         "import jeit.acoustic, jeit.data, jeit.design, jeit.design.study, jeit.cli\n"
         "print('pydantic' in sys.modules)\n"
-        "jeit.data.description.parse_description({}, 'a.toml')\n"
+        "from jeit.data.description import parse_description\n"
+        "parse_description({}, 'a.toml')\n"
         "print('pydantic' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.image import Plane, cut_by_plane, isosurface_of, node_values
-from jeit.image.marching import part_above, passed
+from jeit.image.plane import part_above, passed
 from jeit.mesh import Mesh, box, centroids, cylinder, measures, rectangle
 
 BOX = (0.17, 0.255, 0.17)

@@ -7,7 +7,7 @@ from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.imaging import prepare_difference
-from jeit.imaging.exchanged_rows import told_exchanges
+from jeit.imaging.wiring import told_exchanges
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent, haar

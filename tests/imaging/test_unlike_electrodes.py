@@ -11,9 +11,9 @@ from jeit import image_difference
 from jeit.data import Measurement, read
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
-from jeit.image.score import challenge_score
+from jeit.image.merit import challenge_score
 from jeit.imaging import ImagingSettings, prepare_difference
-from jeit.inverse.channel_weights import electrode_misfits
+from jeit.inverse.channels import electrode_misfits
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent

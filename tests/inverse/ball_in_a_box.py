@@ -7,7 +7,7 @@ import numpy as np
 
 from jeit.electrodes import FaceDiscs
 from jeit.forward import ForwardModel
-from jeit.inverse.nonlinear.observed import independent_data
+from jeit.inverse.nonlinear.problem import independent_data
 from jeit.inverse.shapes.problem import ShapeProblem
 from jeit.mesh import bisect, box, centroids, cut
 from jeit.protocol import opposite

@@ -7,7 +7,7 @@ import pytest
 
 from jeit.electrodes import BoundaryElectrodes, PointElectrodes
 from jeit.forward import ForwardModel
-from jeit.forward.contact_sensitivity import ContactSensitivity
+from jeit.forward.changes import ContactSensitivity
 from jeit.inverse import calibrate
 from jeit.layout import ring
 from jeit.mesh import cylinder, disk

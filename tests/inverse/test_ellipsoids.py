@@ -9,8 +9,8 @@ from ball_in_a_box import BALL, BATH, RADIUS, SIZE, discs, model, shape_problem,
 from jeit.electrodes import CombinedElectrodes, plates
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, TotalVariation, reconstruct
-from jeit.inverse.nonlinear.observed import independent_data
-from jeit.inverse.shapes import EllipsoidPrior, StarPrior, certainty, reconstruct_shapes, search
+from jeit.inverse.nonlinear.problem import independent_data
+from jeit.inverse.shapes import EllipsoidPrior, StarPrior, ellipsoid, reconstruct_shapes, search
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
 from jeit.inverse.shapes.finer import finer
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
@@ -98,7 +98,7 @@ def test_the_kind_of_bodies_may_be_known(coarse):
     assert columns.odds == 0
     problem: Any = None
     assert search._otherwise(problem, Fit(bodies, point, 1.0, ROWS)) is None  # pyright: ignore
-    assert certainty.alternatives(problem, Fit(columns, point, 1.0, ROWS)) == [
+    assert ellipsoid.alternatives(problem, Fit(columns, point, 1.0, ROWS)) == [
         (None, pytest.approx(np.nan, nan_ok=True))
     ]
 
@@ -121,7 +121,7 @@ def test_the_range_of_bodies_of_one_material_is_of_each_for_itself_too(ellipsoid
     moved = point.copy()
     moved[25] = np.log(2) / spread
     one, each = Fit(same, point, 1.0, ROWS), Fit(ellipsoids, moved, 1.0, ROWS)
-    found = certainty.contrast_deviations(problem, one, each)
+    found = ellipsoid.contrast_deviations(problem, one, each)
     slope = spread * contrast
     wide = [0.3 * slope, 0.3 * slope, contrast + 0.3 * 2 * slope]
     np.testing.assert_allclose(found, np.hypot([0.1 * slope] * 3 if told else wide, 0.1))
@@ -252,10 +252,10 @@ def test_a_kind_is_doubted_by_the_data_alone_and_has_a_deviation_of_its_own(coar
 
     problem: Any = Told()
     fitted = Fit(bodies, coefficients, 1.0, ROWS)
-    ((other, deviation),) = certainty.alternatives(problem, fitted)  # pyright: ignore
+    ((other, deviation),) = ellipsoid.alternatives(problem, fitted)  # pyright: ignore
     assert (other is None) == told
     if other is not None:
-        (own,) = certainty.contrast_deviations(problem, fitted)  # pyright: ignore
+        (own,) = ellipsoid.contrast_deviations(problem, fitted)  # pyright: ignore
         assert other.column != column
         assert deviation**2 - 0.01 == pytest.approx(4 * (own**2 - 0.01))
 

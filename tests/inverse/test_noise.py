@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.inverse.channel_weights import repeated_noise
+from jeit.inverse.channels import repeated_noise
 
 TRUE = np.geomspace(1e-6, 1e-3, 30)
 

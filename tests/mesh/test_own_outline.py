@@ -19,7 +19,7 @@ from jeit.mesh.generate.curve import smooth
 from jeit.mesh.generate.unstructured import Target, mesh_within
 from jeit.plot import plot_mesh
 from jeit.protocol import adjacent
-from jeit.report.describe import describe_domain
+from jeit.report.folder import describe_domain
 from jeit_solvers.engines import namespace
 
 matplotlib.use("Agg")

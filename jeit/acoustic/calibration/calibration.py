@@ -75,7 +75,7 @@ class Calibration(eqx.Module):
         calibration has; `OSError` where there is no such file."""
         # pydantic takes longer to import than most of what jeit does with a calibration.
         from jeit.acoustic.calibration.calibration_tables import CalibrationTable
-        from jeit.files.faults import told_faults
+        from jeit.files.limits import told_faults
         from jeit.files.schema import validated
 
         name = Path(path).name

@@ -13,8 +13,7 @@ from jeit.acoustic.localisation.locate import microphones_in_use
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.overlay import brightness, fade
 from jeit.acoustic.tracking import Track
-from jeit.report.describe import plain, version_of
-from jeit.report.folder import results, write_json, write_rows
+from jeit.report.folder import plain, results, version_of, write_json, write_rows
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
 # Maps of so many pixels a side, so many frames at once.

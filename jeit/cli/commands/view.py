@@ -45,7 +45,7 @@ def view(
     from jeit.plot.solid import interactive
     from jeit.plot.solid.camera import Camera
     from jeit.report import read_image, write_views
-    from jeit.report.saved_image_views import VIEW_FILES, drawn_values
+    from jeit.report.saved_image import VIEW_FILES, drawn_values
 
     camera, levels = Camera(azimuth, elevation), tuple(level or (0.5,))
     planes = [_plane(text) for text in plane_mm or ()]

@@ -13,8 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.data.instruments.adjacent import CHANNELS, adjacent_recording
-from jeit.data.instruments.recording import content_of, cut_off, description_of, frame_at, measurement_of
+from jeit.data.instruments.recording import (
+    CHANNELS,
+    adjacent_recording,
+    content_of,
+    cut_off,
+    description_of,
+    frame_at,
+    measurement_of,
+)
 from jeit.data.measurement import Measurement
 
 DESCRIPTION = "Dräger PulmoVista (.eit): 208 adjacent voltages a frame, with their rate"

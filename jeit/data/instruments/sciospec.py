@@ -20,9 +20,9 @@ import numpy as np
 
 from jeit.arguments import told
 from jeit.data.description import Description
+from jeit.data.frame_recording import join
 from jeit.data.instruments.recording import Recording, content_of, description_of, measurement_of
 from jeit.data.measurement import Measurement
-from jeit.data.series import join
 from jeit.files import check_electrodes
 from jeit.protocol import from_matrices, measurement_patterns
 
@@ -75,7 +75,7 @@ def read_all(paths: Sequence[Path], description: str | Path | None = None) -> Me
     """Read files of one set-up, one after the other.
 
     `[data] frame_rate` of a description says when, where each holds one frame; else their dates do. Raises as `read`
-    and `jeit.data.series.join`.
+    and `jeit.data.frame_recording.join`.
     """
     joined = join([read(path, description) for path in paths])
     rate = description_of(paths[0], description).layout.frame_rate

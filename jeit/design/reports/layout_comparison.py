@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from jeit.design.comparison import LayoutComparison
-from jeit.report.describe import plain
-from jeit.report.folder import results, write_json
+from jeit.report.folder import plain, results, write_json
 
 # Letters of a name in the picture.
 _LONGEST = 32

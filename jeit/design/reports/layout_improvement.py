@@ -9,8 +9,7 @@ from jeit.design.improvement import ImprovedLayout
 from jeit.design.scores import Scores
 from jeit.layout import write_layout
 from jeit.mesh import Disk, Domain, Rectangle
-from jeit.report.describe import describe_domain, plain
-from jeit.report.folder import results, write_json
+from jeit.report.folder import describe_domain, plain, results, write_json
 
 
 def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:

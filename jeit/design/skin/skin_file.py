@@ -38,7 +38,7 @@ def read_described_skin(path: str | Path) -> Skin:
         raise FileNotFoundError(f"'{path}': there is no such file.")
     # pydantic takes longer to import than most of what jeit does with a skin's file.
     from jeit.design.skin.skin_tables import SkinTable
-    from jeit.files.faults import told_faults
+    from jeit.files.limits import told_faults
     from jeit.files.schema import validated
 
     table = validated(SkinTable, read_toml(path), path.name)

@@ -12,7 +12,7 @@ from jeit.design.defaults import CONTRAST, MOST_CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
 from jeit.design.skin.reached_cells import is_curved, reached_cells, said
 from jeit.design.skin.touch_grid import check_places
-from jeit.electrodes.window import smooth_step
+from jeit.electrodes.discs import smooth_step
 from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array, host
 

@@ -11,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 
 from jeit.arguments import told
-from jeit.files.processes import boot, is_alive
+from jeit.files.whole import boot, is_alive
 
 try:
     import fcntl

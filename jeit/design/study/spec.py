@@ -213,7 +213,7 @@ def read_study(path: str | Path) -> Study:
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
     # pydantic takes longer to import than most of what jeit does with a study's file.
     from jeit.design.study.study_tables import StudyTable
-    from jeit.files.faults import told_faults
+    from jeit.files.limits import told_faults
     from jeit.files.schema import validated
 
     text = read_text(path, most=_LONGEST)

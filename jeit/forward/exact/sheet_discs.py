@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import ive
 
-from jeit.forward.exact.disk import ConductingDisk
+from jeit.forward.exact.rim import ConductingDisk
 
 
 def disc_contact_resistance(conductivity: complex, radius: float, contact_impedance: complex) -> complex:

@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
-from jeit.inverse.hyperparameter.greit_noise_figure import greit_noise_figure
+from jeit.inverse.hyperparameter.rules import greit_noise_figure
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.linearisation import combined_blocks, data_directions, used_channels
 from jeit.mesh import Mesh, centroids, check_flat, measures

@@ -1,4 +1,4 @@
-from .links import Bounded, Linear, Log
+from .parametrisation import Bounded, Linear, Log
 from .solvers import LBFGSB, GaussNewton, LevenbergMarquardt, OneStep, ProjectedGradient
 from .unknowns import Background, ContactImpedance, ElectrodePosition, Scale
 

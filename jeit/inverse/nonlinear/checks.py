@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jeit.arguments import told
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
-from jeit.inverse.channel_weights import relative_noise
+from jeit.inverse.channels import relative_noise
 from jeit.inverse.linearisation import check_mask
 from jeit_solvers.engines import has_values, host, namespace
 

@@ -19,14 +19,11 @@ from jeit.inverse.channels import Data
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
-from jeit.inverse.nonlinear.informed import informed
-from jeit.inverse.nonlinear.observed import independent_data
 from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametrisation
-from jeit.inverse.nonlinear.problem import Inversion
+from jeit.inverse.nonlinear.problem import Inversion, independent_data, informed
 from jeit.inverse.nonlinear.solvers import LBFGSB, SOLVERS, AbstractSolver, GaussNewton, as_solver
-from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.defaults import PRIOR
-from jeit.inverse.prior.priors import AbstractPrior
+from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit.inverse.spectrum import Spectrum
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_device, on_host

@@ -1,7 +1,15 @@
-"""Covariances of low rank: Γ ≈ S Sᵀ with far fewer columns than cells, by a pivoted Cholesky factorisation.
+"""Priors of many cells by few shapes: low-rank factors of their covariance, on grids where bodies are large.
+
+Covariances of low rank: Γ ≈ S Sᵀ with far fewer columns than cells, by a pivoted Cholesky factorisation.
 
 One column after the other, where the diagonal of Γ - S Sᵀ is largest, until its sum is below a share of that of Γ.
 Harbrecht, Peters and Schneider, Appl. Numer. Math. 62 (2012) 428-440.
+
+A Gaussian covariance between many places without a matrix of pairs of them, by way of a regular grid.
+
+Γ = P G Pᵀ: G is the covariance on a grid of a third of the correlation length, which is a product of one along x, one
+along y and one along z and is applied axis by axis; P is cubic interpolation from four grid points along each axis,
+which is off by some thousandths at that spacing.
 """
 
 from __future__ import annotations
@@ -11,6 +19,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jaxtyping import Array, Float
 
 # Of places that are as large but for this, as those of symmetric meshes are, the first: rounding is not to decide.
@@ -77,3 +86,63 @@ def _pivots(scaled, tolerance: float, size: int):
     nothing = 0, jnp.zeros(size, int), jnp.zeros((size, len(scaled))), jnp.ones(len(scaled))
     rank, pivots, _, _ = jax.lax.while_loop(go_on, add, nothing)
     return pivots, rank
+
+
+# Grid points per correlation length, and points of a cubic along an axis.
+_PER_LENGTH, _CUBIC = 3, 4
+# Grid points, for every place and in all, beyond which a grid is no gain; all pairs of places cost far more than that.
+_EACH, _MOST = 8, 500_000
+# Columns at a time, for all on the grid at once would take more memory than the places do.
+_COLUMNS = 64
+
+
+class GriddedGaussian:
+    """Γ_ij = exp(-|x_i - x_j|² / 2 length²) between `places` (m, d), metres; `length` in metres.
+    `variance` (m,): its diagonal, one but for what interpolation takes off."""
+
+    def __init__(self, places: Float[np.ndarray, "m d"], length: float):
+        spacing = length / _PER_LENGTH
+        low = places.min(axis=0) - 1.5 * spacing
+        self._shape = tuple(int(count) for count in np.ceil((places.max(axis=0) - low) / spacing) + 2)
+        steps = [np.arange(count) for count in self._shape]
+        self._along = [np.exp(-((one[:, None] - one) ** 2) / (2 * _PER_LENGTH**2)) for one in steps]
+        place = (places - low) / spacing
+        self._interpolation = _cubic(place, self._shape)
+        weights, nodes = _weights(place), np.arange(_CUBIC)
+        between = np.exp(-((nodes[:, None] - nodes) ** 2) / (2 * _PER_LENGTH**2))
+        self.variance = np.prod(np.einsum("mdi,ij,mdj->md", weights, between, weights), axis=1)
+
+    @staticmethod
+    def suits(places: Float[np.ndarray, "m d"], length: float) -> bool:
+        """Whether the grid would be small beside the pairs of places."""
+        extent = np.ptp(places, axis=0) / length * _PER_LENGTH + 5
+        return bool(np.prod(extent) < min(_EACH * len(places), _MOST))
+
+    def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
+        """Γ times columns."""
+        found = np.empty(columns.shape)
+        for start in range(0, columns.shape[1], _COLUMNS):
+            some = slice(start, start + _COLUMNS)
+            grid = (self._interpolation.T @ columns[:, some]).reshape(*self._shape, -1)
+            for axis, along in enumerate(self._along):
+                grid = np.moveaxis(np.tensordot(along, grid, axes=(1, axis)), 0, axis)
+            found[:, some] = self._interpolation @ grid.reshape(int(np.prod(self._shape)), -1)
+        return found
+
+
+def _weights(place: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
+    """Of Lagrange's cubics through the two grid points on either side, along every axis."""
+    t = place - np.floor(place) + 1
+    nodes = np.arange(_CUBIC)
+    return np.stack([np.prod([(t - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1)
+
+
+def _cubic(place: Float[np.ndarray, "m d"], shape: tuple[int, ...]) -> scipy.sparse.csr_array:
+    """Weights (m, grid points) of Lagrange's cubics at places in units of the grid."""
+    first, nodes, along = np.floor(place).astype(int) - 1, np.arange(_CUBIC), _weights(place)
+    weight, index = np.ones((len(place), 1)), np.zeros((len(place), 1), int)
+    for axis, count in enumerate(shape):
+        weight = (weight[:, :, None] * along[:, axis, None, :]).reshape(len(place), -1)
+        index = (index[:, :, None] * count + (first[:, axis, None] + nodes)[:, None, :]).reshape(len(place), -1)
+    ends = np.arange(0, weight.size + 1, weight.shape[1])
+    return scipy.sparse.csr_array((weight.ravel(), index.ravel(), ends), shape=(len(place), int(np.prod(shape))))

@@ -13,8 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from jeit.inverse.prior.bases import NodalBasis
 from jeit.inverse.prior.nodal import in_columns
-from jeit.inverse.prior.normal import SparseNormal
-from jeit.inverse.prior.penalty import AbstractPenalty
+from jeit.inverse.prior.penalties import AbstractPenalty, SparseNormal
 from jeit.mesh import Mesh, gradients, measures
 from jeit_solvers import (
     Factor,

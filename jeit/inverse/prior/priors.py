@@ -1,4 +1,4 @@
-"""Priors: what is thought of an image before the data are seen, as a precision Q with energy xᵀQx.
+"""Priors of conductivity: what is known of an image before it is measured, as a precision Q with energy xᵀQx.
 
 A linear image minimises ‖W^½ (J x - v)‖² + λ² xᵀQx. With M measurements and m ≫ M cells it is found in data space,
 from products of the prior covariance Γ = Q⁻¹ with Jᵀ alone; where Q has a null space (Laplace: the constant), Γ is
@@ -21,17 +21,34 @@ import scipy.sparse
 from jaxtyping import Array, Float
 from scipy.spatial.distance import cdist
 
-from jeit.arguments import check_has_values
+from jeit.arguments import check_has_values, check_kind
 from jeit.inverse.hyperparameter.defaults import RULE
 from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, Regions
-from jeit.inverse.prior.gridded import GriddedGaussian
-from jeit.inverse.prior.low_rank import pivoted_cholesky, traced_pivoted_cholesky
+from jeit.inverse.prior.low_rank import GriddedGaussian, pivoted_cholesky, traced_pivoted_cholesky
 from jeit.inverse.prior.nodal import NodalSystem, by_columns
-from jeit.inverse.prior.penalty import AbstractPenalty, QuadraticForm, Ridge
+from jeit.inverse.prior.penalties import (
+    AbstractPenalty,
+    QuadraticForm,
+    Ridge,
+)
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geometry import interior_facets
-from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, solve
+from jeit_solvers import (
+    FactorisationPlan,
+    SparsityPattern,
+    analyse,
+    factorise,
+    solve,
+)
 from jeit_solvers.engines import has_values, host, on_host
+
+_WANTED = "an object of jeit.inverse: Noser(), Gaussian(length in metres), Laplace(), Tikhonov(), TotalVariation()"
+
+
+def check_prior(prior: Any) -> None:
+    """Raise `ValueError` for what is no prior: names of priors are the command line's and `ImagingSettings`' only."""
+    check_kind("prior", prior, AbstractPrior, _WANTED)
+
 
 # Rows of a dense covariance at a time.
 _BLOCK = 512

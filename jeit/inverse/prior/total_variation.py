@@ -19,8 +19,7 @@ from jaxtyping import Array, Float, Int
 from jeit.inverse.hyperparameter.defaults import EDGE_PRICE
 from jeit.inverse.prior.bases import DiagonalBasis
 from jeit.inverse.prior.nodal_total_variation import NodalTotalVariation
-from jeit.inverse.prior.normal import SparseNormal
-from jeit.inverse.prior.penalty import AbstractPenalty
+from jeit.inverse.prior.penalties import AbstractPenalty, SparseNormal
 from jeit.inverse.prior.priors import AbstractPrior, cell_factorisation, check_cells
 from jeit.mesh import measures
 from jeit.mesh.geometry import interior_facets

@@ -14,14 +14,12 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_has_values, check_kind, is_number, told
 from jeit.forward import ForwardModel
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
-from jeit.inverse.nonlinear.observed import independent_data
+from jeit.inverse.nonlinear.problem import independent_data
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior
-from jeit.inverse.shapes.certainty import alternatives, contrast_deviations
-from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior, Ellipsoids
+from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior, Ellipsoids, alternatives, contrast_deviations
 from jeit.inverse.shapes.finer import Finer, finer
-from jeit.inverse.shapes.problem import Fit, ShapeProblem
-from jeit.inverse.shapes.smooth_field import SmoothField
+from jeit.inverse.shapes.problem import Fit, ShapeProblem, SmoothField
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
 from jeit.mesh import check_flat
 from jeit_solvers.engines import as_array

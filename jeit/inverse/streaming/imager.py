@@ -19,19 +19,17 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.arguments import is_number, told
-from jeit.electrodes.precomputed import IntegratedElectrodes
+from jeit.electrodes.point import IntegratedElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import IndependentChannels, Weighing
 from jeit.inverse.hyperparameter.rules import Rule
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
-from jeit.inverse.nonlinear.informed import informed
 from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametrisation
-from jeit.inverse.nonlinear.problem import Inversion
+from jeit.inverse.nonlinear.problem import Inversion, informed
 from jeit.inverse.nonlinear.reconstruct import pose
 from jeit.inverse.nonlinear.solvers import AbstractSolver, GaussNewton, as_solver, expand, residual
-from jeit.inverse.prior.checks import check_prior
 from jeit.inverse.prior.defaults import smooth_prior
-from jeit.inverse.prior.priors import AbstractPrior
+from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit_solvers.engines import as_array
 
 FRAME_STEPS = 4

@@ -1,8 +1,9 @@
-"""Where cells shall be small: `Refine`, and the wanted cell size as a function of position."""
+"""Refinement of plane meshes, and meshes of few nodes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +15,35 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
 from jeit.mesh.generate.curve import Curve, Size, within
+
+# Steps in which a number of nodes that will do is looked for, and the largest.
+_STEP, _MOST = 1.1, 2e6
+
+
+class TooFewNodes(ValueError):
+    """Raised for a plane mesh of `asked` nodes that takes `least` about. `solid`: what is said, after "num_points: ",
+    where the plane mesh is that of a solid, with {asked} and {least} for the numbers of that."""
+
+    def __init__(self, message: str, least: int, solid: str):
+        super().__init__(message)
+        self.least, self.solid = least, solid
+
+
+@contextmanager
+def nodes_of_solid(asked: int | None, in_plane: Callable[[int], int]) -> Iterator[None]:
+    """A `ValueError` about the nodes of a plane mesh, raised within, speaks of those `asked` of the solid on it;
+    `in_plane`: how many of them its plane mesh has."""
+    try:
+        yield
+    except TooFewNodes as error:
+        if asked is None:
+            raise
+        number = float(asked)
+        while in_plane(round(number)) < error.least and number < _MOST:
+            number *= _STEP
+        least = float(f"{number:.2g}")
+        raise ValueError(f"num_points: {error.solid.format(asked=asked, least=f'{least:.0f}')}") from None
+
 
 # How fast cells may grow away from nodes that lie close together and from a user's own size function.
 _OWN_GROWTH = 0.45

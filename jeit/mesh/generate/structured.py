@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from jeit.mesh.generate.few_nodes import TooFewNodes
+from jeit.mesh.generate.refine import TooFewNodes
 
 # Height of a row per mean edge along it: between a square's 1 and an equilateral triangle's 0.87.
 _ROW = 0.93

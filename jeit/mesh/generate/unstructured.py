@@ -17,8 +17,7 @@ from jeit.mesh import loops
 from jeit.mesh.generate import _triangulate
 from jeit.mesh.generate._delaunay import Front, doubled_areas, triangulate
 from jeit.mesh.generate.curve import Curve, Size, within
-from jeit.mesh.generate.few_nodes import TooFewNodes
-from jeit.mesh.generate.refine import Refinement, SizeField
+from jeit.mesh.generate.refine import Refinement, SizeField, TooFewNodes
 from jeit.mesh.mesh import Mesh
 
 DEFAULT_NUM_POINTS = 1200

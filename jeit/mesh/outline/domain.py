@@ -36,7 +36,7 @@ class Domain(Body):
 
     Readers, layouts, rasters and mesh builders ask for nothing but what stands here, so that a new outline is one
     class. Arc length runs counter-clockwise along the outer edge. For edges of straight sides, or drawn as chords, each
-    method is a line that calls `jeit.mesh.outline.polyline`; see `Polygon`.
+    method is a line that calls `jeit.mesh.outline.polygon`; see `Polygon`.
     """
 
     @property

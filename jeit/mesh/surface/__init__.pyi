@@ -1,9 +1,7 @@
-from .bending import bend
-from .boundary import surface_of
+from .bending import bend, node_normals, surface_of
 from .shells import shell
 from .sleeves import forearm, tube
 from .spheres import cap, sphere
-from .vertex_normals import node_normals
 
 __all__ = [
     "bend",

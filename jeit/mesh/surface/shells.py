@@ -10,8 +10,8 @@ from jeit.mesh._topology import odd_permutation
 from jeit.mesh.generate import unstructured
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import check_length
-from jeit.mesh.prisms import stacked_cells, stacked_wall
-from jeit.mesh.surface.vertex_normals import node_normals
+from jeit.mesh.solids import stacked_cells, stacked_wall
+from jeit.mesh.surface.bending import node_normals
 
 _TAGS = ("inner", "outer", "side")
 # Times that the largest thickness is halved in on.

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull
 from jeit.arguments import told
 from jeit.mesh.generate import unstructured
 from jeit.mesh.generate.refine import Refinement
-from jeit.mesh.merging import merged
+from jeit.mesh.loose_triangles import merged
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import check_length
 from jeit.mesh.shapes import disk

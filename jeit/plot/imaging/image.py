@@ -15,8 +15,7 @@ from jeit.image import Inclusion, Raster
 from jeit.mesh import Mesh
 from jeit.plot.axes import axes_or_new, bare, draw_scale_bar, extent_of
 from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
-from jeit.plot.imaging.electrodes import draw_electrodes
-from jeit.plot.imaging.inclusions import draw_inclusions
+from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions
 from jeit.plot.imaging.mesh import check_body, draw_outline, draw_slice_outline
 
 

@@ -12,8 +12,7 @@ from matplotlib.colors import to_rgba
 from jeit.electrodes.electrode_shapes import Draped, ElectrodeShapes, surface_triangles
 from jeit.mesh import Mesh
 from jeit.plot.axes import SOFT
-from jeit.plot.imaging.electrode_numbers import at_one_place
-from jeit.plot.imaging.electrodes import METAL
+from jeit.plot.imaging.electrodes import METAL, at_one_place
 from jeit.plot.solid.scene import BODY, Scene, draw_number
 
 _HULL = 0.1

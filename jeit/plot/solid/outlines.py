@@ -9,7 +9,7 @@ from matplotlib.patches import Circle, Polygon
 from scipy.spatial import ConvexHull
 
 from jeit.image import Inclusion, Plane
-from jeit.image.marching import passed_edges
+from jeit.image.plane import passed_edges
 from jeit.plot.axes import INK
 from jeit.plot.solid.camera import Camera
 from jeit.plot.solid.scene import mark_sign

@@ -15,8 +15,7 @@ from jeit.arguments import told
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, cut_by_plane
-from jeit.image.marching import passed_edges
-from jeit.image.plane import AXES
+from jeit.image.plane import AXES, passed_edges
 from jeit.mesh import Mesh
 from jeit.plot.axes import INK, axes_or_new, draw_colour_bar, draw_scale_bar
 from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale

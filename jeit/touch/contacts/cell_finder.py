@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse
 
-from jeit.image.watershed import basins, shared_facets
+from jeit.image.segmentation import basins, shared_facets
 from jeit.mesh import Mesh, centroids, measures
 from jeit.mesh.geodesic import Triangles
 from jeit.touch.contacts.cell_outline import outline_of_cells

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 from jeit.design import Skin
-from jeit.forward.contact_sensitivity import ContactSensitivity
+from jeit.forward.changes import ContactSensitivity
 from jeit.forward.model import select_channels
 from jeit.touch.networks.touches import DEPTHS
 from jeit.touch.simulate.contact.indent_sets import image_places

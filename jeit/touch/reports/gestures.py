@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jeit.report.describe import plain, version_of
-from jeit.report.folder import results, write_json
+from jeit.report.folder import plain, results, version_of, write_json
 from jeit.touch import LearntGestures
 from jeit.touch.gestures.gesture_model import GESTURE_FILE
 

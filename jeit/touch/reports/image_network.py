@@ -12,8 +12,7 @@ from jaxtyping import Float, Int
 
 from jeit.arguments import counted
 from jeit.files import clear_unfinished, written_whole
-from jeit.report.describe import plain, version_of
-from jeit.report.folder import results, results_folder, write_json
+from jeit.report.folder import plain, results, results_folder, version_of, write_json
 from jeit.report.growing import GrowingRows, GrowingTable, Sample, saying_what_is_left
 from jeit.report.stream import PICTURES
 from jeit.touch.networks import ImageNetwork, LearntImages

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jeit.report.describe import plain, version_of
-from jeit.report.folder import results, write_json, write_rows
+from jeit.report.folder import plain, results, version_of, write_json, write_rows
 from jeit.touch import LearntSkin, Standing, Touches, write_skin
 
 SKIN_FILES = ("skin.skops", "report.json", "learning.png")

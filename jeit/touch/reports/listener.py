@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jeit.report.describe import plain, version_of
-from jeit.report.folder import results, write_json, write_rows
+from jeit.report.folder import plain, results, version_of, write_json, write_rows
 from jeit.touch.listening import Heard, Listener
 from jeit.touch.listening.feature_images import EVERY, LENGTH
 

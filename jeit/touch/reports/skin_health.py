@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jeit.report.describe import plain, version_of
-from jeit.report.folder import results, write_json, write_rows
+from jeit.report.folder import plain, results, version_of, write_json, write_rows
 from jeit.touch.health import HealthEvent, SkinHealth
 
 HEALTH_FILES = ("events.csv", "report.json", "health.png")

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.arguments import counted
-from jeit.report.describe import plain, version_of
-from jeit.report.folder import results, results_folder, write_json
+from jeit.report.folder import plain, results, results_folder, version_of, write_json
 from jeit.report.growing import GrowingTable
 from jeit.touch import NamedTouch, TouchWatch, WatchedFrame
 

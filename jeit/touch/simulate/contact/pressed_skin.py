@@ -17,7 +17,7 @@ from jeit.design.skin.touched_cells import TouchedCells, padded
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
 from jeit.forward.assembly import check_conductivity
-from jeit.forward.contact_sensitivity import ContactSensitivity
+from jeit.forward.changes import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
 from jeit.mesh import Mesh, centroids, measures
 from jeit.touch.simulate.contact.cell_pressure import pressed_cells
