@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import importlib
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 from jeit.arguments import check_name, listed
-from jeit.data import _matlab, eidors, kit4, ktc2023, table
-from jeit.data.instruments import carefusion, draeger, goettingen, sciospec, swisstom
 from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 
@@ -19,32 +17,42 @@ _IN_MEMORY = 4
 
 @dataclass(frozen=True)
 class Format:
-    """A file format: how to know it, how to read it, whether a description may go with it, and whether it may borrow
-    that of another measurement."""
+    """A file format: the module that reads it, the endings of its files, whether a description may go with a file,
+    whether it may borrow that of another measurement, and the bundled description that it always has.
 
-    summary: str
-    recognises: Callable[[Path], bool]
-    read: Callable[..., Measurement]
+    The module is imported when a file has such an ending.
+    """
+
+    module: str
+    endings: tuple[str, ...]
     described: bool = False
     borrows: bool = False
+    bundled: str | None = None
+
+    @property
+    def reader(self) -> Any:
+        """The module, with `DESCRIPTION`, `recognises(path)` and `read(path)`."""
+        return importlib.import_module(f"jeit.data.{self.module}")
+
+    def recognises(self, path: Path) -> bool:
+        """Whether a file is of this format, from its ending and its content."""
+        return path.suffix.lower() in self.endings and self.reader.recognises(path)
 
 
+_TABLES = (".csv", ".txt", ".dat", ".npy", ".npz")
 # The first that recognises a file reads it. To add a format, write a module like kit4.py and list it here.
 FORMATS: dict[str, Format] = {
-    "kit4": Format(kit4.DESCRIPTION, kit4.recognises, kit4.read),
-    "ktc2023": Format(ktc2023.DESCRIPTION, ktc2023.recognises, ktc2023.read),
-    "eidors": Format(eidors.DESCRIPTION, eidors.recognises, eidors.read, described=True),
-    "sciospec": Format(sciospec.DESCRIPTION, sciospec.recognises, sciospec.read, described=True),
-    "draeger": Format(draeger.DESCRIPTION, draeger.recognises, draeger.read, described=True),
-    "carefusion": Format(carefusion.DESCRIPTION, carefusion.recognises, carefusion.read, described=True),
-    "swisstom": Format(swisstom.DESCRIPTION, swisstom.recognises, swisstom.read, described=True),
-    "goettingen": Format(goettingen.DESCRIPTION, goettingen.recognises, goettingen.read, described=True),
-    "table": Format(table.DESCRIPTION, table.recognises, table.read, described=True, borrows=True),
-    "tank6cm": Format(
-        "6 cm tank (.csv, 208 rows of real and imaginary pairs): a table with the bundled description",
-        lambda path: False,
-        partial(table.read, description="tank6cm"),
-    ),
+    "kit4": Format("kit4", (".mat",)),
+    "ktc2023": Format("ktc2023", (".mat",)),
+    "eidors": Format("eidors", (".mat",), described=True),
+    "sciospec": Format("instruments.sciospec", (".eit",), described=True),
+    "draeger": Format("instruments.draeger", (".eit",), described=True),
+    "carefusion": Format("instruments.carefusion", (".eit",), described=True),
+    "swisstom": Format("instruments.swisstom", (".eit",), described=True),
+    "goettingen": Format("instruments.goettingen", (".get",), described=True),
+    "table": Format("table", _TABLES, described=True, borrows=True),
+    # A table of 208 rows of real and imaginary pairs, with the bundled description: only where it is named.
+    "tank6cm": Format("table", (), bundled="tank6cm"),
 }
 
 
@@ -69,11 +77,12 @@ def read(
     """
     file = Path(path)
     if file.is_dir():
+        sciospec = FORMATS["sciospec"]
         members = sorted(one for one in file.iterdir() if one.is_file() and sciospec.recognises(one))
         if not members or format not in (None, "sciospec"):
             raise ValueError(f"{file} is a folder. Give one data file in it.")
         check_memory(file.name, _IN_MEMORY * sum(one.stat().st_size for one in members))
-        return replace(sciospec.read_all(members, description), name=file.name, source=str(file))
+        return replace(sciospec.reader.read_all(members, description), name=file.name, source=str(file))
     if not file.is_file():
         raise ValueError(f"path: there is no file {file}. Check the name and the working directory.")
     if file.stat().st_size == 0:
@@ -81,13 +90,14 @@ def read(
     name = _recognise(file, description) if format is None else format
     check_name("format", name, FORMATS)
     chosen = FORMATS[name]
+    reader = chosen.reader
     if chosen.borrows:
-        return chosen.read(file, description=description, like=like)
+        return reader.read(file, description=description, like=like)
     if chosen.described:
-        return chosen.read(file, description=description)
+        return reader.read(file, description=description)
     if description is not None:
         raise ValueError(f"Format '{name}' describes itself; tables and files of instruments take a description.")
-    return chosen.read(file)
+    return reader.read(file, description=chosen.bundled) if chosen.bundled else reader.read(file)
 
 
 def _recognise(file: Path, description: str | Path | None) -> str:
@@ -95,6 +105,8 @@ def _recognise(file: Path, description: str | Path | None) -> str:
         if candidate.recognises(file):
             return name
     if file.suffix.lower() == ".mat":
+        from jeit.data import _matlab, eidors, kit4, ktc2023
+
         if description is not None or eidors.find_description(file) is not None:
             return "eidors"
         raise ValueError(

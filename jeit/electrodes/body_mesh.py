@@ -6,9 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.electrodes.electrodes import AbstractElectrodes
-from jeit.electrodes.patches import FacePatches
 from jeit.mesh import Body, Mesh, OwnMesh, Rectangle, Solid
-from jeit.mesh.graded import graded_box, graded_layers
 from jeit.mesh.sizes import size_told
 
 # How far from a face a position may be and yet lie on it, relative to the body's size; as a check of electrodes has it.
@@ -33,7 +31,12 @@ def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None
         raise ValueError(
             "num_points is missing: give about how many nodes the mesh is to have, such as 2000, or 10000 of a solid."
         )
-    if not (isinstance(body, Solid) and isinstance(electrodes, FacePatches)):
+    if not isinstance(body, Solid):
+        return body.mesh(num_points=num_points, refine=electrodes.refinement(body) or None)
+    from jeit.electrodes.patches import FacePatches
+    from jeit.mesh.graded import graded_box, graded_layers
+
+    if not isinstance(electrodes, FacePatches):
         return body.mesh(num_points=num_points, refine=electrodes.refinement(body) or None)
     outline, height = body.outline, float(body.thickness)
     place = np.asarray(electrodes.position)

@@ -8,9 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from jeit.electrodes.combined import CombinedElectrodes
 from jeit.electrodes.electrodes import AbstractElectrodes
-from jeit.electrodes.facets import FacetElectrodes
 from jeit.mesh import Mesh
 
 _ROUND, _SIDE = 32, 8
@@ -63,6 +61,9 @@ def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.nd
         pen = _PlanePen()
         electrodes.draw(mesh, pen)
         return pen.drawn
+    from jeit.electrodes.combined import CombinedElectrodes
+    from jeit.electrodes.facets import FacetElectrodes
+
     if isinstance(electrodes, CombinedElectrodes):
         return [one for part in electrodes.parts for one in _all_polygons(mesh, part)]
     triangles = surface_triangles(mesh)

@@ -22,7 +22,6 @@ from jeit.electrodes.electrodes import (
 )
 from jeit.electrodes.facets import covered_moments
 from jeit.mesh import Body, Mesh, Refine
-from jeit.mesh.geodesic import Triangles
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undifferentiated, values_at_once
 
@@ -76,6 +75,8 @@ def check_placed(electrodes: AbstractPlacedElectrodes, mesh: Mesh) -> None:
     """Raise `ValueError` for patches of which a mesh has little: off its surface, or larger than it."""
     sizes = {name: np.asarray(one) for name, one in electrodes.geometry().items() if name in ("width", "height")}
     points = np.asarray(mesh.points)
+    from jeit.mesh.geodesic import Triangles
+
     surface = Triangles(points, np.asarray(mesh.facets))
     half = np.maximum(*sizes.values()) / 2
     check_on_surface(np.asarray(electrodes.position), half, lambda places: surface.nearest(places).away)

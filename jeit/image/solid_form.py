@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import numpy as np
 
-from jeit.image.plane import TriangleSurface
+if TYPE_CHECKING:
+    from jeit.image.plane import TriangleSurface
 
 _ROUND, _UP = 48, 24
 
@@ -23,6 +26,8 @@ class SolidForm(eqx.Module):
 
     def surface(self) -> TriangleSurface:
         """Triangles all round it."""
+        from jeit.image.plane import TriangleSurface
+
         up = np.linspace(0, np.pi, _UP + 1)
         radius, height = np.sin(up), -np.cos(up)
         if self.column:

@@ -1,4 +1,5 @@
-from .arrangements import grid, perimeter, quasi_uniform, ring, ring_and_centre, spread
+from .arrangements import grid, perimeter, quasi_uniform, ring, ring_and_centre
+from .even_spread import spread
 from .files import read_layout, write_layout
 from .layout import Layout
 from .names import BUILT_IN, named_layout

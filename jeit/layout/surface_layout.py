@@ -13,7 +13,7 @@ from jeit.arguments import check_kind
 from jeit.electrodes import FaceDiscs, SurfaceDiscs
 from jeit.electrodes.electrodes import as_electrode_values, as_positions
 from jeit.electrodes.surface_discs import check_on_surface
-from jeit.layout.arrangements import spread
+from jeit.layout.even_spread import spread
 from jeit.layout.labels import check_labels
 from jeit.layout.layout import Layout, check_size
 from jeit.mesh import Mesh

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.mesh import _checks, _surface, _topology
+from jeit.mesh import _checks, _topology
 from jeit_solvers.engines import as_array, has_values
 
 
@@ -95,6 +95,8 @@ class Mesh(eqx.Module):
             _checks.check_coinciding(coordinates)
             indices = _checks.orient(coordinates, indices)
         if space > dimension:
+            from jeit.mesh import _surface
+
             indices = _surface.orient_surface(indices, coordinates)
         first, second, single = _topology.pair_facets(indices)
         _checks.check_connected(first // (dimension + 1), second // (dimension + 1), len(indices))

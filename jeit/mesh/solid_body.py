@@ -14,7 +14,6 @@ from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Domain
 from jeit.mesh.outline.domain import check_length
 from jeit.mesh.sizes import size_told
-from jeit.mesh.solids import choose_layers, in_plane, layer
 from jeit_solvers.engines import as_array
 
 
@@ -51,6 +50,8 @@ class Solid(Body):
 
         Tags: 'bottom', 'top', 'side', and those of the outline's mesh. Raises as `jeit.mesh.box`.
         """
+        from jeit.mesh.solids import choose_layers, in_plane, layer
+
         number, layers = choose_layers(float(self.outline.area), self.thickness, num_points, cell_size, None)
         with nodes_of_solid(num_points, in_plane(float(self.outline.area), self.thickness, None)):
             plane = self.outline.mesh(num_points=number, cell_size=cell_size, refine=refine)

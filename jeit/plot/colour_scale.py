@@ -83,3 +83,4 @@ def check_scale(scale: ColourScale) -> None:
 
 
 CHANGE = ColourScale()
+LOGARITHM = ColourScale(quantity="log₁₀ of conductivity over background", unit="")

@@ -25,7 +25,6 @@ from jeit.report.folder import (
     write_json,
 )
 from jeit.report.saved_image import saved_extras
-from jeit.report.volume_files import draft_vtu
 
 IMAGE_FILES = ("image.png", "image.npz", "report.json", "image.vtu")
 """What `write_image` writes; the last of solids only."""
@@ -50,6 +49,8 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
         if result.mesh.dimension == 3:
             background, change = np.asarray(result.calibration.conductivity), np.asarray(result.change)
             values = {"change of conductivity": change, "conductivity": background + change}
+            from jeit.report.volume_files import draft_vtu
+
             draft_vtu(made / "image.vtu", result.mesh, values, electrodes=result.electrodes)
 
 
@@ -80,13 +81,13 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     """The picture of a result, as a matplotlib `Figure` that needs no display; both parts of one of admittivity."""
     from matplotlib.figure import Figure
 
-    from jeit.plot.colour_scale import CHANGE
-    from jeit.plot.imaging.admittivity import plot_admittivity
+    from jeit.plot.colour_scale import CHANGE, LOGARITHM
     from jeit.plot.imaging.electrodes import draw_labels, draw_outlines
     from jeit.plot.imaging.image import plot_image
-    from jeit.plot.solid.overview import LOGARITHM, plot_solid
 
     if result.is_complex:
+        from jeit.plot.imaging.admittivity import plot_admittivity
+
         figure = Figure(figsize=(11.5, 5.2), layout="constrained")
         figure.suptitle(result.measurement.name)
         electrodes = result.electrodes
@@ -95,6 +96,8 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     scale = LOGARITHM if result.iterative else CHANGE
     electrodes = result.electrodes
     if result.mesh.dimension == 3:
+        from jeit.plot.solid.overview import plot_solid
+
         figure = plot_solid(result.mesh, _drawn(result), electrodes, inclusions=result.inclusions, scale=scale)
         figure.suptitle(result.measurement.name)
         return figure

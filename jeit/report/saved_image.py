@@ -252,8 +252,7 @@ def write_views(
 
 def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
     """What is drawn of an image, per cell, and its scale: the departure of iterative ones, real parts of complex."""
-    from jeit.plot.colour_scale import CHANGE, ColourScale
-    from jeit.plot.solid.overview import LOGARITHM
+    from jeit.plot.colour_scale import CHANGE, LOGARITHM, ColourScale
 
     if image.departure is not None:
         return image.departure, LOGARITHM

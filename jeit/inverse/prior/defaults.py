@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from jeit.inverse.prior.matern import Matern
 from jeit.inverse.prior.priors import AbstractPrior, Gaussian, Laplace, Noser, Tikhonov
 
 PRIOR = Noser()
@@ -18,11 +17,17 @@ def smooth_prior(size: float) -> Gaussian:
     return Gaussian(0.085 * size)
 
 
+def _matern(size: float) -> AbstractPrior:
+    from jeit.inverse.prior.matern import Matern
+
+    return Matern(smooth_prior(size).length)
+
+
 PRIORS: dict[str, Callable[[float], AbstractPrior]] = {
     "tikhonov": lambda size: Tikhonov(),
     "laplace": lambda size: Laplace(),
     "noser": lambda size: Noser(),
     "gaussian": smooth_prior,
-    "matern": lambda size: Matern(smooth_prior(size).length),
+    "matern": _matern,
 }
 """Quadratic priors by name, made for a body of a given size: its longer side, metres."""

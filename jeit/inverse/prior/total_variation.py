@@ -18,7 +18,6 @@ from jaxtyping import Array, Float, Int
 
 from jeit.inverse.hyperparameter.defaults import EDGE_PRICE
 from jeit.inverse.prior.bases import DiagonalBasis
-from jeit.inverse.prior.nodal_total_variation import NodalTotalVariation
 from jeit.inverse.prior.penalties import AbstractPenalty, SparseNormal
 from jeit.inverse.prior.priors import AbstractPrior, cell_factorisation, check_cells
 from jeit.mesh import measures
@@ -74,6 +73,8 @@ class TotalVariation(AbstractPrior):
             raise ValueError("regions: total variation finds its own; leave them out, or take another prior.")
         check_cells(mesh)
         if mesh.dimension == 3 and not per_cell and has_values(mesh):
+            from jeit.inverse.prior.nodal_total_variation import NodalTotalVariation
+
             return NodalTotalVariation.create(mesh, reference, hyperparameter, self.smoothing, _LEVEL)
         pairs, nodes = interior_facets(mesh)
         points = on_host(mesh.points)

@@ -1,6 +1,6 @@
 """Bodies in solids as ellipsoids and columns, and how certain their contrasts are.
 
-Their other kind are columns, which stand through the whole height: the same along x and y alone, of the area π r².
+A column stands through the whole height of a body: the same along x and y alone, of the area π r².
 
 Contrasts, and what they make of the conductivity, are those of `jeit.inverse.shapes.bodies`. The derivative of a
 matrix's exponential by its eigenvectors: Higham, Functions of Matrices (SIAM 2008), section 3.2.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -18,11 +18,13 @@ from jeit.inverse.nonlinear.problem import independent_data
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior
 from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior, Ellipsoids, alternatives, contrast_deviations
-from jeit.inverse.shapes.finer import Finer, finer
 from jeit.inverse.shapes.problem import Fit, ShapeProblem, SmoothField
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
 from jeit.mesh import check_flat
 from jeit_solvers.engines import as_array
+
+if TYPE_CHECKING:
+    from jeit.inverse.shapes.finer import Finer
 
 # How many times the objective must rise, at least, when a body is left out and the others fitted again.
 LEAST_RISE = 1.4
@@ -275,6 +277,8 @@ class _Told(NamedTuple):
 def _on_finer_meshes(told: _Told, least_rise: float, tell: Callable[[str], None]) -> tuple[_Told, Finer | None]:
     """The same fitted where the mesh is finer on their surfaces, again until they stay there; ghosts that a coarser one
     made are not. And the last of those meshes."""
+    from jeit.inverse.shapes.finer import finer
+
     given, there = told.setting, None
     for again in range(_MOST_MESHES):
         _, level, (before, rises, doubtful) = told

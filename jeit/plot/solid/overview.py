@@ -23,7 +23,6 @@ from jeit.plot.solid.shaded_surface import mappable
 from jeit.plot.solid.slices import cell_values, draw_slice, dress_slice
 
 _MOST_LISTED = 5
-LOGARITHM = ColourScale(quantity="log₁₀ of conductivity over background", unit="")
 """Of iterative images."""
 
 
