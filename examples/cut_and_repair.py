@@ -51,7 +51,7 @@ def main() -> float:
     after = watch(before, frames[seconds >= MENDED_AT], seconds[seconds >= MENDED_AT])
     for event in after.events:
         said = f"{event.kind}, {1e3 * event.length:.0f} mm ({event.status})"
-        print(f"{event.time:6.1f} s, told at {event.told:.1f} s: {said}")
+        print(f"{event.time:6.1f} s, told at {event.noticed:.1f} s: {said}")
 
     figure, axes = plt.subplots(1, 4, figsize=(18, 4.6), layout="constrained")
     finder, errors = CellFinder(coarse.mesh, sign=-1), []

@@ -26,7 +26,7 @@ from jeit.touch.kohonen import (
     map_quality,
     neuron_shares,
     time_constant,
-    touches_told,
+    touches_reported,
 )
 from jeit.touch.simulate import Bar, Disc, Press, Prism, Ring
 
@@ -219,7 +219,7 @@ def _several(disk: WeighedSkin, placed: PlacedMap, rest: np.ndarray, trials: int
             frames, places = disk.skin.frames(jax.random.key(50), [()] * trials), np.zeros((trials, 0, 2))
         counts, off, strengths = np.zeros(5, int), [], []
         for frame, where in zip(frames, places, strict=True):
-            found = touches_told(placed, frame, rest)
+            found = touches_reported(placed, frame, rest)
             counts[min(len(found), 4)] += 1
             if number and len(found) == number:
                 distance = np.linalg.norm(where[:, None] - np.array([one.place for one in found]), axis=-1)
@@ -336,7 +336,7 @@ def _draw(folder: Path, curves, located, drawings, multi, pressed, sensed) -> No
         frame = disk.skin.frames(jax.random.key(60), [touch])[0]
         activity = placed.learnt.activity(frame)[0]
         title = " + ".join(f"{one:g} g" for one in WEIGHTS[:number])
-        plot_map(placed.places, activity, touches=touches_told(placed, frame, rest), title=title, ax=ax)
+        plot_map(placed.places, activity, touches=touches_reported(placed, frame, rest), title=title, ax=ax)
         ax.plot(*where[:number].T, "o", markersize=17, markerfacecolor="none", color=MARKED)
     for ax, (name, frame) in zip(axes[2], pressed.items(), strict=True):
         plot_map(placed.places, neuron_shares(placed, frame, rest), label="Share", title=f"{name}, 3 N", ax=ax)

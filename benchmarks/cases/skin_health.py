@@ -68,7 +68,7 @@ def _cuts(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked]]
             told += bool(events)
             cuts = [event for event in events if event.kind == EventKind.CUT]
             named += bool(cuts)
-            after += [event.told - BEGINS for event in events[:1]]
+            after += [event.noticed - BEGINS for event in events[:1]]
             error += [apart(cut.along(1e-3), event.path) for event in cuts[:1] if event.path is not None]
             away = far(skin, one, cut)
             if depth == 1 and events and away:
@@ -105,7 +105,7 @@ def _faults(skin: DamagedSkin, quick: bool) -> tuple[list[list[str]], list[Asked
             told += bool(events)
             right = [event for event in events if event.electrode == electrode]
             named += bool(right)
-            after += [event.told - BEGINS for event in events[:1]]
+            after += [event.noticed - BEGINS for event in events[:1]]
         median = f"{np.median(after):.1f} s" if after else "–"
         rows.append([SKINS[skin.name], f"{kind} electrodes", str(number), str(told), str(named), median, ""])
         if kind != "loose":

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.mesh import Domain, Polygon
 from jeit_solvers.engines import as_array, namespace, on_host, slopes
 
@@ -100,7 +100,7 @@ def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -
         vertices = np.asarray(outline, float)
     except (TypeError, ValueError):
         wanted = "an outline, such as Disk(0.1), or vertices (K, 2) or (K, 3) in metres"
-        raise ValueError(f"outline must be {wanted}; it is {told(outline)}.") from None
+        raise ValueError(f"outline must be {wanted}; it is {describe(outline)}.") from None
     if vertices.ndim != 2 or vertices.shape[1] not in (2, 3) or len(vertices) < 3:
         raise ValueError(f"outline: give at least three vertices (K, 2) or (K, 3) in metres; got {vertices.shape}.")
     if vertices.shape[1] == 2:

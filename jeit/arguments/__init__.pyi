@@ -6,13 +6,13 @@ from .checks import (
     check_metres,
     check_name,
     counted,
+    describe,
     did_you_mean,
     is_number,
     listed,
     percent,
     readings,
     real_array,
-    told,
 )
 
 __all__ = [
@@ -23,11 +23,11 @@ __all__ = [
     "check_metres",
     "check_name",
     "counted",
+    "describe",
     "did_you_mean",
     "is_number",
     "listed",
     "percent",
     "readings",
     "real_array",
-    "told",
 ]

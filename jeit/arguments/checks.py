@@ -21,7 +21,7 @@ _PLAIN, _LONGEST = (str, bytes, int, float, complex, type(None)), 60
 def check_kind(name: str, given: Any, kind: type | tuple[type, ...], wanted: str) -> None:
     """Raise `ValueError`, about the argument `name`, for what is no `kind`; `wanted` says what is, with an example."""
     if not isinstance(given, kind):
-        raise ValueError(f"{name} must be {wanted}; it is {told(given)}.")
+        raise ValueError(f"{name} must be {wanted}; it is {describe(given)}.")
 
 
 def is_number(given: Any) -> bool:
@@ -30,7 +30,7 @@ def is_number(given: Any) -> bool:
     return isinstance(number, Real) and not isinstance(number, bool) and math.isfinite(number)
 
 
-def told(given: Any) -> str:
+def describe(given: Any) -> str:
     """What was given, in a few words: 'laplace', nan, a list, an array of float64 of shape (3,)."""
     thing = _scalar(given)
     if isinstance(thing, (np.ndarray, jax.Array)):
@@ -61,9 +61,9 @@ def real_array(name: str, given: Any, wanted: str) -> np.ndarray:
     try:
         values = np.asarray(given)
     except (ValueError, TypeError):
-        raise ValueError(f"{name} must be {wanted}; it is {told(given)}, which is no array.") from None
+        raise ValueError(f"{name} must be {wanted}; it is {describe(given)}, which is no array.") from None
     if values.dtype.kind not in "iuf":
-        raise ValueError(f"{name} must be {wanted}, real numbers; it is {told(values)}.")
+        raise ValueError(f"{name} must be {wanted}, real numbers; it is {describe(values)}.")
     return values.astype(float)
 
 
@@ -106,7 +106,7 @@ def check_key(key: Any, name: str = "key") -> None:
         if new or (key.dtype == np.uint32 and key.ndim == 1):
             return
     seed = key if isinstance(key, int) and not isinstance(key, bool) else 0
-    raise ValueError(f"{name} must be one random key, such as jax.random.key({seed}); it is {told(key)}.")
+    raise ValueError(f"{name} must be one random key, such as jax.random.key({seed}); it is {describe(key)}.")
 
 
 IN_MILLIMETRES = "were millimetres given for metres?"
@@ -117,7 +117,7 @@ def check_metres(name: str, value: Any, most: float = np.inf, limit: str = "") -
     """Raise `ValueError`, about the argument `name`, for what is no positive length in metres, and for one of more than
     `most` metres; `limit` says in words what is so long."""
     if not (is_number(value) and value > 0):
-        raise ValueError(f"{name} must be a positive length in metres; it is {told(value)}.")
+        raise ValueError(f"{name} must be a positive length in metres; it is {describe(value)}.")
     if value > most:
         raise ValueError(f"{name} is {1e3 * float(value):g} mm, more than {limit}, {1e3 * most:g} mm; {IN_MILLIMETRES}")
 
@@ -126,7 +126,7 @@ def check_name(argument: str, given: Any, names: Iterable[str], otherwise: str =
     """Raise `ValueError`, about `argument`, for what is none of `names`; `otherwise` says what else could be given."""
     known = list(names)
     if not (isinstance(given, str) and given in known):
-        said = f"it is {told(given)}{did_you_mean(given, known)}"
+        said = f"it is {describe(given)}{did_you_mean(given, known)}"
         raise ValueError(f"{argument} must be one of {', '.join(known)}{otherwise}; {said}.")
 
 

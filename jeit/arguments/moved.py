@@ -45,7 +45,11 @@ _MOVED = {
         "simulate_gesture_stream simulate_gestures simulate_presses",
     },
 }
-MOVED = {
+_RENAMED = {
+    "jeit.touch.attributes.least_told": "jeit.touch.attributes.least_detected",
+    "jeit.touch.kohonen.touches_told": "jeit.touch.kohonen.touches_reported",
+}
+MOVED = _RENAMED | {
     f"{page}.{name}": f"{home}.{name}"
     for page, homes in _MOVED.items()
     for home, names in homes.items()

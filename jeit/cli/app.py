@@ -151,11 +151,11 @@ def _explain(error: Exception) -> int:
 
 
 def _fail(message: str, status: int) -> int:
-    print(f"jeit: {_told(message)}", file=sys.stderr)
+    print(f"jeit: {_one_line(message)}", file=sys.stderr)
     return status
 
 
-def _told(message: str) -> str:
+def _one_line(message: str) -> str:
     """One line that a terminal shows as it is, of its beginning and its end where it is long."""
     line = "".join(letter if letter.isprintable() else "�" for letter in " ".join(message.split()))
     half = (_LONGEST - 3) // 2
@@ -172,7 +172,7 @@ def _shown_once() -> Callable[..., None]:
             return
         if said not in shown and not discarded_damaged(said):
             shown.add(said)
-            print(f"jeit: warning: {_told(said)}", file=sys.stderr)
+            print(f"jeit: warning: {_one_line(said)}", file=sys.stderr)
 
     return show
 

@@ -52,7 +52,7 @@ class Steps:
         """The name of the step that was begun last, empty before the first."""
         return self._step
 
-    def tell(self, detail: str) -> None:
+    def report(self, detail: str) -> None:
         """Say how far the step under way is, beside its spinner."""
         if self._status is not None:
             self._status.update(Text(f"{self._step} … {detail}"))

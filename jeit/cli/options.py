@@ -104,9 +104,9 @@ def naming_options(options: dict[str, str]) -> Iterator[None]:
         yield
     except (ValueError, FileNotFoundError) as error:
         said = str(error)
-        if (told := in_options(said, options)) == said:
+        if (renamed := in_options(said, options)) == said:
             raise
-        raise ValueError(told) from error
+        raise ValueError(renamed) from error
 
 
 def read_file(

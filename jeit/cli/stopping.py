@@ -57,18 +57,18 @@ class Stopping:
     def before(self, pictures: Sequence[str], step: Steps) -> Callable[[str], None]:
         """Tells of what is written and drawn as steps; nothing is drawn where a signal has come."""
 
-        def tell(what: str) -> None:
+        def report(what: str) -> None:
             part = "draw" if what.partition(":")[0] in pictures else "write"
             if part == "draw" and self.signal is not None:
                 raise _StoppedError
             if step.under_way != part:
                 step(part)
-            step.tell(what)
+            step.report(what)
 
-        return tell
+        return report
 
     @contextmanager
-    def ending(self, come: "FramesTold", *files: str) -> Iterator[None]:
+    def ending(self, come: "FrameCounter", *files: str) -> Iterator[None]:
         """End the command after what is within, where a signal has come, and say after how many frames; `files` have
         them."""
         try:
@@ -109,7 +109,7 @@ class Stopping:
             raise KeyboardInterrupt
 
 
-class FramesTold:
+class FrameCounter:
     """Says of the step under way how many frames have come, of `number` where that is known, a few times a second."""
 
     def __init__(self, step: Steps, number: int | None = None):
@@ -122,4 +122,4 @@ class FramesTold:
         now = time.monotonic()
         if now - self._last > _EVERY:
             self._last = now
-            self._step.tell(f"frame {self.number:,}{self._of}")
+            self._step.report(f"frame {self.number:,}{self._of}")

@@ -132,11 +132,11 @@ def _elements(content: bytes) -> Iterator[_Variable]:
         else:
             beginning = element[:_BEGINNING]
         if kind == _MATRIX:
-            yield _Variable(*_told(beginning, order), element, packed, order)
+            yield _Variable(*_header(beginning, order), element, packed, order)
         place = start + size
 
 
-def _told(beginning: bytes, order: str) -> tuple[str, tuple[int, ...], int, bool, int]:
+def _header(beginning: bytes, order: str) -> tuple[str, tuple[int, ...], int, bool, int]:
     """Name, shape, class, whether complex, and where numbers begin, of an array's first three sub-elements."""
     _, flags, place = _part(beginning, 0, order)
     _, shape, place = _part(beginning, place, order)

@@ -18,7 +18,7 @@ from jeit.layout import perimeter, ring
 from jeit.mesh import Body, Disk, Domain, OwnMesh, Rectangle, Solid
 from jeit.mesh import read as read_mesh
 from jeit.mesh.outline import OUTLINES
-from jeit.mesh.sizes import LARGE, size_told
+from jeit.mesh.sizes import LARGE, size_checked
 
 if TYPE_CHECKING:
     from jeit.data.description_tables import ElectrodesTable, FacetsTable, GeometryTable, MeshTable, PlacedTable
@@ -130,7 +130,7 @@ _NO_ARGUMENT = {"shape", "thickness"}
 def described_body(table: GeometryTable, folder: Path, origin: str) -> Body:
     """The body of a table `[geometry]`; a mesh's file is looked for in `folder`. Raises `ValueError`, and warns once of
     lengths that are too large for metres, by their keys."""
-    with size_told():
+    with size_checked():
         body = _body(table, folder, origin)
     warn_large_body(table, body, origin)
     return body

@@ -89,10 +89,10 @@ def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
             f"'{measurement.name}' and the reference '{reference.name}' are not both complex. Read both with "
             "the same component (real, imaginary, magnitude or complex)."
         )
-    for one, told in ((measurement, ""), (reference, "the reference ")):
+    for one, prefix in ((measurement, ""), (reference, "the reference ")):
         if not np.asarray(one.mask).any():
             raise ValueError(
-                f"{told}'{one.name}' has no usable voltage: each is NaN, infinite, or masked for what its notes say. "
+                f"{prefix}'{one.name}' has no usable voltage: each is NaN, infinite, or masked for what its notes say. "
                 "Give another frame."
             )
     common = np.asarray(measurement.mask).any(axis=0) & np.asarray(reference.mask).any(axis=0)

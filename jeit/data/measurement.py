@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact
 from numpy.typing import ArrayLike
 
-from jeit.arguments import counted, did_you_mean, is_number, told
+from jeit.arguments import counted, describe, did_you_mean, is_number
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh
 from jeit.mesh.solid_body import as_body
@@ -120,7 +120,7 @@ class Measurement(eqx.Module):
     def at_rate(self, rate: float) -> "Measurement":
         """The same frames, `rate` of them in a second from time 0. Raises `ValueError` for what is no rate."""
         if not (is_number(rate) and rate > 0):
-            raise ValueError(f"rate must be positive, frames in a second; it is {told(rate)}.")
+            raise ValueError(f"rate must be positive, frames in a second; it is {describe(rate)}.")
         return self._replace(self.voltages, self.mask, times=np.arange(self.num_frames) / float(rate))
 
     def frames(self, which: slice | ArrayLike) -> "Measurement":

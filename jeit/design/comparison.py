@@ -66,7 +66,7 @@ def compare_layouts(
     check_skin("first", first)
     check_skin("second", second)
     check_same_outline(first.layout, second.layout)
-    tell = progress or (lambda step: None)
+    report = progress or (lambda step: None)
     ready = []
     # Both, before either is touched: what is wrong with one is said at once.
     for skin in (first, second):
@@ -75,7 +75,7 @@ def compare_layouts(
         ready.append((skin, grid, skin.touched_cells(grid.places, contrast=contrast), number))
     responses = []
     for skin, grid, touched, number in ready:
-        tell(f"touch {skin.layout.name}")
+        report(f"touch {skin.layout.name}")
         key = jax.random.key(seed)
         responses.append(skin_response(skin, grid, key=key, touched=touched, num_taxels=number))
     return LayoutComparison((first, second), (responses[0], responses[1]), margin, places, contrast, seed)
@@ -118,10 +118,10 @@ def comparison(one: SkinResponse, other: SkinResponse) -> list[dict]:
     sensitive place; `taxel_count`, those of any area, and `taxel_area_cm2`; `taxel_overlap`, how many cover a place in
     the mean; `two_point_mm`, their mean diameter.
     """
-    return [_told(*pair) for pair in ((one, other), (other, one))]
+    return [_figures(*pair) for pair in ((one, other), (other, one))]
 
 
-def _told(response: SkinResponse, other: SkinResponse) -> dict:
+def _figures(response: SkinResponse, other: SkinResponse) -> dict:
     theta, taxels = response.sensitivity, response.taxels
     areas = 1e4 * np.asarray(taxels.areas)
     return {

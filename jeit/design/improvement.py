@@ -78,16 +78,16 @@ def improve_layout(
     Raises `ValueError` where no layout satisfies what is asked, and as `Skin.create` and `optimise_layout` do.
     """
     check_layout("layout", layout)
-    tell = progress or (lambda step: None)
+    report = progress or (lambda step: None)
     space = DesignSpace(minimum_spacing=MINIMUM_SPACING) if space is None else space
-    tell("mesh")
+    report("mesh")
     sheet, objective = _setting(layout, num_points, _PLACES, noise, material)
-    tell("optimise")
+    report("optimise")
     key = jax.random.key(seed)
     found = optimise_layout(sheet, objective, space, steps=steps, starts=starts, key=key, callback=callback)
     if found.status == "infeasible":
         raise ValueError(f"no layout found: {found.reason}")
-    tell("confirm")
+    report("confirm")
     finer, objective = _setting(layout, _FINER * num_points, _MORE_PLACES, noise, material)
     moved = finer.with_layout(found.layout, material.get("contact_impedance"))
     before, after = objective.scores(finer), objective.scores(moved)

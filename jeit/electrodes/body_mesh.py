@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from jeit.electrodes.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh, OwnMesh, Rectangle, Solid
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import size_checked
 
 # How far from a face a position may be and yet lie on it, relative to the body's size; as a check of electrodes has it.
 _ON = 1e-3
@@ -15,7 +15,7 @@ _ON = 1e-3
 _ROUND = 16
 
 
-@size_told()
+@size_checked()
 def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None = None) -> Mesh:
     """A mesh of about `num_points` nodes, finer where electrodes are, their edges in faces of its cells where they are
     rectangles on a box, or on the wall of a cylinder; of a body that comes as a mesh, that. Raises `ValueError` where

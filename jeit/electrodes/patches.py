@@ -42,7 +42,7 @@ def check_on_surface(position: Float[np.ndarray, "L 3"], allowed: Float[np.ndarr
             hint = "is the mesh in millimetres? Read it with scale = 1e-3."
         raise ValueError(
             f"position: electrode {number + 1} at {np.round(position[number], 6).tolist()} m lies "
-            f"{_told(float(far[number]))} off the body's surface; {hint}"
+            f"{_length_text(float(far[number]))} off the body's surface; {hint}"
         )
 
 
@@ -68,7 +68,9 @@ def check_size(name: str, sizes: Float[np.ndarray, " L"], most: float, of: str) 
     for number in np.flatnonzero(sizes > (1 + _SAME) * most)[:1]:
         size = float(sizes[number])
         hint = IN_MILLIMETRES if 10 * most < size <= 1000 * most else "give the size of what lies on it."
-        raise ValueError(f"{name}: electrode {number + 1}'s is {_told(size)}, larger than {of}, {_told(most)}; {hint}")
+        raise ValueError(
+            f"{name}: electrode {number + 1}'s is {_length_text(size)}, larger than {of}, {_length_text(most)}; {hint}"
+        )
 
 
 def check_placed(electrodes: AbstractPlacedElectrodes, mesh: Mesh) -> None:
@@ -85,7 +87,7 @@ def check_placed(electrodes: AbstractPlacedElectrodes, mesh: Mesh) -> None:
         check_size(name, one, across, "the body")
 
 
-def _told(metres: float) -> str:
+def _length_text(metres: float) -> str:
     return f"{1e3 * metres:.3g} mm" if metres < 1 else f"{metres:.3g} m"
 
 

@@ -61,7 +61,7 @@ ALL = "; there are "
 """What goes before all the words that there are."""
 
 
-def told_faults(origin: str, sentences: list[str], keys: Sequence[str] = ()) -> str:
+def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) -> str:
     """One message of several `sentences` about the file `origin`: the first, and more as far as there is room beside
     the `keys` that the others are about, of which up to ten are named."""
     first = cut(f"{cut(origin, 2 * KEY)}: {sentences[0]}", _LONGEST - 20)

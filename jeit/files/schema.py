@@ -26,8 +26,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, FailFast, Field, GetCoreSchemaHandler, ValidationError, model_validator
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
 
-from jeit.arguments import IN_MILLIMETRES, did_you_mean, told
-from jeit.files.limits import ALL, KEY, cut, told_faults
+from jeit.arguments import IN_MILLIMETRES, describe, did_you_mean
+from jeit.files.limits import ALL, KEY, cut, faults_message
 
 # Characters of names listed in a message, at most.
 _NAMES = 160
@@ -78,25 +78,25 @@ class Table(BaseModel):
             case "literal_error":
                 return not_among(given, re.findall("'([^']+)'", context["expected"]))
             case "bool_type" if not isinstance(given, list):
-                return f"must be true or false, without quotes; it is {told(given)}."
+                return f"must be true or false, without quotes; it is {describe(given)}."
             case "bool_type":
                 return "takes one value, not a list: true or false."
             case "string_type":
-                return f"must be text in quotes; it is {told(given)}."
+                return f"must be text in quotes; it is {describe(given)}."
             case "string_too_short":
                 return "is empty text; write some."
             case "string_too_long":
                 return f"is text of {len(given)} characters; write {context['max_length']} or fewer."
             case "list_type":
-                return f"must be a list; it is {told(given)}."
+                return f"must be a list; it is {describe(given)}."
             case "too_short":
                 return f"has {context['actual_length']} things in it; give {context['min_length']} at least."
             case "too_long":
                 return f"has more than the {context['max_length']} that it may."
             case "model_type":
-                return f"must be a table, with keys of its own; it is {told(given)}."
+                return f"must be a table, with keys of its own; it is {describe(given)}."
             case kind:
-                return f"is {told(given)}, which cannot be ({kind})."
+                return f"is {describe(given)}, which cannot be ({kind})."
 
 
 T = TypeVar("T", bound=Table)
@@ -139,11 +139,11 @@ class Number:
         """The number. Raises `fault`."""
         if not _is_number(given, whole):
             wanted = "a whole number" if whole else "a number"
-            raise fault(f"must be {wanted}{otherwise}, {self.span}; it is {told(given)}.")
+            raise fault(f"must be {wanted}{otherwise}, {self.span}; it is {describe(given)}.")
         if given > _LARGEST and math.isinf(self.high):
-            raise fault(f"is {told(given)}, beyond double precision.")
+            raise fault(f"is {describe(given)}, beyond double precision.")
         if not self.low <= given <= self.high:
-            shown = f"{given:g}" if isinstance(given, float) else told(given)
+            shown = f"{given:g}" if isinstance(given, float) else describe(given)
             hint = f" {self.beyond}" if self.beyond and given > self.high else "" if whole else self._hint(given)
             raise fault(f"is {shown}, and must be {self.span}.{hint}")
         return int(given) if whole else float(given)
@@ -198,14 +198,13 @@ class Numbers:
                 raise fault(f"must be {self._wanted}; it has rows of {len(rows[0])} and of {len(row)}.")
         wrong = next((item for row in rows for item in row if not self._right(item)), None)
         if wrong is not None:
-            raise fault(f"must be {self._wanted}; it has {told(wrong)} in it.")
+            raise fault(f"must be {self._wanted}; it has {describe(wrong)} in it.")
         return np.array(given, self.kind)
 
     def _counted(self, given: Any, axis: int) -> Any:
         if not isinstance(given, (list, tuple)):
-            raise fault(
-                f"must be {self._wanted}; {'it is' if axis == 0 or len(self.axes) == 1 else 'a row is'} {told(given)}."
-            )
+            which = "it is" if axis == 0 or len(self.axes) == 1 else "a row is"
+            raise fault(f"must be {self._wanted}; {which} {describe(given)}.")
         least, most = self.axes[axis]
         if not least <= len(given) <= most:
             raise fault(
@@ -276,7 +275,7 @@ class OneOf:
 
     def _read(self, given: Any) -> Table:
         if not isinstance(given, Mapping):
-            raise fault(f"must be a table, with keys of its own; it is {told(given)}.")
+            raise fault(f"must be a table, with keys of its own; it is {describe(given)}.")
         if self.other is not None and self.mark in given:
             return self.other.model_validate(given)
         if self.key not in given:
@@ -307,14 +306,14 @@ def validated(table: type[T], given: Any, origin: str) -> T:
         faults = error.errors(include_url=False, include_input=False)
     keys = [_place(_steps(one)) for one in faults]
     said = [f"{key}{one['msg']}" for key, one in zip(keys, faults, strict=True)]
-    raise ValueError(told_faults(origin, said, [key.strip() for key in keys]))
+    raise ValueError(faults_message(origin, said, [key.strip() for key in keys]))
 
 
 def not_among(given: Any, words: Iterable[str], likely: str = "") -> str:
     """What is said of a word that is none of `words`; `likely`: which of them is meant, if that is known."""
     known = [*words]
     meant = likely or did_you_mean(given[:KEY] if isinstance(given, str) else given, known)
-    return f"must be one of {_few(known)}; it is {told(given)}{meant}."
+    return f"must be one of {_few(known)}; it is {describe(given)}{meant}."
 
 
 def _steps(one: Any) -> tuple[int | str, ...]:

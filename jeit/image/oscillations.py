@@ -19,7 +19,7 @@ import scipy.optimize
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_name, is_number, told
+from jeit.arguments import check_name, describe, is_number
 
 Window = Literal["hann", "none"]
 # Widths of a peak, in 1 / T; frequencies looked at in a resolution, where the strongest is looked for.
@@ -110,7 +110,7 @@ def _band(frequency) -> tuple[float, float]:
     """The lowest and the highest frequency."""
     band = (frequency, frequency) if is_number(frequency) else frequency
     if not (isinstance(band, tuple | list) and len(band) == 2 and all(is_number(one) and one > 0 for one in band)):
-        raise ValueError(f"frequency must be positive hertz, or a band (lowest, highest); it is {told(frequency)}.")
+        raise ValueError(f"frequency must be positive hertz, or a band (lowest, highest); it is {describe(frequency)}.")
     if band[0] > band[1]:
         raise ValueError(f"frequency: the band from {band[0]:g} to {band[1]:g} Hz is the wrong way round.")
     return float(band[0]), float(band[1])

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, is_number, told
+from jeit.arguments import check_kind, describe, is_number
 from jeit.mesh import Mesh, measures
 
 # A tetrahedron's nodes from the highest to the lowest: the ends of the edges that a level passes, round the polygon,
@@ -130,7 +130,7 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
     """
     check_solid(mesh)
     if not is_number(level) or level == 0:
-        raise ValueError(f"level must be a value of the image, above or below zero; it is {told(level)}.")
+        raise ValueError(f"level must be a value of the image, above or below zero; it is {describe(level)}.")
     sign = 1.0 if level > 0 else -1.0
     height = sign * node_values(mesh, values) - abs(level)
     points = np.asarray(mesh.points)
@@ -187,9 +187,9 @@ class Plane:
         """The plane on which `axis`, "x", "y" or "z", is `value` metres: seen from the right, the front or above, so
         that the two other axes point to the right and up. Raises `ValueError`."""
         if axis not in AXES:
-            raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {told(axis)}.")
+            raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {describe(axis)}.")
         if not is_number(value):
-            raise ValueError(f"value must be where the plane meets the {axis} axis, in metres; it is {told(value)}.")
+            raise ValueError(f"value must be a place on the {axis} axis, in metres; it is {describe(value)}.")
         point, normal = np.zeros(3), np.zeros(3)
         point[AXES.index(axis)] = value
         normal[AXES.index(axis)] = -1.0 if axis == "y" else 1.0
@@ -203,7 +203,7 @@ class Plane:
         for name, value in (("point", place), ("normal", direction)):
             if value.shape != (3,) or not all(is_number(one) for one in value):
                 raise ValueError(
-                    f"{name} must be three finite numbers; it is {told(point if name == 'point' else normal)}."
+                    f"{name} must be three finite numbers; it is {describe(point if name == 'point' else normal)}."
                 )
         place, direction = place.astype(float), direction.astype(float)
         length = float(np.linalg.norm(direction))

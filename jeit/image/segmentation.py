@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from jeit.arguments import is_number, told
+from jeit.arguments import describe, is_number
 from jeit.image.merit import CONDUCTIVE, RESISTIVE
 from jeit.mesh import Mesh, centroids, measures
 from jeit.mesh.geometry import interior_facets
@@ -19,7 +19,7 @@ def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray
     Raises `ValueError` for a centre of other coordinates, a radius that is not positive, and where no cell is left.
     """
     if not (is_number(radius) and radius > 0):
-        raise ValueError(f"radius must be a positive number of metres; it is {told(radius)}.")
+        raise ValueError(f"radius must be a positive number of metres; it is {describe(radius)}.")
     distance = np.linalg.norm(_from(mesh, centre, "centre"), axis=1)
     return _some(mesh, distance <= radius, "no centroid of a cell is so near to centre; make radius larger")
 

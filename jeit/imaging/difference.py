@@ -96,14 +96,14 @@ class ImagedDifference:
     def peak_ranges(self) -> tuple[tuple[float, float], ...]:
         """From where to where the change in each inclusion may lie, S/m (2-D: S), a standard deviation either way, of
         either kind where the data do not tell an ellipsoid from a column; empty where the data do not tell it."""
-        if self.shapes is None or not all(one.contrast_is_told for one in self.shapes.bodies):
+        if self.shapes is None or not all(one.contrast_is_determined for one in self.shapes.bodies):
             return ()
         background, bodies = float(self.calibration.conductivity), self.shapes.bodies
         others = zip(self.shapes.alternatives, self.shapes.alternative_deviations, strict=True)
         ranges = []
         for one, deviation, (other, its) in zip(bodies, self.shapes.contrast_deviations, others, strict=True):
-            told = [(one.contrast, deviation), *([(other.contrast, its)] if other else [])]
-            ends = [contrast + side * spread for contrast, spread in told for side in (-1, 1)]
+            contrasts = [(one.contrast, deviation), *([(other.contrast, its)] if other else [])]
+            ends = [contrast + side * spread for contrast, spread in contrasts for side in (-1, 1)]
             changes = [float(background * np.expm1(one.sign * end)) for end in ends]
             ranges.append((min(changes), max(changes)))
         return tuple(ranges)

@@ -50,7 +50,7 @@ def image_frequencies(
     base = first.mean_frame()
     weight = frequency_weight(one, base) if weighted else 1.0
     voltages = as_array(weight * np.asarray(base.voltages))
-    scaled = replace(base, voltages=voltages, name=f"{_told(weight)} × {base.name}" if weighted else base.name)
+    scaled = replace(base, voltages=voltages, name=f"{_weight_text(weight)} × {base.name}" if weighted else base.name)
     return ImagedFrequencies(image_difference(one, scaled, settings), complex(weight))
 
 
@@ -72,5 +72,5 @@ def frequency_weight(second: Measurement, first: Measurement) -> float | complex
     return weight.item()
 
 
-def _told(weight: float | complex) -> str:
+def _weight_text(weight: float | complex) -> str:
     return f"{weight.real:.3g}{weight.imag:+.3g}i" if isinstance(weight, complex) else f"{weight:.3g}"

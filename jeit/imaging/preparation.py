@@ -19,7 +19,7 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
 from jeit.imaging.clock import Clock
-from jeit.imaging.wiring import Wiring, find_wiring, told_exchanges
+from jeit.imaging.wiring import Wiring, exchanges_message, find_wiring
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channels import electrode_misfits
@@ -172,13 +172,13 @@ def prepare_difference(
         domain, electrodes = body_of(one, base)
         both = np.asarray(one.mask)[0] & np.asarray(base.mask)[0]
         difference = as_array(np.where(both, np.asarray(one.voltages)[0] - np.asarray(base.voltages)[0], 0))
-        if not as_is and (exchanged := told_exchanges(one, base)):
+        if not as_is and (exchanged := exchanges_message(one, base)):
             raise ValueError(f"'{one.name}' does not fit its reference: {exchanged}")
     with clock("mesh"):
         model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
     with clock("wiring"):
         wiring = find_wiring(model, base)
-        if wiring.told or quality.imageable:  # noise may look like another wiring, but not be explained by it
+        if wiring.explanation or quality.imageable:  # noise may look like another wiring, but not be explained by it
             check_wiring(wiring, base, as_is)
         if not quality.imageable:
             with naming_frame(measurement, number):
@@ -213,7 +213,7 @@ def calibrated_model(
         chosen = contact or default_contact(base)
         voltages, mask = np.asarray(base.voltages)[0], np.asarray(base.mask)[0]
         calibration = calibrate(model, voltages, mask=mask, contact=chosen)
-        if contact is None and chosen == "each" and not calibration.tells_contacts_apart:
+        if contact is None and chosen == "each" and not calibration.distinguishes_contacts:
             chosen = "common"  # the data do not tell so many impedances apart
             calibration = calibrate(model, voltages, mask=mask, contact=chosen)
         calibration = jax.block_until_ready(calibration)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from numbers import Integral
 
-from jeit.arguments import check_kind, check_name, is_number, told
+from jeit.arguments import check_kind, check_name, describe, is_number
 from jeit.imaging.method import METHODS
 from jeit.inverse import RULES
 from jeit.inverse.prior.defaults import MEASURED, PRIORS
@@ -96,7 +96,7 @@ def check_body(contact: str | None, num_points: int | None) -> None:
     if contact is not None:
         check_name("contact", contact, CONTACTS)
     if num_points is not None and not (isinstance(num_points, Integral) and 50 <= num_points <= 100_000):
-        raise ValueError(f"num_points: give 50 to 100,000 nodes of the mesh; it is {told(num_points)}.")
+        raise ValueError(f"num_points: give 50 to 100,000 nodes of the mesh; it is {describe(num_points)}.")
 
 
 def check_hyperparameter(hyperparameter: float | str) -> None:
@@ -104,4 +104,4 @@ def check_hyperparameter(hyperparameter: float | str) -> None:
     if isinstance(hyperparameter, str):
         check_name("hyperparameter", hyperparameter, RULES, ", or a number")
     elif not (is_number(hyperparameter) and hyperparameter > 0):
-        raise ValueError(f"hyperparameter must be a positive number or a rule; it is {told(hyperparameter)}.")
+        raise ValueError(f"hyperparameter must be a positive number or a rule; it is {describe(hyperparameter)}.")

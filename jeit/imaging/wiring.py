@@ -32,7 +32,7 @@ from jeit_solvers.engines import on_host
 _STEP, _BETTER, _MOST = 0.9, 0.5, 4
 
 
-def told_exchanges(frame: Measurement, reference: Measurement) -> str:
+def exchanges_message(frame: Measurement, reference: Measurement) -> str:
     """Which drives, or which measurements of every drive, look exchanged in a frame, in a sentence, counted from 1;
     empty where no exchange halves its difference from the reference, and where some drive has other readings than
     others."""
@@ -121,17 +121,17 @@ class Wiring:
     @property
     def fault(self) -> str:
         """What is wrong, in a sentence; empty where nothing is, or nothing that would not do for an image."""
-        if self.told or self.described < _HOPELESS:
-            return self.told
+        if self.explanation or self.described < _HOPELESS:
+            return self.explanation
         return (
             f"the model misses {percent(self.described)} of it, and no order of channels, sign, or exchange of a few "
             "electrodes explains it: are geometry, electrodes, protocol and the order of the channels as described?"
         )
 
     @property
-    def told(self) -> str:
+    def explanation(self) -> str:
         """What was found, in a sentence, electrodes counted from 1; empty where all is as described."""
-        found = [_told_places(self.places, self._cycles())]
+        found = [_exchanged_places(self.places, self._cycles())]
         found.append(self.order and f"the channels look ordered {self.order}")
         found.append("all voltages look to have the opposite sign" if self.reversed_signs else "")
         said = ", and ".join(one for one in found if one)
@@ -262,7 +262,7 @@ def _exchanged(places: tuple[int, ...], first: int, second: int) -> tuple[int, .
     return tuple(changed)
 
 
-def _told_places(places: tuple[int, ...], cycles: list[list[int]]) -> str:
+def _exchanged_places(places: tuple[int, ...], cycles: list[list[int]]) -> str:
     """Which electrodes stand where, in words."""
     if cycles and places in _turns(len(places)):
         way = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"

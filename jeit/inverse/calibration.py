@@ -141,7 +141,7 @@ class Calibration(eqx.Module):
         return Status.of_number(self.outcome)
 
     @property
-    def tells_contacts_apart(self) -> bool:
+    def distinguishes_contacts(self) -> bool:
         """Whether every contact impedance fitted is known to within a factor of three."""
         return bool(self.status == Status.CONVERGED and (self.contact_deviation < 1).all())
 

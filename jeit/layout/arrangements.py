@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from jeit.arguments import is_number, told
+from jeit.arguments import describe, is_number
 from jeit.mesh import Domain
 
 
@@ -108,4 +108,4 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
 def check_count(number: int, least: int) -> None:
     """Raise `ValueError` for what is no whole number of electrodes, or fewer than `least`."""
     if not is_number(number) or int(number) != number or number < least:
-        raise ValueError(f"Give a whole number of electrodes, at least {least}; got {told(number)}.")
+        raise ValueError(f"Give a whole number of electrodes, at least {least}; got {describe(number)}.")

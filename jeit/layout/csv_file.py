@@ -13,7 +13,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import listed, told
+from jeit.arguments import describe, listed
 from jeit.files import check_electrodes, read_as, read_text
 from jeit.layout.layout import LARGEST, SMALLEST, Layout, bounds, check_discs_fit
 from jeit.layout.surface_layout import SurfaceLayout
@@ -151,11 +151,11 @@ def _columns(header: list[str], wanted: Sequence[str]) -> dict[str, tuple[int, f
         name = length[1] if length else title.lower()
         if name in wanted and not length:
             raise ValueError(
-                f"the column {told(title)} does not say its unit; call it {name}_mm (or {name}_cm, {name}_m)."
+                f"the column {describe(title)} does not say its unit; call it {name}_mm (or {name}_cm, {name}_m)."
             )
         if name not in (*wanted, _LABEL, _IMPEDANCE):
             raise ValueError(
-                f"there is no column {told(title)} in a layout; the first line names the columns: {_template(wanted)}."
+                f"there is no column {describe(title)} in a layout; the first line names columns: {_template(wanted)}."
             )
         if name in columns:
             raise ValueError(f"there are two columns for {name}; keep one.")
@@ -177,5 +177,5 @@ def _number(cell: str, delimiter: str, where: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{where} is {told(cell)}; give a finite number, such as 12.5.")
+        raise ValueError(f"{where} is {describe(cell)}; give a finite number, such as 12.5.")
     return value

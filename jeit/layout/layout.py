@@ -142,12 +142,12 @@ def check_size(size: float) -> None:
     """Raise `ValueError` for a skin of a `size`, metres, that is not known to exist."""
     if not SMALLEST - _ROUNDING <= size <= LARGEST + _ROUNDING:
         raise ValueError(
-            f"centres: the skin would be {_told(size)} across; are millimetres taken for metres, or metres for "
+            f"centres: the skin would be {_length_text(size)} across; are millimetres taken for metres, or metres for "
             "millimetres? Lengths differ by a factor of 1000."
         )
 
 
-def _told(length: float) -> str:
+def _length_text(length: float) -> str:
     return f"{length:.3g} m" if length > LARGEST else f"{1e3 * length:.3g} mm"
 
 

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.files import check_electrodes, check_size, read_as
 from jeit.layout.csv_file import MOST_BYTES, millimetres
 from jeit.layout.layout import Layout
@@ -149,15 +149,15 @@ def _to_metres(root: ElementTree.Element) -> np.ndarray:
         size = re.fullmatch(rf"({NUMBER})\s*({'|'.join(_UNITS)})", root.get(name, "").strip())
         if size is None:
             raise ValueError(
-                f"{name} is {told(root.get(name))}, which says no length; set the document's size in mm "
+                f"{name} is {describe(root.get(name))}, which says no length; set the document's size in mm "
                 f'({name}="200mm").'
             )
         if box and (len(box) != 4 or not inside[0] > 0):
-            raise ValueError(f"viewBox is {told(root.get('viewBox'))}; it is four numbers, the last two positive.")
+            raise ValueError(f"viewBox is {describe(root.get('viewBox'))}; it is four numbers, the last two positive.")
         scales.append(float(size[1]) * _UNITS[size[2]] / inside[0] if box else _UNITS["px"])
     if not math.isclose(*scales, rel_tol=1e-3):
         raise ValueError(
-            f"viewBox is {told(root.get('viewBox'))}, so that a unit is {1e3 * scales[0]:.4g} mm across and "
+            f"viewBox is {describe(root.get('viewBox'))}, so that a unit is {1e3 * scales[0]:.4g} mm across and "
             f"{1e3 * scales[1]:.4g} mm up; make its sides as width and height."
         )
     return np.array([[scales[0], 0, 0], [0, -scales[0], 0]])

@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 
-from jeit.arguments import told
+from jeit.arguments import describe
 
 # Possessive: what is no number is found so in one pass, however long it is.
 NUMBER = r"[-+]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?+\d++)?+"
@@ -21,7 +21,7 @@ def transform_of(element: ElementTree.Element) -> np.ndarray:
     """The matrix (2, 3) of an element's transform. Raises `ValueError` for one that cannot be read."""
     text, found = element.get("transform", "").strip(), np.eye(2, 3)
     if re.fullmatch(r"(\w++\s*+\([^()]*+\)[\s,]*+)*+", text) is None:
-        raise ValueError(f"transform of {described(element)} is {told(text)}, not a list of transforms.")
+        raise ValueError(f"transform of {described(element)} is {describe(text)}, not a list of transforms.")
     for kind, inside in re.findall(r"(\w+)\s*\(([^()]*)\)", text):
         numbers = [number_of(element, "transform", part) for part in re.split(r"[\s,]+", inside.strip()) if part]
         match kind, numbers:
@@ -64,7 +64,7 @@ def tag_of(element: ElementTree.Element) -> str:
 def described(element: ElementTree.Element) -> str:
     """An element as messages name it."""
     return (
-        f"<{tag_of(element)[:20]} id={told(element.get('id'))}>"
+        f"<{tag_of(element)[:20]} id={describe(element.get('id'))}>"
         if "id" in element.attrib
         else f"a <{tag_of(element)[:20]}>"
     )
@@ -73,10 +73,10 @@ def described(element: ElementTree.Element) -> str:
 def number_of(element: ElementTree.Element, name: str, text: str | None) -> float:
     """The number that `text`, of the attribute `name`, is. Raises `ValueError`."""
     if text is None or re.fullmatch(NUMBER, text.strip()) is None:
-        raise ValueError(f"{name} of {described(element)} is {told(text)}, not a number.")
+        raise ValueError(f"{name} of {described(element)} is {describe(text)}, not a number.")
     value = float(text)
     if not abs(value) < LARGEST:
-        raise ValueError(f"{name} of {described(element)} is {told(text)}, too large for a drawing.")
+        raise ValueError(f"{name} of {described(element)} is {describe(text)}, too large for a drawing.")
     return value
 
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jeit.arguments import check_kind, told
+from jeit.arguments import check_kind, describe
 from jeit.mesh._checks import MOST_POINTS
 from jeit.mesh.mesh import Mesh
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import size_checked
 
 # Of an edge that a surface crosses nearer to its end than so many times its length, the end is moved onto it.
 _NEAR = 0.25
@@ -117,7 +117,7 @@ class _Division:
     def mesh(self, tags) -> Mesh:
         """The mesh, with the `tags` of that which was divided."""
         named = {name: self.facets[np.isin(self.side, np.asarray(index))] for name, index in tags.items()}
-        with size_told():
+        with size_checked():
             return Mesh.create(self.points, self.cells, tags=named)
 
     def split(self, edges: Int[np.ndarray, "e 2"], middles: Float[np.ndarray, "e s"]) -> tuple[_Division, np.ndarray]:
@@ -135,7 +135,7 @@ def _too_long(division: _Division, some, size) -> Bool[np.ndarray, " m"]:
     if most.shape != (len(cells),) or not (most > 0).all():
         raise ValueError(
             f"size must give one number per cell, metres, above zero (numpy.inf leaves it); of {len(cells)} cells it "
-            f"gave {told(most)}."
+            f"gave {describe(most)}."
         )
     return _longest(division.points, cells) > most
 
@@ -146,7 +146,9 @@ def _moved_onto(division: _Division, level) -> tuple[_Division, Float[np.ndarray
     points, cells = division.points, division.cells
     value = np.asarray(level(points))
     if value.shape != (len(points),) or not np.isfinite(value).all():
-        raise ValueError(f"level must give one finite number per point; of {len(points)} points it gave {told(value)}.")
+        raise ValueError(
+            f"level must give one finite number per point; of {len(points)} points it gave {describe(value)}."
+        )
     side = np.sign(value)[cells]
     edges, _, _ = _edges(points, cells[side.min(axis=1) * side.max(axis=1) < 0])
     edges = edges[np.prod(np.sign(value)[edges], axis=1) < 0]

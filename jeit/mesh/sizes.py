@@ -9,23 +9,23 @@ from contextvars import ContextVar
 
 LARGE = 10.0
 """Metres. No tank or skin is larger."""
-_TOLD: ContextVar[bool] = ContextVar("size_told", default=False)
+_CHECKED: ContextVar[bool] = ContextVar("size_checked", default=False)
 
 
 @contextmanager
-def size_told() -> Iterator[None]:
+def size_checked() -> Iterator[None]:
     """Within it no size is warned of: meshes of a body or of another mesh, whose own size was. Decorates functions."""
-    before = _TOLD.set(True)
+    before = _CHECKED.set(True)
     try:
         yield
     finally:
-        _TOLD.reset(before)
+        _CHECKED.reset(before)
 
 
 def warn_large(extent: float, name: str, across: float = 1.0, *, of_file: bool = False) -> None:
     """Warn if a length in metres, of something `across` times as large, looks like one of another unit, unless it was
     told of; `of_file`: where it may come from a file, which can be read in its own unit."""
-    if not across * extent > LARGE or _TOLD.get():
+    if not across * extent > LARGE or _CHECKED.get():
         return
     scale = [f" (a file is read with scale={one})" if of_file else "" for one in ("1e-3", "1e-2", "0.0254")]
     warnings.warn(

@@ -13,7 +13,7 @@ from jeit.mesh.generate.refine import Refinement, nodes_of_solid
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Domain
 from jeit.mesh.outline.domain import check_length
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import size_checked
 from jeit_solvers.engines import as_array
 
 
@@ -44,7 +44,7 @@ class Solid(Body):
         """The outline, and the thickness."""
         return {**self.outline.describe(), "thickness": float(self.thickness)}
 
-    @size_told()
+    @size_checked()
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
         """Layers of tetrahedra above a mesh of the outline, about as high as its cells are wide; see `jeit.mesh.box`.
 

@@ -12,7 +12,7 @@ from jeit.mesh.generate.refine import Refinement, nodes_of_solid
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import check_length
 from jeit.mesh.shapes import disk, rectangle
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import size_checked
 
 
 def stacked_cells(cells: np.ndarray, count: int, num_layers: int) -> np.ndarray:
@@ -83,7 +83,7 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
         if new in tags:
             raise ValueError(f"mesh: its tag {name!r} would be called {new!r} in the layer, which is taken. Rename it.")
         tags[new] = side(facets[np.asarray(index)])
-    with size_told():
+    with size_checked():
         return Mesh.create(points, solid, tags=tags)
 
 
@@ -123,7 +123,7 @@ def box(
     width, depth = check_length("width", width), check_length("depth", depth)
     height = check_length("height", height)
     base_points, layers = choose_layers(width * depth, height, num_points, cell_size, num_layers)
-    with size_told(), nodes_of_solid(num_points, in_plane(width * depth, height, num_layers)):
+    with size_checked(), nodes_of_solid(num_points, in_plane(width * depth, height, num_layers)):
         base = rectangle(width, depth, num_points=base_points, cell_size=cell_size, refine=refine)
         return layer(base, height, layers)
 
@@ -148,7 +148,7 @@ def cylinder(
     """
     radius, height = check_length("radius", radius, 2), check_length("height", height)
     base_points, layers = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)
-    with size_told(), nodes_of_solid(num_points, in_plane(np.pi * radius**2, height, num_layers)):
+    with size_checked(), nodes_of_solid(num_points, in_plane(np.pi * radius**2, height, num_layers)):
         base = disk(
             radius,
             num_points=base_points,

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 
-from jeit.arguments import check_kind, is_number, told
+from jeit.arguments import check_kind, describe, is_number
 from jeit.plot.axes import DIVERGING, SEQUENTIAL, draw_colour_bar, prefixed
 
 
@@ -37,7 +37,7 @@ class ColourScale(eqx.Module):
 
     def __check_init__(self):
         if self.limit is not None and not (is_number(self.limit) and self.limit >= 0):
-            raise ValueError(f"limit must be finite and positive, in the values' unit; it is {told(self.limit)}.")
+            raise ValueError(f"limit must be finite and positive, in the values' unit; it is {describe(self.limit)}.")
 
     def of(self, values: np.ndarray, unit: str) -> "FittedScale":
         """The scale for `values` (any shape), without NaN, whose unit is `unit` unless this scale has one.

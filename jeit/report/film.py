@@ -55,7 +55,7 @@ def write_film(
     from jeit.plot.axes import SOFT
     from jeit.plot.colour_scale import ColourScale
     from jeit.plot.imaging.frames import FramePicture, chosen_frames, fit_scale
-    from jeit.plot.imaging.mesh import slice_told
+    from jeit.plot.imaging.mesh import slice_text
 
     path, values = Path(path), np.asarray(changes)
     check_film(path.name)
@@ -65,8 +65,8 @@ def write_film(
     picture = FramePicture(figure.subplots(), mesh, electrodes, fitted)
     fitted.draw_bar(picture.ax, picture.drawn)
     picture.show(values[chosen[0]], said[chosen[0]])
-    if told := slice_told(mesh):
-        figure.supxlabel(told, fontsize=9, color=SOFT)
+    if text := slice_text(mesh):
+        figure.supxlabel(text, fontsize=9, color=SOFT)
     figure.canvas.draw()
     figure.set_layout_engine("none")  # or the picture would move from frame to frame
     pace = min(_PACE if rate is None else rate * len(chosen) / len(values), _FASTEST)

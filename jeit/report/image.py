@@ -248,7 +248,7 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
                 "centroid": one.centroid,
                 **_form(one),
                 "conductivity_over_background": math.exp(one.sign * one.contrast),
-                "conductivity_is": _told_by(one),
+                "conductivity_is": _evidence_text(one),
                 "rise": one.rise,
             }
             for one in bodies
@@ -281,9 +281,9 @@ def _form(body: Star | Ellipsoid) -> dict[str, Any]:
     return {"form": form, "volume": body.volume, "centre": body.centre, "half_axes": body.axes}
 
 
-def _told_by(body: Star | Ellipsoid) -> str:
+def _evidence_text(body: Star | Ellipsoid) -> str:
     """Where the conductivity of a body is from."""
-    if not body.contrast_is_told:
+    if not body.contrast_is_determined:
         return "assumed, as of what is strong"
     if isinstance(body, Ellipsoid) and body.alike:
         return "told by the data, as of one material with all others of its sign"

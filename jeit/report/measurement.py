@@ -51,7 +51,7 @@ def _wiring(measurement: Measurement) -> str | None:
     _, reference = measurement.split_reference() if "reference" in measurement.frame_names else (None, measurement)
     model = ForwardModel(imaging_mesh(domain, electrodes, None, usual=_NODES), electrodes, measurement.protocol)
     found, broken = find_wiring(model, reference), reciprocity_error(reference)
-    if broken is not None and broken > MOST_DIFFERENCE_RECIPROCITY_ERROR and not found.told:
+    if broken is not None and broken > MOST_DIFFERENCE_RECIPROCITY_ERROR and not found.explanation:
         return (
             f"reciprocity broken by {percent(broken)}, and nothing that was tried mends it: channels or drives in "
             "another order than described, or nothing but noise"

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Inexact
 
-from jeit.arguments import counted, told
+from jeit.arguments import counted, describe
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.files import need, npz_arrays
 from jeit.image import Inclusion, Plane, SolidForm
 from jeit.mesh import Mesh
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import size_checked
 from jeit.report.folder import results
 
 if TYPE_CHECKING:
@@ -119,8 +119,8 @@ def read_image(path: str | Path) -> SavedImage:
         _check_kind(arrays)
         need(arrays, *_NEEDED)
         if arrays["points"].dtype.kind not in "fiu":
-            raise ValueError(f"'points' is {told(arrays['points'])}; real numbers are wanted, metres.")
-        with size_told():  # by the command that wrote it
+            raise ValueError(f"'points' is {describe(arrays['points'])}; real numbers are wanted, metres.")
+        with size_checked():  # by the command that wrote it
             mesh = Mesh.create(arrays["points"], arrays["cells"])
         return _image(mesh, arrays)
     except ValueError as error:
@@ -148,7 +148,7 @@ def _image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
             return None
         values = arrays[name]
         if values.shape != (mesh.num_cells,) or values.dtype.kind not in kinds:
-            raise ValueError(f"'{name}' is {told(values)}; there are {counted(mesh.num_cells, 'cell')}.")
+            raise ValueError(f"'{name}' is {describe(values)}; there are {counted(mesh.num_cells, 'cell')}.")
         if not np.isfinite(values).all():
             raise ValueError(f"'{name}' has values that are not finite.")
         return values
@@ -157,7 +157,7 @@ def _image(mesh: Mesh, arrays: dict[str, np.ndarray]) -> SavedImage:
     assert change is not None
     background = arrays.get("background")
     if background is not None and (background.shape != () or background.dtype.kind not in "fiuc"):
-        raise ValueError(f"'background' is {told(background)}; one number is wanted.")
+        raise ValueError(f"'background' is {describe(background)}; one number is wanted.")
     return SavedImage(
         mesh=mesh,
         change=change,

@@ -67,7 +67,7 @@ def write_series(
 
 def _report(found: ImagedSequence, curves: Mapping[str, np.ndarray], oscillations: Sequence[Oscillation]) -> dict:
     series = found.series
-    told = []
+    reported = []
     for one in oscillations:
         at = {name: oscillation(curve, series.times, one.frequency) for name, curve in curves.items()}
         parts = {
@@ -78,7 +78,7 @@ def _report(found: ImagedSequence, curves: Mapping[str, np.ndarray], oscillation
             }
             for name, part in at.items()
         }
-        told.append({"frequency": one.frequency, "resolution": one.resolution, "unit": "Hz", "regions": parts})
+        reported.append({"frequency": one.frequency, "resolution": one.resolution, "unit": "Hz", "regions": parts})
     return plain(
         {
             "measurement": describe_measurement(found.prepared.measurement),
@@ -89,6 +89,6 @@ def _report(found: ImagedSequence, curves: Mapping[str, np.ndarray], oscillation
             "background": series.background,
             "unit": series.unit,
             "hyperparameter": float(found.reconstruction.hyperparameter),
-            "oscillations": told,
+            "oscillations": reported,
         }
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import is_number, told
+from jeit.arguments import describe, is_number
 from jeit.files import clear_unfinished, whole_files, written_whole
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.streaming.frame_check import FrameStatus
@@ -71,13 +71,13 @@ def write_stream(
     if film is not None:
         check_film(film)
     if rate is not None and not (is_number(rate) and rate > 0):
-        raise ValueError(f"rate must be positive, frames in a second; it is {told(rate)}.")
+        raise ValueError(f"rate must be positive, frames in a second; it is {describe(rate)}.")
     made = ("frames.csv", "images.npz", "frames.png", *([] if film is None else [film]))
     folder = results_folder(folder, made)
     for earlier in made[1:]:
         (folder / earlier).unlink(missing_ok=True)  # would not go with these frames
     clear_unfinished(folder)
-    tell = drawing or (lambda said: None)
+    report = drawing or (lambda said: None)
     mesh, seen = calibration.model.mesh, _Seen(calibration)
     with GrowingRows(folder, (mesh.num_cells,)) as rows:
         with GrowingTable(folder / "frames.csv", _COLUMNS) as table:
@@ -91,12 +91,12 @@ def write_stream(
         if not rows.number:
             raise ValueError(f"'{name}': there was no frame in it.")
         others = {"background": calibration.conductivity, "points": mesh.points, "cells": mesh.cells}
-        tell("images")
+        report("images")
         with saying_what_is_left(rows):
-            rows.write_npz(folder / "images.npz", "conductivity", others, lambda far: tell(f"images: {far}"))
+            rows.write_npz(folder / "images.npz", "conductivity", others, lambda far: report(f"images: {far}"))
         latency = seen.latency.values()
         if latency.size:
-            _Pictures(folder, film, rate, tell).draw(rows, seen)
+            _Pictures(folder, film, rate, report).draw(rows, seen)
         return WrittenStream(rows.number, seen.counts, latency, seen.first_reason)
 
 
@@ -138,7 +138,7 @@ class _Pictures:
     folder: Path
     film: str | None
     rate: float | None
-    tell: Callable[[str], None]
+    report: Callable[[str], None]
 
     def draw(self, rows: GrowingRows, seen: _Seen) -> None:
         """The contact sheet, and the film, of some of the rows."""
@@ -146,7 +146,7 @@ class _Pictures:
         from jeit.plot.imaging.frames import SHEET_FRAMES, FrameCount
 
         model, limit = seen.calibration.model, seen.limit
-        self.tell(PICTURES[0])
+        self.report(PICTURES[0])
         changes, titles = self._some(rows, seen, SHEET_FRAMES)
         count = FrameCount(rows.number, seen.counts.get("refused", 0), self._titles(seen.refused))
         scale = ColourScale(limit=limit)
@@ -166,7 +166,7 @@ class _Pictures:
                 titles=titles,
                 rate=pace,
                 limit=limit,
-                progress=lambda far: self.tell(f"{PICTURES[1]}: {far}"),
+                progress=lambda far: self.report(f"{PICTURES[1]}: {far}"),
             )
 
     def _some(self, rows: GrowingRows, seen: _Seen, most: int) -> tuple[Float[np.ndarray, "k m"], list[str]]:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, is_number, told
+from jeit.arguments import check_kind, describe, is_number
 from jeit.electrodes import AbstractElectrodes
 from jeit.files import whole_files
 from jeit.mesh import Mesh, write
@@ -139,7 +139,7 @@ def _frames(mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) ->
     check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
     seconds: Sequence | np.ndarray = np.atleast_1d(np.asarray(times, dtype=object))
     if len(seconds) == 0 or not all(is_number(one) for one in seconds):
-        raise ValueError(f"times must be a time for each frame, seconds; they are {told(times)}.")
+        raise ValueError(f"times must be a time for each frame, seconds; they are {describe(times)}.")
     seconds = np.asarray(seconds, float)
     if not (np.diff(seconds) > 0).all():
         raise ValueError("times must rise from frame to frame.")

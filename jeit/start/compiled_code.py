@@ -26,9 +26,9 @@ def keep_compiled_code() -> None:
     programs up by their text and by its own and the compiler's versions. Those used longest ago go when there are
     thousands, or a quarter of a gigabyte.
     """
-    told = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    given = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     asked = os.environ.get("JEIT_COMPILATION_CACHE", "").strip().lower()
-    if told is not None or asked in ("off", "0", "no", "none", "false", "disabled"):
+    if given is not None or asked in ("off", "0", "no", "none", "false", "disabled"):
         return
     try:
         every = _cache_folder() / "jeit" / "jax"
@@ -48,11 +48,11 @@ def discarded_damaged(warning: str) -> bool:
 
     It would compile it anew in every process to come, and say so again: it does not write over what is there.
     """
-    told = re.match(r"Error reading persistent compilation cache entry for '([\w<>.-]+)'", warning)
+    given = re.match(r"Error reading persistent compilation cache entry for '([\w<>.-]+)'", warning)
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if told is None or not folder or not Path(folder).is_relative_to(_cache_folder() / "jeit"):
+    if given is None or not folder or not Path(folder).is_relative_to(_cache_folder() / "jeit"):
         return False
-    for path in Path(folder).glob(f"{glob.escape(told[1])}-*"):
+    for path in Path(folder).glob(f"{glob.escape(given[1])}-*"):
         with contextlib.suppress(OSError):
             path.unlink()
     return True
@@ -81,13 +81,13 @@ def _used(folder: Path) -> Iterator[tuple[float, int, Path]]:
     """When each file was last used, its bytes, and its path."""
     for path in folder.glob("*/*"):
         with contextlib.suppress(FileNotFoundError):  # another process discards too
-            told = path.stat()
-            yield max(told.st_atime, told.st_mtime), told.st_size, path
+            given = path.stat()
+            yield max(given.st_atime, given.st_mtime), given.st_size, path
 
 
 def _cache_folder() -> Path:
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches"
     variable = "LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME"
-    told = Path(os.environ.get(variable, ""))
-    return told if told.is_absolute() else Path.home() / ".cache"
+    given = Path(os.environ.get(variable, ""))
+    return given if given.is_absolute() else Path.home() / ".cache"

@@ -8,7 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.arguments import check_key, check_kind, check_metres, check_name, did_you_mean, is_number, real_array, told
+from jeit.arguments import (
+    check_key,
+    check_kind,
+    check_metres,
+    check_name,
+    describe,
+    did_you_mean,
+    is_number,
+    real_array,
+)
 from jeit.mesh import Disk
 
 
@@ -31,7 +40,7 @@ from jeit.mesh import Disk
     ],
 )
 def test_what_was_given(given, said):
-    assert told(given) == said
+    assert describe(given) == said
 
 
 @pytest.mark.parametrize("given", [0, -1.5, np.float32(2), np.asarray(1), jnp.asarray(0.5)])

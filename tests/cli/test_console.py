@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from jeit.arguments import percent
-from jeit.cli.commands.reconstruct import told_bodies
+from jeit.cli.commands.reconstruct import bodies_text
 from jeit.cli.console import inclusion_table
 from jeit.image import Inclusion, SolidForm
 
@@ -80,9 +80,9 @@ def test_columns_are_called_so():
 
 @pytest.mark.parametrize(("dimension", "edge"), [(2, "outlines"), (3, "surfaces")])
 def test_bodies_end_at_outlines_in_a_sheet_and_at_surfaces_in_a_solid(dimension, edge):
-    told, strong = (SimpleNamespace(contrast_is_told=known) for known in (True, False))
+    told, strong = (SimpleNamespace(contrast_is_determined=known) for known in (True, False))
     shapes: Any = SimpleNamespace(bodies=[told, strong], doubtful=[told], drift=0.01)
-    assert told_bodies(shapes, dimension) == (
+    assert bodies_text(shapes, dimension) == (
         f"2 {edge} fitted; 1 ghost left out; 1 taken for strong, with peaks at least about as given; the background "
         "has drifted by 1 %"
     )

@@ -123,7 +123,7 @@ def test_a_recording_is_named(folder, tmp_path, capsys):
     assert len(rows) == report["windows"]
     assert (tmp_path / "timeline.png").stat().st_size > 5_000
     heard = Listener.read(model).hear(read_recording(folder / "one.wav"))
-    assert [row["heard"] for row in rows] == heard.told.tolist()
+    assert [row["heard"] for row in rows] == heard.named.tolist()
 
 
 def test_folders_within_a_class_are_held_out_together(folder, tmp_path):

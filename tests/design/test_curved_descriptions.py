@@ -14,7 +14,7 @@ from jeit.design.study.batch import check_points
 from jeit.layout import SurfaceLayout, read_surface_layout, write_layout
 from jeit.mesh import forearm, measures, sphere, tube, write
 from jeit.mesh.geodesic import Triangles
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import size_checked
 
 TUBE = 'kind = "tube"\nradius_mm = 30\nheight_mm = 80'
 SKIN = f'[surface]\n{TUBE}\n[electrodes]\nlayout = "inner-8"\ndiameter_mm = 10\n[mesh]\ncell_mm = 8\n'
@@ -96,7 +96,7 @@ def test_a_scan_is_read_in_its_unit_with_its_own_cells(described, tmp_path):
 @pytest.mark.parametrize(("of_file", "given", "across"), [("mm", "m", "120 m"), ("m", "mm", "0.12 mm")])
 def test_a_scan_in_another_unit_is_told_by_its_key(described, tmp_path, kind, of_file, given, across):
     length = {"mm": 120.0, "m": 0.12}[of_file]
-    with size_told():
+    with size_checked():
         write(forearm(length, (length / 4, length / 6), length / 3, num_points=400), tmp_path / "arm.stl")
     text = SKIN.replace(TUBE, f'file = "arm.stl"\nunit = "{given}"').replace("[mesh]\ncell_mm = 8\n", "")
     said = rf'^skin\.toml: surface\.unit: in "{given}" the skin would be {across} across; give "{of_file}", in which'

@@ -22,7 +22,7 @@ from jeit.data import description_tables, load_description
 from jeit.data.described_body import ELECTRODES, SHAPES
 from jeit.design import read_described_skin
 from jeit.design.study import read_study
-from jeit.files.limits import told_faults
+from jeit.files.limits import faults_message
 from jeit.files.schema import Number, Table, validated
 
 DESCRIPTIONS = {
@@ -359,10 +359,10 @@ def test_what_there_is_no_room_for_is_named_by_its_key():
     assert "more" not in str(caught.value)
     there = ", ".join("x" * 30 for _ in range(10))
     sentences = ["a is missing; give it.", f"b is no key (did you mean 'c'?); there are {there}.", "d is bad."]
-    told = told_faults("a.json", sentences, ["a", "b", "d"])
+    told = faults_message("a.json", sentences, ["a", "b", "d"])
     assert told == "a.json: a is missing; give it. b is no key (did you mean 'c'?). d is bad."
-    assert told_faults("a.json", [f"{there}."] * 3, ["a", "b", "d"]) == f"a.json: {there}. Wrong too: b, d."
-    assert len(told_faults("a.json", [there] * 30, ["k" * 40] * 30)) <= 400
+    assert faults_message("a.json", [f"{there}."] * 3, ["a", "b", "d"]) == f"a.json: {there}. Wrong too: b, d."
+    assert len(faults_message("a.json", [there] * 30, ["k" * 40] * 30)) <= 400
 
 
 class One(Table):

@@ -7,7 +7,7 @@ from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.imaging import prepare_difference
-from jeit.imaging.wiring import told_exchanges
+from jeit.imaging.wiring import exchanges_message
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent, haar
@@ -49,7 +49,7 @@ def exchanged(*pairs, axis=0):
     ],
 )
 def test_what_is_exchanged_in_a_frame_is_told(pairs, axis, said):
-    told = told_exchanges(measured(OBJECT, exchanged(*pairs, axis=axis)), EMPTY)
+    told = exchanges_message(measured(OBJECT, exchanged(*pairs, axis=axis)), EMPTY)
     assert told.startswith(said)
     assert all(f"{one + 1} and {other + 1}" in told for one, other in pairs)
 
@@ -63,9 +63,9 @@ def test_it_is_refused_with_that():
 
 def test_objects_and_noise_are_no_exchange():
     for change in (OBJECT, np.where(NEAR, 2.0, 0.02), np.where(NEAR, 2e-4, 0.02)):
-        assert told_exchanges(measured(change), EMPTY) == ""
+        assert exchanges_message(measured(change), EMPTY) == ""
     noisy = measured(OBJECT, noise=0.5)
-    assert told_exchanges(noisy, EMPTY) == ""
+    assert exchanges_message(noisy, EMPTY) == ""
     with pytest.raises(ValueError, match="noisy"):
         prepare_difference(noisy, EMPTY, num_points=500)
 
@@ -73,4 +73,4 @@ def test_objects_and_noise_are_no_exchange():
 def test_protocols_whose_drives_have_readings_of_their_own_are_left_alone():
     model = MODEL.with_protocol(adjacent(16))
     frame = Measurement(np.array(model.voltages(0.02))[::-1], np.ones(208, bool), model.protocol)
-    assert told_exchanges(frame, frame) == ""
+    assert exchanges_message(frame, frame) == ""

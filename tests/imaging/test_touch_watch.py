@@ -56,7 +56,7 @@ def test_a_set_is_learnt(made, learnt):
     assert (model.reading.num_channels, model.reading.protocol) == (48, DESCRIPTION.protocol("skin.toml").name)
     right = model.standing.held_out == model.standing.right
     assert right.mean() > 0.8  # of three
-    assert len(right) + len(learnt.untold) == len(made[0])
+    assert len(right) + len(learnt.without_touch) == len(made[0])
 
 
 @pytest.mark.slow

@@ -61,7 +61,7 @@ def test_a_sound_tank_raises_no_alarm(protocol):
 def test_two_exchanged_electrodes_are_found(pair):
     wiring = find_wiring(MODEL, measured(places=exchanged(pair)))
     assert wiring.places == exchanged(pair)
-    assert f"electrodes {pair[0] + 1} and {pair[1] + 1} look exchanged" in wiring.told
+    assert f"electrodes {pair[0] + 1} and {pair[1] + 1} look exchanged" in wiring.explanation
     assert wiring.misfit < 0.02 < 0.15 < wiring.described
 
 
@@ -70,7 +70,7 @@ def test_two_exchanges_and_a_ring_of_three_are_found():
     turned = exchanged((3, 4), (4, 5))
     wiring = find_wiring(MODEL, measured(places=turned))
     assert wiring.places == turned
-    assert "each look as if they stood where the next one should" in wiring.told
+    assert "each look as if they stood where the next one should" in wiring.explanation
 
 
 @pytest.mark.parametrize("order", list(channel_orders(adjacent(COUNT)))[1:])
@@ -79,7 +79,7 @@ def test_another_order_of_channels_is_found(order):
     wiring = find_wiring(MODEL, measured(order=order))
     first = list(channel_orders(MODEL.protocol))[1]
     assert (wiring.order, wiring.reversed_signs, wiring.places) == (first, False, PLACES)
-    assert f"the channels look ordered {first}" in wiring.told
+    assert f"the channels look ordered {first}" in wiring.explanation
 
 
 def test_a_fixed_order_described_as_rotating_is_the_protocols_own_fixed_order():
@@ -91,7 +91,7 @@ def test_a_fixed_order_described_as_rotating_is_the_protocols_own_fixed_order():
 def test_the_opposite_sign_is_found_also_beside_an_exchange():
     wiring = find_wiring(MODEL, measured(sign=-1, places=exchanged((2, 6))))
     assert (wiring.reversed_signs, wiring.places) == (True, exchanged((2, 6)))
-    assert "opposite sign" in wiring.told
+    assert "opposite sign" in wiring.explanation
 
 
 def test_a_sign_that_explains_a_frame_alone_is_told_alone_and_with_no_way_out_that_is_shut():
@@ -116,9 +116,9 @@ def test_electrodes_counted_from_another_one_are_found_where_the_body_shows_it()
         wiring = find_wiring(model, measured(model, domain, places))
         assert wiring.places == places
         way = "from another one" if places == shifted else "the other way round"
-        assert f"look counted {way}, electrode 1 standing where 4 should" in wiring.told
+        assert f"look counted {way}, electrode 1 standing where 4 should" in wiring.explanation
     round_again = tuple(-k % COUNT for k in range(COUNT))
-    told = find_wiring(model, measured(model, domain, round_again)).told
+    told = find_wiring(model, measured(model, domain, round_again)).explanation
     assert "look counted the other way round" in told
     assert "electrode 1" not in told
     # A round, even tank looks alike from all electrodes.

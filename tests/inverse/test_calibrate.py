@@ -81,7 +81,7 @@ def test_every_impedance_is_recovered_and_told_apart(model):
     for one in (result, start):
         assert one.status == "converged"
         np.testing.assert_allclose(one.model.electrodes.contact_impedance, impedance, rtol=1e-3)
-        assert one.tells_contacts_apart
+        assert one.distinguishes_contacts
 
 
 def test_contact_sensitivity_against_differences(model):
@@ -121,5 +121,5 @@ def test_impedances_that_no_channel_tells_are_not_told_apart(model):
     blind = ForwardModel(MESH, model.electrodes, protocol.subset(~protocol.channels_on_driven_electrodes()))
     voltages = np.array(blind.voltages(0.3))
     voltages *= 1 + 0.02 * np.random.default_rng(1).normal(size=voltages.size)
-    assert not calibrate(blind, voltages, contact="each").tells_contacts_apart
-    assert calibrate(blind, voltages, contact="fixed").tells_contacts_apart
+    assert not calibrate(blind, voltages, contact="each").distinguishes_contacts
+    assert calibrate(blind, voltages, contact="fixed").distinguishes_contacts

@@ -368,7 +368,7 @@ def test_of_many_to_start_from_only_those_that_data_ask_for_are_taken(coarse, fi
     small, data = independent_data(coarse, frame, np.ones(len(change), bool), noise, at_once=True)  # pyright: ignore
     setting = search._Setting(ShapeProblem(small, data, np.full(coarse.mesh.num_cells, BATH)), None)
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), [BALL + 0.008, [-0.03, 0.04, 0.03]], [1, -1])
-    _, fit, chosen = search._told_one_by_one(setting, balls, balls.of_radii([0.025, 0.02]))
+    _, fit, chosen = search._added_one_by_one(setting, balls, balls.of_radii([0.025, 0.02]))
     assert chosen == [0]
     assert len(fit.bodies.sign) == 1
 
@@ -386,7 +386,7 @@ def test_those_beyond_doubt_are_fitted_together_before_others_are_tried(coarse):
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), places, [1, 1, -1])
     start: Any = balls.of_radii([0.02, 0.02, 0.02])
     recorded: Any = Recorded()
-    _, _, chosen = search._told_one_by_one(recorded, balls, start, 2)
+    _, _, chosen = search._added_one_by_one(recorded, balls, start, 2)
     assert chosen == [0, 1]
     assert [signs for signs, _ in fitted] == [[1, 1], [1, 1, -1]]
     np.testing.assert_array_equal(fitted[0][1], balls.without(2, start)[1])

@@ -144,13 +144,13 @@ def calibrate_each(
     check_settings("intensity", intensity)
     if intensity is not None and taps.samples is None:
         raise ValueError("intensity: band and window are for taps that come as samples; these are intensities.")
-    tell = progress or (lambda step: None)
+    report = progress or (lambda step: None)
     if taps.samples is not None:
-        tell("measure intensities")
+        report("measure intensities")
     heard = _listen(taps, intensity)
     found, refused = {}, {}
     for kind in decays or DECAYS.values():
-        tell(f"fit {kind.name}")
+        report(f"fit {kind.name}")
         try:
             found[kind.name] = _fit(kind, heard)
         except _NoFitError as error:
@@ -229,7 +229,7 @@ def _fit(kind: type[AbstractDecay], heard: _Heard) -> _Fitted:
     return _Fitted(fit, tried, good, reasons, explained, left)
 
 
-def _calibration_fit(taps: Taps, heard: _Heard, fitted: _Fitted, told) -> CalibrationFit:
+def _calibration_fit(taps: Taps, heard: _Heard, fitted: _Fitted, notes) -> CalibrationFit:
     fit, good = fitted.fit, fitted.good
     # The factor between parameters and strengths, as `Calibration` has it.
     gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.values)).gain))[good].mean()
@@ -248,7 +248,7 @@ def _calibration_fit(taps: Taps, heard: _Heard, fitted: _Fitted, told) -> Calibr
         _range(strength[loud]),
         fitted.left.widening,
     )
-    rest = strength, fit.outlier, fitted.explained, shared, told
+    rest = strength, fit.outlier, fitted.explained, shared, notes
     return CalibrationFit(calibration, heard.distance, heard.power.T, fitted.tried, *rest)
 
 

@@ -17,7 +17,7 @@ from jeit.acoustic.noise import IntensityNoise
 from jeit.acoustic.signal._arrays import check_extent, check_microphones
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.surface import AbstractSurface, CurvedSurface, Plane
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.files import read_json, written_whole
 from jeit.mesh import Polygon
 from jeit_solvers.engines import as_array, on_host
@@ -75,7 +75,7 @@ class Calibration(eqx.Module):
         calibration has; `OSError` where there is no such file."""
         # pydantic takes longer to import than most of what jeit does with a calibration.
         from jeit.acoustic.calibration.calibration_tables import CalibrationTable
-        from jeit.files.limits import told_faults
+        from jeit.files.limits import faults_message
         from jeit.files.schema import validated
 
         name = Path(path).name
@@ -89,14 +89,14 @@ class Calibration(eqx.Module):
             )
         if content.get("version") != VERSION:
             raise ValueError(
-                f"{name[:80]} is of version {told(content.get('version'))} of the format; this jeit reads version "
+                f"{name[:80]} is of version {describe(content.get('version'))} of the format; this jeit reads version "
                 f"{VERSION}. Calibrate again, or use the jeit that wrote it."
             )
         table = validated(CalibrationTable, content, name)
         try:
             return cls._from_table(table)
         except ValueError as error:
-            raise ValueError(told_faults(name, [str(error)])) from None
+            raise ValueError(faults_message(name, [str(error)])) from None
 
     def _content(self) -> dict[str, Any]:
         microphone_array = on_host(self.microphone_array)

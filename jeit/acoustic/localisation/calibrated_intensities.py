@@ -59,12 +59,12 @@ def calibrated_intensities(
     usual = np.asarray(calibration.microphone_array.noise.floor)
     ratio = np.where(calibration.usable, heard.floor / np.where(usual > 0, usual, np.inf), 0.0)
     higher = f"the noise floor, taken from the quietest windows, is up to {ratio.max():.3g} times the calibration's"
-    told = describe_faults([higher if one > _SAME_FLOOR else "" for one in ratio])
+    text = describe_faults([higher if one > _SAME_FLOOR else "" for one in ratio])
     note = (
-        f"{told}. If the recording never pauses, touches count as silence: give a recording of the array untouched "
+        f"{text}. If the recording never pauses, touches count as silence: give a recording of the array untouched "
         "(silence=). If gain, unit, surroundings or microphones have changed, calibrate again."
     )
-    return dataclasses.replace(heard, notes=(note,)) if told else heard
+    return dataclasses.replace(heard, notes=(note,)) if text else heard
 
 
 def _above_silence(heard: Intensities, quiet: Intensities) -> Intensities:

@@ -46,10 +46,10 @@ class Consistency(eqx.Module):
 
     def differences(self, chart: Float[Array, "2 F"]) -> Float[Array, "M F"]:
         """I_k g_k − I_i g_i, and 0 for what is not used."""
-        told = self.power / self.microphone_array.response(chart)
-        xp = namespace(self, told)
-        most = xp.take_along_axis(told, self.loudest[None], axis=0)
-        return xp.where(self.use, most - told, 0.0)
+        estimates = self.power / self.microphone_array.response(chart)
+        xp = namespace(self, estimates)
+        most = xp.take_along_axis(estimates, self.loudest[None], axis=0)
+        return xp.where(self.use, most - estimates, 0.0)
 
     def cost(self, chart: Float[Array, "2 F"]) -> Float[Array, " F"]:
         """The loss L, relative to the square of the loudest intensity."""
@@ -91,30 +91,30 @@ class Consistency(eqx.Module):
         decay, where = self.microphone_array.decay, self.microphone_array.microphones
         constant = xp.sum(where**2, axis=1) + decay.b
         quadratic = xp.column_stack([xp.ones(len(where)), -2 * where, constant]) / decay.a[:, None]
-        told = [self.power * column[:, None] for column in quadratic.T]
-        most = [xp.take_along_axis(each, self.loudest[None], axis=0)[0] for each in told]
-        total = [xp.sum(each, axis=0) for each in told]
+        estimates = [self.power * column[:, None] for column in quadratic.T]
+        most = [xp.take_along_axis(each, self.loudest[None], axis=0)[0] for each in estimates]
+        total = [xp.sum(each, axis=0) for each in estimates]
         coefficients = []
-        for i in range(len(told)):
+        for i in range(len(estimates)):
             for j in range(i + 1):
                 both = number * most[i] * most[j] - most[i] * total[j] - most[j] * total[i]
-                both = both + xp.sum(told[i] * told[j], axis=0)
+                both = both + xp.sum(estimates[i] * estimates[j], axis=0)
                 coefficients.append(both if i == j else 2 * both)
         return xp.stack(coefficients, axis=1) @ features
 
     def covariance(self, chart: Float[Array, "2 F"], strength: Float[Array, " F"]) -> Float[Array, "2 2 F"]:
         """Of the minimum, from the intensities' variances: Σ_i (∂u/∂I_i)(∂u/∂I_i)ᵀ var I_i, with the derivative of the
         minimum by the implicit function theorem, ∂u/∂I = −H⁻¹ ∂²L/∂u∂I at small differences."""
-        told, along = slopes(lambda u: 1 / self.microphone_array.response(u), chart)
-        xp = namespace(self, told)
+        estimates, along = slopes(lambda u: 1 / self.microphone_array.response(u), chart)
+        xp = namespace(self, estimates)
         slope = xp.stack(along) * self.power
         most = xp.take_along_axis(slope, self.loudest[None, None], axis=1)
         rise = xp.where(self.use, most - slope, 0.0)
         matrix = xp.einsum("kmf,lmf->klf", rise, rise)
         # ∂/∂I_i of ½∂L/∂u: −g_i times the rise of its difference; of the loudest, g_k times that of all.
-        is_loudest = xp.arange(told.shape[0])[:, None] == self.loudest
-        drive = xp.where(is_loudest, xp.sum(rise, axis=1, keepdims=True) * told, -told * rise)
-        received = strength / told
+        is_loudest = xp.arange(estimates.shape[0])[:, None] == self.loudest
+        drive = xp.where(is_loudest, xp.sum(rise, axis=1, keepdims=True) * estimates, -estimates * rise)
+        received = strength / estimates
         variance = self.microphone_array.noise.variance(received) / xp.where(self.scale > 0, self.scale, 1.0) ** 2
         spread = xp.einsum("kmf,lmf,mf->klf", drive, drive, xp.where(self.use, variance, 0.0))
         inverse = inverse_small(matrix)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from jeit.arguments import is_number, told
+from jeit.arguments import describe, is_number
 
 
 def check_positive(name: str, value: float) -> None:
     """Raises `ValueError` for what is not a finite number above zero."""
     if not (is_number(value) and value > 0):
-        raise ValueError(f"{name} must be a positive number in SI units; it is {told(value)}.")
+        raise ValueError(f"{name} must be a positive number in SI units; it is {describe(value)}.")
 
 
 def check_not_negative(name: str, value: float) -> None:
     """Raises `ValueError` for what is not a finite number from zero up."""
     if not (is_number(value) and value >= 0):
-        raise ValueError(f"{name} must be zero or positive; it is {told(value)}.")
+        raise ValueError(f"{name} must be zero or positive; it is {describe(value)}.")

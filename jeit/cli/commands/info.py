@@ -39,7 +39,7 @@ def info(
         ("masked", f"{found['masked']} of {found['voltages']} voltages"),
         ("largest current", scaled(found["largest_current"], "A")),
         ("largest voltage", scaled(found["largest_voltage"], "V")),
-        ("body", _told(body)),
+        ("body", _body_text(body)),
         ("electrodes", f"{found['electrodes']['number']}, {found['electrodes']['kind']}"),
         ("reciprocity error", percent(found["reciprocity_error"])),
         ("noise", known or "not known"),
@@ -50,7 +50,7 @@ def info(
     plain_console().print(pairs(measurement.name, rows))
 
 
-def _told(body: dict[str, Any]) -> str:
+def _body_text(body: dict[str, Any]) -> str:
     """Shape and size of a body, in the words of a description."""
     from jeit.arguments import counted
 

@@ -198,7 +198,7 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
         rows.append(("linear image", fall))
     rows += [("doubt", doubt) for doubt in result.doubts]
     if result.shapes is not None:
-        rows.append(("bodies", told_bodies(result.shapes, result.mesh.dimension)))
+        rows.append(("bodies", bodies_text(result.shapes, result.mesh.dimension)))
     if result.why:
         rows.append(("chosen, for", result.why))
     if unlike := result.unlike_electrodes:
@@ -217,14 +217,14 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
     console.print()
 
 
-def told_bodies(shapes: "ShapeReconstruction", dimension: int) -> str:
+def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
     """What was fitted as shapes, in half a sentence: outlines in a sheet, surfaces in a solid."""
     from jeit.arguments import counted, percent
     from jeit.inverse.shapes import Ellipsoid
 
     edge = "surface" if dimension == 3 else "outline"
     left = f"; {counted(len(shapes.doubtful), 'ghost')} left out" if shapes.doubtful else ""
-    strong = sum(not one.contrast_is_told for one in shapes.bodies)
+    strong = sum(not one.contrast_is_determined for one in shapes.bodies)
     upright = sum(isinstance(one, Ellipsoid) and one.column for one in shapes.bodies)
     columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
     assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""

@@ -117,9 +117,9 @@ def series(
         regions = {text: partial(_region, text, one) for text, one in spelled.items()}
         found = image_sequence(measured, base, settings, regions=regions, progress=step)
         with naming_options({"frequency": "--frequency"}):
-            told = [oscillation(found.series.changes, found.series.times, one) for one in bands]
+            oscillations = [oscillation(found.series.changes, found.series.times, one) for one in bands]
         step("write")
-        report = write_series(found, output, regions=found.regions, oscillations=told, film=wanted)
+        report = write_series(found, output, regions=found.regions, oscillations=oscillations, film=wanted)
     if quiet:
         return
     frames, unit = counted(report["frames"], "frame"), report["unit"]

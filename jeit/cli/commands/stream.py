@@ -100,7 +100,7 @@ def stream(
 
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written, scaled
-    from jeit.cli.stopping import FramesTold, Stopping
+    from jeit.cli.stopping import FrameCounter, Stopping
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as images_of
     from jeit.inverse.nonlinear.solvers import SOLVERS, frame_solvers
@@ -139,7 +139,7 @@ def stream(
             rate = measured.frame_rate if rate is None else rate
         with naming_options({"rate": "--rate"}), Steps(console, quiet=quiet) as step:
             step("image")
-            come = FramesTold(step, number)
+            come = FrameCounter(step, number)
 
             def show(one) -> None:
                 come.one_more()

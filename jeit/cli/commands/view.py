@@ -68,7 +68,7 @@ def view(
 
 def _plane(text: str):
     """The plane that `text` spells, in millimetres. Raises `ValueError`."""
-    from jeit.arguments import told
+    from jeit.arguments import describe
     from jeit.image import Plane
 
     try:
@@ -80,5 +80,5 @@ def _plane(text: str):
     except ValueError:
         raise ValueError(
             f"--plane-mm must be such as z=20, or a point and a direction, 0,0,85/1,1,0, in millimetres; it is "
-            f"{told(text)}."
+            f"{describe(text)}."
         ) from None

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.data.description import Description
 from jeit.data.frame_recording import join
 from jeit.data.instruments.recording import Recording, content_of, description_of, measurement_of
@@ -102,7 +102,9 @@ def _number(lines: list[str], at: int, path: Path, *, whole: bool = False) -> fl
         value = float(text)
         if np.isfinite(value) and (not whole or (value == int(value) and abs(value) < 1e9)):
             return value
-    raise ValueError(f"{path.name}, line {at + 1}: must be a {'whole ' if whole else ''}number; it is {told(text)}.")
+    raise ValueError(
+        f"{path.name}, line {at + 1}: must be a {'whole ' if whole else ''}number; it is {describe(text)}."
+    )
 
 
 def _list(line: str, name: str) -> list[int]:
@@ -145,7 +147,7 @@ def _values(line: str, at: int, path: Path) -> np.ndarray:
     try:
         return np.array([float(one) for one in line.split()])
     except ValueError:
-        raise ValueError(f"{path.name}, line {at + 1}: {told(line.strip())} is not numbers.") from None
+        raise ValueError(f"{path.name}, line {at + 1}: {describe(line.strip())} is not numbers.") from None
 
 
 def _channels(header: _Header, columns: int, path: Path) -> tuple[list[int], list[int]]:

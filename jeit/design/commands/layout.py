@@ -128,10 +128,10 @@ def compare(
 def _show(console, result: "LayoutComparison") -> None:
     from rich.table import Table
 
-    from jeit.design.reports.layout_comparison import told_apart
+    from jeit.design.reports.layout_comparison import distinct_names
 
     figures = result.figures
-    table = Table("", *told_apart([one["layout"] for one in figures]), box=None, padding=(0, 2, 0, 0))
+    table = Table("", *distinct_names([one["layout"] for one in figures]), box=None, padding=(0, 2, 0, 0))
     for column in table.columns[1:]:
         column.justify = "right"
     for name, key, factor in _TOLD:

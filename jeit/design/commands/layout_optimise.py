@@ -90,7 +90,7 @@ def optimise(
     console = plain_console()
 
     def say(done: int, values) -> None:
-        step.tell(f"step {done} of at most {steps}, best score {values.max():.3f}")
+        step.report(f"step {done} of at most {steps}, best score {values.max():.3f}")
 
     with Steps(console, quiet=quiet) as step:
         result = improve_layout(start, space, **search, **material, progress=step, callback=say)

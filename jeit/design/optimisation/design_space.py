@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jeit.arguments import check_kind, check_metres, is_number, told
+from jeit.arguments import check_kind, check_metres, describe, is_number
 from jeit.design.optimisation.constraints import Constraints
 from jeit.design.optimisation.variables import Symmetry, Variables, Varied
 from jeit.design.skin.skin import Skin, longer_side
@@ -54,7 +54,7 @@ class DesignSpace(eqx.Module):
         if outline is not None:
             check_kind("outline", outline, Domain, "an outline, such as Rectangle(0.2, 0.2)")
         if not is_number(minimum_spacing):
-            raise ValueError(f"minimum_spacing must be a length in metres; it is {told(minimum_spacing)}.")
+            raise ValueError(f"minimum_spacing must be a length in metres; it is {describe(minimum_spacing)}.")
         wanted = "a list of domains, such as [Disk(0.01, (0.02, 0.0))]"
         check_kind("keep_out", keep_out, Sequence, wanted)
         for one in keep_out:

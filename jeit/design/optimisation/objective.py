@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, told
+from jeit.arguments import check_kind, describe
 from jeit.design.defaults import CONTRAST, CORRELATION, NOISE, TEMPERATURE
 from jeit.design.optimisation.variables import Varied
 from jeit.design.scores import Score, Scores, TouchPrior, layout_scores
@@ -40,7 +40,7 @@ class Objective(eqx.Module):
 
     def __check_init__(self):
         if not callable(self.score):
-            raise ValueError(f"score must be a function of Scores, such as balanced; it is {told(self.score)}.")
+            raise ValueError(f"score must be a function of Scores, such as balanced; it is {describe(self.score)}.")
         check_kind("touches", self.touches, SheetTouches, "SheetTouches, as of skin.sheet_touches(places)")
         check_kind("prior", self.prior, TouchPrior, "a TouchPrior, as of TouchPrior.create(places, correlation=0.05)")
 

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.arguments import check_kind, is_number, told
+from jeit.arguments import check_kind, describe, is_number
 from jeit.design.optimisation.objective import Objective
 from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin, check_skin
@@ -62,10 +62,10 @@ def optimise_surface_layout(
     if not isinstance(layout, SurfaceLayout) or skin.num_layers:
         raise ValueError("skin must be a curved sheet: Skin.create(surface_layout, num_layers=0); see optimise_layout.")
     if not isinstance(steps, int) or steps < 1:
-        raise ValueError(f"steps must be a whole number from 1; it is {told(steps)}.")
+        raise ValueError(f"steps must be a whole number from 1; it is {describe(steps)}.")
     for name, length in (("minimum_spacing", minimum_spacing), ("margin", margin)):
         if not is_number(length) or length < 0:
-            raise ValueError(f"{name} must be in metres, not negative; it is {told(length)}.")
+            raise ValueError(f"{name} must be in metres, not negative; it is {describe(length)}.")
     surface, radii = Triangles.of(layout.surface), np.asarray(layout.diameters) / 2
     apart = np.maximum(minimum_spacing, radii[:, None] + radii)
     np.fill_diagonal(apart, 0.0)

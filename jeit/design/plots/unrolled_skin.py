@@ -70,8 +70,8 @@ def plot_unrolled(
         ax.legend(loc="lower right", frameon=False, labelcolor=INK, ncols=len(marks), borderaxespad=0)
     if unrolled.mean_distortion > _TOLD:
         mean, most = 100 * unrolled.mean_distortion, 100 * unrolled.distortion
-        told = f"lengths off by {mean:.2g} % on average, {most:.2g} % at most"
-        ax.text(0.5, 0.02, told, transform=ax.transAxes, ha="center", color=SOFT, fontsize=8)
+        text = f"lengths off by {mean:.2g} % on average, {most:.2g} % at most"
+        ax.text(0.5, 0.02, text, transform=ax.transAxes, ha="center", color=SOFT, fontsize=8)
     if title:
         ax.set_title(title)
     return ax

@@ -57,7 +57,7 @@ def draw_layout_comparison(result: LayoutComparison):
     both = result.responses
     highest = max(float(one.sensitivity.values.max()) for one in both)
     largest = max(float(one.taxels.max_area) for one in both)
-    names = told_apart([_shortened(one.layout.name) for one in both])
+    names = distinct_names([_shortened(one.layout.name) for one in both])
     for row, name, one in zip(axes, names, both, strict=True):
         centres, outline = one.layout.centres, flat_layout(one.layout).known_outline
         plot_sensitivity_map(
@@ -82,7 +82,7 @@ def draw_layout_comparison(result: LayoutComparison):
     return figure
 
 
-def told_apart(names: list[str]) -> list[str]:
+def distinct_names(names: list[str]) -> list[str]:
     """Two names, numbered if they are the same."""
     return names if names[0] != names[1] else [f"{name} ({k})" for k, name in enumerate(names, 1)]
 

@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from jeit.design.reports.study_pictures import draw_maps, draw_scatter, draw_scores, scores_of, shown, told
+from jeit.design.reports.study_pictures import draw_maps, draw_scatter, draw_scores, scores_of, shown, values_and_unit
 from jeit.design.study.run import study_progress
 from jeit.design.study.spec import Study
 from jeit.design.study.store import Store, open_results
@@ -88,7 +88,7 @@ def _picture(figure: Any, caption: str) -> str:
 def _table(study: Study, data) -> str:
     """A line for every point: what was swept, then what was found."""
     swept = list(study.points[0].coordinates)
-    found = {name: told(data, name) for name in scores_of(data)}
+    found = {name: values_and_unit(data, name) for name in scores_of(data)}
     heads = ["point", *swept, *(name if unit == "1" else f"{name} / {unit}" for name, (_, unit) in found.items())]
     lines = ["".join(f'<th class="{"text" if head in _TEXT else "number"}">{escape(head)}</th>' for head in heads)]
     columns = [data[name].values.tolist() for name in swept] + [values.tolist() for values, _ in found.values()]

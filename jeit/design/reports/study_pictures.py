@@ -57,7 +57,7 @@ def scores_of(data) -> list[str]:
     return [name for name in data.data_vars if data[name].dims == ("point",)]
 
 
-def told(data, name: str) -> tuple[np.ndarray, str]:
+def values_and_unit(data, name: str) -> tuple[np.ndarray, str]:
     """Values of a score at every point, and their unit: as in the store, but millivolts for volts."""
     values, unit = data[name].values, data[name].attrs.get("units", "1")
     return (1e3 * values, "mV") if unit == "V" else (values, unit)
@@ -75,7 +75,7 @@ def draw_scores(data):
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
     point = np.arange(data.sizes["point"])
     for axes, name in zip(panels, names, strict=False):
-        values, unit = told(data, name)
+        values, unit = values_and_unit(data, name)
         for number, layout in enumerate(dict.fromkeys(data.layout.values.tolist())):
             these = data.layout.values == layout
             finite, infinite = these & np.isfinite(values), these & np.isinf(values)
@@ -191,8 +191,8 @@ def titles_of(study: Study) -> list[str]:
     varying = [name for name in _LABELS if len({values[name] for values in coordinates}) > 1]
     titles = []
     for number, values in enumerate(coordinates):
-        told = [_label(name, values[name]) for name in varying]
-        lines = [", ".join(told[start : start + 2]) for start in range(0, len(told), 2)]
+        labels = [_label(name, values[name]) for name in varying]
+        lines = [", ".join(labels[start : start + 2]) for start in range(0, len(labels), 2)]
         titles.append("\n".join([f"{number}: {_plain(str(values['layout']))}", *lines]))
     return titles
 

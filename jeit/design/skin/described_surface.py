@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.layout.layout import LARGEST, SMALLEST
 from jeit.mesh import Mesh, bend, cap, forearm, from_gmsh, measures, read, rectangle, sphere, tube
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import size_checked
 
 if TYPE_CHECKING:
     from jeit.design.skin.surface_tables import SurfaceTable
@@ -31,7 +31,7 @@ def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Me
     CAD file without Gmsh.
     """
     try:
-        with size_told():  # what is too large is refused
+        with size_checked():  # what is too large is refused
             surface = _made(table, folder, cell_size)
     except (ValueError, OSError) as error:
         raise ValueError(f"surface: {error}") from None
@@ -49,12 +49,14 @@ def _check_unit(table: SurfaceTable, surface: Mesh) -> None:
     across = {unit: extent * one / _UNITS[table.unit] for unit, one in _UNITS.items()}
     likely = min(across, key=lambda unit: abs(np.log(across[unit] / _USUAL)))
     hint = (
-        f'give "{likely}", in which it is {_told(across[likely])}' if likely != table.unit else "is it the right file?"
+        f'give "{likely}", in which it is {_length_text(across[likely])}'
+        if likely != table.unit
+        else "is it the right file?"
     )
-    raise ValueError(f'surface.unit: in "{table.unit}" the skin would be {_told(extent)} across; {hint}.')
+    raise ValueError(f'surface.unit: in "{table.unit}" the skin would be {_length_text(extent)} across; {hint}.')
 
 
-def _told(metres: float) -> str:
+def _length_text(metres: float) -> str:
     return f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
 
 
@@ -94,7 +96,7 @@ def _made(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
         surface = from_gmsh(file, cell_size=cell_size / scale, dimension=2, scale=scale)
     if not surface.is_surface:
         raise ValueError(
-            f"{told(table.file)} is flat or a solid; a curved skin needs triangles in space, such as those that "
+            f"{describe(table.file)} is flat or a solid; a curved skin needs triangles in space, such as those that "
             "jeit.mesh.surface_of takes off a solid."
         )
     return surface

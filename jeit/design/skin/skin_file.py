@@ -38,14 +38,14 @@ def read_described_skin(path: str | Path) -> Skin:
         raise FileNotFoundError(f"'{path}': there is no such file.")
     # pydantic takes longer to import than most of what jeit does with a skin's file.
     from jeit.design.skin.skin_tables import SkinTable
-    from jeit.files.limits import told_faults
+    from jeit.files.limits import faults_message
     from jeit.files.schema import validated
 
     table = validated(SkinTable, read_toml(path), path.name)
     try:
         return _made(table, path.parent)
     except ValueError as error:
-        raise ValueError(told_faults(path.name, [str(error)])) from None
+        raise ValueError(faults_message(path.name, [str(error)])) from None
 
 
 def _made(table: SkinTable, folder: Path) -> Skin:

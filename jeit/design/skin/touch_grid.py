@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_kind, told
+from jeit.arguments import check_kind, describe
 from jeit.design.defaults import PLACES
 from jeit.layout import spread
 from jeit.mesh import Domain
@@ -124,7 +124,7 @@ def check_places(places, dimension: int = 2) -> Float[np.ndarray, "n d"]:
     try:
         found = np.asarray(places, float)
     except (TypeError, ValueError):
-        raise ValueError(f"{wanted}; it is {told(places)}.") from None
+        raise ValueError(f"{wanted}; it is {describe(places)}.") from None
     if found.ndim != 2 or found.shape[1] != dimension or not len(found):
         raise ValueError(f"{wanted}; they have shape {found.shape}.")
     lost = np.flatnonzero(~np.isfinite(found).all(axis=1))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.design.defaults import CONTACT_IMPEDANCE
 from jeit.design.study.layouts import check_number, check_spacing, is_file
 from jeit.layout import SurfaceLayout, read_surface_layout
@@ -33,7 +33,7 @@ def curved_layout(
     try:
         layout = _make(name, folder, surface, outward, diameter)
     except (ValueError, OSError) as error:
-        raise ValueError(f"electrodes.layouts: {told(name)}: {error}") from None
+        raise ValueError(f"electrodes.layouts: {describe(name)}: {error}") from None
     if minimum_gap > 0:
         check_spacing(layout, layout.lengths(), minimum_gap)
     if not math.isnan(contact_impedance):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.design.defaults import CONTACT_IMPEDANCE
 from jeit.layout import Layout, SurfaceLayout, named_layout, read_layout
 from jeit.layout.names import DIAMETER, same_outline
@@ -28,7 +28,7 @@ def study_layout(
     try:
         layout = _make(name, folder, outline, diameter)
     except (ValueError, OSError) as error:
-        raise ValueError(f"electrodes.layouts: {told(name)}: {str(error).removeprefix('name: ')}") from None
+        raise ValueError(f"electrodes.layouts: {describe(name)}: {str(error).removeprefix('name: ')}") from None
     centres = np.asarray(layout.centres)
     check_spacing(layout, np.linalg.norm(centres[:, None] - centres, axis=-1), minimum_gap)
     if not math.isnan(contact_impedance):

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.files.whole import boot, is_alive
 
 try:
@@ -118,12 +118,12 @@ def _is_here(owner: dict) -> bool:
 
 
 def _refusal(owner: dict, place: Path, path: Path, kind: str) -> str:
-    who = f"process {told(owner['pid'])}" if "pid" in owner else "another process"
-    since = f" since {told(owner['since']).strip(chr(39))}" if "since" in owner else ""
+    who = f"process {describe(owner['pid'])}" if "pid" in owner else "another process"
+    since = f" since {describe(owner['since']).strip(chr(39))}" if "since" in owner else ""
     if not owner or (_is_here(owner) and fcntl is not None):
         who = "this process" if owner.get("pid") == os.getpid() else who
         return f"{path} is being written by {who}{since}; wait until it ends, or stop it, then resume the {kind}."
-    where = "this machine" if _is_here(owner) else told(owner.get("host"))
+    where = "this machine" if _is_here(owner) else describe(owner.get("host"))
     return (
         f"{path} is being written by {who} on {where}{since}, or was when that was killed: from here that cannot be "
         f"told. Where it still runs, wait; where it does not, delete {place} and resume the {kind}."

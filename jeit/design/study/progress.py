@@ -20,7 +20,7 @@ class Progress(NamedTuple):
     seconds_left: float | None
 
 
-class Teller:
+class ProgressReporter:
     """Calls `progress` about work in `chunks`, and reckons the time left from the points finished since it was made;
     `done` were before."""
 
@@ -28,7 +28,7 @@ class Teller:
         self._chunks, self._done, self._progress = chunks, set(done), progress
         self._all = sum(len(chunk) for chunk in chunks)
         self._first, self._start = self._points(), time.monotonic()
-        self._tell(self._first, None)
+        self._report(self._first, None)
 
     def finished(self, number: int) -> None:
         """A chunk is."""
@@ -41,11 +41,11 @@ class Teller:
 
     def _reckon(self, points: int) -> None:
         pace = (time.monotonic() - self._start) / (points - self._first)
-        self._tell(points, pace * (self._all - points))
+        self._report(points, pace * (self._all - points))
 
     def _points(self) -> int:
         return sum(len(self._chunks[number]) for number in self._done)
 
-    def _tell(self, points: int, seconds_left: float | None) -> None:
+    def _report(self, points: int, seconds_left: float | None) -> None:
         if self._progress is not None:
             self._progress(Progress(points, self._all, len(self._done), len(self._chunks), seconds_left))

@@ -11,7 +11,7 @@ import numpy as np
 from jeit.arguments.extras import need_extra
 from jeit.design.study.batch import check_points, solve_chunk
 from jeit.design.study.cluster import over_cluster
-from jeit.design.study.progress import Progress, Teller
+from jeit.design.study.progress import Progress, ProgressReporter
 from jeit.design.study.spec import Study
 from jeit.design.study.store import Store, open_results, writing
 
@@ -38,10 +38,10 @@ def run_study(
     with writing(study, path) as store:
         done = set(store.sound())
         left = [number for number in range(len(study.chunks)) if number not in done]
-        tell = Teller(study.chunks, done, progress)
-        for number, results in _solved(study, left, client, tell.solved):
+        report = ProgressReporter(study.chunks, done, progress)
+        for number, results in _solved(study, left, client, report.solved):
             store.write(number, results)
-            tell.finished(number)
+            report.finished(number)
     return open_results(study, path)
 
 

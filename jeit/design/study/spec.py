@@ -213,7 +213,7 @@ def read_study(path: str | Path) -> Study:
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
     # pydantic takes longer to import than most of what jeit does with a study's file.
     from jeit.design.study.study_tables import StudyTable
-    from jeit.files.limits import told_faults
+    from jeit.files.limits import faults_message
     from jeit.files.schema import validated
 
     text = read_text(path, most=_LONGEST)
@@ -221,7 +221,7 @@ def read_study(path: str | Path) -> Study:
     try:
         return _study(text, table, path.parent)
     except ValueError as error:
-        raise ValueError(told_faults(path.name, [str(error)])) from None
+        raise ValueError(faults_message(path.name, [str(error)])) from None
 
 
 def _study(text: str, table: StudyTable, folder: Path) -> Study:

@@ -61,7 +61,7 @@ def damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
         return _UNREADABLE
     found = {folder.name for folder in path.iterdir() if folder.is_dir()}
     if found != set(expected):
-        return f"its arrays are not those of its contents: {_told(found ^ set(expected))}"
+        return f"its arrays are not those of its contents: {_shortened(found ^ set(expected))}"
     if content.get("zarr_format") != 3 or content.get("node_type") != "group":
         return "it is no group of Zarr's format 3"
     consolidated = content.get("consolidated_metadata")
@@ -99,8 +99,8 @@ def _unpacked(beginning: bytes, size: int) -> int | None:
         single = about >> 5 & 1
         start = 5 + (1 - single) + (0, 1, 2, 4)[about & 3]
         length = (single, 2, 4, 8)[about >> 6]
-        told = int.from_bytes(beginning[start : start + length], "little")
-        return told + (256 if length == 2 else 0) if length else None
+        number = int.from_bytes(beginning[start : start + length], "little")
+        return number + (256 if length == 2 else 0) if length else None
     if beginning[:1] == b"\x02" and len(beginning) >= 16:
         return max(size, int.from_bytes(beginning[4:8], "little"))
     return size
@@ -124,11 +124,11 @@ def _node_danger(node: Any) -> str | None:
         return "asks for storage transformers"
     data_type = node.get("data_type")
     if "data_type" in node and not (isinstance(data_type, str) and data_type in _TYPES):
-        return f"holds neither numbers nor text but {_told([data_type])}"
+        return f"holds neither numbers nor text but {_shortened([data_type])}"
     codecs = node.get("codecs", [])
     names = [codec.get("name") if isinstance(codec, dict) else codec for codec in _listed(codecs)]
     strange = [name for name in names if not (isinstance(name, str) and name in CODECS)]
-    return f"asks for {_told(strange)}, and not only for codecs that pack bytes" if strange else None
+    return f"asks for {_shortened(strange)}, and not only for codecs that pack bytes" if strange else None
 
 
 def _node_damage(node: Any, expected: ArrayShape) -> str | None:
@@ -157,6 +157,6 @@ def _listed(values: Any) -> list[Any]:
     return values if isinstance(values, list) else [values]
 
 
-def _told(values: Any) -> str:
+def _shortened(values: Any) -> str:
     """Names from a file that nobody can trust: short, and on one line."""
     return ", ".join(ascii(value)[:60] for value in [*values][:3])

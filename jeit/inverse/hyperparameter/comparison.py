@@ -56,12 +56,12 @@ def compare_rules(
     rule as it begins; other arguments as in `one_step`.
     `jeit.plot.plot_choice` draws the result. Raises `ValueError` for arguments that do not fit.
     """
-    rules, tell = RULES if rules is None else rules, progress or (lambda step: None)
-    tell("linearise")
+    rules, report = RULES if rules is None else rules, progress or (lambda step: None)
+    report("linearise")
     linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
     data = linear.whiten(difference)
     chosen = {}
     for name, rule in rules.items():
-        tell(name)
+        report(name)
         chosen[name] = choose(linear.spectrum, rule, data, model.mesh)
     return chosen

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit.inverse.channels import relative_noise
@@ -58,7 +58,9 @@ def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
         )
     values = np.asarray(background) if has_values(background) else np.ones(())
     if (wrong := values[~((values > 0) & np.isfinite(values))]).size:
-        raise ValueError(f"background must be positive and finite, S/m (2-D: S), everywhere; {told(wrong[0])} is not.")
+        raise ValueError(
+            f"background must be positive and finite everywhere, S/m (2-D: S); {describe(wrong[0])} is not."
+        )
     return namespace(background).broadcast_to(background.astype(float), (model.mesh.num_cells,))
 
 

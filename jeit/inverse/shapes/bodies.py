@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jeit.arguments import is_number, told
+from jeit.arguments import describe, is_number
 
 # Fields of `Bodies` that say one thing of every body, besides where it starts.
 _OF_EACH = ("sign", "other", "alike")
@@ -48,9 +48,9 @@ class BodyPrior(abc.ABC):
     def __post_init__(self):
         for name, value in self._numbers.items():
             if not (is_number(value) and value > 0):
-                raise ValueError(f"{name} must be a positive number; it is {told(value)}.")
+                raise ValueError(f"{name} must be a positive number; it is {describe(value)}.")
         if self.modes != int(self.modes):
-            raise ValueError(f"modes must be a whole number from 1; it is {told(self.modes)}.")
+            raise ValueError(f"modes must be a whole number from 1; it is {describe(self.modes)}.")
 
     @property
     def _numbers(self) -> dict[str, Any]:

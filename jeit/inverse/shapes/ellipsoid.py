@@ -41,8 +41,8 @@ def contrast_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = N
 def _contrasts(problem: ShapeProblem, fitted: Fit) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Contrasts of bodies, and their standard deviations by Laplace's approximation."""
     bodies = fitted.bodies
-    told = [bodies.contrast(k, row) for k, row in enumerate(bodies.rows(fitted.coefficients))]
-    contrast, slope = np.array(told).reshape(-1, 2).T
+    contrasts = [bodies.contrast(k, row) for k, row in enumerate(bodies.rows(fitted.coefficients))]
+    contrast, slope = np.array(contrasts).reshape(-1, 2).T
     return contrast, bodies.rows(problem.deviations(fitted))[:, bodies.dimension + 1] * slope
 
 
@@ -167,7 +167,7 @@ class Ellipsoid(eqx.Module):
         return self.volume
 
     @property
-    def contrast_is_told(self) -> bool:
+    def contrast_is_determined(self) -> bool:
         """Whether by the data: of every ellipsoid."""
         return True
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_has_values, check_kind, is_number, told
+from jeit.arguments import check_has_values, check_kind, describe, is_number
 from jeit.forward import ForwardModel
 from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
 from jeit.inverse.nonlinear.problem import independent_data
@@ -143,7 +143,7 @@ def reconstruct_shapes(
     prior = kind() if prior is None else prior
     check_kind("prior", prior, kind, f"one of bodies of that dimension, such as {kind.__name__}(modes=2)")
     if not (is_number(least_rise) and least_rise >= 1):
-        raise ValueError(f"least_rise must be a number from 1; it is {told(least_rise)}.")
+        raise ValueError(f"least_rise must be a number from 1; it is {describe(least_rise)}.")
     sign, centre, radius = _checked_start(start, model.mesh.dimension)
     small, data = independent_data(model, measured, used, deviation, at_once=True)
     solid = model.mesh.dimension == 3
@@ -153,19 +153,19 @@ def reconstruct_shapes(
     if isinstance(prior, EllipsoidPrior) and prior.kinds == "columns":
         bodies, coefficients = bodies.otherwise(range(len(radius)), coefficients)
     setting = _Setting(problem, None if smooth is None else SmoothField.create(smooth, problem))
-    level, tell = 0.0, progress or (lambda stage: None)
-    tell("bodies")
+    level, report = 0.0, progress or (lambda stage: None)
+    report("bodies")
     if smooth is not None:
-        level, balls, _ = _told_one_by_one(setting, *bodies.with_modes(1, coefficients))
+        level, balls, _ = _added_one_by_one(setting, *bodies.with_modes(1, coefficients))
         bodies, coefficients = balls.bodies.with_modes(prior.modes, balls.coefficients)
         problem = setting.problem(level)
     fitted = problem.fit(*_grown(problem, bodies, coefficients, _FIRST_STEPS), _STEPS)
     found = _without_ghosts(problem, fitted, (), least_rise)
-    tell("bodies, how many")
-    best, there = _Told(setting, level, _changed(problem, found, least_rise)), None
+    report("bodies, how many")
+    best, there = _State(setting, level, _changed(problem, found, least_rise)), None
     if solid:
-        best, there = _on_finer_meshes(best, least_rise, tell)
-        tell("bodies, of which kind")
+        best, there = _on_finer_meshes(best, least_rise, report)
+        report("bodies, of which kind")
     (setting, level, (each, rises, doubtful)), beside = best, best.setting.beside
     problem = setting.problem(level)
     fitted = _of_one_material(problem, each)
@@ -240,7 +240,7 @@ class _Setting(NamedTuple):
             level, coefficients = likeliest, fit.coefficients
 
 
-def _told_one_by_one(setting: _Setting, bodies: Bodies, coefficients, sure: int = 0) -> tuple[float, Fit, list[int]]:
+def _added_one_by_one(setting: _Setting, bodies: Bodies, coefficients, sure: int = 0) -> tuple[float, Fit, list[int]]:
     """The level of a smooth field, the bodies that data ask for besides, each after those before it, and which they
     are. The first `sure` are beyond doubt and fitted together: one of two that is fitted alone moves between them, and
     does not come back."""
@@ -266,7 +266,7 @@ class _Found(NamedTuple):
     doubtful: tuple[Body, ...]
 
 
-class _Told(NamedTuple):
+class _State(NamedTuple):
     """What was `found` in a `setting`, with the field at its `level`."""
 
     setting: _Setting
@@ -274,17 +274,17 @@ class _Told(NamedTuple):
     found: _Found
 
 
-def _on_finer_meshes(told: _Told, least_rise: float, tell: Callable[[str], None]) -> tuple[_Told, Finer | None]:
+def _on_finer_meshes(state: _State, least_rise: float, report: Callable[[str], None]) -> tuple[_State, Finer | None]:
     """The same fitted where the mesh is finer on their surfaces, again until they stay there; ghosts that a coarser one
     made are not. And the last of those meshes."""
     from jeit.inverse.shapes.finer import finer
 
-    given, there = told.setting, None
+    given, there = state.setting, None
     for again in range(_MOST_MESHES):
-        _, level, (before, rises, doubtful) = told
+        _, level, (before, rises, doubtful) = state
         if not len(before.bodies.sign):
             break
-        tell(f"bodies, finer mesh {again + 1}")
+        report(f"bodies, finer mesh {again + 1}")
         there = finer(given.alone, before, _EDGES[again > 0])
         setting, bodies, coefficients = given.on(there.problem), there.bodies, before.coefficients
         missed = np.array(rises) * before.cost
@@ -294,7 +294,7 @@ def _on_finer_meshes(told: _Told, least_rise: float, tell: Callable[[str], None]
             order = np.argsort(-missed)
             start = np.append(coefficients[0], bodies.rows(coefficients)[order])
             sure = int((missed > _SURELY * before.cost).sum())
-            level, fit, some = _told_one_by_one(setting, bodies.only(order), start, sure)
+            level, fit, some = _added_one_by_one(setting, bodies.only(order), start, sure)
             left = np.setdiff1d(np.arange(len(order)), some)
             doubtful = (*doubtful, *(bodies.body(k, coefficients, rises[k]) for k in order[left]))
             missed = missed[order[some]]
@@ -304,10 +304,10 @@ def _on_finer_meshes(told: _Told, least_rise: float, tell: Callable[[str], None]
         found = _without_ghosts(problem, fit, doubtful, least_rise, missed)
         if again < _MOST_MESHES - 1 and (other := _otherwise(problem, found.fit)):
             found = _without_ghosts(problem, other, found.doubtful, least_rise)
-        told, after = _Told(setting, level, found), found.fit
+        state, after = _State(setting, level, found), found.fit
         if again and not bodies.moved(coefficients, after.bodies, after.coefficients):
             break
-    return told, there
+    return state, there
 
 
 def _without_ghosts(
@@ -331,7 +331,7 @@ def _without_ghosts(
             others[k] = problem.fit(*bodies.without(k, coefficients), _STEPS_WITHOUT, 2 * _ROUGHLY)
             missed[k] = others[k].cost
         least = min(others, key=lambda k: missed[k], default=None)
-        if least is None or (missed[least] >= least_rise * cost and _is_told(problem, others[least], fitted)):
+        if least is None or (missed[least] >= least_rise * cost and _is_supported(problem, others[least], fitted)):
             return _Found(fitted, list(missed / cost), tuple(doubtful))
         doubtful.append(bodies.body(least, coefficients, float(missed[least]) / cost))
         missed = np.delete(missed, least)
@@ -347,7 +347,7 @@ def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None
         for number in range(bodies.num_splits)
     ]
     found = _best(problem, fitted, tried)
-    return found if found and cost >= least_rise * found.cost and _is_told(problem, fitted, found) else None
+    return found if found and cost >= least_rise * found.cost and _is_supported(problem, fitted, found) else None
 
 
 def _otherwise(problem: ShapeProblem, fitted: Fit) -> Fit | None:
@@ -356,7 +356,7 @@ def _otherwise(problem: ShapeProblem, fitted: Fit) -> Fit | None:
     plain = np.flatnonzero(~fitted.bodies.other & (not fitted.bodies.prior.is_of_one_kind))
     some = [[k] for k in plain] + [plain] * (len(plain) > 1)
     found = _best(problem, fitted, [fitted.bodies.otherwise(one, fitted.coefficients) for one in some])
-    return found if found and _is_told(problem, fitted, found) else None
+    return found if found and _is_supported(problem, fitted, found) else None
 
 
 def _of_one_material(problem: ShapeProblem, fitted: Fit) -> Fit:
@@ -379,7 +379,7 @@ def _best(problem: ShapeProblem, fitted: Fit, starts: Sequence[tuple[Bodies, Flo
     return problem.fit(best.bodies, best.coefficients, _STEPS)
 
 
-def _is_told(problem: ShapeProblem, simple: Fit, other: Fit) -> bool:
+def _is_supported(problem: ShapeProblem, simple: Fit, other: Fit) -> bool:
     """Whether the evidence is for the other."""
     return problem.surprise(other) + _MARGIN <= problem.surprise(simple)
 

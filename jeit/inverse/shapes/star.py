@@ -90,7 +90,7 @@ class Star(eqx.Module):
         return self.area
 
     @property
-    def contrast_is_told(self) -> bool:
+    def contrast_is_determined(self) -> bool:
         """Whether by the data: of weak bodies."""
         return self.weak
 

@@ -156,9 +156,9 @@ class FrameCheck:
         return rail
 
     def _without_saturated(self, values, difference, usable, rail):
-        rest, told = usable & ~rail, counted(int(np.count_nonzero(rail)), "channel")
+        rest, channels = usable & ~rail, counted(int(np.count_nonzero(rail)), "channel")
         if np.count_nonzero(rest) < _LEAST_CHANNELS * np.count_nonzero(self.mask):
-            return values, rest, FrameStatus.REFUSED, f"Saturated: {told} at the ends of the range."
+            return values, rest, FrameStatus.REFUSED, f"Saturated: {channels} at the ends of the range."
         if np.linalg.norm(difference[rest]) > _LARGEST_DIFFERENCE * self.size:
-            return values, rest, FrameStatus.REFUSED, f"Saturated: {told}, and the others are far off too."
-        return values, rest, FrameStatus.PARTIAL, f"Left out: {told} at the ends of the range, saturated."
+            return values, rest, FrameStatus.REFUSED, f"Saturated: {channels}, and the others are far off too."
+        return values, rest, FrameStatus.PARTIAL, f"Left out: {channels} at the ends of the range, saturated."

@@ -18,7 +18,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import is_number, told
+from jeit.arguments import describe, is_number
 from jeit.electrodes.point import IntegratedElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import IndependentChannels, Weighing
@@ -44,7 +44,7 @@ _BLIND = 1e3
 def check_memory(memory) -> None:
     """Raises `ValueError` for what is no number of frames."""
     if not (is_number(memory) and memory >= 0):
-        raise ValueError(f"memory must be a number of frames, or 0 for none; it is {told(memory)}.")
+        raise ValueError(f"memory must be a number of frames, or 0 for none; it is {describe(memory)}.")
 
 
 class FrameEstimate(eqx.Module):

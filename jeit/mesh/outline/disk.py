@@ -16,7 +16,7 @@ from jeit.mesh.generate.refine import Refine, Refinement
 from jeit.mesh.generate.unstructured import Target, check_count, check_positions, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import Domain, Pen, check_length, check_near_origin, check_position, numerics
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import size_checked
 from jeit_solvers.engines import as_array
 
 
@@ -87,7 +87,7 @@ class Disk(Domain):
         """One circle."""
         pen.circle(self.centre, self.radius)
 
-    @size_told()
+    @size_checked()
     def mesh(
         self,
         num_points: int | None = None,

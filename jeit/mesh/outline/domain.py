@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.mesh.body import Body
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
@@ -115,7 +115,7 @@ def check_length(name: str, value: Any, across: float = 1.0) -> Any:
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected one length in metres, got {value!r}.") from None
     if not np.isfinite(number) or number <= 0:
-        raise ValueError(f"{name}: expected a positive length in metres, got {told(value)}.")
+        raise ValueError(f"{name}: expected a positive length in metres, got {describe(value)}.")
     warn_large(number, name, across)
     return number
 

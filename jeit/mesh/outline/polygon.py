@@ -16,7 +16,7 @@ from jeit.mesh.generate.unstructured import Target, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import polyline
 from jeit.mesh.outline.domain import Domain, Pen, check_near_origin
-from jeit.mesh.sizes import size_told, warn_large
+from jeit.mesh.sizes import size_checked, warn_large
 from jeit_solvers.engines import as_array, has_values
 
 
@@ -91,7 +91,7 @@ class Polygon(Domain):
         for loop in self.loops():
             pen.loop(np.asarray(loop))
 
-    @size_told()
+    @size_checked()
     def mesh(
         self,
         num_points: int | None = None,

@@ -15,7 +15,7 @@ from jeit.mesh.generate.unstructured import Target, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import polyline
 from jeit.mesh.outline.domain import Domain, Pen, check_length, check_near_origin, check_position
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import size_checked
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 
 
@@ -89,7 +89,7 @@ class Rectangle(Domain):
         """One loop of four sides."""
         pen.loop(np.asarray(self.vertices))
 
-    @size_told()
+    @size_checked()
     def mesh(
         self,
         num_points: int | None = None,

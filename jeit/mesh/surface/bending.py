@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array
 
-from jeit.arguments import check_name, told
+from jeit.arguments import check_name, describe
 from jeit.mesh.geometry import normals
 from jeit.mesh.mesh import Mesh
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import size_checked
 
 
 def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
@@ -24,7 +24,7 @@ def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
         check_name("tag", tag, mesh.tags)
         facets = facets[np.asarray(mesh.tags[tag])]
     used, cells = np.unique(facets, return_inverse=True)
-    with size_told():
+    with size_checked():
         return Mesh.create(np.asarray(mesh.points)[used], cells.reshape(facets.shape))
 
 
@@ -54,8 +54,8 @@ def node_normals(mesh: Mesh) -> np.ndarray:
     mean /= np.linalg.norm(mean, axis=1, keepdims=True)
     least = np.ones(len(points))
     np.minimum.at(least, cells, (mean[cells] * facing[:, None]).sum(axis=2))
-    slope, told = _slopes(points, cells, mean)
-    smooth = (least > _CREASE) & told
+    slope, determined = _slopes(points, cells, mean)
+    smooth = (least > _CREASE) & determined
     fitted = mean - np.where(smooth[:, None], slope, 0)
     return fitted / np.linalg.norm(fitted, axis=1, keepdims=True)
 
@@ -84,10 +84,10 @@ def _slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tuple[
         for j in range(_TERMS):
             matrix[:, k, j] = np.bincount(one, terms[:, k] * terms[:, j], count)
     values = np.linalg.eigvalsh(matrix)
-    told = values[:, 0] > _LEAST * values[:, -1]
-    matrix[~told] = np.eye(_TERMS)
+    determined = values[:, 0] > _LEAST * values[:, -1]
+    matrix[~determined] = np.eye(_TERMS)
     found = np.linalg.solve(matrix, right[..., None])[:, :2, 0]
-    return np.einsum("ni,nij->nj", found, axes[:, :2]), told
+    return np.einsum("ni,nij->nj", found, axes[:, :2]), determined
 
 
 # A fold is moved onto a node within this share of the distance of folds, for cells would be cut into slivers.
@@ -111,11 +111,11 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
     if mesh.dimension != 2 or mesh.is_surface:
         raise ValueError("mesh: only a flat (2-D) sheet bends without stretching; this one is not flat.")
     if axis not in ("x", "y"):
-        raise ValueError(f"axis: the cylinder's axis is 'x' or 'y', not {told(axis)}.")
+        raise ValueError(f"axis: the cylinder's axis is 'x' or 'y', not {describe(axis)}.")
     if isinstance(radius, bool) or not isinstance(radius, float | int | np.floating) or not abs(radius) > 0:
-        raise ValueError(f"radius: expected a length in metres that is not zero, got {told(radius)}.")
+        raise ValueError(f"radius: expected a length in metres that is not zero, got {describe(radius)}.")
     if num_folds is not None and (isinstance(num_folds, bool) or not isinstance(num_folds, int) or num_folds < 1):
-        raise ValueError(f"num_folds: expected a whole number of at least 1, got {told(num_folds)}.")
+        raise ValueError(f"num_folds: expected a whole number of at least 1, got {describe(num_folds)}.")
     across = 0 if axis == "y" else 1
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     folds = _folds(points[:, across], points[cells], across, num_folds)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.mesh.generate import unstructured
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.loose_triangles import merged
@@ -65,7 +65,9 @@ def cap(
     """
     radius = check_length("radius", radius)
     if not (isinstance(angle, float | int | np.floating) and 0 < angle < 0.95 * np.pi):
-        raise ValueError(f"angle: expected radians from the pole, more than 0 and less than 2.98, got {told(angle)}.")
+        raise ValueError(
+            f"angle: expected radians from the pole, more than 0 and less than 2.98, got {describe(angle)}."
+        )
     flat = disk(radius * float(angle), num_points=num_points, cell_size=cell_size, refine=refine)
     x, y = np.asarray(flat.points).T
     distance = np.hypot(x, y)

@@ -172,11 +172,11 @@ def draw_numbers(
         k = one[0]
         effects = rim if inside[k] or not beside[k] else None  # the image lies behind
         style = {"ha": "center", "va": "center", "fontsize": fontsize, "color": INK, "zorder": 4}
-        told = ", ".join(str(k + first) for k in one)
+        text = ", ".join(str(k + first) for k in one)
         if len(one) > 1:
             style["ha"] = _beside(shift[k])
         x, y = places[k] + (1.0 if style["ha"] == "center" else _CLOSER) * shift[k]
-        ax.text(x, y, told, path_effects=effects, **style)
+        ax.text(x, y, text, path_effects=effects, **style)
 
 
 def _beside(shift: Float[np.ndarray, " 2"]) -> str:

@@ -20,7 +20,7 @@ from jeit.mesh import Mesh
 from jeit.plot.axes import INK, SOFT, bare, draw_colour_bar, draw_scale_bar
 from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale, check_scale
 from jeit.plot.imaging.electrodes import draw_electrodes
-from jeit.plot.imaging.mesh import check_body, draw_outline, draw_slice_outline, slice_told
+from jeit.plot.imaging.mesh import check_body, draw_outline, draw_slice_outline, slice_text
 from jeit_solvers.engines import as_array
 
 # Pixels along a side of a picture, and the grey of a body without an image.
@@ -140,16 +140,16 @@ def plot_frames(
     if count is None:
         refused = [title for title, row in zip(said, values, strict=True) if not np.isfinite(row).all()]
         count = FrameCount(len(values), len(refused), refused)
-    told = _told(count, len(chosen), mesh)
-    if told:
-        figure.supxlabel(told, fontsize=9, color=SOFT)
+    text = _count_text(count, len(chosen), mesh)
+    if text:
+        figure.supxlabel(text, fontsize=9, color=SOFT)
     return figure
 
 
-def _told(count: FrameCount, chosen: int, mesh: Mesh) -> str:
+def _count_text(count: FrameCount, chosen: int, mesh: Mesh) -> str:
     """What the sheet does not show: frames left out, and which were refused."""
     parts = [] if chosen == count.number else [f"{chosen} of {count.number} frames"]
     if count.refused:
         some = ", ".join(count.names[:_NAMED]) + (" …" if count.refused > _NAMED else "")
         parts.append(f"{count.refused} of {count.number} refused: {some}")
-    return "; ".join([*parts, *filter(None, [slice_told(mesh, what="slices")])])
+    return "; ".join([*parts, *filter(None, [slice_text(mesh, what="slices")])])

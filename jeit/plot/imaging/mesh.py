@@ -62,7 +62,7 @@ def draw_slice_outline(
     ax.contour(shown, [0.5], extent=wider, origin="upper", colors=INK, linewidths=0.9, zorder=2)
 
 
-def slice_told(mesh: Mesh, height: float | None = None, what: str = "slice") -> str:
+def slice_text(mesh: Mesh, height: float | None = None, what: str = "slice") -> str:
     """Where a solid is cut, at z = `height` metres or half way up: "slice at z = 20.0 mm"; of a plane mesh nothing."""
     if mesh.dimension == 2:
         return ""

@@ -14,7 +14,7 @@ from jeit.image import ImageSeries, Oscillation, Raster, amplitude_spectrum
 from jeit.plot.axes import INK, bare, draw_scale_bar, prefixed
 from jeit.plot.colour_scale import ColourScale, FittedScale
 from jeit.plot.imaging.electrodes import draw_electrodes
-from jeit.plot.imaging.mesh import check_body, draw_outline, draw_slice_outline, slice_told
+from jeit.plot.imaging.mesh import check_body, draw_outline, draw_slice_outline, slice_text
 from jeit_solvers.engines import as_array
 
 # Share of the largest amplitude below which no phase is drawn; and times its noise.
@@ -43,7 +43,7 @@ def plot_series(
     figure = Figure(figsize=(11.0, 3.4 * rows + 3.0), layout="constrained")
     grid = figure.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [0.8])
     maps = _Maps(series, electrodes, height)
-    functional = ", ".join(filter(None, ["functional image", slice_told(series.mesh, height)]))
+    functional = ", ".join(filter(None, ["functional image", slice_text(series.mesh, height)]))
     deviation = ColourScale(difference=False, quantity="Standard deviation over time")
     maps.draw(figure.add_subplot(grid[0, 0]), series.functional(), deviation, functional)
     for row, one in enumerate(oscillations):

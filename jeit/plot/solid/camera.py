@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import is_number, told
+from jeit.arguments import describe, is_number
 
 # Over the left shoulder of who looks: to the right and up on the page, and towards the viewer.
 _LIGHT = np.array([-0.35, 0.5, 0.79])
@@ -29,7 +29,7 @@ class Camera:
     def __post_init__(self):
         for name, value in (("azimuth", self.azimuth), ("elevation", self.elevation)):
             if not is_number(value):
-                raise ValueError(f"{name} must be an angle in degrees; it is {told(value)}.")
+                raise ValueError(f"{name} must be an angle in degrees; it is {describe(value)}.")
         if not -90 <= self.elevation <= 90:
             raise ValueError(f"elevation must lie between −90 (from below) and 90 degrees; it is {self.elevation:g}.")
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, is_number, told
+from jeit.arguments import check_kind, describe, is_number
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
@@ -123,7 +123,7 @@ def check_levels(levels: Sequence[float]) -> list[float]:
     """Shares of the strongest change. Raises `ValueError` for others."""
     shares: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
     if len(shares) == 0 or not all(is_number(one) and 0 < one < 1 for one in shares):
-        given = ", ".join(told(one) for one in shares[:4]) or "none"
+        given = ", ".join(describe(one) for one in shares[:4]) or "none"
         raise ValueError(f"levels must be shares of the strongest change, from 0 to 1; given were {given}.")
     return [float(one) for one in shares]
 

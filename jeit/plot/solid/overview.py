@@ -64,7 +64,7 @@ def plot_solid(
         x, y = (seen.min(axis=0) + seen.max(axis=0)) / 2
         # All slices to one scale of lengths, whichever side is longest.
         dress_slice(panel, plane, (x - half, x + half, y - half, y + half), cross=True)
-    _tell(figure.add_subplot(grid[1, 2]), place, levels, inclusions, difference=scale.difference)
+    _caption(figure.add_subplot(grid[1, 2]), place, levels, inclusions, difference=scale.difference)
     if scale.bar:
         bar = figure.add_subplot(grid[:, 3])
         draw_colour_bar(space, mappable(fitted), fitted.label, signed=scale.difference, place=bar)
@@ -78,7 +78,7 @@ def strongest_place(mesh: Mesh, image: np.ndarray, inclusions: Sequence[Inclusio
     return np.asarray(centroids(mesh))[np.abs(image - (np.median(image))).argmax()]
 
 
-def _tell(ax: Axes, place, levels, inclusions: Sequence[Inclusion], *, difference: bool) -> None:
+def _caption(ax: Axes, place, levels, inclusions: Sequence[Inclusion], *, difference: bool) -> None:
     """What is drawn, and what was found, in words."""
     ax.set_axis_off()
     shares = ", ".join(f"{100 * share:g}" for share in sorted(levels))

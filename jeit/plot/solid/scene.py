@@ -152,12 +152,12 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], place: tuple
 
 
 def draw_number(
-    ax: Axes, place: Float[np.ndarray, "2"], told: str, *, fontsize: float, faint: bool, align: str = "center"
+    ax: Axes, place: Float[np.ndarray, "2"], text: str, *, fontsize: float, faint: bool, align: str = "center"
 ) -> None:
     """A number on the page, with a rim that parts it from what is behind; `align`: what of it is at `place`."""
     x, y = place
     ax.text(
-        x, y, told, ha=align, va="center", fontsize=fontsize, color=INK, alpha=0.45 if faint else 1.0,
+        x, y, text, ha=align, va="center", fontsize=fontsize, color=INK, alpha=0.45 if faint else 1.0,
         path_effects=_RIM, zorder=4,
     )  # fmt: skip
 

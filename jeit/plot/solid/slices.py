@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, cut_by_plane
@@ -102,7 +102,7 @@ def planes_along(mesh: Mesh, axis: str, at: Sequence[float] | int) -> list[Plane
     """Planes across an axis: so many, evenly spaced with half a space at either end, or at these places in metres.
     Raises `ValueError`."""
     if axis not in AXES:
-        raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {told(axis)}.")
+        raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {describe(axis)}.")
     along = np.asarray(mesh.points)[:, AXES.index(axis)]
     if isinstance(at, int | np.integer) and not isinstance(at, bool):
         if not 1 <= at <= MOST_SLICES:

@@ -74,7 +74,7 @@ def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
     return Localisation(float(off.mean()), float(off.std()), float(off.max()), float(1 - there.mean()))
 
 
-def least_told(amount: ArrayLike, told: ArrayLike) -> float:
+def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
     """The least amount that is told half of the time, in its unit: of separations of two points, those that are told as
     two; of gaps between two touches, those that are told as a gap. Infinite if never.
 
@@ -83,12 +83,12 @@ def least_told(amount: ArrayLike, told: ArrayLike) -> float:
     """
     from scipy.optimize import isotonic_regression
 
-    told = np.asarray(told)
-    if told.dtype.kind != "b":
-        raise ValueError(f"told must be true or false for each trial; it is {told.dtype}.")
-    amount, told = _pair("amount", amount, "told", told.astype(float))
+    detected = np.asarray(detected)
+    if detected.dtype.kind != "b":
+        raise ValueError(f"detected must be true or false for each trial; it is {detected.dtype}.")
+    amount, detected = _pair("amount", amount, "detected", detected.astype(float))
     levels, which, count = np.unique(amount, return_inverse=True, return_counts=True)
-    share = isotonic_regression(np.bincount(which, told) / count, weights=count).x
+    share = isotonic_regression(np.bincount(which, detected) / count, weights=count).x
     above = int(np.argmax(share >= 0.5))
     if share[above] < 0.5:
         return float("inf")

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_key, check_kind, is_number, real_array, told
+from jeit.arguments import check_key, check_kind, describe, is_number, real_array
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.touch.attributes.measures import (
     ContactArea,
     Localisation,
     contact_area,
-    least_told,
+    least_detected,
     point_localisation,
     response_times,
     weber_ratio,
@@ -84,18 +84,18 @@ def touch_attributes(
     """
     check_key(key)
     if not callable(press):
-        raise ValueError(f"press must be a function from touches to frames (n, M); it is {told(press)}.")
+        raise ValueError(f"press must be a function from touches to frames (n, M); it is {describe(press)}.")
     check_kind("linear", linear, LinearReconstruction, "linear images, such as of one_step(...)")
     check_kind("finder", finder, AbstractFinder, "a finder, such as CellFinder(mesh)")
     for name, value in (("within", within), ("load", load), ("diameter", diameter)):
         if not (is_number(value) and value > 0):
-            raise ValueError(f"{name} must be positive; it is {told(value)}.")
+            raise ValueError(f"{name} must be positive; it is {describe(value)}.")
     centre = real_array("middle", middle, "(x, y) in metres")
     if centre.shape != (2,):
         raise ValueError(f"middle must be (x, y) in metres; it has shape {centre.shape}.")
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    tell = progress or (lambda said: None)
-    tell("untouched frames")
+    report = progress or (lambda said: None)
+    report("untouched frames")
     untouched = _frames(press([[] for _ in range(_UNTOUCHED)]), _UNTOUCHED, linear)
     reference, noise = untouched.mean(axis=0), ImageNoise.of_frames(linear, untouched)
 
@@ -105,27 +105,27 @@ def touch_attributes(
     def contacts(touches: Sequence[Sequence[DiscTouch]]) -> list[list[Contact]]:
         return contacts_in(_frames(press(touches), len(touches), linear))
 
-    tell("Weber ratio")
+    report("Weber ratio")
     loads = np.repeat(load * _LOADS, _REPEATS)
     levels, weber = weber_ratio(
         loads, [_size(one) for one in contacts([[DiscTouch(centre, n, diameter)] for n in loads])]
     )
-    tell("localisation")
+    report("localisation")
     places = centre + (within * np.sqrt(random.uniform(size=_PLACES)))[:, None] * _directions(random, _PLACES)
     found = contacts([[DiscTouch(place, load, diameter)] for place in places])
     localisation = point_localisation(places, np.array([_where(one) for one in found]))
-    tell("two points")
+    report("two points")
     apart = np.repeat(_SEPARATIONS * diameter, _TRIALS)
     half = apart[:, None] / 2 * _directions(random, len(apart))
     found = contacts([[DiscTouch(centre + way * one, load, diameter) for way in (-1, 1)] for one in half])
-    two_points = least_told(apart, np.array([len(one) > 1 for one in found]))
-    tell("contact area")
+    two_points = least_detected(apart, np.array([len(one) > 1 for one in found]))
+    report("contact area")
     wide = np.repeat(_DIAMETERS, _REPEATS)
     found = contacts([[DiscTouch(centre, load * one**2, one * diameter)] for one in wide])
     area = contact_area(np.pi / 4 * (wide * diameter) ** 2, [one[0].area if one else 0.0 for one in found])
     rise = fall = None
     if recording is not None:
-        tell("times")
+        report("times")
         seconds = real_array("recording", recording[0], "seconds (T,), and frames (T, M)")
         frames = _frames(recording[1], len(np.atleast_1d(seconds)), linear)
         rise, fall = response_times(seconds, [_size(one) for one in contacts_in(frames)])

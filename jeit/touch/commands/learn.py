@@ -79,7 +79,7 @@ def image(
             touches=touches,
             seed=seed,
             client=client,
-            progress=step.tell,
+            progress=step.report,
         )
         step("write")
         write_learnt_images(learnt, output)

@@ -165,7 +165,7 @@ def fit(
     under_way = output / "training"
     with Steps(console, quiet=quiet) as step:
         step("read")
-        labelled = read_clips(clips, progress=step.tell)
+        labelled = read_clips(clips, progress=step.report)
         step("learn")
         with naming_options({"method": "--method", "labels": "FOLDER-BY-CLASS"}):
             listener = Listener.fit(
@@ -175,7 +175,7 @@ def fit(
                 key=jax.random.key(seed),
                 batches=batches or BATCHES,
                 folder=under_way,
-                progress=step.tell,
+                progress=step.report,
             )
         step("write")
         write_listener(listener, output)

@@ -47,7 +47,7 @@ def image_by_network(
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written
     from jeit.cli.options import make_folder
-    from jeit.cli.stopping import FramesTold, Stopping
+    from jeit.cli.stopping import FrameCounter, Stopping
     from jeit.design import describes_skin, read_described_skin
     from jeit.imaging.stream_preparation import parse_frames
     from jeit.report.stream import PICTURES
@@ -86,7 +86,7 @@ def image_by_network(
             raise ValueError("--reference: give a file of frames of the skin that nobody touches.")
         rest = resting_frame(still, str(reference or data))
         step("image")
-        come = FramesTold(step, None if numbers is None else len(numbers))
+        come = FrameCounter(step, None if numbers is None else len(numbers))
 
         def show(one: "FrameDepth") -> None:
             come.one_more()

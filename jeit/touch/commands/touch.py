@@ -97,7 +97,7 @@ def fit(
                 model=model,
                 num_channels=channels,
                 per_session=per_session,
-                progress=step.tell,
+                progress=step.report,
             )
         step("write")
         write_learnt_skin(skin, output)

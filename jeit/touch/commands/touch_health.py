@@ -82,7 +82,7 @@ def health(
             raise ValueError("--rate: only one of the recordings says when its frames came; give the frames a second.")
         step("learn")
         sound = learn_health(
-            known, description, sign=-1 if lowers else 1, rate=rate, patience=patience, progress=step.tell
+            known, description, sign=-1 if lowers else 1, rate=rate, patience=patience, progress=step.report
         )
         step("watch")
         seconds = seconds_of(judged, rate)
@@ -91,7 +91,7 @@ def health(
             doubts = doubts_of(sound, known, judged.frames)
         now = sound
         for first in range(0, len(times), _AT_ONCE):
-            step.tell(f"{first:,} of {counted(len(times), 'frame')}")
+            step.report(f"{first:,} of {counted(len(times), 'frame')}")
             now = watch(now, judged.frames[first : first + _AT_ONCE], times[first : first + _AT_ONCE])
         step("write")
         write_health(now, times, judged.frames, output, name=recording.name, timed=seconds is not None, notes=doubts)

@@ -61,7 +61,7 @@ def gestures(
             description = load_description(skin)
         made = GestureSet.read(recordings)
         step("learn")
-        learnt = learn_gestures(description, made, method=method or "auto", progress=step.tell)
+        learnt = learn_gestures(description, made, method=method or "auto", progress=step.report)
         step("write")
         write_gestures(learnt, output, name=recordings.name)
     if quiet:
@@ -156,7 +156,7 @@ def watch(
             else:
                 frames, still, own = _recorded(Path(stream), description, still, untouched, rate or usual)
             step("prepare")
-            images = TouchImages.prepare(description, still, replace(TOUCH_IMAGES, as_is=as_is), progress=step.tell)
+            images = TouchImages.prepare(description, still, replace(TOUCH_IMAGES, as_is=as_is), progress=step.report)
             watch = TouchWatch.create(images, model, still, rate=own, patience=patience)
         for note in () if quiet else watch.notes:
             console.print(f"  note: {note}", soft_wrap=True)
@@ -168,8 +168,8 @@ def watch(
             if one.note and not quiet:
                 console.print(f"  note: {one.note}", soft_wrap=True)
             # Live, a touch is named with the first frame that has none; of a file it is told once, as in the end.
-            told = one.ended if stream != "-" else () if one.named is None else (one.named,)
-            for touch in () if quiet else told:
+            ended = one.ended if stream != "-" else () if one.named is None else (one.named,)
+            for touch in () if quiet else ended:
                 console.print(_line(touch))
 
         written = write_watch(watch.follow(stopping.until(frames)), watch, output, name=stream, progress=show)

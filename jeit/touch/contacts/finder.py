@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import sparse
 
-from jeit.arguments import check_kind, is_number, told
+from jeit.arguments import check_kind, describe, is_number
 from jeit.mesh import Mesh, check_flat
 from jeit.touch.contacts.contact import Contact
 from jeit.touch.contacts.image_noise import ImageNoise
@@ -98,12 +98,14 @@ def check_finder(mesh: Mesh, sign: int, floor: float, *, flat: bool = True) -> N
     if mesh.dimension != 2:
         raise ValueError("mesh has three dimensions; contacts are found on sheets: reconstruct on a 2-D mesh.")
     if not (is_number(sign) and sign in (1, -1)):
-        raise ValueError(f"sign must be 1, where touched skin conducts better, or -1, where worse; it is {told(sign)}.")
+        raise ValueError(
+            f"sign must be 1, where touched skin conducts better, or -1, where worse; it is {describe(sign)}."
+        )
     if not (is_number(floor) and floor >= 0):
-        raise ValueError(f"floor must be zero or more, in standard deviations; it is {told(floor)}.")
+        raise ValueError(f"floor must be zero or more, in standard deviations; it is {describe(floor)}.")
 
 
 def check_share(name: str, value) -> None:
     """Raises `ValueError` for what is not between 0 and 1."""
     if not (is_number(value) and 0 <= value < 1):
-        raise ValueError(f"{name} must be a share, from 0 to below 1; it is {told(value)}.")
+        raise ValueError(f"{name} must be a share, from 0 to below 1; it is {describe(value)}.")

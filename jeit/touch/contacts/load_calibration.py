@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from jeit.arguments import check_kind, check_metres, real_array, told
+from jeit.arguments import check_kind, check_metres, describe, real_array
 from jeit.touch.contacts.contact import Contact
 
 # Parameters s, b, c and F½, and what is left to tell how well they fit.
@@ -116,7 +116,7 @@ class LoadCalibration(eqx.Module):
         check_kind("contact", contact, Contact, "a Contact, as of find_contacts")
         if contact.peak * self.sign <= 0:
             raise ValueError(
-                f"contact: its peak {told(contact.peak)} is not {'positive' if self.sign > 0 else 'negative'}, as "
+                f"contact: its peak {describe(contact.peak)} is not {'positive' if self.sign > 0 else 'negative'}, as "
                 "those calibrated are; it is no load. Give the finder the sign that it had for calibration."
             )
         distance = float(np.linalg.norm(contact.centroid - self.centre)) / self.radius
@@ -130,7 +130,7 @@ class LoadCalibration(eqx.Module):
         # Two standard deviations of a peak about the curve are no sign of a greater load.
         if share > min(self.highest * np.exp(2 * self.scatter), max(self.highest, _HIGHEST)):
             raise ValueError(
-                f"contact: its peak {told(contact.peak)} is {share / self.highest:.2f} times the highest that was "
+                f"contact: its peak {describe(contact.peak)} is {share / self.highest:.2f} times the highest that was "
                 f"calibrated there, by {self.loads[1]:g} N; calibrate with greater loads."
             )
         force = float(np.exp(half) * share / (1 - share))

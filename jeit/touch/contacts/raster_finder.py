@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import sparse
 from scipy.special import ndtr
 
-from jeit.arguments import is_number, told
+from jeit.arguments import describe, is_number
 from jeit.arguments.extras import optional
 from jeit.image import Raster
 from jeit.mesh import Mesh
@@ -83,11 +83,11 @@ class RasterFinder(AbstractFinder):
         check_finder(mesh, sign, floor)
         for name, value, least in (("block", block, 3), ("opening", opening, 1)):
             if not (isinstance(value, int) and value >= least and value % 2):
-                raise ValueError(f"{name} must be an odd number of pixels from {least} up; it is {told(value)}.")
+                raise ValueError(f"{name} must be an odd number of pixels from {least} up; it is {describe(value)}.")
         if not (isinstance(pixels, int) and 16 <= pixels <= _MOST_PIXELS):
-            raise ValueError(f"pixels must be a whole number from 16 to {_MOST_PIXELS}; it is {told(pixels)}.")
+            raise ValueError(f"pixels must be a whole number from 16 to {_MOST_PIXELS}; it is {describe(pixels)}.")
         if not (is_number(constant) and abs(constant) < 255):
-            raise ValueError(f"constant must be grey levels, between −255 and 255; it is {told(constant)}.")
+            raise ValueError(f"constant must be grey levels, between −255 and 255; it is {describe(constant)}.")
         self.raster = Raster.create(mesh, shape=(pixels, pixels))
         self.smoothing = gaussian_means(mesh, smoothing)
         self.block, self.constant, self.opening = block, float(constant), opening

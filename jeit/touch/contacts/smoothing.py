@@ -6,7 +6,7 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import KDTree
 
-from jeit.arguments import is_number, told
+from jeit.arguments import describe, is_number
 from jeit.mesh import Mesh, centroids, measures
 
 # Standard deviations beyond which a Gaussian is nothing.
@@ -27,7 +27,7 @@ def gaussian_means(mesh: Mesh, length: float | None) -> sparse.csr_array:
     if not (is_number(length) and 0 <= length < widest):
         raise ValueError(
             f"smoothing must be metres, zero or more and less than the skin is wide ({widest:.3g} m); it is "
-            f"{told(length)}."
+            f"{describe(length)}."
         )
     if not length:
         return sparse.csr_array(sparse.diags_array(np.ones(len(areas))))

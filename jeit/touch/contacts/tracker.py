@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
-from jeit.arguments import check_kind, check_metres, is_number, real_array, told
+from jeit.arguments import check_kind, check_metres, describe, is_number, real_array
 from jeit.touch.contacts.contact import Contact
 
 # Of what a contact is off its prediction, how much goes into the velocity: half, so that two frames' noise evens out.
@@ -93,16 +93,16 @@ class ContactTracker(eqx.Module):
         are none."""
         check_metres("reach", self.reach)
         if not (is_number(self.fastest) and self.fastest >= 0):
-            raise ValueError(f"fastest must be zero or more, in metres a second; it is {told(self.fastest)}.")
+            raise ValueError(f"fastest must be zero or more, in metres a second; it is {describe(self.fastest)}.")
         if not (is_number(self.gap) and self.gap > 0):
-            raise ValueError(f"gap must be positive, in seconds; it is {told(self.gap)}.")
+            raise ValueError(f"gap must be positive, in seconds; it is {describe(self.gap)}.")
         if not (isinstance(self.least, int) and self.least >= 1):
-            raise ValueError(f"least must be a number of frames, 1 or more; it is {told(self.least)}.")
+            raise ValueError(f"least must be a number of frames, 1 or more; it is {describe(self.least)}.")
 
     def follow(self, time: float, contacts: Sequence[Contact]) -> "ContactTracker":
         """After a frame at `time`, seconds, with these contacts. Raises `ValueError` for a time that is not later."""
         if not (is_number(time) and time > self.time):
-            raise ValueError(f"time must be later than the frame before, {self.time:g} s; it is {told(time)}.")
+            raise ValueError(f"time must be later than the frame before, {self.time:g} s; it is {describe(time)}.")
         check_kind("contacts", contacts, (list, tuple, np.ndarray), "a list of them, those of one frame")
         for number, contact in enumerate(contacts):
             check_kind(f"contacts[{number}]", contact, Contact, "a Contact, as of find_contacts")
@@ -132,16 +132,16 @@ class ContactTracker(eqx.Module):
         first = [
             _Followed(self.number + k, time, one.centroid, np.zeros(2), ((time, one),)) for k, one in enumerate(new)
         ]
-        closed = self.closed + self._told_of(late)
+        closed = self.closed + self._reported(late)
         values = (time, (*followed, *first), closed, self.number + len(new))
         return ContactTracker(self.gap, self.reach, self.fastest, self.least, *values)
 
     @property
     def touches(self) -> list[TouchPath]:
         """All touches so far, those that go on too, in order of onset."""
-        return sorted(self.closed + self._told_of(self.open), key=lambda path: path.number)
+        return sorted(self.closed + self._reported(self.open), key=lambda path: path.number)
 
-    def _told_of(self, followed: Iterable[_Followed]) -> tuple[TouchPath, ...]:
+    def _reported(self, followed: Iterable[_Followed]) -> tuple[TouchPath, ...]:
         return tuple(one.path() for one in followed if len(one.seen) >= self.least)
 
 

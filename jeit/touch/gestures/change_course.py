@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_kind, is_number, real_array, told
+from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.mesh import Mesh, centroids, check_flat, measures
 
 # Fewer frames do not say how far the next one may stray.
@@ -66,7 +66,7 @@ class TouchLevel(eqx.Module):
         if mesh.dimension != 2:
             raise ValueError("mesh must be of two dimensions, a sheet's.")
         if not (is_number(level) and level > 0):
-            raise ValueError(f"level must be positive, in the images' unit; it is {told(level)}.")
+            raise ValueError(f"level must be positive, in the images' unit; it is {describe(level)}.")
         self.level = float(level)
         self.centres, self.areas = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
 

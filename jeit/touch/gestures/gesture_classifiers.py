@@ -84,7 +84,7 @@ def held_out_odds(
     they have one class alone."""
     odds = np.full((len(right), right.max() + 1), -1e3)
 
-    def tell(fold: int) -> None:
+    def predict(fold: int) -> None:
         out = folds == fold
         if len(np.unique(right[~out])) < 2:
             raise ValueError("labels: but for one fold, or person, there is one gesture only; give touches of more.")
@@ -92,7 +92,7 @@ def held_out_odds(
         model = GESTURE_CLASSIFIERS[method](scale(values[~out]), right[~out])
         odds[np.ix_(out, model.classes_)] = log_odds(model, scale(values[out]))
 
-    over_folds(tell, int(folds.max()) + 1)
+    over_folds(predict, int(folds.max()) + 1)
     return odds
 
 

@@ -27,7 +27,7 @@ class LearntGestures:
 
     model: GestureModel
     images: TouchImages
-    untold: tuple[int, ...]
+    without_touch: tuple[int, ...]
 
 
 def learn_gestures(
@@ -44,27 +44,27 @@ def learn_gestures(
     `TouchImages.prepare` and `GestureModel.fit` do, and where most recordings have no touch.
     """
     check_kind("recordings", recordings, GestureSet, "a GestureSet, as of GestureSet.read(path)")
-    tell = progress or (lambda said: None)
+    report = progress or (lambda said: None)
     check_name("method", method, METHODS)
     check_labels(recordings.gesture)
-    images = TouchImages.prepare(description, recordings.reference[None], progress=tell)
+    images = TouchImages.prepare(description, recordings.reference[None], progress=report)
     still = images.changes(recordings.untouched)
     level, sign = _level_and_sign(images, still, recordings)
     touches: list[StreamTouch] = []
-    kept, untold = [], []
+    kept, without_touch = [], []
     for number, (seconds, changes) in enumerate(_imaged(images, recordings, range(len(recordings)))):
         if number % 50 == 0:
-            tell(f"images: recording {number} of {len(recordings)}")
+            report(f"images: recording {number} of {len(recordings)}")
         found = find_touches(level, seconds, sign * changes) if len(seconds) else []
         if found:
             touches.append(max(found, key=lambda one: one.offset - one.onset))
             kept.append(number)
         else:
-            untold.append(number)
-    if len(untold) > len(kept):
+            without_touch.append(number)
+    if len(without_touch) > len(kept):
         raise ValueError(
-            f"recordings: {len(untold)} of {len(recordings)} have no touch that exceeds the untouched skin's noise and "
-            "drift; touch more firmly, or record the untouched skin just before."
+            f"recordings: {len(without_touch)} of {len(recordings)} have no touch that exceeds the untouched skin's "
+            "noise and drift; touch more firmly, or record the untouched skin just before."
         )
     rate = 1 / float(np.median([np.median(np.diff(one.course.seconds)) for one in touches if len(one.course) > 1]))
     protocol = images.calibration.model.protocol
@@ -75,10 +75,10 @@ def learn_gestures(
         method=method,
         form=form,
         reading=Reading(level.level, images.background, sign, rate, images.num_channels, protocol.name),
-        notes=(f"{counted(len(untold), 'recording')} without a touch left out.",) if untold else (),
-        progress=tell,
+        notes=(f"{counted(len(without_touch), 'recording')} without a touch left out.",) if without_touch else (),
+        progress=report,
     )
-    return LearntGestures(model, images, tuple(untold))
+    return LearntGestures(model, images, tuple(without_touch))
 
 
 def _level_and_sign(images: TouchImages, still: np.ndarray, recordings: GestureSet) -> tuple[TouchLevel, int]:

@@ -110,12 +110,12 @@ class GestureModel:
         check_name("form", form, ("auto", *FORMS))
         named, people_of = _checked(touches, labels, people)
         names, right = np.unique(named, return_inverse=True)
-        told = list(notes)
+        remarks = list(notes)
         if people_of is not None and len(np.unique(people_of)) > 1:
             folds = person_folds(people_of, _FOLDS)
         else:
             folds = random_folds(right, _FOLDS)
-            told.append("one person, or nobody, was told of: chosen on touches held out at random, not on people.")
+            remarks.append("one person, or nobody, was told of: chosen on touches held out at random, not on people.")
         found = []
         for shape in FORMS:
             values = FORMS[shape](touches).values
@@ -146,7 +146,7 @@ class GestureModel:
             farthest=_farthest(known, folds),
             reading=reading,
             standing=Standing(tried[0][0], tried, names[odds.argmax(axis=1)], named),
-            notes=tuple(told),
+            notes=tuple(remarks),
         )
 
     def predict(self, touches: list[StreamTouch]) -> Gestures:

@@ -13,7 +13,7 @@ from sklearn.tree import DecisionTreeRegressor
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from jeit.arguments import told
+from jeit.arguments import describe
 
 # Responses are clipped to it (Friedman et al. 2000, section 4.2; WEKA's); weights are no less, nor is a step halved
 # more often.
@@ -50,15 +50,17 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
         rounds and rates that are none.
         """
         if not (isinstance(self.n_estimators, Integral) and self.n_estimators >= 1):
-            raise ValueError(f"n_estimators must be a number of rounds, 1 or more; it is {told(self.n_estimators)}.")
+            raise ValueError(
+                f"n_estimators must be a number of rounds, 1 or more; it is {describe(self.n_estimators)}."
+            )
         if not (isinstance(self.learning_rate, Real) and 0 < self.learning_rate <= 1):
-            raise ValueError(f"learning_rate must be above 0, and 1 at most; it is {told(self.learning_rate)}.")
+            raise ValueError(f"learning_rate must be above 0, and 1 at most; it is {describe(self.learning_rate)}.")
         # Single precision, in which scikit-learn's trees part samples.
         X, y = validate_data(self, X, y, dtype=np.float32)
         check_classification_targets(y)
         self.classes_, number = np.unique(y, return_inverse=True)
         if len(self.classes_) < 2:
-            raise ValueError(f"y has one class only, {told(self.classes_[0])}; give samples of two or more.")
+            raise ValueError(f"y has one class only, {describe(self.classes_[0])}; give samples of two or more.")
         right = np.eye(len(self.classes_))[number]
         score = np.zeros(right.shape)
         stumps, steps, likelihood = [], [], [_log_likelihood(score, number)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jeit.arguments import is_number, told
+from jeit.arguments import describe, is_number
 
 # So many times the conductivity is another skin's, or another unit's.
 _OTHER_SKIN = 5.0
@@ -27,11 +27,11 @@ class Reading:
         """Raises `ValueError` for levels and rates that are not positive, and what is no sign or number."""
         for name in ("level", "background", "rate"):
             if not (is_number(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"{name} must be positive; it is {told(getattr(self, name))}.")
+                raise ValueError(f"{name} must be positive; it is {describe(getattr(self, name))}.")
         if self.sign not in (-1, 1):
-            raise ValueError(f"sign must be 1 or -1; it is {told(self.sign)}.")
+            raise ValueError(f"sign must be 1 or -1; it is {describe(self.sign)}.")
         if not (isinstance(self.num_channels, int) and self.num_channels > 0):
-            raise ValueError(f"num_channels must be a positive number; it is {told(self.num_channels)}.")
+            raise ValueError(f"num_channels must be a positive number; it is {describe(self.num_channels)}.")
 
     def check_same_skin(self, num_channels: int, protocol: str, background: float) -> None:
         """Raise `ValueError` for frames of another number of channels, by another protocol, or of a skin of another

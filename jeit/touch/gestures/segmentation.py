@@ -13,7 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_kind, is_number, told
+from jeit.arguments import check_kind, describe, is_number
 from jeit.touch.gestures.change_course import ChangeCourse, TouchLevel, check_images, check_seconds
 
 # Seconds untouched that part two touches; frames of a touch, at least; rounding of times.
@@ -83,7 +83,7 @@ class TouchStream(eqx.Module):
         """After a frame (m,) at `second`. Raises `ValueError` for a time before the last one, and images of another
         mesh."""
         if not (is_number(second) and second >= self.second):
-            raise ValueError(f"second must not be before the last frame, {self.second:g} s; it is {told(second)}.")
+            raise ValueError(f"second must not be before the last frame, {self.second:g} s; it is {describe(second)}.")
         frame = check_images(np.asarray(image)[None], len(self.level.areas))
         if second == self.second or not np.isfinite(frame).all():
             return replace(self, lost=(self.lost[0], self.lost[1] + 1)) if self.open else self
@@ -156,6 +156,6 @@ def find_touches(
 def _check(level, gap, least) -> None:
     check_kind("level", level, TouchLevel, "a TouchLevel, such as TouchLevel.of_untouched(mesh, images)")
     if not (is_number(gap) and gap > 0):
-        raise ValueError(f"gap must be positive, in seconds; it is {told(gap)}.")
+        raise ValueError(f"gap must be positive, in seconds; it is {describe(gap)}.")
     if not (isinstance(least, int) and least >= 1):
-        raise ValueError(f"least must be a number of frames, 1 or more; it is {told(least)}.")
+        raise ValueError(f"least must be a number of frames, 1 or more; it is {describe(least)}.")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_kind, is_number, told
+from jeit.arguments import check_kind, describe, is_number
 from jeit.inverse.streaming.stream import FrameImage
 from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, TouchStream
 from jeit.touch.gestures.touch_images import TouchImages
@@ -101,7 +101,7 @@ class TouchWatch:
         check_kind("model", model, GestureModel, "a GestureModel, as of GestureModel.read(path)")
         for name, value in (("rate", rate), ("patience", patience)):
             if not (is_number(value) and value > 0):
-                raise ValueError(f"{name} must be positive; it is {told(value)}.")
+                raise ValueError(f"{name} must be positive; it is {describe(value)}.")
         if model.reading is None:
             raise ValueError("model does not say how its skin was read; learn it with learn_gestures.")
         protocol = images.calibration.model.protocol
@@ -163,7 +163,7 @@ class _Session:
         for second, frame in frames:
             self.came = time.perf_counter()
             if not (is_number(second) and second >= self.second):
-                raise ValueError(f"seconds must not fall: after {self.second:g} s a frame has {told(second)}.")
+                raise ValueError(f"seconds must not fall: after {self.second:g} s a frame has {describe(second)}.")
             self.second = float(second)
             try:
                 values = np.asarray(frame)

@@ -58,7 +58,7 @@ class HealthEvent(eqx.Module):
     kind: EventKind
     status: EventStatus
     time: float
-    told: float
+    noticed: float
     frame: int
     channels: Bool[np.ndarray, " M"]
     change: Float[np.ndarray, " M"]

@@ -26,7 +26,7 @@ class Change:
     size: float
     time: float
     frame: int
-    told: float
+    noticed: float
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Int
 from jeit.electrodes import BoundaryElectrodes, NodeElectrodes, PointElectrodes, SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.mesh import Mesh, centroids, check_flat, measures
-from jeit.mesh.sizes import size_told
+from jeit.mesh.sizes import size_checked
 
 # Halvings of a cell at most.
 _ROUNDS = 12
@@ -41,7 +41,7 @@ def finer_model(
     return model, np.arange(mesh.num_cells), edge
 
 
-@size_told()
+@size_checked()
 def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tuple[Mesh, Int[np.ndarray, " m"]]:
     """A flat mesh whose cells within `radius` metres of a `centre` (2,) are no larger than `area`, m²; and of each
     cell (m,), the number of that which it is a part of."""

@@ -67,28 +67,28 @@ def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndar
     there = np.isfinite(frames)
     if not (there[:, known.used].mean(axis=1) >= _READ).any():
         raise ValueError("frames: none of them has a reading in half of the healthy recording's channels.")
-    told = []
+    doubts = []
     window = known.window * known.stride
     if len(frames) < 2 * window:
-        told.append(
+        doubts.append(
             f"{len(frames)} frames are fewer than two windows of {window}: a change that lasts cannot be told from a "
             "touch in them."
         )
     if known.brief or len(healthy.frames) < _FEW:
-        told.append(
+        doubts.append(
             f"the healthy recording has {len(healthy.frames)} frames, few beside the length of touches, or at all: "
             "what is told may be false, and what is not may be there. Give forty of the longest touches, and a minute."
         )
     silent = np.flatnonzero(known.used & ~there.any(axis=0))
     if silent.size:
-        told.append(f"without any reading: channels {', '.join(map(str, silent[:12]))}, counted from 0.")
+        doubts.append(f"without any reading: channels {', '.join(map(str, silent[:12]))}, counted from 0.")
     first = np.where(there.any(axis=0), np.take_along_axis(frames, there.argmax(axis=0)[None], axis=0)[0], np.nan)
     constant = np.flatnonzero(known.used & there.any(axis=0) & (~there | (frames == first)).all(axis=0))
     if constant.size and len(frames) > 2:
-        told.append(f"constant throughout: channels {', '.join(map(str, constant[:12]))}, counted from 0.")
+        doubts.append(f"constant throughout: channels {', '.join(map(str, constant[:12]))}, counted from 0.")
     off = np.nanmedian(np.where(there, frames, np.nan)[:, known.used & there.any(axis=0)], axis=0)
     own = known.reference[known.used & there.any(axis=0)]
     ratio = float(np.median(np.abs(off)) / max(np.median(np.abs(own)), 1e-300))
     if not 1 / _ANOTHER < ratio < _ANOTHER:
-        told.append(f"frames are {ratio:.3g} times the healthy ones: are both in the same unit?")
-    return told
+        doubts.append(f"frames are {ratio:.3g} times the healthy ones: are both in the same unit?")
+    return doubts

@@ -77,13 +77,13 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
     sharp = np.median(along[first : first + quarter]) - np.median(along[max(0, first - quarter) : first])
     thirds = [np.median(part) for part in np.array_split(along[first:], 3)]
     earlier = [np.median(part) for part in np.array_split(along[:first], 3)]
-    if sharp < _SHARP or min(thirds) < _STAYED or max(earlier) > _NOT_YET or not told_apart(along, first):
+    if sharp < _SHARP or min(thirds) < _STAYED or max(earlier) > _NOT_YET or not is_distinct(along, first):
         return None
     # The step need not be where the windows meet.
     return Step(median(frames[first:]) - median(frames[:first]), size, first)
 
 
-def told_apart(along: Float[np.ndarray, " n"], first: int) -> bool:
+def is_distinct(along: Float[np.ndarray, " n"], first: int) -> bool:
     """Whether frames are 0 before the `first` and 1 from it on, but for noise and a few: between two touches frames
     come back."""
     noise = 1.4826 * np.median(np.abs(np.diff(along))) / np.sqrt(2)

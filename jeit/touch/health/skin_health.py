@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, is_number, real_array, told
+from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit.protocol import Protocol
@@ -18,7 +18,7 @@ from jeit.touch.health.event import EventKind, EventStatus, HealthEvent
 from jeit.touch.health.finding import Change, Finding, findings
 from jeit.touch.health.healthy import Healthy, averaged
 from jeit.touch.health.imaged_skin import ImagedSkin
-from jeit.touch.health.lasting import Step, lasting_step, median, size_of, told_apart
+from jeit.touch.health.lasting import Step, is_distinct, lasting_step, median, size_of
 
 # Seconds that no touch is held; windows that none is, where frames have no times.
 PATIENCE, _PATIENCE_WINDOWS = 30.0, 3
@@ -115,7 +115,7 @@ class SkinHealth:
                 raise ValueError("times must rise from frame to frame, in seconds; some do not.")
             period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
         if patience is not None and not (is_number(patience) and patience > 0):
-            raise ValueError(f"patience must be positive, in seconds; it is {told(patience)}.")
+            raise ValueError(f"patience must be positive, in seconds; it is {describe(patience)}.")
         wanted = PATIENCE if times is not None and patience is None else patience
         learnt = Healthy.learn(frames, period, None if wanted is None else float(wanted) / _WINDOW)
         window = learnt.window * learnt.stride * learnt.period
@@ -145,7 +145,7 @@ class SkinHealth:
         as `status` and `reason` say. Raises `ValueError` for what is no time, and for another number of channels.
         """
         if not is_number(time):
-            raise ValueError(f"time must be seconds; it is {told(time)}.")
+            raise ValueError(f"time must be seconds; it is {describe(time)}.")
         values = real_array("frame", frame, f"{self.reference.size} voltages")
         if values.shape != self.reference.shape:
             raise ValueError(
@@ -200,7 +200,7 @@ class SkinHealth:
             kind=EventKind.REPAIRED,
             status=EventStatus.CONFIRMED,
             time=self.time,
-            told=self.time,
+            noticed=self.time,
             frame=self.frames,
             channels=np.abs(change) > self.healthy.limit * self.healthy.scale,
             change=change,
@@ -299,7 +299,7 @@ class SkinHealth:
         first = np.array([one for _, _, one in self._window]) - healthy.reference
         along = np.nan_to_num(first / healthy.level**2) @ change / max((change / healthy.level**2) @ change, 1e-300)
         begun = replace(self, _settled=True, reference=np.where(np.isfinite(latest), latest, self.reference))
-        if size <= healthy.level_limit or not told_apart(along, 0):
+        if size <= healthy.level_limit or not is_distinct(along, 0):
             return begun
         time, frame, _ = self._window[0]
         change = Change(change, size / healthy.level_limit * healthy.limit, time, frame, self.time)
@@ -319,7 +319,7 @@ class SkinHealth:
             return replace(self, _pending=None)
         if self.time - pending.change.time < self.patience:
             return self
-        lasted = replace(pending.change, vector=np.where(self.trusted, left, 0.0), told=self.time)
+        lasted = replace(pending.change, vector=np.where(self.trusted, left, 0.0), noticed=self.time)
         reason = f"{pending.finding.reason} It has lasted for {self.time - pending.change.time:.3g} s or frames."
         return replace(self, _pending=None)._with(
             lasted, [replace(pending.finding, reason=reason)], EventStatus.LASTING
@@ -407,7 +407,7 @@ class SkinHealth:
             kind=found.kind,
             status=status,
             time=change.time,
-            told=change.told,
+            noticed=change.noticed,
             frame=change.frame,
             channels=large & own,
             change=np.where(own, change.vector, 0.0),

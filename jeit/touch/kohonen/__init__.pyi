@@ -4,7 +4,7 @@ from .placed_map import PlacedMap
 from .quality import MapQuality, map_quality
 from .self_organising_map import SelfOrganisingMap, fit_maps
 from .settling import learning_curves, time_constant
-from .several_touches import MapTouch, neuron_shares, touches_told
+from .several_touches import MapTouch, neuron_shares, touches_reported
 from .training import Schedule
 
 __all__ = [
@@ -20,6 +20,6 @@ __all__ = [
     "neuron_shares",
     "read_map",
     "time_constant",
-    "touches_told",
+    "touches_reported",
     "write_map",
 ]

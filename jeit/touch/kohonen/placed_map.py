@@ -69,10 +69,10 @@ class PlacedMap:
             off = spread = missed = 0.0
             for out in (odd, ~odd):
                 part = cls._of(learnt, frames[~out], positions[~out], winners[~out], fit)
-                told = part._told(frames[out])
-                off += float(np.sum((told.places - positions[out]) ** 2))
-                spread += float(np.sum(told.spread**2))
-                missed += float(np.sum(told.left**2))
+                placed = part._told(frames[out])
+                off += float(np.sum((placed.places - positions[out]) ** 2))
+                spread += float(np.sum(placed.spread**2))
+                missed += float(np.sum(placed.left**2))
             ways.append((off, fit, float(np.sqrt(off / max(spread, 1e-300))), float(np.sqrt(missed / frames.size))))
         _, fit, widening, _ = min(ways)
         whole = cls._of(learnt, frames, positions, winners, fit)
@@ -111,8 +111,8 @@ class PlacedMap:
         these, or on the grid from the nearest, as any of them. Raises `ValueError` for frames of another number of
         channels, and NaN.
         """
-        told = self._told(self.learnt.checked(frames))
-        return told.places, self.widening * told.spread
+        placed = self._told(self.learnt.checked(frames))
+        return placed.places, self.widening * placed.spread
 
     def _told(self, frames: Float[np.ndarray, "n M"]) -> "_Told":
         near, shares, left = self._shares(frames)

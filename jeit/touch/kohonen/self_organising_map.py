@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_key, check_kind, counted, is_number, real_array, told
+from jeit.arguments import check_key, check_kind, counted, describe, is_number, real_array
 from jeit.touch.kohonen.training import Schedule, train
 
 # Fewer frames teach no order.
@@ -42,7 +42,7 @@ class SelfOrganisingMap:
         if weights.ndim != 3 or not weights.size or not np.isfinite(weights).all():
             raise ValueError(f"weights must be finite, (R, C, M), a frame for every neuron; they are {weights.shape}.")
         if not (is_number(self.scale) and self.scale > 0):
-            raise ValueError(f"scale must be positive, in the unit of frames; it is {told(self.scale)}.")
+            raise ValueError(f"scale must be positive, in the unit of frames; it is {describe(self.scale)}.")
 
     @classmethod
     def fit(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, is_number, real_array, told
+from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.touch.kohonen.placed_map import PlacedMap
 
 # Of the strongest touch, what is believed at the least; of the extent of the map's places, how far touches are apart.
@@ -41,7 +41,7 @@ def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> 
     return shares
 
 
-def touches_told(
+def touches_reported(
     placed: PlacedMap,
     frame: ArrayLike,
     reference: ArrayLike,
@@ -59,9 +59,9 @@ def touches_told(
     Raises `ValueError` as `neuron_shares` does, and for a share or distance that cannot be.
     """
     if not (is_number(least) and 0 <= least < 1):
-        raise ValueError(f"least must be a share, from 0 to below 1; it is {told(least)}.")
+        raise ValueError(f"least must be a share, from 0 to below 1; it is {describe(least)}.")
     if apart is not None and not (is_number(apart) and apart > 0):
-        raise ValueError(f"apart must be positive, in metres; it is {told(apart)}.")
+        raise ValueError(f"apart must be positive, in metres; it is {describe(apart)}.")
     sum_of = _Sum.of(placed, frame, reference)
     if apart is None:
         apart = _APART * float(np.ptp(sum_of.places, axis=0).max())

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.arguments import is_number, real_array, told
+from jeit.arguments import describe, is_number, real_array
 
 # Frames after which weights are moved, in either phase.
 _ORDERED, _TUNED = 16, 64
@@ -49,7 +49,7 @@ class Schedule(eqx.Module):
         for name in ("ordering", "tuning"):
             value = getattr(self, name)
             if not (is_number(value) and int(value) == value and value >= 0):
-                raise ValueError(f"{name} must be a whole number of frames, zero or more; it is {told(value)}.")
+                raise ValueError(f"{name} must be a whole number of frames, zero or more; it is {describe(value)}.")
         if not self.ordering + self.tuning:
             raise ValueError("ordering and tuning are both zero: nothing would be learnt.")
         _check_falling("rate", self.rate, 1.0, "shares of the way to a frame, at most 1, such as (0.3, 0.02)")

@@ -45,8 +45,8 @@ def learn_answers(
     found: dict[str, Any] = dict.fromkeys(("place", "force", "label", "keys"))
     every = np.arange(len(whole))
     if presses.positions is not None:
-        rows, folds, told = places_and_folds(presses)
-        notes += told
+        rows, folds, remarks = places_and_folds(presses)
+        notes += remarks
         places = presses.positions[rows]
         found["place"], standing["place"] = _numbers(whole, reference, places, rows, folds, method, imaged, progress)
     if presses.force is not None:
@@ -56,7 +56,7 @@ def learn_answers(
         force = presses.force[:, None]
         found["force"], standing["force"] = _numbers(whole, reference, force, every, folds, method, imaged, progress)
     if presses.label is not None:
-        folds, told = time_folds(presses.frames, *_when(presses, every), kinds=presses.label)
+        folds, remarks = time_folds(presses.frames, *_when(presses, every), kinds=presses.label)
         learnt, tried = learn_labels(
             whole,
             reference,
@@ -66,13 +66,13 @@ def learn_answers(
             imaged=imaged,
             progress=progress,
         )
-        notes += [*told, *learnt.notes]
+        notes += [*remarks, *learnt.notes]
         found["label"] = learnt
         methods = [(f"{one.method} on {one.form}", one.error) for one in tried]
         standing["label"] = Standing(methods[0][0], methods, learnt.classes[tried[0].held_out], presses.label)
     if presses.touched is not None:
-        folds, told = time_folds(presses.frames, *_when(presses, every), kinds=presses.touched)
-        notes += told
+        folds, remarks = time_folds(presses.frames, *_when(presses, every), kinds=presses.touched)
+        notes += remarks
         if presses.touched.sum(axis=1).max() < 2:
             notes.append("no two keys were pressed together: what is said of keys pressed together is a guess.")
         found["keys"], tried = learn_keys(whole, reference, presses.touched, folds, progress=progress)
@@ -86,8 +86,8 @@ def places_and_folds(presses: Presses) -> tuple[np.ndarray, np.ndarray, tuple[st
     """Rows of presses that have a place, the folds of those, and notes."""
     positions = np.asarray(presses.positions)
     rows = np.flatnonzero(~np.isnan(positions).any(axis=1))
-    folds, told = time_folds(presses.frames[rows], *_when(presses, rows), alike=positions[rows])
-    return rows, folds, told
+    folds, remarks = time_folds(presses.frames[rows], *_when(presses, rows), alike=positions[rows])
+    return rows, folds, remarks
 
 
 def _numbers(whole, reference, targets, rows, folds, method, imaged, progress) -> tuple[LearntNumbers, Standing]:

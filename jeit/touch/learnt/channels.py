@@ -117,7 +117,7 @@ class Channels:
             rows = some[borne]
             alive[rows], scores[rows] = pattern, some_scores[borne]
             residual[rows] = np.where(pattern, some_residual[borne], 0.0)
-            whole[np.ix_(rows, ~pattern)] = self._foretold(whole[np.ix_(rows, pattern)], pattern)
+            whole[np.ix_(rows, ~pattern)] = self._predicted(whole[np.ix_(rows, pattern)], pattern)
             left = np.setdiff1d(left, rows, assume_unique=True)
         novelty = _novelty(scores, residual, alive, self.spread) / self.usual
         return whole * self.scale, alive, np.maximum(novelty, _NEAR * self.neighbourhood(scores))
@@ -148,11 +148,11 @@ class Channels:
         beyond = np.where(given, np.abs(residual) / np.sqrt(np.maximum(free, 1e-6)) / self.farthest, np.inf)
         return beyond, scores, residual
 
-    def _foretold(self, alive_readings: Float[np.ndarray, "n a"], alive: np.ndarray) -> Float[np.ndarray, "n m-a"]:
+    def _predicted(self, alive_readings: Float[np.ndarray, "n a"], alive: np.ndarray) -> Float[np.ndarray, "n m-a"]:
         """What channels that are not `alive` (m,) would most likely have read."""
         dead = self.directions[~alive] * self.weight
-        told = dead @ (alive_readings @ self.directions[alive]).T
-        return np.linalg.solve(np.eye(len(dead)) - dead @ self.directions[~alive].T, told).T
+        predicted = dead @ (alive_readings @ self.directions[alive]).T
+        return np.linalg.solve(np.eye(len(dead)) - dead @ self.directions[~alive].T, predicted).T
 
     def unsure(self, alive: Bool[np.ndarray, "n m"], number: int) -> Float[np.ndarray, "q n m"]:
         """By what the readings foretold may be off, of frames with some channels `alive`: the q ≤ `number` greatest

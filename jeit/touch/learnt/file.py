@@ -7,7 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from jeit.arguments import listed, told
+from jeit.arguments import describe, listed
 from jeit.arguments.extras import need_extra
 from jeit.files import check_archive, reason, written_whole
 from jeit.touch.kohonen.placed_map import PlacedMap
@@ -106,7 +106,7 @@ def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[d
         if not isinstance(content, dict) or content.get("kind") != kind:
             raise ValueError("it is of another kind")
         if content["version"] != version:
-            raise ValueError(f"it is of version {told(content['version'])}, and this jeit reads {version}")
+            raise ValueError(f"it is of version {describe(content['version'])}, and this jeit reads {version}")
         check_seal(path)
         own: Any = _whole(content["skin"])
         return make(own)

@@ -98,9 +98,9 @@ class Images:
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
         """What one of each feature is: of the contact a part of its own deviation, of cells that of all."""
-        told = values.shape[1] - len(self.imaged.sizes)
+        number = values.shape[1] - len(self.imaged.sizes)
         own = values.std(axis=0)
-        return np.concatenate([own[:told] / _WEIGHT, np.full(len(own) - told, np.sqrt(np.mean(own[told:] ** 2)))])
+        return np.concatenate([own[:number] / _WEIGHT, np.full(len(own) - number, np.sqrt(np.mean(own[number:] ** 2)))])
 
 
 def check_imaged(model: ForwardModel, num_channels: int) -> None:

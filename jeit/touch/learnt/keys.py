@@ -79,7 +79,7 @@ def learn_keys(
     number, keys = touched.shape
     odds = {name: np.empty((number, keys)) for name in _candidates()}
 
-    def tell(fold: int) -> None:
+    def predict(fold: int) -> None:
         out = folds == fold
         for form in _FORMS:
             features = Standardised.learn(form, changes[~out], reference[~out])
@@ -105,7 +105,7 @@ def learn_keys(
                         odds[name][out, key] = said[:, 1] - said[:, 0]
         progress(f"keys, fold {fold + 1} of {folds.max() + 1}")
 
-    over_folds(tell, folds.max() + 1)
+    over_folds(predict, folds.max() + 1)
     members, methods, held_out = [], [], np.empty((number, keys), bool)
     for key in range(keys):
         right = touched[:, key]

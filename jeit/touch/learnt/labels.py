@@ -98,12 +98,12 @@ def _hold_out(method, form, forms: Forms, changes, reference, right, folds) -> T
     number = right.max() + 1
     odds = np.full((len(right), number), -1e3)
 
-    def tell(fold: int) -> None:
+    def predict(fold: int) -> None:
         out = folds == fold
         features = forms.learn(form, changes[~out], reference[~out], right[~out, None])
         model = CLASSIFIERS[method](features(changes[~out], reference[~out]), right[~out])
         odds[np.ix_(out, model.classes_)] = log_odds(model, features(changes[out], reference[out]))
 
-    over_folds(tell, folds.max() + 1)
+    over_folds(predict, folds.max() + 1)
     held_out = odds.argmax(axis=1)
     return TriedLabels(method, form, held_out, odds, float(np.mean(held_out != right)))

@@ -84,8 +84,8 @@ class LearntSkin:
         """
         _check_fit(presses, method, model, num_channels, per_session)
         with one_thread():
-            tell = progress or (lambda said: None)
-            return cls._fit(presses, method, model, num_channels, per_session, tell)
+            report = progress or (lambda said: None)
+            return cls._fit(presses, method, model, num_channels, per_session, report)
 
     @classmethod
     def _fit(cls, presses: Presses, method, model, num_channels, per_session, progress) -> "LearntSkin":
@@ -116,11 +116,11 @@ class LearntSkin:
         imaged = None
         if model is not None:
             progress("images")
-            imaged, told = Imaged.create(model, whole, channels.used, mean)
-            said += told
+            imaged, remarks = Imaged.create(model, whole, channels.used, mean)
+            said += remarks
         ours = None if mean is None else reference_used(presses.reference, mean, channels.used, len(whole))
-        found, standing, told = learn_answers(whole, ours, presses, method, imaged, progress)
-        notes = list(dict.fromkeys([*notes, *said, *told]))
+        found, standing, remarks = learn_answers(whole, ours, presses, method, imaged, progress)
+        notes = list(dict.fromkeys([*notes, *said, *remarks]))
         return cls(
             channels,
             mean,
@@ -148,13 +148,13 @@ class LearntSkin:
             changes = standardised(changes, group)
         changes = np.where(self._stuck(frames, changes), np.nan, changes)
         found = over_threads(
-            self._tell,
+            self._predict,
             changes,
             reference_used(reference, self.mean_reference, self.channels.used, len(changes)),
             at_once=_AT_ONCE,
         )
         said: dict[str, Any] = {one.name: found.get(one.name) for one in fields(Touches) if one.name != "notes"}
-        return Touches(**said, notes=self._told(found["alive"], found["unlike"]))
+        return Touches(**said, notes=self._doubts(found["alive"], found["unlike"]))
 
     def _stuck(self, frames: np.ndarray, changes: np.ndarray) -> np.ndarray:
         """Channels (M,) that read the same in all of many touched frames, though others change; when nothing touches, a
@@ -162,10 +162,10 @@ class LearntSkin:
         same = (frames == frames[0]).all(axis=0)
         if same.all() or not same.any() or len(frames) < _MANY:
             return np.zeros_like(same)
-        told = np.where(same, 0.0, np.nan_to_num(changes))[:, self.channels.used] / self.channels.scale
-        return same & (np.count_nonzero(np.sqrt(np.mean(told**2, axis=1)) > self.quiet) >= _MANY)
+        scaled = np.where(same, 0.0, np.nan_to_num(changes))[:, self.channels.used] / self.channels.scale
+        return same & (np.count_nonzero(np.sqrt(np.mean(scaled**2, axis=1)) > self.quiet) >= _MANY)
 
-    def _tell(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
+    def _predict(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
         """What `Touches` say of some frames, as far as it was learnt."""
         whole, alive, novelty = self.channels.complete(changes)
         touching = np.sqrt(np.mean((whole / self.channels.scale) ** 2, axis=1)) > self.quiet
@@ -241,7 +241,7 @@ class LearntSkin:
             )
         return reference
 
-    def _told(self, alive: np.ndarray, unlike: np.ndarray) -> tuple[str, ...]:
+    def _doubts(self, alive: np.ndarray, unlike: np.ndarray) -> tuple[str, ...]:
         notes = []
         numbers = np.flatnonzero(self.channels.used)
         alive = alive[:, numbers]

@@ -136,13 +136,13 @@ class _Cut:
     def hold_out(self, method: str, form: str) -> Tried:
         said = np.empty_like(self.targets)
 
-        def tell(fold: int) -> None:
+        def predict(fold: int) -> None:
             out = self.folds == fold
             learnt, asked = self._scores(form, fold, out, rotated=method not in OF_CHANNELS)
             model = REGRESSORS[method](learnt, (self.targets[~out] - self.mean) / self.scale)
             said[out] = self.mean + self.scale * np.asarray(model.predict(asked)).reshape(int(out.sum()), -1)
 
-        over_folds(tell, self.folds.max() + 1)
+        over_folds(predict, self.folds.max() + 1)
         return Tried(method, form, said, _off(said, self.targets))
 
     def _scores(self, form: str, fold: int, out: np.ndarray, *, rotated: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -21,7 +21,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import brentq
 
 from jeit.acoustic import Recording
-from jeit.arguments import check_kind, is_number, told
+from jeit.arguments import check_kind, describe, is_number
 
 BANDS, FRAMES = 64, 41
 # Seconds: of a frame, from frame to frame, from window to window.
@@ -75,7 +75,7 @@ def check_highest(highest: float) -> float:
     """Raises `ValueError` for what is no highest frequency of sound images, Hz."""
     if not (is_number(highest) and LOWEST <= highest < np.inf):
         raise ValueError(
-            f"highest must be a frequency in Hz, {LOWEST:g} or more, up to which sound is told; it is {told(highest)}."
+            f"highest must be a frequency in Hz, {LOWEST:g} or more, of the features; it is {describe(highest)}."
         )
     return float(highest)
 

@@ -47,7 +47,7 @@ class Heard:
         return len(self.times)
 
     @property
-    def told(self) -> np.ndarray:
+    def named(self) -> np.ndarray:
         """The likeliest name of each window (W,), "" where it is quiet or of no numbers."""
         likeliest = np.array([*self.names, ""])[self.probabilities.argmax(axis=1)]
         return np.where(self.quiet | ~self.known, "", likeliest)
@@ -72,12 +72,12 @@ class Heard:
     @property
     def events(self) -> tuple[Event, ...]:
         """Stretches of one name, one after the other."""
-        told, found = self.told, []
+        names, found = self.named, []
         # A name holds to half way to the next window.
         steps = [self.times[:1] - EVERY / 2, (self.times[1:] + self.times[:-1]) / 2, self.times[-1:] + EVERY / 2]
         edges = np.maximum(np.concatenate(steps), 0).tolist()
-        cuts = np.flatnonzero(told[1:] != told[:-1]) + 1
-        for some in np.split(np.arange(len(told)), cuts):
+        cuts = np.flatnonzero(names[1:] != names[:-1]) + 1
+        for some in np.split(np.arange(len(names)), cuts):
             if not some.size:
                 continue
             place = None
@@ -86,7 +86,11 @@ class Heard:
                 place = located.mean(axis=0) if len(located) else None
             found.append(
                 Event(
-                    edges[some[0]], edges[some[-1] + 1], str(told[some[0]]), float(self.probability[some].mean()), place
+                    edges[some[0]],
+                    edges[some[-1] + 1],
+                    str(names[some[0]]),
+                    float(self.probability[some].mean()),
+                    place,
                 )
             )
         return tuple(found)

@@ -90,8 +90,8 @@ class Listener:
         check_name("method", method, METHODS)
         key = jax.random.key(0) if key is None else key
         check_key(key)
-        tell = progress or (lambda said: None)
-        windows = Windows.of(clips, tell)
+        report = progress or (lambda said: None)
+        windows = Windows.of(clips, report)
         fold = held_out_folds(windows.right_of_clip, windows.group_of_clip, _FOLDS)
         notes = [*clips.notes, *windows.notes]
         alone = np.array(windows.names)[np.unique(windows.right_of_clip[fold < 0])]
@@ -109,23 +109,23 @@ class Listener:
         loud = windows.images.loudness
         of_clips = np.maximum.reduceat(loud, np.flatnonzero(np.diff(windows.clip, prepend=-1)))
         if loudness is None:
-            loudness = _loudness_counts(windows, fold, key, tell)
+            loudness = _loudness_counts(windows, fold, key, report)
         if not loudness:
             windows = windows.levelled
         found = []
         for name in names:
-            found.append((name, _held_out(name, windows, fold, key, batches, folder, tell)))
+            found.append((name, _held_out(name, windows, fold, key, batches, folder, report)))
         kept = [(windows.errors(odds), place, name, odds) for place, (name, odds) in enumerate(found)]
         # Of those that err as often the last, the plainest.
         kept.sort(key=lambda one: (*one[0], -one[1]))
         (_, _, chosen, odds) = kept[0]
-        tell(f"{chosen}, all clips")
-        everything = windows.lesson(np.ones(len(windows.clip), bool), key, batches, _file(folder, chosen), tell)
+        report(f"{chosen}, all clips")
+        everything = windows.lesson(np.ones(len(windows.clip), bool), key, batches, _file(folder, chosen), report)
         model = LEARNERS[chosen].learn(everything)
         out = np.isfinite(odds).all(axis=1)
         standing = None
         if out.any():
-            said, right = windows.told(odds)
+            said, right = windows.named(odds)
             tried = [(name, errors[0]) for errors, _, name, _ in kept]
             standing = Standing(chosen, tried, np.array(windows.names)[said], np.array(windows.names)[right])
         else:
@@ -278,25 +278,25 @@ class Listener:
         )
 
 
-def _held_out(name: str, windows: Windows, fold: np.ndarray, key: Array, batches: int, folder, tell) -> np.ndarray:
+def _held_out(name: str, windows: Windows, fold: np.ndarray, key: Array, batches: int, folder, report) -> np.ndarray:
     """Log-odds (W, C) of windows when their clip's fold was held out; NaN of those that never were."""
     odds = np.full((len(windows.images), windows.classes), np.nan)
     for number in range(int(fold.max()) + 1):
-        tell(f"{name}, fold {number + 1} of {int(fold.max()) + 1}")
+        report(f"{name}, fold {number + 1} of {int(fold.max()) + 1}")
         out = (fold == number)[windows.clip]
-        lesson = windows.lesson(~out, key, batches, _file(folder, f"{name}-{number}"), tell)
+        lesson = windows.lesson(~out, key, batches, _file(folder, f"{name}-{number}"), report)
         odds[out] = LEARNERS[name].learn(lesson).log_odds(windows.images[out])
     return odds
 
 
-def _loudness_counts(windows: Windows, fold: np.ndarray, key: Array, tell) -> bool:
+def _loudness_counts(windows: Windows, fold: np.ndarray, key: Array, report) -> bool:
     """Whether a discriminant that knows how loud windows are names more clips right, by more than a standard deviation
     of chance. Where nothing can be held out, what several microphones hear is of one gain, and it does."""
     if fold.max() < 0:
         return windows.images.intensity.shape[1] > 1
     right = []
     for own in (windows, windows.levelled):
-        said, truth = own.told(_held_out("linear", own, fold, key, 1, None, tell))
+        said, truth = own.named(_held_out("linear", own, fold, key, 1, None, report))
         right.append(said == truth)
     more, fewer = (right[0] & ~right[1]).sum(), (right[1] & ~right[0]).sum()
     return bool(more - fewer > np.sqrt(more + fewer))

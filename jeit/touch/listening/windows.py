@@ -41,7 +41,7 @@ class Windows:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, clips: LabelledClips, tell: Callable[[str], None]) -> "Windows":
+    def of(cls, clips: LabelledClips, report: Callable[[str], None]) -> "Windows":
         """Of clips: those near the loudest of each. Raises `ValueError` for clips without numbers."""
         names, right = np.unique(clips.labels, return_inverse=True)
         group = np.unique(clips.groups, return_inverse=True)[1]
@@ -62,7 +62,7 @@ class Windows:
                 group_of_piece.append((group[number], place * _PARTS // max(len(pieces), _PARTS) if only else 0))
             if only and len(pieces) > 1:
                 cut.add(str(names[right[number]]))
-            tell(f"{counted(number + 1, 'clip')} of {len(clips)}")
+            report(f"{counted(number + 1, 'clip')} of {len(clips)}")
         clip = np.repeat(np.arange(len(parts)), [len(one) for one in parts])
         right_of_clip = right[of_piece]
         notes = ()
@@ -85,12 +85,12 @@ class Windows:
         """C."""
         return len(self.names)
 
-    def lesson(self, rows: np.ndarray, key: Array, batches: int, checkpoint: Path | None, tell) -> Lesson:
+    def lesson(self, rows: np.ndarray, key: Array, batches: int, checkpoint: Path | None, report) -> Lesson:
         """What some windows (W,) teach."""
         groups = self.group_of_clip[self.clip[rows]]
-        return Lesson(self.images[rows], self.right[rows], groups, self.classes, key, batches, checkpoint, tell)
+        return Lesson(self.images[rows], self.right[rows], groups, self.classes, key, batches, checkpoint, report)
 
-    def told(self, odds: Float[np.ndarray, "W C"]) -> tuple[np.ndarray, np.ndarray]:
+    def named(self, odds: Float[np.ndarray, "W C"]) -> tuple[np.ndarray, np.ndarray]:
         """What is said of every clip that was held out, as a whole, and its class."""
         out = np.isfinite(odds).all(axis=1)
         share = odds[out] - np.logaddexp.reduce(odds[out], axis=1, keepdims=True)
@@ -104,7 +104,7 @@ class Windows:
         out = np.isfinite(odds).all(axis=1)
         if not out.any():
             return 0.0, 0.0
-        said, right = self.told(odds)
+        said, right = self.named(odds)
         return float(np.mean(said != right)), float(np.mean(odds[out].argmax(axis=1) != self.right[out]))
 
 

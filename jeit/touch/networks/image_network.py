@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, check_name, is_number, real_array, told
+from jeit.arguments import check_kind, check_name, describe, is_number, real_array
 from jeit.design import Skin
 from jeit.protocol import Protocol
 from jeit.touch.networks.missing import MOST_MISSING, filled
@@ -244,12 +244,12 @@ def _untrained(head: dict[str, Any]) -> ThreeStages | Unrolled:
     channels, key = head["made_for"]["channels"], jax.random.key(0)
     for number in (rows, columns, channels):
         if not (isinstance(number, int) and 1 <= number <= 10_000):
-            raise ValueError(f"its head tells of {told(number)} rows, columns or channels")
+            raise ValueError(f"its head tells of {describe(number)} rows, columns or channels")
     numbers = [head["thickness_m"], head["noise"], *head["extent_m"]]
     if len(numbers) != 6 or not all(is_number(one) for one in numbers):
         raise ValueError("its head tells of no thickness, noise and extent")
     if not (isinstance(head["steps"], int) and 0 <= head["steps"] <= _MOST_STEPS):
-        raise ValueError(f"its head tells of {told(head['steps'])} steps")
+        raise ValueError(f"its head tells of {describe(head['steps'])} steps")
     if head["design"] == "three-stages":
         return ThreeStages(channels, (rows, columns), key=key)
     return Unrolled(channels, (rows, columns), head["steps"], key=key)

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_kind, check_name, told
+from jeit.arguments import check_kind, check_name, describe
 from jeit.arguments.extras import need_extra
 from jeit.design import Skin, touches_away_from_the_edge
 from jeit.design.study.store import OtherContents
@@ -68,7 +68,7 @@ class ImageStanding:
 
     **Fields**: `explained`, the share of the squares of depths in the touches of a test set that its maps get right,
     at most 1; `place`, errors of the middle of a single ball, metres, over a grid of places (mean, sd, rms), and
-    `deepest`, how deep it is told to be, over its depth, in the median; `right` and `told`, some maps, (k, rows,
+    `deepest`, its estimated depth over its depth, in the median; `right` and `estimated`, some maps, (k, rows,
     columns) over the thickness.
     """
 
@@ -76,7 +76,7 @@ class ImageStanding:
     place: dict[str, float]
     deepest: float
     right: Float[np.ndarray, "k rows columns"]
-    told: Float[np.ndarray, "k rows columns"]
+    estimated: Float[np.ndarray, "k rows columns"]
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,8 @@ def learn_images(
     check_kind("skin", skin, Skin, "a Skin, as of read_described_skin('skin.toml')")
     if not isinstance(skin.layout, Layout):
         raise ValueError(
-            f"skin: networks image flat skins, and {told(skin.layout.name)} is of a curved one; give its surface as a "
-            "rectangle, skin.width_mm and skin.height_mm in place of the table [surface]."
+            f"skin: networks image flat skins, and {describe(skin.layout.name)} is of a curved one; give its surface "
+            "as a rectangle, skin.width_mm and skin.height_mm in place of the table [surface]."
         )
     check_name("design", design, DESIGNS)
     if not isinstance(preset, Preset):
@@ -123,13 +123,13 @@ def learn_images(
         preset = PRESETS[preset]
     if touches is not None:
         if not (isinstance(touches, int) and touches >= 1):
-            raise ValueError(f"touches must be a whole number, 1 or more; it is {told(touches)}.")
+            raise ValueError(f"touches must be a whole number, 1 or more; it is {describe(touches)}.")
         preset = dataclasses.replace(preset, number=touches)
-    tell = (lambda _: None) if progress is None else progress
+    report = (lambda _: None) if progress is None else progress
     work = Path(folder) / "work"
     work.mkdir(parents=True, exist_ok=True)
     seconds, start = {}, time.monotonic()
-    tell("noise")
+    report("noise")
     noise = detection_noise(skin)
     sets = {}
     for name, number, own in zip(
@@ -142,7 +142,7 @@ def learn_images(
                 indents,
                 where,
                 client=client,
-                progress=lambda now, name=name: tell(f"touches {name}: {now.points} of {now.all_points}"),
+                progress=lambda now, name=name: report(f"touches {name}: {now.points} of {now.all_points}"),
             )
         except OtherContents:
             raise ValueError(
@@ -164,7 +164,7 @@ def learn_images(
         learnt = train_three_stages(sets["learnt"], held, noise, runs)
     seconds["training"] = time.monotonic() - start - seconds["touches"]
     network = ImageNetwork.of_skin(learnt.network, skin, noise, SHAPE)
-    tell("standing")
+    report("standing")
     standing = stand(network, skin, judged)
     seconds["all"] = time.monotonic() - start
     write_network(network, Path(folder) / FILE)
@@ -175,14 +175,14 @@ def stand(network: ImageNetwork, skin: Skin, examples: Examples, seed: int = 0) 
     """How well a network images touches, with the noise that it was trained with."""
     random = np.random.default_rng(seed)
 
-    def told(change):
+    def answered(change):
         return network.share(change + network.noise * random.normal(size=change.shape))
 
-    maps = told(examples.change)
+    maps = answered(examples.change)
     explained = 1 - float(np.mean((maps - examples.depth) ** 2) / np.mean(examples.depth**2))
     grid = touches_away_from_the_edge(skin.outline, _BALL / 2, _PLACES, _PLACES)
     tip, depth = ball(_BALL), min(_DEPTH * float(skin.thickness), _BALL / 2)
-    found = told(relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places]))
+    found = answered(relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places]))
     rows, columns = network.shape
     place = errors(centroids_of(found, image_places(skin, columns, rows)), grid.places)
     deepest = float(np.median(found.max(axis=(1, 2)))) * float(skin.thickness) / depth

@@ -45,8 +45,8 @@ class Runs(NamedTuple):
         """One, its key its own by its name."""
         key = jax.random.fold_in(self.key, int.from_bytes(name.encode()[:4], "little"))
         kept = None if self.folder is None else self.folder / f"{name}.training"
-        tell = self.progress
-        said = None if tell is None else (lambda text: tell(f"{name}, {text}"))
+        report = self.progress
+        said = None if report is None else (lambda text: report(f"{name}, {text}"))
         return fit(network, objective, training, validation, self.plan, key=key, checkpoint=kept, progress=said)
 
 

@@ -48,10 +48,10 @@ def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axe
         x, y = contact.centroid
         ax.add_patch(Polygon(contact.contour, fill=False, edgecolor=INK, linewidth=1.2, zorder=3))
         ax.plot(x, y, marker="+", color=INK, markersize=9, markeredgewidth=1.4, zorder=4, path_effects=_HALO)
-        told = f"({1e3 * x:+.1f}, {1e3 * y:+.1f}) mm".replace("-", "−")
+        text = f"({1e3 * x:+.1f}, {1e3 * y:+.1f}) mm".replace("-", "−")
         top = contact.contour[:, 1].max()
         ax.annotate(
-            told,
+            text,
             (x, top),
             (0, 4),
             textcoords="offset points",

@@ -14,7 +14,7 @@ def plot_heard(heard: Heard, *, title: str | None = None, ax: Axes | None = None
     """Draw the probabilities of all names in time, a row each, a bar under the name that is told; quiet is blank."""
     ax = axes_or_new(ax, (8.0, 3.2))
     names, times = heard.names, heard.times
-    shown = np.where((heard.told != "")[:, None], heard.probabilities, np.nan).T
+    shown = np.where((heard.named != "")[:, None], heard.probabilities, np.nan).T
     extent = (float(times[0]) - EVERY / 2, float(times[-1]) + EVERY / 2, -0.5, len(names) - 0.5)
     drawn = ax.imshow(
         100 * shown,
@@ -34,7 +34,7 @@ def plot_heard(heard: Heard, *, title: str | None = None, ax: Axes | None = None
     ax.set_yticks(range(len(names)), names)
     ax.set_xlim(0, extent[1])
     ax.set_xlabel("Time (s)", color=INK)
-    quiet = int((heard.told == "").sum())
+    quiet = int((heard.named == "").sum())
     said = f"{heard.name}: red, what is told" + (f"; blank, {quiet} of {len(heard)} windows quiet" if quiet else "")
     ax.set_title(said if title is None else title)
     soften_axes(ax)

@@ -41,7 +41,7 @@ def plot_map(
         raise ValueError("places: no neuron has one.")
     if values is not None and np.shape(values) != places.shape[:2]:
         raise ValueError(f"values must be one for each neuron, {places.shape[:2]}; they have shape {np.shape(values)}.")
-    check_kind("touches", touches, (list, tuple), "a list of touches, as of touches_told")
+    check_kind("touches", touches, (list, tuple), "a list of touches, as of touches_reported")
     ax = axes_or_new(ax)
     extent = extent_of(places[there])
     bare(ax, extent, numbered=False)

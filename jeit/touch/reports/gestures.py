@@ -32,7 +32,7 @@ def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
         "gestures": list(model.names),
         "classifier": f"{model.method} on {model.form}",
         "reading": None if model.reading is None else vars(model.reading),
-        "recordings_without_a_touch": list(learnt.untold),
+        "recordings_without_a_touch": list(learnt.without_touch),
         "notes": list(model.notes),
         "units": {"level": "S", "rate": "1/s"},
         "versions": {package: version_of(package) for package in _PACKAGES},

@@ -76,7 +76,7 @@ def draw_learnt_images(learnt: LearntImages):
 
     from jeit.touch.plots import plot_depth_map, plot_losses
 
-    right, told = learnt.standing.right, learnt.standing.told
+    right, estimated = learnt.standing.right, learnt.standing.estimated
     figure = Figure(figsize=(3 + 2.6 * (len(right) + 1), 5.4), layout="constrained")
     parts = figure.subfigures(1, 2, width_ratios=(4.4, 2.6 * max(len(right), 1)), squeeze=False)
     losses, maps = parts[0]
@@ -84,7 +84,7 @@ def draw_learnt_images(learnt: LearntImages):
     panels = maps.subplots(2, len(right), squeeze=False)
     thickness = learnt.network.thickness
     most = thickness * float(right.max())
-    for row, (name, some) in zip(panels, (("right", right), ("told", told)), strict=True):
+    for row, (name, some) in zip(panels, (("right", right), ("told", estimated)), strict=True):
         for ax, one in zip(row, some, strict=True):
             plot_depth_map(thickness * one, learnt.network.extent, most=most, colour_bar=ax is row[-1], ax=ax)
         row[0].set_title(name)
@@ -133,38 +133,38 @@ def write_depths(
     for earlier in DEPTH_FILES[1:]:
         (where / earlier).unlink(missing_ok=True)  # would not go with these frames
     clear_unfinished(where)
-    tell = drawing or (lambda said: None)
+    report = drawing or (lambda said: None)
     with GrowingRows(where, network.shape) as rows:
-        told = _Told(network)
+        imaged = _Imaged(network)
         with GrowingTable(where / "frames.csv", ("frame", "x_m", "y_m", "depth_m")) as table:
             for one in found:
-                line, depth = told.take(one)
+                line, depth = imaged.take(one)
                 with saying_what_is_left(rows):
                     table.write(line)
                     rows.append(depth)
                 if progress is not None:
                     progress(one)
-        if not told.imaged:
+        if not imaged.imaged:
             (where / "frames.csv").unlink()
-            reason = told.first_reason or "there is none"
+            reason = imaged.first_reason or "there is none"
             raise ValueError(
                 f"'{name}': {counted(rows.number, 'frame')}, and none could be imaged; the first: {reason}"
             )
-        tell("images")
+        report("images")
         with saying_what_is_left(rows):
             extent = np.array(network.extent)
-            rows.write_npz(where / "depth.npz", "depth", {"extent": extent}, lambda far: tell(f"images: {far}"))
+            rows.write_npz(where / "depth.npz", "depth", {"extent": extent}, lambda far: report(f"images: {far}"))
         with results(where, ("report.json",)) as made:
-            write_json(told.report(name, rows.number), made / "report.json")
-        tell(PICTURES[0])
-        row, number = told.row.values().astype(int), told.number.values().astype(int)
+            write_json(imaged.report(name, rows.number), made / "report.json")
+        report(PICTURES[0])
+        row, number = imaged.row.values().astype(int), imaged.number.values().astype(int)
         chosen = np.unique(np.linspace(0, len(row) - 1, _DRAWN).round().astype(int))
         with written_whole(where / "depth.png") as file:
-            _draw_depths(rows.read(row[chosen]), number[chosen], told.deepest.depth, network).savefig(file, dpi=130)
-        return WrittenDepths(rows.number, told.imaged, told.deepest, told.latency.values())
+            _draw_depths(rows.read(row[chosen]), number[chosen], imaged.deepest.depth, network).savefig(file, dpi=130)
+        return WrittenDepths(rows.number, imaged.imaged, imaged.deepest, imaged.latency.values())
 
 
-class _Told:
+class _Imaged:
     """What is kept of the frames that a network imaged, whose number may be any."""
 
     def __init__(self, network: ImageNetwork):

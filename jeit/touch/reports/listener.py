@@ -73,7 +73,7 @@ def report_listener(listener: Listener) -> dict[str, Any]:
 def report_heard(heard: Heard, *, model: str) -> dict[str, Any]:
     """All that was heard, as plain numbers, strings, lists and dictionaries; what is not known is None."""
     whole, probability = heard.whole
-    told, counts = np.unique(heard.told, return_counts=True)
+    names, counts = np.unique(heard.named, return_counts=True)
     events = [
         {
             "heard": one.name or None,
@@ -92,7 +92,7 @@ def report_heard(heard: Heard, *, model: str) -> dict[str, Any]:
             "window_s": LENGTH,
             "every_s": EVERY,
             "whole": {"heard": whole or None, "probability": probability if whole else None},
-            "windows_of_each": {name or "quiet": count for name, count in zip(told, counts, strict=True)},
+            "windows_of_each": {name or "quiet": count for name, count in zip(names, counts, strict=True)},
             "events": events,
             "notes": list(heard.notes),
             "units": {"length": "m", "time": "s"},
@@ -145,7 +145,7 @@ def draw_heard(heard: Heard):
 def _columns(heard: Heard) -> dict[str, list]:
     columns: dict[str, list] = {
         "time_s": [f"{time:.4f}" for time in heard.times],
-        "heard": heard.told.tolist(),
+        "heard": heard.named.tolist(),
         "probability": _texts(heard.probability),
         **{f"p_{name}": _texts(own) for name, own in zip(heard.names, heard.probabilities.T, strict=True)},
         "microphone": heard.strongest.tolist(),

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from jeit.arguments import told
+from jeit.arguments import describe
 
 
 class Rows(Protocol):
@@ -41,7 +41,7 @@ class ArrayRows:
         if len(lengths) != 1 or min(lengths) < 1:
             raise ValueError(
                 f"{name} must be arrays of one and the same number of rows, 1 or more, such as (inputs, targets); it "
-                f"is {told(arrays)} of {sorted(lengths) or 'none'}."
+                f"is {describe(arrays)} of {sorted(lengths) or 'none'}."
             )
         self.arrays = arrays
         self.sizes = (lengths.pop(),)

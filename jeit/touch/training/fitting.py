@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.arguments import check_key, check_kind, is_number, told
+from jeit.arguments import check_key, check_kind, describe, is_number
 from jeit.arguments.extras import need_extra
 from jeit.touch.training.batches import ArrayRows, Order
 from jeit.touch.training.checkpoint import Checkpoint, Course, State
@@ -59,13 +59,13 @@ class Plan:
         for name in ("rate", "decay"):
             given = getattr(self, name)
             if not (is_number(given) and given > 0):
-                raise ValueError(f"{name} must be positive; it is {told(given)}.")
+                raise ValueError(f"{name} must be positive; it is {describe(given)}.")
         for name in ("batch", "epochs", "patience", "decay_epochs", "look_every"):
             given = getattr(self, name)
             if not (isinstance(given, int) and given >= 1) and not (name == "look_every" and given is None):
-                raise ValueError(f"{name} must be a whole number, 1 or more; it is {told(given)}.")
+                raise ValueError(f"{name} must be a whole number, 1 or more; it is {describe(given)}.")
         if not (is_number(self.seconds) and self.seconds >= 0):
-            raise ValueError(f"seconds must be zero or more; it is {told(self.seconds)}.")
+            raise ValueError(f"seconds must be zero or more; it is {describe(self.seconds)}.")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jeit.arguments import told
+from jeit.arguments import describe
 from jeit.files import reason, written_whole
 
 # Of the file: how it begins; bytes of the head, and of all arrays together, at most.
@@ -115,9 +115,9 @@ def _head(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
         raise ValueError("its head is no JSON") from None
     if not isinstance(head, dict) or head.get("kind") != kind:
         other = head.get("kind") if isinstance(head, dict) else head
-        raise ValueError(f"it is {told(other)}")
+        raise ValueError(f"it is {describe(other)}")
     if head.get("version") != version:
-        raise ValueError(f"it is of version {told(head.get('version'))}, and this jeit reads {version}")
+        raise ValueError(f"it is of version {describe(head.get('version'))}, and this jeit reads {version}")
     return head
 
 

@@ -91,7 +91,7 @@ def test_a_press_that_is_held_is_told_by_time_or_by_the_user():
     (sure,) = waiting.confirm(waiting.held).events
     assert sure.status == EventStatus.CONFIRMED
     (lasted,) = watch(health, held_press()).events
-    assert lasted.told - lasted.time >= 250
+    assert lasted.noticed - lasted.time >= 250
     assert "only time" in lasted.reason
     assert watch(health, held_press(end=300)).events == ()
 
@@ -152,7 +152,7 @@ def test_a_single_channel_that_goes_wrong_is_named_and_left_out(health, kind, sa
     assert np.flatnonzero(event.channels).tolist() == [9]
     assert f"Channel 9 {'is several' if said == 'noisy' else 'does not move'}" in event.reason
     assert np.flatnonzero(~after.trusted).tolist() == [9]
-    assert event.told - 300 <= 2.5 * health.healthy.window * health.healthy.stride
+    assert event.noticed - 300 <= 2.5 * health.healthy.window * health.healthy.stride
     denied = after.deny(event)
     assert denied.trusted.all()
     again = watch(denied, spoilt(kind)[400:], 1000 + np.arange(200.0))

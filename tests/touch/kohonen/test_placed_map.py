@@ -11,7 +11,7 @@ from ringed_sensors import CHANNELS, NOISE, REST, changes, drawn_places, frames_
 from scipy.optimize import linear_sum_assignment
 
 from jeit.touch import PlacedMap, SelfOrganisingMap
-from jeit.touch.kohonen import read_map, touches_told, write_map
+from jeit.touch.kohonen import read_map, touches_reported, write_map
 
 
 def test_places_lie_between_neurons(placed):
@@ -60,7 +60,7 @@ def test_touches_at_once_are_told_apart(placed, strengths):
     for _ in range(20):
         where = _apart(random, len(strengths))
         frame = REST + np.array(strengths) @ changes(where) + random.normal(0, NOISE, CHANNELS)
-        found = touches_told(placed, frame, REST)
+        found = touches_reported(placed, frame, REST)
         if len(found) != len(strengths):
             continue
         distance = np.linalg.norm(where[:, None] - np.array([one.place for one in found]), axis=-1)
@@ -79,8 +79,8 @@ def _apart(random, number):
 
 def test_nothing_is_told_of_an_untouched_skin(placed):
     random = np.random.default_rng(2)
-    assert touches_told(placed, REST, REST) == []
-    noisy = [touches_told(placed, REST + random.normal(0, NOISE, CHANNELS), REST) for _ in range(50)]
+    assert touches_reported(placed, REST, REST) == []
+    noisy = [touches_reported(placed, REST + random.normal(0, NOISE, CHANNELS), REST) for _ in range(50)]
     assert sum(map(bool, noisy)) == 0
 
 

@@ -7,7 +7,7 @@ from minisom import MiniSom
 from ringed_sensors import CHANNELS, REST, drawn_places, frames_at
 
 from jeit.touch import PlacedMap, SelfOrganisingMap
-from jeit.touch.kohonen import Schedule, drawn_map, fit_maps, map_quality, neuron_shares, read_map, touches_told
+from jeit.touch.kohonen import Schedule, drawn_map, fit_maps, map_quality, neuron_shares, read_map, touches_reported
 
 
 def test_a_neurons_own_frame_activates_it_fully(learnt):
@@ -85,12 +85,12 @@ BAD = {
     "places the same": (lambda s: PlacedMap.learn(s["learnt"], FRAMES, np.ones((40, 2))), "different places"),
     "places missing": (lambda s: PlacedMap.learn(s["learnt"], FRAMES, np.ones((39, 2))), "40, d"),
     "locate NaN": (lambda s: s["placed"].locate(BROKEN), "NaN"),
-    "touches of many": (lambda s: touches_told(s["placed"], FRAMES, REST), "one finite frame"),
-    "touches of NaN": (lambda s: touches_told(s["placed"], BROKEN[0], REST), "NaN"),
+    "touches of many": (lambda s: touches_reported(s["placed"], FRAMES, REST), "one finite frame"),
+    "touches of NaN": (lambda s: touches_reported(s["placed"], BROKEN[0], REST), "NaN"),
     "touches, no rest": (lambda s: neuron_shares(s["placed"], FRAMES[0], REST[:5]), "reference"),
-    "touches of a map": (lambda s: touches_told(s["learnt"], FRAMES[0], REST), "placed"),
-    "a share": (lambda s: touches_told(s["placed"], FRAMES[0], REST, least=1.5), "least"),
-    "a distance": (lambda s: touches_told(s["placed"], FRAMES[0], REST, apart=-1.0), "apart"),
+    "touches of a map": (lambda s: touches_reported(s["learnt"], FRAMES[0], REST), "placed"),
+    "a share": (lambda s: touches_reported(s["placed"], FRAMES[0], REST, least=1.5), "least"),
+    "a distance": (lambda s: touches_reported(s["placed"], FRAMES[0], REST, apart=-1.0), "apart"),
     "a file": (lambda s: read_map(__file__), "is no map"),
 }
 

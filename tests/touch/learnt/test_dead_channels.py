@@ -84,10 +84,12 @@ def test_what_is_missed_is_what_the_other_channels_leave():
         rest = np.arange(6) != one
         told = other[:, rest] @ np.linalg.solve(covariance[np.ix_(rest, rest)], covariance[rest, one])
         left.append(other[:, one] - told)
-    missed, unforetold = _missed(other, variance, directions)[:, 8]
+    missed, unpredicted = _missed(other, variance, directions)[:, 8]
     np.testing.assert_allclose(missed, np.mean(np.square(left), axis=1), rtol=1e-9)
     # The second, over the share of a channel's diagonal in what foretells it, is the first.
-    np.testing.assert_allclose(unforetold * np.diag(np.linalg.inv(covariance)) ** -1 / _DIAGONALS[8], missed, rtol=1e-9)
+    np.testing.assert_allclose(
+        unpredicted * np.diag(np.linalg.inv(covariance)) ** -1 / _DIAGONALS[8], missed, rtol=1e-9
+    )
 
 
 def test_frames_that_lack_different_channels_are_mended_as_each_alone():

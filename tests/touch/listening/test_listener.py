@@ -92,11 +92,11 @@ def test_windows_of_silence_are_quiet(learnt):
     heard = learnt["linear"].hear(Recording(long, 44_100.0, name="long"))
     assert heard.whole[0] == "metal"
     # At its edges a window holds little of a tap, and may take that for another.
-    assert np.mean(heard.told[heard.loud] == "metal") > 0.6
+    assert np.mean(heard.named[heard.loud] == "metal") > 0.6
     assert heard.quiet.sum() > 10
     assert [event.name for event in heard.events].count("") >= 2
     nothing = learnt["linear"].hear(Recording(np.zeros((1, 44_100)), 44_100.0))
-    assert set(nothing.told) == {""}
+    assert set(nothing.named) == {""}
     assert nothing.whole == ("", 0.0)
     faint = learnt["linear"].hear(Recording(1e-6 * tap.samples, 44_100.0))
     assert "quieter than anything" in faint.notes[0]

@@ -16,7 +16,7 @@ from jeit.acoustic.simulate.sound import SimulatedSound
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import microphone_noise, sample_times
 from jeit.acoustic.simulate.wind_sound import room_sound
-from jeit.arguments import check_kind, check_name, told
+from jeit.arguments import check_kind, check_name, describe
 
 # Decibels: the room's sound beside the microphones' own noise, and how much that differs from clip to clip.
 _ROOM, _ROOM_SPREAD = -6.0, 4.0
@@ -66,7 +66,7 @@ def sound_clips(
     for number, modality in enumerate(modalities):
         check_name(f"modalities[{number}]", modality, MODALITIES)
     if not (isinstance(each, int) and each >= 1):
-        raise ValueError(f"each must be a number of clips, 1 or more; it is {told(each)}.")
+        raise ValueError(f"each must be a number of clips, 1 or more; it is {describe(each)}.")
     check_positive("duration", duration)
     return _clips(key, skin, people, each, tuple(modalities), duration)
 

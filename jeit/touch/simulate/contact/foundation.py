@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_metres, is_number, told
+from jeit.arguments import check_metres, describe, is_number
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
 from jeit.touch.simulate.contact.pressure import (
     AbstractPressure,
@@ -117,4 +117,4 @@ def level(
 def check_modulus(modulus) -> None:
     """Raise `ValueError` for what is no positive modulus in pascals."""
     if not (is_number(modulus) and modulus > 0):
-        raise ValueError(f"modulus must be positive, in pascals (1e6 for a soft rubber); it is {told(modulus)}.")
+        raise ValueError(f"modulus must be positive, in pascals (1e6 for a soft rubber); it is {describe(modulus)}.")

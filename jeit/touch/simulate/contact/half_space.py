@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from jeit.arguments import is_number, told
+from jeit.arguments import describe, is_number
 from jeit.touch.simulate.contact.foundation import check_modulus
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
 from jeit.touch.simulate.contact.pressure import (
@@ -48,9 +48,9 @@ class HalfSpace(AbstractSupport):
         pixels."""
         check_modulus(modulus)
         if not (is_number(poisson) and -1 < poisson <= 0.5):
-            raise ValueError(f"poisson must be above −1 and at most 0.5, that of rubber; it is {told(poisson)}.")
+            raise ValueError(f"poisson must be above −1 and at most 0.5, that of rubber; it is {describe(poisson)}.")
         if not (isinstance(pixels, int) and pixels >= 8):
-            raise ValueError(f"pixels must be a whole number, 8 or more; it is {told(pixels)}.")
+            raise ValueError(f"pixels must be a whole number, 8 or more; it is {describe(pixels)}.")
         self.modulus, self.poisson, self.pixels = float(modulus), float(poisson), pixels
 
     @property

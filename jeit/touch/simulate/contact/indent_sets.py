@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jeit.arguments import check_kind, told
+from jeit.arguments import check_kind, describe
 from jeit.design import Skin
 from jeit.design.skin.resting_skin import RestingSkin
 from jeit.design.study.contents import Contents
@@ -50,7 +50,7 @@ class IndentSet:
             if not (isinstance(given, int) and given >= 1):
                 raise ValueError(f"{name} must be a whole number, 1 or more; it is {given!r}.")
         if not (isinstance(seed, int) and 0 <= seed < 2**63):
-            raise ValueError(f"seed must be a whole number, 0 or more; it is {told(seed)}.")
+            raise ValueError(f"seed must be a whole number, 0 or more; it is {describe(seed)}.")
         if draws.depth[1] >= float(skin.thickness):
             raise ValueError(
                 f"draws go {1e3 * draws.depth[1]:.3g} mm deep, and the skin is {1e3 * float(skin.thickness):.3g} mm "

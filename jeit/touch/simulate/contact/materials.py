@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jeit.arguments import check_metres, check_name, is_number, told
+from jeit.arguments import check_metres, check_name, describe, is_number
 from jeit.touch.simulate.contact.foundation import Foundation
 from jeit.touch.simulate.contact.pressure import AbstractSupport, check_support
 
@@ -70,7 +70,7 @@ class Material(eqx.Module):
 
 def _check(name: str, value, holds: Callable[[float], bool], wanted: str) -> None:
     if not (is_number(value) and holds(value)):
-        raise ValueError(f"{name} must be {wanted}; it is {told(value)}.")
+        raise ValueError(f"{name} must be {wanted}; it is {describe(value)}.")
 
 
 def _are_branches(creep) -> bool:

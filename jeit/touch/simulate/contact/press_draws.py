@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jeit.arguments import check_key, check_kind, is_number, real_array, told
+from jeit.arguments import check_key, check_kind, describe, is_number, real_array
 from jeit.mesh import Domain
 from jeit.touch.simulate.contact.indenters import AbstractIndenter, check_indenter
 from jeit.touch.simulate.contact.press import Press
@@ -56,7 +56,7 @@ class PressDraws(eqx.Module):
         if not (isinstance(at_once, int) and at_once >= 1):
             raise ValueError(f"at_once must be a whole number, 1 or more; it is {at_once!r}.")
         if not (is_number(margin) and margin >= 0):
-            raise ValueError(f"margin must be metres, zero or more; it is {told(margin)}.")
+            raise ValueError(f"margin must be metres, zero or more; it is {describe(margin)}.")
         self.indenters, self.outline, self.at_once = indenters, outline, at_once
         self.load, self.margin = (float(span[0]), float(span[1])), float(margin)
         if not self._inside(self._anywhere(np.random.default_rng(0), 1000)).any():
@@ -66,7 +66,7 @@ class PressDraws(eqx.Module):
         """So many touches. Raises `ValueError` for what is no key, and no number."""
         check_key(key)
         if not (isinstance(number, (int, np.integer)) and not isinstance(number, bool) and number >= 0):
-            raise ValueError(f"number must be a whole number of touches, 0 or more; it is {told(number)}.")
+            raise ValueError(f"number must be a whole number of touches, 0 or more; it is {describe(number)}.")
         random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         counts = random.integers(1, self.at_once, number, endpoint=True)
         total = counts.sum()

@@ -14,11 +14,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from jeit.arguments import check_kind, told
+from jeit.arguments import check_kind, describe
 from jeit.arguments.extras import need_extra
 from jeit.design.study.cluster import over_cluster
 from jeit.design.study.contents import Contents
-from jeit.design.study.progress import Progress, Teller
+from jeit.design.study.progress import Progress, ProgressReporter
 from jeit.design.study.store import Store, writing
 from jeit.touch.simulate.contact.indent_sets import IndentSet
 from jeit.touch.simulate.contact.press import Press
@@ -62,7 +62,7 @@ class PressSet:
             if not (isinstance(given, int) and given >= 1):
                 raise ValueError(f"{name} must be a whole number, 1 or more; it is {given!r}.")
         if not (isinstance(seed, int) and 0 <= seed < 2**63):
-            raise ValueError(f"seed must be a whole number, 0 or more; it is {told(seed)}.")
+            raise ValueError(f"seed must be a whole number, 0 or more; it is {describe(seed)}.")
         check_seconds("held", held)
         check_seconds("elapsed", elapsed)
         self.skin, self.draws, self.number, self.seed = skin, draws, number, seed
@@ -150,10 +150,10 @@ def simulate_presses(
     with writing(presses.contents(), path) as store:
         done = set(store.sound())
         left = [number for number in range(len(presses.chunks)) if number not in done]
-        tell = Teller(presses.chunks, done, progress)
+        report = ProgressReporter(presses.chunks, done, progress)
         for number, results in _solved(presses, left, client):
             store.write(number, results)
-            tell.finished(number)
+            report.finished(number)
     return open_presses(presses, path)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_key, check_kind, check_name, is_number, real_array, told
+from jeit.arguments import check_key, check_kind, check_name, describe, is_number, real_array
 from jeit.design.skin.reached_cells import is_curved
 from jeit.design.skin.touched_cells import TouchedCells, padded
 from jeit.design.skin.voltage_changes import touch_changes
@@ -152,7 +152,7 @@ class PressedSkin(eqx.Module):
         check_kind("recordings", recordings, (list, tuple), wanted)
         for number, pair in enumerate(recordings):
             if not (isinstance(pair, tuple) and len(pair) == 2):
-                raise ValueError(f"recordings[{number}]: give {wanted}; it is {told(pair)}.")
+                raise ValueError(f"recordings[{number}]: give {wanted}; it is {describe(pair)}.")
         if not recordings:
             return []
         times = [_check_times(seconds) for _, seconds in recordings]
@@ -294,7 +294,7 @@ def _even(number: int) -> int:
 def check_seconds(name: str, value) -> None:
     """Raise `ValueError`, about the argument `name`, for what is no time from zero on."""
     if not (is_number(value) and value >= 0):
-        raise ValueError(f"{name} must be seconds, zero or more; it is {told(value)}.")
+        raise ValueError(f"{name} must be seconds, zero or more; it is {describe(value)}.")
 
 
 def _check_times(seconds) -> Float[np.ndarray, " T"]:

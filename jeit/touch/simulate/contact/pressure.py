@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import map_coordinates
 
-from jeit.arguments import check_kind, is_number, told
+from jeit.arguments import check_kind, describe, is_number
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
 
 
@@ -97,7 +97,7 @@ def contact_window(pressed, reach: float, number: int) -> Float[np.ndarray, "2"]
 def check_load(load) -> None:
     """Raise `ValueError` for what is no positive load in newtons."""
     if not (is_number(load) and load > 0):
-        raise ValueError(f"load must be positive, in newtons (100 g weigh 0.98 N); it is {told(load)}.")
+        raise ValueError(f"load must be positive, in newtons (100 g weigh 0.98 N); it is {describe(load)}.")
 
 
 def check_seen(contact: Bool[np.ndarray, "N N"], pixel) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_key, check_kind, check_metres, is_number, real_array, told
+from jeit.arguments import check_key, check_kind, check_metres, describe, is_number, real_array
 from jeit.forward.assembly import check_conductivity
 from jeit.mesh import Domain, Mesh, Refine, centroids, check_flat, measures
 
@@ -34,9 +34,9 @@ class Cut(eqx.Module):
         if not np.linalg.norm(np.diff(path, axis=0), axis=1).min() > 0:
             raise ValueError("path: two places that follow each other are one; give a path that goes somewhere.")
         if not (is_number(depth) and 0 < depth <= 1):
-            raise ValueError(f"depth must be a share of the thickness, above 0 and up to 1; it is {told(depth)}.")
+            raise ValueError(f"depth must be a share of the thickness, above 0 and up to 1; it is {describe(depth)}.")
         if not (is_number(residual) and 0 < residual < 1):
-            raise ValueError(f"residual must be between 0 and 1; it is {told(residual)}.")
+            raise ValueError(f"residual must be between 0 and 1; it is {describe(residual)}.")
         self.path, self.depth, self.residual = path, float(depth), float(residual)
 
     @property
@@ -126,9 +126,9 @@ def draw_cut(
     if span.shape != (2,) or not 0 < span[0] <= span[1] < np.inf:
         raise ValueError(f"length must be the least and the greatest, metres, such as (0.02, 0.06); it is {length!r}.")
     if not (is_number(bent) and 0 <= bent <= 1):
-        raise ValueError(f"bent must be a chance, from 0 to 1; it is {told(bent)}.")
+        raise ValueError(f"bent must be a chance, from 0 to 1; it is {describe(bent)}.")
     if not (is_number(margin) and margin >= 0):
-        raise ValueError(f"margin must be metres, zero or more; it is {told(margin)}.")
+        raise ValueError(f"margin must be metres, zero or more; it is {describe(margin)}.")
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     low_x, high_x, low_y, high_y = map(float, outline.extent)
     whole, turned = random.uniform(*span), random.random() < bent

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_key, check_kind, check_name, is_number, real_array, told
+from jeit.arguments import check_key, check_kind, check_name, describe, is_number, real_array
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model, select_channels
 
@@ -41,10 +41,10 @@ class ElectrodeFault(eqx.Module):
     def __check_init__(self):
         """Raises `ValueError` for an electrode or a kind that there is not, and a rail that is no voltage."""
         if not (isinstance(self.electrode, (int, np.integer)) and self.electrode >= 0):
-            raise ValueError(f"electrode must be its number, from 0; it is {told(self.electrode)}.")
+            raise ValueError(f"electrode must be its number, from 0; it is {describe(self.electrode)}.")
         check_name("kind", self.kind, FAULTS)
         if self.rail is not None and not is_number(self.rail):
-            raise ValueError(f"rail must be volts, or None; it is {told(self.rail)}.")
+            raise ValueError(f"rail must be volts, or None; it is {describe(self.rail)}.")
 
     def changes(
         self, key: Array, model: ForwardModel, conductivity: ArrayLike, seconds: Float[np.ndarray, " T"]

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.arguments import check_key, check_kind, is_number, told
+from jeit.arguments import check_key, check_kind, describe, is_number
 from jeit.touch.simulate.contact import MovingPress, PressedSkin
 from jeit.touch.simulate.damage.electrode_fault import ElectrodeFault, check_fault
 
@@ -25,7 +25,7 @@ class Mishap(eqx.Module):
     def __check_init__(self):
         """Raises `ValueError` for what is no time, skin or fault."""
         if not (is_number(self.time) and self.time >= 0):
-            raise ValueError(f"time must be seconds, zero or more; it is {told(self.time)}.")
+            raise ValueError(f"time must be seconds, zero or more; it is {describe(self.time)}.")
         if self.skin is not None:
             check_kind("skin", self.skin, PressedSkin, "a PressedSkin, that with the damage")
         check_kind("faults", self.faults, tuple, "a tuple of them")

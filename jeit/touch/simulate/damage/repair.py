@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, is_number, told
+from jeit.arguments import check_kind, describe, is_number
 from jeit.forward.assembly import check_conductivity
 from jeit.mesh import Mesh
 from jeit.touch.simulate.contact import Material
@@ -29,7 +29,7 @@ def mended(
     check_kind("cut", cut, Cut, "the Cut that was mended")
     check_kind("material", material, Material, 'a Material, such as material("hydrogel")')
     if not (is_number(share) and share > 0):
-        raise ValueError(f"share must be positive, about 0.9 to 1.1; it is {told(share)}.")
+        raise ValueError(f"share must be positive, about 0.9 to 1.1; it is {describe(share)}.")
     values = np.array(np.broadcast_to(np.asarray(check_conductivity(mesh, conductivity)), mesh.num_cells), float)
     values[cut.cells(mesh)] *= share
     return values, dataclasses.replace(material, hysteresis=min(0.9, _MORE * material.hysteresis))

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.arguments import check_key, check_kind, is_number, told
+from jeit.arguments import check_key, check_kind, describe, is_number
 from jeit.mesh import Domain
 from jeit.touch.simulate.contact.press import MovingPress
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin
@@ -55,9 +55,9 @@ def simulate_gesture_stream(
     if not people:
         raise ValueError("people: give one at least, such as [Person.draw(key)].")
     if not (isinstance(number, int) and number >= 1):
-        raise ValueError(f"number must be a number of gestures, 1 or more; it is {told(number)}.")
+        raise ValueError(f"number must be a number of gestures, 1 or more; it is {describe(number)}.")
     if not (is_number(pause) and pause >= 0):
-        raise ValueError(f"pause must be seconds, zero or more; it is {told(pause)}.")
+        raise ValueError(f"pause must be seconds, zero or more; it is {describe(pause)}.")
     for_draws, for_touches, for_frames = jax.random.split(key, 3)
     rng = np.random.default_rng(np.asarray(jax.random.bits(for_draws, (4,))).tolist())
     gesture, person = rng.choice(GESTURES, number), rng.integers(len(people), size=number)

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.arguments import check_key, check_kind, check_name, is_number, told
+from jeit.arguments import check_key, check_kind, check_name, describe, is_number
 from jeit.mesh import Domain
 from jeit.touch.simulate.contact.press import MovingPress
 from jeit.touch.simulate.people.gesture_motion import gesture_motion
@@ -52,7 +52,7 @@ class Person(eqx.Module):
         check_name("gesture", gesture, GESTURES)
         check_kind("outline", outline, Domain, "an outline, such as Rectangle(0.32, 0.2)")
         if not (is_number(rate) and rate > 0):
-            raise ValueError(f"rate must be frames per second, positive; it is {told(rate)}.")
+            raise ValueError(f"rate must be frames per second, positive; it is {describe(rate)}.")
         low_x, high_x, low_y, high_y = map(float, outline.extent)
         if min(high_x - low_x, high_y - low_y) < _LEAST_SIDE:
             raise ValueError(f"outline must be {1e3 * _LEAST_SIDE:g} mm wide and high at least, for a hand.")

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jeit.arguments import check_key, check_kind, check_name, told
+from jeit.arguments import check_key, check_kind, check_name, describe
 from jeit.data import GestureSet
 from jeit.mesh import Domain
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin
@@ -50,7 +50,7 @@ def simulate_gestures(
     for number, gesture in enumerate(gestures):
         check_name(f"gestures[{number}]", gesture, GESTURES)
     if not (isinstance(each, int) and each >= 1):
-        raise ValueError(f"each must be a number of touches, 1 or more; it is {told(each)}.")
+        raise ValueError(f"each must be a number of touches, 1 or more; it is {describe(each)}.")
     before, quiet, touched, late = jax.random.split(key, 4)
     reference = skin.record(before, [], np.arange(_REFERENCE) / rate).mean(axis=0)
     later = np.random.default_rng(np.asarray(jax.random.bits(late, (4,))).tolist())
