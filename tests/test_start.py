@@ -7,7 +7,7 @@ import sys
 import jax
 import pytest
 
-from jeit.start import compiled_code
+from jeit.start import compiled_code, take_double_precision
 
 PROGRAM = """
 import jeit, jax, jax.numpy as jnp
@@ -124,6 +124,12 @@ def test_a_relative_cache_folder_is_not_taken(monkeypatch):
 
 
 def test_double_precision_unless_told_otherwise():
+    assert jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_double_precision_that_the_user_asked_for_is_not_warned_of(monkeypatch):
+    monkeypatch.setenv("JAX_ENABLE_X64", "1")
+    take_double_precision()
     assert jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
 

@@ -1,12 +1,13 @@
-"""Passive acoustic tomography: an array of microphones under a skin hears a touch, and says where it is.
+"""Passive acoustic tomography: locate touches on a skin from the signals of an array of microphones under it.
 
-`read_taps` and `calibrate_microphones` give the decay model of every microphone, kept in a `Calibration`;
-`read_recording` and `locate_touches` turn a recording into places and strokes, step by step through `intensities`,
-`locate` and `track`. Beneath them: `Localiser`, which is batched and differentiable, and the Cramér-Rao bound.
+`read_taps` and `calibrate_microphones` fit the decay model of every microphone and return a `Calibration`.
+`read_recording` and `locate_touches` convert a recording to positions and tracks; `intensities`, `locate` and `track`
+are the steps. The underlying estimator is `Localiser`, which is batched and differentiable; `cramer_rao` computes the
+Cramér-Rao bound.
 
-Rooms: `signal` (recordings, faults, intensities), `calibration` (fits to taps), `localisation` (objectives, minima,
-maps, two sources). Beside them: `decay`, the decay models; `microphones`, the array; `surface`, on which
-sources are; `noise`; `track`, places in time; `touches`, all of it in one call.
+Subpackages: `signal` (recordings, faults, intensities), `calibration` (fits to taps), `localisation` (objectives,
+minima, maps, two sources). Modules: `decay`, the decay models; `microphones`, the array; `surface`, the surface on
+which sources lie; `noise`; `tracking`, positions over time; `touches`, the whole pipeline in one call.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Decay models: what each microphone receives of a source, as a function of their distance.
+"""Decay models: the intensity received by each microphone as a function of its distance from the source.
 
-A source of strength I₀ at distance r is received with intensity I₀ f_i(r). Every model gives log f_i and is fitted in
-the logarithms of its parameters, which keeps them positive.
+A source of strength I₀ at distance r is received with intensity I₀ f_i(r). Every model gives log f_i. The fit is over
+the logarithms of the parameters, which keeps them positive.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _TIP = 1e-16
 
 
 class AbstractDecay(eqx.Module):
-    """Responses f_i of M microphones. Add a model by writing one class."""
+    """Base class of decay models: responses f_i of M microphones. A new model is one subclass."""
 
     name: ClassVar[str]
     parameters: ClassVar[tuple[str, ...]]
@@ -33,7 +33,7 @@ class AbstractDecay(eqx.Module):
 
     @abc.abstractmethod
     def response(self, squared_distance: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """f_i itself, by the cheapest way to it."""
+        """Response f_i at squared distances r² (m²)."""
 
     @property
     @abc.abstractmethod
@@ -47,17 +47,17 @@ class AbstractDecay(eqx.Module):
     @classmethod
     @abc.abstractmethod
     def from_logarithms(cls, values: Float[Array, "K M"]) -> Self:
-        """The model of these logarithms."""
+        """The model whose parameters have these logarithms."""
 
     @classmethod
     @abc.abstractmethod
     def start(cls, spacing: float, num_microphones: int) -> Self:
-        """A guess with gain 1 that reaches about as far as `spacing` (m)."""
+        """Initial guess with gain 1 and a range of about `spacing` (m)."""
 
     @classmethod
     @abc.abstractmethod
     def bounds(cls, extent: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Least and greatest sensible logarithms for an array `extent` (m) across."""
+        """Lower and upper bounds of the logarithms for an array `extent` (m) across."""
 
 
 class InverseSquare(AbstractDecay):
@@ -210,8 +210,8 @@ DECAYS: dict[str, type[AbstractDecay]] = {
 
 
 def find_decay(name: str | type[AbstractDecay]) -> type[AbstractDecay]:
-    """The class of a decay model by its name ("inverse-square", "exponential", "attenuated"), or as given; `ValueError`
-    where there is none of that name."""
+    """Class of a decay model from its name ("inverse-square", "exponential", "attenuated") or the class itself. Raises
+    `ValueError` for an unknown name."""
     if isinstance(name, type) and issubclass(name, AbstractDecay):
         return name
     check_name("decay", name, DECAYS, ", a class like theirs, or 'auto'")

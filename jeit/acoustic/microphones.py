@@ -1,4 +1,4 @@
-"""An array of microphones: where they are, what each receives of a source, and how well that is known."""
+"""`MicrophoneArray`: positions of the microphones, the expected intensities of a source, and their variances."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class MicrophoneArray(eqx.Module):
     noise: IntensityNoise
 
     def response(self, chart: Float[Array, "2 ..."]) -> Float[Array, "M ..."]:
-        """f_i of sources at chart coordinates."""
+        """Responses f_i to sources at chart coordinates."""
         place = self.surface.place(chart)
         mine = self.microphones.reshape(self.microphones.shape + (1,) * (place.ndim - 1))
         squares = [(place[k] - mine[:, k]) ** 2 for k in range(place.shape[0])]
@@ -40,6 +40,6 @@ class MicrophoneArray(eqx.Module):
 
 
 def check_array(microphone_array: MicrophoneArray) -> None:
-    """Raises `ValueError` for what is no `MicrophoneArray`."""
+    """Check the type of an array. Raises `ValueError` for what is no `MicrophoneArray`."""
     wanted = "a MicrophoneArray, such as calibration.microphone_array"
     check_kind("microphone_array", microphone_array, MicrophoneArray, wanted)

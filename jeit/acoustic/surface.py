@@ -1,7 +1,7 @@
-"""Surfaces on which a source may be: charts of two coordinates u (m), with an outline in them.
+"""Surfaces on which sources lie: charts of two coordinates u (m), with an outline in the chart.
 
 A plane is its own chart. A curved surface is a height over its best plane, interpolated by a thin-plate spline through
-points known to lie on it; it may curve as it likes as long as no two of its points lie above each other.
+known points of it; no two points of the surface may lie above each other.
 """
 
 import abc
@@ -15,7 +15,7 @@ from jeit.arguments import describe
 from jeit.mesh import Domain, Polygon
 from jeit_solvers.engines import as_array, namespace, on_host, slopes
 
-# Knots of the spline: more make every evaluation slower and the surface no smoother.
+# Most knots of the spline: more make evaluations slower and the surface no smoother.
 _MOST_KNOTS = 300
 
 
@@ -26,7 +26,7 @@ class AbstractSurface(eqx.Module):
 
     @abc.abstractmethod
     def place(self, chart: Float[Array, "2 ..."]) -> Float[Array, "d ..."]:
-        """Points in space of chart coordinates."""
+        """Points in space from chart coordinates."""
 
     @abc.abstractmethod
     def project(self, points: Float[Array, "d ..."]) -> Float[Array, "2 ..."]:
@@ -35,7 +35,7 @@ class AbstractSurface(eqx.Module):
     @property
     @abc.abstractmethod
     def dimension(self) -> int:
-        """Of the space: 2 or 3."""
+        """Dimension of the space: 2 or 3."""
 
 
 class Plane(AbstractSurface):
@@ -53,7 +53,7 @@ class Plane(AbstractSurface):
 
     @property
     def dimension(self):
-        """2."""
+        """Dimension of the space, 2."""
         return 2
 
 
@@ -69,7 +69,7 @@ class CurvedSurface(AbstractSurface):
     affine: Float[Array, " 3"]
 
     def place(self, chart):
-        """The point above u."""
+        """Points above the chart coordinates u."""
         flat = chart.reshape(2, -1)
         squared = namespace(self, chart).sum((flat[:, None] - self.knots.T[:, :, None]) ** 2, axis=0)
         height = self.weights @ _thin_plate(squared) + self.affine[0] + self.affine[1:] @ flat
@@ -83,12 +83,12 @@ class CurvedSurface(AbstractSurface):
 
     @property
     def dimension(self):
-        """3."""
+        """Dimension of the space, 3."""
         return 3
 
 
 def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -> AbstractSurface:
-    """The surface within `outline`: vertices (K, 2), or an outline such as `Disk`; or (K, 3) in space.
+    """Create the surface within `outline`: vertices (K, 2), or an outline such as `Disk`; or (K, 3) in space.
 
     In space the surface passes through the outline and `points` (T, 3), places of taps for instance. Raises
     `ValueError` for outlines that are none, and for surfaces that fold over their best plane.
@@ -120,7 +120,7 @@ def bounding_box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Ar
 def in_space(
     surface: AbstractSurface, chart: Float[Array, "2 F"], covariance: Float[Array, "2 2 F"]
 ) -> tuple[Float[Array, "F d"], Float[Array, "F d d"]]:
-    """Places in space, and their covariances, of places and covariances in the chart."""
+    """Positions in space, and their covariances, from positions and covariances in the chart."""
     place, along = slopes(surface.place, chart)
     xp = namespace(place, covariance)
     along = xp.stack(along)
@@ -134,8 +134,8 @@ def longer_side(surface: AbstractSurface) -> Float[Array, ""]:
 
 
 def chart_grid(surface: AbstractSurface, columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Middles of columns × rows pixels that fill the outline's box, (2, rows, columns), bottom row first; and which of
-    them lie inside the outline, (rows, columns)."""
+    """Centres of columns × rows pixels that fill the outline's box, (2, rows, columns), bottom row first; and the mask
+    of those inside the outline, (rows, columns)."""
     at_hand: AbstractSurface = on_host(surface)
     (left, bottom), (right, top) = bounding_box(at_hand)
     x = left + (right - left) * (np.arange(columns) + 0.5) / columns
@@ -145,7 +145,7 @@ def chart_grid(surface: AbstractSurface, columns: int, rows: int) -> tuple[np.nd
 
 
 def outline_sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[Array, "2 K"]]:
-    """Where each side of the outline, and of its holes, starts and ends, in the chart."""
+    """Start and end of each side of the outline and of its holes, in the chart."""
     loops = surface.outline.loops()
     xp = namespace(loops)
     start, end = (xp.concatenate([xp.roll(loop, -shift, axis=0) for loop in loops]) for shift in (0, 1))

@@ -1,4 +1,4 @@
-"""From a recording to touches in one call: intensities, the place of every frame, and the track of every touch."""
+"""Localisation of touches in one call: intensities, the position in every frame, and the track of every touch."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.acoustic.tracking import Track, track
 
-# Pixels of the map on which the paper's loss is searched.
+# Pixels of the map on which the paper's loss is minimised.
 _PAPERS_MAP = (200, 200)
 
 
 class LocatedTouches(eqx.Module):
-    """What was found in a recording: its `intensities`, the `locations` of its frames, and the `track` through them;
-    with the `calibration` and the `method` that found it."""
+    """Touches located in a recording: its `intensities`, the `locations` of its frames, and the `track` through them;
+    with the `calibration` and the `method` used."""
 
     intensities: Intensities
     locations: Locations
@@ -40,8 +40,8 @@ def locate_touches(
     silence: Recording | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> LocatedTouches:
-    """Find every touch of a recording, as `jeit locate` does: `jeit.acoustic.reports.write_track` writes what it
-    writes.
+    """Locate every touch of a recording, as `jeit locate` does; `jeit.acoustic.reports.write_track` writes its output
+    files.
 
     `method`: "likelihood", or "consistency" for the paper's loss on a map of 200 × 200 pixels, refined. `gap`: seconds
     without a place that end a touch. `intensity`: band and window, for samples, those of the calibration unless given.
@@ -57,14 +57,14 @@ def locate_touches(
     if not (np.isfinite(gap) and gap > 0):
         raise ValueError(f"gap must be positive, in seconds; it is {gap}.")
     said("measure intensities")
-    heard = calibrated_intensities(recording, calibration, intensity, silence=silence)
-    if len(heard.times) > 1 and np.median(np.diff(heard.times)) > gap:
+    result = calibrated_intensities(recording, calibration, intensity, silence=silence)
+    if len(result.times) > 1 and np.median(np.diff(result.times)) > gap:
         raise ValueError(
-            f"gap: frames are {np.median(np.diff(heard.times)):g} s apart, more than the {gap:g} s that end a touch: "
+            f"gap: frames are {np.median(np.diff(result.times)):g} s apart, more than the {gap:g} s that end a touch: "
             "give times in seconds, or a longer gap."
         )
     said("locate")
     map_shape = _PAPERS_MAP if method == "consistency" else None
-    locations = locate(heard, calibration, method=method, map_shape=map_shape)
+    locations = locate(result, calibration, method=method, map_shape=map_shape)
     said("track")
-    return LocatedTouches(heard, locations, track(locations, gap=gap), calibration, method)
+    return LocatedTouches(result, locations, track(locations, gap=gap), calibration, method)

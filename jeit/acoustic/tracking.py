@@ -1,8 +1,8 @@
-"""Tracks: places of one frame after another, smoothed in time, and when each touch begins and ends.
+"""Tracks: positions of consecutive frames smoothed in time, and onset and offset of each touch.
 
-A touch moves with a velocity that changes at random: white acceleration of spectral density q (m²/s³). Places are
-filtered forwards by Kalman's filter and smoothed backwards after Rauch, Tung and Striebel; frames without a place are
-passed over, and one too far from where the touch can be is not believed. q is the likeliest of a range.
+A touch moves with a velocity that changes at random: white acceleration of spectral density q (m²/s³). Positions are
+filtered forwards by a Kalman filter and smoothed backwards after Rauch, Tung and Striebel. Frames without a position
+are skipped, and a position too far from the predicted one is rejected. q is the most likely of a range.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from jeit.acoustic.localisation.locations import FEW_FRAMES, Locations
 from jeit.arguments import check_kind
 from jeit_solvers.engines import at_once, namespace, scan
 
-# Densities tried: from a finger that rests to one that is flung about (m²/s³).
+# Candidate densities: from a finger at rest to one that moves violently (m²/s³).
 _DENSITIES = np.geomspace(1e-5, 10.0, 13)
 _BELIEVED = 1e-4
-# Speed (m/s) that a touch may begin with, one standard deviation.
+# Standard deviation of the initial speed of a touch (m/s).
 _FIRST_SPEED = 0.5
 
 
@@ -48,12 +48,12 @@ class Track(eqx.Module):
 
 
 def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None = None) -> Track:
-    """Smooth the places of a recording, touch by touch.
+    """Smooth the positions of a recording, touch by touch.
 
     `gap`: seconds without a place after which a touch has ended. `acceleration`: spectral density q of the random
-    acceleration (m²/s³), the likeliest of a range unless given. Errors of windows that share a sample are alike:
-    covariances are taken `locations.overlap` times as wide. Raises `ValueError` for what is not positive, and for what
-    are no locations.
+    acceleration (m²/s³), the most likely of a range unless given. Errors of windows that share a sample are correlated:
+    covariances are multiplied by `locations.overlap`. Raises `ValueError` for what is not positive, and for what is no
+    `Locations`.
     """
     check_kind("locations", locations, Locations, "Locations, as of locate(recording, calibration)")
     if not (np.isfinite(gap) and gap > 0):
@@ -71,7 +71,7 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
         part = slice(first, last + 1)
         measured = np.where(located[part, None], locations.position[part], 0.0)
         spread = np.where(located[part, None, None], locations.covariance[part], np.eye(d)) * locations.overlap
-        # A covariance may be singular, on a curved surface; nothing is known better than a tenth of a micrometre.
+        # A covariance may be singular on a curved surface; the least standard deviation is a tenth of a micrometre.
         spread = spread + 1e-14 * np.eye(d)
         step = np.diff(times[part], prepend=times[first])
         state, error, believed = _smoothed(step, measured, spread, located[part], densities)
@@ -94,7 +94,7 @@ def _runs(times, located, gap: float) -> list[tuple[int, int]]:
 
 
 def _smoothed(step, measured, spread, located, densities) -> tuple[np.ndarray, ...]:
-    """What `_smooth` gives: of a touch of few frames in NumPy; of more compiled, padded to a power of two."""
+    """Result of `_smooth`: in NumPy for a touch of few frames; compiled for more, padded to a power of two."""
     frames, d = measured.shape
     if frames <= FEW_FRAMES:
         return at_once(_smooth, step, measured, spread, located, densities)
@@ -109,7 +109,7 @@ def _smoothed(step, measured, spread, located, densities) -> tuple[np.ndarray, .
 
 
 def _smooth(step, measured, spread, located, densities):
-    """States (n, 2 d), their covariances, and which places were believed, at the likeliest of the densities."""
+    """States (n, 2 d), their covariances, and the mask of accepted positions, at the most likely of the densities."""
     xp, d = namespace(measured), measured.shape[1]
     score, filtered = _filter(step, measured, spread, located, densities)
     best = xp.argmax(score)
@@ -124,7 +124,7 @@ def _smooth(step, measured, spread, located, densities):
         error = error + gain @ (later_error - next_error) @ gain.T
         return (mean, error), (mean, error)
 
-    # After the last frame nothing else is known than was predicted for it: there the smoother changes nothing.
+    # After the last frame there are only predictions: there the smoother changes nothing.
     beyond = predicted_mean[-1], predicted_error[-1]
     later = (xp.concatenate([array[1:], array[-1:]]) for array in (predicted_mean, predicted_error, step))
     _, (means, errors) = scan(back, beyond, (mean, error, *later), reverse=True)
@@ -133,7 +133,7 @@ def _smooth(step, measured, spread, located, densities):
 
 def _filter(step, measured, spread, located, densities):
     """Log-likelihood (Q,) of each density, and for every frame and density mean, covariance, their predictions, and
-    whether its place was believed."""
+    whether its position was accepted."""
     xp, d = namespace(measured), measured.shape[1]
     limit = float(chdtri(d, _BELIEVED))
 
@@ -147,10 +147,10 @@ def _filter(step, measured, spread, located, densities):
         square = xp.sum(off * xp.linalg.solve(inner, off[:, :, None])[:, :, 0], axis=1)
         believed = there & (square < limit)
         logarithm = xp.log(xp.linalg.det(inner))
-        # A place not believed still counts against a density, as much as one at the limit.
+        # A rejected position still lowers the likelihood of a density, as much as one at the limit.
         score = xp.where(there, -0.5 * (xp.minimum(square, limit) + logarithm), 0.0)
         new_mean = xp.where(believed[:, None], mean + xp.einsum("qij,qj->qi", gain, off), mean)
-        # Joseph's form, and symmetric: the difference of the textbook's is lost in rounding where places are exact.
+        # Joseph's form, which is symmetric: the textbook difference is lost in rounding where positions are exact.
         keep = xp.eye(2 * d) - xp.concatenate([gain, xp.zeros_like(gain)], axis=2)
         updated = keep @ error @ xp.swapaxes(keep, 1, 2) + gain @ spread @ xp.swapaxes(gain, 1, 2)
         new_error = xp.where(believed[:, None, None], (updated + xp.swapaxes(updated, 1, 2)) / 2, error)
@@ -165,7 +165,7 @@ def _filter(step, measured, spread, located, densities):
 
 
 def _move(step, d: int) -> Float[Array, "s s"]:
-    """What a step of time does to position and velocity."""
+    """Transition matrix of position and velocity for a time step."""
     xp = namespace(step)
     return xp.kron(xp.eye(2) + step * xp.eye(2, k=1), xp.eye(d))
 

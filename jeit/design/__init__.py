@@ -1,9 +1,9 @@
-"""Where electrodes should go, before any material is cut.
+"""Design of electrode layouts: comparison, optimisation, and choice of measurements, before any material is cut.
 
-What a skin of a given layout, its electrodes' positions, will feel: sensitivity maps, virtual taxels, scores. Better
-layouts: moved by gradients, within an outline and with minimum spacing; and the measurements worth making with them.
-Studies of many layouts, which survive a crash. Here is what a designer uses; the rest, such as the classes of what is
-found, is in the modules.
+For a given layout (the electrodes' positions), sensitivity maps, virtual taxels and scores are computed. Layouts are
+optimised by gradients, within an outline and with minimum spacing, and the most informative measurements are selected.
+Studies of many layouts can be resumed after a crash. This package exports the main functions; the others, such as the
+classes of results, are in the modules.
 
 Names are imported when first used: the command line shows defaults (`jeit.design.defaults`) without waiting.
 """

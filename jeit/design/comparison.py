@@ -1,4 +1,5 @@
-"""Two layouts of a skin side by side, as in text S4 of Park et al. 2022: sensitivity, blind spots, virtual taxels."""
+"""Comparison of two layouts of a skin: sensitivity, blind spots and virtual taxels, as in text S4 of Park et al.
+2022."""
 
 from __future__ import annotations
 
@@ -15,12 +16,12 @@ from jeit.design.skin.touch_grid import touches_away_from_the_edge
 from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh.geodesic import Triangles
 
-# By so much less than the other's least a place must feel to be blind: rounding of coordinates is not.
+# Relative margin below the other's minimum for a blind spot, so that rounding of coordinates makes none.
 _ROUNDING = 1e-6
 
 
 class LayoutComparison(eqx.Module):
-    """What two skins feel.
+    """Sensitivity and virtual taxels of two skins.
 
     **Fields**: `skins`; `responses` of each; `margin`, metres, `places` along a side, `contrast` and `seed` of the
     touches, as in `compare_layouts`.
@@ -35,7 +36,7 @@ class LayoutComparison(eqx.Module):
 
     @property
     def figures(self) -> list[dict]:
-        """What is told of each, as in `comparison`."""
+        """Figures of each layout, as in `comparison`."""
         return comparison(*self.responses)
 
 
@@ -50,14 +51,16 @@ def compare_layouts(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> LayoutComparison:
-    """Touch two skins of different layouts all over, one place at a time; as `jeit layout compare`.
+    """Compute the responses of two skins of different layouts to touches at a grid of positions; as `jeit layout
+    compare`.
 
     **Arguments:**
 
-    - `first`, `second`: of the same outline, made with `Skin.create`.
-    - `margin`: touched no nearer to the edge, where a touch is partly off the skin, metres; `places`: along a side.
-    - `contrast`: of the touched part's conductivity: 0 for an insulator, above 1 for a conductor.
-    - `num_taxels`: virtual taxels to look for, 90 unless given, or one a place; `seed`: of their k-means.
+    - `first`, `second`: skins of the same outline, made with `Skin.create`.
+    - `margin`: least distance of touches from the edge, metres, where a touch is partly off the skin; `places`: number
+      of positions along a side.
+    - `contrast`: ratio of the touched part's conductivity to the rest's: 0 for an insulator, above 1 for a conductor.
+    - `num_taxels`: number of virtual taxels, 90 unless given, at most one per position; `seed`: of their k-means.
     - `progress`: called with the name of each step as it begins.
 
     Raises `ValueError`, before either is touched, for skins of different outlines, a margin that leaves no place, and
@@ -68,7 +71,7 @@ def compare_layouts(
     check_same_outline(first.layout, second.layout)
     report = progress or (lambda step: None)
     ready = []
-    # Both, before either is touched: what is wrong with one is said at once.
+    # Both are checked before either is touched, so that errors are raised at once.
     for skin in (first, second):
         grid = touches_away_from_the_edge(skin.outline, margin, places, places)
         number = number_of_taxels(grid, num_taxels)
@@ -82,7 +85,7 @@ def compare_layouts(
 
 
 def check_same_outline(first: Layout | SurfaceLayout, second: Layout | SurfaceLayout) -> None:
-    """Raise `ValueError` unless both are on the same skin, but for where its drawing has its origin."""
+    """Raise `ValueError` unless both layouts have the same outline, up to a shift of the origin."""
     if isinstance(first, SurfaceLayout) or isinstance(second, SurfaceLayout):
         areas = [_area(layout) for layout in (first, second)]
         if type(first) is not type(second) or abs(areas[0] - areas[1]) > 1e-2 * areas[0]:
@@ -112,11 +115,11 @@ def _area(layout: Layout | SurfaceLayout) -> float:
 
 
 def comparison(one: SkinResponse, other: SkinResponse) -> list[dict]:
-    """What is told of each of two layouts, as plain numbers.
+    """Figures of each of two layouts, as plain numbers.
 
-    `sensitivity_…_V`; `blind_spot_fraction`, the share of the area that is less sensitive than the other's least
-    sensitive place; `taxel_count`, those of any area, and `taxel_area_cm2`; `taxel_overlap`, how many cover a place in
-    the mean; `two_point_mm`, their mean diameter.
+    `sensitivity_…_V`; `blind_spot_fraction`, the share of the area that is less sensitive than the other layout's least
+    sensitive position; `taxel_count`, the number of taxels with an area above zero, and `taxel_area_cm2`;
+    `taxel_overlap`, the mean number of taxels that cover a position; `two_point_mm`, their mean diameter.
     """
     return [_figures(*pair) for pair in ((one, other), (other, one))]
 

@@ -1,4 +1,4 @@
-"""What a skin, its measurement and its touches are where nobody says otherwise: in Python, studies and commands alike.
+"""Default values of a skin, its measurement and its touches, shared by the Python API, studies and commands.
 
 The skin and its touches are those of Park et al., Science Robotics 7, eabm7187 (2022), text S4; SI units throughout.
 """
@@ -29,22 +29,22 @@ CONTRAST = 0.0
 # Places touched along a side: the paper's, where one layout is looked at; half of them in a study, which has many.
 PLACES = 48
 STUDY_PLACES = 24
-# No nearer to the edge, where a touch is partly off the skin.
+# Least distance from the edge, where a touch is partly off the skin.
 MARGIN = 10e-3  # m
 
 # The mesh: 6 mm electrodes are 1.3 cells across, and the middle of the uppermost layer 0.5 mm below the surface.
 CELL_SIZE = 4.5e-3  # m
 NUM_LAYERS = 5
 
-# Of conductivities where a touch is: beyond it exact voltages are not found, and change no more.
+# Largest contrast of a touch: beyond it exact voltages are not found, and no longer change.
 MOST_CONTRAST = 1e6
 
-# Virtual taxels: the paper's clusters and cosine.
+# Virtual taxels: number of clusters and cosine threshold of the paper.
 NUM_TAXELS = 90
 THRESHOLD = 0.7
-# Of the amplitudes of touches before any is felt: two deviations of the touch.
+# Prior correlation length of the amplitudes of touches: two deviations of the touch.
 CORRELATION = 15e-3  # m
-# Of the smooth minimum of sensitivity.
+# Temperature of the smooth minimum of sensitivity.
 TEMPERATURE = 0.1
 
 # A search for a better layout: on a sheet of so many nodes, about, as each of its steps takes a gradient; and no closer

@@ -1,4 +1,4 @@
-"""A better layout for a sheet: optimised on a coarse mesh, and judged with the one given on a finer one."""
+"""Improvement of a sheet's layout: optimised on a coarse mesh, and compared with the given layout on a finer one."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from jeit.layout import Layout
 from jeit.layout.surface_layout import check_layout, flat_layout
 from jeit.protocol import two_terminal
 
-# Of the mesh that results are confirmed on, times those of the one optimised on; and of places along a side.
+# Nodes of the mesh for the final scores, relative to the mesh optimised on; and positions along a side.
 _FINER, _PLACES, _MORE_PLACES = 4, 16, 24
 
 
 class ImprovedLayout(eqx.Module):
-    """A layout moved until it was as good as it gets.
+    """Result of `improve_layout`: the optimised layout, with the scores of both layouts.
 
     **Fields**: `start`, the layout given; `optimisation`, of the `skin` on the mesh optimised on; `before` and `after`,
     scores of both layouts on a finer mesh, at more places; `space`, `noise` (volts), `seed` and
@@ -44,7 +44,7 @@ class ImprovedLayout(eqx.Module):
 
     @property
     def layout(self) -> Layout:
-        """The better one, or that given if there is none."""
+        """The optimised layout, or the given one if none is better."""
         return flat_layout(self.optimisation.layout)
 
 
@@ -61,21 +61,20 @@ def improve_layout(
     callback: Callable[[int, np.ndarray], None] | None = None,
     **material: Any,
 ) -> ImprovedLayout:
-    """Move the electrodes of `layout` until its worst sensitivity and mean variance are as good as they get; as
-    `jeit layout optimise`.
+    """Optimise the electrode positions of `layout` for worst sensitivity and mean variance; as `jeit layout optimise`.
 
     All two-terminal pairs of a sheet are measured, so the order of electrodes does not matter.
 
     **Arguments:**
 
-    - `space`: the layouts allowed; unless given, all on the skin with electrodes' centres 8 mm apart or more.
+    - `space`: the allowed layouts; unless given, all on the skin with electrodes' centres 8 mm apart or more.
     - `noise`: standard deviation of a voltage at 1 mA, volts.
     - `steps`, `starts`, `callback`: as in `optimise_layout`; `seed`: of the random starts.
     - `num_points`: nodes of the mesh to optimise on, about; results are confirmed on four times as many.
     - `progress`: called with the name of each step as it begins.
     - `material`: thickness, conductivity and contact impedance, as in `Skin.create`.
 
-    Raises `ValueError` where no layout satisfies what is asked, and as `Skin.create` and `optimise_layout` do.
+    Raises `ValueError` where no layout satisfies the constraints, and as `Skin.create` and `optimise_layout` do.
     """
     check_layout("layout", layout)
     report = progress or (lambda step: None)

@@ -1,4 +1,4 @@
-"""What a skin of one layout feels, as in text S4 of Park et al. 2022: sensitivity and virtual taxels."""
+"""Response of a skin of one layout to touches: sensitivity and virtual taxels, as in text S4 of Park et al. 2022."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jeit.layout import Layout, SurfaceLayout
 
 
 class SkinResponse(eqx.Module):
-    """What a skin of one `layout` feels: its `sensitivity`, and its `taxels`."""
+    """Response of a skin of one `layout` to touches: its `sensitivity`, and its `taxels`."""
 
     layout: Layout | SurfaceLayout
     sensitivity: SensitivityMap
@@ -33,14 +33,14 @@ def skin_response(
     threshold: float = THRESHOLD,
     linear: bool = False,
 ) -> SkinResponse:
-    """Touch a skin at every place of `grid`, one at a time.
+    """Compute the sensitivity and virtual taxels of a skin from single touches at every position of `grid`.
 
     **Arguments:**
 
     - `key`: for the taxels' k-means, from `jax.random.key`.
-    - `touched`: what the touches change, `skin.touched_cells(grid.places)` unless given.
-    - `num_taxels`: 90 unless given, or one a place; `threshold`: as in `find_taxels`.
-    - `linear`: changes of the voltages are linear, instead of exact.
+    - `touched`: the conductivity changes by the touches, `skin.touched_cells(grid.places)` unless given.
+    - `num_taxels`: 90 unless given, at most one per position; `threshold`: as in `find_taxels`.
+    - `linear`: whether to compute linear instead of exact changes of the voltages.
 
     Raises `ValueError` for more taxels than places, touches of other places, and as `Skin.touched_cells` and
     `Skin.voltage_changes` do.
@@ -60,7 +60,7 @@ def skin_response(
 
 
 def number_of_taxels(grid: TouchGrid, num_taxels: int | None) -> int:
-    """How many taxels are looked for, as in `skin_response`. Raises `ValueError` for none, or more than places."""
+    """Number of taxels, as in `skin_response`. Raises `ValueError` for none, or more than positions."""
     if num_taxels is None:
         return min(NUM_TAXELS, len(grid.places))
     if not 1 <= num_taxels <= len(grid.places):

@@ -1,13 +1,14 @@
-"""Layout scores: how well a sheet with a given layout feels touches, as numbers that have gradients.
+"""Layout scores: differentiable measures of how precisely a sheet with a given layout detects and locates touches.
 
 A touch at place k of amplitude a_k changes the M voltages by a_k Δv_k, linearly; their noise has standard deviation σ.
-With the amplitudes of touches at all places a priori a = S c, c independent of unit variance, voltages that are
-y = Aᵀa + noise, the rows of A being the Δv_k, leave them the covariance
+With the prior a = S c of the amplitudes of touches at all places, c independent of unit variance, and voltages y = Aᵀa
++ noise, the rows of A being the Δv_k, the posterior covariance of the amplitudes is
 
     C = S (1 + Sᵀ A σ⁻² Aᵀ S)⁻¹ Sᵀ.
 
-Where a touch is, its amplitude unknown, is told no better than by the Cramér-Rao bound: for the parameters (x, y, a)
-the Fisher information is J_ij = ∂_i(a Δv)ᵀ σ⁻² ∂_j(a Δv), and the variance of the place, tr of the block x, y of J⁻¹.
+The position of a touch of unknown amplitude has the Cramér-Rao bound as its least variance: for the parameters (x, y,
+a) the Fisher information is J_ij = ∂_i(a Δv)ᵀ σ⁻² ∂_j(a Δv), and the variance of the place, tr of the block x, y of
+J⁻¹.
 
 Atkinson, Donev and Tobias, Optimum Experimental Designs (Oxford, 2007), chapter 10; Kay, Fundamentals of Statistical
 Signal Processing: Estimation Theory (1993), chapter 3.
@@ -37,7 +38,7 @@ _SQUARINGS = 10
 
 
 class TouchPrior(eqx.Module):
-    """What is thought of the amplitudes of touches before any voltage is read: covariance SSᵀ.
+    """Gaussian prior of the amplitudes of touches, with covariance SSᵀ.
 
     **Fields**: `factor` S (n, r), relative to the touches that voltages are computed for.
     """
@@ -48,11 +49,12 @@ class TouchPrior(eqx.Module):
     def create(
         cls, places: ArrayLike, *, correlation: float, deviation: float = 1.0, lengths: ArrayLike | None = None
     ) -> "TouchPrior":
-        """deviation² exp(-d² / 2 correlation²) between places (n, 2) at a distance d, metres; places on a curved skin,
-        (n, 3), at `lengths` (n, n) from each other, `Geodesics.between`, straight through space unless given.
+        """Create the prior with covariance deviation² exp(-d² / 2 correlation²) between positions (n, 2) at a distance
+        d, metres; for positions (n, 3) on a curved skin, d is `lengths` (n, n), as from `Geodesics.between`, or the
+        straight distance unless given.
 
-        What holds less than a millionth of the largest variance is left out. Raises `ValueError` for a correlation or
-        deviation that is not positive, and for what are no places.
+        Components with less than a millionth of the largest variance are omitted. Raises `ValueError` for a correlation
+        or deviation that is not positive, and for what are no places.
         """
         if not (0 < correlation < np.inf and 0 < deviation < np.inf):
             raise ValueError(
@@ -69,7 +71,7 @@ class TouchPrior(eqx.Module):
 
 
 class Scores(eqx.Module):
-    """How good a layout is; after `jax.vmap` every array leads with the axis of the layouts.
+    """Scores of a layout; after `jax.vmap` the leading axis of every array is that of the layouts.
 
     **Fields**
 
@@ -77,7 +79,8 @@ class Scores(eqx.Module):
     - `soft_worst`: smooth minimum of Θ, volts, (mean Θ^(-1/T))^(-T); its temperature T → 0 makes it the minimum.
     - `variance` (n,): of the amplitude at each place after the voltages are read, relative, the diagonal of C.
     - `log_information`: D-optimality, log det of the information over the prior's, nats.
-    - `largest_variance`: E-optimality, the largest eigenvalue of C: of the pattern of touches that is known worst.
+    - `largest_variance`: E-optimality, the largest eigenvalue of C: the variance of the least certain pattern of
+      touches.
     - `localisation_error` (n,): Cramér-Rao bound of the root-mean-square distance of an unbiased estimate of the place
       of one touch of amplitude 1, metres.
     """
@@ -122,15 +125,15 @@ def layout_scores(
     noise: ArrayLike,
     temperature: float = TEMPERATURE,
 ) -> Scores:
-    """All scores of the layout of a model on a sheet, from one factorisation and the Jacobian.
+    """Compute all scores of the layout of a model on a sheet, from one factorisation and the Jacobian.
 
     Differentiable in the electrodes' positions, radii and contact impedances; for a batch of layouts of L electrodes
     (the protocol, the places, and so on are the same)::
 
         jax.vmap(lambda electrodes: layout_scores(model.with_electrodes(electrodes), …))(stacked_electrodes)
 
-    A protocol of all two-terminal pairs does not depend on the order of the electrodes, and spans all that they can
-    measure; one of neighbours depends on their numbers, which mean nothing once they move.
+    A protocol of all two-terminal pairs does not depend on the order of the electrodes, and spans all their
+    measurements; one of neighbours depends on their numbers, which lose their meaning once the electrodes move.
 
     **Arguments:** `conductivity` of the sheet, siemens; `noise`, standard deviation of the channels, (M,) or one for
     all, volts; `temperature` of the smooth minimum. Raises `ValueError` for a model that is not of a sheet and for
@@ -164,7 +167,7 @@ def _check(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise,
 
 @either_engine
 def _scores(jacobian, conductivity, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> Scores:
-    """From the Jacobian (M, m) of the voltages."""
+    """Compute the scores from the Jacobian (M, m) of the voltages."""
     xp = namespace(jacobian)
     weights, slopes = touches.weights(conductivity)
     changes = weights @ jacobian.T  # (n, M)
@@ -187,7 +190,8 @@ def _scores(jacobian, conductivity, touches: SheetTouches, prior: TouchPrior, no
 
 
 def _largest_eigenvalue(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
-    """Of a symmetric matrix without negative ones, by repeated squaring: products alone, which batch.
+    """Largest eigenvalue of a positive semidefinite matrix, by repeated squaring: matrix products only, which can be
+    batched.
 
     The derivative of a simple eigenvalue is that of vᵀ(matrix)v with its vector v held.
     """
@@ -202,7 +206,7 @@ def _largest_eigenvalue(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
 def _localisation_error(along_a: Float[Array, "n M"], along: Float[Array, "2 n M"]) -> Float[Array, " n"]:
     """√tr of the 2 × 2 block of the inverse of the information, by its Schur complement; infinite where singular."""
     xp, size = namespace(along_a), (along_a**2).sum(axis=1)
-    # What of the slopes an amplitude cannot explain; formed before it is squared, for the difference may be small.
+    # The part of the slopes orthogonal to the amplitude; formed before it is squared, for the difference may be small.
     x, y = along - ((along * along_a).sum(axis=2) / size)[..., None] * along_a
     xx, yy, xy = (x * x).sum(axis=1), (y * y).sum(axis=1), (x * y).sum(axis=1)
     determinant = xx * yy - xy**2

@@ -1,4 +1,4 @@
-"""Sensitivity maps: how much the voltages of a skin change where it is touched."""
+"""Sensitivity maps: the norm of the voltage changes of a skin by a touch at each position."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jeit_solvers.engines import either_engine, has_values, namespace
 
 @either_engine
 def uniformity(sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
-    """Mean Θ of n places over its root mean square: 1 where all are alike, less the more they differ."""
+    """Mean of Θ over n positions divided by its root mean square: 1 where all are equal, less the more they differ."""
     return sensitivity.mean(axis=-1) / namespace(sensitivity).sqrt((sensitivity**2).mean(axis=-1))
 
 
@@ -58,7 +58,7 @@ class SensitivityMap(eqx.Module):
     @property
     @either_engine
     def uniformity(self) -> Float[Array, ""]:
-        """Mean Θ over its root mean square: 1 where all places are alike, less the more they differ."""
+        """Mean Θ divided by its root mean square: 1 where all positions are equal, less the more they differ."""
         return uniformity(self.values)
 
     def blind_spot(self, level) -> Float[Array, ""]:
@@ -90,7 +90,7 @@ def sensitivity_map(
     contrast: float = CONTRAST,
     linear: bool = False,
 ) -> SensitivityMap:
-    """Touch a skin at every place of `grid` and see how its voltages change.
+    """Compute the sensitivity map of a skin from the voltage changes by touches at every position of `grid`.
 
     `indentation`: the unit deformation of Park et al. 2022 unless given. `thickness` (a sheet's) and `contrast` as in
     `touched_cells`; `linear` as in `touch_changes`. Raises `ValueError` as they do.

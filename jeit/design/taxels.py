@@ -1,4 +1,4 @@
-"""Virtual taxels: the parts of a skin whose touches look alike in the voltages (Park et al. 2022, text S4)."""
+"""Virtual taxels: regions of a skin whose touches cause similar voltage changes (Park et al. 2022, text S4)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 
 
 class Taxels(eqx.Module):
-    """The k virtual taxels of a layout, from touches at n places; make them with `find_taxels`.
+    """The k virtual taxels of a layout, from touches at n positions; create them with `find_taxels`.
 
     **Fields**: `places` (n, 2) metres, on a curved skin (n, 3); `cell_area` (n,), the part of the skin that each place
     stands for, m²; `clusters`, of the voltage changes of the touches, with their means; `similarity` (k, n), cosine of
@@ -34,13 +34,13 @@ class Taxels(eqx.Module):
 
     @property
     def labels(self) -> Int[Array, "*layouts n"]:
-        """The taxel whose cluster each place is in: every place is in one."""
+        """Index of the taxel whose cluster each position is in; every position is in one."""
         return self.clusters.labels
 
     @property
     @either_engine
     def members(self) -> Bool[Array, "*layouts k n"]:
-        """Which places each taxel covers. Taxels overlap, and some places may be in none."""
+        """Mask of the positions that each taxel covers. Taxels overlap, and some positions may be in none."""
         return self.similarity >= self.threshold
 
     @property
@@ -78,13 +78,13 @@ class Taxels(eqx.Module):
     @property
     @either_engine
     def coverage(self) -> Int[Array, "*layouts n"]:
-        """How many taxels cover each place."""
+        """Number of taxels that cover each position."""
         return self.members.sum(axis=-2)
 
     @property
     @either_engine
     def overlap(self) -> Float[Array, "*layouts"]:
-        """How many taxels cover a point of the skin on average: their areas' sum over the skin's."""
+        """Mean number of taxels that cover a point of the skin: the sum of their areas divided by the skin's."""
         return self.areas.sum(axis=-1) / self.cell_area.sum(axis=-1)
 
     @property
@@ -96,7 +96,7 @@ class Taxels(eqx.Module):
     @property
     @either_engine
     def two_point_discrimination(self) -> Float[Array, "*layouts"]:
-        """Distance from which on two touches can be told apart, metres: the mean of the `diameters`.
+        """Least distance at which two touches are distinguishable, metres: the mean of the `diameters`.
 
         The paper's estimate, "average diameter of the virtual taxels". Two touches nearer than that are within one
         taxel, on average: their changes differ in strength rather than in pattern.
@@ -115,12 +115,12 @@ def find_taxels(
     directions: bool = False,
     restarts: int = 10,
 ) -> Taxels:
-    """Virtual taxels from the voltage `changes` (n, m) of one and the same touch at `places` (n, 2), on a curved skin
-    (n, 3), metres.
+    """Find virtual taxels from the voltage `changes` (n, m) by the same touch at `places` (n, 2), on a curved skin (n,
+    3), metres.
 
-    The changes are parted into clusters by k-means; a taxel is where the cosine of the angle between its cluster's mean
-    and a place's change is at least `threshold`. Park et al. 2022, text S4: 48 × 48 places, 90 clusters, 0.7. Places
-    whose touches change nothing are in no taxel.
+    The changes are clustered by k-means; a taxel consists of the positions at which the cosine of the angle between its
+    cluster's mean and the position's change is at least `threshold`. Park et al. 2022, text S4: 48 × 48 places, 90
+    clusters, 0.7. Places whose touches change nothing are in no taxel.
 
     For a batch of layouts with changes (B, n, m), and `keys` from `jax.random.split(key, B)`::
 
@@ -129,11 +129,11 @@ def find_taxels(
     **Arguments:**
 
     - `cell_area`: of the part of the skin that each place stands for, m²; a number or (n,).
-    - `num_taxels`: k, how many clusters.
+    - `num_taxels`: k, the number of clusters.
     - `threshold`: a cosine, more than 0 and less than 1.
     - `key`: for k-means, from `jax.random.key`.
-    - `directions`: part the changes scaled to length 1. As they are, as in the paper, places of low sensitivity are
-      lumped together, since their changes are all small; scaled, each cluster is of places of like pattern.
+    - `directions`: whether to cluster the changes scaled to length 1. Unscaled, as in the paper, positions of low
+      sensitivity fall into one cluster, since their changes are all small; scaled, each cluster has a similar pattern.
     - `restarts`: of k-means, of which the best is kept.
 
     Raises `ValueError` for shapes that disagree, changes that are not finite or all zero, and lengths and areas whose
@@ -155,13 +155,13 @@ def _cosines(vectors: Float[Array, "k m"], unit: Float[Array, "n m"]) -> Float[A
 
 @either_engine
 def _unit(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """Scaled to length 1, and zero where they are zero, with a derivative that is zero there as well."""
+    """Scale vectors to length 1; zero vectors stay zero and have zero derivative."""
     xp, square = namespace(vectors), (vectors**2).sum(axis=1, keepdims=True)
     return xp.where(square > 0, vectors / xp.sqrt(xp.where(square > 0, square, 1)), 0)
 
 
 def _check(changes, places, cell_area, num_taxels, threshold) -> None:
-    """Raise `ValueError`; what is traced is judged by its shape alone."""
+    """Raise `ValueError` for invalid arguments; traced arrays are checked by shape only."""
     shape = np.shape(changes)
     in_space = np.shape(places) == (*shape[:1], 3) and not (has_values(places) and not np.ptp(places, axis=0).any())
     fits = np.shape(places) == (*shape[:1], 2) or in_space

@@ -1,7 +1,5 @@
 """Round electrodes: discs inside a sheet, on faces of a solid body, and on curved sheets."""
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import numpy as np

@@ -27,6 +27,7 @@ from jeit.mesh import Disk
         ("laplace", "'laplace'"),
         ("a" * 100, f"'{'a' * 58}…"),
         (None, "None"),
+        pytest.param(10**5000, "a number without end", id="10**5000"),
         (float("nan"), "nan"),
         (np.float64(0.5), "0.5"),
         (jnp.asarray(3), "3"),

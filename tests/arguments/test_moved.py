@@ -13,10 +13,10 @@ from jeit.arguments.moved import MOVED
 @pytest.mark.parametrize("old", MOVED)
 def test_an_old_name_is_found_and_warned_of(old):
     page, _, name = old.rpartition(".")
-    home, _, _ = MOVED[old].rpartition(".")
+    home, _, new = MOVED[old].rpartition(".")
     with pytest.warns(DeprecationWarning, match=f"^{re.escape(old)} is now {re.escape(MOVED[old])}; the old"):
         found = getattr(importlib.import_module(page), name)
-    assert found is getattr(importlib.import_module(home), name)
+    assert found is getattr(importlib.import_module(home), new)
 
 
 @pytest.mark.parametrize(

@@ -41,10 +41,10 @@ def test_progress_says_the_step_and_the_best_score(monkeypatch):
     said = []
     step = Steps(Console(file=io.StringIO(), force_terminal=True), quiet=False)
     with step:
-        step.tell("nothing is under way yet")
+        step.report("nothing is under way yet")
         step("optimise")
         monkeypatch.setattr(step._status, "update", said.append)
-        step.tell("step 3 of at most 60, best score 1.234")
+        step.report("step 3 of at most 60, best score 1.234")
     assert [str(one) for one in said] == ["optimise … step 3 of at most 60, best score 1.234"]
 
 

@@ -23,7 +23,7 @@ from jeit.data.described_body import ELECTRODES, SHAPES
 from jeit.design import read_described_skin
 from jeit.design.study import read_study
 from jeit.files.limits import faults_message
-from jeit.files.schema import Number, Table, validated
+from jeit.files.schema import Number, Table, Word, validated
 
 DESCRIPTIONS = {
     "disk": {
@@ -377,6 +377,18 @@ class Small(Table):
     what = "a list"
     microphones: list[One]
     strengths: list[float]
+
+
+class Named(Table):
+    """A table of one word."""
+
+    what = "a name"
+    word: Word
+
+
+def test_empty_text_is_refused():
+    with pytest.raises(ValueError, match=r"^a\.json: word is empty text"):
+        validated(Named, {"word": ""}, "a.json")
 
 
 def test_heavy_things_are_imported_where_they_are_used():

@@ -54,6 +54,19 @@ def test_a_stream_is_written_as_it_was_imaged(calibrated, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frames.csv", "frames.png", "images.npz"]
 
 
+def test_an_unchanged_frame_has_no_peak(calibrated, tmp_path):
+    flat = np.ones(calibrated.model.mesh.num_cells)
+    unchanged = FrameImage(0, flat, FrameStatus.UNCHANGED, "no change", np.ones(40, bool), 0.5, 0, 1e-3)
+    write_stream([unchanged, *images(calibrated, 1)], calibrated, tmp_path, film=None)
+    with (tmp_path / "frames.csv").open(encoding="utf-8") as file:
+        still, pressed = list(csv.DictReader(file))
+    assert still["status"] == "unchanged"
+    assert still["misfit"] == "0.5"
+    peaks = {name for name in still if name.startswith(("x", "y", "peak"))}
+    assert peaks
+    assert all(still[name] == "" and pressed[name] != "" for name in peaks)
+
+
 def test_one_frame_that_was_imaged_is_shown(calibrated, tmp_path, monkeypatch):
     """Though none of those that would be drawn was."""
     monkeypatch.setattr("jeit.report.stream.FILM_FRAMES", 4)

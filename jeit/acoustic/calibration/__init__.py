@@ -1,1 +1,1 @@
-"""From taps at known places to the decay model and noise of every microphone."""
+"""Calibration: the decay model and noise of every microphone, estimated from taps at known positions."""

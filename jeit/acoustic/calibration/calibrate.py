@@ -1,7 +1,7 @@
-"""Calibration: decay models and noise of every microphone, from taps at known places and of unknown strength.
+"""Calibration: fit the decay model and noise of every microphone to taps at known positions, of unknown strength.
 
-Robust least squares fit them. Of the decay models there are, that one is taken which locates best taps that it was not
-fitted to. Taps that no microphone agrees with are left out, and said.
+The models are fitted by robust least squares. Of the available decay models, the one that best locates taps outside its
+own fit is selected. Outlying taps are excluded from the fit and reported.
 """
 
 from __future__ import annotations
@@ -29,25 +29,26 @@ from jeit_solvers.engines import as_array, host, on_device
 
 # The decay model that predicts best.
 AUTO = "auto"
-# A model that locates left-out taps better by less than this part is no better than one of fewer parameters.
+# Relative improvement in the error of left-out taps below which the model with fewer parameters is preferred.
 _NO_BETTER = 0.05
-# A relative error that is more than exact places leave: 18 to 21 % on simulated skins, whose coupling is uneven.
+# Relative error above the 18 to 21 % found on simulated skins with uneven coupling and exact positions.
 _MUCH = 0.23
-# Where less than this part of the microphones that heard enough follow the model, and taps that were left out are
-# located no better than by a guess, the places given are not those.
+# The given positions are rejected where less than this share of the microphones with enough taps follow the model and
+# left-out taps are located no better than by a guess.
 _LEAST_SHARE = 0.5
 
 
 class CalibrationFit(eqx.Module):
-    """A `calibration`, and the T taps it comes from.
+    """A `calibration` and the T taps that it was fitted to.
 
-    - `distance`: (T, M) metres; `power`: (T, M) intensities above the floor; `usable`: (T, M) which were fitted.
-    - `strength`: (T,) of the taps; NaN where none was heard, or the tap left out.
-    - `outlier`: (T,), taps left out because no single source at the place given explains them.
+    - `distance`: (T, M) metres; `power`: (T, M) intensities above the floor; `usable`: (T, M), True where fitted.
+    - `strength`: (T,) of the taps; NaN where no microphone received the tap, or the tap was excluded.
+    - `outlier`: (T,), taps excluded because no single source at the given position explains them.
     - `explained`: (M,) share of the variance of a microphone's levels that its model explains.
-    - `shared`: (M,) microphones whose own taps do not say how their response falls off: it is that of the others.
-    - `left_out`: names of the decay models that were fitted, the chosen one first, each with the median distance, m, of
-      taps it was not fitted to from where it locates them; infinite where it located none.
+    - `shared`: (M,) microphones whose own taps do not determine the decay of their response, which is then taken from
+      the other microphones.
+    - `left_out`: names of the fitted decay models, the chosen one first, each with its median localisation error, m,
+      for taps left out of the fit; infinite where it located none.
     """
 
     calibration: Calibration
@@ -62,13 +63,13 @@ class CalibrationFit(eqx.Module):
 
     @property
     def error(self) -> float:
-        """Relative error of an intensity that the decay models predict, in the median of the usable microphones."""
+        """Relative error of the predicted intensities: the median over the usable microphones."""
         calibration = self.calibration
         return float(np.median(np.asarray(calibration.microphone_array.noise.relative)[calibration.usable]))
 
     @property
     def evidence(self) -> str:
-        """How well the decay model locates taps that it was not fitted to, beside the others, in words."""
+        """A sentence that compares the decay models by how well they locate left-out taps."""
         if not self.left_out:
             return ""
         mine, *others = (_millimetres(off) for _, off in self.left_out)
@@ -78,7 +79,7 @@ class CalibrationFit(eqx.Module):
 
     @property
     def note(self) -> str:
-        """What a large error means, in a sentence; empty where it is not large."""
+        """A sentence that explains a large error; empty where the error is not large."""
         if self.error <= _MUCH:
             return ""
         return (
@@ -102,14 +103,15 @@ def calibrate_microphones(
 ) -> CalibrationFit:
     """Fit the decay model of every microphone to `taps`.
 
-    `decay`: "inverse-square", a / (r² + b), the paper's; "exponential", a exp(−r / l); "attenuated",
-    a exp(−r / l) / (r² + b); or "auto", that of these which best locates taps that it was not fitted to (by the median
-    distance, four parts of the places left out in turn). `intensity`: band and window, for taps that come as samples.
-    `progress` is called with the name of each step as it begins.
+    `decay`: "inverse-square", a / (r² + b), the paper's; "exponential", a exp(−r / l); "attenuated", a exp(−r / l) /
+    (r² + b); or "auto", the one of these that best locates left-out taps (median distance in four-fold cross-validation
+    over the positions). `intensity`: band and window, for taps given as samples. `progress` is called with the name of
+    each step as it begins.
 
-    What `jeit calibrate-microphones` does; `jeit.acoustic.reports.write_calibration` writes what it writes. Raises
-    `ValueError` where fewer than three microphones can be calibrated, where most do not hear what is said to be tapped,
-    for another `decay`, for `intensity` where the taps are intensities, and for things of another kind.
+    The command `jeit calibrate-microphones` calls this function; `jeit.acoustic.reports.write_calibration` writes its
+    output files. Raises `ValueError` where fewer than three microphones can be calibrated, where most microphones do
+    not agree with the given positions, for another `decay`, for `intensity` where the taps are intensities, and for
+    arguments of the wrong type.
     """
     every = isinstance(decay, str) and decay == AUTO
     kinds = () if every else (find_decay(decay),)
@@ -118,11 +120,11 @@ def calibrate_microphones(
 
 
 def choose(fits: dict[str, CalibrationFit], refused: dict[str, str]) -> CalibrationFit:
-    """Of some decay models' fits, that which locates left-out taps best; the simpler one of two that do so as well.
-    Raises `ValueError`, and says why, where there is none."""
+    """Select the fit that locates left-out taps best; of two that are equally good, the simpler one. Raises
+    `ValueError` with the reasons where there is no fit."""
     if not fits:
         raise ValueError(next(iter(refused.values())))
-    # Simpler models come first: they are listed by the number of their parameters.
+    # Models are listed by their number of parameters, the simplest first.
     least = min(fit.left_out[0][1] for fit in fits.values())
     return next(fit for fit in fits.values() if not fit.left_out[0][1] > (1 + _NO_BETTER) * least)
 
@@ -135,10 +137,11 @@ def calibrate_each(
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, CalibrationFit], dict[str, str]]:
-    """The fit of each of some decay models, all unless given, by its name; and why others are refused.
+    """Fit each of the given decay models (default: all). Returns the fits by name, and the reasons for models without a
+    fit.
 
     `progress` is called with the name of each step as it begins. Raises `ValueError` as `calibrate_microphones` does,
-    but for what no model fits.
+    except where no model fits.
     """
     check_kind("taps", taps, Taps, "Taps, as of read_taps(path)")
     check_settings("intensity", intensity)
@@ -147,24 +150,24 @@ def calibrate_each(
     report = progress or (lambda step: None)
     if taps.samples is not None:
         report("measure intensities")
-    heard = _listen(taps, intensity)
+    readings = _read(taps, intensity)
     found, refused = {}, {}
     for kind in decays or DECAYS.values():
         report(f"fit {kind.name}")
         try:
-            found[kind.name] = _fit(kind, heard)
+            found[kind.name] = _fit(kind, readings)
         except _NoFitError as error:
             refused[kind.name] = str(error)
     left_out = {name: fitted.left.median for name, fitted in found.items()} | dict.fromkeys(refused, np.inf)
     fits = {}
     for name, fitted in found.items():
         others = tuple(item for item in left_out.items() if item[0] != name)
-        fits[name] = _calibration_fit(taps, heard, fitted, ((name, left_out[name]), *others))
+        fits[name] = _calibration_fit(taps, readings, fitted, ((name, left_out[name]), *others))
     return fits, refused
 
 
-class _Heard(NamedTuple):
-    """What the taps of a calibration are, and what is known of the noise."""
+class _Readings(NamedTuple):
+    """Positions and powers of the taps of a calibration, and the noise model."""
 
     microphones: Float[np.ndarray, "M d"]
     surface: AbstractSurface
@@ -178,8 +181,8 @@ class _Heard(NamedTuple):
 
 
 class _Fitted(NamedTuple):
-    """A fit, which taps it `tried`, which microphones are `good` and why others are not, what each model explains, and
-    how taps are located that are left out."""
+    """A fit, the readings `tried`, the `good` microphones, the reasons why others are not, the share of variance that
+    each model explains, and the localisation of left-out taps."""
 
     fit: TapFit
     tried: Bool[np.ndarray, "T M"]
@@ -190,10 +193,10 @@ class _Fitted(NamedTuple):
 
 
 class _NoFitError(Exception):
-    """A decay model that these taps cannot be fitted by, and why."""
+    """Raised where a decay model cannot be fitted to the taps; the message gives the reason."""
 
 
-def _listen(taps: Taps, intensity: IntensitySettings | None) -> _Heard:
+def _read(taps: Taps, intensity: IntensitySettings | None) -> _Readings:
     surface = make_surface(taps.outline, taps.positions)
     settings = None
     if taps.samples is None:
@@ -207,19 +210,19 @@ def _listen(taps: Taps, intensity: IntensitySettings | None) -> _Heard:
     distance = np.linalg.norm(taps.positions[:, None] - taps.microphones, axis=-1)
     known = np.where(usable, power, np.nan).T
     noisy = noise, settings is not None, tuple(faults), settings
-    return _Heard(taps.microphones, surface, taps.positions, distance, known, *noisy)
+    return _Readings(taps.microphones, surface, taps.positions, distance, known, *noisy)
 
 
-def _fit(kind: type[AbstractDecay], heard: _Heard) -> _Fitted:
-    """Raises `_NoFitError` where that says nothing of places."""
-    enough, why = check_heard(kind, heard.distance.T, heard.power, heard.faults)
+def _fit(kind: type[AbstractDecay], readings: _Readings) -> _Fitted:
+    """Fit one decay model. Raises `_NoFitError` where the fit does not determine positions."""
+    enough, why = check_heard(kind, readings.distance.T, readings.power, readings.faults)
     if why:
         raise _NoFitError(why)
-    squared = heard.distance.T**2
-    fit = fit_taps(kind, heard.microphones, squared, heard.power, heard.noise, heard.known_noise)
+    squared = readings.distance.T**2
+    fit = fit_taps(kind, readings.microphones, squared, readings.power, readings.noise, readings.known_noise)
     tried = fit.use.T
-    fit, good, reasons, explained = leave_out(fit, heard.faults)
-    left = locate_left_out(fit, heard.microphones, heard.surface, heard.places)
+    fit, good, reasons, explained = leave_out(fit, readings.faults)
+    left = locate_left_out(fit, readings.microphones, readings.surface, readings.places)
     if good.sum() < 3 or (good.sum() < _LEAST_SHARE * enough.sum() and not left.located):
         raise _NoFitError(
             f"only {good.sum()} of the {enough.sum()} microphones that heard the taps follow a decay model, and three "
@@ -229,7 +232,7 @@ def _fit(kind: type[AbstractDecay], heard: _Heard) -> _Fitted:
     return _Fitted(fit, tried, good, reasons, explained, left)
 
 
-def _calibration_fit(taps: Taps, heard: _Heard, fitted: _Fitted, notes) -> CalibrationFit:
+def _calibration_fit(taps: Taps, readings: _Readings, fitted: _Fitted, notes) -> CalibrationFit:
     fit, good = fitted.fit, fitted.good
     # The factor between parameters and strengths, as `Calibration` has it.
     gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.values)).gain))[good].mean()
@@ -237,22 +240,22 @@ def _calibration_fit(taps: Taps, heard: _Heard, fitted: _Fitted, notes) -> Calib
     shared, errors = fit.shared & good, standard_errors(fit)
     errors[1:, shared] = np.nan
     decay = on_device(fit.kind.from_logarithms(host.concatenate([fit.values[:1] - gain, fit.values[1:]])))
-    loud = (fit.use & (heard.power > 3 * fit.noise.deviation[:, None])).any(axis=0)
+    loud = (fit.use & (readings.power > 3 * fit.noise.deviation[:, None])).any(axis=0)
     calibration = Calibration(
-        MicrophoneArray(as_array(taps.microphones), heard.surface, decay, on_device(fit.noise)),
+        MicrophoneArray(as_array(taps.microphones), readings.surface, decay, on_device(fit.noise)),
         good,
         fitted.reasons,
         errors,
-        heard.settings,
+        readings.settings,
         taps.name,
         _range(strength[loud]),
         fitted.left.widening,
     )
     rest = strength, fit.outlier, fitted.explained, shared, notes
-    return CalibrationFit(calibration, heard.distance, heard.power.T, fitted.tried, *rest)
+    return CalibrationFit(calibration, readings.distance, readings.power.T, fitted.tried, *rest)
 
 
 def _range(strength: np.ndarray) -> tuple[float, float] | None:
-    """Of the weakest and the strongest tap."""
+    """Strengths of the weakest and the strongest tap."""
     known = strength[strength > 0]
     return (float(known.min()), float(known.max())) if known.size else None

@@ -1,4 +1,4 @@
-"""What is known of an array of microphones after its calibration, and the file that keeps it."""
+"""`Calibration`: decay models and noise of an array of microphones, and its JSON file."""
 
 from __future__ import annotations
 
@@ -30,23 +30,24 @@ _UNITS = {"length": "m", "intensity": "square of the samples' unit"}
 _SCALE = "strength 1 is the source whose intensity upon a microphone has geometric mean 1 over the usable ones"
 # The arrays of a curved surface.
 _CURVE = ("origin", "axes", "normal", "knots", "weights", "affine")
-# Bytes of a file: some hundred for each microphone.
+# Largest file in bytes; a microphone takes some hundred.
 _LARGEST = 2**24
 
 
 class Calibration(eqx.Module):
-    """Microphones, their surface, decay models and noise, and which of them are of use.
+    """A calibrated array: microphones, surface, decay models, noise, and which microphones are usable.
 
     - `microphone_array`: microphones (M, d) in metres, surface, decay, noise.
-    - `usable`: (M,), and `reasons`, why a microphone is not ("" for the others).
-    - `standard_errors`: (K, M), relative, of the decay model's K parameters.
-    - `intensity`: band and window with which the taps' samples were read; None where intensities were given.
+    - `usable`: (M,); `reasons`: why a microphone is not usable ("" for the others).
+    - `standard_errors`: (K, M) relative standard errors of the decay model's K parameters.
+    - `intensity`: band and window used for the taps' samples; None where intensities were given.
     - `name`: of the taps.
     - `strengths`: of the weakest and the strongest tap; None where not known.
-    - `widening`: by which `locate` multiplies covariances, so that ellipses hold taps that were left out of the fit.
+    - `widening`: factor by which `locate` multiplies covariances, so that the ellipses contain taps left out of the
+      fit.
 
-    The data fix parameters and strengths but for a factor. It is chosen so that the geometric mean of f_i(0) over the
-    usable microphones is 1: a source's strength is the intensity that a typical microphone right under it would read.
+    The data determine parameters and strengths up to a common factor. It is chosen so that the geometric mean of f_i(0)
+    over the usable microphones is 1: a source's strength is the intensity at a typical microphone directly under it.
     """
 
     microphone_array: MicrophoneArray
@@ -60,19 +61,19 @@ class Calibration(eqx.Module):
 
     @property
     def num_microphones(self) -> int:
-        """M."""
+        """Number of microphones, M."""
         return len(self.microphone_array.microphones)
 
     def save(self, path: str | Path) -> None:
-        """Write a JSON file, with its version and units."""
+        """Write the calibration to a JSON file, with format version and units."""
         text = json.dumps(self._content(), indent=1, ensure_ascii=False, allow_nan=False)
         with written_whole(path) as file:
             file.write(f"{text}\n".encode())
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
-        """Read what `save` wrote. Raises `ValueError` for another format, version or unit, and for values that no
-        calibration has; `OSError` where there is no such file."""
+        """Read a file written by `save`. Raises `ValueError` for another format, version or unit, and for invalid
+        values; `OSError` where there is no such file."""
         # pydantic takes longer to import than most of what jeit does with a calibration.
         from jeit.acoustic.calibration.calibration_tables import CalibrationTable
         from jeit.files.limits import faults_message

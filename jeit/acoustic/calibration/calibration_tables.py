@@ -1,4 +1,4 @@
-"""The tables of a calibration's file, key by key: what each may hold, from where to where, in which unit."""
+"""Tables of a calibration file: type, range and unit of every key."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Loop = Annotated[np.ndarray, Numbers(((3, _MOST_VERTICES), (2, 2)), -1e6, 1e6, "
 
 
 class UnitsTable(Table):
-    """Of the units of all that is in the file."""
+    """Units of the values in the file."""
 
     what = "units"
     length: Literal["m"]
@@ -28,7 +28,7 @@ class UnitsTable(Table):
 
 
 class CurveTable(Table):
-    """Of how a surface curves above its plane: see `CurvedSurface`."""
+    """Height of a curved surface above its plane; see `CurvedSurface`."""
 
     what = "a curve"
     origin: Vector
@@ -40,7 +40,7 @@ class CurveTable(Table):
 
 
 class SurfaceTable(Table):
-    """Of the surface, metres."""
+    """The surface, in metres."""
 
     what = "a surface"
     outline: Loop
@@ -49,7 +49,7 @@ class SurfaceTable(Table):
 
 
 class IntensityTable(Table):
-    """Of how samples were read: see `IntensitySettings`."""
+    """Band and window used for the samples; see `IntensitySettings`."""
 
     what = "intensity"
     low: Annotated[float, Number(0, 1e9, "Hz")] = 50.0
@@ -59,7 +59,7 @@ class IntensityTable(Table):
 
 
 class ErrorsTable(Table):
-    """Of relative standard errors, of each parameter of the decay model; null where not known."""
+    """Relative standard error of each parameter of the decay model; null where unknown."""
 
     what = "relative standard errors"
     a: NotNegative | None = None
@@ -68,7 +68,7 @@ class ErrorsTable(Table):
 
 
 class MicrophoneTable(Table):
-    """Of a microphone: place, parameters of the decay model, noise."""
+    """One microphone: position, parameters of the decay model, noise."""
 
     what = "a microphone"
     position: Annotated[np.ndarray, Numbers(((2, 3),), -1e6, 1e6, "m")]
@@ -85,7 +85,7 @@ class MicrophoneTable(Table):
 
 
 class CalibrationTable(Table):
-    """Of a whole calibration."""
+    """A complete calibration file."""
 
     what = "a calibration"
     format: Literal["jeit microphone calibration"]

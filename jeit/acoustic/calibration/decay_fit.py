@@ -1,10 +1,10 @@
-"""Decay models fitted to taps of unknown strength: the least-squares problems of a calibration.
+"""Least-squares problems of a calibration: decay models fitted to taps of unknown strength.
 
-Microphones are the first axis, taps the last. Each microphone alone, the taps' strengths given, is a problem of K
-unknowns; all of them together with the strengths one of K M + T, in which the strengths are eliminated (a Schur
-complement): what is left is no larger than the array. Microphones of an array are of one kind, mostly: all parameters
-but the first scatter about what the array has in common, by a `spread` that costs; what is common is eliminated too, as
-the mean that costs least. All of it is NumPy's, for a calibration is made once.
+Microphones are the first axis, taps the last. With the taps' strengths given, each microphone is a problem of K
+unknowns. All microphones together with the strengths have K M + T unknowns; the strengths are eliminated by a Schur
+complement, which leaves a system of K M unknowns. Microphones of an array are mostly of one kind: all parameters but
+the first are penalised for deviating from the array's common value, relative to a `spread`. The common value is
+eliminated too, as the mean that minimises the penalty. The code uses NumPy, since a calibration is made once.
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ from jeit_solvers import Descent, minimise_small, solve_definite
 from jeit_solvers.engines import host, slopes
 
 _MOST_STEPS = 100
-# A factor of e to this power is the most that a strength changes by in a step.
+# Largest change of the logarithm of a strength in a step.
 _LONGEST_STEP = 3.0
-# Rounds in which parameters are put to their bounds and taken back.
+# Rounds in which parameters are fixed at their bounds and released again.
 _MOST_HELD = 6
-# In units of the weights, which are inverse variances: what is left once the data are met to rounding.
+# Smallest residual, in units of the weights (inverse variances), once the data are fitted to rounding error.
 _SOLVER = Descent(rtol=1e-10, atol=1e-20, damping=1e-2, history=1)
 
 
 class DecayProblem(NamedTuple):
     """Levels y (M, T) at squared distances r² (m²), with weights (0: not used), and the floors N (M,).
 
-    `spread` (K,): by how much the logarithms of a parameter scatter over the microphones; infinite: by any amount.
+    `spread` (K,): standard deviation of the logarithm of each parameter over the microphones; infinite for no
+    constraint.
     """
 
     level: Float[np.ndarray, "M T"]
@@ -41,19 +42,19 @@ class DecayProblem(NamedTuple):
     spread: Float[np.ndarray, " K"]
 
     def log_response(self, logarithms: Any) -> Float[np.ndarray, "M T"]:
-        """log f of models of these logarithms, (K, M)."""
+        """log f of the models whose parameters have these logarithms, (K, M)."""
         return np.asarray(self.decay.from_logarithms(logarithms).log_response(host.asarray(self.squared_distance)))
 
     def expected(
         self, logarithms: Float[np.ndarray, "K M"], strength: Float[np.ndarray, " T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"]]:
-        """log(e^s f + N), and its slope in s or log f."""
+        """log(e^s f + N), and its derivative with respect to s or log f."""
         return self.levels(strength + self.log_response(logarithms))
 
     def levels(
         self, log_received: Float[np.ndarray, "M T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"]]:
-        """log(S + N) of log S, and its slope."""
+        """log(S + N) from log S, and its derivative."""
         received = np.exp(log_received)
         total = received + self.floor[:, None]
         return np.log(total), received / total
@@ -61,20 +62,20 @@ class DecayProblem(NamedTuple):
     def expand(
         self, logarithms: Float[np.ndarray, "K M"], strength: Float[np.ndarray, " T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"], Float[np.ndarray, "K M T"]]:
-        """y − m, and 0 for what has no weight; the slopes of m in s, and in the parameters."""
+        """Residual y − m, 0 where the weight is 0, and the derivatives of m with respect to s and the parameters."""
         log_response, along = slopes(self.log_response, logarithms)
         mean, share = self.levels(strength + log_response)
         return self.residual(mean), share, share * np.stack(along)
 
     def residual(self, mean: Float[np.ndarray, "M T"]) -> Float[np.ndarray, "M T"]:
-        """y − m, and 0 for what has no weight."""
+        """Residual y − m; 0 where the weight is 0."""
         return np.where(self.weight > 0, self.level - mean, 0.0)
 
 
 def fit_strengths(
     problem: DecayProblem, logarithms: Float[np.ndarray, "K M"], start: Float[np.ndarray, " T"]
 ) -> Float[np.ndarray, " T"]:
-    """The strengths of all taps, the microphones' models given."""
+    """Fit the strengths of all taps for given models of the microphones."""
 
     def expand(unknown, taps):
         level, log_response, weight = taps
@@ -103,7 +104,7 @@ def fit_together(
     strength: Float[np.ndarray, " T"],
     free: Bool[np.ndarray, "K M"],
 ) -> tuple[Float[np.ndarray, "K M"], Float[np.ndarray, " T"]]:
-    """The parameters that are `free`, and the strengths of all taps, at once."""
+    """Fit the `free` parameters and the strengths of all taps jointly."""
 
     def unpack(unknowns):
         return unknowns[: start.size].reshape(start.shape), unknowns[start.size :]
@@ -135,8 +136,8 @@ def fit_within(
     heard: Bool[np.ndarray, " M"],
     bounds: tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]],
 ) -> tuple[Float[np.ndarray, "K M"], Float[np.ndarray, " T"], Bool[np.ndarray, "K M"]]:
-    """The same, between `bounds` on the logarithms, of the microphones that `heard` something; and which parameters are
-    held at a bound. One comes back from there where the cost falls inwards."""
+    """As `fit_together`, with `bounds` on the logarithms, for the microphones in the mask `heard` (those with usable
+    readings). Also returns which parameters are held at a bound; one is released where the cost decreases inwards."""
     lower, upper = (bound[:, None] for bound in bounds)
     held = ((start <= lower) | (start >= upper)) & heard
     values = start
@@ -156,15 +157,16 @@ def fit_within(
 def log_covariance(
     problem: DecayProblem, logarithms: Float[np.ndarray, "K M"], strength: Float[np.ndarray, " T"], free, scale
 ) -> np.ndarray:
-    """Covariance (K M, K M) of the logarithms of parameters, parameter by parameter, where weights are inverse
-    variances and the overall scale is fixed by `scale` · logarithms = constant, (K M,); NaN where not `free` (K, M)."""
+    """Covariance (K M, K M) of the logarithms of the parameters, parameter by parameter. Weights are inverse variances;
+    the overall scale is fixed by `scale` · logarithms = constant, (K M,). NaN where not `free` (K, M)."""
     schur = _schur(_normal_equations(problem, logarithms, strength, free)[1], 0.0)
     number, count = logarithms.shape
     kept = np.asarray(free).ravel()
     shift = np.concatenate([np.ones(count), np.zeros((number - 1) * count)])[kept]
     normal = np.asarray(scale)[kept]
     result = np.full((number * count, number * count), np.nan)
-    # The direction that data cannot see (all responses up, all strengths down) is projected along onto the convention.
+    # The direction that the data do not determine (all responses up, all strengths down) is projected out by the
+    # convention.
     inverse = np.linalg.pinv(schur[np.ix_(kept, kept)], rcond=1e-12, hermitian=True)
     project = np.eye(len(shift)) - np.outer(shift, normal) / (normal @ shift)
     result[np.ix_(kept, kept)] = project @ inverse @ project.T
@@ -172,8 +174,8 @@ def log_covariance(
 
 
 class _System(NamedTuple):
-    """Normal equations: microphones' blocks (M, K, K), coupling (K, M, T) to the strengths, their diagonal (T,); ties
-    (K, M, M) between microphones."""
+    """Normal equations: blocks (M, K, K) of the microphones, coupling (K, M, T) to the strengths, diagonal (T,) of the
+    strengths, and ties (K, M, M) between microphones."""
 
     matrix: np.ndarray
     ties: np.ndarray
@@ -204,16 +206,20 @@ def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[n
 
 
 def _ties(problem: DecayProblem) -> Float[np.ndarray, "K M M"]:
-    """The matrices of Σ_m (v_m − v̄)² / spread², v̄ the mean over microphones that heard something."""
-    heard = (problem.weight > 0).any(axis=1).astype(float)
-    return (np.diag(heard) - np.outer(heard, heard) / max(heard.sum(), 1.0)) / problem.spread[:, None, None] ** 2
+    """Matrices of the quadratic forms Σ_m (v_m − v̄)² / spread², v̄ the mean over microphones with any weighted
+    reading."""
+    received = (problem.weight > 0).any(axis=1).astype(float)
+    return (np.diag(received) - np.outer(received, received) / max(received.sum(), 1.0)) / problem.spread[
+        :, None, None
+    ] ** 2
 
 
 def _step(system: _System, damping):
     number, count = system.gradient.shape
     diagonal = _tap_diagonal(system, damping)
     schur = _schur(system, damping)
-    # What data cannot see, all responses up and all strengths down, is held; so are parameters that are not free.
+    # The undetermined direction (all responses up, all strengths down) is held fixed; so are parameters that are not
+    # free.
     shift = np.concatenate([np.where(system.free[0], 1.0, 0.0), np.zeros((number - 1) * count)])
     typical = np.trace(schur) / schur.shape[0] + 1e-300
     held = ~system.free.ravel()

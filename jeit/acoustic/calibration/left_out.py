@@ -1,7 +1,7 @@
-"""How well taps are located that a fit has not seen: the evidence by which one decay model is preferred to another.
+"""Cross-validation of decay models: localisation errors of taps left out of the fit, by which models are compared.
 
-The places that were tapped are dealt to a few parts; where the taps of each part were is told by models fitted to the
-taps of the others. Taps at one place stay together, or the model would have seen them.
+The tapped positions are divided into a few folds; the taps of each fold are located by models fitted to the taps of the
+other folds. Taps at one position stay in one fold, so that the model has not been fitted to that position.
 """
 
 from __future__ import annotations
@@ -25,16 +25,18 @@ from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import as_array, at_once, host, namespace, on_device
 
 _PARTS = 4
-# Relative error with which rasters are screened, at least; steps of a descent.
+# Least relative error assumed in screening rasters; steps of a descent.
 _SCREENED_AT, _MOST_STEPS = 0.2, 30
-# Taps that must have been located for their errors to widen anything; χ² of two degrees that 90 % stay under.
+# Located taps required before their errors widen covariances; 90 % quantile of χ² with two degrees of freedom.
 _FEWEST, _MOST_OF_THEM = 10, 0.9
 _CHI_SQUARE = -2 * math.log(1 - _MOST_OF_THEM)
 
 
 class LeftOutTaps(NamedTuple):
-    """Of T taps, NaN for those that were not heard or are outliers: `off` (T,) metres from where they were said to be;
-    `square` (T,), that in units of the covariance, squared. `guess`: how far off the middle of all places is, median.
+    """Localisation errors of T left-out taps; NaN for taps that were not detected or are outliers.
+
+    `off` (T,): distance from the given position, metres; `square` (T,): squared error in units of the covariance;
+    `guess`: median distance of the positions from their mean.
     """
 
     off: Float[np.ndarray, " T"]
@@ -43,14 +45,14 @@ class LeftOutTaps(NamedTuple):
 
     @property
     def median(self) -> float:
-        """Half of them are located better, metres; infinite where none is."""
+        """Median localisation error, metres; infinite where no tap is located."""
         known = self.off[np.isfinite(self.off)]
         return float(np.median(known)) if known.size else np.inf
 
     @property
     def widening(self) -> float:
-        """What covariances must be multiplied by for ellipses to hold the taps, but for the tenth that is farthest off;
-        1 at least, for what errors of models look like from here may look worse from elsewhere."""
+        """Factor on the covariances for which the ellipses contain 90 % of the taps; at least 1, since errors of the
+        models may be larger elsewhere."""
         known = self.square[np.isfinite(self.square)]
         if known.size < _FEWEST:
             return 1.0
@@ -58,29 +60,29 @@ class LeftOutTaps(NamedTuple):
 
     @property
     def located(self) -> bool:
-        """Whether places are told any better than by the middle of them all: twice as well."""
+        """Whether the median error is at most half that of guessing the mean of all positions."""
         return self.median < 0.5 * self.guess
 
 
 def locate_left_out(
     fit: TapFit, microphones: Float[np.ndarray, "M d"], surface: AbstractSurface, places: Float[np.ndarray, "T d"]
 ) -> LeftOutTaps:
-    """Every tap, by models that were fitted to taps at other places, with the noise of the whole fit."""
+    """Locate every tap with models fitted to taps at other positions, and the noise of the whole fit."""
     part = _deal(places)
     off, square = np.full((2, len(places)), np.nan)
     coarse = Localiser.create(_array(fit, fit.values, microphones, surface)).coarse
     for k in range(int(part.max()) + 1):
         out = (part == k) & ~fit.outlier
         kept = replace(fit, outlier=fit.outlier | (part == k))
-        heard = np.asarray(kept.use.any(axis=1))
-        use = fit.usable[:, out] & heard[:, None]
+        received = np.asarray(kept.use.any(axis=1))
+        use = fit.usable[:, out] & received[:, None]
         if not out.any() or not (use.sum(axis=0) >= 3).any():
             continue
-        values, _, _ = fit_within(kept.problem(), fit.values, fit.strength, heard, fit.bounds)
+        values, _, _ = fit_within(kept.problem(), fit.values, fit.strength, received, fit.bounds)
         array = _array(fit, values, microphones, surface)
         found, covariance = at_once(_most_likely, array, coarse, np.nan_to_num(fit.power[:, out]), use)
         offset = found - places[out]
-        # On a curved surface a covariance is flat.
+        # On a curved surface the covariance is singular.
         known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(offset).all(axis=1) & (use.sum(axis=0) >= 3)
         inverse = np.linalg.pinv(np.where(known[:, None, None], covariance, 0.0), hermitian=True, rcond=1e-9)
         off[out] = np.where(known, np.linalg.norm(offset, axis=1), np.nan)
@@ -95,8 +97,8 @@ def _array(fit: TapFit, values, microphones, surface: AbstractSurface) -> Microp
 
 
 def _most_likely(array: MicrophoneArray, coarse: Pixels, power, use):
-    """Places (F, d) and covariances (F, d, d) by Fisher's scoring from the best two valleys of a raster, within the
-    outline's box: what a `Localiser` finds, but for the last digits and for outlines that are no rectangles."""
+    """Positions (F, d) and covariances (F, d, d) by Fisher scoring from the best two valleys of a raster, within the
+    outline's bounding box: the result of a `Localiser`, except for the last digits and for non-rectangular outlines."""
     xp = namespace(array, power)
     rough = eqx.tree_at(lambda one: one.noise.relative, array, xp.maximum(array.noise.relative, _SCREENED_AT))
     maps = Likelihood.create(power, use, rough).screen(Likelihood.features(rough, coarse.chart))
@@ -122,7 +124,7 @@ def _most_likely(array: MicrophoneArray, coarse: Pixels, power, use):
 
 
 def _deal(places: Float[np.ndarray, "T d"]) -> Int[np.ndarray, " T"]:
-    """Which part each tap is in: places in a fixed random order, one part after the other."""
+    """Fold of each tap: positions are assigned to the folds in turn, in a fixed random order."""
     step = 1e-4 * max(float(np.ptp(places, axis=0).max()), 1e-300)
     _, which = np.unique(np.round(places / step), axis=0, return_inverse=True)
     order = np.random.default_rng(0).permutation(which.max() + 1)

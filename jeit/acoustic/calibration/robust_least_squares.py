@@ -1,8 +1,8 @@
-"""Iteratively reweighted least squares: decay models of all microphones, strengths of all taps, the noise of both.
+"""Iteratively reweighted least squares: fit decay models of all microphones, strengths of all taps, and the noise.
 
-First as if all microphones' responses had the same shape, which nearly any taps determine; then each with its own, as
-far as its taps say and as shapes of the array scatter. Between, what the residuals say of the noise, and new weights,
-until nothing changes. Every step takes a `TapFit` and returns another.
+First all microphones share one shape of the response, which nearly any taps determine. Then each has its own shape, as
+far as its taps determine it, with the scatter of the shapes over the array as the prior. Noise and weights are
+re-estimated from the residuals in between, until convergence. Every step takes a `TapFit` and returns another.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise, below_nothing
 from jeit_solvers.engines import host, on_host, slopes
 
 _ALTERNATIONS, _REWEIGHTINGS = 6, 12
-# Student's t with so many degrees of freedom weighs residuals.
+# Degrees of freedom of Student's t, which weights the residuals.
 _TAIL = 5.0
-# A tap whose mean square residual is so many times the median tap's is left out.
+# Ratio of a tap's mean square residual to the median tap's above which the tap is excluded.
 _OUTLIER = 12.0
-# By how much logarithms of shapes scatter over an array: as if all were alike; at first; at least and at most.
+# Scatter of the logarithms of shapes over an array: for identical microphones; initially; least and greatest.
 _ALIKE, _FIRST, _LEAST, _MOST = 0.03, 0.5, 0.1, 1.0
-# A shape that a microphone's own taps tell no better than to this relative error is that of the others.
+# A microphone whose own taps determine the shape only to this relative error or worse takes that of the others.
 _LOOSE = 0.5
 
 
 class TapFit(eqx.Module):
-    """Where the fit of M microphones to T taps stands.
+    """State of the fit of M microphones to T taps.
 
     - `squared`: squared distances (M, T), m²; `power`: (M, T) above the floor, NaN where there is none to use.
     - `noise`; `known_noise`: whether its floor was measured.
     - `values`: logarithms of the decay model's parameters, (K, M), those `held` (K, M) at their `bounds`, two of (K,);
       `spread`: (K,) by how much each scatters over the array. `strength`: (T,) logarithms.
-    - `weight`: (M, T) inverse variances of levels, less for what is far off.
-    - `outlier`: (T,) taps left out; `dropped`: (M,) microphones left out.
+    - `weight`: (M, T) inverse variances of levels, reduced for large residuals.
+    - `outlier`: (T,) excluded taps; `dropped`: (M,) excluded microphones.
     """
 
     kind: type[AbstractDecay] = eqx.field(static=True)
@@ -58,31 +58,31 @@ class TapFit(eqx.Module):
 
     @property
     def usable(self) -> Bool[np.ndarray, "M T"]:
-        """Readings whose level is a number, of microphones that are not left out."""
+        """Readings with a finite level, of microphones that are not excluded."""
         above = np.nan_to_num(self.power, nan=-np.inf) + self.noise.floor[:, None] > 0
         return above & ~self.dropped[:, None]
 
     @property
     def use(self) -> Bool[np.ndarray, "M T"]:
-        """Readings that are fitted."""
+        """Readings used in the fit."""
         return self.usable & ~self.outlier
 
     @property
     def heard(self) -> Bool[np.ndarray, " T"]:
-        """Taps that any microphone has heard."""
+        """Taps with a reading used in the fit, at any microphone."""
         return np.asarray(self.use.any(axis=0))
 
     @property
     def free(self) -> Bool[np.ndarray, "K M"]:
-        """Parameters that data determine."""
+        """Parameters determined by the data: those not held at a bound."""
         return ~self.held & self.usable.any(axis=1)
 
     @property
     def shared(self) -> Bool[np.ndarray, " M"]:
-        """Microphones whose own taps do not say how their response falls off: it is that of the others.
+        """Microphones whose own taps do not determine the decay of their response, which is taken from the others.
 
-        Where no tap was near a microphone, b may be anything from nothing up: the least value would have it draw all
-        places to itself.
+        Where no tap was near a microphone, b is only bounded from above by the data; the least value would pull all
+        positions towards that microphone.
         """
         alone = np.where(np.arange(len(self.spread)) == 1, np.inf, self.spread)
         own = standard_errors(replace(self, spread=alone))[1]
@@ -90,17 +90,17 @@ class TapFit(eqx.Module):
 
     @property
     def level(self) -> Float[np.ndarray, "M T"]:
-        """y = log(power + floor), anything where that is not usable."""
+        """Level y = log(power + floor); arbitrary where not usable."""
         return np.asarray(self.noise.level(host.where(self.usable, self.power, 1.0)))
 
     def problem(self, *, with_outliers: bool = False) -> DecayProblem:
-        """The least-squares problem with the weights as they are."""
+        """The least-squares problem with the present weights."""
         weight = np.where(self.usable if with_outliers else self.use, self.weight, 0.0)
         floor = np.asarray(self.noise.floor)
         return DecayProblem(self.level, self.squared, weight, floor, self.kind, self.spread)
 
     def expected(self) -> Float[np.ndarray, "M T"]:
-        """Levels that the models say."""
+        """Levels predicted by the models."""
         return self.problem().expected(self.values, self.strength)[0]
 
 
@@ -112,7 +112,7 @@ def fit_taps(
     noise: IntensityNoise,
     known_noise: bool,
 ) -> TapFit:
-    """Fit all microphones as if they were alike, then each as its own taps say."""
+    """Fit all microphones with a common shape, then each microphone to its own taps."""
     extent = float(np.sqrt(squared.max()))
     spacing = float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
     lower, upper = (np.array(bound) for bound in kind.bounds(extent))
@@ -133,7 +133,7 @@ def fit_taps(
         dropped=np.zeros(len(microphones), bool),
         bounds=(lower, upper),
     )
-    # The loudest microphone alone says how strong a tap was.
+    # The strength of a tap is estimated from the loudest microphone alone.
     seen = np.where(fit.use, power, -np.inf)
     loudest = seen.argmax(axis=0), np.arange(taps)
     response = fit.problem().log_response(fit.values)
@@ -149,12 +149,13 @@ def fit_taps(
 
 
 def refit_without(fit: TapFit, bad: Bool[np.ndarray, " M"]) -> TapFit:
-    """Once more, without the microphones that were found to be of no use."""
+    """Repeat the fit without the microphones in `bad`."""
     return _refine(replace(fit, dropped=fit.dropped | bad), _REWEIGHTINGS, scattered=True)
 
 
 def standard_errors(fit: TapFit) -> Float[np.ndarray, "K M"]:
-    """Deviations of the logarithms of parameters, the scale fixed as a calibration has it; NaN where they are held."""
+    """Standard deviations of the logarithms of the parameters, with the scale of a calibration; NaN where they are
+    held."""
     free = fit.free
     if free[0].sum() < 2:
         return np.full(free.shape, np.nan)
@@ -168,11 +169,11 @@ def standard_errors(fit: TapFit) -> Float[np.ndarray, "K M"]:
 
 
 def _refine(fit: TapFit, rounds: int, *, scattered: bool = False) -> TapFit:
-    """All microphones together, and what their residuals say, until nothing changes; by how much they scatter is found
-    along, if that is asked for."""
+    """Alternate the joint fit of all microphones and the re-estimation of noise and weights until convergence; with
+    `scattered`, estimate the scatter of the parameters too."""
     for _ in range(rounds):
-        before, heard = fit.values, np.asarray(fit.usable.any(axis=1))
-        values, strength, held = fit_within(fit.problem(), before, fit.strength, heard, fit.bounds)
+        before, received = fit.values, np.asarray(fit.usable.any(axis=1))
+        values, strength, held = fit_within(fit.problem(), before, fit.strength, received, fit.bounds)
         fit = replace(fit, values=values, strength=strength, held=held)
         strength = fit_strengths(fit.problem(with_outliers=True), fit.values, fit.strength)
         fit = _reweighed(replace(fit, strength=strength))
@@ -184,17 +185,17 @@ def _refine(fit: TapFit, rounds: int, *, scattered: bool = False) -> TapFit:
 
 
 def _spread(shapes) -> Float[np.ndarray, " K"]:
-    """Gains may differ by any amount."""
+    """The spread of each parameter; infinite for the gain."""
     return np.concatenate([[np.inf], shapes])
 
 
 def _scatter(fit: TapFit) -> Float[np.ndarray, " K"]:
-    """The spread of shapes that what is found of each, and how well, makes likeliest (expectation maximisation)."""
+    """Maximum-likelihood spread of the shapes, from the estimates and their errors (expectation maximisation)."""
     known = fit.usable.any(axis=1)
     if known.sum() < 2:
         return fit.spread
     shapes, errors = fit.values[1:, known], np.nan_to_num(standard_errors(fit)[1:, known])
-    # One that is off by far says nothing of the others.
+    # An outlying microphone does not contribute.
     off = np.abs(shapes - np.median(shapes, axis=1, keepdims=True))
     near = np.minimum(off, 3 * fit.spread[1:, None])
     square = (near**2 + errors**2).sum(axis=1) / (known.sum() - 1)
@@ -202,10 +203,10 @@ def _scatter(fit: TapFit) -> Float[np.ndarray, " K"]:
 
 
 def _reweighed(fit: TapFit) -> TapFit:
-    """The noise, the outliers and the weights that the residuals say."""
+    """Re-estimate the noise, the outliers and the weights from the residuals."""
     expected = fit.expected()
     received = np.maximum(np.exp(expected) - fit.noise.floor[:, None], 0.0)
-    # What unknown strengths and parameters take out of the residuals.
+    # Degrees of freedom used by the unknown strengths and parameters.
     count = fit.use.sum()
     spent = fit.heard.sum() + fit.free.sum()
     inflation = count / max(count - spent, 0.1 * count)
@@ -229,9 +230,9 @@ def _reweighed(fit: TapFit) -> TapFit:
 
 
 def _residual_of_equals(fit: TapFit, received: np.ndarray) -> Float[np.ndarray, "M T"]:
-    """Residuals where all microphones say alike how strong a tap was.
+    """Residuals with equal weights of all microphones in estimating the strength of a tap.
 
-    With weights of their own one could be believed ever more for agreeing with strengths that it alone decides.
+    With individual weights one microphone could dominate the estimated strengths and so gain weight without limit.
     """
     relative = fit.noise.relative
     alike = replace(fit, noise=replace(fit.noise, relative=np.full(len(relative), np.median(relative))))
@@ -241,7 +242,7 @@ def _residual_of_equals(fit: TapFit, received: np.ndarray) -> Float[np.ndarray, 
 
 
 def _level_variance(fit: TapFit, received: np.ndarray) -> np.ndarray:
-    """Of levels where `received` is expected, which no weight of which may be boundless."""
+    """Variance of levels with the expected power `received`, bounded from below so that all weights are finite."""
     floor = 1e-6 * np.nanmax(np.where(fit.use, fit.power, np.nan), axis=1, initial=1e-300)[:, None]
     return _variance(fit, np.maximum(received, floor))
 

@@ -1,4 +1,4 @@
-"""What the residuals of a calibration say of the noise: each microphone's relative error, and what it reads of nothing.
+"""Noise of each microphone, estimated from the residuals of a calibration: relative error and additive deviation.
 
 Arrays are (M, T): M microphones, T taps. Residuals are of levels, log(power + floor).
 """
@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float
 
 from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise
 
-# Beyond so many deviations residuals say nothing of the noise.
+# Residuals beyond so many standard deviations are excluded from the noise estimate.
 _BEYOND = 4.0
-# Taps that the median of all microphones counts for in the noise of each.
+# Number of taps that the median of all microphones counts as, in the noise of each.
 _DRAWN = 20.0
-# Taps that say nothing of additive noise.
+# Least number of taps to estimate additive noise from.
 _FEW = 8
 
 
@@ -25,11 +25,12 @@ def relative_errors(
     use: Bool[np.ndarray, "M T"],
     inflation: float,
 ) -> Float[np.ndarray, " M"]:
-    """τ of each microphone: what its residuals show beyond the floor's noise (moments, without what is far off).
+    """Relative error τ of each microphone, from the moments of its residuals beyond the floor's noise, without
+    outliers.
 
-    `received` is expected; `inflation` makes up for what fitted parameters took out of the residuals' squares. Each is
-    drawn towards the median of all, as much as if that had been seen in a few more taps: of few taps the moments may
-    well come out as nothing, or less.
+    `received`: expected power; `inflation`: correction of the squared residuals for the fitted parameters. Each
+    estimate is shrunk towards the median of all microphones, which counts as a few more taps: with few taps the moments
+    may be zero or negative.
     """
     floor, rest, cross = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
     seen, excess = np.zeros(len(received)), np.zeros(len(received))
@@ -55,11 +56,11 @@ def relative_errors(
 def additive_deviations(
     power: Float[np.ndarray, "M T"], received: Float[np.ndarray, "M T"], use: Bool[np.ndarray, "M T"], inflation: float
 ) -> Float[np.ndarray, " M"]:
-    """s of each microphone, where only intensities are known: what it reads of nothing.
+    """Additive deviation s of each microphone, where only intensities are known: its reading without a source.
 
-    The likeliest pair of relative and additive deviation, on a grid and a finer one about the best; 0 unless that is
-    clearly better than none. No microphone is believed to be more than twice as quiet as the median one: few taps say
-    little of noise, and one that is taken to be silent takes noise for a touch.
+    The maximum-likelihood pair of relative and additive deviation, on a grid and a finer one about the best; 0 unless
+    that is clearly better than none. The estimate is at least half the median of all microphones: few taps determine
+    the noise poorly, and a microphone whose noise is underestimated causes false detections.
     """
     deviation = np.zeros(len(received))
     coarse = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])

@@ -1,4 +1,4 @@
-"""Which microphones of an array a fit is good for, and why others are not."""
+"""Selection of the microphones that a fit describes well, and the reasons why others are unusable."""
 
 from __future__ import annotations
 
@@ -9,23 +9,22 @@ from jeit.acoustic.calibration.robust_least_squares import TapFit, refit_without
 from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.signal.faults import describe_faults
 
-# A microphone is of no use whose model explains less of its levels' variance.
+# A microphone is unusable if its model explains less than this share of the variance of its levels.
 _LEAST_EXPLAINED = 0.3
-# Nor one whose relative error is so many times the median of all, which counts as this much at least.
+# Also if its relative error is so many times the median of all, where the median counts as this much at least.
 _UNLIKE, _WELL = 2.5, 0.1
-# By so much at least the logarithm of a response falls over the distances that were tapped.
+# Least decrease of the logarithm of a response over the tapped distances.
 _FLAT = 0.1
 
 
 def check_heard(
     kind: type[AbstractDecay], distance: Float[np.ndarray, "M T"], power: Float[np.ndarray, "M T"], faults
 ) -> tuple[Bool[np.ndarray, " M"], str]:
-    """Which microphones heard taps from enough places; and why there is too little to fit anything to, "" if there is
-    enough."""
+    """Which microphones received taps from enough distances, and the reason if too few did to fit a model, else ""."""
     needed = len(kind.parameters) + 2
     step = 1e-4 * distance.max()
-    heard = np.isfinite(power)
-    places = np.array([np.unique(np.round(far[one] / step)).size for far, one in zip(distance, heard, strict=True)])
+    received = np.isfinite(power)
+    places = np.array([np.unique(np.round(far[one] / step)).size for far, one in zip(distance, received, strict=True)])
     enough = places >= needed
     if enough.sum() >= 3:
         return enough, ""
@@ -37,10 +36,11 @@ def check_heard(
 
 
 def leave_out(fit: TapFit, faults) -> tuple[TapFit, Bool[np.ndarray, " M"], tuple[str, ...], Float[np.ndarray, " M"]]:
-    """The fit to microphones that are of use, which these are, why others are not, and what each model explains."""
+    """Refit without the unusable microphones. Returns the fit, the mask of usable microphones, the reasons for the
+    others, and the share of variance that each model explains."""
     reasons, explained = _judge(fit, faults)
     bad = np.array([bool(reason) for reason in reasons])
-    # What some are left out for may show in others only without them.
+    # Faults of some microphones may show only once others are excluded.
     while bad.any() and (~fit.dropped & ~bad).sum() >= 3:
         fit = refit_without(fit, bad)
         again, explained = _judge(fit, ("",) * len(bad), explained)
@@ -50,8 +50,8 @@ def leave_out(fit: TapFit, faults) -> tuple[TapFit, Bool[np.ndarray, " M"], tupl
 
 
 def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
-    """Why each microphone is of no use, "" where it is; and the share of its levels' variance that its model explains,
-    as it was `explained` before for those that are left out."""
+    """The reason why each microphone is unusable, "" where it is usable; and the share of the variance of its levels
+    that its model explains, taken from `explained` for excluded microphones."""
     expected, level, use = fit.expected(), fit.level, fit.use
     falls = _falls(fit)
     needed = len(fit.kind.parameters) + 2
@@ -61,7 +61,7 @@ def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[
     reasons = []
     for k, fault in enumerate(faults):
         used = use[k]
-        heard = (used & (fit.power[k] > 3 * deviation[k])).sum()
+        received = (used & (fit.power[k] > 3 * deviation[k])).sum()
         if not used.any():
             reasons.append(fault)
             continue
@@ -71,8 +71,8 @@ def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[
             reasons.append("what it hears does not fall with distance")
         elif used.sum() >= needed and not share[k] >= _LEAST_EXPLAINED:
             reasons.append(f"its model explains {100 * max(share[k], 0):.0f} % of what it heard")
-        elif heard < needed:
-            reasons.append(f"it heard {heard} of the taps only, and {needed} are needed")
+        elif received < needed:
+            reasons.append(f"it heard {received} of the taps only, and {needed} are needed")
         elif relative[k] > _UNLIKE * max(typical, _WELL):
             reasons.append(
                 f"its model is off by {100 * relative[k]:.0f} %, and those of others by {100 * typical:.0f} %: is it "
@@ -84,7 +84,7 @@ def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[
 
 
 def _falls(fit: TapFit) -> Float[np.ndarray, " M"]:
-    """From the nearest tap to the farthest, the logarithm of each microphone's response."""
+    """Decrease of the logarithm of each microphone's response from the nearest tap to the farthest."""
     response, use = fit.problem().log_response(fit.values), fit.use
     most, least = (
         pick(response, axis=1, where=use, initial=far) for pick, far in ((np.max, -np.inf), (np.min, np.inf))

@@ -1,4 +1,4 @@
-"""`jeit calibrate-microphones`: taps at known places in, the decay model of every microphone out."""
+"""`jeit calibrate-microphones`: fit the decay model of every microphone to taps at known positions."""
 
 from __future__ import annotations
 
@@ -106,8 +106,8 @@ def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
 
     from jeit.acoustic import cramer_rao
 
-    heard, usable = fit.strength > 0, np.asarray(fit.calibration.usable)
-    bound = cramer_rao(fit.calibration.microphone_array, taps.positions[heard], fit.strength[heard], use=usable)
+    received, usable = fit.strength > 0, np.asarray(fit.calibration.usable)
+    bound = cramer_rao(fit.calibration.microphone_array, taps.positions[received], fit.strength[received], use=usable)
     return float(np.median(np.sqrt(np.linalg.eigvalsh(bound)[:, -1])))
 
 

@@ -1,4 +1,4 @@
-"""`jeit locate`: a recording of a calibrated array of microphones in; where and when it was touched out."""
+"""`jeit locate`: positions and times of the touches in a recording of a calibrated array of microphones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jeit.acoustic import LocatedTouches, Recording
 
 _OPTIONS = {"intensity": "--low, --high, --window and --hop"}
-# Of a touch that has moved farther, start and end are printed, not the middle.
+# For a touch that has moved farther, start and end are printed instead of the middle.
 _STROKE = 0.015  # m
 
 

@@ -1,4 +1,4 @@
-"""Options of intensities, which the commands that read microphones share."""
+"""Intensity options shared by the commands that read microphones."""
 
 from __future__ import annotations
 

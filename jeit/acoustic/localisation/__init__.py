@@ -1,1 +1,1 @@
-"""From intensities to places: objectives, their minimisation, maps, bounds, and recordings located frame by frame."""
+"""Localisation from intensities: objectives, their minimisation, maps, bounds, and localisation frame by frame."""

@@ -1,4 +1,4 @@
-"""Intensities of a recording as its calibration took the taps', above its own noise floor or that of silence."""
+"""Intensities of a recording, with the calibration's settings, above the recording's noise floor or that of silence."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jeit.acoustic.signal.intensity import IntensitySettings, check_settings, in
 from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.arguments import check_kind
 
-# A noise floor so many times as high is another one.
+# Ratio of noise floors above which they are considered different.
 _SAME_FLOOR = 4.0
 
 
@@ -23,12 +23,12 @@ def calibrated_intensities(
     *,
     silence: Recording | None = None,
 ) -> Intensities:
-    """Intensities of a recording, as the calibration took them.
+    """Intensities of a recording, measured with the settings of the calibration.
 
-    `silence`: samples of the same array at the same gain, untouched. The noise floor is theirs then, which a recording
-    without pauses needs; otherwise it comes from the quietest windows of the recording itself. Raises `ValueError` for
-    another number of microphones, for a silence that is louder than the recording's quietest windows, and for things of
-    another kind.
+    `silence`: samples of the same array at the same gain, untouched, from which the noise floor is then taken. A
+    recording without pauses needs it; otherwise the floor comes from the quietest windows of the recording itself.
+    Raises `ValueError` for another number of microphones, for a silence that is louder than the recording's quietest
+    windows, and for arguments of the wrong type.
     """
     given = {"recording": recording} if silence is None else {"recording": recording, "silence": silence}
     for name, one in given.items():
@@ -47,42 +47,42 @@ def calibrated_intensities(
     if isinstance(recording, Intensities):
         return recording
     settings = intensity or calibration.intensity or IntensitySettings()
-    heard = intensities(recording, settings)
+    recorded = intensities(recording, settings)
     if silence is not None:
-        return _above_silence(heard, intensities(silence, settings))
-    # Only a floor measured in the same way can be compared.
+        return _above_silence(recorded, intensities(silence, settings))
+    # Noise floors are comparable only if measured with the same settings.
     if settings != calibration.intensity:
         if calibration.intensity is None:
-            return heard
+            return recorded
         note = "band or window are not the calibration's: its decay models may not hold; calibrate with the same."
-        return dataclasses.replace(heard, notes=(note,))
+        return dataclasses.replace(recorded, notes=(note,))
     usual = np.asarray(calibration.microphone_array.noise.floor)
-    ratio = np.where(calibration.usable, heard.floor / np.where(usual > 0, usual, np.inf), 0.0)
+    ratio = np.where(calibration.usable, recorded.floor / np.where(usual > 0, usual, np.inf), 0.0)
     higher = f"the noise floor, taken from the quietest windows, is up to {ratio.max():.3g} times the calibration's"
     text = describe_faults([higher if one > _SAME_FLOOR else "" for one in ratio])
     note = (
         f"{text}. If the recording never pauses, touches count as silence: give a recording of the array untouched "
         "(silence=). If gain, unit, surroundings or microphones have changed, calibrate again."
     )
-    return dataclasses.replace(heard, notes=(note,)) if text else heard
+    return dataclasses.replace(recorded, notes=(note,)) if text else recorded
 
 
-def _above_silence(heard: Intensities, quiet: Intensities) -> Intensities:
-    """Intensities above the floor of silence; what has none there cannot be used."""
+def _above_silence(recorded: Intensities, quiet: Intensities) -> Intensities:
+    """Intensities above the noise floor of silence; microphones without a floor there are unusable."""
     known = np.asarray(quiet.usable.any(axis=0))
-    both = (quiet.floor > 0) & (heard.floor > 0)
-    ratio = float(np.median(quiet.floor[both] / heard.floor[both])) if both.any() else 1.0
+    both = (quiet.floor > 0) & (recorded.floor > 0)
+    ratio = float(np.median(quiet.floor[both] / recorded.floor[both])) if both.any() else 1.0
     if ratio > _SAME_FLOOR:
         raise ValueError(
-            f"silence '{quiet.name}' is {ratio:.3g} times as loud as the quietest windows of '{heard.name}': record "
+            f"silence '{quiet.name}' is {ratio:.3g} times as loud as the quietest windows of '{recorded.name}': record "
             "the array untouched, at the same gain."
         )
     spoilt = [("" if good else f"in the silence: {fault}") for good, fault in zip(known, quiet.faults, strict=True)]
-    faults = ["; ".join(filter(None, pair)) for pair in zip(heard.faults, spoilt, strict=True)]
+    faults = ["; ".join(filter(None, pair)) for pair in zip(recorded.faults, spoilt, strict=True)]
     return dataclasses.replace(
-        heard,
-        power=heard.power + heard.floor - quiet.floor,
+        recorded,
+        power=recorded.power + recorded.floor - quiet.floor,
         floor=quiet.floor,
-        usable=heard.usable & known,
+        usable=recorded.usable & known,
         faults=faults,
     )

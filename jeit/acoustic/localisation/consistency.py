@@ -1,11 +1,11 @@
-"""Intensity consistency: every microphone, corrected for its distance, must tell the same source strength.
+"""Intensity consistency: at the source, the strengths estimated from all microphones by their distances are equal.
 
 The loss of Park 2022, text S2, with g_i = 1 / f_i and k the loudest microphone:
 
     L(u) = Σ_{i≠k} (I_k g_k(u) − I_i g_i(u))².
 
-It knows nothing of noise: far microphones count as much as near ones, multiplied by the distance. Frames are the last
-axis of all arrays here, microphones the first; intensities are taken relative to the loudest.
+The loss ignores noise: far microphones count as much as near ones, multiplied by the distance. Frames are the last axis
+of all arrays here, microphones the first; intensities are relative to the loudest.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jeit_solvers.engines import kept, namespace, slopes
 
 
 class Consistency(eqx.Module):
-    """The loss of frames: `power` relative to the `loudest` (F,) of the microphones in `use` (M, F)."""
+    """Consistency loss of F frames: `power` relative to the `loudest` (F,) of the microphones in `use` (M, F)."""
 
     power: Float[Array, "M F"]
     loudest: Int[Array, " F"]
@@ -32,7 +32,7 @@ class Consistency(eqx.Module):
     def create(
         cls, power: Float[Array, "M F"], use: Bool[Array, "M F"], microphone_array: MicrophoneArray
     ) -> "Consistency":
-        """Of intensities; what is not used may be anything, NaN included."""
+        """Create the loss from intensities; unused values are ignored and may be NaN."""
         xp = namespace(power, use)
         known = xp.where(use, power, 0.0)
         scale = xp.max(known, axis=0)
@@ -41,11 +41,11 @@ class Consistency(eqx.Module):
 
     @property
     def frames(self) -> tuple[Array, ...]:
-        """All that differs from frame to frame."""
+        """The arrays that differ between frames."""
         return self.power, self.loudest, self.scale, self.use
 
     def differences(self, chart: Float[Array, "2 F"]) -> Float[Array, "M F"]:
-        """I_k g_k − I_i g_i, and 0 for what is not used."""
+        """Differences I_k g_k − I_i g_i; 0 where not used."""
         estimates = self.power / self.microphone_array.response(chart)
         xp = namespace(self, estimates)
         most = xp.take_along_axis(estimates, self.loudest[None], axis=0)
@@ -56,20 +56,20 @@ class Consistency(eqx.Module):
         return (self.differences(chart) ** 2).sum(axis=0)
 
     def expand(self, chart: Float[Array, "2 F"]) -> tuple[Array, Array, Array]:
-        """Loss, gradient, and the Gauss-Newton matrix."""
+        """Loss, gradient, and Gauss-Newton matrix."""
         off, along = kept(slopes(self.differences, chart))
         gradient = 2 * namespace(off).stack([(off * slope).sum(axis=0) for slope in along])
         rows = [[2 * (one * other).sum(axis=0) for other in along[: k + 1]] for k, one in enumerate(along)]
         return (off**2).sum(axis=0), gradient, symmetric_small(rows)
 
     def start(self, chart: Float[Array, "2 F"]) -> Float[Array, "2 F"]:
-        """The chart coordinates are all the unknowns there are."""
+        """Initial unknowns: the chart coordinates."""
         return chart
 
     @staticmethod
     def features(microphone_array: MicrophoneArray, chart: Float[Array, "2 P"]) -> Float[Array, "N P"]:
-        """What `screen` needs of candidate places: the ten products of pairs of (|x|², x, y, 1) where 1 / f is
-        (|x − x_i|² + b) / a, on a surface in space fifteen; responses f (M, P) for other models."""
+        """Features of candidate positions for `screen`: the ten products of pairs of (|x|², x, y, 1) where 1 / f is (|x
+        − x_i|² + b) / a, on a surface in space fifteen; responses f (M, P) for other models."""
         if not isinstance(microphone_array.decay, InverseSquare):
             return microphone_array.response(chart)
         place = microphone_array.surface.place(chart)
@@ -78,10 +78,10 @@ class Consistency(eqx.Module):
         return xp.stack([terms[i] * terms[j] for i in range(len(terms)) for j in range(i + 1)])
 
     def screen(self, features: Float[Array, "N P"]) -> Float[Array, "F P"]:
-        """The loss at candidate places, by matrix products for all frames and places.
+        """The loss at candidate positions, by matrix products for all frames and positions.
 
         With A = I_k g_k and n microphones in use it is n A² − 2 A Σ I_i g_i + Σ I_i² g_i². Where g is quadratic in the
-        place, the loss is a polynomial of the fourth degree: ten coefficients a frame and one product."""
+        position, the loss is a polynomial of the fourth degree: ten coefficients per frame and one product."""
         xp = namespace(self, features)
         number = xp.sum(self.use, axis=0)
         if not isinstance(self.microphone_array.decay, InverseSquare):
@@ -103,15 +103,15 @@ class Consistency(eqx.Module):
         return xp.stack(coefficients, axis=1) @ features
 
     def covariance(self, chart: Float[Array, "2 F"], strength: Float[Array, " F"]) -> Float[Array, "2 2 F"]:
-        """Of the minimum, from the intensities' variances: Σ_i (∂u/∂I_i)(∂u/∂I_i)ᵀ var I_i, with the derivative of the
-        minimum by the implicit function theorem, ∂u/∂I = −H⁻¹ ∂²L/∂u∂I at small differences."""
+        """Covariance of the minimum, from the variances of the intensities: Σ_i (∂u/∂I_i)(∂u/∂I_i)ᵀ var I_i, with the
+        derivative of the minimum by the implicit function theorem, ∂u/∂I = −H⁻¹ ∂²L/∂u∂I at small differences."""
         estimates, along = slopes(lambda u: 1 / self.microphone_array.response(u), chart)
         xp = namespace(self, estimates)
         slope = xp.stack(along) * self.power
         most = xp.take_along_axis(slope, self.loudest[None, None], axis=1)
         rise = xp.where(self.use, most - slope, 0.0)
         matrix = xp.einsum("kmf,lmf->klf", rise, rise)
-        # ∂/∂I_i of ½∂L/∂u: −g_i times the rise of its difference; of the loudest, g_k times that of all.
+        # ∂/∂I_i of ½∂L/∂u: −g_i times the gradient of its difference; for the loudest, g_k times the sum over all.
         is_loudest = xp.arange(estimates.shape[0])[:, None] == self.loudest
         drive = xp.where(is_loudest, xp.sum(rise, axis=1, keepdims=True) * estimates, -estimates * rise)
         received = strength / estimates

@@ -1,4 +1,4 @@
-"""The Cramér-Rao bound: how well any unbiased localiser can do."""
+"""The Cramér-Rao bound: least covariance of any unbiased localiser."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ def cramer_rao(
     *,
     use: ArrayLike | None = None,
 ) -> Float[Array, "N d d"]:
-    """Least covariance (m²) with which sources of unknown `strength`, (N,) or one, at `position` (N, d), in
-    metres, can be located.
+    """Cramér-Rao bound (N, d, d), m², of the positions of sources at `position` (N, d), metres, with `strength` (N,) or
+    one for all, which the localiser does not know.
 
-    The inverse of Fisher's matrix of place and log strength, under the noise model of `microphone_array`. `use`: (M,)
-    which microphones there are, all unless given. Raises `ValueError` for what is no array.
+    The inverse of the Fisher matrix of position and log strength, under the noise model of `microphone_array`. `use`:
+    (M,) mask of the microphones used, all unless given. Raises `ValueError` for what is no `MicrophoneArray`.
     """
     check_array(microphone_array)
     present = np.ones(len(microphone_array.microphones), bool) if use is None else use
@@ -39,6 +39,6 @@ def _least_covariance(microphone_array: MicrophoneArray, position, strength, pre
     number = chart.shape[1]
     unknowns = xp.concatenate([chart, xp.log(xp.broadcast_to(xp.asarray(strength, float), (number,)))[None]])
     there = xp.broadcast_to(xp.asarray(present, bool)[:, None], (len(present), number))
-    # Fisher's matrix does not depend on what was measured.
+    # The Fisher matrix does not depend on the measured values.
     _, _, matrix = Likelihood.create(xp.ones(there.shape), there, microphone_array).expand(unknowns)
     return in_space(microphone_array.surface, chart, inverse_small(matrix)[:2, :2])[1]

@@ -1,12 +1,12 @@
-"""Maximum likelihood: where a source most probably is, given what every microphone receives and how well it is known.
+"""Maximum likelihood: the most probable source position, from the received intensities and their error model.
 
-Frames are the last axis of all arrays here, microphones the first. The unknowns of a frame are chart coordinates u
-and the logarithm of strength, s, of one source after the other; what several send adds up. With expected levels
-m_i(u, s) = log(Σ e^s f_i(u) + N_i) and variances v_i(u, s),
+Frames are the last axis of all arrays here, microphones the first. The unknowns of a frame are chart coordinates u and
+the logarithm of strength, s, of one source after the other; powers of several sources add. With expected levels m_i(u,
+s) = log(Σ e^s f_i(u) + N_i) and variances v_i(u, s),
 
     cost = Σ_i ½ (y_i − m_i)² / v_i + ½ log v_i
 
-over the microphones in use; steps are Fisher's scoring, whose matrix Σ ∇m ∇mᵀ / v + ½ ∇log v ∇log vᵀ is the inverse of
+over the microphones in use; steps are Fisher scoring, whose matrix Σ ∇m ∇mᵀ / v + ½ ∇log v ∇log vᵀ is the inverse of
 the Cramér-Rao bound.
 """
 
@@ -21,8 +21,7 @@ from jeit_solvers.engines import kept, namespace, slopes
 
 
 class Likelihood(eqx.Module):
-    """The cost of frames: `power` and `level` y (M, F), which microphones are in `use` (M, F),
-    and the microphones."""
+    """Negative log-likelihood of F frames: `power` and `level` y (M, F), the mask `use` (M, F), and the microphones."""
 
     power: Float[Array, "M F"]
     level: Float[Array, "M F"]
@@ -33,13 +32,13 @@ class Likelihood(eqx.Module):
     def create(
         cls, power: Float[Array, "M F"], use: Bool[Array, "M F"], microphone_array: MicrophoneArray
     ) -> "Likelihood":
-        """Of intensities; what is not used may be anything, NaN included."""
+        """Create the likelihood from intensities; unused values are ignored and may be NaN."""
         known = namespace(power, use).where(use, power, 1.0)
         return cls(known, microphone_array.noise.level(known), use, microphone_array)
 
     @property
     def frames(self) -> tuple[Array, ...]:
-        """All that differs from frame to frame."""
+        """The arrays that differ between frames."""
         return self.power, self.level, self.use
 
     def cost(self, unknowns: Float[Array, "n F"]) -> Float[Array, " F"]:
@@ -50,20 +49,20 @@ class Likelihood(eqx.Module):
         return xp.sum(xp.where(self.use, terms, 0.0), axis=0)
 
     def misfit(self, unknowns: Float[Array, "n F"]) -> Float[Array, " F"]:
-        """Σ (y − m)² / v: chi-square with as many degrees of freedom as microphones in use less unknowns, where the
-        model holds."""
+        """Misfit Σ (y − m)² / v. Where the model holds it is chi-square distributed; its degrees of freedom are the
+        microphones in use minus the unknowns."""
         return (self.residual(unknowns) ** 2).sum(axis=0)
 
     def residual(self, unknowns: Float[Array, "n F"]) -> Float[Array, "M F"]:
-        """(y − m) / √v, and 0 for what is not used."""
+        """Residuals (y − m) / √v; 0 where not used."""
         mean, variance = self.microphone_array.expected(unknowns)
         xp = namespace(self, mean)
         return xp.where(self.use, (self.level - mean) / xp.sqrt(variance), 0.0)
 
     def expand(self, unknowns: Float[Array, "n F"]) -> tuple[Array, Array, Array]:
-        """Cost, its gradient, and Fisher's matrix."""
+        """Cost, gradient, and Fisher matrix."""
         (mean, variance), along = slopes(self.microphone_array.expected, unknowns)
-        # Kept: the logarithms are in every one of the sums below.
+        # Computed once: all sums below use the logarithms.
         mean, variance, along = kept((mean, variance, [(dm, dv / variance) for dm, dv in along]))
         xp = namespace(self, mean)
         used = xp.where(self.use, 1.0, 0.0)
@@ -83,13 +82,13 @@ class Likelihood(eqx.Module):
         return cost, gradient, matrix
 
     def start(self, chart: Float[Array, "2 F"]) -> Float[Array, "3 F"]:
-        """Unknowns at given places, with the strength that suits them best."""
+        """Initial unknowns at given positions, with the best-fitting strength."""
         response = self.microphone_array.response(chart)
         xp = namespace(response)
         return xp.concatenate([chart, xp.log(self.strength(response))[None]])
 
     def strength(self, response: Float[Array, "M F"]) -> Float[Array, " F"]:
-        """Of sources at known places, by least squares with weights from the observed power; positive."""
+        """Strength of sources at known positions, by least squares weighted with the observed power; positive."""
         weight, xp = self._weight(), namespace(self, response)
         fitted = xp.sum(weight * self.power * response, axis=0) / xp.sum(weight * response**2, axis=0)
         loudest = xp.max(xp.where(self.use, self.power / response, 0.0), axis=0)
@@ -97,12 +96,12 @@ class Likelihood(eqx.Module):
 
     @staticmethod
     def features(microphone_array: MicrophoneArray, chart: Float[Array, "2 P"]) -> Float[Array, "M P"]:
-        """What `screen` needs of candidate places: their responses f."""
+        """Features of candidate positions for `screen`: their responses f."""
         return microphone_array.response(chart)
 
     def screen(self, response: Float[Array, "M P"]) -> Float[Array, "F P"]:
-        """What is left unexplained by candidate places of responses f, with weights from the observed power and
-        the best strength: ½ (Σ w p² − (Σ w p f)² / Σ w f²). Two matrix products for all frames and places."""
+        """Weighted residual sum of squares at candidate positions with responses f and the best strength, with weights
+        from the observed power: ½ (Σ w p² − (Σ w p f)² / Σ w f²). Two matrix products for all frames and positions."""
         weight, xp = self._weight(), namespace(self, response)
         seen = weight * self.power
         fitted = xp.maximum(seen.T @ response, 0.0) ** 2 / (weight.T @ response**2)

@@ -1,8 +1,8 @@
-"""The localiser: intensities of many frames to positions, by maximum likelihood or by intensity consistency.
+"""`Localiser`: source positions from the intensities of many frames, by maximum likelihood or intensity consistency.
 
-Each frame is screened on a coarse grid, its best two valleys are descended, and a minimum beyond the outline gives way
-to the best place on the outline. All of it is one program, compiled unless it is asked for once, differentiable by the
-implicit function theorem in the intensities, the microphones' positions and the decay models.
+Each frame is screened on a coarse grid, and a descent starts from each of the best two valleys. A minimum beyond the
+outline is replaced by the best position on the outline. The computation is one program, optionally compiled, and is
+differentiable in the intensities, the microphones' positions and the decay models by the implicit function theorem.
 """
 
 from __future__ import annotations
@@ -34,21 +34,22 @@ from jeit_solvers.engines import (
 )
 
 METHODS = {"likelihood": Likelihood, "consistency": Consistency}
-# Places screened, in the outline's box.
+# Positions screened in the bounding box of the outline.
 _COARSE = 400
-# Frames worked on together: all their arrays stay in the cache.
+# Frames processed together, so that their arrays fit into the cache.
 _CHUNK, _CHUNK_OF_MAPS = 1024, 32
-# Relative error of the decay models with which frames are screened, at least.
+# Least relative error of the decay models assumed in screening.
 _SCREENED_AT = 0.2
 
 
 class SourceEstimate(eqx.Module):
-    """What is found of F frames.
+    """Estimated sources of F frames.
 
     `position` (F, d) in metres, on the surface and inside its outline; its `covariance` (F, d, d) in m²; `strength`
-    (F,), in units of intensity; `misfit` (F,), chi-square of what one source at this place does not explain, with
-    `freedom` (F,) degrees; `excess` (F,), by how much a place beyond the outline would lower −2 log-likelihood (0 for
-    places inside); `rival` (F,), by how much the second best valley is worse (∞ if there is none); `converged` (F,).
+    (F,), in units of intensity; `misfit` (F,), chi-square of the residuals of one source at this position, with
+    `freedom` (F,) degrees; `excess` (F,), by how much a position beyond the outline would lower −2 log-likelihood (0
+    for positions inside); `rival` (F,), by how much the second best valley is worse (∞ if there is none); `converged`
+    (F,).
     """
 
     position: Float[Array, "F d"]
@@ -62,7 +63,7 @@ class SourceEstimate(eqx.Module):
 
 
 class Localiser(eqx.Module):
-    """Finds sources from intensities; make one with `Localiser.create` and call it."""
+    """Estimator of source positions from intensities; construct it with `Localiser.create` and call it."""
 
     microphone_array: MicrophoneArray
     coarse: Pixels
@@ -80,10 +81,12 @@ class Localiser(eqx.Module):
         map_shape: tuple[int, int] | None = None,
         compiled: bool = True,
     ) -> "Localiser":
-        """`method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster on
-        which every frame's whole map is worked out and where the descent starts, (200, 200) in the paper; a coarse grid
-        of 400 places and no maps unless given. `compiled`: False for what is asked for once, which NumPy answers before
-        JAX has compiled it. Raises `ValueError` for another method, or a shape that makes no sense.
+        """Create a localiser for an array of microphones.
+
+        `method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster on
+        which the whole map of every frame is computed and the descent starts, (200, 200) in the paper; unless given, a
+        coarse grid of 400 positions and no maps. `compiled`: False for a single call, which NumPy completes before JAX
+        has compiled it. Raises `ValueError` for another method, or an invalid shape.
         """
         check_array(microphone_array)
         check_name("method", method, METHODS)
@@ -101,14 +104,14 @@ class Localiser(eqx.Module):
         return cls(microphone_array, coarse, pixels, features, method, compiled)
 
     def __call__(self, power: ArrayLike, use: ArrayLike | None = None) -> SourceEstimate:
-        """Locate the source of each frame. `power` (F, M): intensities above the floor; `use`: which to look at, all
-        that are finite unless given. Frames with fewer than three usable microphones give NaN."""
+        """Locate the source of each frame. `power` (F, M): intensities above the floor; `use`: mask of those to use,
+        all finite ones unless given. Frames with fewer than three usable microphones give NaN."""
         return self._run(_locate, power, use)
 
     def maps(self, power: ArrayLike, use: ArrayLike | None = None) -> Float[Array, "F rows columns"]:
-        """The map of each frame: the paper's loss, relative to the square of the loudest intensity, or minus the
-        log-likelihood at the best strength; bottom row first, NaN outside the outline. Raises `ValueError` where the
-        localiser was made without `map_shape`."""
+        """Compute the map of each frame: the paper's loss, relative to the square of the loudest intensity, or the
+        negative log-likelihood at the best strength; bottom row first, NaN outside the outline. Raises `ValueError`
+        where the localiser was created without `map_shape`."""
         if self.pixels is None:
             raise ValueError("maps were not asked for: make the Localiser with map_shape=(rows, columns).")
         return self._run(_maps, power, use)
@@ -116,11 +119,11 @@ class Localiser(eqx.Module):
     def with_maps(
         self, power: ArrayLike, use: ArrayLike | None = None
     ) -> tuple[SourceEstimate, Float[Array, "F rows columns"]]:
-        """Both: what is found of each frame, and its map."""
+        """Compute both the estimate and the map of each frame."""
         return self(power, use), self.maps(power, use)
 
     def _run(self, function, power, use):
-        """`function` of the localiser, of intensities as an array, and of which are to be looked at."""
+        """Call `function` with the localiser, the intensities as an array, and the mask of those to use."""
         at_hand = not self.compiled and has_values(self, power, use)
         xp = np if at_hand else jnp
         power = xp.asarray(power, float)
@@ -131,7 +134,7 @@ class Localiser(eqx.Module):
                 f"power has shape {power.shape} and use {use.shape}; give (frames, microphones) with "
                 f"{len(self.microphone_array.microphones)} microphones."
             )
-        if not len(power):  # as of one that nothing is known of
+        if not len(power):  # as for a microphone without a reading
             found = self._run(function, np.full((1, power.shape[1]), np.nan), None)
             return jax.tree.map(lambda array: array[:0], found)
         return on_device(at_once(function, self, power, use)) if at_hand else _compiled(function, self, power, use)
@@ -143,7 +146,8 @@ def _compiled(function, localiser: Localiser, power, use):
 
 
 def _in_chunks(function, most: int, *arrays):
-    """`function` of a few frames at a time: `arrays` (F, M) are cut, padded, turned to (M, F); results lead with F."""
+    """Call `function` for a few frames at a time: `arrays` (F, M) are split, padded and transposed to (M, F); F is the
+    leading axis of the results."""
     number = arrays[0].shape[0]
     size_of_chunk = min(most, max(number, 1))
     chunks = -(-number // size_of_chunk)
@@ -164,14 +168,14 @@ def _features(objective, microphone_array: MicrophoneArray, chart) -> Array:
 
 
 def _raster(localiser: Localiser, microphone_array: MicrophoneArray) -> tuple[Pixels, Array]:
-    """The paper's raster where maps were asked for, the coarse one otherwise, and the features of its pixels."""
+    """The raster of `map_shape` if given, otherwise the coarse one, and the features of its pixels."""
     if localiser.pixels is not None and localiser.features is not None:
         return localiser.pixels, localiser.features
     return localiser.coarse, METHODS[localiser.method].features(microphone_array, localiser.coarse.chart)
 
 
 def _maps(localiser: Localiser, power, use) -> Array:
-    """Of all frames at once: one product, with nothing to copy."""
+    """Maps of all frames at once, in one product without copies."""
     pixels, features = _raster(localiser, localiser.microphone_array)
     use = _usable(localiser, power, use)
     maps = METHODS[localiser.method].create(power.T, use.T, localiser.microphone_array).screen(features)
@@ -179,10 +183,11 @@ def _maps(localiser: Localiser, power, use) -> Array:
 
 
 def _starts(localiser: Localiser, power, use):
-    """Where the descents of each frame start: first (F, 2), second (F, 2), and whether that is worth it (F,)."""
+    """Starting positions of the descents of each frame: first (F, 2), second (F, 2), and whether to try the second
+    (F,)."""
     still = undifferentiated(localiser.microphone_array)
     pixels, features = _raster(localiser, still)
-    # Valleys of a model known to be exact are narrower than pixels are apart: screened as if it were not.
+    # Valleys of an exact model are narrower than the pixel spacing: a least relative error is assumed in screening.
     still = eqx.tree_at(
         lambda one: one.noise.relative, still, namespace(still).maximum(still.noise.relative, _SCREENED_AT)
     )
@@ -197,7 +202,7 @@ def _starts(localiser: Localiser, power, use):
 
 
 def _usable(localiser: Localiser, power, use):
-    """Without a floor, what is not positive has no logarithm: nothing is known of such a reading."""
+    """Mask of usable readings. Without a floor, readings that are not positive have no logarithm and are not usable."""
     return use & (power + localiser.microphone_array.noise.floor > 0)
 
 
@@ -212,11 +217,11 @@ def _locate(localiser: Localiser, power, use) -> SourceEstimate:
 
 
 def _refine(localiser: Localiser, power, use, first, second, worth) -> SourceEstimate:
-    """From the starts (2, F) of each frame; `power` and `use` (M, F)."""
+    """Descend from the starts (2, F) of each frame; `power` and `use` (M, F)."""
     microphone_array = localiser.microphone_array
     fixed = undifferentiated(microphone_array)
     still = METHODS[localiser.method].create(undifferentiated(power), use, fixed)
-    # Where one pixel of many was the start there is no second valley to try.
+    # On a fine raster the start is the best pixel, and there is no second valley to try.
     unknowns, excess, rival, converged, side = find_minima(
         still, first, second, worth if localiser.pixels is None else None
     )

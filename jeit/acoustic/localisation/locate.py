@@ -1,4 +1,4 @@
-"""From a recording to places: which frames hold a touch, where it is, and what is wrong with the others."""
+"""Localisation of a recording: which frames contain a touch, its position, and the status of the other frames."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.acoustic.surface import longer_side
 from jeit_solvers.engines import as_array, on_host
 
-# Chance that a silent frame is taken for a touch; that a frame one source explains is said not to be.
+# Probability that a silent frame is classified as a touch; that a frame of one source is classified as a misfit.
 _FALSE_ALARM, _FALSE_MISFIT = 1e-6, 1e-4
-# Standard deviations of unknown distribution that a false alarm needs.
-_HEARD_DEVIATIONS = 6.0
-# −2 log-likelihood by which a place beyond the outline must be better to be said outside, and a rival valley worse not
-# to make a frame ambiguous: three standard deviations, and two.
+# Threshold in standard deviations for a detection, where the distribution is unknown.
+_ALARM_DEVIATIONS = 6.0
+# Differences of −2 log-likelihood: by which a position beyond the outline must be better for "outside" (three standard
+# deviations), and below which a rival valley makes a frame ambiguous (two).
 _OUTSIDE, _RIVAL = 9.0, 4.0
-# Two sources are believed that leave this part of what one leaves, and not too much per degree of freedom, even where
-# they do not explain everything; but not one so much weaker than the other: errors of a model look like that.
+# Two sources are accepted if their misfit is below this share of that of one source and not too large per degree of
+# freedom, even if significant; but not if one is this much weaker, since model errors look like a weak second source.
 _BOTH, _STILL_FAIR, _WEAKEST = 0.2, 10.0, 0.05
-# Share of touches that no source on the skin explains, from which something is wrong with the array.
+# Share of touches without a fitting source on the skin above which changes of the setup are searched for.
 _ODD = 0.25
-# Intensities this much below the loudest frame's are no touch, where no floor is known (60 dB).
+# Where no floor is known, intensities this far below the loudest frame's are not a touch (60 dB).
 _DYNAMIC_RANGE = 1e-6
-# No touch is so much stronger or weaker than the calibration's taps (40 dB).
+# Largest plausible ratio of a touch's strength to the calibration taps' (40 dB).
 _SAME_UNIT = 1e4
 
 
@@ -53,18 +53,18 @@ def locate(
     `method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster that is
     searched, (200, 200) in the paper; a coarse grid unless given (both are refined). `intensity`: band and window for
     samples, those of the calibration unless given; `silence`: the array untouched, as of `calibrated_intensities`.
-    `compiled`: whether a program is compiled first, in seconds, which is several times as fast from then on: for more
-    than 1,024 frames with a touch unless given; True is for many recordings, one after the other.
-    Raises `ValueError` for a recording of another number of microphones, and where fewer than three can be used.
+    `compiled`: whether to compile a program first, which takes seconds and is several times as fast afterwards; by
+    default for more than 1,024 frames with a touch. Use True for many recordings in a row. Raises `ValueError` for a
+    recording of another number of microphones, and where fewer than three can be used.
     """
-    heard = calibrated_intensities(recording, calibration, intensity, silence=silence)
-    microphone_array, use, faults = microphones_in_use(heard, calibration)
-    touched = use.any(axis=1) & _above_floor(heard, microphone_array.noise, use)
+    intensities = calibrated_intensities(recording, calibration, intensity, silence=silence)
+    microphone_array, use, faults = microphones_in_use(intensities, calibration)
+    touched = use.any(axis=1) & _above_floor(intensities, microphone_array.noise, use)
     enough = use.sum(axis=1) >= 3
     solve = touched & enough
     compiled = int(solve.sum()) > FEW_FRAMES if compiled is None else compiled
     localiser = Localiser.create(microphone_array, method=method, map_shape=map_shape, compiled=compiled)
-    frames, d = len(heard.times), calibration.microphone_array.microphones.shape[1]
+    frames, d = len(intensities.times), calibration.microphone_array.microphones.shape[1]
     status = np.where(touched, LocationStatus.TOUCH, LocationStatus.NO_TOUCH).astype(object)
     status[~enough] = LocationStatus.UNUSABLE
     result = {
@@ -76,11 +76,11 @@ def locate(
         "second": np.full((frames, d), np.nan),
         "second_strength": np.full(frames, np.nan),
     }
-    notes = list(heard.notes)
+    notes = list(intensities.notes)
     if solve.any():
-        power, used = _padded(heard.power[solve], use[solve], compiled)
+        power, used = _padded(intensities.power[solve], use[solve], compiled)
         found = localiser(power, used)
-        # The likelihood judges frames, whichever loss has placed them.
+        # The status of frames is determined from the likelihood, whichever loss located them.
         judge = found if method == "likelihood" else Localiser.create(microphone_array, compiled=compiled)(power, used)
         number = int(solve.sum())
         for key in ("position", "covariance", "strength"):
@@ -88,40 +88,40 @@ def locate(
         for key in ("misfit", "freedom"):
             result[key][solve] = getattr(judge, key)[:number]
         status[solve] = _judge(judge, found)[:number]
-        _explain(status, result, heard.power, use, microphone_array, compiled)
+        _explain(status, result, intensities.power, use, microphone_array, compiled)
         excess = np.zeros(frames)
         excess[solve] = np.asarray(judge.excess)[:number]
         status[(status == LocationStatus.MISFIT) & (excess > _OUTSIDE)] = LocationStatus.OUTSIDE
         result["covariance"] *= calibration.widening
         _bound(status, result, float(longer_side(on_host(microphone_array.surface))))
-        notes += _notes(status, heard, use, microphone_array)
+        notes += _notes(status, intensities, use, microphone_array)
     return Locations(
-        np.asarray(heard.times),
+        np.asarray(intensities.times),
         **result,
         status=status.astype(str),
         used=use,
-        overlap=heard.overlap,
+        overlap=intensities.overlap,
         faults=faults,
-        notes=(*notes, *_unit(result["strength"], heard, use, calibration)),
-        name=heard.name,
+        notes=(*notes, *_unit(result["strength"], intensities, use, calibration)),
+        name=intensities.name,
     )
 
 
 def _judge(judge: SourceEstimate, found: SourceEstimate) -> np.ndarray:
-    """The status of frames with a touch, but for two touches."""
+    """Status of frames with a touch, before two touches are considered."""
     misfit, freedom = np.asarray(judge.misfit), np.asarray(judge.freedom)
     excess = np.asarray(judge.excess)
     rivalled = np.asarray(judge.rival) < _RIVAL
     status = np.where(rivalled, LocationStatus.AMBIGUOUS, LocationStatus.TOUCH).astype(object)
     status[_unexplained(misfit, freedom)] = LocationStatus.MISFIT
-    # A source beyond the outline explains what none on it does, but for two sources, which nothing explains.
+    # Outside: a source beyond the outline fits where none inside it does; two sources are fitted by neither.
     status[(excess > _OUTSIDE) & ~_unexplained(misfit - excess, freedom)] = LocationStatus.OUTSIDE
     status[~np.isfinite(np.asarray(found.position)).all(axis=1)] = LocationStatus.UNUSABLE
     return status
 
 
 def _unexplained(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """Whether a misfit is too great for chance."""
+    """Whether a misfit is too large to be due to chance."""
     return (freedom > 0) & (chdtrc(np.maximum(freedom, 1), misfit) < _FALSE_MISFIT)
 
 
@@ -133,7 +133,7 @@ def _explain(
     microphone_array: MicrophoneArray,
     compiled: bool,
 ) -> None:
-    """Try two sources where one does not explain the frame; widen the covariance where neither does."""
+    """Fit two sources where one does not explain the frame; widen the covariance where neither does."""
     tried = np.flatnonzero((status == LocationStatus.MISFIT) & (use.sum(axis=1) > 6))
     if tried.size:
         two = locate_two(microphone_array, *_padded(power[tried], use[tried], compiled), compiled=compiled)
@@ -154,7 +154,8 @@ def _explain(
 
 
 def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> None:
-    """A touch not known to a fourth of the skin's size is ambiguous; no covariance is wider than the skin."""
+    """Mark touches located less precisely than a fourth of the skin's size as ambiguous, and limit covariances to the
+    skin."""
     located = np.isfinite(result["position"]).all(axis=1)
     finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
     width = np.zeros(len(status))
@@ -165,13 +166,15 @@ def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> N
     result["covariance"][boundless] = (reach / 2) ** 2 * np.eye(result["covariance"].shape[1])
 
 
-def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, microphone_array: MicrophoneArray) -> list[str]:
-    """What the user should know beyond the status of frames."""
+def _notes(
+    status: np.ndarray, intensities: Intensities, use: np.ndarray, microphone_array: MicrophoneArray
+) -> list[str]:
+    """Notes on changes of the setup since the calibration, which the misfit of many frames indicates."""
     notes = []
     placed = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
     odd = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])
     if odd.sum() > _ODD * placed.sum():
-        exchanged, altered = find_setup_changes(microphone_array, heard.power[placed], use[placed])
+        exchanged, altered = find_setup_changes(microphone_array, intensities.power[placed], use[placed])
         notes += [
             f"microphones {one} and {other} look exchanged since the calibration: exchanged back, their intensities "
             "fit one source. The places are not corrected: exchange the channels and locate again."
@@ -187,8 +190,8 @@ def _notes(status: np.ndarray, heard: Intensities, use: np.ndarray, microphone_a
     return notes
 
 
-def _unit(strength: np.ndarray, heard: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
-    """A note where what was heard is of another order than what the calibration's taps were."""
+def _unit(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
+    """A note where the received intensities differ from those of the calibration's taps by orders of magnitude."""
     asked = "do the recording and the taps have the same gain and unit?"
     if np.isfinite(strength).any():
         typical = float(np.nanmedian(strength))
@@ -196,12 +199,12 @@ def _unit(strength: np.ndarray, heard: Intensities, use: np.ndarray, calibration
         if max(ratio, 1 / ratio) > _SAME_UNIT:
             return [f"touches are {ratio:.3g} times as strong as the calibration's taps: {asked}"]
         return []
-    # Silence whose floor nobody knows scatters as it did in the calibration.
+    # Where the floor is unknown, silence is assumed to scatter as in the calibration.
     deviation = np.asarray(calibration.microphone_array.noise.deviation)
     known = use.any(axis=0) & (deviation > 0)
-    if heard.floor.any() or not known.any():
+    if intensities.floor.any() or not known.any():
         return []
-    ratio = float(np.median(np.where(use, np.abs(heard.power), 0.0).max(axis=0)[known] / deviation[known]))
+    ratio = float(np.median(np.where(use, np.abs(intensities.power), 0.0).max(axis=0)[known] / deviation[known]))
     low = ratio < 1 / _SAME_UNIT
     return [f"what is heard is {ratio:.3g} times as loud as the calibration's noise: {asked}"] if low else []
 
@@ -209,7 +212,8 @@ def _unit(strength: np.ndarray, heard: Intensities, use: np.ndarray, calibration
 def microphones_in_use(
     heard: Intensities, calibration: Calibration
 ) -> tuple[MicrophoneArray, np.ndarray, tuple[str, ...]]:
-    """The microphones with the noise of these intensities, which are to be used (F, M), and what is wrong with others.
+    """The array with the noise of these intensities, the mask of usable readings (F, M), and the faults of the
+    microphones.
 
     Raises `ValueError` if fewer than three microphones are left.
     """
@@ -229,7 +233,7 @@ def microphones_in_use(
             len(faults), floor=heard.floor, freedom=heard.freedom, relative=np.asarray(known.relative)
         )
     else:
-        # What is negative betrays noise that the calibration may not have had.
+        # Negative intensities indicate noise that may have been absent in the calibration.
         wider = np.maximum(below_nothing(heard.power, use), np.asarray(known.deviation))
         noise = eqx.tree_at(
             lambda n: (n.deviation, n.floor),
@@ -246,19 +250,19 @@ def microphones_in_use(
     )
 
 
-def _above_floor(heard: Intensities, noise: IntensityNoise, use: np.ndarray) -> np.ndarray:
-    """Frames in which a microphone hears what silence would not make it hear."""
-    power = np.where(use, heard.power, -np.inf)
-    if np.any(heard.floor > 0) and np.isfinite(heard.freedom):
-        least = heard.floor * (chdtri(heard.freedom, _FALSE_ALARM / use.shape[1]) / heard.freedom - 1)
+def _above_floor(intensities: Intensities, noise: IntensityNoise, use: np.ndarray) -> np.ndarray:
+    """Frames in which any microphone's intensity exceeds the threshold for silence."""
+    power = np.where(use, intensities.power, -np.inf)
+    if np.any(intensities.floor > 0) and np.isfinite(intensities.freedom):
+        least = intensities.floor * (chdtri(intensities.freedom, _FALSE_ALARM / use.shape[1]) / intensities.freedom - 1)
     else:
         loudest = power.max(initial=0.0)
-        least = np.maximum(_HEARD_DEVIATIONS * np.asarray(noise.deviation), _DYNAMIC_RANGE * loudest)
+        least = np.maximum(_ALARM_DEVIATIONS * np.asarray(noise.deviation), _DYNAMIC_RANGE * loudest)
     return np.asarray((power > least).any(axis=1))
 
 
 def _padded(power: np.ndarray, use: np.ndarray, compiled: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Frames repeated up to a round number of them, so that few sizes are ever compiled."""
+    """Repeat the last frame up to a round number of frames, so that few sizes are compiled."""
     if not compiled:
         return power, use
     number = len(power)

@@ -1,4 +1,4 @@
-"""What is found of the frames of a recording: places, and what each frame is."""
+"""`Locations`: position and status of every frame of a recording."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-# So many frames NumPy is done with before a program for them would be compiled.
+# Number of frames up to which NumPy is faster than compiling a program.
 FEW_FRAMES = 1024
 
 
 class LocationStatus(StrEnum):
-    """What a frame is; see `Locations`."""
+    """Status of a frame; see `Locations`."""
 
     TOUCH = "touch"
     NO_TOUCH = "no touch"
@@ -25,20 +25,20 @@ class LocationStatus(StrEnum):
 
 
 class Locations(eqx.Module):
-    """What was found of F frames of M microphones.
+    """Positions and status of F frames of M microphones.
 
     - `times`: (F,) seconds; `status`: (F,) a `LocationStatus` each.
     - `position`: (F, d) metres; `covariance`: (F, d, d) m²; `strength`: (F,). NaN where there is no touch.
-    - `misfit`: (F,) chi-square of what one source leaves unexplained, with `freedom`: (F,) degrees.
-    - `used`: (F, M) which microphones were looked at. `faults`: M strings, what is wrong with one ("" if nothing).
+    - `misfit`: (F,) chi-square of the residuals of one source, with `freedom`: (F,) degrees.
+    - `used`: (F, M) which microphones were used. `faults`: M strings, the fault of each microphone ("" if none).
     - `second`: (F, d) and `second_strength`: (F,), of the weaker of two touches, NaN elsewhere.
-    - `overlap`: windows that share a sample, whose errors are alike.
-    - `notes`: what to know of all of it.
+    - `overlap`: number of windows that share a sample, whose errors are correlated.
+    - `notes`: remarks on the whole recording.
 
-    Status: "touch"; "no touch", nothing is above the floor; "outside", the intensities say a place beyond the outline,
-    and the place given is the best on it; "two touches", one source does not explain the frame but two do; "misfit",
-    neither does, and the covariance is widened accordingly; "ambiguous", two places explain the frame about as well;
-    "unusable", fewer than three microphones could be used.
+    Status: "touch"; "no touch", nothing is above the floor; "outside", the intensities indicate a position beyond the
+    outline, and the position given is the best on it; "two touches", one source does not explain the frame but two do;
+    "misfit", neither does, and the covariance is widened accordingly; "ambiguous", two positions explain the frame
+    about as well; "unusable", fewer than three microphones could be used.
     """
 
     times: Float[np.ndarray, " F"]
@@ -62,5 +62,5 @@ class Locations(eqx.Module):
         return np.asarray(np.isfinite(self.position).all(axis=1))
 
     def counts(self) -> dict[str, int]:
-        """How many frames there are of each status."""
+        """Number of frames of each status."""
         return {str(status): int((self.status == status).sum()) for status in LocationStatus if status in self.status}

@@ -1,7 +1,7 @@
-"""Descents: from starting places to minima on the skin, of any of the objectives, and their derivatives.
+"""Minimisation of an objective on the skin from given starting positions, with derivatives of the minimum.
 
-An objective has `microphone_array`, `frames` (all that differs from frame to frame), `cost`, `expand`, `start`, and
-`features` and `screen` for candidate places: `Likelihood` and `Consistency` do.
+An objective, `Likelihood` or `Consistency`, has `microphone_array`, `frames` (the arrays that differ between frames),
+`cost`, `expand`, `start`, and `features` and `screen` for candidate positions.
 """
 
 from __future__ import annotations
@@ -14,20 +14,22 @@ from jeit.acoustic.surface import bounding_box, longer_side, outline_sides
 from jeit_solvers import Minimum, definite_small, gradient_small, hessian_small, minimise_small, solve_small
 from jeit_solvers.engines import namespace, set_at, undifferentiated
 
-# Places screened along the outline.
+# Positions screened along the outline.
 _EDGE = 240
-# Two valleys closer than this part of the skin's size are one.
+# Valleys closer than this fraction of the skin's size are the same.
 _SAME_VALLEY = 0.05
-# Steps into a second valley before it is compared with the first, and by how much its cost may then be greater.
+# Steps into a second valley before it is compared with the first, and the largest cost difference to continue with.
 _TRIAL_STEPS, _PROMISING, _MOST_STEPS = 8, 8.0, 30
-# What a step must promise, relative to the cost; an exact Newton step follows.
+# Least predicted decrease of a step, relative to the cost; an exact Newton step follows.
 _TOLERANCE = 1e-12
 
 
 def find_minima(objective, first, second, worth):
-    """From both starts (2, F), the second only where that is worth it: unknowns (n, F), by how much the outline costs
-    more than what lies beyond, by how much the rival valley does, whether converged, and the (start, end) of the side
-    of the outline on which frames were held, NaN for those inside."""
+    """Minimise from both starts (2, F), the second only where it is promising.
+
+    Returns the unknowns (n, F), the excess cost of the outline over the minimum beyond it, the excess cost of the rival
+    valley, whether converged, and the (start, end) of the side of the outline on which frames were held, NaN for those
+    inside."""
     surface = objective.microphone_array.surface
     found = _minimise(objective, objective.start(first), None)
     unknowns, converged = found.x, found.converged
@@ -36,7 +38,7 @@ def find_minima(objective, first, second, worth):
     within = surface.outline.contains(unknowns[:2].T)
     rival, least = xp.full(value.shape, xp.inf), value
     if worth is not None:
-        # A few steps show whether that valley is any good; only then is its bottom sought.
+        # After a few steps, only promising valleys are minimised further.
         tried = _minimise(objective, objective.start(second), ~worth, max_steps=_TRIAL_STEPS)
         worth = worth & (tried.value < value + _PROMISING)
         other = _minimise(objective, tried.x, ~worth)
@@ -45,12 +47,12 @@ def find_minima(objective, first, second, worth):
         apart = xp.linalg.norm(other.x[:2] - unknowns[:2], axis=0) > _SAME_VALLEY * longer_side(surface)
         rival = xp.where(apart & worth & within & other_within, xp.abs(other_value - value), xp.inf)
         least = xp.minimum(value, other_value)
-        # Of two valleys of which one lies beyond the outline, the other is taken; the outline itself may yet be better.
+        # If one of two valleys lies beyond the outline, the other is taken; the outline itself may still be better.
         better = xp.where(other_within == within, other_value < value, other_within & xp.isfinite(other_value))
         unknowns = xp.where(better, other.x, unknowns)
         converged = xp.where(better, other.converged, converged)
         value, within = xp.where(better, other_value, value), xp.where(better, other_within, within)
-    # Places beyond the outline give way to the best on it; so do valleys inside that are worse than one beyond.
+    # Positions beyond the outline are replaced by the best on it; so are valleys inside that are worse than one beyond.
     beyond = xp.isfinite(value) & (~within | (least < value))
     nowhere = xp.full((2, 2, value.size), xp.nan)
 
@@ -74,9 +76,10 @@ def find_minima(objective, first, second, worth):
 
 
 def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimum:
-    """Within three times the outline's box; steps of at most a quarter of the skin, and a factor of ten in strength.
+    """Minimise within three times the outline's box, in steps of at most a quarter of the skin and a factor of ten in
+    strength.
 
-    The last of many steps are taken with exact Hessians; the first `max_steps`, where so many are asked for, are not.
+    The last steps use exact Hessians, unless `max_steps` is given, which limits the number of steps without them.
     """
     surface = objective.microphone_array.surface
     low, high = bounding_box(surface)
@@ -102,22 +105,22 @@ def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimu
 
 
 def _exactly(objective, x) -> tuple[Array, Array, Array]:
-    """The objective's expansion with the exact Hessian, where that is positive definite: near a minimum the last steps
-    are few then, however badly the minimum fits."""
+    """The objective's expansion with the exact Hessian, where that is positive definite: few last steps are then needed
+    near a minimum, however large its misfit."""
     value, gradient, model = objective.expand(x)
     hessian = hessian_small(objective.cost, x)
     return value, gradient, namespace(hessian).where(definite_small(hessian), hessian, model)
 
 
 def _on_edge(objective, skip) -> tuple[Minimum, Array]:
-    """The best place on the outline: the best of many, refined along its side. Also the side, (2, 2, F).
+    """The best position on the outline: the best of many, refined along its side. Also returns the side, (2, 2, F).
 
-    Not of the frames to `skip` (F,).
+    Frames in `skip` (F,) are left out.
     """
     start, end = outline_sides(objective.microphone_array.surface)
     xp = namespace(objective, start)
     length = xp.linalg.norm(end - start, axis=0)
-    # Places at equal steps along the whole outline, as (side, share of the side).
+    # Positions at equal steps along the whole outline, as (side, fraction of the side).
     stops = xp.concatenate([xp.zeros(1), xp.cumsum(length)])
     walked = stops[-1] * (xp.arange(_EDGE) + 0.5) / _EDGE
     which = xp.clip(xp.searchsorted(stops, walked, side="right") - 1, 0, length.size - 1)
@@ -153,14 +156,15 @@ def _on_edge(objective, skip) -> tuple[Minimum, Array]:
     )
     end_of = origin + along
     corner = (found.x[0] <= 0) | (found.x[0] >= 1)
-    # Held in a corner, a frame moves nowhere: its side has no length.
+    # A frame held in a corner cannot move: its side has length zero.
     side = xp.stack([origin, xp.where(corner, origin, end_of)])
     return Minimum(unknowns_of(found.x, origin, along), found.value, found.converged, found.steps), side
 
 
 def differentiable_minima(objective, unknowns, side, reach):
-    """The minimum as a function of everything in `objective`: one Newton step from it, x − H⁻¹ ∇cost, is zero in value
-    and, H and x being constants, −H⁻¹ ∂∇cost in derivative, as the implicit function theorem has it."""
+    """The minimum as a differentiable function of everything in `objective`. One Newton step from it, x − H⁻¹ ∇cost,
+    adds zero to the value and, with H and x constant, −H⁻¹ ∂∇cost to the derivative, by the implicit function
+    theorem."""
     at, xp = undifferentiated(unknowns), namespace(objective, unknowns)
 
     def finite_cost(at):

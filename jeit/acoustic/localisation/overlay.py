@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike
 def brightness(
     maps: ArrayLike, *, method: str = "likelihood", share: float = 0.02
 ) -> Float[np.ndarray, "F rows columns"]:
-    """How well each pixel explains its frame: 1 at the best pixel of each map, falling to 0; 0 outside the outline.
+    """Brightness of each pixel from the maps of frames: 1 at the best pixel of each map, falling to 0; 0 outside the
+    outline.
 
-    `maps` (F, rows, columns), as from `Localiser.with_maps`. Of "likelihood" maps it is the likelihood relative to the
+    `maps` (F, rows, columns), as from `Localiser.with_maps`. For "likelihood" maps it is the likelihood relative to the
     best pixel's, exp(−(map − least)). The paper's loss ("consistency") has no such scale: its brightness falls to 1/e
     where the loss is that of the best `share` of the pixels. Raises `ValueError` for other methods or shapes.
     """
@@ -36,11 +37,11 @@ def brightness(
 
 
 def overlay(images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3) -> Float[np.ndarray, "F rows columns"]:
-    """Every frame together with those before it, which fade as exp(−age / `time_constant`): (F, rows, columns).
+    """Overlay every frame with those before it, which fade as exp(−age / `time_constant`): (F, rows, columns).
 
     `images` (F, rows, columns), zero where there is no touch, NaN counts as zero; `times` (F,) in seconds, increasing.
-    Each pixel shows the brightest of what is left, so that a source at rest does not burn in. The last of the result
-    is the picture of the whole recording. Raises `ValueError` for shapes that disagree and a time constant that is not
+    Each pixel shows the maximum of the faded frames, so that a source at rest does not saturate. The last image is the
+    picture of the whole recording. Raises `ValueError` for shapes that disagree and a time constant that is not
     positive.
     """
     frames, when = np.nan_to_num(np.asarray(images, float)), np.asarray(times, float)
@@ -59,9 +60,10 @@ def overlay(images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3) 
 
 
 def fade(images: ArrayLike, times: ArrayLike, *, at: float, time_constant: float) -> Float[np.ndarray, "rows columns"]:
-    """What is left `at` a time (seconds) of some frames: the last picture of their `overlay`, without those before it.
+    """Faded overlay of some frames `at` a time (seconds): the last picture of their `overlay`, without computing the
+    others.
 
-    Of a long recording, the maximum of the pictures of its parts is that of the whole.
+    For a long recording, the picture of the whole is the maximum of the pictures of its parts.
     """
     age = np.maximum(at - np.asarray(times, float), 0.0)
     weight = np.exp(-age / time_constant)

@@ -8,8 +8,8 @@ from jaxtyping import Array, Bool, Float
 from jeit.acoustic.surface import chart_grid
 from jeit_solvers.engines import as_array, namespace, set_at
 
-# Another valley is worth a descent if, screened, it is not worse than so many times the best and so much more; on
-# rasters of more pixels only the best is descended.
+# A second valley is descended if its screened value is at most this factor times the best plus this offset; on rasters
+# with more pixels only the best valley is descended.
 _WORTH, _WORTH_MORE, _FINE = 1.5, 8.0, 2000
 
 
@@ -24,7 +24,8 @@ class Pixels(eqx.Module):
 
     @classmethod
     def create(cls, surface, columns: int, rows: int) -> "Pixels":
-        """Of so many pixels; bottom row first. Raises `ValueError` where none of them lies inside the outline."""
+        """Create a raster of rows × columns pixels, bottom row first. Raises `ValueError` where no pixel lies inside
+        the outline."""
         grid, within = chart_grid(surface, columns, rows)
         if not within.any():
             raise ValueError(f"shape: none of {columns} × {rows} pixels has its middle inside the outline; take more.")
@@ -32,8 +33,8 @@ class Pixels(eqx.Module):
 
 
 def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Array]:
-    """Chart coordinates (2, F) of each map's least pixel, and of the least local minimum elsewhere, with which frames
-    have one worth a descent (F,)."""
+    """Chart coordinates (2, F) of the minimum pixel of each map and of the lowest other local minimum, and a mask (F,)
+    of the frames where the latter is worth a descent."""
     rows, columns = pixels.shape
     inside, xp = pixels.inside.reshape(rows, columns), namespace(maps, pixels)
 
@@ -41,13 +42,13 @@ def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Ar
         fair = ~xp.isnan(values) if pixels.full else inside & ~xp.isnan(values)
         return xp.where(fair, values, xp.inf)
 
-    # The least row first, then the least pixel in it, which is quicker than to look for the pixel at once.
+    # First the row of the minimum, then the pixel in it, which is faster than a search over all pixels.
     square = maps.reshape(-1, rows, columns)
     row = xp.argmin(xp.min(known(square, inside), axis=2), axis=1)
     in_row = known(xp.take_along_axis(square, row[:, None, None], axis=1)[:, 0], inside[row])
     best = row * columns + xp.argmin(in_row, axis=1)
     first = pixels.chart[:, best]
-    if rows * columns > _FINE:  # where pixels are that fine, noise makes valleys of its own
+    if rows * columns > _FINE:  # on such fine rasters, noise causes spurious valleys
         return first, first, xp.zeros(best.shape, bool)
     square = known(square, inside)
     values = square.reshape(len(best), -1)

@@ -1,4 +1,5 @@
-"""What has changed since the calibration: plugs exchanged, a microphone with another gain; found by the misfit."""
+"""Detection of changes since the calibration from the misfit: exchanged microphones, or a microphone with another
+gain."""
 
 from __future__ import annotations
 
@@ -11,16 +12,16 @@ from jaxtyping import Bool, Float
 from jeit.acoustic.localisation.localiser import Localiser
 from jeit.acoustic.microphones import MicrophoneArray
 
-# Loudest frames looked at; misfit per degree of freedom above which something is wrong, and beyond which more does not
-# count; part to which an explanation must lower it to be believed.
+# Number of loudest frames used; misfit per degree of freedom above which a change is searched for, and at which it is
+# clipped; fraction to which a change must lower the misfit to be accepted.
 _FRAMES, _WRONG, _MOST, _BETTER = 24, 3.0, 100.0, 0.7
 _MOST_CHANGES = 4
-# Microphones that must be left for it to mean anything that one source explains them without one.
+# Least number of remaining microphones for a test without one microphone to be meaningful.
 _LEAST_LEFT = 5
 
 
 class SetupChanges(NamedTuple):
-    """`exchanged`: pairs of microphones; `altered`: microphones that do not hear as they did."""
+    """`exchanged`: pairs of exchanged microphones; `altered`: microphones whose response has changed."""
 
     exchanged: list[tuple[int, int]]
     altered: list[int]
@@ -29,12 +30,12 @@ class SetupChanges(NamedTuple):
 def find_setup_changes(
     microphone_array: MicrophoneArray, power: Float[np.ndarray, "F M"], use: Bool[np.ndarray, "F M"]
 ) -> SetupChanges:
-    """Microphones without which, or pairs with whose intensities exchanged back, one source explains the frames; none,
-    where no such change explains them.
+    """Find the microphones, or pairs of exchanged microphones, after whose removal or re-exchange one source explains
+    the frames; empty where no such change does.
 
-    `power` (F, M): intensities above the floor of frames with a touch. Looks at the loudest frames; finds nothing in
-    fewer than three, or where the typical frame is explained as it is. One after the other, the best first: of several
-    at once, only those are found each of which helps alone.
+    `power` (F, M): intensities above the floor of frames with a touch. Uses the loudest frames; returns nothing for
+    fewer than three frames, or where the typical frame is explained already. The search is greedy, the best change
+    first: of several changes, only those are found each of which lowers the misfit alone.
     """
     loudest = np.argsort(-np.where(use, power, 0.0).sum(axis=1))[:_FRAMES]
     changes = SetupChanges([], [])
@@ -45,7 +46,7 @@ def find_setup_changes(
     localiser = Localiser.create(microphone_array)
 
     def misfit(tried: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Mean misfit per degree of freedom, channels in some order and some kept, for each of several such pairs."""
+        """Mean misfit per degree of freedom for each of several pairs of channel order and mask."""
         found = localiser(
             np.concatenate([power[:, order] for order, _ in tried]),
             np.concatenate([use[:, order] & kept for order, kept in tried]),
@@ -57,7 +58,7 @@ def find_setup_changes(
     now = float(misfit([state])[0])
     left = np.flatnonzero(use.any(axis=0))
     while now > _WRONG and len(changes.exchanged) + len(changes.altered) < _MOST_CHANGES and left.size:
-        # One that is altered comes before an exchange with it, which may help a little too.
+        # An altered microphone is tested before exchanges with it, which may lower the misfit a little too.
         singles = [(int(k),) for k in left if left.size > _LEAST_LEFT]
         candidates = singles + [(int(k), int(m)) for k, m in combinations(left, 2)]
         tried = [_changed(state, which) for which in candidates]
@@ -76,7 +77,7 @@ def find_setup_changes(
 
 
 def _changed(state: tuple[np.ndarray, np.ndarray], which: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Order and mask of channels with a pair exchanged, or one left out."""
+    """Order and mask of the channels with a pair exchanged or one channel left out."""
     order, kept = (part.copy() for part in state)
     if len(which) == 2:
         order[list(which)] = order[list(which[::-1])]

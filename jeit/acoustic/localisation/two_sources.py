@@ -1,4 +1,4 @@
-"""Two sources at once: where both are, for frames that one source does not explain."""
+"""Localisation of two simultaneous sources, for frames that one source does not explain."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jeit.acoustic.surface import bounding_box, in_space, longer_side
 from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import at_once, has_values, namespace, on_device, on_host, scan
 
-# Places of which all pairs are screened, and pairs that are tried.
+# Number of positions whose pairs are all screened, and of pairs that are refined.
 _PLACES, _STARTS = 150, 3
 
 
@@ -35,11 +35,13 @@ class TwoSources(eqx.Module):
 def locate_two(
     microphone_array: MicrophoneArray, power: ArrayLike, use: ArrayLike | None = None, *, compiled: bool = False
 ) -> TwoSources:
-    """The most probable pair of sources of each frame: all pairs of a coarse grid are screened, the best three refined.
+    """Locate the most probable pair of sources of each frame: all pairs of a coarse grid are screened, the best three
+    refined.
 
-    `power` (F, M): intensities above the floor; `use`: which to look at, all that are finite unless given. Six unknowns
-    need six microphones or more: frames with fewer give NaN. Both are found inside the outline's box. `compiled`: by a
-    compiled program, for what is asked for again and again; what is traced is in any case.
+    `power` (F, M): intensities above the floor; `use`: mask of those to use, all finite ones unless given. The six
+    unknowns need six microphones or more: frames with fewer give NaN. Both sources are searched for inside the
+    outline's box. `compiled`: whether to compile the program, for repeated calls; traced calls are compiled in any
+    case.
     """
     at_hand = not compiled and np.size(power) > 0 and has_values(microphone_array, power, use)
     xp = np if at_hand else jnp
@@ -103,11 +105,11 @@ def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -
 
 
 def _best_pairs(power, use, response, pixels: Pixels, microphone_array: MicrophoneArray) -> Float[Array, "starts 6"]:
-    """Of all pairs of places, those whose best two strengths leave least of the frame unexplained, apart from each
-    other."""
+    """The pairs of positions, apart from each other, with the lowest residual of the frame at their best two
+    strengths."""
     xp = namespace(response, power)
     weight = xp.where(use, 1 / microphone_array.noise.variance(xp.maximum(power, 0.0)), 0.0)
-    # All numbers near one: intensities may be of any unit.
+    # Intensities may have any unit: scale all numbers to near one.
     scale = xp.max(xp.where(use, power, 0.0))
     weight = weight * scale**2
     seen = xp.where(use, power, 0.0) / scale

@@ -1,4 +1,4 @@
-"""Pictures of acoustic localisation."""
+"""Plots of acoustic localisation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far off places are: pairs of true and estimated ones on the skin, and errors against what they depend on."""
+"""Plots of localisation errors: pairs of true and estimated positions on the skin, and error curves."""
 
 from __future__ import annotations
 
@@ -30,11 +30,12 @@ def plot_pairs(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw true places (P, d) and those `found` (P, d), pair by pair, over `microphones` (M, d); all in metres.
+    """Plot true positions (P, d) and estimated positions `found` (P, d) in pairs, over `microphones` (M, d); all in
+    metres.
 
-    `surface`: its outline, a surface, `MicrophoneArray` or a `Calibration`. Places that were not found, NaN, are
-    hollow. The title is mean ± standard deviation of the error unless given. Raises `ValueError` for shapes that
-    disagree.
+    `surface`: an outline, a surface, a `MicrophoneArray` or a `Calibration`. Positions that were not found (NaN) are
+    drawn as hollow markers. The default title is mean ± standard deviation of the error. Raises `ValueError` for shapes
+    that disagree.
     """
     view = view_of(surface, microphones)
     place, guess = view.chart(true, "true"), view.chart(found, "found")
@@ -70,13 +71,13 @@ def plot_error_curve(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw localisation errors of one or several methods against `values` (K,) of a `quantity`.
+    """Plot localisation errors of one or several methods against `values` (K,) of a `quantity`.
 
-    `errors`: the name of each method with its errors in metres: (K, N), of N places each, drawn by their `statistic`
-    ("median", "mean" or "rms") over a band from the lower to the upper quartile; or (K,), a line alone. NaN counts for
-    nothing. `bound`: the Cramér-Rao bound, (K,), or (K, N) of which the same statistic is drawn. `logarithmic`: whether
-    `values` are on a logarithmic axis, which suits a number of microphones. Errors always are. Raises `ValueError` for
-    shapes that disagree, no errors, and more than six methods.
+    `errors`: the name of each method with its errors in metres: (K, N), of N positions each, drawn as their `statistic`
+    ("median", "mean" or "rms") over a band from the lower to the upper quartile; or (K,), a line alone. NaN is ignored.
+    `bound`: the Cramér-Rao bound, (K,), or (K, N) of which the same statistic is drawn. `logarithmic`: whether the axis
+    of `values` is logarithmic, which suits a number of microphones. The axis of errors always is. Raises `ValueError`
+    for shapes that disagree, no errors, and more than six methods.
     """
     x = np.asarray(values, float)
     if x.ndim != 1 or not x.size or not np.isfinite(x).all() or (logarithmic and not (x > 0).all()):
@@ -109,7 +110,7 @@ def plot_error_curve(
 
 
 def _mark_axes(ax: Axes, x: np.ndarray, logarithmic: bool) -> None:
-    """Ticks and lines of a curve of errors against `x`."""
+    """Set ticks and grid lines of an error curve against `x`."""
     if logarithmic:
         ax.set_xscale("log", base=2)
         ax.set_xticks(x)

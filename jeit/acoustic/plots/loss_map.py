@@ -1,4 +1,4 @@
-"""The map of one touch: how well every place explains what the microphones received."""
+"""Plot of the map of one touch: the objective at every position of the skin."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from jeit.acoustic.plots.surface_view import (
 from jeit.arguments import check_kind, check_name
 from jeit.plot.axes import INK, SEQUENTIAL, axes_or_new, draw_colour_bar
 
-# Decibels over which the size of a microphone's circle says how much it received.
+# Range in decibels over which the size of a microphone's circle shows the received intensity.
 _RANGE = 30.0
-# A map is drawn up to so many standard deviations, or decibels, above its least.
+# Range of a map above its minimum, in standard deviations or decibels.
 _MOST = {"likelihood": 15.0, "consistency": 40.0}
 _MAP_LABELS = {
     "likelihood": "Standard deviations worse than the best place",
@@ -36,8 +36,8 @@ _MAP_LABELS = {
 
 
 class Marks(NamedTuple):
-    """Places marked on a map: the `truth` (d,) and an `estimate` (d,), metres, whose `covariance` (d, d), m², is drawn
-    as the ellipse that holds 95 %."""
+    """Positions marked on a map: the `truth` (d,) and an `estimate` (d,), metres, whose `covariance` (d, d), m², is
+    drawn as its 95 % ellipse."""
 
     truth: ArrayLike | None = None
     estimate: ArrayLike | None = None
@@ -56,15 +56,14 @@ def plot_loss_map(
     colour_bar: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the map of one frame, as `Localiser.with_maps` makes it: brightest where the touch most probably is.
+    """Plot the map of one frame from `Localiser.with_maps`; it is brightest where the touch most probably is.
 
-    `values` (rows, columns), bottom row first, over the box of the outline, NaN outside it. `surface`: a
-    `Calibration`, `MicrophoneArray`, a surface, or an outline. `microphones` (M, d): metres, those of the array unless
-    given; their circles are the larger the more they have `received` (M,), intensities. `marks`: places to
-    mark, the truth and an estimate. `method`: "likelihood" maps
-    are drawn as √(2 (map − least)), standard deviations in which a place is worse than the best; the paper's loss,
-    "consistency", in decibels above its least. Raises `ValueError` for other methods and shapes, and for marks that are
-    none.
+    `values` (rows, columns), bottom row first, over the box of the outline, NaN outside it. `surface`: a `Calibration`,
+    `MicrophoneArray`, a surface, or an outline. `microphones` (M, d): metres, those of the array unless given; the size
+    of their circles increases with the intensities `received` (M,). `marks`: the truth and an estimate to mark.
+    `method`: "likelihood" maps are drawn as √(2 (map − least)), the number of standard deviations by which a position
+    is worse than the best; the paper's loss, "consistency", in decibels above its minimum. Raises `ValueError` for
+    other methods and shapes, and for marks that are none.
     """
     if marks is not None:
         check_kind("marks", marks, Marks, "Marks, such as Marks(truth=(0.02, 0.01))")
@@ -97,7 +96,7 @@ def plot_loss_map(
 
 
 def _draw_marks(ax: Axes, view: View, marks: Marks) -> list[Line2D]:
-    """The marks, and what of them a legend names. Raises `ValueError` for shapes that do not go with the surface."""
+    """Draw the marks and return their legend entries. Raises `ValueError` for shapes that do not match the surface."""
     if marks.covariance is not None and marks.estimate is None:
         raise ValueError("covariance needs an estimate: the place that it is the covariance of.")
     handles = []
@@ -118,13 +117,13 @@ def _above_least(pixels: np.ndarray, method: str) -> np.ndarray:
     least = np.nanmin(pixels)
     if method == "likelihood":
         return np.sqrt(2 * (pixels - least))
-    # The loss may vanish, in the noiseless case: nothing is drawn more than 120 dB under its greatest.
+    # The loss may vanish in the noiseless case: it is clipped at 120 dB below its maximum.
     bottom = max(least, 1e-12 * np.nanmax(pixels), np.finfo(float).tiny)
     return 10 * np.log10(np.maximum(pixels, bottom) / bottom)
 
 
 def _draw_levels(ax: Axes, place: np.ndarray, received: np.ndarray) -> Line2D:
-    """Microphones, their circles' areas in proportion to how many decibels they are above the least shown."""
+    """Draw the microphones as circles with areas proportional to their levels in decibels above the least shown."""
     positive = np.isfinite(received) & (received > 0)
     loudest = received[positive].max(initial=1e-300)
     level = 10 * np.log10(np.where(positive, received, 1e-300) / loudest)

@@ -1,4 +1,4 @@
-"""Receptive fields: what each microphone receives of taps, against their distance."""
+"""Receptive fields: the intensity of taps at each microphone against their distance."""
 
 from __future__ import annotations
 
@@ -24,13 +24,14 @@ _TAP = "#8fb4d9"
 def plot_receptive_fields(
     fit: CalibrationFit, *, microphones: ArrayLike | None = None, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw what each microphone receives, relative to the strength of the tap, against distance, and the fitted curve.
+    """Plot the intensity at each microphone, relative to the strength of the tap, against distance, with the fitted
+    curve.
 
     `microphones`: indices of those to draw, all unless given; they are numbered from 0, as in the calibration's
-    messages. Red circles are taps that the fit has left out, and a microphone of no use says why. The dashed line is
-    the noise, one standard deviation, of a tap of median strength; the number beside the index is the distance at which
-    a microphone receives half of what it does right under the tap. The panels are insets of the axes returned. Raises
-    `ValueError` for microphones that there are not, and for what is no fit.
+    messages. Red circles are taps excluded from the fit; the panel of an unusable microphone states the reason. The
+    dashed line is the noise, one standard deviation, relative to a tap of median strength; the number beside the index
+    is the distance at which a microphone receives half the intensity of a tap directly above it. The panels are insets
+    of the returned axes. Raises `ValueError` for microphones that do not exist, and for what is no `CalibrationFit`.
     """
     check_kind("fit", fit, CalibrationFit, "a CalibrationFit, as of calibrate_microphones")
     number = fit.power.shape[1]
@@ -43,7 +44,7 @@ def plot_receptive_fields(
     rows = -(-chosen.size // columns)
     ax = axes_or_new(ax, (max(4.8, min(11.0, 2.2 * columns)), max(3.6, min(9.0, 1.75 * rows))))
     ax.set_axis_off()
-    # At a height of its own: matplotlib would look for it in all panels.
+    # The height is fixed: matplotlib would search all panels for it.
     ax.set_title(title or "", loc="left", y=1.0, pad=26)
     distance = np.linspace(0, float(fit.distance.max()), 200)
     decay = on_host(fit.calibration.microphone_array.decay)
@@ -59,7 +60,7 @@ def plot_receptive_fields(
     for place, index in enumerate(chosen):
         row, column = divmod(place, columns)
         panel = ax.inset_axes((column * wide, 1 - (row + 1) * tall, 0.93 * wide, 0.9 * tall))
-        panel.set_in_layout(False)  # the labels of all of them reach farther
+        panel.set_in_layout(False)  # their labels extend beyond the axes
         _draw_field(panel, fit, int(index), relative[:, index], (distance, curve[index], noise[index]), columns)
         panel.set_xlim(0, 1e3 * distance[-1])
         panel.set_ylim(low, high)
@@ -69,7 +70,7 @@ def plot_receptive_fields(
 
 
 def _label(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
-    """What the axes of all panels say, and the legend above them."""
+    """Draw the axis labels shared by all panels, and the legend above them."""
     label: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": INK}
     label["annotation_clip"] = False
     ax.annotate("Distance (mm)", (0.5, 0), (0, -22), ha="center", va="top", **label)
@@ -88,17 +89,18 @@ def _label(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
 
 
 def _strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
-    """Of every tap: those left out of the fit have none, and get the median of what the microphones say."""
+    """Strength of every tap. Taps excluded from the fit get the median of the strengths estimated from the
+    microphones."""
     response = np.asarray(on_host(fit.calibration.microphone_array.decay).response(fit.distance.T**2)).T
     strength = np.where((fit.power > 0) & fit.calibration.usable, fit.power / response, np.nan)
-    heard = np.isfinite(strength).any(axis=1)
+    received = np.isfinite(strength).any(axis=1)
     median = np.full(len(strength), np.nan)
-    median[heard] = np.nanmedian(strength[heard], axis=1)
+    median[received] = np.nanmedian(strength[received], axis=1)
     return np.where(np.isfinite(fit.strength), fit.strength, median)
 
 
 def _draw_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, columns: int) -> None:
-    """One panel: taps, curve and noise of a microphone; `lines`: distances (m), the curve there, and the noise."""
+    """Draw one panel: taps, curve and noise of a microphone; `lines`: distances (m), the curve there, and the noise."""
     distance, curve, noise = lines
     reason = fit.calibration.reasons[index]
     shown = np.isfinite(relative) & (relative > 0)
@@ -110,7 +112,7 @@ def _draw_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, c
         size = 9 if columns <= 2 else 5
         panel.scatter(1e3 * fit.distance[which, index], relative[which], s=size, rasterized=True, **style)
     style = {"color": SOFT, "linewidth": 1.2, "linestyle": (0, (1, 1))} if reason else {"color": INK, "linewidth": 1.6}
-    # Of a microphone that heard nothing there is no curve.
+    # No curve is drawn for a microphone without readings.
     near = (distance <= fit.distance[:, index].max()) & shown.any()
     panel.plot(1e3 * distance[near], curve[near], zorder=3, **style)
     if noise > 0:

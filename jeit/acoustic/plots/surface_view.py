@@ -1,4 +1,4 @@
-"""What pictures of touches share: the surface seen from above, its microphones, where a touch is and how surely."""
+"""Common parts of plots of touches: the surface seen from above, its microphones, and error ellipses of touches."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ AnySurface = Calibration | MicrophoneArray | AbstractSurface | Domain | ArrayLik
 
 
 class View(NamedTuple):
-    """A surface seen along its chart's normal: `surface`, in NumPy's arrays, `microphones` (M, 2) in the chart, which
-    are `usable`."""
+    """A surface seen along the normal of its chart: `surface`, with NumPy arrays; `microphones` (M, 2) in the chart;
+    `usable`, which of them are."""
 
     surface: AbstractSurface
     microphones: np.ndarray
@@ -66,7 +66,7 @@ class View(NamedTuple):
 
 
 def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: ArrayLike | None = None) -> View:
-    """The view of a calibration, an array, a surface or an outline; `microphones` (M, d) where it does not know them.
+    """Create the view of a calibration, an array, a surface or an outline; `microphones` (M, d) for the latter two.
 
     Raises `ValueError` for shapes that disagree.
     """
@@ -93,13 +93,13 @@ def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarr
 
 
 def outline_of(view: View) -> Path:
-    """The outline and its holes, in the chart."""
+    """Outline and its holes, in the chart."""
     loops = (Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in view.surface.outline.loops())
     return Path.make_compound_path(*loops)
 
 
 def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool = False) -> list[Line2D]:
-    """Outline and scale bar, and the microphones, those of no use crossed; what of it a legend should name."""
+    """Draw outline, scale bar and microphones, unusable ones crossed; return the legend entries."""
     ax.add_patch(
         PathPatch(outline_of(view), facecolor="none", edgecolor=INK, linewidth=0.9, joinstyle="round", zorder=2)
     )
@@ -127,7 +127,7 @@ def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool 
 
 
 def draw_ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray, *, colour: str = FOUND) -> None:
-    """The ellipse that holds a normal variable with 95 % probability: `middle` (2,), `covariance` (2, 2), metres."""
+    """Draw the 95 % ellipse of a normal distribution: `middle` (2,), metres, and `covariance` (2, 2), m²."""
     variances, axes = np.linalg.eigh(covariance)
     long, short = 2 * _REACH * np.sqrt(np.maximum(variances[::-1], 0))
     angle = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
@@ -138,7 +138,7 @@ def draw_ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray, *, colour
 
 
 def draw_legend(ax: Axes, handles: list) -> None:
-    """A legend under the picture, of as many columns as there is room for; none where there is nothing to name."""
+    """Draw a legend below the plot, with as many columns as fit; none without entries."""
     if not handles:
         return
     # Widths in inches: of a marker with its gaps, and of a letter.

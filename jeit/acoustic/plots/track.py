@@ -1,4 +1,4 @@
-"""Touches in time: where each began, went and ended, over the fading overlay of what was heard."""
+"""Plot of the touches of a recording: onset, path and offset of each, over the fading overlay of the maps."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from jeit.plot.axes import INK, SOFT, axes_or_new, draw_colour_bar
 
 _GLOW = LinearSegmentedColormap.from_list("glow", ["#ffffff", "#bccddf", "#6a8aae"])
 _TIME = LinearSegmentedColormap.from_list("time", ["#0d0887", "#7e03a8", "#cc4778", "#f89540", "#fbd724"])
-# Frames that are no plain touch, each with its marker.
+# Markers of frames with a status other than "touch".
 _ODD = {
     LocationStatus.TWO_TOUCHES: "D",
     LocationStatus.OUTSIDE: "^",
     LocationStatus.MISFIT: "X",
     LocationStatus.AMBIGUOUS: "P",
 }
-# A touch that has moved by less than so many standard deviations, or this part of the surface, has stayed where it was.
+# A touch that moved by less than so many standard deviations, or this fraction of the surface, is drawn at rest.
 _MOVED, _LEAST = 4.0, 0.05
 
 
@@ -43,14 +43,14 @@ def plot_track(
     colour_bar: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the path of every touch, coloured by time, with its onset and offset; dots are the frames it comes from.
+    """Plot the path of every touch, coloured by time, with its onset and offset; dots are the individual frames.
 
     `array`: the `Calibration`, whose unusable microphones are crossed, as are those not used at all in `locations`; or
-    `MicrophoneArray`. `overlay` (rows, columns), bottom row first, over the box of the outline: what was heard, 0 to 1,
-    as the last of `jeit.acoustic.localisation.overlay`. `truth` (N, d), metres: a path known otherwise. A touch that
-    has stayed where it was is drawn as a dot with an ellipse that holds 95 %. Frames that are no plain touch are
-    marked, and named where there are any. On a curved surface everything is in its chart. Raises `ValueError` for
-    shapes that disagree, and for things of another kind.
+    `MicrophoneArray`. `overlay` (rows, columns), bottom row first, over the box of the outline: brightness, 0 to 1, as
+    the last image of `jeit.acoustic.localisation.overlay`. `truth` (N, d), metres: the true path, if known. A touch at
+    rest is drawn as a dot with its 95 % ellipse. Frames with a status other than "touch" are marked, and listed in the
+    legend. On a curved surface everything is in its chart. Raises `ValueError` for shapes that disagree, and for
+    arguments of the wrong type.
     """
     check_kind("track", track, Track, "a Track, as of jeit.acoustic.track(locations)")
     check_kind("locations", locations, Locations, "Locations, as of jeit.acoustic.locate")
@@ -101,7 +101,7 @@ def _say_that_there_is_none(ax: Axes, view: View, locations: Locations) -> None:
 
 
 def _draw_touch(ax: Axes, view: View, track: Track, touch: Touch, path, times: ScalarMappable, named: set) -> list:
-    """A touch, and what of it is not yet in the legend."""
+    """Draw a touch; return its legend entries that are not yet in the legend."""
     frames = slice(touch.first, touch.last + 1)
     places, when = path[frames], track.times[frames]
     surest = touch.first + int(np.argmin(np.trace(track.covariance[frames], axis1=1, axis2=2)))
@@ -128,7 +128,7 @@ def _draw_touch(ax: Axes, view: View, track: Track, touch: Touch, path, times: S
 
 
 def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, times: ScalarMappable) -> list:
-    """Where each frame alone was located: dots, rings round those that the track rejects, and frames that are odd."""
+    """Draw the position of each frame: dots, rings around those that the track rejects, and markers by status."""
     places = view.chart(locations.position, "locations")
     plain = locations.located & ~np.isin(locations.status, list(_ODD))
     believed, doubted = plain & ~track.rejected, locations.located & track.rejected
@@ -136,7 +136,7 @@ def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, times
     dots = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
     ax.scatter(*places[believed].T, color=times.to_rgba(track.times[believed]), **dots)
     if doubted.any():
-        # Around the marker of a frame that is no plain touch.
+        # Around the marker of a frame with another status.
         rings: dict[str, Any] = {"s": np.where(plain, 16, 60)[doubted], "linewidths": 0.8, "facecolors": "none"}
         rings |= {"zorder": 3.7, "edgecolors": times.to_rgba(track.times[doubted])}
         ax.scatter(*places[doubted].T, **rings)
@@ -146,7 +146,7 @@ def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, times
 
 
 def _draw_odd(ax: Axes, view: View, locations: Locations, places: np.ndarray, times: ScalarMappable) -> list:
-    """Frames that are outside, misfits, ambiguous, or of two touches, and the second of these."""
+    """Draw frames that are outside, misfits, ambiguous, or of two touches, and the second touch of the latter."""
     handles = []
     second = view.chart(locations.second, "locations.second")
     for status, marker in _ODD.items():

@@ -1,4 +1,4 @@
-"""Reports, tables and pictures of acoustic localisation, written to a folder."""
+"""Reports, tables and plots of acoustic localisation, written to a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is left of a calibration of microphones on disk: the calibration, and a picture of how well it fits."""
+"""Files of a calibration of microphones: the calibration, and a plot of its fit."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from jeit.report.folder import results
 
 
 def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
-    """Write the calibration to `path` (JSON, which `Calibration.load` reads) and a picture of it beside, with suffix
-    `.png`; the folder is made if need be. Raises `ValueError` for a path that is a folder, in no folder, or that of the
-    picture."""
+    """Write the calibration to `path` (JSON, for `Calibration.load`) and a plot of it to the same path with suffix
+    `.png`; the folder is created if needed. Raises `ValueError` for a path that is a folder, in no folder, or that of
+    the plot."""
     path, picture = calibration_files(path)
     with results(path.parent, (path.name, picture.name)) as made:
         fit.calibration.save(made / path.name)
@@ -19,7 +19,8 @@ def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
 
 
 def calibration_files(path: str | Path) -> tuple[Path, Path]:
-    """The calibration file that `write_calibration` writes for `path`, and its picture; what it raises."""
+    """Paths of the calibration file and the plot that `write_calibration` writes for `path`. Raises `ValueError` as it
+    does."""
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"path {path} is a folder; give a file, such as {path / 'calibration.json'}.")
@@ -30,7 +31,7 @@ def calibration_files(path: str | Path) -> tuple[Path, Path]:
 
 
 def draw_calibration(fit: CalibrationFit):
-    """The receptive fields of all microphones, as a matplotlib `Figure` that needs no display."""
+    """Plot the receptive fields of all microphones, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.acoustic.plots import plot_receptive_fields

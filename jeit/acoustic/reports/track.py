@@ -1,4 +1,4 @@
-"""What is left of a located recording on disk: a table of its frames, a report, and a picture."""
+"""Files of a located recording: a table of its frames, a report, and a plot."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from jeit.acoustic.tracking import Track
 from jeit.report.folder import plain, results, version_of, write_json, write_rows
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
-# Maps of so many pixels a side, so many frames at once.
+# Pixels along a side of the maps; frames processed at once.
 _PIXELS, _FRAMES = 100, 256
 
 
 def write_track(found: LocatedTouches, folder: str | Path) -> None:
-    """Write `track.csv`, `report.json` and `track.png` of what `locate_touches` found into `folder`, made if need be.
+    """Write `track.csv`, `report.json` and `track.png` of a result of `locate_touches` into `folder`, created if
+    needed.
 
-    The table has a line for every frame: `time_s`; the place found, `x_m`, `y_m`, its standard deviations `std_x_m`,
-    `std_y_m` and `covariance` (m², of x and y); `strength`, in units of intensity; `status`; then the smoothed place,
-    `track_x_m`, `track_y_m`, `track_std_x_m`, `track_std_y_m`, and the number of the `touch` from 1. In space, columns
-    for z follow. Empty where there is nothing. Raises `ValueError` for what cannot be a
-    folder.
+    The table has a row for every frame: `time_s`; the estimated position `x_m`, `y_m`, its standard deviations
+    `std_x_m`, `std_y_m` and `covariance` (m², of x and y); `strength`, in units of intensity; `status`; then the
+    smoothed position, `track_x_m`, `track_y_m`, `track_std_x_m`, `track_std_y_m`, and the number of the `touch` from 1.
+    In space, columns for z follow. Missing values are empty. Raises `ValueError` for what cannot be a folder.
     """
     with results(folder, ("track.csv", "report.json", "track.png")) as made:
         columns = _columns(found.locations.position.shape[1])
@@ -37,7 +37,7 @@ def write_track(found: LocatedTouches, folder: str | Path) -> None:
 
 
 def report_track(found: LocatedTouches) -> dict[str, Any]:
-    """All that was found, as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    """Report of a result as plain numbers, strings, lists and dictionaries; None for unknown values."""
     locations, track, calibration = found.locations, found.track, found.calibration
     touches = []
     for number, touch in enumerate(track.touches, 1):
@@ -93,7 +93,7 @@ def report_track(found: LocatedTouches) -> dict[str, Any]:
 
 
 def draw_track(found: LocatedTouches):
-    """The picture, as a matplotlib `Figure` that needs no display."""
+    """Plot the track, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.acoustic.plots import plot_track
@@ -107,19 +107,19 @@ def draw_track(found: LocatedTouches):
 
 
 def _overlay(found: LocatedTouches) -> np.ndarray | None:
-    """The maps of all located frames, the older the fainter (rows, columns); None without a touch."""
-    locations, heard = found.locations, found.intensities
+    """Overlay of the maps of all located frames (rows, columns), older frames fainter; None without a touch."""
+    locations, intensities = found.locations, found.intensities
     located = np.flatnonzero(locations.located & (locations.status != LocationStatus.TWO_TOUCHES))
     if not located.size:
         return None
-    microphone_array, use, _ = microphones_in_use(heard, found.calibration)
+    microphone_array, use, _ = microphones_in_use(intensities, found.calibration)
     localiser = Localiser.create(microphone_array, method=found.method, map_shape=(_PIXELS, _PIXELS), compiled=False)
     times = locations.times[located]
     time_constant = max(0.3, 0.5 * float(times[-1] - times[0]))
     image = np.zeros((_PIXELS, _PIXELS))
     for start in range(0, located.size, _FRAMES):
         some = located[start : start + _FRAMES]
-        bright = brightness(localiser.maps(heard.power[some], use[some]), method=found.method)
+        bright = brightness(localiser.maps(intensities.power[some], use[some]), method=found.method)
         image = np.maximum(image, fade(bright, locations.times[some], at=times[-1], time_constant=time_constant))
     return image
 
@@ -155,7 +155,7 @@ def _rows(locations: Locations, track: Track):
 
 
 def _median_deviation(locations: Locations) -> float:
-    """Of the longest axis of the located frames' ellipses."""
+    """Median standard deviation along the longest axis of the located frames' ellipses."""
     if not locations.located.any():
         return math.nan
     return float(np.median(np.sqrt(np.linalg.eigvalsh(locations.covariance[locations.located])[:, -1])))

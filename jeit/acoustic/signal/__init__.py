@@ -1,1 +1,1 @@
-"""From samples to intensities: recordings and their files, power in a band, faults of microphones."""
+"""Intensities from samples: recordings and their files, band power, faults of microphones."""

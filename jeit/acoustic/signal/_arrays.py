@@ -1,4 +1,4 @@
-"""Checks of what recordings and taps are made of."""
+"""Validation of the arrays and numbers of recordings and taps."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from scipy.spatial import KDTree
 
 from jeit.mesh.loops import distance, inside
 
-# Below this no vibration of a touch would be left in a recording.
+# Lowest sampling rate at which the vibrations of a touch can be recorded.
 LOWEST_RATE = 100.0  # Hz
-# No skin is known that is longer: its coordinates would be in millimetres.
+# Largest plausible length of a skin; beyond it coordinates are likely in millimetres.
 LARGEST_EXTENT = 5.0  # m
-# Taps may miss the outline by so much of the skin's length; microphones nearer than this are at one place.
+# Taps may lie outside the outline by this fraction of the skin's length; microphones closer than this coincide.
 _BESIDE, _SAME = 0.05, 1e-6  # of the length; m
 # Metres from the origin beyond which squares of lengths are of no use.
 _FARTHEST = 1e9
 
 
 def either(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
-    """Which of two arrays the file has: raises `ValueError` for both, and for neither."""
+    """Name of the one of two arrays that the file contains. Raises `ValueError` for both, and for neither."""
     if first in arrays and second in arrays:
         raise ValueError(f"it holds both '{first}' and '{second}'; keep the one to use.")
     if second not in arrays and first not in arrays:
@@ -28,12 +28,13 @@ def either(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
 
 
 def short(values: np.ndarray) -> str:
-    """A few numbers, else their shape."""
+    """Text of a few numbers, or of the shape of more."""
     return f"of shape {values.shape}" if values.size > 4 else str(values.tolist())
 
 
 def real(value, label: str, axes: str) -> np.ndarray:
-    """Real numbers with the axes named, float32 as it is, all else as float64; `ValueError` for anything else."""
+    """Real array with the named axes; float32 is kept, other types become float64. Raises `ValueError` for anything
+    else."""
     try:
         array = np.asarray(value)
     except ValueError:
@@ -48,7 +49,7 @@ def real(value, label: str, axes: str) -> np.ndarray:
 
 
 def number(value, label: str) -> float:
-    """One real number, also when it is an array of one; `ValueError` for anything else."""
+    """One real number, from a number or an array of one. Raises `ValueError` for anything else."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiu" or array.size != 1:
         raise ValueError(f"{label} must be one real number; it is {array.dtype} of shape {array.shape}.")
@@ -56,7 +57,7 @@ def number(value, label: str) -> float:
 
 
 def sampling_rate(value) -> float:
-    """A rate in Hz that touch could be heard at; `ValueError` for anything else."""
+    """Sampling rate in Hz that is high enough to record touches. Raises `ValueError` for anything else."""
     rate = number(value, "rate")
     if not np.isfinite(rate) or rate < LOWEST_RATE:
         raise ValueError(
@@ -67,7 +68,7 @@ def sampling_rate(value) -> float:
 
 
 def check_full_scale(value) -> float | None:
-    """The largest |sample| possible, or None; `ValueError` for what is not positive and finite."""
+    """The largest possible |sample|, or None. Raises `ValueError` for what is not positive and finite."""
     full_scale = None if value is None else number(value, "full_scale")
     if full_scale is not None and not 0 < full_scale < np.inf:
         raise ValueError(f"full_scale must be the largest sample possible, positive and finite; it is {full_scale:g}.")
@@ -75,7 +76,8 @@ def check_full_scale(value) -> float | None:
 
 
 def coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
-    """Points (n, 2) or (n, 3), metres, with as many coordinates as `dimension` = (2,) or (3,); else `ValueError`."""
+    """Points (n, 2) or (n, 3), metres, with as many coordinates as `dimension` = (2,) or (3,). Raises `ValueError`
+    otherwise."""
     points = real(value, label, "points, 2 or 3").astype(float)
     if points.shape[1] not in (2, 3) or points.shape[1:] != dimension:
         raise ValueError(

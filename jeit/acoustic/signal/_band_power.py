@@ -1,6 +1,6 @@
-"""The power of sound in a band, window by window, and how that of white noise scatters.
+"""Band power of sound in sliding windows, and its distribution for white noise.
 
-Of a window x of N samples at rate r, with a Hann window w and X_k = Σ_n w_n x_n exp(-2πi kn/N), the band power is
+For a window x of N samples at rate r, with a Hann window w and X_k = Σ_n w_n x_n exp(-2πi kn/N), the band power is
 
     P = 2 / (N Σ w²) · Σ_k W_k |X_k|²,
 
@@ -22,9 +22,9 @@ import scipy.fft
 from jaxtyping import Float
 from numpy.lib.stride_tricks import sliding_window_view
 
-# Fewer bins than this in the band, and the power is hardly one of a band.
+# Least number of bins in the band.
 _FEWEST_BINS = 4.0
-# Samples transformed at a time: 2 MiB, to stay in the cache with their transforms.
+# Samples transformed at a time: 2 MiB, which fits into the cache with the transforms.
 _CHUNK = 2**18
 
 
@@ -72,9 +72,9 @@ def band_power(samples: np.ndarray, grid: Grid) -> np.ndarray:
     """(F, M) band power of samples (M, S)."""
     finite = np.isfinite(samples)
     if not finite.all():
-        # Windows that hold these are not usable: any number does.
+        # Windows with these samples are not usable: the value does not matter.
         samples = np.where(finite, samples, 0)
-    # A large constant would cost digits; what is left of it in each window goes below.
+    # A large constant would lose digits; its remainder in each window is removed below.
     samples = samples - samples.mean(axis=1, keepdims=True, dtype=float)
     windows = sliding_window_view(samples, grid.length, axis=-1)[:, :: grid.hop]
     count, number = windows.shape[:2]
@@ -95,7 +95,7 @@ def band_power(samples: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def _trace(grid: Grid, lag: int) -> float:
-    """tr(A_0 A_lag), the forms of two windows `lag` samples apart: half their covariance for noise of variance 1.
+    """tr(A_0 A_lag) of two windows `lag` samples apart: half the covariance of their powers for noise of variance 1.
 
     With g(d) = Σ_k W_k cos(2πkd/N), A_nm = w_n w_m g(n - m), of period N in n - m. So the trace is Σ_d g(d)² r(d) with
     r the autocorrelation of u_n = w_n w_(n+lag) where both windows reach: no N × N matrix is needed.
@@ -112,7 +112,8 @@ def _trace(grid: Grid, lag: int) -> float:
 
 
 def white_freedom(grid: Grid) -> float:
-    """ν of one window's power of white noise; exact but for the mean's removal, which bins 0 and 1 alone notice."""
+    """Degrees of freedom ν of one window's power of white noise; exact except for the mean's removal in bins 0 and
+    1."""
     # tr A = Σ w² Σ W, with the factor of P in the weights already.
     return float(((grid.taper**2).sum() * grid.weights.sum()) ** 2 / _trace(grid, 0))
 

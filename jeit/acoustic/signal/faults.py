@@ -1,8 +1,8 @@
-"""Which microphones, and which stretches of their sound, are not to be trusted: judged from the samples alone.
+"""Detection of faulty microphones and faulty stretches of their sound, from the samples alone.
 
-Four faults are told apart: a channel that never moves (dead), one that stops moving (stuck), one that reaches the end
-of its range (clipping), and samples that are no numbers. What looks like one of them and is none passes: a converter
-that holds each value for several samples, a quiet channel of a few steps of its converter, one loud peak.
+Four faults are distinguished: a channel that never changes (dead), one that stops changing (stuck), one that reaches
+the end of its range (clipping), and samples that are not finite. Similar signals without a fault are accepted: a
+converter that holds each value for several samples, a quiet channel of a few converter steps, one loud peak.
 """
 
 from __future__ import annotations
@@ -12,27 +12,27 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
-# What `sample_faults` writes for each sample, in the order in which reasons name them.
+# Codes that `sample_faults` returns for each sample, in the order in which reasons list them.
 SOUND, NOT_FINITE, STUCK, CLIPPING = range(4)
 _WORDS = {NOT_FINITE: "NaN or infinite", STUCK: "stuck", CLIPPING: "clipping"}
 
-# A microphone in air is never at rest for so long: seconds, and at least so many samples.
+# Least duration of a stuck stretch: seconds, and number of samples.
 _STUCK_TIME, _STUCK_SAMPLES = 0.02, 64
-# A live channel that comes to rest within so many converter steps, or this part of its range, is silent, not stuck.
+# A channel whose signal decays to within so many converter steps, or this fraction of its range, is silent, not stuck.
 _REST_STEPS, _REST_RANGE = 3.0, 1e-4
-# Samples this near the extreme are at it, as a part of the range; and with the full scale known, as a part of that.
+# Samples within this fraction of the range count as extreme; the same as a fraction of the full scale, if known.
 _TOP_RANGE, _TOP_FULL_SCALE = 3e-4, 1e-3
-# A top is flat from three conversions on, if beside them the sound falls this many times as far as a parabola would.
+# A peak of three conversions or more is clipped if the sound beside it falls this many times as far as a parabola.
 _FLAT, _SHARP = 3, 3.0
 
 
 def sample_faults(
     samples: Float[np.ndarray, " S"], rate: float, full_scale: float | None = None
 ) -> tuple[UInt8[np.ndarray, " S"], str]:
-    """What is wrong with each sample of one channel, and why the whole channel is dead ("" where it is not).
+    """Fault code of each sample of one channel, and the reason why the whole channel is dead ("" if it is not).
 
-    The first is 0 where a sample is sound, else `NOT_FINITE`, `STUCK` or `CLIPPING`. `rate` is in Hz; `full_scale` is
-    the largest |sample| possible, None when not known.
+    The code is 0 for a good sample, else `NOT_FINITE`, `STUCK` or `CLIPPING`. `rate` is in Hz; `full_scale` is the
+    largest |sample| possible, None when not known.
     """
     kind = np.zeros(samples.shape, np.uint8)
     finite = np.isfinite(samples)
@@ -46,7 +46,7 @@ def sample_faults(
     if lowest == highest:
         return kind, f"dead: every {'' if whole else 'finite '}sample is {lowest:g}"
     stuck = _stuck(samples, rate, float(highest - lowest))
-    # A channel that hangs at one end of its range is stuck there, not clipping.
+    # A channel that stays at one end of its range is stuck, not clipping.
     live = samples if stuck is None else np.where(stuck, np.nan, samples)
     clipping = _clipping(live, full_scale)
     if clipping is not None:
@@ -59,10 +59,10 @@ def sample_faults(
 def window_faults(
     kind: UInt8[np.ndarray, "*batch S"], dead: str, length: int, hop: int
 ) -> tuple[Bool[np.ndarray, "*batch F"], str]:
-    """Which windows of one channel are usable, and the channel's fault in words ("" for none).
+    """Mask of the usable windows of one channel, and a description of the channel's fault ("" for none).
 
     `kind` and `dead` come from `sample_faults`; windows of `length` samples begin every `hop` samples along the last
-    axis. One bad sample spoils its window.
+    axis. A window with one bad sample is not usable.
     """
     number = 1 + (kind.shape[-1] - length) // hop
     usable = np.ones((*kind.shape[:-1], number), bool)
@@ -83,7 +83,7 @@ def window_faults(
 
 
 def intensity_faults(power: Float[np.ndarray, "F M"]) -> tuple[Bool[np.ndarray, "F M"], tuple[str, ...]]:
-    """The same for intensities that come without their samples: NaN, infinity, and channels of nothing but zeros."""
+    """Usable values and faults of intensities given without samples: NaN, infinity, and channels of zeros only."""
     finite = np.isfinite(power)
     dead = ~(finite & (power != 0)).any(axis=0)
     reasons = []
@@ -98,7 +98,7 @@ def intensity_faults(power: Float[np.ndarray, "F M"]) -> tuple[Bool[np.ndarray, 
 
 
 def describe_faults(reasons: Sequence[str]) -> str:
-    """What is wrong with each microphone, "" for nothing, in one line: "microphones 0-2, 5: dead; microphone 3: …"."""
+    """One line of text from the fault of each microphone ("" for none): "microphones 0-2, 5: dead; microphone 3: …"."""
     groups: dict[str, list[int]] = {}
     for k, reason in enumerate(reasons):
         if reason:
@@ -120,7 +120,7 @@ def _share(hit: np.ndarray) -> str:
 
 
 def _runs(flags: Bool[np.ndarray, " S"]) -> Shaped[np.ndarray, "2 R"]:
-    """Where stretches of True begin, and where they have ended."""
+    """Start and end indices of the stretches of True."""
     change = np.flatnonzero(np.diff(flags, prepend=False, append=False))
     return np.stack([change[::2], change[1::2]])
 
@@ -134,7 +134,7 @@ def _step(samples: np.ndarray) -> float:
 def _stuck(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, " S"] | None:
     """Samples in long stretches of one value, of a channel that never comes to rest elsewhere; None for none."""
     stretch = max(_STUCK_SAMPLES, round(_STUCK_TIME * rate))
-    # A stretch this long covers at least two whole blocks: only where there is one need the runs be looked for.
+    # A stretch this long covers at least two whole blocks: runs are searched for only where there is one.
     block = stretch // 4
     blocks = samples[: samples.size // block * block].reshape(-1, block)
     span = blocks.max(axis=1) - blocks.min(axis=1)
@@ -148,8 +148,8 @@ def _stuck(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, 
     stuck = np.zeros(samples.shape, bool)
     for first, last in zip(start[long], stop[long], strict=True):
         stuck[first : last + 1] = True
-    # A converter's silence is constant too, and so is a noiseless simulation's. But sound fades into silence: among
-    # the blocks that move are some that hardly do. A channel with noise of its own has none of those.
+    # The silence of a converter or of a noiseless simulation is constant too. But sound fades into silence, so that
+    # some blocks hardly change. A channel with its own noise has no such blocks.
     live = ~stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(span)
     rest = max(_REST_STEPS * _step(samples), _REST_RANGE * extent)
     return None if live.any() and span[live].min() <= rest else stuck
@@ -165,7 +165,7 @@ def _clipping(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray,
         if full_scale is not None and top >= (1 - _TOP_FULL_SCALE) * full_scale:
             heights.append(top - (1 - _TOP_FULL_SCALE) * full_scale)
         fall = top - sign * samples
-        # Most channels end here: fewer samples at the top than could be flat, even of a coarse converter.
+        # Most channels return here: too few samples at the top for clipping, even with a coarse converter.
         if np.count_nonzero(fall <= max(heights)) < _FLAT:
             continue
         if not hold:
@@ -178,12 +178,13 @@ def _clipping(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray,
 
 
 def _flat(fall: np.ndarray, near: Bool[np.ndarray, " S"], height: float, hold: float) -> bool:
-    """Whether any stretch of samples `near` the top is a peak cut off; `fall` (S,) is how far below the top each is.
+    """Whether any stretch of samples `near` the top is a clipped peak; `fall` (S,) is the distance of each below the
+    top.
 
-    A whole peak is a parabola: if n samples in a row stay within `height`, they span n - 1 intervals at least, and
-    k samples further on it has fallen by `height` ((n - 1 + 2k) / (n - 1))² at most. One that was cut off falls by
-    about as much as the height cut off, in the same time. So slow and loud peaks pass, however many samples they
-    spend at the top; and so does one value that the converter holds, which is one sample here.
+    A whole peak is a parabola: if n samples in a row stay within `height`, they span n - 1 intervals at least, and k
+    samples further on it has fallen by `height` ((n - 1 + 2k) / (n - 1))² at most. A clipped peak falls by about the
+    clipped height in the same time. So slow and loud peaks are accepted, however many samples they have at the top, and
+    so is one value that the converter holds, which is one sample here.
     """
     start, stop = _runs(near)
     conversions = (stop - start) / hold
@@ -199,6 +200,6 @@ def _flat(fall: np.ndarray, near: Bool[np.ndarray, " S"], height: float, hold: f
 
 
 def _hold(samples: np.ndarray) -> float:
-    """For how many samples the channel holds each conversion: the length of its short runs."""
+    """Number of samples for which the channel holds each conversion: the length of its short runs."""
     lengths = np.diff(np.flatnonzero(samples[1:] != samples[:-1]))
     return float(np.partition(lengths, lengths.size // 20)[lengths.size // 20]) if lengths.size else 1.0

@@ -1,7 +1,7 @@
-"""From sound to intensity: the power of each microphone in a band, in sliding windows, above its noise floor.
+"""Intensity of sound: the band power of each microphone in sliding windows, above its noise floor.
 
-A sine of amplitude A within the band has the intensity A²/2, white noise of variance σ² the part of σ² that the band
-is of 0 to half the rate. How that is done, and how noise scatters, is in `jeit.acoustic.signal._band_power`.
+A sine of amplitude A within the band has the intensity A²/2; white noise of variance σ² has σ² times the band's share
+of the range from 0 to half the rate. `jeit.acoustic.signal._band_power` has the formulas and the variance of noise.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from jeit.acoustic.signal.faults import intensity_faults, sample_faults, window_
 from jeit.acoustic.signal.recording import Intensities, Recording, Taps
 from jeit.arguments import check_kind
 
-# A tap is heard in the windows that reach this part of its loudest.
-_HEARD = 0.5
+# A tap is audible in the windows with at least this fraction of its greatest loudness.
+_AUDIBLE = 0.5
 
 
 class IntensitySettings(eqx.Module):
-    """How intensity is measured: in the band `low` to `high`, Hz, over windows of `window` s that begin every `hop` s.
+    """Settings of intensity: the band `low` to `high`, Hz, and windows of `window` s that begin every `hop` s.
 
-    The touch of a soft skin sounds below 1 kHz; below 50 Hz the skin and the arm that wears it move.
-    Raises `ValueError` for what is no band, and for times that are not in seconds.
+    The sound of touches on a soft skin is below 1 kHz; below 50 Hz are motions of the skin and of the arm that wears
+    it. Raises `ValueError` for an invalid band, and for times that are not in seconds.
     """
 
     low: float = 50.0
@@ -62,9 +62,9 @@ def check_settings(name: str, settings: IntensitySettings | None) -> None:
 
 
 class TapIntensities(NamedTuple):
-    """What `tap_intensities` found: intensities of T taps at M microphones.
+    """Intensities of T taps at M microphones, as returned by `tap_intensities`.
 
-    - `power`: (T, M) mean band power above the noise floor while the tap is heard; may be negative.
+    - `power`: (T, M) mean band power above the noise floor while the tap is audible; may be negative.
     - `floor`: (M,) noise power that was subtracted.
     - `freedom`: (T,) degrees of freedom ν of each mean, so that noise alone has the variance 2 floor² / ν.
     - `usable`: (T, M), `faults`: M strings, as in `Intensities`.
@@ -80,7 +80,7 @@ class TapIntensities(NamedTuple):
 def intensities(
     recording: Recording, settings: IntensitySettings | None = None, floor: Float[np.ndarray, " M"] | None = None
 ) -> Intensities:
-    """Intensities of a recording, window by window, with the windows that faults spoil marked.
+    """Intensities of a recording in sliding windows; windows with faults are marked as not usable.
 
     The noise floor (M,), in the square of the samples' unit, is estimated from the quietest windows, a fifth of which
     at least must be free of touch; give `floor` where it is known, from a recording of silence, or where the touch
@@ -112,14 +112,14 @@ def intensities(
 
 
 def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> TapIntensities:
-    """One intensity for each tap and microphone, for calibration.
+    """Intensity of each tap at each microphone, for calibration.
 
-    A tap's power is the mean over the windows in which it is heard, the same for all microphones: those in which the
-    sum over microphones of power / floor, less that of noise, is at least half its maximum. A microphone that has a
-    fault in one of them is not usable for that tap: its mean over other windows would be of another loudness. The
-    floor comes from the quietest windows of all taps, so that the taps should hold some silence, before or after. The
-    windows overlap; `freedom` counts what they share exactly, for white noise. It does not know that the windows were
-    chosen: of a tap that is not heard at all, the loudest windows of noise are taken, somewhat above the floor.
+    A tap's power is the mean over the windows in which it is audible, the same for all microphones: those in which the
+    sum over microphones of power / floor, less that of noise, is at least half its maximum. A microphone with a fault
+    in one of them is not usable for that tap: its mean over other windows would be of another loudness. The floor comes
+    from the quietest windows of all taps, so that the taps should hold some silence, before or after. The windows
+    overlap; `freedom` counts what they share exactly, for white noise. It does not account for the selection of
+    windows: for a tap that is not audible at all, the loudest windows of noise are taken, somewhat above the floor.
 
     Taps that already hold intensities are returned as they are, with a floor of zero and infinite freedom. Raises
     `ValueError` for what is no `Taps`, and where band, window and samples do not fit each other.
@@ -145,31 +145,31 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     count, windows, microphones = power.shape
     freedom = white_freedom(grid)
     floor = noise_floor(power.reshape(-1, microphones), usable.reshape(-1, microphones), freedom)
-    # A channel without noise, of a simulation, would otherwise decide alone; a dead one has nothing to say.
+    # A noiseless simulated channel would otherwise dominate; a dead channel is ignored.
     alive = usable.any(axis=(0, 1))
     least = np.maximum(floor, max(1e-9 * power.max(), np.finfo(float).tiny))
     loudness = np.where(alive, power / least - floor / least, 0).sum(axis=-1)
-    heard = loudness >= _HEARD * loudness.max(axis=1, keepdims=True)
-    # Where no window is above the floor the rule chooses too few or too many: take the loudest.
-    heard |= loudness == loudness.max(axis=1, keepdims=True)
-    mean = np.einsum("tf,tfm->tm", heard, power) / heard.sum(axis=1)[:, None]
+    audible = loudness >= _AUDIBLE * loudness.max(axis=1, keepdims=True)
+    # Where no window is above the floor the rule selects too few or too many: include the loudest.
+    audible |= loudness == loudness.max(axis=1, keepdims=True)
+    mean = np.einsum("tf,tfm->tm", audible, power) / audible.sum(axis=1)[:, None]
     shared = shared_noise(grid, windows)
-    each = np.array([freedom * one.sum() ** 2 / shared[np.ix_(one, one)].sum() for one in heard])
-    whole = (usable | ~heard[..., None]).all(axis=1)
+    each = np.array([freedom * one.sum() ** 2 / shared[np.ix_(one, one)].sum() for one in audible])
+    whole = (usable | ~audible[..., None]).all(axis=1)
     return TapIntensities(mean - floor, floor, each, whole, tuple(faults))
 
 
 def noise_floor(
     power: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, "F M"], freedom: float, share: float = 0.2
 ) -> Float[np.ndarray, " M"]:
-    """(M,) mean band power of noise alone, though touches are heard in some of the F windows.
+    """Noise floor (M,): mean band power of the noise, estimated from F windows of which some contain touches.
 
-    At least the part `share` of the windows must be quiet. The start is a low quantile of the powers over that of
-    χ²_ν / ν, as in minimum statistics (R. Martin, IEEE Trans. Speech Audio Process. 9, 504-512, 2001). That start is
-    up to a few tenths too high when most windows are loud, since the share that is quiet is not known. So it is
-    improved: the mean of the powers below c times the floor, over what that mean is for χ²_ν / ν cut off at c,
-    repeated until it stands. `freedom` is ν; with ν infinite the low quantile is returned as it is. A channel without
-    usable windows has the floor 0.
+    At least the part `share` of the windows must be quiet. The start is a low quantile of the powers over that of χ²_ν
+    / ν, as in minimum statistics (R. Martin, IEEE Trans. Speech Audio Process. 9, 504-512, 2001). That start is up to a
+    few tenths too high when most windows are loud, since the share that is quiet is not known. So it is refined: the
+    mean of the powers below c times the floor, divided by that mean for χ²_ν / ν truncated at c, repeated until
+    convergence. `freedom` is ν; with ν infinite the low quantile is returned as it is. A channel without usable windows
+    has the floor 0.
 
     Noise that is much louder at one end of the band scatters more than ν of white noise says, and its floor comes out
     low: for power as 1/f from 50 to 1000 Hz by 8 %, as 1/f² by a third.
@@ -191,7 +191,7 @@ def noise_floor(
         raise ValueError("power is NaN or infinite in windows that usable calls usable; mark those False.")
     number = usable.sum(axis=0)
     ordered = np.sort(np.where(usable, power, np.inf), axis=0)
-    # The middle of the windows that are quiet for certain.
+    # The median of the windows that are certainly quiet.
     rank = np.clip(np.floor(0.5 * share * number).astype(int), 0, max(len(power) - 1, 0))
     floor = np.take_along_axis(ordered, rank[None], axis=0)[0] if len(power) else np.zeros(power.shape[1])
     floor = np.where(number > 0, floor, 0.0)
@@ -213,7 +213,8 @@ def noise_floor(
 
 
 def degrees_of_freedom(settings: IntensitySettings, rate: float) -> float:
-    """ν of one window's power of white noise sampled at `rate` Hz: its variance is 2 mean² / ν. Exact."""
+    """Degrees of freedom ν of one window's power of white noise sampled at `rate` Hz: its variance is exactly 2 mean² /
+    ν."""
     return white_freedom(make_grid(settings, rate, None, "settings"))
 
 

@@ -1,8 +1,7 @@
-"""What a skin with M microphones hears: recordings, intensities and calibration taps, and the files they come from.
+"""Recordings, intensities and calibration taps of a skin with M microphones, and their files.
 
-Everything is checked on the way in, so that what comes later need not look again: real numbers, the right shapes,
-metres and hertz. What a broken microphone writes (NaN, zeros, flat tops) is let in: `jeit.acoustic.signal.faults` finds
-it.
+All input is validated here, so that later steps need not check it again: real numbers, shapes, metres and hertz. The
+output of a broken microphone (NaN, zeros, flat tops) is accepted; `jeit.acoustic.signal.faults` detects it.
 """
 
 from __future__ import annotations
@@ -32,22 +31,22 @@ from jeit.acoustic.signal.sound_file import read_sound
 from jeit.files import need, npz_arrays, written_whole
 from jeit.mesh.loops import check_loop
 
-# Said of files that are neither.
+# Message for files that are neither.
 _OTHERWISE = "neither an NPZ nor a sound file"
 
 
-# No sample is so loud, in any unit; squares of louder ones would be infinite in single precision.
+# Greatest sample in any unit; squares of larger ones would be infinite in single precision.
 _LOUDEST = 1e15
 
 
 class Recording(eqx.Module):
-    """Sound of M microphones, sampled together.
+    """Samples of M microphones, taken simultaneously.
 
-    - `samples`: (M, S) in any unit (volts, counts, parts of full scale); NaN or infinite where the device said so, and
-      infinite where they are beyond any (1e15).
+    - `samples`: (M, S) in any unit (volts, counts, fractions of full scale); NaN or infinite as given by the device,
+      and infinite beyond 1e15.
     - `rate`: samples a second of each microphone, Hz.
-    - `full_scale`: the largest |sample| that the device can give, or None when that is not known.
-    - `name`: where it comes from.
+    - `full_scale`: the largest |sample| that the device can give, or None if unknown.
+    - `name`: the source of the recording.
     """
 
     samples: Float[np.ndarray, "M S"]
@@ -82,8 +81,8 @@ class Intensities(eqx.Module):
       infinite when unknown.
     - `overlap`: windows that share a sample, window / hop; 1 where none do.
     - `usable`: (F, M) False where a fault spoils the window.
-    - `faults`: M strings, what is wrong with a channel in words; "" for a sound one.
-    - `name`: where they come from. `notes`: what to know of how they were measured.
+    - `faults`: M strings that describe the fault of each channel; "" for none.
+    - `name`: their source. `notes`: remarks on how they were measured.
     """
 
     times: Float[np.ndarray, " F"]
@@ -109,7 +108,7 @@ class Intensities(eqx.Module):
         name: str = "intensities",
         notes: Sequence[str] | np.ndarray = (),
     ):
-        """`usable` and `faults` are worked out from NaN and dead channels when not given.
+        """`usable` and `faults` are derived from NaN and dead channels if not given.
 
         Raises `ValueError` for what is not real, for shapes that disagree, and for times that do not increase.
         """
@@ -147,12 +146,12 @@ class Intensities(eqx.Module):
 
 
 class Taps(eqx.Module):
-    """T touches at known places, as calibration needs them; d = 2 or 3.
+    """T touches at known positions, for calibration; d = 2 or 3.
 
     - `microphones`: (M, d), `positions`: (T, d), `outline`: (K, d) corners of the skin in order; metres. A plane
       outline is turned counter-clockwise.
     - `power`: (T, M) intensity of each tap above the noise floor, or None;
-    - `samples`: (T, M, S) what was heard of each tap, or None, and `rate` in Hz.
+    - `samples`: (T, M, S) recording of each tap, or None, and `rate` in Hz.
     - `name`, `full_scale`: as in `Recording`.
     """
 
@@ -179,8 +178,8 @@ class Taps(eqx.Module):
     ):
         """Give either `power`, or `samples` and `rate`.
 
-        Raises `ValueError` for what is no such thing: also for microphones farther from the skin than it is long, two
-        at one place, and in the plane taps farther outside the outline than 5 % of its length.
+        Raises `ValueError` for invalid arrays, for microphones farther from the skin than its length, for two
+        microphones at one position, and in the plane for taps farther outside the outline than 5 % of its length.
         """
         self.outline = coordinates(outline, "outline", np.shape(microphones)[-1:])
         self.microphones = coordinates(microphones, "microphones", self.outline.shape[1:])
@@ -221,12 +220,12 @@ class Taps(eqx.Module):
 
 
 def read_recording(path: str | Path) -> Recording | Intensities:
-    """Read what a skin heard: a WAV file of any number of channels, an NPZ file, or what `soundfile` reads (FLAC, Ogg,
-    AIFF …) where that is installed.
+    """Read a recording from a WAV file with any number of channels, an NPZ file, or a file that `soundfile` reads
+    (FLAC, Ogg, AIFF …) where that is installed.
 
     An NPZ file holds `samples` (M, S) and `rate` in Hz, optionally `full_scale`; or `intensity` (F, M) and `times` (F,)
-    in seconds, optionally `floor` (M,), `freedom` and `overlap`. A sound file's integers become parts of full scale, -1
-    to 1. Raises `ValueError` for any other content, and `OSError` where there is no such file.
+    in seconds, optionally `floor` (M,), `freedom` and `overlap`. Integers of a sound file become fractions of full
+    scale, -1 to 1. Raises `ValueError` for any other content, and `OSError` where there is no such file.
     """
     path = Path(path)
     try:
@@ -254,8 +253,9 @@ def read_recording(path: str | Path) -> Recording | Intensities:
 def read_taps(path: str | Path) -> Taps:
     """Read calibration taps from an NPZ file.
 
-    It holds `microphones` (M, d), `outline` (K, d), `positions` (T, d), and `intensity` (T, M), or `samples` (T, M, S)
-    with `rate`; optionally `full_scale`. Raises `ValueError` for other content, `OSError` where there is no such file.
+    The file contains `microphones` (M, d), `outline` (K, d), `positions` (T, d), and `intensity` (T, M), or `samples`
+    (T, M, S) with `rate`; optionally `full_scale`. Raises `ValueError` for other content, `OSError` where there is no
+    such file.
     """
     path = Path(path)
     geometry = ("microphones", "outline", "positions")

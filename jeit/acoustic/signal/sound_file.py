@@ -12,19 +12,19 @@ import scipy.io.wavfile
 from jeit.arguments.extras import optional
 from jeit.files import check_memory, read_as, reason
 
-# Bytes of memory for each of a file of eight bits a sample.
+# Bytes of memory for each byte of a file with eight bits per sample.
 _IN_MEMORY = 16
-# What files of other formats begin with: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
+# First bytes of other formats: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
 _OTHERS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
-# And those that soundfile does not read either: MP4 from its fifth byte on, WebM, WMA, AMR.
+# Formats that soundfile does not read either: MP4 from its fifth byte on, WebM, WMA, AMR.
 _MP4, _CLOSED = b"ftyp", (b"\x1aE\xdf\xa3", b"0&\xb2u", b"#!AMR")
 
 
 def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
-    """Samples (M, S), their rate in Hz and full scale of a sound file; None for a file that is none of those known.
+    """Samples (M, S), rate in Hz and full scale of a sound file; None for a file of an unknown format.
 
-    Integers become parts of full scale, -1 to 1; floats stay as they are, and where they go beyond 1 full scale is not
-    known. Raises `ValueError` for files that are broken, and those that need `soundfile` where it is not installed.
+    Integers become fractions of full scale, -1 to 1; floats are unchanged, and where they exceed 1 the full scale is
+    unknown. Raises `ValueError` for broken files, and for those that need `soundfile` where it is not installed.
     """
     check_memory(path.name, _IN_MEMORY * path.stat().st_size)
     with path.open("rb") as file:
@@ -87,5 +87,5 @@ def _read_other(path: Path) -> tuple[np.ndarray, float, float | None]:
 
 
 def _full_scale(samples: np.ndarray) -> float | None:
-    """Floats beyond 1 are in some other unit: then full scale is not known."""
+    """Full scale of float samples: 1, or None (unknown) if any exceed 1, since they are then in some other unit."""
     return None if (np.abs(samples[np.isfinite(samples)]) > 1.0).any() else 1.0

@@ -1,4 +1,4 @@
-"""Simulated sound: a skin that sounds, its microphones and the touches on it."""
+"""Simulated sound: an acoustic skin, its microphones, and touches on it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bursts: how loud a tap is in time."""
+"""Bursts: the amplitude of a tap as a function of time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ONSET = 0.02
 
 
 class Burst(eqx.Module):
-    """One tap in time: it rises fast and dies away within `length` seconds, over which its root mean square is
+    """Envelope of one tap: it rises fast and decays within `length` seconds, over which its root mean square is
     `strength`. Raises `ValueError` for what is not positive."""
 
     strength: float = 1.0

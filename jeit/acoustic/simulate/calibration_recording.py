@@ -1,4 +1,4 @@
-"""Taps at known places of a simulated skin, as a calibration needs them: many at once."""
+"""Simulated calibration taps at known positions of a skin."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from jeit.acoustic.simulate.synthesis import (
     transform_size,
 )
 
-# How many values of a calibration are made at once: 32 MB.
+# Number of values computed at once: 32 MB.
 PIECE = 2**22
 
 
 class CalibrationTaps(eqx.Module):
-    """Taps at known places: `samples` (T, M, S), `rate`, `positions` (T, 2) metres, `strengths` (T,)."""
+    """Taps at known positions: `samples` (T, M, S), `rate`, `positions` (T, 2) metres, `strengths` (T,)."""
 
     samples: Float[np.ndarray, "T M S"]
     rate: float
@@ -51,11 +51,11 @@ def calibration_taps(
     noise: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> CalibrationTaps:
-    """`repeats` taps at each of `positions` (P, 2), metres: T = P · repeats recordings, those of one place together.
+    """Simulate `repeats` taps at each of `positions` (P, 2), metres: T = P · repeats recordings, grouped by position.
 
-    Strengths are log-normal about that of `burst` with standard deviation `strength_spread` in the logarithm, as a
-    hand's or a vibrator's are: whoever calibrates does not know them. `progress` is called with how far it is.
-    Otherwise as `tap`, which says what is raised.
+    Strengths are log-normal about that of `burst` with standard deviation `strength_spread` in the logarithm, as for a
+    hand or a vibrator; a calibration does not know them. `progress` is called with the progress. Otherwise as `tap`.
+    Raises `ValueError` as `tap` does.
     """
     check_skin_and_key(skin, key)
     places = skin.layer.check_inside("positions", positions)
@@ -73,7 +73,7 @@ def calibration_taps(
     samples = np.empty((len(places), repeats, skin.num_microphones, len(times)))
     level = noise_power(skin) if noise else None
     keys = jax.random.split(rest, len(places))
-    # In pieces of one size, so that next to the result little else takes memory, and one program serves them all.
+    # In pieces of one size, so that memory beside the result is small, and one compiled program serves all.
     pieces = min(len(places), -(-samples.size // PIECE))
     for part in np.array_split(np.arange(-(-len(places) // pieces) * pieces), pieces):
         part = np.minimum(part, len(places) - 1)

@@ -1,4 +1,4 @@
-"""Checks of the numbers that a simulated acoustic skin and its touches are given."""
+"""Validation of the numeric arguments of a simulated acoustic skin and its touches."""
 
 from __future__ import annotations
 

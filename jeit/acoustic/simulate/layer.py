@@ -1,4 +1,4 @@
-"""The soft layer that carries the sound: its material, with speed and loss, and its shape, with spreading and edges."""
+"""The soft layer in which sound propagates: material, with wave speed and loss, and shape, with spreading and edges."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jeit.layout.layout import LARGEST
 
 
 class Elastomer(eqx.Module):
-    """A soft rubber. What a touch radiates in it are mostly shear waves, of speed √(modulus / density).
+    """A soft rubber. A touch radiates mostly shear waves in it, of speed √(modulus / density).
 
     **Fields**: `shear_modulus` in pascals and `density` in kg/m³: about 100 kPa, a soft silicone, gives 10 m/s at
     `attenuation_frequency` (Hz). `attenuation` in nepers per metre at that frequency, growing as frequency to the
@@ -82,7 +82,7 @@ class ElastomerLayer(eqx.Module):
 
     @property
     def longest_delay(self) -> float:
-        """The time sound takes over the longest path that is simulated, seconds."""
+        """Travel time of sound along the longest simulated path, seconds."""
         return 2 * float(np.hypot(self.width, self.height)) / self.material.wave_speed
 
     def spreading(self, length: Array, depth) -> Array:

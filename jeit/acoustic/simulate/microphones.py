@@ -1,4 +1,4 @@
-"""The microphones of a simulated skin: where they are, what they are like, and how they are read."""
+"""The microphones of a simulated skin: positions, properties, and readout."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SLOTS = 4
 
 
 class MicrophoneModel(eqx.Module):
-    """What the microphones under a skin are like, and how much they differ from one another.
+    """Properties of the microphones under a skin, and their spread.
 
     **Fields**
 
@@ -26,7 +26,7 @@ class MicrophoneModel(eqx.Module):
     - `gain_spread_db`, `noise_spread_db`, in decibels of power, and `depth_spread`, relative: standard deviations, all
       log-normal, this library's choices, not the paper's.
 
-    Raises `ValueError` for what no microphone is.
+    Raises `ValueError` for invalid properties.
     """
 
     depth: float = 0.01
@@ -46,7 +46,7 @@ class MicrophoneModel(eqx.Module):
 
 
 class Readout(eqx.Module):
-    """How the microphones are read: analogue filters, multiplexers, and the converter's clock.
+    """Readout of the microphones: analogue filters, multiplexers, and the converter's clock.
 
     **Fields**
 
@@ -80,11 +80,11 @@ class Readout(eqx.Module):
 
     @property
     def coupling(self):
-        """Amplitude of what is left of the microphone read before."""
+        """Amplitude of the crosstalk from the microphone read before."""
         return 10 ** (self.coupling_db / 20)
 
     def stagger(self, number: int) -> np.ndarray:
-        """How much later than the first each of `number` microphones is sampled, (M,) seconds."""
+        """Delay of the sampling of each of `number` microphones after the first, (M,) seconds."""
         return STEP * (np.arange(number) % SLOTS) * self.multiplexed
 
 

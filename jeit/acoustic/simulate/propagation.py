@@ -1,4 +1,4 @@
-"""How sound gets from a touch to the microphones: spreading, loss, dispersion, edge echoes, and the multiplexer.
+"""Propagation of sound from a touch to the microphones: spreading, loss, dispersion, edge echoes, and the multiplexer.
 
 Sound is propagated frequency by frequency; powers are integrals over frequency with no random numbers in them.
 """

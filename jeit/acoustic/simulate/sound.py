@@ -1,4 +1,4 @@
-"""What the channels of a simulated skin read of a source, with the truth about it beside the samples.
+"""Simulated recordings: the channels' samples for a source, with its true position and amplitude.
 
 A touch of envelope e(t) at one place is received, on average over keys, with the energy Σ e² times `expected_power`,
 but for what rings on beyond the recording's ends.
@@ -33,7 +33,7 @@ HOP = 0.01
 
 
 class SimulatedSound(eqx.Module):
-    """What the channels of a skin read during a touch, and the truth about it.
+    """Samples of the channels of a skin during a touch, and the true source.
 
     **Fields**: `samples` (M, S), in units of the skin's sources; `rate`, samples per second; `position` (N, 2) metres,
     where the source is (or was last, or will be first) at `position_times` (N,), seconds; N is 0 for `quiet`. `active`
@@ -49,12 +49,12 @@ class SimulatedSound(eqx.Module):
 
     @property
     def times(self) -> np.ndarray:
-        """When the first channel is sampled, (S,) seconds from the start; the others follow by `skin.stagger`."""
+        """Sampling times of the first channel, (S,) seconds from the start; the others follow by `skin.stagger`."""
         return np.arange(self.samples.shape[1]) / self.rate
 
 
 def quiet(skin: SoundingSkin, key: Array, *, duration: float = 1.0) -> SimulatedSound:
-    """The microphones' own noise and nothing else, for `duration` seconds. Raises `ValueError` where that is none."""
+    """Simulate the microphones' own noise only, for `duration` seconds. Raises `ValueError` for an invalid duration."""
     check_skin_and_key(skin, key)
     check_positive("duration", duration)
     times = sample_times(skin, duration)
@@ -82,7 +82,8 @@ def superpose(skin: SoundingSkin, key: Array | None, *recordings: SimulatedSound
 
 
 def record(skin: SoundingSkin, key: Array, places: np.ndarray, envelope: np.ndarray, noise: bool) -> SimulatedSound:
-    """What is read of a source of root mean square `envelope` (S,), in the blocks at `places` (B, 2), or (1, 2)."""
+    """Simulate the samples for a source of root mean square `envelope` (S,), in the blocks at `places` (B, 2), or (1,
+    2)."""
     source, own = jax.random.split(key)
     count, centres = len(envelope), block_times(skin, len(envelope))
     places = np.broadcast_to(places, (len(centres), 2))

@@ -1,4 +1,4 @@
-"""A simulated acoustic skin: what microphones under an elastomer layer receive from a touch on its surface.
+"""Simulated acoustic skin: the sound received from touches by microphones under an elastomer layer.
 
 No openly licensed recording of a skin with microphones exists; this stands in where one is needed. Sound is propagated
 frequency by frequency, with spreading, viscoelastic loss, delays and echoes of the edges, so that localisation is
@@ -84,7 +84,7 @@ class SoundingSkin(eqx.Module):
 
     @property
     def num_microphones(self) -> int:
-        """M."""
+        """Number of microphones, M."""
         return self.microphones.shape[0]
 
     @property
@@ -94,7 +94,7 @@ class SoundingSkin(eqx.Module):
 
     @property
     def stagger(self) -> np.ndarray:
-        """How much later than the first each microphone is sampled, (M,) seconds."""
+        """Delay of the sampling of each microphone after the first, (M,) seconds."""
         return self.readout.stagger(self.num_microphones)
 
 

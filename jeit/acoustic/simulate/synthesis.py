@@ -1,4 +1,4 @@
-"""Sound as random numbers: the spectrum of a touch under its envelope, and the microphones' own noise.
+"""Synthesis of random sound: the spectrum of a touch under its envelope, and the microphones' own noise.
 
 A touch of soft rubber is random noise in a band, in bursts or steadily. White noise is shaped in time first and in
 frequency after. Every function takes an explicit key: the same key, the same samples.
@@ -27,12 +27,12 @@ def bin_frequencies(skin: SoundingSkin, size: int, bins: int) -> Array:
 
 
 def filled_bins(skin: SoundingSkin, size: int, *, blur: float = 0.0) -> int:
-    """How many bins of a real transform of `size` samples are not empty: half an octave over the band, and `blur`."""
+    """Number of nonzero bins of a real transform of `size` samples: half an octave over the band, and `blur`."""
     return min(int((np.sqrt(2) * skin.readout.band[1] + blur) * size / skin.rate) + 1, size // 2)
 
 
 def transform_size(count: int, padding: float, rate: float) -> int:
-    """A length of transform that is quick, for `count` samples and `padding` seconds of zeros or more."""
+    """A fast transform length for `count` samples and at least `padding` seconds of zeros."""
     needed = count + int(np.ceil(padding * rate))
     return 2 * int(np.asarray(next_fast_len((needed + 1) // 2)))
 
@@ -63,12 +63,12 @@ def _noise_samples(skin, key, level, count, size, bins):
 
 
 def microphone_noise(skin: SoundingSkin, key: Array, count: int) -> Float[np.ndarray, "M S"]:
-    """`count` samples (M, S) of the microphones' own noise."""
+    """Simulate `count` samples (M, S) of the microphones' own noise."""
     # Noise made from a spectrum repeats after `size` samples; a tail that is cut off parts its end from its beginning.
     size = transform_size(count, RINGING, skin.rate)
     return np.asarray(_noise_samples(skin, key, noise_power(skin), count, size, filled_bins(skin, size)))
 
 
 def sample_times(skin: SoundingSkin, duration: float) -> Float[np.ndarray, " S"]:
-    """When the first channel is sampled in `duration` seconds, (S,) s."""
+    """Sampling times of the first channel in `duration` seconds, (S,) s."""
     return np.arange(max(2, round(duration * skin.rate))) / skin.rate

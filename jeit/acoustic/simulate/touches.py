@@ -1,4 +1,4 @@
-"""Touches on a simulated acoustic skin: taps, pats, tickles, strokes, with the truth beside the samples.
+"""Simulated touches on an acoustic skin: taps, pats, tickles and strokes, with the true source beside the samples.
 
 Every function takes an explicit key: the same key, the same samples.
 """
@@ -33,7 +33,8 @@ def tap(
     duration: float = 0.15,
     noise: bool = True,
 ) -> SimulatedSound:
-    """A `burst` at one `position` (2,), metres, as of a vibrator with a rubber tip: `repeats` of it at `frequency`, Hz.
+    """Simulate `repeats` of a `burst` at one `position` (2,), metres, at `frequency`, Hz, as by a vibrator with a
+    rubber tip.
 
     `duration` of the recording in seconds, made longer where the bursts need it. `noise`: whether to add the
     microphones' own. Raises `ValueError` for a position off the skin, and for what is not positive or does not fit.
@@ -60,7 +61,7 @@ def pat(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """A few firm taps of a hand at one `position` (2,), metres, `interval` seconds apart; see `tap`."""
+    """Simulate a few firm taps of a hand at one `position` (2,), metres, `interval` seconds apart; see `tap`."""
     check_positive("interval", interval)
     repeated = {"repeats": taps, "frequency": 1 / interval}
     return tap(skin, key, position, burst=burst, **repeated, duration=duration, noise=noise)
@@ -77,7 +78,7 @@ def tickle(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Many light taps that wander round `position` (2,), metres, of random strength and rhythm.
+    """Simulate many light taps that wander around `position` (2,), metres, of random strength and rhythm.
 
     Each lands within `radius` metres of `position` (at the edge, on the skin), half way between a new place there and
     the place before it. Strengths are log-normal about that of `burst` with standard deviation 0.3 in the logarithm,
@@ -114,7 +115,7 @@ def stroke(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """A finger that rubs along `path`, all through `duration` seconds.
+    """Simulate a finger that rubs along `path` for `duration` seconds.
 
     `path`: corners (K, 2) of a line, metres, run along at even speed, or a function of times (N,) in seconds that gives
     positions (N, 2). `strength`: root mean square at 0.1 m/s; it goes as the square root of the speed. Raises

@@ -1,4 +1,4 @@
-"""Air in motion: a jet that blows on a simulated skin, and the sound of the room that it is in."""
+"""Simulated air noise: a jet that blows on a skin, and the sound of the surrounding room."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from jeit.acoustic.simulate.synthesis import (
     transform_size,
 )
 
-# Places that a jet is made of, and frequencies at which what they add up to is worked out: between them it is smooth.
+# Number of positions that a jet consists of, and of frequencies at which their sum is computed; it is smooth in
+# between.
 _PLACES, _FREQUENCIES = 64, 160
 # Kolmogorov's law of turbulence: the density of its energy falls as frequency to minus this.
 TURBULENCE = 5 / 3
@@ -40,13 +41,14 @@ def wind(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """A jet of air that blows steadily about `position` (2,), metres, as of an air brush.
+    """Simulate a steady jet of air about `position` (2,), metres, as of an air brush.
 
     Eddies press at 64 places, normal about `position` with a deviation of `radius` metres, each a source of its own,
     whose power density falls as frequency to minus `slope`; together their root mean square is `strength`. Eddies are
-    much smaller than microphones are apart, and no two microphones hear the same ones: each has the power that these
-    places give it, and noise of its own. Loudness wavers by `gusts`, the deviation of its logarithm, within `gust_time`
-    seconds. Raises `ValueError` for a position off the skin, and for what is not positive.
+    much smaller than the spacing of the microphones, and no two microphones receive the same ones: each microphone
+    receives the power that these positions give it, as independent noise. Loudness varies by `gusts`, the deviation of
+    its logarithm, within `gust_time` seconds. Raises `ValueError` for a position off the skin, and for what is not
+    positive.
     """
     check_skin_and_key(skin, key)
     middle = skin.layer.check_inside("position", [position])[0]
@@ -59,7 +61,7 @@ def wind(
     places = np.clip(middle + radius * np.asarray(jax.random.normal(where, (_PLACES, 2))), -half, half)
     times = sample_times(skin, duration)
     loud = np.exp(gusts * _wavering(gust, len(times), gust_time * skin.rate) - gusts**2)
-    density = _density(skin, slope, _heard(skin, jnp.asarray(places), _grid(skin)))
+    density = _density(skin, slope, _received_power(skin, jnp.asarray(places), _grid(skin)))
     samples = strength * loud * _coloured(skin, own, density, len(times))
     if noise:
         samples = samples + microphone_noise(skin, rest, len(times))
@@ -71,7 +73,7 @@ def wind(
 def room_sound(
     skin: SoundingSkin, key: Array, *, level_db: float = 0.0, slope: float = 1.0, duration: float = 1.0
 ) -> SimulatedSound:
-    """What a room adds with nobody near: one sound that all microphones hear alike, through air and mounting.
+    """Simulate the sound of a room: one signal received equally by all microphones, through air and mounting.
 
     `level_db`: its power beside the nominal microphone's own noise, decibels; its density falls as frequency to minus
     `slope`. Raises `ValueError` for a level that is not finite, a negative slope, and no duration.
@@ -89,14 +91,15 @@ def room_sound(
 
 
 def _grid(skin: SoundingSkin) -> Float[np.ndarray, " G"]:
-    """Frequencies over the band and half an octave beside it, Hz, evenly in their logarithm."""
+    """Frequencies over the band and half an octave beside it, Hz, evenly spaced in their logarithm."""
     low, high = skin.readout.band
     return np.geomspace(low / np.sqrt(2), high * np.sqrt(2), _FREQUENCIES)
 
 
 @jax.jit
-def _heard(skin: SoundingSkin, places: Array, frequencies: Array) -> Array:
-    """Power (M, G) at each microphone over that of the sources, of equal ones at all places (P, 2)."""
+def _received_power(skin: SoundingSkin, places: Array, frequencies: Array) -> Array:
+    """Power (M, G) received at each microphone from equal sources at all positions (P, 2), relative to that of the
+    sources."""
     total = jnp.zeros((skin.microphones.shape[0], len(frequencies)))
 
     def add(index, total):
@@ -105,15 +108,15 @@ def _heard(skin: SoundingSkin, places: Array, frequencies: Array) -> Array:
     return jax.lax.fori_loop(0, len(places), add, total) / len(places)
 
 
-def _density(skin: SoundingSkin, slope: float, heard: ArrayLike) -> Float[np.ndarray, "M G"]:
-    """Power densities, 1/Hz, of sources of mean square 1 that are heard as `heard` (M, G) says."""
+def _density(skin: SoundingSkin, slope: float, received: ArrayLike) -> Float[np.ndarray, "M G"]:
+    """Power densities, 1/Hz, received from sources of mean square 1 with the relative powers `received` (M, G)."""
     grid = _grid(skin)
     shape = np.asarray(band_filter(skin, jnp.asarray(grid))) * (grid / grid[0]) ** -slope
-    return np.asarray(heard) * shape / np.trapezoid(shape, grid)
+    return np.asarray(received) * shape / np.trapezoid(shape, grid)
 
 
 def _coloured(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "M G"], count: int) -> np.ndarray:
-    """`count` samples (M, S) of independent noises of these densities."""
+    """Simulate `count` samples (M, S) of independent noises of these densities."""
     size = transform_size(count, RINGING, skin.rate)
     bins = filled_bins(skin, size)
     frequencies = np.asarray(bin_frequencies(skin, size, bins))
@@ -126,7 +129,7 @@ def _coloured(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "M G"],
 
 
 def _wavering(key: Array, count: int, correlated: float) -> Float[np.ndarray, " S"]:
-    """A slow normal noise (S,) of variance 1 that forgets itself within `correlated` samples."""
+    """Slow normal noise (S,) of variance 1, correlated over `correlated` samples."""
     knots = int(np.ceil(count / correlated)) + 3
     values = np.asarray(jax.random.normal(key, (knots,)))
     # Between knots weights are the sine and cosine of one angle: the variance is 1 everywhere.

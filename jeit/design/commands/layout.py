@@ -1,4 +1,4 @@
-"""`jeit layout`: layouts of electrodes compared and improved, before any material is cut."""
+"""`jeit layout`: compare and improve layouts of electrodes, before any material is cut."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ layout.command()(optimise)
 _FILES = ("report.json", "comparison.png")
 # Along a side: 65,536 touches in all.
 _MOST_PLACES = 256
-# Options by the names that their values have further down.
+# Option names by the names of their values further down.
 _OPTIONS = {
     "thickness": "--thickness-mm",
     "cell_size": "--cell-mm",
@@ -31,7 +31,7 @@ _OPTIONS = {
     "margin": "--margin-mm",
     "outline": "--width-mm and --height-mm",
 }
-# What is told: its name and unit, its key in the report, and what to multiply by.
+# Printed quantities: name and unit, key in the report, and factor.
 _TOLD = (
     ("electrodes", "electrodes", 1.0),
     ("measurements", "measurements", 1.0),

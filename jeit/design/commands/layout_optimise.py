@@ -1,4 +1,4 @@
-"""`jeit layout optimise`: move the electrodes of a layout to where the skin feels its worst place best."""
+"""`jeit layout optimise`: move the electrodes of a layout to increase the sensitivity of the skin's worst position."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from jeit.mesh import Disk, Domain, Rectangle
 
 RESULTS = ("layout.csv", "layout.svg", "travel.png", "report.json")
-# Nodes to optimise on: fewest that make cells at all, and as many as there can be four times of.
+# Nodes of the mesh to optimise on: fewest that make cells, and most that can be multiplied by four.
 _LEAST_NODES, _MOST_NODES = 4, 250_000
-# What is told: its key in the report, its name and unit, and what to multiply by.
+# Printed quantities: key in the report, name and unit, and factor.
 _TOLD = (
     ("worst_sensitivity_V", "least sensitivity / mV", 1e3),
     ("mean_sensitivity_V", "mean sensitivity / mV", 1e3),

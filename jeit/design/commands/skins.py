@@ -1,4 +1,4 @@
-"""Flat skins on the command line: the options that describe them, and a layout of electrodes with its skin."""
+"""Options that describe flat skins on the command line, and a layout of electrodes with its skin."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Width = Annotated[float, typer.Option("--width-mm", help="Of the skin, centred a
 Height = Annotated[float, typer.Option("--height-mm", help="Of the skin, centred at 0, if the layout does not say it.")]
 Thickness = Annotated[float, typer.Option("--thickness-mm", help="Of the skin, millimetres.")]
 Conductivity = Annotated[float, typer.Option("--conductivity", help="Of the skin, siemens per metre.")]
-# Of conductivities in S/m: deionised water and silver, with room to spare.
+# Range of conductivities in S/m: from below deionised water to above silver.
 _LEAST_CONDUCTIVITY, _MOST_CONDUCTIVITY = 1e-9, 1e9
 
 

@@ -1,4 +1,4 @@
-"""`jeit study`: a sweep over layouts from a TOML file, which can be stopped at any moment and goes on."""
+"""`jeit study`: run a sweep over layouts from a TOML file; it can be stopped at any moment and resumed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def run(
     if store.exists() and not (store / "zarr.json").is_file():
         raise ValueError(f"--output {store}: there is something else already; choose another name.")
     if store.exists():
-        with locked(store, "study"):  # or else a process that writes it is told of, before anybody deletes it
+        with locked(store, "study"):  # a process that still writes it is reported, before anybody deletes it
             pass
         raise ValueError(f"{store} is there already: 'jeit study resume {file}' goes on with it; or delete it.")
     _run(sweep, file, store, page, scheduler, quiet)
@@ -58,7 +58,7 @@ def resume(
     sweep, store = _read(file, output)
     if not store.exists():
         raise ValueError(f"there is no {store} to go on with: begin with 'jeit study run {file}'.")
-    Store(sweep, store, create=False)  # is it one, and this study's?
+    Store(sweep, store, create=False)  # whether it is a store, and of this study
     _run(sweep, file, store, page, scheduler, quiet)
 
 
@@ -119,7 +119,7 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
     from jeit.design.study import run_study
 
     where = _page(file, store, page)
-    need_extra("cluster", "a study")  # before a bar says that it has begun
+    need_extra("cluster", "a study")  # before the progress bar starts
     console = plain_console()
     done, left = (TextColumn(f"{{{said}}}", markup=False) for said in ("task.description", "task.fields[left]"))
     columns = (done, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), left)

@@ -1,1 +1,1 @@
-"""Which measurements are worth making: candidates, and the choice among them."""
+"""Measurement selection: candidate measurements, and the choice of the most informative."""

@@ -1,7 +1,7 @@
-"""`Candidates`: what each measurement that could be made would tell of the conductivity.
+"""`Candidates`: information on the conductivity in each candidate measurement.
 
-The conductivity is x = x₀ + S c with independent coefficients c of unit variance, so that its prior covariance is
-Γ = SSᵀ. Measurement i reads J_i x with noise of standard deviation σ_i; of c it sees f_i = SᵀJ_iᵀ / σ_i, with unit
+The conductivity is x = x₀ + S c with independent coefficients c of unit variance, so that its prior covariance is Γ =
+SSᵀ. Measurement i reads J_i x with noise of standard deviation σ_i, which is f_iᵀc with f_i = SᵀJ_iᵀ / σ_i at unit
 noise.
 """
 
@@ -18,7 +18,7 @@ from jeit_solvers.engines import has_values
 
 
 class Candidates(eqx.Module):
-    """What each of M candidate measurements would tell, whitened by its noise and by the prior.
+    """Sensitivity of each of M candidate measurements, whitened by its noise and by the prior.
 
     **Fields**: `rows` (M, r), f_i of every candidate; `weight` (r, r), the matrix V that sums up a covariance.
     """
@@ -52,21 +52,21 @@ class Candidates(eqx.Module):
     ) -> "Candidates":
         """Candidates under a prior with covariance SSᵀ, `factor` S (m, r); the rest as in `create`.
 
-        For any number of candidates: all drives with all measurements. Where S leaves out small parts of the variance
-        (a prior's `basis`), it leaves out what precise measurements would tell of them, which flatters few of them.
-        Raises `ValueError` for shapes or values that do not go together.
+        For any number of candidates, such as all drives with all measurements. Where S omits small parts of the
+        variance (a prior's `basis`), the information of precise measurements on these parts is omitted too, which
+        overrates the share of few measurements. Raises `ValueError` for shapes or values that do not go together.
         """
         jacobian, factor, noise, weights = _check(jacobian, factor, noise, weights, ("cells", "coefficients"))
         return cls(jacobian @ factor / noise[:, None], factor.T @ (weights[:, None] * factor))
 
     @property
     def num_candidates(self) -> int:
-        """M."""
+        """Number of candidates, M."""
         return self.rows.shape[0]
 
 
 def _check(jacobian, prior, noise, weights, shape: tuple[str, str]) -> tuple[Array, Array, Array, Array]:
-    """The arguments of `Candidates` as arrays that fit each other; `prior` has this `shape`."""
+    """Check the arguments of `Candidates` and return them as arrays of matching shapes; `prior` has this `shape`."""
     jacobian, prior = jnp.asarray(jacobian, float), jnp.asarray(prior, float)
     noise = jnp.asarray(noise, float)
     if jacobian.ndim != 2 or prior.ndim != 2 or jacobian.shape[1] != prior.shape[0]:
@@ -94,9 +94,10 @@ def _check(jacobian, prior, noise, weights, shape: tuple[str, str]) -> tuple[Arr
 
 @jax.jit
 def _from_product(jacobian, product, noise, weights) -> Candidates:
-    """Coefficients in which the data are independent: S = ΓJᵀ N^-½ U Λ^-½ where N^-½ JΓJᵀ N^-½ = UΛUᵀ, N the noise.
+    """Whitened rows from ΓJᵀ, in coefficients for which the data are independent: S = ΓJᵀ N^-½ U Λ^-½ where N^-½ JΓJᵀ
+    N^-½ = UΛUᵀ, N the noise.
 
-    SSᵀ is the part of Γ that the measurements see; the rest tells them nothing, and they it.
+    SSᵀ is the part of Γ that the measurements depend on; they are independent of the rest.
     """
     kernel = jacobian @ product / (noise[:, None] * noise)
     values, vectors = jnp.linalg.eigh((kernel + kernel.T) / 2)

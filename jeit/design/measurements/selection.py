@@ -1,4 +1,4 @@
-"""Measurement selection: of all measurements that could be made, the few that tell most of the conductivity.
+"""Measurement selection: the subset of candidate measurements with the most information on the conductivity.
 
 With f_i as in `Candidates`, the coefficients of the conductivity have covariance C = (I + Σ_{i∈T} f_i f_iᵀ)⁻¹ after the
 measurements of a set T, and the set is as good as its
@@ -27,19 +27,19 @@ from jeit_solvers.dense.cholesky import inverse_cholesky
 from jeit_solvers.engines import has_values
 
 Criterion = Literal["D", "A"]
-# A swap must be worth more than this share of what the set tells, or rounding could swap for ever.
+# Least relative gain of information by a swap; below it rounding errors could cause endless swaps.
 _WORTH = 1e-9
 
 
 class Selection(eqx.Module):
-    """The measurements chosen, and what they keep of what all would tell.
+    """The chosen measurements, and their information relative to that of all candidates.
 
     **Fields**
 
-    - `chosen`: (N,) numbers of the candidates, the most telling first; `protocol.subset(chosen)` measures them.
-    - `gains`: (N,) what each of the greedy choices added, before any exchange; in "D" they never grow.
+    - `chosen`: (N,) indices of the candidates, the most informative first; `protocol.subset(chosen)` measures them.
+    - `gains`: (N,) information added by each greedy choice, before any exchange; non-increasing for "D".
     - `information`: of the chosen ("D": nats, "A": variance removed), and `total`, of all candidates.
-    - `swaps`: how many the exchange made, and `settled`, whether no further swap would help.
+    - `swaps`: number of swaps by the exchange; `settled`: whether no further swap increases the information.
     """
 
     chosen: Int[Array, " N"]
@@ -63,13 +63,13 @@ def select_measurements(
     exchange: bool = True,
     max_swaps: int | None = None,
 ) -> Selection:
-    """Choose `number` of the candidates that lose least information.
+    """Select `number` of the candidates so as to lose the least information.
 
-    Greedily, each time the one that adds most to those chosen before; then, with `exchange`, by the best swap of one
-    chosen for one not chosen, again and again until none helps (Fedorov's exchange) or `max_swaps`, `number` unless
-    given, are made. Deterministic. The greedy set has at least 1 - 1/e of the best possible "D" (the criterion is
-    submodular); `information_bound` tells how much better any other could be. A greedy choice costs O(M r) operations,
-    a swap O(N M r). Works under `jit` and `vmap`: one call for many layouts.
+    The selection is greedy: each step adds the candidate with the largest gain. Then, with `exchange`, the best swap of
+    a chosen for another candidate is repeated until none helps (Fedorov's exchange) or `max_swaps` (default `number`)
+    are made. Deterministic. The greedy set has at least 1 - 1/e of the best possible "D" (the criterion is submodular);
+    `information_bound` bounds how much better any other set could be. A greedy choice costs O(M r) operations, a swap
+    O(N M r). Works under `jit` and `vmap`: one call for many layouts.
 
     Raises `ValueError` for a number that is not from 1 to M, and another criterion.
     """
@@ -81,7 +81,7 @@ def select_measurements(
 
 
 def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -> Float[Array, "..."]:
-    """What sets of candidates tell: (...,) for sets `chosen` (..., N), of N different candidates each.
+    """Information of sets of candidates: (...,) for sets `chosen` (..., N), of N different candidates each.
 
     Raises `ValueError` for numbers that are no candidates.
     """
@@ -97,12 +97,12 @@ def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -
 def information_bound(
     candidates: Candidates, number: int, *, criterion: Criterion = "D", iterations: int = 50
 ) -> Float[Array, ""]:
-    """What no choice of `number` candidates can exceed.
+    """Upper bound of the information of any `number` candidates.
 
     If every candidate may be measured in part, 0 ≤ w_i ≤ 1 with Σw_i = N, the information is a concave function of w,
-    and each of its tangents bounds it. The least bound met on the way of Frank and Wolfe's method to the maximum is
-    returned; more `iterations` tighten it. Close where many candidates tell much the same; loose where noise is so low
-    that each tells something new, for then parts of all of them would tell more than any few.
+    and each of its tangents bounds it. The least bound in the iterations of the Frank-Wolfe method towards the maximum
+    is returned; more `iterations` tighten it. The bound is tight where many candidates carry similar information, and
+    loose where the noise is so low that each candidate adds information, since fractions of all then exceed any few.
 
     Boyd and Vandenberghe, Convex Optimization (2004), section 7.5. Raises `ValueError` for a `number` that is not from
     1 to that of the candidates, or another criterion.
@@ -126,9 +126,9 @@ def random_selections(key: Array, num_candidates: int, number: int, count: int) 
 def nearest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"]:
     """The `number` shortest of all pairs of electrodes at `centres` (L, d): channels of `two_terminal(L)`.
 
-    `lengths` (L, L) between them, metres, in place of distances straight through space: `SurfaceLayout.lengths`. The
-    obvious pattern that measures every place from close by. Of pairs of the same length the first are taken.
-    Raises `ValueError` for a number that is not from 1 to L(L - 1)/2.
+    `lengths` (L, L) between them, metres, in place of distances straight through space: `SurfaceLayout.lengths`. This
+    pattern measures every position from close by. Of pairs of the same length the first are taken. Raises `ValueError`
+    for a number that is not from 1 to L(L - 1)/2.
     """
     return _by_length(centres, number, 1, lengths)
 
@@ -188,7 +188,8 @@ def _select(candidates: Candidates, number: int, criterion: Criterion, limit: in
 
 
 def _greedy(candidates: Candidates, number: int, criterion: Criterion):
-    """The chosen (N,) and what each added: a Cholesky factorisation of I + FFᵀ with the best as the next pivot.
+    """Greedy choice (N,) and the gain of each: a Cholesky factorisation of I + FFᵀ with the best candidate as the next
+    pivot.
 
     Choosing p turns C into C - uuᵀ with u = C f_p / √(1 + f_pᵀC f_p); the u found so far are the rows of `known`.
     """
@@ -211,7 +212,7 @@ def _greedy(candidates: Candidates, number: int, criterion: Criterion):
         state = known.at[turn].set(direction), jnp.maximum(left - seen**2, 0), removable, free.at[best].set(False)
         return state, (best, gain[best])
 
-    left = jnp.sum(rows**2, axis=1)  # f_jᵀC f_j: the variance of reading j that is not known yet
+    left = jnp.sum(rows**2, axis=1)  # f_jᵀC f_j: the remaining variance of reading j
     removable = jnp.sum((rows @ weight) * rows, axis=1)  # f_jᵀCVC f_j
     known = jnp.zeros((number, rows.shape[1]))
     start = (known, left, removable, jnp.ones(len(rows), bool))
@@ -219,7 +220,7 @@ def _greedy(candidates: Candidates, number: int, criterion: Criterion):
 
 
 def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[Array, "N M"]:
-    """What the set gains where its i-th is swapped for candidate j, (N, M); -inf where j is in it.
+    """Gain of the set by a swap of its i-th member for candidate j, (N, M); -inf where j is in the set.
 
     With c_ij = f_iᵀC f_j and b_ij = f_iᵀCVC f_j, C of the present set, a swap multiplies det C⁻¹ by
     q = (1 + c_jj)(1 - c_ii) + c_ij² and lowers tr VC by ((1 - c_ii) b_jj + 2 c_ij b_ij - (1 + c_jj) b_ii) / q.

@@ -1,1 +1,1 @@
-"""Better layouts: electrodes moved by gradients within constraints."""
+"""Layout optimisation: electrodes moved by gradients within constraints."""

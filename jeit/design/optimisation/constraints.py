@@ -1,4 +1,4 @@
-"""What a layout that can be made must satisfy: electrodes inside an outline, apart, and off regions kept free."""
+"""Constraints on layouts: electrodes inside an outline, at a minimum spacing, and outside of keep-out regions."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ class Constraints(eqx.Module):
             )
 
     def shortfall(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> Float[Array, " q"]:
-        """How much each constraint lacks, metres: positive where it is violated. Differentiable almost everywhere."""
+        """Violation of each constraint, metres: positive where it is violated. Differentiable almost everywhere."""
         return jnp.concatenate(list(self.shortfalls(centres, radii).values()))
 
     def shortfalls(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> dict[str, Float[Array, " q"]]:
-        """The same by the names of the constraints: "minimum_spacing", "outline" and "keep_out"."""
+        """Violations by the names of the constraints: "minimum_spacing", "outline" and "keep_out"."""
         first, second = np.triu_indices(len(radii), 1)
         distance = jnp.sqrt(jnp.sum((centres[first] - centres[second]) ** 2, axis=1) + 1e-24)
         outside = [radii + domain.signed_distance(centres) for domain in self.keep_out]

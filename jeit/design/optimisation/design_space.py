@@ -1,4 +1,4 @@
-"""Which layouts a search may take: where electrodes may be, and what of them is varied besides their places."""
+"""`DesignSpace`: the layouts allowed in an optimisation, and the parameters varied besides the positions."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from jeit.mesh import Domain
 
 
 class DesignSpace(eqx.Module):
-    """The layouts of a skin that a search may take.
+    """The layouts of a skin allowed in an optimisation.
 
     **Fields**
 
-    - `outline`: that electrodes stay inside of, the skin's unless given. `minimum_spacing`: of centres, metres;
-      electrodes never overlap. `keep_out`: domains that no electrode may touch.
+    - `outline`: contains all electrodes; the skin's unless given. `minimum_spacing`: of centres, metres; electrodes
+      never overlap. `keep_out`: domains that no electrode may overlap.
     - `symmetry`: about the middle of the outline's box. The layout must have an equal share of its electrodes in every
       half (x or y below the middle) or quarter; those of the first are kept, and the others become their images. Take
       several starts: there are fewer ways out of a poor layout.
-    - `sizes`: electrodes' sizes are moved too, between half and twice what they are, or between two diameters, metres.
+    - `sizes`: whether to vary the electrodes' sizes too, between half and twice their own, or between two diameters,
+      metres.
     - `contact_impedance`: electrodes' are varied too, between two values, ohm·m². `thickness`: that of the sheet is
       varied too, between two values, metres, from the skin's on; its conductance grows with it.
     """
@@ -50,7 +51,7 @@ class DesignSpace(eqx.Module):
         contact_impedance: tuple[float, float] | None = None,
         thickness: tuple[float, float] | None = None,
     ):
-        """Raises `ValueError` for an outline, spacing or regions of another kind; the rest is judged with a skin."""
+        """Raises `ValueError` for an outline, spacing or regions of the wrong type; other checks need a skin."""
         if outline is not None:
             check_kind("outline", outline, Domain, "an outline, such as Rectangle(0.2, 0.2)")
         if not is_number(minimum_spacing):
@@ -64,8 +65,8 @@ class DesignSpace(eqx.Module):
         self.contact_impedance, self.thickness = contact_impedance, thickness
 
     def constraints(self, skin: Skin) -> Constraints:
-        """What its layouts satisfy on a `skin`. Raises `ValueError` where neither says the outline, and for a spacing
-        that is none."""
+        """Constraints on the layouts of a `skin`. Raises `ValueError` where neither has an outline, and for an invalid
+        spacing."""
         if isinstance(skin.layout, SurfaceLayout):
             raise ValueError("skin is curved; move its electrodes with jeit.design.optimise_surface_layout.")
         outline = skin.layout.outline if self.outline is None else self.outline
@@ -76,8 +77,8 @@ class DesignSpace(eqx.Module):
         return Constraints(outline, self.minimum_spacing, self.keep_out)
 
     def variables(self, skin: Skin, constraints: Constraints, depth: float) -> Variables:
-        """What stands for its layouts, from that of a `skin` on, whose touches are `depth` metres deep. Raises
-        `ValueError` for what cannot be."""
+        """Variables of the layouts, starting from that of a `skin`, whose touches are `depth` metres deep. Raises
+        `ValueError` for impossible settings."""
         options = {"sizes": self.sizes, "contacts": self.contact_impedance, "thickness": self.thickness}
         outline = constraints.outline
         variables = Variables.create(outline, varied_of(skin), symmetry=self.symmetry, **options)
@@ -88,7 +89,7 @@ class DesignSpace(eqx.Module):
 
 
 def varied_of(skin: Skin) -> Varied:
-    """What of a sheet a search may vary, as it is."""
+    """The parameters of a sheet that an optimisation may vary, with their present values."""
     discs = skin.model.electrodes
     contact_impedance = discs.contact_impedance  # pyright: ignore[reportAttributeAccessIssue]
     return Varied(skin.layout.centres, skin.layout.diameters / 2, contact_impedance, jnp.asarray(skin.thickness, float))

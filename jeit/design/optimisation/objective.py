@@ -1,4 +1,4 @@
-"""What a search makes large: a score of a sheet's layout."""
+"""Objective of a layout optimisation: a score of a sheet's layout, to be maximised."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def balanced(scores: Scores) -> Float[Array, ""]:
 
 
 class Objective(eqx.Module):
-    """`score` of the `Scores` of a layout, to be made large.
+    """The `score`, a function of the `Scores` of a layout, to be maximised.
 
     **Fields**: `touches`, of the skin, as of `Skin.sheet_touches`; `prior`, `noise` (volts) and `temperature` as in
     `layout_scores`; `score`, a function of `Scores` with differences of order 1, as logarithms have. Raises
@@ -63,12 +63,12 @@ class Objective(eqx.Module):
         return cls(touches, TouchPrior.create(places, correlation=correlation), **options)
 
     def scores(self, skin: Skin) -> Scores:
-        """All scores of a skin. Raises `ValueError` as `layout_scores` does."""
+        """Compute all scores of a skin. Raises `ValueError` as `layout_scores` does."""
         options = {"prior": self.prior, "noise": self.noise, "temperature": self.temperature}
         return layout_scores(skin.model, skin.model_conductivity, self.touches, **options)
 
     def scores_of_varied(self, skin: Skin, varied: Varied) -> Scores:
-        """The same with other electrodes and another thickness; differentiable in them."""
+        """Compute the scores with other electrodes and another thickness; differentiable in them."""
         model = skin.model.with_electrodes(SheetDiscs(varied.centres, varied.radii, varied.contact_impedance))
         conductance = skin.model_conductivity * (varied.thickness / skin.thickness)
         touches = self.touches.at_thickness(varied.thickness)

@@ -1,8 +1,8 @@
-"""Layout optimisation: electrodes moved by gradients through the forward model until a score is best.
+"""Layout optimisation: a score is maximised over electrode positions by gradients through the forward model.
 
 Bounded L-BFGS minimises -score + w Σ (shortfall / pitch)² over positions in the outline's box, with w growing from
-stage to stage (the quadratic penalty method: Nocedal and Wright, Numerical Optimization, 2006, chapter 17); what of the
-constraints is still missing then is made up by the nearest descent of the penalty alone.
+stage to stage (the quadratic penalty method: Nocedal and Wright, Numerical Optimization, 2006, chapter 17); remaining
+violations of the constraints are then removed by descent of the penalty alone.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from jeit.mesh import Domain
 _STAGES = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
 # Constraints are met with so much to spare, metres, that rounding a layout to whole nanometres breaks none.
 _SPARE = 2e-7
-# Of a skin's size, that its mesh may lack.
+# Fraction of a skin's size that its mesh may lack.
 _OFF = 0.01
-# Of a score: less is no improvement.
+# Least improvement of a score.
 _ROUNDING = 1e-9
 # Random places from which those inside the outline are taken.
 _DRAWS = 20_000
 
 
 class Optimisation(eqx.Module):
-    """What `optimise_layout` found from S starts.
+    """Result of `optimise_layout` from S starts.
 
     **Fields**
 
     - `layout`: the best that satisfies all constraints; the one given, if none is better.
     - `scores`: all scores of `layout`; `value`, its score; `start_value`, that of the layout given.
     - `centres` (S, L, 2), `radii` (S, L), metres, `contact_impedance` (S, L), ohm·m², `thickness` (S,) of the sheet,
-      metres, and `values` (S,): where each start ended, and its score there.
-    - `shortfall` (S,): most that any constraint lacks there, metres; 0 where all are satisfied.
+      metres, and `values` (S,): the result of each start, and its score.
+    - `shortfall` (S,): largest violation of a constraint there, metres; 0 where all are satisfied.
     - `history` (S, T): score of each start after each step, without penalties; `snapshots` (S, T, L, 2), metres, and
       the first is the start itself.
     - `best`: the start that `layout` comes from; None if it is the one given.
@@ -83,7 +83,7 @@ def optimise_layout(
     key: Array | None = None,
     callback: Callable[[int, Float[np.ndarray, " S"]], None] | None = None,
 ) -> Optimisation:
-    """Move the electrodes of a sheet until its `objective` is as large as it gets.
+    """Maximise the `objective` of a sheet over the positions of its electrodes.
 
     Take a protocol that does not depend on the order of electrodes, such as that of all two-terminal pairs, and confirm
     what comes out on a finer mesh. Same arguments, same result.
@@ -96,8 +96,8 @@ def optimise_layout(
       `key` and moved apart.
     - `callback`: called after each step with its number and the scores (S,).
 
-    Raises `ValueError` for a layer, what `layout_scores` refuses, touches of another thickness, and constraints that
-    cannot be.
+    Raises `ValueError` for a layer, for arguments that `layout_scores` rejects, for touches of another thickness, and
+    for constraints that cannot be satisfied.
     """
     space = DesignSpace() if space is None else space
     _check(skin, objective, space, steps, starts, key)
@@ -138,7 +138,7 @@ def optimise_layout(
 
 
 class _Search(eqx.Module):
-    """From where S starts are to where they end, and what is said of it."""
+    """The optimisation from S starts, and its result."""
 
     skin: Skin
     objective: Objective
@@ -150,7 +150,7 @@ class _Search(eqx.Module):
         return _cost(values, jnp.asarray(weight), self)
 
     def run(self, begin: Float[Array, "S v"], steps: int, callback) -> tuple[Float[Array, "S v"], Record, str]:
-        """Where the starts end, the way there, and how the last stage ended."""
+        """Run the optimisation: final variables of the starts, their history, and the termination of the last stage."""
         record = Record(callback)
         values, status, done = begin, "step limit", 0
         record.add(values, self.cost(values, _STAGES[0][0])[1])
@@ -162,7 +162,7 @@ class _Search(eqx.Module):
         return _feasible(self.variables, self.constraints, values), record, status
 
     def judge(self, ends: Varied, values, lacking, start_value: float, status: str) -> tuple[int | None, str, str]:
-        """Which start is best, None if not one improves on the layout given, and what to say of it."""
+        """Index of the best start, None if none improves on the given layout, with the status and its reason."""
         layout = self.skin.layout
         good = (lacking <= 0) & np.isfinite(values)
         fits = self.variables.holds(varied_of(self.skin))
@@ -220,7 +220,7 @@ def _penalty(variables: Variables, constraints: Constraints, values, spare=0.0) 
 
 
 def _lacking(constraints: Constraints, centres, radii) -> float:
-    """Most that any constraint lacks, metres; nothing where it is within rounding."""
+    """Largest violation of a constraint, metres; 0 where it is within rounding."""
     return float(jnp.max(constraints.shortfall(jnp.asarray(centres), jnp.asarray(radii))))
 
 
@@ -236,7 +236,7 @@ def _feasible(variables: Variables, constraints: Constraints, values):
 
 @eqx.filter_jit
 def _missing(values, variables: Variables, constraints: Constraints):
-    """Penalty of each start (S,) and its gradient (S, v); steep, for the descent is to end at zero, not near it."""
+    """Penalty of each start (S,) and its gradient (S, v); steep, so that the descent ends at zero, not near it."""
     return jax.vmap(jax.value_and_grad(lambda own: 1e6 * _penalty(variables, constraints, own, _SPARE)))(values)
 
 

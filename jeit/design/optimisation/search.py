@@ -1,4 +1,4 @@
-"""Bounded descent from several starts at once, step by step on record."""
+"""Bounded minimisation from several starts at once, with a record of every step."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from jaxtyping import Array, Float
 
 from jeit_solvers import Status, scipy_lbfgsb
 
-# A cost that falls by less in a step, relative, has settled.
+# Relative decrease of the cost in a step below which it has converged.
 _TOLERANCE = 1e-5
 
 
 class Record:
-    """The way of S starts: variables (S, v) and scores (S,) after every step."""
+    """History of S starts: variables (S, v) and scores (S,) after every step."""
 
     def __init__(self, callback: Callable[[int, Float[np.ndarray, " S"]], None] | None = None):
         self.variables: list[np.ndarray] = []
@@ -23,7 +23,7 @@ class Record:
         self._callback = callback
 
     def add(self, variables, values) -> None:
-        """One step more."""
+        """Add a step."""
         self.variables.append(np.array(variables))
         self.values.append(np.array(values))
         if self._callback is not None:
@@ -33,8 +33,8 @@ class Record:
 def descend(
     cost, variables: Float[Array, "S v"], steps: int, record: Record, *, tolerance: float = _TOLERANCE
 ) -> tuple[Float[Array, "S v"], Status]:
-    """Minimise the sum of the starts' costs between 0 and 1 by L-BFGS; where it ends, and how: converged, at the step
-    limit, or stalled where no step along the gradient lowers it.
+    """Minimise the sum of the starts' costs over variables between 0 and 1 by L-BFGS. Returns the final variables and
+    the termination: converged, step limit, or stalled where no step along the gradient lowers the cost.
 
     `cost`: of variables (S, v) to costs (S,), scores (S,) for the record, and the gradient (S, v) of the costs.
     """

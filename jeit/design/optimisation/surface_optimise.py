@@ -1,4 +1,4 @@
-"""Better layouts of curved sheets: electrodes moved along the surface by gradients through the forward model.
+"""Layout optimisation of curved sheets: electrodes moved along the surface by gradients through the forward model.
 
 Gradient ascent with a line search: every step is in the tangent planes of the electrodes, its end is moved to the
 nearest point of the surface, which is where the way along it leads, to second order; a step that lowers the score, or
@@ -23,12 +23,12 @@ from jeit.layout import SurfaceLayout
 from jeit.mesh.geodesic import Triangles
 from jeit_solvers.engines import as_array
 
-# Of the pitch: the longest first step, and the shortest that is tried.
+# Longest first step and shortest step, as fractions of the pitch.
 _LONGEST, _SHORTEST = 0.3, 1e-3
 
 
 class SurfaceOptimisation(eqx.Module):
-    """What `optimise_surface_layout` found.
+    """Result of `optimise_surface_layout`.
 
     **Fields**: `layout`, the best; its `value` and `start_value`, that of the layout given; `history` (T,) of the score
     after every step, which never falls, and `snapshots` (T, L, 3), metres.
@@ -50,7 +50,8 @@ def optimise_surface_layout(
     margin: float = 0.0,
     callback: Callable[[int, float], None] | None = None,
 ) -> SurfaceOptimisation:
-    """Move the electrodes of a curved sheet along it until its `objective` is as large as gradients make it.
+    """Maximise the `objective` of a curved sheet over the positions of its electrodes, by gradient ascent along the
+    surface.
 
     `objective`: of touches of the sheet, as for `optimise_layout`. `minimum_spacing` between centres, metres, and
     electrodes never overlap; `margin` from the edge, metres, besides their own radius. `callback`: called with each
@@ -101,7 +102,7 @@ def optimise_surface_layout(
 
 
 def surface_scores(skin: Skin, objective: Objective, position: Float[Array, "L 3"]) -> Scores:
-    """All scores of a curved sheet with electrodes at other positions; differentiable in them."""
+    """Compute all scores of a curved sheet with electrodes at other positions; differentiable in them."""
     discs = skin.model.electrodes
     assert isinstance(discs, SurfaceDiscs)
     model = skin.model.with_electrodes(SurfaceDiscs(position, discs.radius, discs.contact_impedance))

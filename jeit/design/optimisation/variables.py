@@ -1,4 +1,4 @@
-"""The variables of a layout to be optimised: numbers between 0 and 1, and the electrodes that they stand for."""
+"""Variables of a layout optimisation: numbers between 0 and 1, and their mapping to electrodes."""
 
 from __future__ import annotations
 
@@ -34,30 +34,30 @@ class Varied(NamedTuple):
 
 
 class Range(eqx.Module):
-    """Positive values between `least` (k,) and `least` · exp(`span`), evenly in their logarithm."""
+    """Range of positive values between `least` (k,) and `least` · exp(`span`), linear in the logarithm."""
 
     least: Float[np.ndarray, " k"]
     span: Float[np.ndarray, " k"]
 
     @classmethod
     def create(cls, name: str, ends, start, unit: str) -> "Range":
-        """From two `ends`, for all of `start` (k,). Raises `ValueError`."""
+        """Create from two `ends`, for all of `start` (k,). Raises `ValueError` for invalid ends."""
         least, most = ends if np.shape(ends) == (2,) else (0.0, 0.0)
         if not 0 < least < most < np.inf:
             raise ValueError(f"{name} must be two values in {unit}, the smaller one first; it is {ends!r}.")
         return cls(np.full(np.shape(start), least), np.full(np.shape(start), np.log(most / least)))
 
     def variables(self, values) -> Float[np.ndarray, " k"]:
-        """Numbers between 0 and 1 that stand for `values`, or for the nearest end."""
+        """Variables between 0 and 1 that correspond to `values`, or to the nearest end."""
         return np.minimum(np.maximum(np.log(np.asarray(values) / self.least) / self.span, 0), 1)
 
     def values(self, variables) -> Float[Array, " k"]:
-        """What numbers between 0 and 1 stand for."""
+        """Values that correspond to variables between 0 and 1."""
         return jnp.asarray(self.least) * jnp.exp(self.span * variables)
 
 
 class Variables(eqx.Module):
-    """From variables between 0 and 1 to a `Varied`: G generators, of which the other electrodes are images.
+    """Mapping from variables between 0 and 1 to a `Varied`: G generators, of which the other electrodes are images.
 
     **Fields**: `low`, `size` (2,) of the box of centres, metres; `images` (k, 2, 2); `order` (L,) of the images in the
     layout; `given`, what to start from; `sizes` (G), `contacts` (G) and `thickness` (1), the ranges of what is
@@ -80,7 +80,7 @@ class Variables(eqx.Module):
     def create(
         cls, outline: Domain, given: Varied, *, symmetry=None, sizes=False, contacts=None, thickness=None
     ) -> "Variables":
-        """The variables of what is `given`. Raises `ValueError` for what cannot be."""
+        """Create the variables from the `given` electrodes. Raises `ValueError` for impossible settings."""
         if symmetry is not None:
             check_name("symmetry", symmetry, filter(None, _IMAGES), ", or None")
         centres, radii = np.asarray(given.centres), np.asarray(given.radii)
@@ -131,18 +131,18 @@ class Variables(eqx.Module):
 
     @property
     def num_generators(self) -> int:
-        """G."""
+        """Number of generators, G."""
         return len(self.order) // len(self.images)
 
     @property
     def smallest(self) -> Float[np.ndarray, " L"]:
-        """Radii (L,) that the electrodes may shrink to, metres."""
+        """Least radii (L,) of the electrodes, metres."""
         if self.sizes is None:
             return np.asarray(self.given.radii)
         return np.tile(self.sizes.least, len(self.images))[self.order]
 
     def varied(self, variables: Float[Array, " v"]) -> Varied:
-        """What the variables stand for."""
+        """The `Varied` that corresponds to the variables."""
         number = self.num_generators
         place, rest = variables[: 2 * number].reshape(number, 2) * self.size - self.size / 2, variables[2 * number :]
         centres = jnp.einsum("kij,gj->kgi", self.images, place).reshape(-1, 2) + self.low + self.size / 2

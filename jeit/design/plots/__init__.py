@@ -1,4 +1,4 @@
-"""Pictures of electrode layouts and their studies."""
+"""Plots of electrode layouts and their studies."""
 
 from __future__ import annotations
 

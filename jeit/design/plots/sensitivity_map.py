@@ -1,4 +1,4 @@
-"""Sensitivity maps of a skin, and the histograms of several."""
+"""Plots of sensitivity maps, and of histograms of several."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def plot_sensitivity_map(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw Θ in millivolts over the skin. `electrodes`: positions (L, 2), metres; `limit`: volts at the bar's end.
+    """Plot Θ in millivolts over the skin. `electrodes`: positions (L, 2), metres; `limit`: volts at the bar's end.
 
     Raises `ValueError` for what is no sensitivity map.
     """
@@ -62,7 +62,7 @@ def plot_sensitivity_map(
 def plot_sensitivity_histograms(
     maps: Mapping[str, SensitivityMap], *, bins: int = 40, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the share of the area at each sensitivity, of maps {name: map}; the first one's minimum is marked.
+    """Plot the share of the area at each sensitivity, for maps {name: map}; the minimum of the first is marked.
 
     Raises `ValueError` for what are none.
     """

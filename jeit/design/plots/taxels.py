@@ -1,4 +1,4 @@
-"""Virtual taxels: where they are and how large, their areas' histogram, and what each is sensitive to."""
+"""Plots of virtual taxels: map, histogram of areas, and similarity of each position to a taxel."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def plot_taxels(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the map of the taxels of one layout, place by place.
+    """Plot the map of the taxels of one layout.
 
-    `colour`: "area", of the taxel whose cluster the place is in; "coverage", how many taxels cover the place; "label",
-    a colour for each cluster. `outlines`: draw where the similarity to each taxel falls below the threshold.
-    `electrodes`: positions (L, 2) or (L, 3), metres. `limit`: value at the end of the colour bar, in m² for "area".
-    Raises `ValueError` for other colours, and batches.
+    `colour`: "area", of the taxel whose cluster the position is in; "coverage", the number of taxels that cover the
+    position; "label", a colour for each cluster. `outlines`: draw where the similarity to each taxel falls below the
+    threshold. `electrodes`: positions (L, 2) or (L, 3), metres. `limit`: value at the end of the colour bar, in m² for
+    "area". Raises `ValueError` for other colours, and batches.
     """
     check_name("colour", colour, _QUANTITIES)
     _check_single(taxels)
@@ -69,10 +69,10 @@ def plot_taxels(
 def plot_taxel_areas(
     taxels: Taxels | Mapping[str, Taxels], *, bins: int = 20, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the histogram of the taxels' areas of one layout, or of several: {name: taxels}.
+    """Plot the histogram of the taxels' areas of one layout, or of several: {name: taxels}.
 
-    `bins`: as many, of the same width for all, from 0 to the largest area. The legend gives mean ± standard deviation.
-    Raises `ValueError` for batches, no layouts and more than six.
+    `bins`: number of bins, of the same width for all, from 0 to the largest area. The legend gives mean ± standard
+    deviation. Raises `ValueError` for batches, no layouts and more than six.
     """
     layouts = dict(taxels) if isinstance(taxels, Mapping) else {"taxels": taxels}
     if not 1 <= len(layouts) <= len(_COLOURS):
@@ -104,7 +104,8 @@ def plot_similarity(
     colour_bar: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw how like the mean change of taxel `index` the change of each place is, and the outline of the taxel.
+    """Plot the similarity of each position's voltage change to the mean change of taxel `index`, and the taxel's
+    outline.
 
     `electrodes`: positions (L, 2) or (L, 3), metres. Raises `ValueError` for a taxel that is not there, and batches.
     """
@@ -114,7 +115,7 @@ def plot_similarity(
         raise ValueError(f"index must be from 0 to {number - 1}, of one of the {number} taxels; it is {index!r}.")
     ax = axes_or_new(ax)
     cells = _draw_cells(ax, taxels, np.asarray(taxels.similarity[index]), colour_map="magma")
-    # What is opposite is no more alike than what has nothing in common.
+    # Negative similarities are drawn as 0.
     cells.set_clim(0, 1)
     _draw_outlines(ax, taxels, [index], colour="white", width=1.6)
     _dress(ax, taxels, electrodes, f"{1e4 * float(taxels.areas[index]):.1f} cm²" if title is None else title)
@@ -144,14 +145,14 @@ def _sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
 def _draw_cells(ax: Axes, taxels: Taxels, values: np.ndarray, *, colour_map: str) -> PolyCollection:
     half = np.stack(_sides(taxels), axis=1)[:, None] / 2
     corners = np.asarray(taxels.places)[:, None] + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    # Edges in the cells' own colour: without them the background shines through the seams.
+    # Edges in the cells' own colour hide the seams between cells.
     cells = PolyCollection(list(corners), array=values, cmap=colormaps[colour_map], edgecolors="face", linewidth=0.4)
     ax.add_collection(cells)
     return cells
 
 
 def _map_colours(taxels: Taxels) -> np.ndarray:
-    """A colour (k,) for each cluster, the first of the palette that none of its neighbours has."""
+    """Colour (k,) of each cluster: the first of the palette that none of its neighbours has."""
     labels, count = np.asarray(taxels.labels), len(taxels.similarity)
     first, second = labels[_triangles(taxels).edges].T
     neighbours = np.zeros((count, count), bool)

@@ -1,4 +1,4 @@
-"""Where electrodes travelled while a layout was optimised, from start to end."""
+"""Plot of the electrodes' paths in a layout optimisation."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def plot_travel(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the way of every electrode of one of the starts, hollow where it began, filled where it ended, and a legend.
+    """Plot the path of every electrode for one of the starts, with a hollow start, a filled end, and a legend.
 
-    `start`: which, from 0; `keep_out`: regions to be hatched. The title gives the mean way in millimetres unless one is
-    given. Raises `ValueError` for a start that is not there, and for what is no `Optimisation`.
+    `start`: which, from 0; `keep_out`: regions to be hatched. The default title gives the mean path length in
+    millimetres. Raises `ValueError` for a start that does not exist, and for what is no `Optimisation`.
     """
     check_kind("optimisation", optimisation, Optimisation, "an Optimisation, as of optimise_layout")
     number = len(optimisation.centres)
@@ -60,7 +60,7 @@ def plot_travel(
 
 
 def _explain(ax: Axes, *, kept_free: bool) -> None:
-    """A legend below, beside the scale bar."""
+    """Draw a legend below the plot, beside the scale bar."""
     disc = {"marker": "o", "markersize": 8, "linestyle": "none"}
     handles: list[Artist] = [
         Line2D([], [], markerfacecolor="none", markeredgecolor=SOFT, label="where it began", **disc),

@@ -1,4 +1,4 @@
-"""Images of curved skins, unrolled: laid flat, as seen from outside, true to scale."""
+"""Plots of curved skins unrolled to a plane, as seen from outside, to scale."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jeit.mesh.geodesic import Unrolled
 from jeit.plot.axes import INK, SERIES_COLOURS, SOFT, axes_or_new, bare, draw_scale_bar, extent_of
 from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
 
-# Shares of lengths from which on a picture says that it is distorted.
+# Relative distortion of lengths from which on the plot states it.
 _TOLD = 0.005
 
 
@@ -33,13 +33,13 @@ def plot_unrolled(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a surface laid flat, as of `jeit.mesh.geodesic.unroll(skin.model.mesh)`, dashed where it was cut open.
+    """Plot an unrolled surface, as from `jeit.mesh.geodesic.unroll(skin.model.mesh)`, with dashed lines along the cut.
 
     `values`: one for each triangle of the surface, flat, or for each node, shaded. `electrodes` are discs, numbered.
     `marks`: places (p, 3), metres, on the surface, by what the legend calls them. `scale`: how values become colours;
-    changes of sheet conductivity in S unless it says otherwise. Where laying it flat stretches or shrinks the surface
-    by half a per cent or more, the picture says by how much. Raises `ValueError` for values of another shape, complex
-    or not finite, and things of another kind.
+    changes of sheet conductivity in S unless it says otherwise. Where unrolling stretches or shrinks the surface by
+    half a per cent or more, the plot states the distortion. Raises `ValueError` for values of another shape, complex or
+    not finite, and for arguments of the wrong type.
     """
     check_kind("unrolled", unrolled, Unrolled, "a surface laid flat, as of unroll(skin.model.mesh)")
     check_scale(scale)

@@ -1,4 +1,4 @@
-"""What two layouts feel, on disk: a picture and a report."""
+"""Files of a comparison of two layouts: a plot and a report."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 from jeit.design.comparison import LayoutComparison
 from jeit.report.folder import plain, results, write_json
 
-# Letters of a name in the picture.
+# Most letters of a name in the plot.
 _LONGEST = 32
 
 
 def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> None:
-    """Write `comparison.png` and `report.json` into `folder`, made if need be.
+    """Write `comparison.png` and `report.json` into `folder`, created if needed.
 
     Raises `ValueError` for what cannot be one.
     """
@@ -23,7 +23,7 @@ def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> Non
 
 
 def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
-    """What is told of both "layouts", and the "options" of skins and touches, as plain numbers and strings."""
+    """Report of both "layouts", and the "options" of skins and touches, as plain numbers and strings."""
     skin, response = result.skins[0], result.responses[0]
     options = {
         "thickness_mm": 1e3 * skin.thickness,
@@ -40,7 +40,8 @@ def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
 
 
 def draw_layout_comparison(result: LayoutComparison):
-    """Maps of sensitivity and of taxels of both, on one scale, and their histograms, as a matplotlib `Figure`."""
+    """Plot the sensitivity and taxel maps of both layouts on one scale, and their histograms, as a matplotlib
+    `Figure`."""
     from matplotlib.artist import Artist
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -64,7 +65,7 @@ def draw_layout_comparison(result: LayoutComparison):
             one.sensitivity, electrodes=centres, limit=highest, title=f"{name}: sensitivity", ax=row[0]
         )
         plot_taxels(one.taxels, electrodes=centres, limit=largest, title=f"{name}: taxels", ax=row[1])
-        # Its bar, drawn last, is placed by the touched part; both maps are of the whole skin.
+        # The colour bar, drawn last, is placed by the touched part; both maps show the whole skin.
         for bar in (row[1].lines[-1], row[1].texts[-1]):
             bar.remove()
         draw_scale_bar(row[1], outline.extent)
@@ -88,5 +89,5 @@ def distinct_names(names: list[str]) -> list[str]:
 
 
 def _shortened(name: str) -> str:
-    """A layout's name, as much of it as there is room for above a map."""
+    """A layout's name, shortened to fit above a map."""
     return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"

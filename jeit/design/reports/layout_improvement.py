@@ -1,4 +1,4 @@
-"""A better layout on disk: for the laser cutter, as a picture of how it came about, and a report."""
+"""Files of an optimised layout: for the laser cutter, a plot of the electrodes' paths, and a report."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jeit.report.folder import describe_domain, plain, results, write_json
 
 
 def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
-    """Write `layout.csv`, `layout.svg`, `travel.png` and `report.json` into `folder`, made if need be.
+    """Write `layout.csv`, `layout.svg`, `travel.png` and `report.json` into `folder`, created if needed.
 
     Raises `ValueError` for what cannot be one.
     """
@@ -25,7 +25,7 @@ def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
 
 
 def draw_improved_layout(result: ImprovedLayout):
-    """Where the electrodes went, as a matplotlib `Figure`."""
+    """Plot the electrodes' paths, as a matplotlib `Figure`."""
     from matplotlib.figure import Figure
 
     from jeit.design.plots import plot_travel
@@ -37,8 +37,8 @@ def draw_improved_layout(result: ImprovedLayout):
 
 
 def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
-    """How it went, figures of the layout given ("start") and of the better one ("optimised"), both on the finer mesh,
-    and what was asked for, as plain numbers and strings; None where there is no finite value."""
+    """Report of the optimisation, figures of the given layout ("start") and of the better one ("optimised"), both on
+    the finer mesh, and the options, as plain numbers and strings; None where there is no finite value."""
     found, skin, space = result.optimisation, result.skin, result.space
     content = {
         "layout": result.start.name,
@@ -76,7 +76,8 @@ def _figures(scores: Scores) -> dict[str, Any]:
 
 
 def _region(domain: Domain) -> str | dict[str, Any]:
-    """As the command takes it: a disc "x,y,radius" or rectangle "x1,y1,x2,y2", millimetres; others in words."""
+    """Region in the format of the command: a disc "x,y,radius" or rectangle "x1,y1,x2,y2", millimetres; others in
+    words."""
     if isinstance(domain, Disk):
         numbers = (*domain.centre, domain.radius)
     elif isinstance(domain, Rectangle):

@@ -1,4 +1,4 @@
-"""A study as one HTML page that needs nothing else: its pictures, its table, and the exact configuration."""
+"""Report of a study as one self-contained HTML page: plots, table, and the exact configuration."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ img { max-width: 100% } pre { background: #f4f4f4; padding: 1em; overflow-x: aut
 
 
 def write_study_report(study: Study, store: str | Path, path: str | Path) -> None:
-    """Write what the study in `store` has found so far as one HTML file at `path`, replaced as a whole.
+    """Write the results so far of the study in `store` as one HTML file at `path`, replaced as a whole.
 
     Maps of 24 finished points at most on one scale; mean against least sensitivity; every point's values and scores;
     the study file, fingerprint and versions. Raises `ValueError` if no chunk is finished, `OSError` if the page cannot
@@ -86,7 +86,7 @@ def _picture(figure: Any, caption: str) -> str:
 
 
 def _table(study: Study, data) -> str:
-    """A line for every point: what was swept, then what was found."""
+    """Table with a row for every point: the swept values, then the results."""
     swept = list(study.points[0].coordinates)
     found = {name: values_and_unit(data, name) for name in scores_of(data)}
     heads = ["point", *swept, *(name if unit == "1" else f"{name} / {unit}" for name, (_, unit) in found.items())]

@@ -1,4 +1,4 @@
-"""Pictures of a study's results, for its report."""
+"""Plots of a study's results, for its report."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from jeit.design.study.spec import Study
 from jeit.mesh import Rectangle
 from jeit.mesh.geodesic import Geodesics, Triangles, unroll
 
-# More maps than that are no longer looked at.
+# Most maps in a report.
 _MAPS, _COLUMNS = 24, 4
-# Of an unrolled map, from where on nodes are no longer seen.
+# Number of nodes of an unrolled map above which they are not distinguishable.
 _NODES = 3000
-# Swept values as they stand above a map; electrodes are told by the layout.
+# Text of swept values above a map; the electrodes are given by the layout's name.
 _LABELS = {
     "diameter_mm": "⌀ {:g} mm",
     "contact_impedance_ohm_m2": "{:g} Ω m²",
@@ -25,14 +25,14 @@ _LABELS = {
     "noise_V": "noise {:g} V",
     "cell_mm": "cells {:g} mm",
 }
-# Names of scores in the store that need a word more above a picture.
+# Titles of scores whose name in the store needs another word.
 _TITLES = {"mean": "mean sensitivity", "minimum": "least sensitivity"}
-# Where ticks of a logarithmic scale stand, times powers of ten, and how they are written.
+# Ticks of a logarithmic scale, times powers of ten, and their format.
 _TICKS, _PLAIN_NUMBER = (1.0, 2.0, 5.0), "{x:g}"
 
 
 def draw_scatter(data):
-    """Mean against least sensitivity, a colour for each layout."""
+    """Plot mean against least sensitivity, with a colour for each layout."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -53,7 +53,7 @@ def draw_scatter(data):
 
 
 def scores_of(data) -> list[str]:
-    """Names of the scores: what has one value for each point."""
+    """Names of the scores, the arrays with one value for each point."""
     return [name for name in data.data_vars if data[name].dims == ("point",)]
 
 
@@ -64,7 +64,7 @@ def values_and_unit(data, name: str) -> tuple[np.ndarray, str]:
 
 
 def draw_scores(data):
-    """Every score, point by point, a colour for each layout."""
+    """Plot every score, point by point, with a colour for each layout."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -95,14 +95,14 @@ def draw_scores(data):
 
 
 def shown(data) -> np.ndarray:
-    """Numbers of the finished points whose maps are drawn: all, or as many as are looked at, evenly among them."""
+    """Indices of the finished points whose maps are drawn: all, or the largest number allowed, evenly spaced."""
     finished = np.flatnonzero(data.finished.values)
     chosen = np.linspace(0, len(finished) - 1, min(len(finished), _MAPS)).round().astype(int)
     return finished[chosen]
 
 
 def draw_maps(study: Study, data):
-    """Sensitivity maps of the points that are `shown`, on one scale, with their electrodes."""
+    """Plot the sensitivity maps of the points in `shown`, on one scale, with their electrodes."""
     from matplotlib.collections import EllipseCollection
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
@@ -166,8 +166,8 @@ class _Flat:
 
 
 class _Unrolled:
-    """Maps of curved skins, laid flat, in millimetres: at every place of the skin the value of the touch that is
-    nearest along it."""
+    """Maps of curved skins, unrolled, in millimetres; every position has the value of the nearest touch along the
+    surface."""
 
     def __init__(self, outline: Triangles, grid: TouchGrid):
         fine = outline
@@ -186,7 +186,8 @@ class _Unrolled:
 
 
 def titles_of(study: Study) -> list[str]:
-    """Number and layout of every point, and below them what else differs between the points, two values a line."""
+    """Title of every point: number and layout, and below them the other values that differ between points, two per
+    line."""
     coordinates = [point.coordinates for point in study.points]
     varying = [name for name in _LABELS if len({values[name] for values in coordinates}) > 1]
     titles = []
@@ -202,5 +203,5 @@ def _label(name: str, value) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text that matplotlib takes as it is: no formulas, and no label that begins with an underscore is left out."""
+    """Text that matplotlib shows unchanged: formulas are escaped, and labels that begin with an underscore are kept."""
     return " " * text.startswith("_") + text.replace("$", r"\$")

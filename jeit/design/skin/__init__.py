@@ -1,1 +1,1 @@
-"""A skin and its touches: indentations, the cells they change, and the voltages that change with them."""
+"""Skins and touches: indentations, the cells they change, and the resulting voltage changes."""

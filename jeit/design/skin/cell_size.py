@@ -1,4 +1,4 @@
-"""How fine the mesh of a skin can be, and how coarse."""
+"""Limits of the cell size of a skin's mesh."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from jeit.mesh.generate.unstructured import MOST_POINTS
 
 # Nodes of a plane mesh, times cell size squared over area: 1.155 for equilateral cells, and some for the edge.
 _NODES = 1.2
-# Of cells, times the smallest diameter of electrodes.
+# Largest cell size, relative to the smallest diameter of the electrodes.
 _COARSEST = 1.5
 
 
 def check_cell_size(
     name: str, cell_size: float, layout: Layout | SurfaceLayout, area: float, num_layers: int = 0
 ) -> None:
-    """Raise `ValueError`, which speaks of `name` in millimetres, where cells of so many metres are too large for the
-    electrodes of `layout`, or too many.
+    """Raise `ValueError`, with `name` in millimetres in its message, where cells of this size (metres) are too large
+    for the electrodes of `layout`, or too many.
 
     `area` of the skin in m²; `num_layers` of cells, 0 for a sheet.
     """
@@ -43,5 +43,5 @@ def check_cell_size(
 
 
 def smallest_diameter(layout: Layout | SurfaceLayout) -> float:
-    """Of the electrodes, metres."""
+    """Smallest diameter of the electrodes, metres."""
     return float(np.asarray(layout.diameters).min())

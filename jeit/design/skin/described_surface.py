@@ -1,4 +1,4 @@
-"""The surface of a curved skin as its table says: made, or read from a file beside it."""
+"""The surface of a curved skin from its table: generated, or read from a file."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from jeit.design.skin.surface_tables import SurfaceTable
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
-# A skin's extent, metres, from which a likely unit is found.
+# Plausible extent of a skin, metres, from which the likely unit of a file is determined.
 _USUAL = 0.15
 # An equilateral triangle's side, over the root of its area.
 _SIDE = 2 / 3**0.25
 
 
 def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
-    """A surface with cells of `cell_size` metres, or as its file of triangles has it; files are relative to `folder`.
+    """Create a surface with cells of `cell_size` metres, or read its file of triangles; paths are relative to `folder`.
 
-    Raises `ValueError`, which speaks of surface, for what cannot be made or read, or is no surface; `ImportError` for a
-    CAD file without Gmsh.
+    Raises `ValueError` for a surface that cannot be created or read, or is invalid; `ImportError` for a CAD file
+    without Gmsh.
     """
     try:
-        with size_checked():  # what is too large is refused
+        with size_checked():  # a surface that is too large is rejected
             surface = _made(table, folder, cell_size)
     except (ValueError, OSError) as error:
         raise ValueError(f"surface: {error}") from None
@@ -40,7 +40,7 @@ def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Me
 
 
 def _check_unit(table: SurfaceTable, surface: Mesh) -> None:
-    """Raise `ValueError` for a file's surface as large, or small, as no skin is, with the likely unit."""
+    """Raise `ValueError` for a file whose surface is implausibly large or small, with the likely unit."""
     from jeit.design.skin.surface_tables import ScanTable
 
     extent = float(np.ptp(np.asarray(surface.points), axis=0).max())
@@ -61,7 +61,7 @@ def _length_text(metres: float) -> str:
 
 
 def surface_identity(table: SurfaceTable, folder: Path) -> str:
-    """Text that differs for other surfaces: of a file by all that is in it."""
+    """Text that identifies a surface; for a file it depends on the content."""
     kept = table.model_dump()
     if "file" in kept:
         kept["file"] = hashlib.sha256((folder / kept["file"]).read_bytes()).hexdigest()

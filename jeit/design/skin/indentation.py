@@ -1,4 +1,4 @@
-"""Touch as an indentation of a skin's surface: how deep it goes, as a function of the distance from its middle."""
+"""Indentations of a skin's surface by touches: depth as a function of the distance from the centre."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from jeit_solvers.engines import either_engine, namespace
 
 
 class AbstractIndentation(eqx.Module):
-    """Depth of an indentation. Add another by writing one class."""
+    """Base class of indentations. A new indentation is one subclass."""
 
     @abc.abstractmethod
     def depth_at(self, distance: Float[Array | np.ndarray, "..."]) -> Float[Array | np.ndarray, "..."]:
-        """Depth in metres at horizontal distances (metres) from the middle."""
+        """Depth in metres at horizontal distances (metres) from the centre."""
 
     @property
     @abc.abstractmethod
     def reach(self) -> float:
-        """Distance in metres beyond which there is none."""
+        """Distance in metres beyond which the depth is 0."""
 
 
 class Bell(AbstractIndentation):
-    """depth · exp(−r² / (2 deviation²)): the unit deformation of Park et al. 2022, text S4, unless told otherwise.
+    """depth · exp(−r² / (2 deviation²)): by default the unit deformation of Park et al. 2022, text S4.
 
     Cut off at three deviations, where it is a hundredth of its depth.
     """
@@ -42,7 +42,7 @@ class Bell(AbstractIndentation):
 
     @either_engine
     def depth_at(self, distance):
-        """The bell."""
+        """Depth of the bell at distances (metres), metres."""
         xp = namespace(self, distance)
         distance = xp.asarray(distance)
         return xp.where(distance < self.reach, self.depth * xp.exp(-0.5 * (distance / self.deviation) ** 2), 0.0)
@@ -71,7 +71,7 @@ class Hemisphere(AbstractIndentation):
 
     @either_engine
     def depth_at(self, distance):
-        """The cap of the ball."""
+        """Depth of the ball at distances (metres), metres."""
         xp, radius = namespace(self, distance), self.diameter / 2
         height = xp.sqrt(xp.maximum(radius**2 - xp.asarray(distance) ** 2, 0.0))
         return xp.maximum(self.depth - radius + height, 0.0)

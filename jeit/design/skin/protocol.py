@@ -1,4 +1,4 @@
-"""What is measured of a skin."""
+"""Measurement protocols of skins."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def skin_protocol(
     num_pairs: int | None = None,
     current: float = CURRENT,
 ) -> Protocol:
-    """The measurements of a skin with electrodes of `layout`, at `current` amperes.
+    """Create the measurement protocol of a skin with electrodes of `layout`, at `current` amperes.
 
-    `num_pairs`, of "two-terminal" only: between so many of the electrodes nearest to each other, on a curved skin by
-    the way along it, 0 for all pairs; 94 unless given, as in Park et al. 2022, or all if there are fewer. Raises
-    `ValueError` for another name, more pairs than there are, pairs of another protocol, and as the protocols do.
+    `num_pairs`, for "two-terminal" only: number of the pairs of nearest electrodes, on a curved skin by the distance
+    along it, 0 for all pairs; 94 unless given, as in Park et al. 2022, or all if there are fewer. Raises `ValueError`
+    for another name, more pairs than there are, pairs of another protocol, and as the protocols do.
     """
     check_layout("layout", layout)
     check_name("protocol", name, PROTOCOLS)
@@ -44,7 +44,7 @@ def skin_protocol(
 
 
 def number_of_pairs(layout: Layout | SurfaceLayout, num_pairs: int | None) -> int:
-    """How many pairs are measured, as in `skin_protocol`. Raises `ValueError` for more than there are."""
+    """Number of measured pairs, as in `skin_protocol`. Raises `ValueError` for more than there are."""
     pairs = layout.num_electrodes * (layout.num_electrodes - 1) // 2
     if num_pairs is None:
         return min(NUM_PAIRS, pairs)

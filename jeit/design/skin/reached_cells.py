@@ -1,4 +1,4 @@
-"""Which cells of a skin a touch may reach: how far along its surface, and how deep below it (NumPy)."""
+"""Cells of a skin within reach of a touch: distance along the surface, and depth below it (NumPy)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from scipy.spatial import KDTree
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geodesic import Geodesics, Triangles
 
-# Of a curved skin's thickness, or its cells, that places may be off its surface.
+# Distance that positions may be off a curved skin's surface, relative to its thickness or cells.
 _OFF = 0.5
 
 
 class ReachedCells(NamedTuple):
-    """Of n touches: `near`, the numbers of each one's cells, and `distance`, metres from its place along the surface;
-    `below` (m,), metres from the surface to every cell's middle, infinite for those deeper than asked for; and
-    `thickness` of a layer, metres, None of a sheet."""
+    """Cells within reach of n touches: `near`, the indices of each touch's cells, and `distance`, metres from its
+    position along the surface; `below` (m,), metres from the surface to every cell's middle, infinite for those deeper
+    than asked for; and `thickness` of a layer, metres, None of a sheet."""
 
     near: list[Int[np.ndarray, " c"]]
     distance: list[Float[np.ndarray, " c"]]
@@ -27,22 +27,23 @@ class ReachedCells(NamedTuple):
 
 
 def is_curved(mesh: Mesh) -> bool:
-    """Whether it is a surface in space, or a shell of one."""
+    """Whether a mesh is a surface in space, or a shell of one."""
     return mesh.is_surface or {"inner", "outer"} <= set(mesh.tags)
 
 
 def touched_surface(mesh: Mesh, face: str = "outer") -> Triangles:
-    """Of a curved skin: itself, or the `face` of a shell."""
+    """The touched surface of a curved skin: a sheet itself, or the `face` of a shell."""
     return Triangles.of(mesh, None if mesh.is_surface else face)
 
 
 def reached_cells(
     mesh: Mesh, places: Float[np.ndarray, "n d"], reach: float, deepest: float, face: str = "outer"
 ) -> ReachedCells:
-    """Cells whose middles lie within `reach` of `places` along the surface, and less than `deepest` below it, metres.
+    """Find the cells whose centroids lie within `reach` of `places` along the surface, and less than `deepest` below
+    it, metres.
 
-    Of a flat layer below its top, at its greatest z; of a shell below its `face`, along the inward normal. Raises
-    `ValueError` for places off a curved surface.
+    Depths of a flat layer are below its top, at its greatest z; of a shell below its `face`, along the inward normal.
+    Raises `ValueError` for places off a curved surface.
     """
     middle = np.asarray(centroids(mesh))
     if is_curved(mesh):
@@ -79,11 +80,11 @@ def _on_surface(mesh: Mesh, middle, places, reach: float, deepest: float, face: 
 
 
 def shell_thickness(mesh: Mesh) -> float:
-    """Of a shell, metres: the median of how far the nodes of its inner face are from the outer one."""
+    """Thickness of a shell, metres: the median distance of the nodes of its inner face from the outer one."""
     inner = Triangles.of(mesh, "inner").points
     return float(np.median(Triangles.of(mesh, "outer").nearest(inner).away))
 
 
 def said(place) -> str:
-    """A place in millimetres: "(12, 3.5)"."""
+    """Text of a position in millimetres: "(12, 3.5)"."""
     return "(" + ", ".join(f"{1e3 * value:.4g}" for value in place) + ")"

@@ -1,4 +1,4 @@
-"""`RestingSkin`: what exact changes by touches need of a skin at rest, worked out once for any number of touches."""
+"""`RestingSkin`: precomputed quantities of an untouched skin, for exact voltage changes by any number of touches."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from jeit.forward.transfer import fields_and_inverse
 from jeit_solvers import NearInverse, Strips, over_cores
 from jeit_solvers.engines import on_device
 
-# Touches that a compiled program works on; and sizes that nodes and cells are filled up to: programs are compiled for
-# each, and the work of a touch grows with the square of its nodes.
+# Touches per call of a compiled program; and sizes to which nodes and cells are padded: one program is compiled for
+# each size, and the cost of a touch grows with the square of its nodes.
 _TOGETHER, _NODES, _CELLS = 2 * EXACT_AT_ONCE, 2**0.5, 2.0
 
 
 class RestingSkin(eqx.Module):
-    """A skin that nobody touches, known between all nodes that may be touched.
+    """An untouched skin, with its inverse system matrix between all nodes that may be touched.
 
     **Fields**: `model`; `rest` (M,), its voltages, volts; `element` (m, q, q), the cells' parts of its matrix; `strips`
     of the nodes that may be touched; the `fields` there and the `inverse` between any two of them.
@@ -78,12 +78,12 @@ class RestingSkin(eqx.Module):
 
 
 def _size(number, factor: float):
-    """The least of some sizes, each `factor` times the one before, that is not less; multiples of 16."""
+    """Round up to one of a series of sizes, each `factor` times the one before; multiples of 16."""
     power = np.ceil(np.log(np.maximum(number, 16) / 16) / np.log(factor) - 1e-9)
     return (np.ceil(factor**power - 1e-9) * 16).astype(int)
 
 
 def _wide(rows: np.ndarray, size: int, mode) -> np.ndarray:
-    """Rows (n, k, …) of `size` entries: cut short, or filled up."""
+    """Truncate or pad rows (n, k, …) to `size` entries."""
     missing = max(size - rows.shape[1], 0)
     return np.pad(rows[:, :size], [(0, 0), (0, missing), *[(0, 0)] * (rows.ndim - 2)], mode)

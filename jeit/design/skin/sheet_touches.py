@@ -1,4 +1,4 @@
-"""Touches of a sheet whose voltage changes have derivatives in the places touched."""
+"""Touches of a sheet whose voltage changes are differentiable in the positions touched."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jeit_solvers.engines import gather, host, namespace, sum_into
 
 
 class SheetTouches(eqx.Module):
-    """Touches of a sheet at n places, and how they change as the places move; make them with `sheet_touches`.
+    """Touches of a sheet at n positions, with derivatives in the positions; create them with `sheet_touches`.
 
     **Fields**: `touched`; `slope` (n, c, 2), the derivative of `touched.change` in the place, per metre, on a curved
     sheet in two directions at right angles along it; `thickness` of the layer that the sheet stands for and `depth` of
@@ -30,7 +30,8 @@ class SheetTouches(eqx.Module):
     depth: float
 
     def at_thickness(self, thickness) -> "SheetTouches":
-        """The same touches of a layer of another thickness, metres: they take depth / thickness of the way."""
+        """The same touches of a layer of another thickness, metres; their changes are proportional to depth /
+        thickness."""
         share = self.thickness / thickness
         touched = eqx.tree_at(lambda one: one.change, self.touched, self.touched.change * share)
         return SheetTouches(touched, self.slope * share, jnp.asarray(thickness), self.depth)
@@ -50,9 +51,9 @@ class SheetTouches(eqx.Module):
 def sheet_touches(
     mesh: Mesh, indentation: AbstractIndentation, places, *, thickness: float, contrast: float = CONTRAST
 ) -> SheetTouches:
-    """Indent a sheet (2-D mesh) of a layer of `thickness` metres at `places` (n, 2), metres.
+    """Compute the touches of a sheet (2-D mesh) of a layer of `thickness` metres at `places` (n, 2), metres.
 
-    The rest as in `touched_cells`. The derivative is of the indentation's depth at the middles of the cells. Raises
+    Other arguments as in `touched_cells`. The derivative is that of the indentation's depth at the centroids. Raises
     `ValueError` as `touched_cells` does, and for a mesh that is no sheet.
     """
     if mesh.dimension != 2:
@@ -73,8 +74,8 @@ def sheet_touches(
 
 
 def _laid_out(mesh: Mesh, touched: TouchedCells, reach: float) -> Float[np.ndarray, "n c 2"]:
-    """Middles of touched cells as seen from their touches' places along the surface: in the plane that touches it
-    there, as far as the way along the surface is long."""
+    """Centroids of touched cells in the tangent plane at their touch's position, at the distance measured along the
+    surface."""
     surface, places, cells = Triangles.of(mesh), np.asarray(touched.places), np.asarray(touched.cells)
     middles = np.asarray(centroids(mesh))
     normal = surface.normals_at(surface.nearest(places))

@@ -1,4 +1,4 @@
-"""`Skin`: a layout of electrodes in a sheet, or on the bottom of a layer, flat or curved; checked, meshed, touched."""
+"""`Skin`: a layout of electrodes in a sheet or on the bottom of a layer, flat or curved, with its mesh and touches."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ from jeit.mesh.geodesic import Triangles
 from jeit.protocol import Protocol
 from jeit_solvers.engines import host
 
-# Of a layer of cells, times a touch's depth: the middle of its uppermost cells is a quarter of it below the surface.
+# Thickness of a layer of cells, relative to a touch's depth: centroids of the uppermost are a quarter of it deep.
 _THICKEST = 3.0
 
 
 class Skin(eqx.Module):
-    """A skin of one layout: its electrodes' discs in a sheet, or on the bottom of a layer touched on its top.
+    """A skin of one layout: disc electrodes in a sheet, or on the bottom of a layer that is touched on its top.
 
-    Of a `SurfaceLayout` the sheet or the layer is curved; places touched are (n, 3), on its surface, and all else is
-    the same.
+    With a `SurfaceLayout` the sheet or the layer is curved; touched positions are (n, 3), on its surface, and all else
+    is the same.
 
     **Fields**
 
     - `layout`: of the electrodes, with the skin's outline, or its surface.
     - `model`: its forward model: mesh, electrodes and protocol.
-    - `thickness`: metres, of a sheet that of the layer which it stands for.
+    - `thickness`: metres; for a sheet, that of the layer which it represents.
     - `conductivity`: of the material, S/m, one number or one for each cell.
-    - `num_layers`: of cells of a layer; 0 for a sheet.
-    - `cell_size`: metres, of the plane mesh, if that was asked for.
+    - `num_layers`: number of layers of cells; 0 for a sheet.
+    - `cell_size`: metres, of the plane mesh, if it was given.
 
-    Make it with `Skin.create`, which checks and meshes; or from a `model` of one's own, of `SheetDiscs` (`SurfaceDiscs`
-    on a curved sheet) or `FaceDiscs`.
+    Create it with `Skin.create`, which checks the arguments and makes the mesh; or from a custom `model` of
+    `SheetDiscs` (`SurfaceDiscs` on a curved sheet) or `FaceDiscs`.
     """
 
     layout: Layout | SurfaceLayout
@@ -101,7 +101,7 @@ class Skin(eqx.Module):
         num_points: int | None = None,
         protocol: Protocol | None = None,
     ) -> "Skin":
-        """Check and mesh a skin with electrodes of `layout`.
+        """Create a skin with electrodes of `layout`: check the arguments and make the mesh.
 
         `thickness` in metres, `conductivity` in S/m. `contact_impedance` of the electrodes, ohm·m²: the layout's unless
         given, and 1e-4 where it does not say. `num_layers` of cells, 0 for a sheet. `cell_size`, metres (4.5e-3), or
@@ -136,25 +136,25 @@ class Skin(eqx.Module):
 
     @property
     def outline(self) -> Domain | Triangles:
-        """Of the skin, metres; of a curved one the surface that is touched."""
+        """Outline of the skin, metres; for a curved one the touched surface."""
         if isinstance(self.layout, SurfaceLayout):
             return touched_surface(self.model.mesh, self.touched_face)
         return self.layout.known_outline
 
     @property
     def flat_outline(self) -> Domain:
-        """Of a flat skin, metres. Raises `ValueError` for a curved one, which has none."""
+        """Outline of a flat skin, metres. Raises `ValueError` for a curved one, which has none."""
         return flat_layout(self.layout).known_outline
 
     @property
     def touched_face(self) -> str:
-        """Of a curved layer: "outer", or "inner" where its electrodes are on the outer one."""
+        """The touched face of a curved layer: "outer", or "inner" where its electrodes are on the outer one."""
         inward = isinstance(self.layout, SurfaceLayout) and not self.layout.outward
         return "inner" if inward else "outer"
 
     @property
     def model_conductivity(self) -> Float[Array, "..."]:
-        """What the model takes: the material's in S/m for a layer, a sheet's in siemens."""
+        """Conductivity for the forward model: the material's in S/m for a layer, a sheet's in siemens."""
         return model_conductivity(self.conductivity, self.thickness, self.num_layers)
 
     def with_layout(self, layout: Layout | SurfaceLayout, contact_impedance: ArrayLike | None = None) -> "Skin":
@@ -174,11 +174,11 @@ class Skin(eqx.Module):
     def touched_cells(
         self, places: ArrayLike, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
     ) -> TouchedCells:
-        """What touches at `places` (n, 2), on a curved skin (n, 3), metres, change, one at a time; `Bell` unless
-        given, as in `touched_cells`.
+        """Conductivity changes by single touches at `places` (n, 2), on a curved skin (n, 3), metres; the indentation
+        is `Bell` unless given, as in `touched_cells`.
 
-        Raises `ValueError` for touches as deep as the skin, of which one changes no cell, as where a layer has too few
-        layers of cells, and for a contrast that changes nothing.
+        Raises `ValueError` for touches as deep as the skin, for a touch that changes no cell, as where a layer has too
+        few layers of cells, and for a contrast that changes nothing.
         """
         indentation = Bell() if indentation is None else indentation
         if not self.num_layers:
@@ -203,18 +203,20 @@ class Skin(eqx.Module):
     def sheet_touches(
         self, places: ArrayLike, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
     ) -> SheetTouches:
-        """The same of a sheet, with derivatives in the places. Raises `ValueError` as `sheet_touches` does."""
+        """Touches of a sheet, with derivatives in the positions. Raises `ValueError` as `sheet_touches` does."""
         indentation = Bell() if indentation is None else indentation
         return sheet_touches(self.model.mesh, indentation, places, thickness=float(self.thickness), contrast=contrast)
 
     def voltage_changes(self, touched: TouchedCells, *, linear: bool = False) -> Float[Array, "n M"]:
-        """Changes (n, M) of its voltages by touches, volts: exact, or linear; errors and limits of `touch_changes`."""
+        """Changes (n, M) of the voltages by touches, volts: exact, or linear; errors and limits as in
+        `touch_changes`."""
         return touch_changes(self.model, self.model_conductivity, touched, linear=linear)
 
 
 def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Protocol], **options) -> list[Skin]:
-    """Skins of layouts and their protocols, with `options` of `Skin.create`, whose errors it raises; one mesh and its
-    factorisation's plan serve all that follow each other on the same outline with as many electrodes."""
+    """Create skins from layouts and their protocols, with `options` of `Skin.create`, whose errors it raises.
+    Consecutive layouts with the same outline and number of electrodes share one mesh and the plan of its
+    factorisation."""
     made: list[Skin] = []
     for layout, protocol in zip(layouts, protocols, strict=True):
         if made and _serves(made[-1], layout):
@@ -226,7 +228,7 @@ def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Prot
 
 
 def _serves(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
-    """Whether the mesh of a skin is that of a layout too."""
+    """Whether the mesh of a skin can be used for a layout too."""
     if isinstance(layout, SurfaceLayout):
         own = skin.layout
         if not isinstance(own, SurfaceLayout) or own.outward != layout.outward or not _as_many(skin, layout):
@@ -248,7 +250,7 @@ def check_skin(name: str, given) -> None:
 
 
 def longer_side(outline: Domain | Triangles) -> float:
-    """Of the box of an outline, metres: how wide a skin is."""
+    """The longer side of an outline's bounding box, metres."""
     if isinstance(outline, Triangles):
         return float(np.ptp(outline.points, axis=0).max())
     low_x, high_x, low_y, high_y = outline.extent
@@ -256,12 +258,12 @@ def longer_side(outline: Domain | Triangles) -> float:
 
 
 def model_conductivity(conductivity, thickness, num_layers: int):
-    """What a forward model takes: the material's `conductivity`, S/m, for a layer, a sheet's in siemens."""
+    """Conductivity for a forward model: the material's `conductivity`, S/m, for a layer, a sheet's in siemens."""
     return conductivity if num_layers else conductivity * thickness
 
 
 def plain_outline(outline: Domain) -> Domain:
-    """A drawing's four corners are a rectangle if they are one: it is then meshed as one."""
+    """Replace an outline of four corners by a rectangle if it is one, so that it is meshed as such."""
     if [len(loop) for loop in outline.loops()] != [4]:
         return outline
     low_x, high_x, low_y, high_y = outline.extent
@@ -274,7 +276,8 @@ def plain_outline(outline: Domain) -> Domain:
 def curved_model(
     layout: SurfaceLayout, thickness: float, num_layers: int, contact_impedance, protocol: Protocol | None
 ) -> ForwardModel:
-    """Of a sheet that is the layout's surface, or of a shell of it. Raises `ValueError` as `Skin.create` does."""
+    """Create the forward model of a sheet that is the layout's surface, or of a shell of it. Raises `ValueError` as
+    `Skin.create` does."""
     surface = layout.surface
     check_metres("thickness", thickness, longer_side(Triangles.of(surface)), "the skin is wide")
     mesh = shell(surface, thickness, num_layers, outward=layout.outward) if num_layers else surface
@@ -285,8 +288,8 @@ def curved_model(
 def skin_electrodes(
     layout: Layout | SurfaceLayout, num_layers: int, contact_impedance=None
 ) -> SheetDiscs | SurfaceDiscs | FaceDiscs:
-    """Discs in a sheet (`num_layers` 0), or on the bottom of a layer. Contact impedance in ohm·m²: the layout's unless
-    given, and 1e-4 where it does not say."""
+    """Create disc electrodes in a sheet (`num_layers` 0), or on the bottom of a layer. Contact impedance in ohm·m²: the
+    layout's unless given, and 1e-4 where it does not say."""
     if contact_impedance is None and layout.contact_impedance is None:
         contact_impedance = CONTACT_IMPEDANCE
     if isinstance(layout, SurfaceLayout):

@@ -1,4 +1,4 @@
-"""A skin as a TOML file says: its layout, material, protocol and mesh."""
+"""Skins described by a TOML file: layout, material, protocol and mesh."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def describes_skin(path: str | Path) -> bool:
-    """True for a TOML file with a table "skin", whatever else is wrong with it; False for any other file."""
+    """True for a TOML file with a table "skin", even if it is invalid otherwise; False for any other file."""
     try:
         return isinstance(read_toml(path).get("skin"), dict)
     except (OSError, ValueError):
@@ -26,12 +26,12 @@ def describes_skin(path: str | Path) -> bool:
 
 
 def read_described_skin(path: str | Path) -> Skin:
-    """The skin that a TOML file describes: tables skin, electrodes (with `layout`, a name or a file beside it),
+    """Read the skin that a TOML file describes: tables skin, electrodes (with `layout`, a name or a file beside it),
     measurement and mesh, as in a study file, each key with one value and all but the layout with a default; of a curved
     skin the table surface, too.
 
-    Raises `FileNotFoundError`, and `ValueError` for files that are no TOML, keys and values that there are not, and as
-    `Skin.create` does.
+    Raises `FileNotFoundError`, and `ValueError` for files that are not TOML, for unknown keys and invalid values, and
+    as `Skin.create` does.
     """
     path = Path(path)
     if not path.is_file():

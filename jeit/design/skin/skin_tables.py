@@ -1,4 +1,4 @@
-"""The tables of a skin's file, key by key: what each may hold, from where to where, in which unit."""
+"""Tables of a skin's file: type, range and unit of every key."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LAYERS = Number(1, 50)
 
 
 class MaterialTable(Table):
-    """Of what the skin is."""
+    """The skin's model and material."""
 
     what = "a skin"
     model: Literal["sheet", "layer"] = "sheet"
@@ -36,7 +36,7 @@ class MaterialTable(Table):
 
 
 class LayoutTable(Table):
-    """Of its electrodes. NaN is for the layout to say."""
+    """The electrodes. NaN means the layout's own value."""
 
     what = "a skin"
     layout: Word
@@ -45,7 +45,7 @@ class LayoutTable(Table):
 
 
 class MeasurementTable(Table):
-    """Of what is measured of it."""
+    """The measurement protocol."""
 
     what = "a skin"
     protocol: ProtocolName = defaults.PROTOCOL
@@ -54,7 +54,7 @@ class MeasurementTable(Table):
 
 
 class CellsTable(Table):
-    """Of its mesh."""
+    """The mesh."""
 
     what = "a skin"
     cell_mm: Annotated[float, CELL] = 1e3 * defaults.CELL_SIZE
@@ -62,7 +62,7 @@ class CellsTable(Table):
 
 
 class SkinTable(Table):
-    """Of a whole skin."""
+    """A complete skin file."""
 
     what = "a skin"
     skin: MaterialTable = MaterialTable()

@@ -1,4 +1,4 @@
-"""The table of a curved skin's surface, by its kind: what each key may hold, from where to where, in which unit."""
+"""Tables of a curved skin's surface by its kind: type, range and unit of every key."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _SECTION = Numbers(((2, 2),), 2, 5000, "mm", single=True)
 
 
 class TubeTable(Table):
-    """Of the side of a cylinder."""
+    """The lateral surface of a cylinder."""
 
     what = "a tube"
     kind: Literal["tube"]
@@ -23,7 +23,7 @@ class TubeTable(Table):
 
 
 class ForearmTable(Table):
-    """Of a tapered sleeve: a radius, or half the widths of an oval, of either end."""
+    """A tapered sleeve: a radius, or the half widths of an oval, of either end."""
 
     what = "a forearm"
     kind: Literal["forearm"]
@@ -34,7 +34,7 @@ class ForearmTable(Table):
 
 
 class SphereTable(Table):
-    """Of a ball."""
+    """A sphere."""
 
     what = "a sphere"
     kind: Literal["sphere"]
@@ -43,7 +43,7 @@ class SphereTable(Table):
 
 
 class CapTable(Table):
-    """Of what of a ball lies about its pole."""
+    """The cap of a sphere about its pole."""
 
     what = "a cap"
     kind: Literal["cap"]
@@ -53,7 +53,7 @@ class CapTable(Table):
 
 
 class BentSheetTable(Table):
-    """Of a flat sheet, rolled round a cylinder along `axis`."""
+    """A flat sheet bent around a cylinder along `axis`."""
 
     what = "a bent sheet"
     kind: Literal["bent sheet"]
@@ -65,7 +65,7 @@ class BentSheetTable(Table):
 
 
 class ScanTable(Table):
-    """Of a file of triangles or of CAD, and what a length of 1 in it is."""
+    """A file of triangles or a CAD file, with its unit of length."""
 
     what = "a surface's file"
     file: Word
@@ -74,7 +74,7 @@ class ScanTable(Table):
 
     @property
     def has_cells(self) -> bool:
-        """Whether its triangles are the cells; those of a CAD file Gmsh makes."""
+        """Whether the triangles of the file are the cells; those of a CAD file are made by Gmsh."""
         return not self.file.lower().endswith(CAD)
 
 

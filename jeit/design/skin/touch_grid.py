@@ -1,4 +1,4 @@
-"""Where a skin is touched: the middles of equal rectangles over it."""
+"""Grids of touched positions: the centres of equal rectangles over a skin."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jeit.mesh.geodesic import Triangles
 
 
 class TouchGrid(eqx.Module):
-    """Where a skin is touched: the middles of equal rectangles that cover it.
+    """Grid of touched positions: the centres of equal rectangles that cover a skin.
 
     - `places`: (n, 2) metres, on a curved skin (n, 3); `rows`, `columns`: (n,) of each in the raster, row 0
       at the least y.
@@ -29,27 +29,30 @@ class TouchGrid(eqx.Module):
 
     @property
     def cell_area(self) -> float:
-        """Of a rectangle, m²."""
+        """Area of a rectangle, m²."""
         return self.pitch[0] * self.pitch[1]
 
     def raster(self, values) -> Float[np.ndarray, "rows columns"]:
-        """Values (n,) as an image, NaN off the skin."""
+        """Arrange values (n,) as an image, NaN off the skin."""
         image = np.full(self.shape, np.nan)
         image[self.rows, self.columns] = np.asarray(values)
         return image
 
 
 class SurfaceGrid(TouchGrid):
-    """Where a curved skin is touched: `places` (n, 3), metres, spread evenly over it by ways along its surface.
+    """Touched positions of a curved skin: `places` (n, 3), metres, spread evenly over it by distances along its
+    surface.
 
-    They are in no raster: one row. **Fields**: those of `TouchGrid`, and `areas` (n,) m², what each place stands for.
+    They form no raster but one row. **Fields**: those of `TouchGrid`, and `areas` (n,) m², the area that each position
+    represents.
     """
 
     areas: Float[np.ndarray, " n"]
 
     @classmethod
     def spread(cls, surface: Triangles, number: int, margin: float = 0.0) -> "SurfaceGrid":
-        """So many places, `margin` metres from the edge. Raises `ValueError` where that leaves no room."""
+        """Spread a number of positions, `margin` metres from the edge. Raises `ValueError` where that leaves no
+        room."""
         places = spread(surface, number, margin=margin)
         kept = surface.node_areas * (surface.distance_to_border(surface.points) >= margin)
         each = float(kept.sum()) / number
@@ -57,8 +60,8 @@ class SurfaceGrid(TouchGrid):
         return cls(places, *flat, (1, number), (each**0.5, each**0.5), np.full(number, each))
 
     def on(self, surface: Triangles, face: Triangles) -> "SurfaceGrid":
-        """The same places on another surface: from where they are nearest to `surface` to the same point of the same
-        triangle of `face`, whose nodes are as many; areas as much larger as it is there."""
+        """Map the positions to another surface: from the nearest point of `surface` to the same point of the same
+        triangle of `face`, which has as many nodes; areas are scaled accordingly."""
         at = surface.nearest(self.places)
         areas = self.areas * at.of_nodes(surface, face.node_areas / surface.node_areas)
         each = float(areas.mean())
@@ -74,10 +77,11 @@ class SurfaceGrid(TouchGrid):
 
 
 def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
-    """Rectangles over the bounding box of `outline`, those whose middle lies inside; 48 × 48 as in Park et al. 2022.
+    """Create the grid of the rectangles over the bounding box of `outline` whose centre lies inside; 48 × 48 as in Park
+    et al. 2022.
 
-    Of a curved skin, whose outline is its surface, as many places spread evenly over it. Raises `ValueError` for fewer
-    than one row or column, and for what is no outline.
+    For a curved skin, whose outline is its surface, as many positions are spread evenly over it. Raises `ValueError`
+    for fewer than one row or column, and for what is no outline.
     """
     check_kind("outline", outline, (Domain, Triangles), "an outline, such as skin.outline or Rectangle(0.2, 0.2)")
     if columns < 1 or rows < 1:
@@ -98,7 +102,8 @@ def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = P
 def touches_away_from_the_edge(
     outline: Domain | Triangles, margin: float, columns: int = PLACES, rows: int = PLACES
 ) -> TouchGrid:
-    """The places of `touch_grid` whose touches reach over no edge: farther than `margin` (metres) from the outline.
+    """The positions of `touch_grid` whose touches do not reach over an edge: farther than `margin` (metres) from the
+    outline.
 
     Raises `ValueError` if no place is so far from the edge.
     """

@@ -1,4 +1,4 @@
-"""What touches do to a mesh: the few cells that each of them changes, and by how much."""
+"""Cells of a mesh changed by touches, and the relative changes of their conductivity."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class TouchedCells(eqx.Module):
     **Fields**
 
     - `places`: (n, 2) metres, on a curved skin (n, 3), middles of the touches.
-    - `cells`: (n, c), and `change`: (n, c), −1 for a cell that conducts no more; 0 where a touch has fewer cells.
-    - `num_cells`: of the mesh they are of.
+    - `cells`: (n, c) indices; `change`: (n, c), −1 for a cell that no longer conducts; 0 where a touch has fewer cells.
+    - `num_cells`: number of cells of the mesh.
     """
 
     places: Float[Array, "n d"]
@@ -43,7 +43,8 @@ def touched_cells(
     edge: float = 0.0,
     face: str = "outer",
 ) -> TouchedCells:
-    """Indent the top of a layer, or a sheet, at `places` (n, 2) in metres, one at a time; on a curved skin (n, 3).
+    """Compute the cells changed by single indentations of a layer's top, or of a sheet, at `places` (n, 2) in metres;
+    on a curved skin (n, 3).
 
     **Layer** (3-D mesh, top at its greatest z): cells in the indented part, by their centroids, get `contrast` times
     their conductivity: 0, the default, for an insulating indenter (Park et al. 2022, text S4). With an `edge` in metres
@@ -99,7 +100,7 @@ def touched_cells(
 
 
 def padded(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of whole numbers as one array, with zeros at their ends, and where they are."""
+    """Rows of whole numbers as one array, padded with zeros, and the mask of the entries."""
     length = np.array([len(row) for row in rows])
     there = np.arange(max(length.max(), 1)) < length[:, None]
     padded = np.zeros(there.shape, np.int32)

@@ -10,12 +10,12 @@ from jeit.design.skin.touched_cells import TouchedCells
 from jeit.forward import ForwardModel
 from jeit_solvers import Strips
 
-# Touches whose nodes are sought at once; and what the number of nodes is a multiple of: programs are compiled for each.
+# Touches processed at once; and the multiple to which the number of nodes is padded: programs are compiled for each.
 _AT_ONCE, _MULTIPLE = 64, 16
 
 
 class TouchedNodes(eqx.Module):
-    """Nodes of n touches.
+    """Nodes changed by n touches.
 
     `strips`: all of them, in strips across the skin; `nodes` (n, k): those of each touch, as places in the strips, the
     last one repeated to be as many; `corners` (n, c, d + 1): nodes of the touches' cells, as places among those k.
@@ -27,13 +27,14 @@ class TouchedNodes(eqx.Module):
 
 
 def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | None = None) -> TouchedNodes:
-    """Nodes of the cells that touches change; `strips` of these and more nodes, of these alone unless given."""
+    """Find the nodes of the cells that touches change; `strips` of these and more nodes, of these alone unless
+    given."""
     mesh, cells, real = model.mesh, np.asarray(touches.cells), np.asarray(touches.change) != 0
     touched = np.zeros(mesh.num_points, bool)
     touched[np.asarray(mesh.cells)[cells[real]]] = True
     if strips is None:
         strips = Strips.create(model.system.pattern, np.asarray(mesh.points), touched)
-    nowhere = strips.number * strips.wanted  # a place for all that is not touched
+    nowhere = strips.number * strips.wanted  # one entry for all untouched nodes
     place = np.where(touched, strips.place, nowhere).astype(np.int32)[np.asarray(mesh.cells)]
     corners, found = np.zeros((*cells.shape, mesh.cells.shape[1]), np.int32), []
     for start in range(0, len(cells), _AT_ONCE):

@@ -1,4 +1,4 @@
-"""Changes of voltages by touches, one touch at a time: exact by low-rank updates of one factorisation, or linear.
+"""Voltage changes by single touches: exact, by low-rank updates of one factorisation, or linear.
 
 A touch adds D to the system matrix K of the electrode model, nonzero only among its k nodes. With the fields F for unit
 currents into the electrodes and G = K⁻¹, both restricted to those nodes,
@@ -32,23 +32,23 @@ from jeit.protocol import Protocol
 from jeit_solvers import over_cores
 from jeit_solvers.engines import has_values, on_device
 
-# Of the error's bound, relative to the voltages; steps to get there.
+# Tolerance of the error's bound, relative to the voltages; most steps.
 _TOLERANCE, _MOST_STEPS = 1e-8, 200
 # Flow around what is cut off changes by a factor that its shape bounds, not the conductivity left. And where next to
 # nothing is left, the conductivity bounds too much.
 _CUT_OFF, _MOST_WEAKENED = 10.0, 1e6
-# Of the voltages, relative to the load's energy: below, they are rounding.
+# Voltages below this, relative to the load's energy, are rounding errors.
 _SMALLEST = 1e-12
-# Touches worked on at once: their blocks of the inverse are to stay in the cache, or of the Jacobian.
+# Touches processed at once, so that their blocks of the inverse or the Jacobian fit into the cache.
 EXACT_AT_ONCE, _LINEAR = 2, 8
-# What the inverse's reach is a multiple of: programs are compiled for each.
+# Multiple to which the inverse's reach is padded: programs are compiled for each.
 _STRIPS = 3
 
 
 def touch_changes(
     model: ForwardModel, conductivity, touched: TouchedCells, *, linear: bool = False
 ) -> Float[Array, "n M"]:
-    """Changes (n, M) of the protocol's M voltages by n touches, one at a time, in volts.
+    """Compute the changes (n, M) of the protocol's M voltages by n single touches, in volts.
 
     `linear`: J δσ, the Jacobian's, differentiable in everything and batched with `vmap`; else exact, as if the model
     had been solved anew for every touch, to 1e-8 of the largest. Raises `ValueError` for touches of another mesh and
@@ -138,7 +138,7 @@ def _joined(chunks: Float[Array, "c s *m"]) -> Float[Array, "cs *m"]:
 
 
 def _weakened(change: Float[Array, "b c"]) -> Float[Array, " b"]:
-    """By what factor touches lower the energy of a field, at most."""
+    """Largest factor by which touches lower the energy of a field."""
     left = 1 + change
     return jnp.clip(jnp.where(left > 0, 1 / jnp.where(left > 0, left, 1.0), _CUT_OFF).max(axis=1), 1, _MOST_WEAKENED)
 
@@ -158,7 +158,7 @@ def _impedance_changes(blocks, corners, inverse, fields, weakened):
         scaled = residual + ratio * scaled  # G⁻¹ of the direction, which is a combination of what G was applied to
         product = scaled + added @ direction
         curvature = jnp.sum(direction * product, axis=1, keepdims=True)
-        # What has converged stays: nothing but rounding is left of it, and of its curvature.
+        # Converged touches are left unchanged: their residual and curvature are rounding errors.
         going = (energy > enough) & (curvature > 0)
         length = jnp.where(going, energy / jnp.where(going, curvature, 1.0), 0.0)
         solution, residual = solution + length * direction, residual - length * product
@@ -193,7 +193,7 @@ def _transposed(matrices):
 
 
 def _symmetric(packed: Float[Array, "p m"], size: int) -> Float[Array, "m q q"]:
-    """Full matrices from lower triangles."""
+    """Symmetric matrices from their lower triangles."""
     rows, columns = np.tril_indices(size)
     place = np.zeros((size, size), int)
     place[rows, columns] = place[columns, rows] = np.arange(len(rows))

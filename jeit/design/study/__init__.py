@@ -1,7 +1,8 @@
-"""Studies: a TOML file describes a sweep over layouts, skins and protocols, which runs in chunks and survives a crash.
+"""Studies: sweeps over layouts, skins and protocols described by a TOML file, run in chunks and resumable after a
+crash.
 
-`read_study` checks the file, `run_study` solves what is not finished, `open_results` opens it in xarray;
-`jeit.design.reports.write_study_report` makes one page of it. Needs the extra `cluster`: zarr, xarray and
+`read_study` checks the file, `run_study` computes the unfinished chunks, `open_results` opens the results in xarray;
+`jeit.design.reports.write_study_report` writes a report of one page. Needs the extra `cluster`: zarr, xarray and
 dask.distributed.
 """
 

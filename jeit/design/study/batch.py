@@ -1,4 +1,4 @@
-"""The points of a chunk in one jitted batch, or one by one: sensitivity maps, and the scores made of them."""
+"""Sensitivity maps and scores of the points of a chunk, in one jitted batch or one by one."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from jeit.protocol import Protocol
 
 
 class _Shared(eqx.Module):
-    """What points of one shape have in common: the model, and the cells `touched` on a skin of `thickness` metres.
+    """Data shared by points of one shape: the model, and the cells `touched` on a skin of `thickness` metres.
 
     `touches`, the same with their derivatives in the places, and the `prior` are None unless a score needs them.
     """
@@ -49,8 +49,8 @@ class _Shared(eqx.Module):
 
 
 class _Varied(eqx.Module):
-    """Where points of one shape differ; `conductivity` of the mesh's cells, noise in volts. A batch of k of them is one
-    whose every array leads with an axis of k."""
+    """Data that differ between points of one shape; `conductivity` of the mesh's cells, noise in volts. In a batch of k
+    of them every array has a leading axis of k."""
 
     electrodes: SheetDiscs | SurfaceDiscs | FaceDiscs
     protocol: Protocol
@@ -60,9 +60,10 @@ class _Varied(eqx.Module):
 
 
 def check_points(study: Study) -> None:
-    """Make every skin, touch it, and place every electrode. Raises `ValueError` for a mesh that is too coarse."""
+    """Check all points by creating their skins, touches and electrodes. Raises `ValueError` for a mesh that is too
+    coarse."""
     seen = set()
-    for index in itertools.chain.from_iterable(study.chunks):  # one shape after the other
+    for index in itertools.chain.from_iterable(study.chunks):  # grouped by shape
         point = study.points[index]
         key = (id(point.layout), point.shape)
         if key in seen:
@@ -90,10 +91,10 @@ def check_points(study: Study) -> None:
 
 
 def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None = None) -> dict[str, np.ndarray]:
-    """Results of chunk `number` for each of its k points: "sensitivity" (k, n) in volts, and scores (k,).
+    """Compute the results of chunk `number` for each of its k points: "sensitivity" (k, n) in volts, and scores (k,).
 
-    Linear maps in one compiled batch, as large for every chunk of a shape, and parted between the devices that JAX
-    sees; exact maps one after the other, and `solved` is told after each but the last how many there are.
+    Linear maps are computed in one compiled batch, of equal size for every chunk of a shape, divided among the devices
+    of JAX. Exact maps are computed one after the other; after each but the last, `solved` is called with their number.
     """
     points = [study.points[index] for index in study.chunks[number]]
     shared = _shared(study, points[0].shape)
@@ -112,13 +113,14 @@ def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None 
 
 
 def study_grid(study: Study) -> TouchGrid:
-    """Where the skins are touched; curved layers above or below these places of their electrodes' surface."""
+    """Grid of touched positions; curved layers are touched above or below these positions of their electrodes'
+    surface."""
     return touch_grid(study.outline, study.columns, study.rows)
 
 
 @lru_cache(maxsize=4)
 def _skin(study: Study, shape: Shape) -> Skin:
-    """Of the first point of a shape; the others are of the same mesh."""
+    """Skin of the first point of a shape; the others have the same mesh."""
     point = next(point for point in study.points if point.shape == shape)
     return Skin.create(
         point.layout,
@@ -159,7 +161,7 @@ def _varied(point: Point, current: float) -> _Varied:
 
 
 def _stacked(trees):
-    """Trees of arrays as one, with a leading axis."""
+    """Stack trees of arrays along a new leading axis."""
     return jax.tree.map(lambda *arrays: jnp.stack(arrays), *trees)
 
 
@@ -185,7 +187,7 @@ def _batch(
 def _exact(
     shared: _Shared, varied: list[_Varied], options: dict, solved: Callable[[int], None] | None
 ) -> Iterator[dict[str, Array]]:
-    """Results of each skin, whose maps are exact."""
+    """Results of each skin with exact maps."""
     for number, one in enumerate(varied, 1):
         model, touched = _touched(shared, one)
         yield _results(shared, one, touch_changes(model, one.conductivity, touched), **options)
@@ -209,7 +211,7 @@ def _touched(shared: _Shared, varied: _Varied) -> tuple[ForwardModel, TouchedCel
 def _results(
     shared: _Shared, varied: _Varied, changes: Float[Array, "n M"], *, scores, num_taxels: int, threshold: float
 ) -> dict[str, Array]:
-    """What is told of one skin whose touches make these changes, volts."""
+    """Results of one skin from the voltage changes by its touches, volts."""
     found = SensitivityMap(shared.grid, changes)
     results = {"sensitivity": found.values}
     for name in ("minimum", "mean", "uniformity"):
@@ -238,7 +240,7 @@ def _results(
 def _optimality(
     shared: _Shared, varied: _Varied, touches: SheetTouches, prior: TouchPrior, scores: tuple[str, ...]
 ) -> dict[str, Array]:
-    """Scores of linear changes. A batch has the Jacobian already, and XLA does not compute it again."""
+    """Optimality scores from linear changes. A batch has the Jacobian already, and XLA does not compute it again."""
     model, _ = _touched(shared, varied)
     touches = touches.at_thickness(varied.thickness)
     found = layout_scores(model, varied.conductivity, touches, prior=prior, noise=varied.noise)
@@ -249,7 +251,7 @@ def _optimality(
         if name in scores:
             results[name] = getattr(found, name)
     if "localisation_error" in scores:
-        # Where a place cannot be told at all, mean and worst are infinite; the share says of how much of the skin.
+        # Where a position cannot be determined, mean and worst are infinite; the share is that part of the skin's area.
         results["localisation_error_mean"] = 1e3 * jnp.mean(found.localisation_error)
         results["localisation_error_max"] = 1e3 * jnp.max(found.localisation_error)
         results["localisation_lost"] = jnp.mean(jnp.isinf(found.localisation_error))

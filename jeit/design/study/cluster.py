@@ -1,4 +1,4 @@
-"""Chunks of work on the workers of a cluster."""
+"""Distribution of chunks of work over the workers of a cluster."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ _Result = TypeVar("_Result")
 def over_cluster(
     client: Any, solve: Callable[[Any, int], _Result], work: Any, numbers: Iterable[int]
 ) -> Iterator[tuple[int, _Result]]:
-    """Numbers of chunks with what `solve(work, number)` returns, as they are solved by the workers of a
-    `dask.distributed.Client`; those of a worker that is lost are solved again."""
+    """Yield the numbers of chunks with the results of `solve(work, number)`, as the workers of a
+    `dask.distributed.Client` complete them; chunks of a lost worker are solved again."""
     distributed = optional("distributed", "a cluster")
     # The work is sent once, as a task: where the only worker that has it is lost, it is sent again. Scattered, it would
     # be lost; with every chunk, a layer of 70 MB would go out a thousand times.

@@ -1,4 +1,4 @@
-"""What is in a store: the arrays of a study, and their names, units and meanings."""
+"""Contents of a store: the arrays of a study, with their names, units and descriptions."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _SCORES = {
 
 
 class Contents(NamedTuple):
-    """What a store holds, results by chunks.
+    """Description of a store's contents, results by chunks.
 
     **Fields**: `kind`, one word for it, and `made_by`, what makes it, for messages; `fingerprint`, of all that decides
     the results; `chunks`, the rows of every array that each chunk has; `arrays`, names of the results; `attributes`,
@@ -50,7 +50,7 @@ class Contents(NamedTuple):
 
 
 def study_contents(study: Study) -> Contents:
-    """Of a study's store: a row of every array is a point, in files of its own."""
+    """Contents of a study's store: each row of an array is a point, in separate files."""
     coordinates = [point.coordinates for point in study.points]
     along = {name: [values[name] for values in coordinates] for name in coordinates[0]}
     arrays = _arrays(study)
@@ -80,7 +80,7 @@ def study_contents(study: Study) -> Contents:
 
 
 def _arrays(study: Study) -> dict[str, tuple[str, str]]:
-    """Unit and meaning of every result of `study`."""
+    """Unit and description of every result of `study`."""
     arrays = {"sensitivity": ("V", "sensitivity ‖Δv‖ to a touch")}
     for score, some in _SCORES.items():
         if score in study.scores:

@@ -1,4 +1,4 @@
-"""The layouts that a study of curved skins names: spread over its surface, or read from tables."""
+"""Layouts named in a study of curved skins: spread over the surface, or read from tables."""
 
 from __future__ import annotations
 

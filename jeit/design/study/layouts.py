@@ -1,4 +1,4 @@
-"""The layouts that a study file names: those that `named_layout` knows, made for its skin, or read from files."""
+"""Layouts named in a study file: those of `named_layout`, made for its skin, or read from files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ _SUFFIXES = (".csv", ".dxf", ".svg")
 def study_layout(
     name: str, folder: Path, outline: Rectangle, diameter: float, contact_impedance: float, minimum_gap: float
 ) -> Layout:
-    """The layout called `name` on a skin of `outline`, with files relative to `folder`; lengths in metres, ohm·m².
+    """Create or read the layout `name` on a skin of `outline`, with files relative to `folder`; units are metres and
+    ohm·m².
 
     Diameter and contact impedance are the file's own, or 6 mm and 1e-4 ohm·m², where they are NaN. Raises
     `ValueError` for an unknown name, electrodes that overlap or leave the skin, and gaps below `minimum_gap`.
@@ -39,7 +40,7 @@ def study_layout(
 
 
 def is_file(name: str) -> bool:
-    """Whether a study reads this layout, rather than knows how to make it."""
+    """Whether this layout is read from a file."""
     return Path(name).suffix.lower() in _SUFFIXES
 
 

@@ -1,4 +1,4 @@
-"""One process at a time writes a store: a file beside it says which, and is seen through where that process is dead."""
+"""Lock for one writing process per store: a file beside the store names the process, and is ignored if it has ended."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _LONGEST = 4096
 
 @contextlib.contextmanager
 def locked(path: Path, kind: str) -> Iterator[None]:
-    """Be the only process that writes the store at `path`, of a `kind` in one word.
+    """Context in which this process alone writes the store at `path`, of a `kind` in one word.
 
-    The lock is the file `.NAME.lock` beside the store, held by `flock`, which the system takes back from a process that
-    dies however it dies. What stands in it names the owner, and holds by itself where the file is of another machine,
-    whose processes cannot be asked after. Raises `ValueError` where another process, or another thread of this one,
-    writes the store, and `OSError` where no file can be written beside it.
+    The lock is the file `.NAME.lock` beside the store, held by `flock`, which the system releases when the process ends
+    for any reason. Its content names the owner; where that is on another machine, whose processes cannot be checked,
+    the content alone holds the lock. Raises `ValueError` where another process, or another thread of this one, writes
+    the store, and `OSError` where no file can be written beside it.
     """
     path = path.resolve()  # one lock, by whatever link it is reached
     place = path.with_name(f".{path.name}.lock")
@@ -53,7 +53,7 @@ def _own(place: Path, path: Path, kind: str) -> int:
         handle = os.open(place, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         try:
             held = _hold(handle)
-            if held and not _is_at(handle, place):  # its owner has just ended, and taken it away
+            if held and not _is_at(handle, place):  # its owner has just ended and removed it
                 os.close(handle)
                 continue
             owner = _owner(handle)
@@ -72,7 +72,7 @@ def _own(place: Path, path: Path, kind: str) -> int:
 
 
 def _hold(handle: int) -> bool | None:
-    """Whether this process now holds the file; None where the system, or the file's, knows no such thing."""
+    """Whether this process now holds the file; None where the system or the file system does not support locks."""
     if fcntl is None:
         return None
     try:
@@ -100,7 +100,7 @@ def _sign(handle: int) -> None:
 
 
 def _owner(handle: int) -> dict:
-    """What the file says; nothing where its owner died before it said anything."""
+    """Owner named in the file; empty if the owner ended before it was written."""
     try:
         owner = json.loads(os.pread(handle, _LONGEST, 0))
     except (ValueError, RecursionError):
@@ -109,7 +109,8 @@ def _owner(handle: int) -> dict:
 
 
 def _gone(owner: dict, *, certain: bool) -> bool:
-    """Whether the owner is dead: `certain` where it no longer holds the file, which tells of this machine only."""
+    """Whether the owner has ended; `certain` where it no longer holds the file, which is conclusive on this machine
+    only."""
     return _is_here(owner) and (certain or not is_alive(owner.get("pid")))
 
 

@@ -1,4 +1,4 @@
-"""What the skins of a study are meshes of, for each size of cells, and how layouts are made on it."""
+"""Outlines or surfaces of a study's skins for each cell size, and the functions that create layouts on them."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ Maker = Callable[[str, float, float, float], Layout | SurfaceLayout]
 
 
 def meshes_of(table: StudyTable, folder: Path) -> tuple[list[float], Rectangle | Triangles, Sequence[Maker]]:
-    """Sizes of cells, metres; the outline, of curved skins the surface of the first size; and what makes layouts: one
-    for all sizes, or of curved skins one for each."""
+    """Cell sizes, metres; the outline, for curved skins the surface of the first size; and the functions that create
+    layouts: one for all sizes, or for curved skins one for each."""
     from jeit.design.skin.surface_tables import ScanTable  # it was imported when the table was read
 
     cells = [1e-3 * size for size in table.mesh.cell_mm]

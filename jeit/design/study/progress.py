@@ -1,4 +1,4 @@
-"""How far work in chunks is, and how long it will take."""
+"""Progress of work in chunks, and estimate of the remaining time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 
 class Progress(NamedTuple):
-    """How far a study is: finished and all points and chunks; `seconds_left`, None until the first of this run.
+    """Progress of a study: finished and total points and chunks; `seconds_left`, None until the first point of this
+    run.
 
     With exact maps, `points` also counts those of a chunk that is not finished, and would be solved again.
     """
@@ -21,8 +22,8 @@ class Progress(NamedTuple):
 
 
 class ProgressReporter:
-    """Calls `progress` about work in `chunks`, and reckons the time left from the points finished since it was made;
-    `done` were before."""
+    """Calls `progress` for work in `chunks`, and estimates the remaining time from the points finished since its
+    creation; `done` were finished before."""
 
     def __init__(self, chunks: Sequence[Sequence[int]], done: set[int], progress: Callable[[Progress], None] | None):
         self._chunks, self._done, self._progress = chunks, set(done), progress
@@ -31,12 +32,12 @@ class ProgressReporter:
         self._report(self._first, None)
 
     def finished(self, number: int) -> None:
-        """A chunk is."""
+        """Report a finished chunk."""
         self._done.add(number)
         self._reckon(self._points())
 
     def solved(self, points: int) -> None:
-        """So many points of the chunk under way are."""
+        """Report the number of finished points of the current chunk."""
         self._reckon(self._points() + points)
 
     def _reckon(self, points: int) -> None:

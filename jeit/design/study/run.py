@@ -19,17 +19,17 @@ from jeit.design.study.store import Store, open_results, writing
 def run_study(
     study: Study, path: str | Path, *, client: Any = None, progress: Callable[[Progress], None] | None = None
 ):
-    """Run what is not finished of a study, and return its results, as of `open_results`.
+    """Run the unfinished chunks of a study, and return its results, as of `open_results`.
 
-    Killed at any moment, it goes on from the last finished chunk when run again, to the same store bit for bit.
+    If killed at any moment, the next run continues after the last finished chunk and gives the same store bit for bit.
 
-    - `path`: of the Zarr store; made if there is none.
+    - `path`: path of the Zarr store; created if there is none.
     - `client`: a `dask.distributed.Client`, whose workers have jeit installed; chunks of a worker that is lost are
       solved again, and only this process writes. In this process unless given.
     - `progress`: called with a `Progress` at the start and after each chunk; in this process, after each exact map too.
 
-    One process at a time: others are told which, dead ones are seen through. Raises `ValueError` for meshes too coarse
-    for their electrodes or touches, for another study's store, and for one that another process writes, before
+    Only one process at a time may run a study; locks of ended processes are ignored. Raises `ValueError` for meshes too
+    coarse for their electrodes or touches, for another study's store, and for one that another process writes, before
     anything runs, `ImportError` without the extra `cluster`, and `OSError` where the store cannot be written, such as
     on a full disk: finished chunks are kept.
     """
@@ -46,7 +46,8 @@ def run_study(
 
 
 def study_progress(study: Study, path: str | Path) -> Progress:
-    """How far the study in a store is; chunks that no longer read as written do not count. Raises as `Store` does."""
+    """Progress of the study in a store; chunks that no longer match their checksums do not count. Raises as `Store`
+    does."""
     finished = Store(study, path, create=False).sound()
     points = sum(len(study.chunks[number]) for number in finished)
     return Progress(points, len(study.points), len(finished), len(study.chunks), None)
@@ -55,7 +56,7 @@ def study_progress(study: Study, path: str | Path) -> Progress:
 def _solved(
     study: Study, numbers: list[int], client: Any, solved: Callable[[int], None]
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Chunks with their results, as they are solved; `solved` as in `solve_chunk`."""
+    """Yield chunks with their results, as they are solved; `solved` as in `solve_chunk`."""
     if client is None:
         for number in numbers:
             yield number, solve_chunk(study, number, solved)

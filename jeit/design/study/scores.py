@@ -1,4 +1,4 @@
-"""The scores that a study can give its skins."""
+"""Scores available in a study."""
 
 from __future__ import annotations
 

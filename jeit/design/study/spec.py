@@ -1,4 +1,4 @@
-"""`Study`: a sweep over layouts and what surrounds them, as a TOML file says; checked before anything runs."""
+"""`Study`: a sweep over layouts and skin parameters from a TOML file, checked before anything runs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from jeit.protocol import Protocol
 if TYPE_CHECKING:
     from jeit.design.study.study_tables import StudyTable
 
-# Bump when the same study would give other numbers.
+# Increase when the same study would give other results.
 _VERSION = 2
 # Fewest electrodes of a protocol.
 _FEWEST = {"adjacent": 4, "opposite": 4, "two-terminal": 2}
@@ -54,7 +54,7 @@ class Shape(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """One skin of a study: its `layout` (with diameters and contact impedances) and what surrounds it, in SI units.
+    """One skin of a study: its `layout` (with diameters and contact impedances) and other parameters, in SI units.
 
     `pairs`: of the nearest electrodes, that a two-terminal `protocol` measures, 0 for all. `layers`: of cells of a
     solid skin's mesh, 0 for a sheet.
@@ -77,11 +77,11 @@ class Point:
 
     @property
     def electrodes(self) -> SheetDiscs | SurfaceDiscs | FaceDiscs:
-        """In the sheet, or on the bottom of the layer."""
+        """Electrodes in the sheet, or on the bottom of the layer."""
         return skin_electrodes(self.layout, self.layers)
 
     def measured(self, current: float) -> Protocol:
-        """What is measured at a `current` in amperes."""
+        """Measurement protocol at a `current` in amperes."""
         return skin_protocol(self.layout, self.protocol, num_pairs=self.pairs, current=current)
 
     @property
@@ -111,8 +111,8 @@ class Study:
       are, or linear; `columns`, `rows`: of the grid of touches.
     - `current`: amperes. `scores`: those wanted; `num_taxels`, `threshold`, `seed`: of `find_taxels`; `correlation`: of
       `TouchPrior`, metres.
-    - `chunk_points`: most points in a chunk. `text`: the study file. `surface`: what tells the surface of curved skins
-      from others, empty for flat ones.
+    - `chunk_points`: most points in a chunk. `text`: the study file. `surface`: text that identifies the surface of
+      curved skins, empty for flat ones.
 
     Studies are equal if their results would be.
     """
@@ -148,7 +148,7 @@ class Study:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of all that decides the results: not of comments or the study's name."""
+        """SHA-256 of all that determines the results, without comments and the study's name."""
         of_skin = [self.surface] if isinstance(self.outline, Triangles) else [*map(float, self.outline.extent)]
         content = [_VERSION, *of_skin, type(self.indentation).__name__]
         content += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
@@ -169,7 +169,7 @@ class Study:
 
 
 def read_study(path: str | Path) -> Study:
-    """The study that a TOML file describes. Lengths are in millimetres; lists are swept, in every combination::
+    """Read the study that a TOML file describes. Lengths are in millimetres; lists are swept, in every combination::
 
         name = "32 electrodes: inside or around"
         [skin]
@@ -303,7 +303,7 @@ def _indentation(table: StudyTable) -> AbstractIndentation:
 
 
 def _check_touches(table: StudyTable) -> None:
-    """Whether touches are enough for the scores, and few enough for memory."""
+    """Check that there are enough touches for the scores, and few enough for memory."""
     scores, touches = table.scores, table.touch.columns * table.touch.rows
     of_sheets = [score for score in OPTIMALITY if score in scores.wanted]
     stored = 8.0 * table.num_points * touches
@@ -332,7 +332,7 @@ def _check_touches(table: StudyTable) -> None:
 def _check_layout(
     layout: Layout | SurfaceLayout, outline: Rectangle | Triangles, layers: int, table: StudyTable
 ) -> None:
-    """Whether a layout, whatever else is swept, can be measured and meshed."""
+    """Check that a layout can be measured and meshed with all swept parameters."""
     widest, thickest = 1e3 * longer_side(outline), max(table.skin.thickness_mm)
     if thickest > widest:
         raise ValueError(f"skin.thickness_mm is {thickest:g}, more than the skin is wide: {widest:g} mm.")
@@ -355,7 +355,7 @@ def _check_layout(
 
 
 def _pairs(layout: Layout | SurfaceLayout, protocol: str, pairs: int | None) -> int:
-    """As many as are asked for, 0 for all; where nobody says, as many as other skins have, or all."""
+    """Number of pairs as given, 0 for all; unless given, the default number, or all if there are fewer."""
     if pairs is not None:
         return pairs
     return defaults.NUM_PAIRS if protocol == "two-terminal" and _all_pairs(layout) > defaults.NUM_PAIRS else 0
@@ -366,7 +366,7 @@ def _all_pairs(layout: Layout | SurfaceLayout) -> int:
 
 
 def _check_measurement(layout: Layout | SurfaceLayout, protocol: str, pairs: int) -> None:
-    """Whether the layout has electrodes enough for its protocol and pairs."""
+    """Check that the layout has enough electrodes for its protocol and pairs."""
     name, number, fewest = layout.name, layout.num_electrodes, _FEWEST[protocol]
     if number < fewest:
         raise ValueError(
@@ -389,10 +389,10 @@ def _check_measurement(layout: Layout | SurfaceLayout, protocol: str, pairs: int
 
 
 def _metres(lengths: list[float]) -> list[float]:
-    """From millimetres."""
+    """Convert millimetres to metres."""
     return [1e-3 * length for length in lengths]
 
 
 def _tidy(value) -> float:
-    """Without the digits that came with the conversion of units."""
+    """Round off the digits due to the conversion of units."""
     return float(f"{float(value):.12g}")

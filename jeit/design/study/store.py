@@ -1,7 +1,7 @@
-"""`Store`: results on disk, of a study or of other chunks, in Zarr, where a chunk either is finished or does not count.
+"""`Store`: results of a study or of other chunked work on disk, in Zarr; a chunk is either finished or does not count.
 
-No chunk touches another's files. Which chunks are finished stands, with a checksum
-of each, in one file that is replaced as a whole, after the chunk's own.
+Chunks have separate files. The list of finished chunks, with a checksum of each, is in one file that is replaced as a
+whole after the files of a chunk are written.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _A_PATH = "that of the store, such as 'results.zarr'"
 
 
 class OtherContents(ValueError):
-    """A store holds something else than is asked for."""
+    """Raised where a store has other contents than requested."""
 
 
 class Store:
@@ -76,7 +76,7 @@ class Store:
 
     @property
     def versions(self) -> dict[str, str]:
-        """Of the packages that made the store."""
+        """Versions of the packages that made the store."""
         return self._attributes()["versions"]
 
     def finished(self) -> dict[int, str]:
@@ -84,11 +84,11 @@ class Store:
         return {int(number): checksum for number, checksum in self._attributes()["finished"].items()}
 
     def sound(self) -> list[int]:
-        """Numbers of the finished chunks whose results read as they were written."""
+        """Numbers of the finished chunks whose results match their checksums."""
         return [number for number, checksum in self.finished().items() if self._checksum(number) == checksum]
 
     def write(self, number: int, results: Mapping[str, np.ndarray]) -> None:
-        """Write chunk `number`, then that it is finished. Raises `OSError`, after which it does not count."""
+        """Write chunk `number`, then mark it as finished. Raises `OSError`, after which it does not count."""
         try:
             for name, values in results.items():
                 self.write_array(name, self.contents.chunks[number], values)
@@ -114,7 +114,7 @@ class Store:
         content = _read_json(self.path)
         finished = content["attributes"]["finished"] | {str(number): checksum}
         content["attributes"]["finished"] = dict(sorted(finished.items(), key=lambda item: int(item[0])))
-        # Beside the store, not in it: Zarr would wonder what it is if it were left behind.
+        # Beside the store, not in it, where a file left behind would be unknown to Zarr.
         temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.tmp")
         try:
             with open(temporary, "w", encoding="utf-8") as file:
@@ -139,7 +139,7 @@ class Store:
         return optional("xarray", _TASK).open_zarr(str(self.path), chunks=None, zarr_format=3)
 
     def _check(self, expected: Mapping[str, ArrayShape]) -> None:
-        """Before Zarr looks at any of it."""
+        """Check the store before Zarr opens any of it."""
         try:
             reason = danger(self.path)
             wrong = None if reason else damage(self.path, expected)
@@ -155,7 +155,7 @@ class Store:
             raise self._damaged(wrong)
 
     def _attributes(self) -> dict:
-        """Those of a study's store; none if it is something else. Raises `ValueError` if they cannot be read."""
+        """Attributes of a study's store; empty for anything else. Raises `ValueError` if they cannot be read."""
         try:
             content = _read_json(self.path)
         except (FileNotFoundError, NotADirectoryError):
@@ -179,10 +179,10 @@ class Store:
 
 @contextlib.contextmanager
 def writing(work: Study | Contents, path: str | Path) -> Iterator[Store]:
-    """The store of `work` at `path`, made empty if there is none, for this process alone to write.
+    """Open the store of `work` at `path`, created empty if there is none, for this process alone to write.
 
-    What killed runs left half-written, under names of their own, is cleared. Raises as `Store` does, and `ValueError`
-    where another process writes it.
+    Temporary files of killed runs are removed. Raises as `Store` does, and `ValueError` where another process writes
+    it.
     """
     check_kind("path", path, (str, os.PathLike), _A_PATH)
     contents = work if isinstance(work, Contents) else study_contents(work)
@@ -196,10 +196,10 @@ def writing(work: Study | Contents, path: str | Path) -> Iterator[Store]:
 
 
 def open_results(study: Study, path: str | Path):
-    """The results as an `xarray.Dataset` with dimensions point and place; what is not finished is NaN.
+    """Open the results as an `xarray.Dataset` with dimensions point and place; unfinished points are NaN.
 
-    `xarray.open_zarr(path)` opens the same store, but cannot tell what an interrupted run left half-written, nor what
-    somebody else's may run. Raises as `Store` does.
+    `xarray.open_zarr(path)` opens the same store, but does not detect half-written chunks of an interrupted run, nor
+    code that somebody else's store may run. Raises as `Store` does.
     """
     xarray = optional("xarray", _TASK)
     store = Store(study, path, create=False)
@@ -227,14 +227,14 @@ def _shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:
 
 
 def _runs(points: Sequence[int]) -> list[slice]:
-    """Points that follow each other, together."""
+    """Group consecutive points."""
     places = np.asarray(points)
     ends = np.flatnonzero(np.diff(places) != 1) + 1
     return [slice(int(run[0]), int(run[-1]) + 1) for run in np.split(places, ends)]
 
 
 def _create(zarr: ModuleType, contents: Contents, path: Path) -> None:
-    """All at once: made under another name, then renamed."""
+    """Create the store atomically: under another name, then renamed."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.new")
     shutil.rmtree(temporary, ignore_errors=True)
     attributes = {
@@ -255,7 +255,7 @@ def _create(zarr: ModuleType, contents: Contents, path: Path) -> None:
 
 
 def _clear_beside(path: Path) -> None:
-    """Take away what runs that were killed have left beside the store."""
+    """Remove the files that killed runs have left beside the store."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.*"):
         pid, _, kind = left.name.removeprefix(f".{path.name}.").partition(".")
         if pid.isdecimal() and kind == "new":

@@ -1,4 +1,4 @@
-"""What a store says of itself, looked at as plain JSON before Zarr opens any of it.
+"""Check of a store's metadata as plain JSON, before Zarr opens any of it.
 
 Zarr looks up a codec by the name in a file, and one of them, pickle, runs whatever the file holds. So a store from
 somebody else is opened only where it is what jeit writes: format 3, the arrays of its contents and no other, of numbers
@@ -35,8 +35,8 @@ class ArrayShape(NamedTuple):
 
 
 def danger(path: Path) -> str | None:
-    """Why the store must not be opened, whatever it should hold; None where nothing in it can run or lead elsewhere.
-    Raises `OSError` for files that cannot be read."""
+    """The reason why the store must not be opened; None where nothing in it can run code or link to other paths. Raises
+    `OSError` for files that cannot be read."""
     for folder, folders, files in os.walk(path):
         for name in [*folders, *files]:
             place = Path(folder, name)
@@ -54,7 +54,7 @@ def danger(path: Path) -> str | None:
 
 
 def damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
-    """What is not as in a store of the arrays `expected`, by name; None where all is. Raises `OSError` for files
+    """The difference from a store of the arrays `expected`, by name; None if there is none. Raises `OSError` for files
     that cannot be read."""
     content = _read(path / _METADATA)
     if content is None:
@@ -80,7 +80,7 @@ def damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
 
 
 def _chunk_damage(folder: Path, array: ArrayShape) -> str | None:
-    """Whether a chunk says to be larger, unpacked, than its array's are."""
+    """Whether a chunk declares a larger unpacked size than its array's chunks have."""
     most = _LARGEST if array.data_type == "string" else 8 * math.prod(array.chunks) + _BESIDE
     for file in folder.rglob("*"):
         if file.is_file() and file.name != _METADATA:

@@ -1,4 +1,4 @@
-"""The tables of a study's file, key by key: what each may hold, from where to where, in which unit; lists are swept."""
+"""Tables of a study's file: type, range and unit of every key; lists are swept."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MOST_LAYOUTS, _MOST_POINTS = 2000, 100_000
 
 
 class MaterialSweep(Table):
-    """Of what the skins are."""
+    """The skins' model and material."""
 
     what = "a study"
     model: Literal["sheet", "layer"] = "sheet"
@@ -40,7 +40,7 @@ class MaterialSweep(Table):
 
 
 class LayoutSweep(Table):
-    """Of their electrodes. NaN is for the layout to say."""
+    """The electrodes. NaN means the layout's own value."""
 
     what = "a study"
     layouts: Several[Word]
@@ -50,7 +50,7 @@ class LayoutSweep(Table):
 
 
 class MeasurementSweep(Table):
-    """Of what is measured of them."""
+    """The measurement protocol."""
 
     what = "a study"
     protocol: Several[ProtocolName] = Field(default=[defaults.PROTOCOL])
@@ -60,7 +60,7 @@ class MeasurementSweep(Table):
 
 
 class TouchTable(Table):
-    """Of where and how they are touched."""
+    """The touches and their grid."""
 
     what = "a study"
     indentation: Literal["bell", "hemisphere"] = "bell"
@@ -74,7 +74,7 @@ class TouchTable(Table):
 
 
 class CellsSweep(Table):
-    """Of their meshes."""
+    """The meshes."""
 
     what = "a study"
     cell_mm: Annotated[list[float], CELL] = Field(default=[1e3 * defaults.CELL_SIZE])
@@ -82,7 +82,7 @@ class CellsSweep(Table):
 
 
 class ScoresTable(Table):
-    """Of what is wanted."""
+    """The wanted scores and their parameters."""
 
     what = "a study"
     wanted: Several[ScoreName] = Field(default=["minimum", "mean", "uniformity"])
@@ -93,7 +93,7 @@ class ScoresTable(Table):
 
 
 class StudyTable(Table):
-    """Of a whole study."""
+    """A complete study file."""
 
     what = "a study"
     name: Word = "study"
@@ -108,13 +108,13 @@ class StudyTable(Table):
 
     @property
     def num_layouts(self) -> int:
-        """How many layouts it makes."""
+        """Number of layouts."""
         one = self.electrodes
         return math.prod(map(len, (one.layouts, one.diameter_mm, one.contact_impedance_ohm_m2)))
 
     @property
     def num_points(self) -> int:
-        """How many points: every combination."""
+        """Number of points: all combinations."""
         skin, measurement = self.skin, self.measurement
         of_points = (measurement.protocol, measurement.pairs or [0], measurement.noise_V, self.mesh.cell_mm)
         return self.num_layouts * math.prod(map(len, (skin.thickness_mm, skin.conductivity_S_per_m, *of_points)))

@@ -1,4 +1,4 @@
-"""People who pat, tickle, stroke and blow on a skin with microphones, each in a way of their own."""
+"""Simulated people who pat, tickle, stroke and blow on a skin with microphones, with individual traits."""
 
 from __future__ import annotations
 

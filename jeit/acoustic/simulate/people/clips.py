@@ -1,4 +1,4 @@
-"""Clips of many people on a skin with microphones, one after the other: what it hears, and who did what."""
+"""Labelled sound clips of many people touching a skin with microphones."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from jeit.acoustic.simulate.synthesis import microphone_noise, sample_times
 from jeit.acoustic.simulate.wind_sound import room_sound
 from jeit.arguments import check_kind, check_name, describe
 
-# Decibels: the room's sound beside the microphones' own noise, and how much that differs from clip to clip.
+# Decibels: level of the room's sound relative to the microphones' own noise, and its deviation between clips.
 _ROOM, _ROOM_SPREAD = -6.0, 4.0
 
 
 @dataclass(frozen=True)
 class SoundClip:
-    """One clip: the `touch` with its truth, and the `noise` (M, S) that is heard with it; its `modality`, and `person`,
-    a number. What the skin hears is `samples`."""
+    """One clip: the `touch` with its truth, and the `noise` (M, S) added to it; its `modality`, and `person`, a number.
+    The recorded sound is `samples`."""
 
     touch: SimulatedSound
     noise: Float[np.ndarray, "M S"]
@@ -34,11 +34,11 @@ class SoundClip:
 
     @property
     def samples(self) -> Float[np.ndarray, "M S"]:
-        """Touch and noise together."""
+        """Sum of touch and noise."""
         return self.touch.samples + self.noise
 
     def noisier(self, decibels: float) -> Float[np.ndarray, "M S"]:
-        """What would be heard with noise stronger by so many decibels."""
+        """Samples of the touch with the noise raised by a number of decibels."""
         return self.touch.samples + 10 ** (decibels / 20) * self.noise
 
 
@@ -51,7 +51,7 @@ def sound_clips(
     modalities: Sequence[str] = MODALITIES,
     duration: float = 2.9,
 ) -> Iterator[SoundClip]:
-    """`each` clips of each modality by each person, in this order, one at a time: a set need not fit into memory.
+    """Yield `each` clips of each modality by each person, in this order, one at a time: a set need not fit into memory.
 
     Noise is the microphones' own and the room's, normal in decibels about -6 dB of that. Every clip has a key of its
     own. Raises `ValueError` for what is no key, skin, person, modality or number, and no people.

@@ -1,4 +1,4 @@
-"""How a skin is patted, tickled, stroked and blown on by most people: the modalities of Park et al. (2022) as numbers.
+"""Population medians of the traits of pats, tickles, strokes and wind, the modalities of Park et al. (2022).
 
 The paper has no numbers; these were chosen here, once, before any accuracy was looked at. A hand pats three times a
 second, with thuds of 80 ms; fingers that tickle land fifteen times a second, lightly, within a centimetre; a stroke

@@ -1,4 +1,5 @@
-"""People on a skin with microphones: each pats, tickles, strokes and blows in a way of their own, never twice alike."""
+"""Simulated people on a skin with microphones: individual pats, tickles, strokes and wind, which vary between
+touches."""
 
 from __future__ import annotations
 
@@ -22,14 +23,14 @@ from jeit.arguments import check_key, check_kind, check_name
 # From tap to tap of one clip, deviations of the logarithms of strength and rhythm; and metres by which a hand that pats
 # lands elsewhere.
 _STRENGTH, _RHYTHM, _ELSEWHERE = 0.25, 0.12, 4e-3
-# Metres from the edge that a touch's middle keeps; slower than this share of its mean a hand at a turn does not get.
+# Least distance of a touch's centre from the edge, metres; least speed of a hand at a turn, relative to its mean.
 _MARGIN, _SLOWEST = 0.02, 0.1
-# A burst lasts so many samples at least, a trait however drawn.
+# Least length of a burst in samples, whatever trait is drawn.
 _SHORTEST = 0.01
 
 
 class SoundingPerson(eqx.Module):
-    """How one person touches: `medians`, of each modality its traits by name, in SI units."""
+    """Traits of one person: `medians`, for each modality its traits by name, in SI units."""
 
     medians: Mapping[str, Mapping[str, float]] = eqx.field(static=True)
 
@@ -44,7 +45,8 @@ class SoundingPerson(eqx.Module):
 
     @classmethod
     def draw(cls, key: Array) -> "SoundingPerson":
-        """Anybody: traits log-normal about those of most people, `slope` normal. Raises `ValueError` for no key."""
+        """Draw a person: traits log-normal about the population medians, `slope` normal. Raises `ValueError` for no
+        key."""
         check_key(key)
         rng = _generator(key)
         own = {}
@@ -59,7 +61,7 @@ class SoundingPerson(eqx.Module):
         return cls(own)
 
     def touch(self, key: Array, modality: str, skin: SoundingSkin, *, duration: float = 2.9) -> SimulatedSound:
-        """`duration` seconds of one modality somewhere on the skin, going on all the while, without any noise.
+        """Simulate `duration` seconds of one modality at a random position of the skin, without noise.
 
         Traits are log-normal about the person's own with a deviation of 0.25. Raises `ValueError` for what is no key,
         skin, modality or duration.
@@ -77,13 +79,13 @@ class SoundingPerson(eqx.Module):
                 traits[name] = max(own + SLOPE_AMONG / 2 * rng.normal(), 0.1)
             else:
                 traits[name] = float(own * np.exp(WITHIN * rng.normal()))
-        # A touch's own colour; the microphones' noise, which is worked out with the skin's, is not made here.
+        # The touch has its own spectral slope; the microphones' noise, which depends on the skin's, is not added here.
         toned = eqx.tree_at(lambda one: one.spectral_slope, skin, traits.pop("slope"))
         return _MAKES[modality](rng, toned, rest, traits, duration)
 
 
 def _taps(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
-    """Pats and tickles: taps of random strength and rhythm, and places within `radius`."""
+    """Simulate pats and tickles: taps of random strength and rhythm, at positions within `radius`."""
     burst = Burst(traits["strength"], max(traits["length"], _SHORTEST))
     interval, radius = traits["interval"], traits.get("radius", _ELSEWHERE)
     count = int(np.ceil(2 * duration / interval)) + 2
@@ -101,7 +103,7 @@ def _taps(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict
 
 
 def _stroke(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
-    """To and fro along a straight path, slower where it turns."""
+    """Simulate a stroke to and fro along a straight path, slower at the turns."""
     angle, phase = rng.uniform(0, 2 * np.pi, 2)
     half = traits["path"] / 2 * np.array([np.cos(angle), np.sin(angle)])
     room = np.array([skin.layer.width, skin.layer.height]) / 2 - _MARGIN
@@ -118,7 +120,7 @@ def _stroke(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: di
 
 
 def _wind(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
-    """A jet that is held over one place."""
+    """Simulate an air jet held over one position."""
     return wind(skin, key, _somewhere(rng, skin), slope=skin.spectral_slope, duration=duration, noise=False, **traits)
 
 
@@ -126,7 +128,7 @@ _MAKES: dict[str, Callable[..., SimulatedSound]] = {"pat": _taps, "tickle": _tap
 
 
 def _silent(skin: SoundingSkin, duration: float) -> SimulatedSound:
-    """Nobody there."""
+    """Simulate silence, with nobody there."""
     silence = quiet(skin, jax.random.key(0), duration=duration)
     return SimulatedSound(
         np.zeros_like(silence.samples), skin.rate, np.zeros((0, 2)), np.zeros(0), silence.active, False
