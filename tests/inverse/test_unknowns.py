@@ -10,7 +10,7 @@ from jeit.electrodes import BoundaryElectrodes, PointElectrodes, SheetDiscs
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, Parametrisation, TotalVariation, posterior, reconstruct
 from jeit.inverse.nonlinear import Background, ContactImpedance, ElectrodePosition, GaussNewton, Scale
-from jeit.inverse.nonlinear.observed import independent_data
+from jeit.inverse.nonlinear.problem import independent_data
 from jeit.inverse.nonlinear.reconstruct import pose
 from jeit.layout import grid, ring
 from jeit.mesh import Disk, Rectangle, centroids
