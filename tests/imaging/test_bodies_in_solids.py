@@ -11,6 +11,8 @@ from jeit.data import Measurement
 from jeit.electrodes import FacePatches
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
+from jeit.image import Raster
+from jeit.image.segmentation import CONDUCTIVE
 from jeit.imaging import ImagedDifference, ImagingSettings, automatic, difference, method
 from jeit.inverse import Laplace
 from jeit.inverse.shapes import Ellipsoid, ShapeReconstruction
@@ -29,6 +31,21 @@ def measured(model, conductivity, seed, domain=BOX):
     voltages = voltages * (1 + 1e-4 * np.random.default_rng(seed).normal(size=voltages.shape))
     known = {"electrodes": model.electrodes, "domain": domain, "name": str(seed)}
     return Measurement(voltages, np.ones(voltages.shape, bool), model.protocol, **known)
+
+
+def test_labels_of_a_solid_are_those_half_way_up():
+    mesh = BOX.mesh(num_points=300)
+    raster = Raster.create(mesh, shape=(40, 30), height=0.05)
+
+    def ball(z):
+        return Ellipsoid(1, np.array([0.0, 0.0, z]), 0.03 * np.eye(3), 1e-4, np.zeros(3), 1.0, False, False, 10.0)
+
+    middle = difference._labels(mesh, [ball(0.05)], raster)
+    left, right, low, high = raster.extent
+    pixel = (right - left) * (high - low) / middle.size
+    assert middle.max() == CONDUCTIVE
+    assert (middle > 0).sum() * pixel == pytest.approx(np.pi * 0.03**2, rel=0.1)
+    assert not difference._labels(mesh, [ball(0.01)], raster).any()
 
 
 @pytest.mark.slow

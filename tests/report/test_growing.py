@@ -16,6 +16,7 @@ from jeit.mesh import Disk
 from jeit.protocol import adjacent
 from jeit.report import write_stream
 from jeit.report.growing import GrowingRows, GrowingTable, Sample
+from jeit.report.stream import _Seen
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +66,18 @@ def test_an_unchanged_frame_has_no_peak(calibrated, tmp_path):
     peaks = {name for name in still if name.startswith(("x", "y", "peak"))}
     assert peaks
     assert all(still[name] == "" and pressed[name] != "" for name in peaks)
+
+
+def test_noise_does_not_fill_the_colours(calibrated):
+    """Where no frame has changed, the scale ends at 1 % of the background; else at the largest change."""
+    noise = 1 + np.full(calibrated.model.mesh.num_cells, 1e-6)
+    unchanged = FrameImage(0, noise, FrameStatus.UNCHANGED, "no change", np.ones(40, bool), 0.5, 0, 1e-3)
+    seen = _Seen(calibrated)
+    seen.take(unchanged)
+    assert seen.limit == pytest.approx(0.01)
+    for one in images(calibrated, 1):
+        seen.take(one)
+    assert seen.limit == pytest.approx(1e-3, rel=1e-3)
 
 
 def test_one_frame_that_was_imaged_is_shown(calibrated, tmp_path, monkeypatch):

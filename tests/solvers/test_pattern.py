@@ -1,5 +1,7 @@
 """Patterns, assembly and the lineax operator: against matrices added up entry by entry, and bad input explained."""
 
+from itertools import combinations
+
 import jax
 import jax.numpy as jnp
 import lineax
@@ -9,6 +11,7 @@ import sparse_problems
 from scipy.sparse import csr_array
 
 from jeit_solvers import ConjugateGradient, SparseCholesky, SparseSymmetric, SparsityPattern, analyse, factorise, solve
+from jeit_solvers.sparse.plan import elimination_tree
 
 
 def added_up(groups, matrices, size):
@@ -18,6 +21,16 @@ def added_up(groups, matrices, size):
         for nodes, block in zip(elements, blocks, strict=True):
             total[np.ix_(nodes, nodes)] += block
     return total
+
+
+def test_fronts_hold_the_factor_and_the_factor_holds_the_matrix():
+    """Counts by which the direct solver is chosen, or an iterative one."""
+    points, cells = sparse_problems.disk_cells(300)
+    pattern = SparsityPattern.from_elements([cells], 300)
+    tree = elimination_tree(pattern, points)
+    edges = {tuple(sorted(pair)) for cell in cells.tolist() for pair in combinations(cell, 2)}
+    assert tree.num_front_entries >= tree.num_factor_entries >= 300 + len(edges)
+    assert tree.num_operations >= 2 * tree.num_factor_entries
 
 
 @pytest.fixture
